@@ -1,0 +1,115 @@
+#include "pool.h"
+
+#include <algorithm>
+#include <atomic>
+#include <condition_variable>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+#include "export.h"
+
+namespace se {
+namespace {
+
+struct Job {
+  void (*body)(void*, int64_t, int64_t, int) = nullptr;
+  void* context = nullptr;
+  int64_t n = 0, grain = 1, chunks = 0;
+  int slots = 0;  // workers that may still join
+  std::atomic<int64_t> next{0}, done{0};
+
+  void work(int worker) {
+    for (;;) {
+      const int64_t chunk = next.fetch_add(1, std::memory_order_relaxed);
+      if (chunk >= chunks) return;
+      body(context, chunk * grain, std::min(n, (chunk + 1) * grain), worker);
+      done.fetch_add(1, std::memory_order_release);
+    }
+  }
+};
+
+class Pool {
+ public:
+  void run(Job& job, int threads) {
+    {
+      std::lock_guard lock(mutex_);
+      while (static_cast<int>(workers_.size()) < threads - 1) workers_.emplace_back([this] { loop(); });
+      job_ = &job;
+      joined_ = 0;
+      job.slots = threads - 1;
+      ++generation_;
+    }
+    wake_.notify_all();
+    job.work(0);
+    std::unique_lock lock(mutex_);
+    job_ = nullptr;  // nobody joins from here on
+    idle_.wait(lock, [&] { return active_ == 0; });
+  }
+
+  ~Pool() {
+    {
+      std::lock_guard lock(mutex_);
+      stop_ = true;
+    }
+    wake_.notify_all();
+    for (auto& worker : workers_) worker.join();
+  }
+
+ private:
+  void loop() {
+    uint64_t seen = 0;
+    std::unique_lock lock(mutex_);
+    for (;;) {
+      wake_.wait(lock, [&] { return stop_ || (job_ && generation_ != seen); });
+      if (stop_) return;
+      seen = generation_;
+      Job* job = job_;
+      if (joined_ >= job->slots) continue;
+      const int worker = ++joined_;
+      ++active_;
+      lock.unlock();
+      job->work(worker);
+      lock.lock();
+      if (--active_ == 0) idle_.notify_all();
+    }
+  }
+
+  std::mutex mutex_;
+  std::condition_variable wake_, idle_;
+  std::vector<std::thread> workers_;
+  Job* job_ = nullptr;
+  uint64_t generation_ = 0;
+  int joined_ = 0, active_ = 0;
+  bool stop_ = false;
+};
+
+std::mutex run_mutex;  // one job at a time; a second caller works alone
+
+Pool& pool() {
+  static Pool* instance = new Pool;  // never destroyed: workers may outlive static destructors at interpreter exit
+  return *instance;
+}
+
+}  // namespace
+
+void parallel_chunks(int64_t n, int64_t grain, int threads, void (*body)(void*, int64_t, int64_t, int), void* context) {
+  if (n <= 0) return;
+  Job job;
+  job.body = body;
+  job.context = context;
+  job.n = n;
+  job.grain = std::max<int64_t>(1, grain);
+  job.chunks = (n + job.grain - 1) / job.grain;
+  threads = static_cast<int>(std::min<int64_t>(threads, job.chunks));
+  std::unique_lock lock(run_mutex, std::defer_lock);
+  if (threads <= 1 || !lock.try_lock()) {
+    job.work(0);
+    return;
+  }
+  pool().run(job, threads);
+}
+
+}  // namespace se
+
+SE_EXPORT int se_abi_version() { return 1; }

@@ -1,0 +1,74 @@
+"""Loads the compiled library built for this processor (sources in csrc/), or says why there is none.
+
+One shared library per instruction set is installed in `scene_experts/_native`; the best that this processor runs is taken. Nothing here
+imports anything of the project but the errors, so every layer may use it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import sys
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import scene_experts
+
+ABI_VERSION = 1
+LEVELS = ("avx512", "avx2", "portable")  # best first
+_SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
+
+
+def levels() -> tuple[str, ...]:
+    """The instruction sets of this processor that a library may have been built for, best first."""
+    capability = torch.backends.cpu.get_cpu_capability()
+    best = "avx512" if capability.startswith("AVX512") else "avx2" if capability.startswith("AVX2") else "portable"
+    return LEVELS[LEVELS.index(best) :]
+
+
+def path(level: str) -> Path | None:
+    """Where the library for `level` is installed, or None."""
+    for root in scene_experts.__path__:
+        candidate = Path(root) / "_native" / f"se_{level}{_SUFFIX}"
+        if candidate.is_file():
+            return candidate
+    return None
+
+
+@functools.cache
+def load(level: str | None = None) -> ctypes.CDLL | None:
+    """The library for `level` (None: the best of this processor), or None where none is installed or it is of another version."""
+    for name in (level,) if level else levels():
+        where = path(name)
+        if where is None:
+            continue
+        library = ctypes.CDLL(str(where))
+        if library.se_abi_version() == ABI_VERSION:
+            library.level = name  # type: ignore[attr-defined]
+            return library
+    return None
+
+
+def why_not() -> str | None:
+    """None where a library loads; else one sentence that says why not and what to do."""
+    if load() is not None:
+        return None
+    found = [name for name in LEVELS if path(name)]
+    if not found:
+        return "the compiled CPU library is not installed: install a C++20 compiler (g++ or clang++) and run `pip install .` again"
+    return f"the compiled CPU library ({', '.join(found)}) does not fit this processor or this version: run `pip install .` again"
+
+
+def pointer(tensor: Tensor | None) -> ctypes.c_void_p:
+    """The address of a contiguous CPU tensor's first element (None: a null pointer)."""
+    if tensor is None:
+        return ctypes.c_void_p(0)
+    assert tensor.device.type == "cpu" and tensor.is_contiguous()
+    return ctypes.c_void_p(tensor.data_ptr())
+
+
+def threads() -> int:
+    """How many threads native code may use: torch's own setting."""
+    return torch.get_num_threads()
