@@ -25,11 +25,11 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"spherical harmonics are defined here for degrees 0 to {MAX_DEGREE}, not {degree}")
     x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
     terms = [torch.full_like(x, C0)]
     if degree >= 1:
         terms += [-C1 * y, C1 * z, -C1 * x]
     if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
         bands = (x * y, y * z, 2 * zz - xx - yy, x * z, xx - yy)
         terms += [c * b for c, b in zip(C2, bands, strict=True)]
     if degree >= 3:

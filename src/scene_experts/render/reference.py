@@ -1,0 +1,233 @@
+"""The rasteriser in plain torch: slow, differentiable by autograd on any device and in any precision; the others are tested against it.
+
+Per Gaussian (EWA splatting as in 3DGS, with the true principal point as in gsplat):
+    view      p = R mean + t; drawn only if p.z > near.
+    centre    u = fx p.x / p.z + cx, v likewise; the centre of pixel (i, j) is (i + 0.5, j + 0.5).
+    Jacobian  J = [[fx / z, 0, -fx tx / z^2], [0, fy / z, -fy ty / z^2]], where tx = z clamp(p.x / z, -cx / fx - m, (W - cx) / fx + m) with
+              m = 0.3 W / (2 fx): 1.3 tan(fov / 2) either side of a centred axis; ty likewise. Outside the limits p.x has no gradient
+              through J, and z has that of tx = z limit.
+    2D cov    C = J R Sigma R^T J^T + 0.3 I, Sigma from the quaternions as passed (not normalised here). det C <= 0: not drawn.
+    antialias (off by default) opacity *= sqrt(max(0.005^2, det(C - 0.3 I) / det C)); no gradient through the ratio where it is floored.
+              gsplat has this floor from 1.6 on; 1.5.3 floors at 0.
+    radius    r = ceil(3 sqrt(lambda)), lambda = mid + sqrt(max(0.1, mid^2 - det C)), mid = trace / 2. It is not drawn, and its radius
+              is 0, if the square [u - r, u + r] x [v - r, v + r] meets no 16 x 16 tile of the picture: if u + r <= 0 or
+              u - r >= 16 ceil(W / 16), or v likewise.
+Per pixel, by depth z (ties by index), over all drawn Gaussians:
+    power = -1/2 (a dx^2 + c dy^2) - b dx dy with the conic (a, b, c) = C^-1; skipped if power > 0.
+    alpha = min(0.99, opacity exp(power)); skipped if alpha < 1/255.
+    If T (1 - alpha) < 1e-4 the pixel stops, and this Gaussian is not blended. Else colour += T alpha c, depth += T alpha z, T *= 1 - alpha.
+    Output: colour + T background, 1 - T, depth.
+
+Different from the original CUDA code of 3DGS: a drawn Gaussian reaches every pixel where its alpha is at least 1/255 (there: only the tiles
+of its 3 sigma square, which cuts off alphas up to 0.011), and the gradient is the true one, zero where alpha is clamped to 0.99 (there it
+passes: `clamp_gradient`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from scene_experts.geometry.rotation import covariance
+from scene_experts.types import Camera, Gaussians, Render
+
+BLUR = 0.3  # px^2, added to the diagonal of the 2D covariance
+MAX_ALPHA = 0.99
+MIN_ALPHA = 1 / 255
+MIN_TRANSMITTANCE = 1e-4
+MIN_COMPENSATION = 0.005
+TILE = 16  # px; the radius rule is in these tiles whatever tile the picture is made in
+_CHECKPOINT = 1 << 24  # (pixel, Gaussian) pairs above which tiles are computed again in backward instead of kept
+
+
+class Projected(NamedTuple):
+    """Gaussians as ellipses in the picture."""
+
+    mean2d: Tensor  # [M, 2] px
+    depth: Tensor  # [M] world units along z
+    cov2d: Tensor  # [M, 3] px^2: xx, xy, yy, blur included
+    conic: Tensor  # [M, 3]: the inverse, xx, xy, yy
+    compensation: Tensor  # [M] antialias factor of the opacity
+    radii: Tensor  # [M] int32 px
+
+
+@dataclass(frozen=True)
+class ReferenceRasterizer:
+    """The definition of the picture, in plain torch.
+
+    `clamp_gradient` lets the gradient of opacity and shape pass where alpha is cut at 0.99, as the original CUDA code does.
+    `tile` is the edge in pixels of the blocks the picture is made in (None: all at once); it changes speed and memory, not the picture.
+    """
+
+    antialias: bool = False
+    clamp_gradient: bool = False
+    tile: int | None = TILE
+    name: str = "reference"
+
+    def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
+        """Draws M Gaussians over `background` [3]; see `types.Render`. A later backward pass overwrites `mean2d_grad`."""
+        projected = project(g.means, g.quats, g.scales, camera)
+        ids = torch.where(projected.radii > 0)[0]
+        ids = ids[projected.depth.detach()[ids].argsort(stable=True)]  # near to far
+        mean2d, opacity = projected.mean2d[ids], g.opacities[ids]
+        if self.antialias:
+            opacity = opacity * projected.compensation[ids]
+        grad = watch_mean2d(mean2d, (g.scales, g.quats, g.opacities, g.colors), camera, len(g), ids)
+        columns = [mean2d, projected.conic[ids], opacity[:, None], g.colors[ids], projected.depth[ids, None]]
+        reach = _reach(mean2d, projected.cov2d[ids], opacity)
+        out = self._picture(torch.cat(columns, dim=1), reach, camera)
+        color, depth, transmittance = out[..., :3], out[..., 3], out[..., 4]
+        image = color + transmittance[..., None] * background.to(color)
+        return Render(image, 1 - transmittance, depth, projected.radii, grad)
+
+    @torch.no_grad()
+    def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
+        """Whether round-axis Gaussians at `means` [A, 3] with `scales` [A, 3] would be drawn (radius > 0), [A] bool (Scaffold-GS)."""
+        return visible(means, scales, camera)
+
+    def _picture(self, splats: Tensor, reach: Tensor, camera: Camera) -> Tensor:
+        """Colour, depth and final transmittance [H, W, 5] of splats [V, 10] sorted near to far."""
+        height, width = camera.height, camera.width
+        block = (height, width) if self.tile is None or not len(splats) else (self.tile, self.tile)
+        down, across = -(-height // block[0]), -(-width // block[1])
+        entries, counts = _bin(reach, block, down, across)
+        lists = splats[entries].split(counts)  # one gather for all, so that backward is one scatter
+        pairs = len(entries) * block[0] * block[1]
+        recompute = torch.is_grad_enabled() and splats.requires_grad and pairs > _CHECKPOINT
+        blank = splats.new_tensor([0.0, 0.0, 0.0, 0.0, 1.0]).expand(block[0] * block[1], 5)
+        tiles = []
+        for number, part in enumerate(lists):
+            if not len(part) and len(lists) > 1:
+                tiles.append(blank)
+                continue
+            corner = (number // across * block[0], number % across * block[1])
+            pixels = _centres(corner, block, splats)
+            if recompute:
+                tiles.append(checkpoint(_blend, part, pixels, self.clamp_gradient, use_reentrant=False))
+            else:
+                tiles.append(_blend(part, pixels, self.clamp_gradient))
+        grid = torch.stack(tiles).view(down, across, block[0], block[1], 5).transpose(1, 2)
+        return grid.reshape(down * block[0], across * block[1], 5)[:height, :width]
+
+
+def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Projected:
+    """Steps view to radius of the module's definition, for M Gaussians; what is not drawn has harmless finite values and radius 0."""
+    camera = camera.to(means.device, means.dtype)
+    rotation, shift = camera.world_to_cam[:3, :3], camera.world_to_cam[:3, 3]
+    view = means @ rotation.T + shift
+    front = view[:, 2] > camera.near
+    x, y, z = torch.where(front[:, None], view, view.new_tensor([0.0, 0.0, 1.0])).unbind(1)  # no division by 0 behind the camera
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    mean2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
+
+    margin_x, margin_y = 0.3 * camera.width / (2 * fx), 0.3 * camera.height / (2 * fy)
+    tx = z * (x / z).clamp(-cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
+    ty = z * (y / z).clamp(-cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack([fx / z, zero, -fx * tx / z**2, zero, fy / z, -fy * ty / z**2], dim=1).view(-1, 2, 3)
+    to_pixels = jacobian @ rotation
+    cov = to_pixels @ covariance(quats, scales) @ to_pixels.transpose(1, 2)
+
+    sharp = cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2
+    xx, xy, yy = cov[:, 0, 0] + BLUR, cov[:, 0, 1], cov[:, 1, 1] + BLUR
+    det = xx * yy - xy**2
+    drawn = front & (det > 0)
+    det = torch.where(drawn, det, torch.ones_like(det))
+    conic = torch.stack([yy / det, -xy / det, xx / det], dim=1)
+    compensation = (sharp / det).clamp_min(MIN_COMPENSATION**2).sqrt()
+    radii = _radii(mean2d.detach(), xx.detach(), yy.detach(), det.detach(), drawn, camera)
+    return Projected(mean2d, view[:, 2], torch.stack([xx, xy, yy], dim=1), conic, compensation, radii)
+
+
+@torch.no_grad()
+def visible(means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
+    """Whether a Gaussian with unrotated axes at each of `means` [A, 3] with `scales` [A, 3] has a radius greater than 0, [A] bool."""
+    quats = torch.zeros((len(means), 4), dtype=means.dtype, device=means.device)
+    quats[:, 0] = 1
+    return project(means, quats, scales, camera).radii > 0
+
+
+def watch_mean2d(mean2d: Tensor, others: tuple[Tensor, ...], camera: Camera, total: int, ids: Tensor) -> Tensor:
+    """A buffer [total, 2] of zeros; backward writes d loss / d mean in NDC (pixel gradient times W/2, H/2) of `mean2d` to rows `ids`."""
+    buffer = mean2d.new_zeros((total, 2))
+    if not torch.is_grad_enabled():
+        return buffer
+    if not mean2d.requires_grad and any(t.requires_grad for t in others):
+        mean2d.requires_grad_()
+    if mean2d.requires_grad:
+        half = mean2d.new_tensor([camera.width / 2, camera.height / 2])
+
+        def store(gradient: Tensor) -> None:
+            buffer[ids] = gradient.detach() * half
+
+        mean2d.register_hook(store)
+    return buffer
+
+
+def _radii(mean2d: Tensor, xx: Tensor, yy: Tensor, det: Tensor, drawn: Tensor, camera: Camera) -> Tensor:
+    """The 3 sigma radius [M] int32, 0 for what is not drawn."""
+    mid = (xx + yy) / 2
+    radius = (3 * (mid + (mid**2 - det).clamp_min(0.1).sqrt()).sqrt()).ceil()
+    edge = mean2d.new_tensor([-(-camera.width // TILE) * TILE, -(-camera.height // TILE) * TILE])
+    meets = (mean2d + radius[:, None] > 0) & (mean2d - radius[:, None] < edge)
+    drawn = drawn & meets.all(1) & radius.isfinite()
+    return torch.where(drawn, radius.clamp_max(2.0**30), torch.zeros_like(radius)).to(torch.int32)
+
+
+@torch.no_grad()
+def _reach(mean2d: Tensor, cov2d: Tensor, opacity: Tensor) -> Tensor:
+    """The box [V, 4] (left, top, right, bottom, px) outside which alpha < 1/255; empty (right < left) if it is so everywhere."""
+    log = torch.log(opacity / MIN_ALPHA)
+    extent = (2 * log.clamp_min(0)).sqrt()[:, None] * cov2d[:, [0, 2]].sqrt() * 1.001 + 0.01  # a little more than needed, for rounding
+    extent = torch.where(log[:, None] >= -1e-3, extent, torch.full_like(extent, -math.inf))
+    return torch.cat([mean2d - extent, mean2d + extent], dim=1)
+
+
+@torch.no_grad()
+def _bin(reach: Tensor, block: tuple[int, int], down: int, across: int) -> tuple[Tensor, list[int]]:
+    """For each block in row order its splats in the given order: their indices [B], one block after the other, and how many each has."""
+    size = reach.new_tensor([block[1], block[0]])
+    most = reach.new_tensor([across, down])
+    first = (reach[:, :2] / size).floor().maximum(torch.zeros_like(most)).minimum(most).long()
+    last = ((reach[:, 2:] / size).floor() + 1).maximum(torch.zeros_like(most)).minimum(most).long()  # exclusive
+    span = (last - first).clamp_min(0)
+    span = span * (reach[:, 2:] > reach[:, :2]).all(1, keepdim=True)
+    count = span[:, 0] * span[:, 1]
+    splat = torch.repeat_interleave(torch.arange(len(reach), device=reach.device), count)
+    local = torch.arange(len(splat), device=reach.device) - (count.cumsum(0) - count)[splat]
+    columns = span[splat, 0]
+    row = first[splat, 1] + torch.div(local, columns, rounding_mode="floor")
+    column = first[splat, 0] + local % columns
+    number = row * across + column
+    order = number.argsort(stable=True)  # keeps near to far within a block
+    return splat[order], torch.bincount(number, minlength=down * across).tolist()
+
+
+def _centres(corner: tuple[int, int], block: tuple[int, int], like: Tensor) -> Tensor:
+    """Pixel centres [P, 2] (x, y) of a block whose first pixel is `corner` (row, column)."""
+    rows = torch.arange(block[0], device=like.device, dtype=like.dtype) + (corner[0] + 0.5)
+    columns = torch.arange(block[1], device=like.device, dtype=like.dtype) + (corner[1] + 0.5)
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    return torch.stack([x.flatten(), y.flatten()], dim=1)
+
+
+def _blend(splats: Tensor, pixels: Tensor, clamp_gradient: bool) -> Tensor:
+    """Front-to-back blending of splats [S, 10], sorted, at pixels [P, 2]: colour, depth, final transmittance [P, 5]."""
+    u, v, a, b, c, opacity = splats[:, :6].unbind(1)
+    dx, dy = u - pixels[:, :1], v - pixels[:, 1:]  # [P, S]
+    power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
+    raw = opacity * power.clamp_max(0).exp()
+    alpha = raw.clamp_max(MAX_ALPHA)
+    if clamp_gradient:
+        alpha = raw + (alpha - raw).detach()
+    alpha = torch.where((power <= 0) & (alpha >= MIN_ALPHA), alpha, torch.zeros_like(alpha))
+    after = (1 - alpha.detach()).cumprod(1)  # transmittance behind each splat; it only falls, so the stop cuts off a tail
+    kept = torch.where(after >= MIN_TRANSMITTANCE, alpha, torch.zeros_like(alpha))
+    through = (1 - kept).cumprod(1)
+    before = torch.cat([torch.ones_like(pixels[:, :1]), through], dim=1)
+    return torch.cat([(kept * before[:, :-1]) @ splats[:, 6:], before[:, -1:]], dim=1)
