@@ -1,0 +1,218 @@
+"""Camera lenses: the eleven classic COLMAP models, their distortion, and the pinhole each is undistorted to.
+
+Symbols: (u, v) are normalised pinhole coordinates x/z, y/z; pixels are COLMAP's, the centre of the first pixel at (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_experts.errors import InputError
+
+Array = NDArray[np.float64]
+
+# Order is COLMAP's numbering. Names of parameters: "f" stands for fx = fy.
+MODELS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "FOV": ("fx", "fy", "cx", "cy", "omega"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "THIN_PRISM_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+}
+FISHEYE = frozenset(name for name in MODELS if name.endswith("FISHEYE"))
+_LARGEST_ANGLE = math.radians(88.0)  # rays further from the axis than this have no useful place on a flat image
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera model of COLMAP with its size and parameters in pixels.
+
+    Raises InputError for an unknown model, a wrong number of parameters, values that are not finite, a focal length or a size that is not positive.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if self.model not in MODELS:
+            raise InputError(f"expected a camera model among {', '.join(MODELS)}, found {self.model!r}; convert the model to one of those")
+        if len(self.params) != len(MODELS[self.model]):
+            raise InputError(
+                f"expected {len(MODELS[self.model])} parameters for camera model {self.model}, found {len(self.params)}; restore the file"
+            )
+        if not all(math.isfinite(p) for p in self.params) or self.fx <= 0 or self.fy <= 0 or self.width < 1 or self.height < 1:
+            raise InputError(
+                f"expected a camera with a positive size and focal length and finite parameters, found {self.model} "
+                f"{self.width}x{self.height} {self.params}; remove it or reconstruct the capture again"
+            )
+
+    def value(self, name: str) -> float:
+        """The parameter `name`, 0 where the model has none."""
+        names = MODELS[self.model]
+        return self.params[names.index(name)] if name in names else 0.0
+
+    @property
+    def fx(self) -> float:
+        return self.params[0]
+
+    @property
+    def fy(self) -> float:
+        return self.params[1] if MODELS[self.model][1] == "fy" else self.params[0]
+
+    @property
+    def cx(self) -> float:
+        return self.value("cx")
+
+    @property
+    def cy(self) -> float:
+        return self.value("cy")
+
+    @property
+    def distorted(self) -> bool:
+        """Whether straight lines bend. A fisheye always does; the others only with a coefficient that is not 0."""
+        geometric = {"f", "fx", "fy", "cx", "cy"}
+        return self.model in FISHEYE or any(p != 0 for n, p in zip(MODELS[self.model], self.params) if n not in geometric)
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The same lens before an image of another size; exact, each axis by its own ratio.
+
+        With pixel centres at +0.5 both the focal length and the principal point are multiplied by the ratio and nothing is added.
+        Raises InputError when the ratios differ so much that one shared focal length cannot hold both.
+        """
+        sx, sy = width / self.width, height / self.height
+        if sx == sy == 1.0:
+            return self
+        names, params = MODELS[self.model], list(self.params)
+        model = self.model
+        if names[0] == "f" and sx != sy:  # one shared focal length cannot follow two ratios
+            model = _TWO_FOCALS[self.model]
+            params = [self.value(n) if n not in ("fx", "fy") else self.params[0] for n in MODELS[model]]
+            names = MODELS[model]
+        factor = {"f": sx, "fx": sx, "cx": sx, "fy": sy, "cy": sy}
+        return Lens(model, width, height, tuple(p * factor.get(n, 1.0) for n, p in zip(names, params)))
+
+    def distort(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Normalised pinhole coordinates to normalised distorted ones (the pixel is (fx u' + cx, fy v' + cy))."""
+        if self.model == "FOV":
+            return _fov(self.value("omega"), u, v)
+        if self.model in FISHEYE:  # first the equidistant image: |(u, v)| = angle from the axis
+            r = np.hypot(u, v)
+            s = np.where(r > 1e-8, np.arctan(r) / np.maximum(r, 1e-8), 1.0)
+            u, v = u * s, v * s
+        return self._bend(u, v)
+
+    def undistort(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """The inverse of `distort`, by Newton's method. Rays beyond 88 degrees from the axis of a fisheye are clamped there."""
+        if self.model == "FOV":
+            return _fov_inverse(self.value("omega"), u, v)
+        a, b = self._unbend(u, v)
+        if self.model in FISHEYE:
+            theta = np.hypot(a, b)
+            s = np.where(theta > 1e-8, np.tan(np.minimum(theta, _LARGEST_ANGLE)) / np.maximum(theta, 1e-8), 1.0)
+            a, b = a * s, b * s
+        return a, b
+
+    def _bend(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Radial, tangential and thin-prism terms (the polynomial part of every model; OpenCV's and COLMAP's formulas)."""
+        k = [self.value(n) for n in ("k1", "k2", "k3", "k4", "k5", "k6")]
+        p1, p2, sx, sy = (self.value(n) for n in ("p1", "p2", "sx1", "sy1"))
+        r2 = u * u + v * v
+        if self.model == "FULL_OPENCV":
+            radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]))) / (1 + r2 * (k[3] + r2 * (k[4] + r2 * k[5])))
+        else:
+            radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * (k[2] + r2 * k[3])))
+        uv = u * v
+        return (
+            u * radial + 2 * p1 * uv + p2 * (r2 + 2 * u * u) + sx * r2,
+            v * radial + 2 * p2 * uv + p1 * (r2 + 2 * v * v) + sy * r2,
+        )
+
+    def _unbend(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Solve `_bend(a, b) = (u, v)` by Newton's method with central differences, starting from (u, v)."""
+        a, b, h = u.copy(), v.copy(), 1e-6
+        for _ in range(60):
+            fu, fv = self._bend(a, b)
+            (r, s), (t, w) = self._bend(a + h, b), self._bend(a - h, b)
+            (x, y), (m, n) = self._bend(a, b + h), self._bend(a, b - h)
+            j00, j10, j01, j11 = (r - t) / (2 * h), (s - w) / (2 * h), (x - m) / (2 * h), (y - n) / (2 * h)
+            det = j00 * j11 - j01 * j10
+            det = np.where(np.abs(det) < 1e-9, 1e-9, det)
+            eu, ev = fu - u, fv - v
+            da, db = (j11 * eu - j01 * ev) / det, (j00 * ev - j10 * eu) / det
+            a, b = a - da, b - db
+            if float(np.max(np.abs(da)) + np.max(np.abs(db))) < 1e-10:
+                break
+        return a, b
+
+
+# The model with two focal lengths that holds each one-focal model exactly.
+_TWO_FOCALS = {
+    "SIMPLE_PINHOLE": "PINHOLE",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+}
+
+
+def _fov(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
+    """Devernay and Faugeras' field-of-view model: r' = atan(2 r tan(omega/2)) / omega."""
+    if abs(omega) < 1e-9:
+        return u, v
+    r = np.hypot(u, v)
+    c = 2 * math.tan(omega / 2)
+    s = np.where(r > 1e-8, np.arctan(c * r) / np.maximum(omega * r, 1e-12), c / omega)
+    return u * s, v * s
+
+
+def _fov_inverse(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
+    if abs(omega) < 1e-9:
+        return u, v
+    r = np.hypot(u, v)
+    c = 2 * math.tan(omega / 2)
+    s = np.where(r > 1e-8, np.tan(np.minimum(omega * r, _LARGEST_ANGLE)) / np.maximum(c * r, 1e-12), omega / c)
+    return u * s, v * s
+
+
+def pinhole_of(lens: Lens) -> Lens:
+    """The pinhole that `lens` is undistorted to: same focal lengths, the largest size without empty pixels (COLMAP's rule, blank_pixels = 0).
+
+    The image border is undistorted; each axis is grown or cropped about the principal point until no output pixel looks outside the
+    photograph, within 0.2 to 2 times the original size. An undistorted lens is returned as a PINHOLE of its own size.
+    """
+    w, h = lens.width, lens.height
+    if not lens.distorted:
+        return Lens("PINHOLE", w, h, (lens.fx, lens.fy, lens.cx, lens.cy))
+
+    def border(x: Array, y: Array) -> tuple[Array, Array]:
+        u, v = lens.undistort((x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy)
+        return u * lens.fx + lens.cx, v * lens.fy + lens.cy
+
+    rows, cols = np.arange(h) + 0.5, np.arange(w) + 0.5
+    left = border(np.full(h, 0.5), rows)[0].max()
+    right = border(np.full(h, w - 0.5), rows)[0].min()
+    top = border(cols, np.full(w, 0.5))[1].max()
+    bottom = border(cols, np.full(w, h - 0.5))[1].min()
+    # The grown size keeps the principal point at the same fraction of the image, hence the larger (stricter) of the two ratios.
+    scale_x = 1 / max(lens.cx / max(lens.cx - left, 1e-9), (w - 0.5 - lens.cx) / max(right - lens.cx, 1e-9))
+    scale_y = 1 / max(lens.cy / max(lens.cy - top, 1e-9), (h - 0.5 - lens.cy) / max(bottom - lens.cy, 1e-9))
+    width, height = (max(1, int(min(max(s, 0.2), 2.0) * n)) for s, n in ((scale_x, w), (scale_y, h)))
+    return Lens("PINHOLE", width, height, (lens.fx, lens.fy, lens.cx * width / w, lens.cy * height / h))
+
+
+def without_principal_point(lens: Lens) -> Lens:
+    """`lens` with the principal point moved to the image centre (what code that ignores it believes)."""
+    centre = {"cx": lens.width / 2, "cy": lens.height / 2}
+    return replace(lens, params=tuple(centre.get(n, p) for n, p in zip(MODELS[lens.model], lens.params)))

@@ -1,0 +1,74 @@
+"""Finds the photographs and masks that a capture's files name. By name, never by position in a sorted list."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from scene_experts.errors import InputError
+
+EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+
+
+@dataclass(frozen=True)
+class Match:
+    """Files by name, the names without one, and what had to be assumed."""
+
+    found: dict[str, Path]
+    absent: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def match_images(folder: Path, names: Sequence[str]) -> Match:
+    """For each of `names` (relative, "/" between folders) its file in `folder`.
+
+    The exact path first; else the only file with the same stem and another extension; else the only file of that base name in `folder`,
+    when no other name shares it. Everything but an exact match is reported in `warnings`.
+    """
+    files = [path for path in folder.rglob("*") if path.suffix.lower() in EXTENSIONS] if folder.is_dir() else []
+    by_stem, by_base = defaultdict(list), defaultdict(list)
+    for path in sorted(files):
+        by_stem[path.relative_to(folder).with_suffix("").as_posix()].append(path)
+        by_base[path.stem].append(path)
+    bases = defaultdict(int)
+    for name in names:
+        bases[PurePosixPath(name).stem] += 1
+    found, absent, other, moved = {}, [], [], []
+    for name in names:
+        stem = PurePosixPath(name)
+        same_stem, same_base = by_stem[stem.with_suffix("").as_posix()], by_base[stem.stem]
+        if (folder / name).is_file():
+            found[name] = folder / name
+        elif len(same_stem) == 1:
+            found[name] = same_stem[0]
+            other.append(f"{name} -> {same_stem[0].name}")
+        elif not same_stem and len(same_base) == 1 and bases[stem.stem] == 1:
+            found[name] = same_base[0]
+            moved.append(f"{name} -> {same_base[0].relative_to(folder).as_posix()}")
+        else:
+            absent.append(name)
+    notes = []
+    if other:
+        notes.append(f"{len(other)} images found under another extension (first: {other[0]})")
+    if moved:
+        notes.append(f"{len(moved)} images found in another folder (first: {moved[0]})")
+    return Match(found, tuple(absent), tuple(notes))
+
+
+def absent_error(folder: Path, names: Sequence[str], absent: Sequence[str]) -> InputError:
+    """The error for images that are not there."""
+    return InputError(
+        f"expected {len(names)} images in {folder}, found {len(absent)} of them absent (first: {absent[0]}); copy them there, name their "
+        f"folder with --images, or train without them with --missing drop"
+    )
+
+
+def find_mask(root: Path, name: str, image: Path) -> Path | None:
+    """The mask file of view `name`, or None: masks/NAME, masks/NAME.png, masks/STEM.png under `root`, or STEM.mask.png, STEM_mask.png beside
+    the photograph."""
+    stem = PurePosixPath(name).with_suffix("").as_posix()
+    candidates = [root / "masks" / part for part in (name, f"{name}.png", f"{stem}.png")]
+    candidates += [image.with_name(f"{image.stem}{ending}") for ending in (".mask.png", "_mask.png")]
+    return next((path for path in candidates if path.is_file() and path != image), None)

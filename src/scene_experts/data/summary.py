@@ -1,0 +1,41 @@
+"""What `scene-experts info` says about a capture."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from scene_experts.data.views import Capture
+from scene_experts.geometry.neighbours import median_neighbour_distance
+
+
+def summarise(capture: Capture) -> dict:
+    """Plain values: kind, views, sizes, camera models, points, extent, world, split, resolution, masks, warnings. Reads no pixels.
+
+    Lengths are in trained units, except `world`, which says how those come from the capture's own.
+    """
+    sources, points = capture.images.sources, capture.points
+    sizes = Counter(f"{v.camera.width}x{v.camera.height}" for v in capture.views)
+    return {
+        "name": capture.name,
+        "root": str(capture.root),
+        "kind": capture.kind,
+        "views": len(capture.views),
+        "train": len(capture.train),
+        "test": len(capture.test),
+        "split": capture.split,
+        "resolution": capture.resolution,
+        "sizes": dict(sizes.most_common()),
+        "file_sizes": dict(Counter(f"{s.lens.width}x{s.lens.height}" for s in sources).most_common()),
+        "camera_models": dict(Counter(s.lens.model for s in sources).most_common()),
+        "undistorted": sum(s.lens.distorted for s in sources),
+        "masks": sum(s.mask is not None for s in sources),
+        "points": 0 if points is None else len(points.xyz),
+        "median_neighbour_distance": None if points is None else median_neighbour_distance(points.xyz),
+        "extent": capture.extent,
+        "near": capture.views[0].camera.near,
+        "world": {"scale": capture.world.scale, "shift": list(capture.world.shift)},
+        "background": list(capture.background),
+        "cache_bytes": capture.images.cache_bytes,
+        "decoded_bytes": sum(s.size[0] * s.size[1] * 3 for s in sources),
+        "warnings": list(capture.warnings),
+    }
