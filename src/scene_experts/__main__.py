@@ -1,0 +1,3 @@
+from scene_experts.cli import entry
+
+entry()

@@ -1,0 +1,82 @@
+"""The command line: `scene-experts COMMAND ...`: finds the command and turns errors into exit codes."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+
+from scene_experts.errors import InputError, RunError
+
+PROG = "scene-experts"
+COMMANDS = {
+    "info": "what a capture holds: views, sizes, cameras, points, split, warnings",
+    "train": "train a scene on a capture",
+    "eval": "render and score the held-out views of a run",
+    "compare": "one table of several runs",
+    "export": "write a trained scene as anchor PLY or compact file",
+    "import": "make a run folder of a published Scaffold-GS result or of a compact file",
+    "doctor": "which backends work here, why not, what to install",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0 done, 1 failed, 2 unusable input."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    if not args or args[0] in ("-h", "--help", "help"):
+        print(usage())
+        return 0 if args else 2
+    if args[0] in ("-V", "--version", "version"):
+        from scene_experts import __version__
+
+        print(f"{PROG} {__version__}")
+        return 0
+    command, rest = args[0], args[1:]
+    if command not in COMMANDS:
+        print(f"error: expected one of {', '.join(COMMANDS)}, found '{command}'; see {PROG} --help", file=sys.stderr)
+        return 2
+    logging.basicConfig(level=logging.WARNING, format="warning: %(message)s")
+    try:
+        from scene_experts import commands  # imports torch: not needed for the help above
+
+        return commands.HANDLERS[command](rest)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except RunError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        with suppress(OSError):
+            sys.stdout.close()
+        return 0
+
+
+def entry() -> None:
+    """The console script."""
+    sys.exit(main())
+
+
+def usage() -> str:
+    """The text of `scene-experts --help`."""
+    width = max(len(name) for name in COMMANDS)
+    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
+    return "\n".join(
+        [
+            f"usage: {PROG} COMMAND [options]",
+            "",
+            "Photographs to compact, sharp 3D scenes.",
+            "",
+            *lines,
+            "",
+            f"{PROG} COMMAND --help says more.",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    entry()

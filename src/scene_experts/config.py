@@ -1,0 +1,160 @@
+"""A training as one typed value: everything that changes its numbers, to and from plain JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import types as pytypes
+import typing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from scene_experts.errors import InputError
+from scene_experts.losses import Weights
+from scene_experts.scene.anchors import Anchors, Rates
+from scene_experts.scene.experts import Experts
+from scene_experts.strategy.grow import GrowAnchors
+
+SCHEDULE = 30_000  # the iterations that all schedule constants are written for
+
+
+@dataclass(frozen=True)
+class Train:
+    """A recipe with its numbers."""
+
+    recipe: tyro.conf.Suppress[str]
+    scene: Anchors = Anchors()
+    loss: Weights = Weights()
+    growth: GrowAnchors = GrowAnchors()
+    rates: Rates = Rates()
+    iterations: int = SCHEDULE
+    """Length of the training. Another length rescales the whole schedule (learning rates, densification windows, warm-up)."""
+    seed: int = 0
+    antialias: bool = False
+    """Compensate opacity for the 0.3 px blur (Mip-Splatting's 2D filter)."""
+    random_background: bool = False
+    """Another background colour every iteration."""
+    max_anchors: int = 0
+    """Stop growing at this many anchors; 0 is no cap."""
+
+    def scaled(self) -> Train:
+        """The same with every window of the schedule in iterations of this training (x iterations / 30,000)."""
+        if self.iterations < 1:
+            raise InputError(f"expected at least 1 iteration, found {self.iterations}; use --iterations 30000")
+        factor = self.iterations / SCHEDULE
+        decoder = self.scene.decoder
+        if isinstance(decoder, Experts):
+            decoder = replace(decoder, warmup=round(decoder.warmup * factor))
+        until = self.loss.opacity_until
+        loss = replace(
+            self.loss,
+            opacity_from=round(self.loss.opacity_from * factor),
+            opacity_until=None if until is None else round(until * factor),
+        )
+        growth = replace(self.growth.scaled(factor), max_anchors=self.max_anchors or self.growth.max_anchors)
+        return replace(self, scene=replace(self.scene, decoder=decoder), loss=loss, growth=growth)
+
+
+@dataclass(frozen=True)
+class Data:
+    """Which capture, and how it is read."""
+
+    path: Annotated[Path, tyro.conf.arg(name="data", aliases=["-s"])]
+    """Folder of the capture: a COLMAP folder (images/, sparse/0/) or one with transforms*.json."""
+    images: str | None = None
+    """Image folder inside the capture, e.g. images_4."""
+    resolution: Annotated[str, tyro.conf.arg(aliases=["-r"])] = "auto"
+    """as-is, factor:N, longest:PX, cap1600, inria:N, or auto (cap1600)."""
+    split: str = "mod8"
+    """mod8 (every 8th view is held out), mod:N, first:N, none, or auto for captures that bring their own split."""
+    normalise: Literal["extent", "none"] = "extent"
+    """extent: train in a world scaled to camera extent 5 (undone in everything written); none: train in the capture's own units."""
+    init: Literal["points", "random"] = "points"
+    """Start from the capture's 3D points, or from random ones."""
+    max_views: int | None = None
+    """Use at most this many views, evenly spread."""
+    ignore_principal_point: bool = False
+    """Pretend the principal point is the image centre, as the reference code bases do (parity only)."""
+    background: tuple[float, float, float] | None = None
+    """RGB in [0, 1] behind the scene; None takes the capture kind's own (black)."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What a run folder's config.json says: enough to evaluate, resume and repeat the run."""
+
+    train: Train
+    data: Data
+    command: str = ""
+    deterministic: bool = False
+    stop_at: int | None = None
+    versions: dict[str, str] = field(default_factory=dict)
+
+
+def to_json(value: Any) -> Any:
+    """Plain JSON of a dataclass tree. Values of union type carry their class name under "type"."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        out = {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {"type": type(value).__name__, **out}
+    if isinstance(value, dict):
+        return {str(k): to_json(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_json(v) for v in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def from_json(kind: Any, value: Any, where: str = "config") -> Any:
+    """The value of type `kind` that `to_json` wrote. Raises InputError naming the place that does not fit."""
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, pytypes.UnionType):
+        return _from_union(args, value, where)
+    if dataclasses.is_dataclass(kind):
+        return _from_object(kind, value, where)
+    if origin is Literal:
+        if value not in args:
+            raise InputError(f"expected one of {list(args)} at {where}, found {value!r}; correct the file")
+        return value
+    if origin is tuple:
+        _expect(isinstance(value, list), "a list", where, value)
+        inner = [args[0]] * len(value) if len(args) == 2 and args[1] is Ellipsis else list(args)
+        _expect(len(inner) == len(value), f"{len(inner)} values", where, value)
+        return tuple(from_json(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(inner, value)))
+    if origin is dict:
+        _expect(isinstance(value, dict), "an object", where, value)
+        return {k: from_json(args[1], v, f"{where}.{k}") for k, v in value.items()}
+    if kind is Path:
+        _expect(isinstance(value, str), "a path", where, value)
+        return Path(value)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    _expect(isinstance(value, kind) and not (kind is int and isinstance(value, bool)), f"a {kind.__name__}", where, value)
+    return value
+
+
+def _from_union(args: tuple[Any, ...], value: Any, where: str) -> Any:
+    if value is None and type(None) in args:
+        return None
+    options = [a for a in args if a is not type(None)]
+    if isinstance(value, dict) and "type" in value:
+        for option in options:
+            if getattr(option, "__name__", None) == value["type"]:
+                return from_json(option, value, where)
+    if len(options) == 1:
+        return from_json(options[0], value, where)
+    raise InputError(f"expected one of {[getattr(o, '__name__', str(o)) for o in options]} at {where}, found {value!r}; correct the file")
+
+
+def _from_object(kind: Any, value: Any, where: str) -> Any:
+    _expect(isinstance(value, dict), "an object", where, value)
+    hints = typing.get_type_hints(kind)  # annotations for the command line are left out
+    known = {f.name for f in dataclasses.fields(kind)}
+    unknown = set(value) - known - {"type"}
+    _expect(not unknown, f"only the keys {sorted(known)}", where, sorted(unknown))
+    return kind(**{name: from_json(hints[name], item, f"{where}.{name}") for name, item in value.items() if name in known})
+
+
+def _expect(fits: bool, what: str, where: str, found: Any) -> None:
+    if not fits:
+        raise InputError(f"expected {what} at {where}, found {found!r}; correct the file or start a new run")

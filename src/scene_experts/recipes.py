@@ -1,0 +1,64 @@
+"""The methods and ablations of the paper, a few lines each. No other source file knows a recipe by name.
+
+Scaffold-GS: Lu et al., CVPR 2024.  MoE-GS: Fu et al., "Scene Experts", AAAI 2026; tables and figures below are that paper's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from scene_experts.config import Train
+from scene_experts.losses import Weights
+from scene_experts.scene.anchors import Anchors
+from scene_experts.scene.experts import Experts, Router
+from scene_experts.scene.mlp import Plain
+
+ALL = ("opacity", "cov", "color")
+
+scaffold_gs = Train(recipe="scaffold-gs", scene=Anchors(decoder=Plain()), loss=Weights(scale=0.01))
+moe_gs = replace(
+    scaffold_gs,
+    recipe="moe-gs",
+    scene=Anchors(decoder=Experts(num=5, top_k=2, warmup=1500)),
+    loss=Weights(scale=0.01, opacity=0.01, load=0.01),
+)
+
+
+def _moe(name: str, *, loss: Weights = moe_gs.loss, add_dist: tuple[str, ...] = (), **experts: object) -> Train:
+    decoder = replace(moe_gs.scene.decoder, **experts)  # type: ignore[type-var]
+    return replace(moe_gs, recipe=name, scene=replace(moe_gs.scene, decoder=decoder, add_dist=add_dist), loss=loss)
+
+
+def _scaffold(name: str, **scene: object) -> Train:
+    return replace(scaffold_gs, recipe=name, scene=replace(scaffold_gs.scene, **scene))  # type: ignore[arg-type]
+
+
+RECIPES: dict[str, tuple[str, Train]] = {
+    "scaffold-gs": ("Scaffold-GS: one network per attribute (the baseline)", scaffold_gs),
+    "moe-gs": ("MoE-GS: five experts per attribute, Top-2 after a dense warm-up (the paper's main results)", moe_gs),
+    "scaffold-gs-opacity": (
+        "Scaffold-GS with the opacity hinge: the paper's 'w/o MoE' (Table 4) and Table 3, row 2",
+        replace(scaffold_gs, recipe="scaffold-gs-opacity", loss=Weights(scale=0.01, opacity=0.01)),
+    ),
+    "moe-gs-no-cl": ("without curriculum: Top-2 from the first iteration (Table 4)", _moe("moe-gs-no-cl", warmup=0)),
+    "moe-gs-no-load": ("without the load-balancing losses (Table 4)", _moe("moe-gs-no-load", loss=replace(moe_gs.loss, load=0.0))),
+    "moe-gs-no-opacity": ("without the opacity hinge (Table 4)", _moe("moe-gs-no-opacity", loss=replace(moe_gs.loss, opacity=0.0))),
+    "moe-gs-dist": ("the decoders also see the distance, as the paper's text has it", _moe("moe-gs-dist", add_dist=ALL)),
+    "moe-gs-posrouter": ("the routers also see the anchor's position (appendix)", _moe("moe-gs-posrouter", router=Router(input_pos=True))),
+    "moe-gs-e3-no-load": (
+        "three experts without L_load (Figure 3a)",
+        _moe("moe-gs-e3-no-load", num=3, loss=replace(moe_gs.loss, load=0.0)),
+    ),
+    **{
+        f"moe-gs-e{num}-{name}": (f"{num} experts, {name} (Figure 6)", _moe(f"moe-gs-e{num}-{name}", num=num, top_k=k))
+        for num in (2, 3, 4, 5)
+        for name, k in (("top1", 1), ("top2", 2), ("dense", None))
+    },
+    **{
+        f"scaffold-gs-depth{depth}": (
+            f"Scaffold-GS with {depth} linear layers (Figure 7)",
+            _scaffold(f"scaffold-gs-depth{depth}", decoder=Plain(depth)),
+        )
+        for depth in (2, 3, 4, 5, 6)
+    },
+}

@@ -1,0 +1,232 @@
+"""Anchors (Scaffold-GS): select -> cull -> decode -> Gaussians.
+
+An anchor v sits on an integer voxel lattice and carries a feature f, a log-scaling l and K offsets O. Seen from a camera,
+three heads turn (f, viewing direction) into the opacity, covariance and colour of K Gaussians at
+mu = x_v + O_v * exp(l_v)[0:3]  (paper eq. 2). Anchors never move; `strategy.grow` adds and removes them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from scene_experts import native
+from scene_experts.errors import InputError
+from scene_experts.geometry.neighbours import knn_d2, median_neighbour_distance
+from scene_experts.geometry.voxel import auto_voxel, to_lattice, unique_cells
+from scene_experts.scene import native_decode
+from scene_experts.scene.experts import Experts, MixtureHead
+from scene_experts.scene.mlp import CHANNELS, MLP, HeadWeights, Plain
+from scene_experts.scene.select import AllAnchors, Selector, visible_rows
+from scene_experts.schedule import Rate
+from scene_experts.table import Table
+from scene_experts.types import Camera, Decoded, Gaussians, Points, Routing
+
+ATTRIBUTES = ("opacity", "cov", "color")
+EPS = 1e-12  # keeps directions and quaternions finite where their length is 0
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """What an anchor scene is made of."""
+
+    K: int = 10
+    """Gaussians per anchor."""
+    F: int = 32
+    """Feature size."""
+    hidden: int = 32
+    """Width of the decoder networks."""
+    add_dist: tuple[str, ...] = ()
+    """Attributes whose networks also see the distance to the camera."""
+    voxel_size: float = 0.0
+    """Edge of the finest lattice in trained world units; 0 takes `voxel_rule`."""
+    voxel_rule: Literal["neighbours", "squared_median", "median_nn"] = "neighbours"
+    """neighbours: a quarter of the median neighbour distance; the others are Scaffold-GS's rule as coded and as documented."""
+    quat_align: bool = False
+    """Flip each expert's quaternion into the hemisphere of the anchor's first expert before mixing (composed decode only)."""
+    decode: Literal["auto", "composed", "native"] = "auto"
+    """Which implementation decodes: the fused native one where it covers the scene, or the composed torch form."""
+    decoder: Plain | Experts = Plain()
+
+
+class AnchorScene(nn.Module):
+    """N anchors and three decoder heads. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], offsets [N,K,3], log_scaling [N,6]."""
+
+    def __init__(self, config: Anchors, table: Table, voxel: float, extent: float, select: Selector | None = None) -> None:
+        """voxel: edge of the finest lattice cell; extent: the scene's R; both in trained world units."""
+        super().__init__()
+        self.config, self.table, self.voxel, self.extent = config, table, voxel, extent
+        self.select = select or AllAnchors()
+        heads: dict[str, nn.Module] = {}
+        for attribute in ATTRIBUTES:
+            inputs = config.F + 3 + (attribute in config.add_dist)
+            heads[attribute] = config.decoder.build(attribute, inputs, config.hidden, config.K * CHANNELS[attribute], config.F)
+        self.heads: Mapping[str, MLP | MixtureHead] = nn.ModuleDict(heads)  # type: ignore[assignment]
+
+    @property
+    def K(self) -> int:
+        return self.config.K
+
+    @classmethod
+    def from_points(cls, config: Anchors, points: Points, extent: float) -> AnchorScene:
+        """One anchor per occupied voxel of the point cloud. Raises InputError when there are no points."""
+        if len(points.xyz) == 0:
+            raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
+        voxel = config.voxel_size or voxel_size(points.xyz, config.voxel_rule)
+        cells, _ = unique_cells(to_lattice(points.xyz, voxel))
+        xyz = (cells.double() * voxel).float()
+        scale = knn_d2(xyz.double()).clamp_min(1e-7).sqrt().log().float()
+        n = len(cells)
+        params = {
+            "feature": torch.zeros(n, config.F),
+            "offsets": torch.zeros(n, config.K, 3),
+            "log_scaling": scale[:, None].repeat(1, 6),
+        }
+        return cls(config, Table(params, {"cell": cells, "xyz": xyz}), voxel, extent)
+
+    def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
+        """Rows for anchors born at lattice cells [n, 3] with scaling `size` and features [n, F]; offsets start at 0."""
+        n = len(cells)
+        return {
+            "cell": cells,
+            "xyz": (cells.double() * self.voxel).to(feature.dtype),
+            "feature": feature,
+            "offsets": feature.new_zeros(n, self.K, 3),
+            "log_scaling": feature.new_full((n, 6), math.log(size)),
+        }
+
+    def forward(self, camera: Camera, step: int, training: bool, cull: Callable[[Tensor, Tensor, Camera], Tensor]) -> Decoded:
+        """The Gaussians that `camera` sees at `step`. `cull(means, scales, camera)` is the rasteriser's visibility test."""
+        table = self.table
+        scales = table.params["log_scaling"].detach()[:, :3].exp()
+        rows = visible_rows(self.select(table, camera, step, training), table.facts["xyz"], scales, camera, cull)
+        decoded = self.decode(rows, camera, step)
+        return self.with_global_routing(decoded, step) if training else decoded
+
+    def decode(self, rows: Tensor, camera: Camera, step: int) -> Decoded:
+        """Gaussians of the given anchors [A], natively where that covers the scene, else in plain torch."""
+        weights = self.native_weights(step)
+        if weights is None:
+            return self.decode_composed(rows, camera, step)
+        p = self.table.params
+        with_dist = {a: a in self.config.add_dist for a in ATTRIBUTES}
+        position = camera.position
+        gaussians, raw, routing = native_decode.decode(
+            rows, self.table.facts["xyz"], p["feature"], p["log_scaling"], p["offsets"], position, weights, with_dist
+        )
+        return Decoded(gaussians, rows, raw, routing)
+
+    def native_weights(self, step: int) -> dict[str, HeadWeights] | None:
+        """The heads' tensors for the native decode, or None where it does not apply (another device or dtype, unusual switches)."""
+        feature = self.table.params["feature"]
+        fits = feature.device.type == "cpu" and feature.dtype == torch.float32 and not self.config.quat_align and native.load() is not None
+        if self.config.decode == "composed" or not fits:
+            if self.config.decode == "native":
+                why = native.why_not() or "a device, dtype or switch it has no code for"
+                raise InputError(f"expected a scene that the native decode covers, found {why}; use --scene.decode auto")
+            return None
+        weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
+        return None if any(w is None for w in weights.values()) else weights  # type: ignore[return-value]
+
+    def inputs(self, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+        """Feature [A, F], unit direction camera -> anchor [A, 3], distance [A, 1]."""
+        v = self.table.facts["xyz"].index_select(0, rows) - camera.position.to(self.table.facts["xyz"])
+        distance = v.norm(dim=1, keepdim=True)
+        return self.table.params["feature"].index_select(0, rows), v / distance.clamp_min(EPS), distance
+
+    def decode_composed(self, rows: Tensor, camera: Camera, step: int) -> Decoded:
+        """The definition, in plain torch: one head call per attribute, then mask, activate and place."""
+        p, K = self.table.params, self.K
+        feature, direction, distance = self.inputs(rows, camera)
+        position = self.table.facts["xyz"].index_select(0, rows) / self.extent
+        out: dict[str, Tensor] = {}
+        routing: dict[str, Routing] = {}
+        for attribute in ATTRIBUTES:
+            head = self.heads[attribute]
+            x = torch.cat([feature, direction] + ([distance] if attribute in self.config.add_dist else []), dim=1)
+            if attribute == "cov" and self.config.quat_align and isinstance(head, MixtureHead):
+                out[attribute], found = head.aligned(x, feature, step, position, K)
+            else:
+                out[attribute], found = head(x, feature, step, position)
+            if found is not None:
+                routing[attribute] = found
+        raw = out["opacity"]  # [A, K]
+        keep = (raw > 0).reshape(-1).nonzero().squeeze(1)  # strictly positive opacity is drawn
+        anchor = torch.div(keep, K, rounding_mode="floor")
+        row = rows.index_select(0, anchor)
+        scaling = p["log_scaling"].index_select(0, row).exp()
+        cov = out["cov"].reshape(-1, 7).index_select(0, keep)
+        source = row * K + (keep - anchor * K)
+        offset = p["offsets"].reshape(-1, 3).index_select(0, source)
+        gaussians = Gaussians(
+            means=self.table.facts["xyz"].index_select(0, row) + offset * scaling[:, :3],  # eq. 2
+            quats=functional.normalize(cov[:, 3:], dim=1, eps=EPS),
+            scales=scaling[:, 3:] * cov[:, :3].sigmoid(),
+            opacities=raw.reshape(-1).index_select(0, keep),
+            colors=out["color"].reshape(-1, 3).index_select(0, keep),
+            source=source,
+        )
+        return Decoded(gaussians, rows, raw, routing)
+
+    def routing(self, step: int) -> dict[str, Routing]:
+        """Routing of every anchor, by attribute: it does not depend on the camera."""
+        feature, position = self.table.params["feature"], self.table.facts["xyz"] / self.extent
+        found = {a: self.heads[a].routing(feature, step, position) for a in ATTRIBUTES}
+        return {a: r for a, r in found.items() if r is not None}
+
+    def with_global_routing(self, decoded: Decoded, step: int) -> Decoded:
+        """For `load_scope = all`: the routing of all anchors in place of the visible ones', so that L_load balances the whole scene."""
+        decoder = self.config.decoder
+        if isinstance(decoder, Experts) and decoder.load_scope == "all" and decoded.routing:
+            return replace(decoded, routing=self.routing(step))
+        return decoded
+
+    def rate_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by the name of their learning rate: one group per column, per head and per router."""
+        groups = {name: [self.table.params[name]] for name in ("feature", "offsets", "log_scaling")}
+        for attribute in ATTRIBUTES:
+            head = self.heads[attribute]
+            named = dict(head.named_parameters())  # type: ignore[attr-defined]
+            groups[attribute] = [p for name, p in named.items() if not name.startswith("router")]
+            routers = [p for name, p in named.items() if name.startswith("router")]
+            if routers:
+                groups[f"{attribute}.router"] = routers
+        return groups
+
+    def network_tensors(self) -> dict[str, Tensor]:
+        """Every tensor of the decoder by name (`opacity.w1`, ...), for files."""
+        return {f"{a}.{name}": p for a in ATTRIBUTES for name, p in self.heads[a].named_parameters()}  # type: ignore[attr-defined]
+
+
+def voxel_size(points: Tensor, rule: str) -> float:
+    """The lattice's edge by rule, from points [P, 3] in trained world units."""
+    if rule == "neighbours":
+        return 0.25 * median_neighbour_distance(points)
+    return auto_voxel(points, rule)
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Learning rates (Scaffold-GS's). `offsets` is multiplied by the scene's extent R."""
+
+    feature: Rate = Rate(0.0075, 0.0075)
+    offsets: Rate = Rate(0.01, 0.0001)
+    log_scaling: Rate = Rate(0.007, 0.007)
+    opacity: Rate = Rate(0.002, 0.00002)
+    cov: Rate = Rate(0.004, 0.004)
+    color: Rate = Rate(0.008, 0.00005)
+    router_scale: float = 1.0
+    """Routers follow their attribute's rate times this."""
+
+    def at(self, group: str, step: int, total: int, extent: float) -> float:
+        """The rate of a group of `rate_groups` at `step` of `total`."""
+        attribute, _, router = group.partition(".")
+        rate: Rate = getattr(self, attribute)
+        factor = self.router_scale if router else extent if attribute == "offsets" else 1.0
+        return rate.at(step, total) * factor

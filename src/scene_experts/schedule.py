@@ -1,0 +1,42 @@
+"""When things happen and how fast: intervals and learning rates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True)
+class Every:
+    """True at the multiples of `interval` strictly between `start` and `stop` (as Scaffold-GS compares them)."""
+
+    start: int
+    stop: int
+    interval: int
+
+    def due(self, step: int) -> bool:
+        return self.start < step < self.stop and step % self.interval == 0
+
+    def scaled(self, factor: float) -> Every:
+        """The same window in a training `factor` times as long; the interval stays."""
+        return replace(self, start=round(self.start * factor), stop=round(self.stop * factor))
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A learning rate that runs log-linearly from `first` to `last` over the training; 0 stays 0."""
+
+    first: float
+    last: float
+
+    def at(self, step: int, total: int) -> float:
+        """The rate at `step` (1-based) of `total`: exp((1 - t/T) ln first + (t/T) ln last), t clipped to [0, T]."""
+        if self.first == 0.0 and self.last == 0.0:
+            return 0.0
+        if self.first == self.last:
+            return self.first
+        t = min(max(step / max(total, 1), 0.0), 1.0)
+        return math.exp((1.0 - t) * math.log(self.first) + t * math.log(self.last))
+
+    def times(self, factor: float) -> Rate:
+        return Rate(self.first * factor, self.last * factor)

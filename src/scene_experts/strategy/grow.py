@@ -1,0 +1,164 @@
+"""Growing and pruning anchors (Scaffold-GS), on an integer lattice.
+
+Every `interval` iterations, offsets whose mean 2D gradient is large found anchors in empty cells of three lattices, coarse to
+fine; anchors whose offsets stay faint are removed. Cells are integers throughout, so no device disagrees about which is taken.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from scene_experts.geometry.voxel import AXIS_LIMIT, coarsen, in_set, pack, scatter_max
+from scene_experts.scene.anchors import AnchorScene
+from scene_experts.schedule import Every
+from scene_experts.strategy import observe
+from scene_experts.types import Decoded, Render
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Edit:
+    """What one adjustment did."""
+
+    grown: int
+    pruned: int
+    anchors: int
+    capped: bool = False  # the cap on anchors held some back
+
+
+@dataclass(frozen=True)
+class GrowAnchors:
+    """Hyper-parameters of density control; its memory is in `table.stats`."""
+
+    start_stat: int = 500
+    adjust: Every = Every(1500, 15_000, 100)
+    """Adjust at multiples of `interval` strictly inside (start, stop); statistics are kept from start_stat to stop."""
+    grad_threshold: float = 0.0002
+    success_threshold: float = 0.8
+    min_opacity: float = 0.005
+    levels: int = 3
+    init_factor: int = 16
+    hierarchy_factor: int = 4
+    scale_clamp: Literal["log0.05", "linear0.05", "off"] = "log0.05"
+    """After each adjustment, Gaussian size bounds (log-scaling 3..5) are held below 0.05 in log or linear units."""
+    elimination: bool = True
+    """Let only a random part of the candidates through: half at the coarsest level, then 3/4, then 7/8."""
+    parity_level_skip: bool = False
+    """Scaffold-GS's quirk: no finer level is tried once a call has added nothing so far."""
+    max_anchors: int = 0
+    """Never more anchors than this; 0 is no cap. The largest gradients go first."""
+    enabled: bool = True
+
+    def scaled(self, factor: float) -> GrowAnchors:
+        """The same in a training `factor` times as long: windows scale; interval, gates and thresholds stay."""
+        return replace(self, start_stat=round(self.start_stat * factor), adjust=self.adjust.scaled(factor))
+
+    def observe(self, scene: AnchorScene, decoded: Decoded, render: Render, step: int) -> None:
+        """Count one view, after its backward pass."""
+        if not self.enabled or not self.start_stat < step < self.adjust.stop:
+            return
+        if "visits" not in scene.table.stats:
+            observe.start(scene.table, scene.K)
+        observe.observe(scene.table, decoded, render)
+
+    def update(self, scene: AnchorScene, step: int, generator: torch.Generator) -> Edit | None:
+        """Grow and prune when due. `generator` draws the random elimination."""
+        if step >= self.adjust.stop:
+            observe.stop(scene.table)
+        if not self.enabled or not self.adjust.due(step) or "visits" not in scene.table.stats:
+            return None
+        grown, capped = self.grow(scene, generator)
+        pruned = self.prune(scene)
+        return Edit(grown, pruned, len(scene.table), capped)
+
+    def cell_factors(self) -> list[int]:
+        """Cell edges of the levels in fine voxels, coarse to fine (16, 4, 1); levels whose factor would be 0 do not exist."""
+        factors = [self.init_factor // self.hierarchy_factor**level for level in range(self.levels)]
+        return [f for f in factors if f > 0]
+
+    @torch.no_grad()
+    def grow(self, scene: AnchorScene, generator: torch.Generator) -> tuple[int, bool]:
+        """Found anchors where gradients are large. Returns how many, and whether the cap held some back."""
+        table = scene.table
+        stats, born = table.stats, len(table)
+        gate = self.adjust.interval * self.success_threshold * 0.5  # 40 of 100
+        eligible = stats["count"] > gate
+        g = torch.where(stats["count"] > 0, stats["grad"] / stats["count"].clamp_min(1), 0.0)
+        scaling = table.params["log_scaling"][:, None, :3].exp()
+        points = table.facts["xyz"].double()[:, None] + (table.params["offsets"] * scaling).double()  # [N, K, 3]
+        capped = False
+        for level, factor in enumerate(self.cell_factors()):
+            if self.parity_level_skip and level > 0 and len(table) == born:
+                continue
+            threshold = self.grad_threshold * (self.hierarchy_factor // 2) ** level
+            candidates = (g >= threshold) & eligible
+            if self.elimination:
+                draw = torch.rand(g.shape, generator=generator).to(g.device)
+                candidates &= draw > 0.5 ** (level + 1)
+            found = self.empty_cells(scene, points[candidates], candidates.nonzero()[:, 0], g[candidates], factor)
+            if found is None:
+                continue
+            cells, feature, strength = found
+            if self.max_anchors and len(table) + len(cells) > self.max_anchors:
+                capped = True
+                room = max(0, self.max_anchors - len(table))
+                best = strength.argsort(descending=True, stable=True)[:room].sort().values
+                cells, feature = cells[best], feature[best]
+            if len(cells):
+                table.append(scene.new_rows(cells * factor, scene.voxel * factor, feature))
+        for name in ("grad", "count"):
+            stats = table.stats[name]
+            stats[:born] = torch.where(eligible, 0.0, stats[:born])
+        return len(table) - born, capped
+
+    def empty_cells(
+        self, scene: AnchorScene, points: Tensor, parents: Tensor, g: Tensor, factor: int
+    ) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Cells (in units of `factor` voxels) that candidate points [P, 3] fall into and no anchor holds.
+
+        Returns cells [n, 3] int64, features [n, F] (element-wise maximum over the parents of all points in the cell) and the
+        largest gradient [n].
+        """
+        if len(points) == 0:
+            return None
+        cells = torch.floor(points / (scene.voxel * factor) + 0.5)
+        inside = (cells.abs() * factor < AXIS_LIMIT - factor).all(1)  # an offset that ran away founds nothing
+        cells, parents, g = cells[inside].long(), parents[inside], g[inside]
+        if len(cells) == 0:
+            return None
+        keys, group = torch.unique(pack(cells), return_inverse=True)
+        taken = in_set(keys, pack(coarsen(scene.table.facts["cell"], factor)))
+        free = (~taken).nonzero().squeeze(1)
+        if len(free) == 0:
+            return None
+        slot = torch.full_like(keys, -1)
+        slot[free] = torch.arange(len(free), device=keys.device)
+        target = slot[group]
+        mine = (target >= 0).nonzero().squeeze(1)
+        target, parents = target[mine], parents[mine]
+        feature = scatter_max(scene.table.params["feature"].index_select(0, parents), target, len(free))
+        strength = scatter_max(g[mine, None], target, len(free)).squeeze(1)
+        first = torch.full((len(free),), len(cells), device=keys.device).scatter_reduce(0, target, mine, "amin")
+        return cells.index_select(0, first), feature, strength
+
+    @torch.no_grad()
+    def prune(self, scene: AnchorScene) -> int:
+        """Remove anchors seen often enough and found faint; start the count of the well-seen ones anew; clamp sizes."""
+        table = scene.table
+        seen = table.stats["visits"] > self.adjust.interval * self.success_threshold  # 80 of 100
+        faint = seen & (table.stats["opacity"] < self.min_opacity * table.stats["visits"])
+        for name in ("visits", "opacity"):
+            table.stats[name][seen] = 0.0
+        pruned = int(faint.sum())
+        if pruned:
+            table.keep(~faint)
+        if self.scale_clamp != "off":
+            table.params["log_scaling"][:, 3:].clamp_(max=0.05 if self.scale_clamp == "log0.05" else math.log(0.05))
+        return pruned

@@ -1,0 +1,336 @@
+"""The training loop: yields events, saves, resumes; knows no method by name."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import math
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from scene_experts import checkpoint
+from scene_experts.config import RunConfig, Train, to_json
+from scene_experts.data.capture import Capture
+from scene_experts.errors import InputError
+from scene_experts.losses import terms
+from scene_experts.render import Rasterizer
+from scene_experts.scene.anchors import AnchorScene
+from scene_experts.strategy.grow import Edit
+from scene_experts.table import Table
+from scene_experts.types import Decoded, Render
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Where and how a training runs; nothing here changes its numbers but `stop_at`."""
+
+    config: RunConfig
+    out: Path | None = None  # the run folder; None keeps nothing
+    device: str = "cpu"
+    resume: bool = False
+    save_every: int = 5000  # iterations between checkpoints; the last iteration is always saved
+    preview_every: int = 0  # iterations between pictures of one held-out view; 0: none
+    log_every: int = 10  # iterations between Stepped events
+    max_memory: float = 0.0  # GiB of resident memory at which growth stops; 0: no cap
+    keep: int = 2  # checkpoints kept
+    stop: list[str] = field(default_factory=list)  # put a reason here (a signal handler does) to save and stop
+
+
+@dataclass(frozen=True)
+class Started:
+    step: int  # 0, or where the run resumes
+    total: int  # the last iteration of this run
+    anchors: int
+
+
+@dataclass(frozen=True)
+class Stepped:
+    step: int
+    terms: dict[str, float]  # weighted, by name
+    psnr: float  # of the training view, dB
+    anchors: int
+    visible: int  # anchors this view decoded
+    gaussians: int  # of them drawn
+    active: float  # share of decoded Gaussians with positive opacity
+    seconds: float  # of training so far, without saving and previews
+    routing: dict[str, list[float]]  # mean share of assignments per expert, by attribute
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    step: int
+    edit: Edit
+
+
+@dataclass(frozen=True)
+class Previewed:
+    step: int
+    view: int
+    picture: Tensor  # [H, W, 3]
+
+
+@dataclass(frozen=True)
+class Saved:
+    step: int
+    path: Path
+
+
+@dataclass(frozen=True)
+class Stopped:
+    step: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Finished:
+    step: int
+    seconds: float
+
+
+Event = Started | Stepped | Adjusted | Previewed | Saved | Stopped | Finished
+
+
+class Training:
+    """Everything that a resumed run must find again: scene, optimiser, random streams, the queue of views, the clock."""
+
+    def __init__(self, cfg: Train, scene: AnchorScene) -> None:
+        self.cfg, self.scene = cfg, scene
+        self.step = 0
+        self.seconds = 0.0
+        self.queue: list[int] = []
+        self.views = torch.Generator().manual_seed(cfg.seed)
+        self.growth = torch.Generator().manual_seed(cfg.seed + 1)
+        groups = [{"params": params, "name": name, "lr": 0.0} for name, params in scene.rate_groups().items()]
+        fused = all(p.device.type in ("cpu", "cuda") and p.dtype == torch.float32 for g in groups for p in g["params"])
+        self.optimizer = torch.optim.Adam(groups, lr=0.0, betas=(0.9, 0.999), eps=1e-15, fused=fused)
+        scene.table.attach(self.optimizer)
+
+    @classmethod
+    def start(cls, cfg: Train, capture: Capture, device: str) -> Training:
+        """A fresh training of `cfg` (already scaled) on a capture. Raises InputError when the capture has no points or no training view."""
+        if capture.points is None:
+            raise InputError("expected 3D points in the capture, found none; use --init random, or run structure from motion again")
+        if not capture.train:
+            raise InputError("expected at least one training view, found none; choose another --split")
+        torch.manual_seed(cfg.seed)
+        return cls(cfg, to_device(AnchorScene.from_points(cfg.scene, capture.points, capture.extent), device))
+
+    def next_view(self, train: tuple[int, ...], ahead: int = 3) -> tuple[int, list[int]]:
+        """The next training view and the few after it: each view once per epoch, in random order."""
+        while len(self.queue) < ahead + 1:
+            self.queue += [train[i] for i in torch.randperm(len(train), generator=self.views).tolist()]
+        return self.queue.pop(0), self.queue[:ahead]
+
+    def set_rates(self) -> None:
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.cfg.rates.at(group["name"], self.step, self.cfg.iterations, self.scene.extent)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The state as named tensors."""
+        table = self.scene.table
+        out = {f"params.{k}": v.detach() for k, v in table.params.items()}
+        out |= {f"facts.{k}": v for k, v in table.facts.items()} | {f"stats.{k}": v for k, v in table.stats.items()}
+        out |= {f"network.{k}": v.detach() for k, v in self.scene.network_tensors().items()}
+        for group in self.optimizer.param_groups:
+            for i, parameter in enumerate(group["params"]):
+                for key, value in self.optimizer.state.get(parameter, {}).items():
+                    out[f"adam.{group['name']}.{i}.{key}"] = value
+        out |= {"rng.torch": torch.get_rng_state(), "rng.views": self.views.get_state(), "rng.growth": self.growth.get_state()}
+        out["queue"] = torch.tensor(self.queue, dtype=torch.int64)
+        return out
+
+    def meta(self) -> dict:
+        return {
+            "recipe": self.cfg.recipe,
+            "step": self.step,
+            "seconds": self.seconds,
+            "voxel": self.scene.voxel,
+            "extent": self.scene.extent,
+            "config": config_hash(self.cfg),
+        }
+
+    @classmethod
+    def restore(cls, cfg: Train, tensors: dict[str, Tensor], meta: dict, device: str) -> Training:
+        """The training that `tensors` and `meta` were taken from. Raises InputError when they are of another configuration."""
+        if meta["config"] != config_hash(cfg):
+            raise InputError(
+                "expected a checkpoint of this configuration, found one trained with other settings; "
+                "resume with the run's own flags, or start in another --out folder"
+            )
+        training = cls(cfg, to_device(scene_from(cfg, tensors, meta), device))
+        table = training.scene.table
+        table.stats = {k.removeprefix("stats."): v.to(device) for k, v in tensors.items() if k.startswith("stats.")}
+        for group in training.optimizer.param_groups:
+            for i, parameter in enumerate(group["params"]):
+                prefix = f"adam.{group['name']}.{i}."
+                state = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+                if state:
+                    training.optimizer.state[parameter] = {k: v.to(device) for k, v in state.items()}
+        torch.set_rng_state(tensors["rng.torch"])
+        training.views.set_state(tensors["rng.views"])
+        training.growth.set_state(tensors["rng.growth"])
+        training.queue = tensors["queue"].tolist()
+        training.step, training.seconds = int(meta["step"]), float(meta["seconds"])
+        return training
+
+
+def scene_from(cfg: Train, tensors: dict[str, Tensor], meta: dict) -> AnchorScene:
+    """A scene from a checkpoint's tensors; `cfg` must be scaled."""
+    pick = lambda prefix: {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
+    scene = AnchorScene(cfg.scene, Table(pick("params."), pick("facts.")), float(meta["voxel"]), float(meta["extent"]))
+    stored, wanted = pick("network."), scene.network_tensors()
+    if stored.keys() != wanted.keys() or any(stored[k].shape != wanted[k].shape for k in wanted):
+        raise InputError("expected the networks of this recipe in the checkpoint, found others; evaluate it with its own run folder")
+    with torch.no_grad():
+        for name, parameter in wanted.items():
+            parameter.copy_(stored[name])
+    return scene
+
+
+def to_device(scene: AnchorScene, device: str) -> AnchorScene:
+    """The scene with all its tensors on `device`."""
+    scene = scene.to(device)
+    scene.table.facts = {k: v.to(device) for k, v in scene.table.facts.items()}
+    return scene
+
+
+def config_hash(cfg: Train) -> str:
+    """A short hash of everything in the configuration."""
+    return hashlib.sha256(json.dumps(to_json(cfg), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iterator[Event]:
+    """Train `cfg` (as the user wrote it; windows are scaled here) on a capture, from scratch or from the run's newest whole checkpoint."""
+    cfg = cfg.scaled()
+    folder = run.out / "checkpoints" if run.out else None
+    training = resume(cfg, folder, run.device) if run.resume and folder else None
+    training = training or Training.start(cfg, capture, run.device)
+    total = min(cfg.iterations, run.config.stop_at or cfg.iterations)
+    yield Started(training.step, total, len(training.scene.table))
+    saved = training.step
+    while training.step < total and not run.stop:
+        began = time.perf_counter()
+        decoded, render, parts, target, edit = iterate(training, run, capture, rasterize)
+        training.seconds += time.perf_counter() - began
+        step = training.step
+        if edit is not None:
+            yield Adjusted(step, edit)
+        if step % run.log_every == 0 or step == total:
+            yield stepped(training, decoded, render, parts, target)
+        if run.preview_every and (step % run.preview_every == 0 or step == total):
+            yield preview(training, run, capture, rasterize)
+        if folder and (step % run.save_every == 0 or step == total):
+            yield Saved(step, save(training, folder, run.keep))
+            saved = step
+    if folder and saved != training.step:
+        yield Saved(training.step, save(training, folder, run.keep))
+    if run.stop and training.step < total:
+        yield Stopped(training.step, run.stop[0])
+    else:
+        yield Finished(training.step, training.seconds)
+
+
+def iterate(
+    training: Training, run: Run, capture: Capture, rasterize: Rasterizer
+) -> tuple[Decoded, Render, dict[str, Tensor], Tensor, Edit | None]:
+    """One iteration, in the paper's order: rates, view, decode, draw, losses, gradients, density control, Adam."""
+    cfg, scene = training.cfg, training.scene
+    training.step += 1
+    training.set_rates()
+    index, following = training.next_view(capture.train)
+    capture.images.prefetch(following)
+    camera = capture.views[index].camera.to(run.device)
+    frame = capture.frame(index)
+    target = frame.rgb.to(run.device).float() / 255.0
+    mask = None if frame.mask is None else frame.mask.to(run.device)
+    background = torch.rand(3, generator=training.views) if cfg.random_background else torch.tensor(capture.background)
+    decoded = scene(camera, training.step, True, rasterize.visible)
+    render = rasterize(decoded.gaussians, camera, background.to(run.device))
+    parts = terms(decoded, render, target, cfg.loss, training.step, mask)
+    loss = torch.stack(list(parts.values())).sum()
+    if loss.requires_grad:
+        loss.backward()
+    cfg.growth.observe(scene, decoded, render, training.step)
+    growth = replace(cfg.growth, max_anchors=anchor_cap(scene, cfg.growth.max_anchors, run.max_memory))
+    edit = growth.update(scene, training.step, training.growth)
+    training.optimizer.step()
+    training.optimizer.zero_grad(set_to_none=True)
+    return decoded, render, parts, target, edit
+
+
+def stepped(training: Training, decoded: Decoded, render: Render, parts: dict[str, Tensor], target: Tensor) -> Stepped:
+    """The figures of the iteration just made."""
+    mse = float((render.image.detach().clamp(0, 1) - target).square().mean())
+    raw = decoded.raw_opacity
+    shares = {}
+    for attribute, r in decoded.routing.items():
+        share = r.gates.detach().mean(0)
+        if r.chosen is not None:
+            share = torch.bincount(r.chosen.reshape(-1), minlength=r.gates.shape[1]) / max(r.chosen.numel(), 1)
+        shares[attribute] = [round(float(c), 4) for c in share]
+    return Stepped(
+        step=training.step,
+        terms={k: float(v.detach()) for k, v in parts.items()},
+        psnr=-10.0 * math.log10(max(mse, 1e-10)),
+        anchors=len(training.scene.table),
+        visible=len(decoded.rows),
+        gaussians=len(decoded.gaussians),
+        active=float((raw.detach() > 0).float().mean()) if raw is not None and raw.numel() else 0.0,
+        seconds=training.seconds,
+        routing=shares,
+    )
+
+
+@torch.no_grad()
+def preview(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Previewed:
+    """A picture of one held-out view (a training view where none is held out)."""
+    index = (capture.test or capture.train)[0]
+    camera = capture.views[index].camera.to(run.device)
+    decoded = training.scene(camera, training.step, False, rasterize.visible)
+    picture = rasterize(decoded.gaussians, camera, torch.tensor(capture.background, device=run.device)).image
+    return Previewed(training.step, index, picture.clamp(0, 1).cpu())
+
+
+def save(training: Training, folder: Path, keep: int) -> Path:
+    """Write a checkpoint, whole or not at all."""
+    tensors = {k: v.detach().cpu().contiguous() for k, v in training.tensors().items()}
+    return checkpoint.save(folder, training.step, tensors, training.meta(), keep=keep)
+
+
+def resume(cfg: Train, folder: Path, device: str) -> Training | None:
+    """The newest whole checkpoint of a run, or None where there is none yet."""
+    path = checkpoint.latest(folder)
+    if path is None:
+        return None
+    tensors, meta = checkpoint.load(path)
+    checkpoint.expect(meta, recipe=cfg.recipe)
+    return Training.restore(cfg, tensors, meta, device)
+
+
+def anchor_cap(scene: AnchorScene, cap: int, max_memory: float) -> int:
+    """The cap on anchors now: the user's own, and what still fits below `max_memory` GiB of resident memory (0: no cap)."""
+    if max_memory <= 0:
+        return cap
+    n = len(scene.table)
+    columns = scene.table.columns().values()
+    per_anchor = sum(v.element_size() * v[0].numel() * (4 if v.requires_grad else 1) for v in columns) + 4 * (2 + 2 * scene.K)
+    left = max_memory * 2**30 - resident_bytes()
+    room = max(0, int(left / (2 * per_anchor)))  # twice: a row edit holds old and new columns at once
+    return min(n + room, cap) if cap else max(n + room, 1)
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process, bytes; 0 where the system does not tell."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return 0
