@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -37,7 +38,7 @@ def load(
     missing: Literal["error", "drop"] = "error",
     seed: int = 0,
 ) -> Capture:
-    """Load the capture in folder `path`: COLMAP (sparse/0 and images), NeRF-synthetic (transforms_train.json) or nerfstudio (transforms.json).
+    """Load the capture in folder `path`: COLMAP (sparse/0, images), NeRF-synthetic (transforms_train.json), nerfstudio (transforms.json).
 
     images: folder of the photographs, relative to `path`, e.g. "images_4"; intrinsics follow the size found there.
     resolution: "auto" (= "cap1600"), "as-is", "cap1600", "factor:N", "longest:N", or "inria:N" (the folder images_N as it is).
@@ -99,7 +100,7 @@ def _read_colmap(root: Path, images: str, missing: str) -> Found:
     assert folder is not None
     model = colmap.read_model(folder)
     names = sorted(image.name for image in model.images)
-    twice = next((a for a, b in zip(names, names[1:]) if a == b), None)
+    twice = next((a for a, b in pairwise(names) if a == b), None)
     if twice is not None:
         raise InputError(f"expected every image once in {folder}, found {twice} twice; remove one of its poses")
     match = match_images(root / images, names)
@@ -168,7 +169,7 @@ def _fitted(view: Posed) -> tuple[Lens, bool]:
         if abs(w * lens.height - h * lens.width) <= max(lens.width, lens.height, 0.01 * w * lens.height):
             return lens.resized(w, h), size != stored
     raise InputError(
-        f"expected {view.path} in the shape of its camera ({view.lens.width}x{view.lens.height} or smaller), found {stored[0]}x{stored[1]}; "
+        f"expected {view.path} in the shape of its camera ({view.lens.width}x{view.lens.height}), found {stored[0]}x{stored[1]}; "
         f"use the photographs that the cameras were reconstructed from"
     )
 

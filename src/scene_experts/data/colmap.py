@@ -114,7 +114,7 @@ def _check_images(images: tuple[Posed, ...], cameras: dict[int, Lens], path: Pat
             raise InputError(f"expected a finite pose for every image, found {image.name} without one in {path}; remove that image from it")
         if image.camera_id not in cameras:
             raise InputError(
-                f"expected the camera of {image.name} among those of {path.parent}, found no camera {image.camera_id}; restore the cameras file"
+                f"expected the camera of {image.name} among those of {path.parent}, found no camera {image.camera_id}; restore it"
             )
 
 
@@ -258,6 +258,10 @@ def write_model(folder: Path, model: Model, text: bool = False) -> None:
         write_bytes(folder / f"{name}{kind}", data)
 
 
+def _encoded(name: str) -> bytes:
+    return name.encode("utf-8", "surrogateescape")
+
+
 def _as_binary(model: Model) -> dict[str, bytes]:
     cameras = struct.pack("<Q", len(model.cameras)) + b"".join(
         struct.pack(f"<iiQQ{len(c.params)}d", key, _NAMES.index(c.model), c.width, c.height, *c.params) for key, c in model.cameras.items()
@@ -284,4 +288,4 @@ def _as_text(model: Model) -> dict[str, bytes]:
     for key, xyz, rgb, error in zip(model.ids.tolist(), model.xyz.tolist(), model.rgb.tolist(), model.error.tolist()):
         points.append(" ".join([str(key), *map(repr, xyz), *map(str, rgb), repr(error)]))
     parts = {"cameras": cameras, "images": images, "points3D": points}
-    return {name: ("\n".join(lines) + "\n").encode("utf-8", "surrogateescape") for name, lines in parts.items()}
+    return {name: _encoded("\n".join(lines) + "\n") for name, lines in parts.items()}

@@ -1,7 +1,7 @@
 """One photograph from its file to the pixels that training sees: decode, turn, undistort, resize, composite, mask.
 
-EXIF orientation: structure-from-motion tools work on the stored pixels, so it is not applied, unless only the turned image has the size that
-the camera model states (then the tool had applied it). Masks are in [0, 1], 1 = counts; they come from alpha and from mask files, and
+EXIF orientation: structure-from-motion tools work on the stored pixels, so it is not applied, unless only the turned image has the size
+that the camera model states (then the tool had applied it). Masks are in [0, 1], 1 = counts; they come from alpha and from mask files, and
 black means "ignore" as in COLMAP.
 """
 
@@ -100,8 +100,8 @@ def check_policy(policy: str) -> str:
 def decode(source: Source) -> tuple[Tensor, Tensor | None]:
     """The frame of `source`: rgb [H, W, 3] uint8 and its mask [H, W] uint8 (255 = counts) or None where every pixel counts.
 
-    Order: undistort at the file's resolution, then resize (Pillow's antialiased bicubic, as the reference codes), then composite in float and
-    round. A pure function of the files. Raises InputError for a file that is unreadable or not of the expected size.
+    Order: undistort at the file's resolution, then resize (Pillow's antialiased bicubic, as the reference codes), then composite in float
+    and round. A pure function of the files. Raises InputError for a file that is unreadable or not of the expected size.
     """
     image = _pixels(source)
     mask = _mask_file(source)
@@ -151,9 +151,7 @@ def _pixels(source: Source) -> Image.Image:
             raise _unreadable(source.path, error) from error
     expected = (source.lens.width, source.lens.height)
     if out.size != expected:
-        raise InputError(
-            f"expected {source.path} to be {expected[0]}x{expected[1]}, found {out.size[0]}x{out.size[1]}; the file changed since the capture was loaded"
-        )
+        raise InputError(f"expected {source.path} to be {expected[0]}x{expected[1]}, found {out.size[0]}x{out.size[1]}; load it again")
     return out
 
 

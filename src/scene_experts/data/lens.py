@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scene_experts.errors import InputError
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 # Order is COLMAP's numbering. Names of parameters: "f" stands for fx = fy.
 MODELS: dict[str, tuple[str, ...]] = {
@@ -37,7 +37,8 @@ _LARGEST_ANGLE = math.radians(88.0)  # rays further from the axis than this have
 class Lens:
     """A camera model of COLMAP with its size and parameters in pixels.
 
-    Raises InputError for an unknown model, a wrong number of parameters, values that are not finite, a focal length or a size that is not positive.
+    Raises InputError for an unknown model, a wrong number of parameters, values that are not finite, and a focal length or a size that is
+    not positive.
     """
 
     model: str
@@ -187,7 +188,7 @@ def _fov_inverse(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
 
 
 def pinhole_of(lens: Lens) -> Lens:
-    """The pinhole that `lens` is undistorted to: same focal lengths, the largest size without empty pixels (COLMAP's rule, blank_pixels = 0).
+    """The pinhole that `lens` is undistorted to: same focal lengths, the largest size without empty pixels (COLMAP's rule).
 
     The image border is undistorted; each axis is grown or cropped about the principal point until no output pixel looks outside the
     photograph, within 0.2 to 2 times the original size. An undistorted lens is returned as a PINHOLE of its own size.

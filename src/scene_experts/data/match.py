@@ -66,8 +66,8 @@ def absent_error(folder: Path, names: Sequence[str], absent: Sequence[str]) -> I
 
 
 def find_mask(root: Path, name: str, image: Path) -> Path | None:
-    """The mask file of view `name`, or None: masks/NAME, masks/NAME.png, masks/STEM.png under `root`, or STEM.mask.png, STEM_mask.png beside
-    the photograph."""
+    """The mask file of view `name`, or None: masks/NAME, masks/NAME.png, masks/STEM.png under `root`, or STEM.mask.png, STEM_mask.png
+    beside the photograph."""
     stem = PurePosixPath(name).with_suffix("").as_posix()
     candidates = [root / "masks" / part for part in (name, f"{name}.png", f"{stem}.png")]
     candidates += [image.with_name(f"{image.stem}{ending}") for ending in (".mask.png", "_mask.png")]

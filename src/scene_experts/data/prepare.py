@@ -77,10 +77,10 @@ def at_most(capture: Capture, count: int) -> Capture:
 def hold_out(capture: Capture, split: str) -> Capture:
     """Divide the views, sorted by their whole name, into training and test views.
 
-    "modN": every Nth is a test view, starting with the first ("mod8" is the protocol of 3DGS and its descendants); "first:N": the first N
+    "modN" or "mod:N": every Nth is a test view, starting with the first ("mod8" is the protocol of 3DGS and its descendants); "first:N": the first N
     are; "none": none is; "files": as the capture's files say. Raises InputError for another word or where no training view would be left.
     """
-    every, first = split.removeprefix("mod"), split.removeprefix("first:")
+    every, first = split.removeprefix("mod").removeprefix(":"), split.removeprefix("first:")
     indices = range(len(capture.views))
     if split == "files":
         test = capture.test
@@ -100,7 +100,7 @@ def hold_out(capture: Capture, split: str) -> Capture:
         raise InputError(
             f"expected training views after --split {split}, found none among {len(indices)} views; use --split none or a smaller test set"
         )
-    return replace(capture, train=train, test=test, split=split)
+    return replace(capture, train=train, test=test, split=split.replace("mod:", "mod"))
 
 
 def downscale(capture: Capture, policy: str) -> Capture:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -108,7 +109,7 @@ def _present(root: Path, posed: list[tuple[Path | None, Posed]], warnings: list[
     if absent:
         warnings.append(f"{len(absent)} of {len(posed)} frames dropped: their image is absent (first: {absent[0]})")
     names = sorted(view.name for view in kept)
-    twice = next((a for a, b in zip(names, names[1:]) if a == b), None)
+    twice = next((a for a, b in pairwise(names) if a == b), None)
     if twice is not None:
         raise InputError(f"expected every image once in the frames of {root}, found {twice} twice; remove one of its poses")
     return kept
@@ -125,9 +126,7 @@ def _pose(frame: dict[str, Any], path: Path) -> NDArray[np.float64]:
         raise InputError(f"expected a finite 4x4 transform_matrix for {where} in {path}, found none; remove that frame")
     u, s, v = np.linalg.svd(pose[:3, :3])
     if np.linalg.det(pose[:3, :3]) <= 0 or np.abs(s - 1).max() > 1e-2:
-        raise InputError(
-            f"expected a rotation in the transform_matrix of {where} in {path}, found a matrix that stretches; restore the file"
-        )
+        raise InputError(f"expected a rotation in the transform_matrix of {where} in {path}, found one that stretches; restore it")
     rotation = (u @ v) * np.array([1.0, -1.0, -1.0])  # columns: right, up -> down, back -> forward
     out = np.eye(4)
     out[:3, :3] = rotation.T
@@ -150,9 +149,7 @@ def _lens(meta: dict[str, Any], frame: dict[str, Any], path: Path) -> Lens | Non
         k = [float(both.get(f"k{i}", 0.0) or 0.0) for i in range(1, 7)]
         p = [float(both.get(f"p{i}", 0.0) or 0.0) for i in (1, 2)]
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"expected numbers for w, h, fl_x, fl_y, cx and cy in {path}, found a problem with {error}; restore the file"
-        ) from None
+        raise InputError(f"expected numbers for w, h, fl_x, fl_y, cx and cy in {path}, found {error}; restore the file") from None
     if model in _PINHOLES:
         return Lens("PINHOLE", width, height, (fx, fy, cx, cy))
     if model == "OPENCV_FISHEYE":
