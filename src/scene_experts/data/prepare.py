@@ -77,8 +77,8 @@ def at_most(capture: Capture, count: int) -> Capture:
 def hold_out(capture: Capture, split: str) -> Capture:
     """Divide the views, sorted by their whole name, into training and test views.
 
-    "modN" or "mod:N": every Nth is a test view, starting with the first ("mod8" is the protocol of 3DGS and its descendants); "first:N": the first N
-    are; "none": none is; "files": as the capture's files say. Raises InputError for another word or where no training view would be left.
+    "modN" or "mod:N": every Nth is a test view, starting with the first ("mod8" is the protocol of 3DGS and its kin); "first:N": the
+    first N are; "none": none is; "files": as the capture's files say. Raises InputError for another word or where no training view is left.
     """
     every, first = split.removeprefix("mod").removeprefix(":"), split.removeprefix("first:")
     indices = range(len(capture.views))
