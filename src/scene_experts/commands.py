@@ -55,6 +55,8 @@ class TrainCommand:
     out: Annotated[Path, tyro.conf.arg(aliases=["-m"])]
     """Run folder to write."""
     cfg: Annotated[Train, tyro.conf.arg(name="")]
+    overwrite: bool = False
+    """Begin anew in a run folder that holds an earlier run, whose checkpoints are removed."""
     resume: bool = False
     """Go on from the run's newest whole checkpoint."""
     stop_at: int | None = None
@@ -82,7 +84,7 @@ def train(args: list[str]) -> int:
         print(f"warning: {warning}", file=sys.stderr)
     line = shlex.join([PROG, "train", *args])
     config = RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, run_folder.versions())
-    run_folder.prepare(command.out, config, command.resume)
+    run_folder.prepare(command.out, config, command.resume, command.overwrite)
     run = Run(
         config=config,
         out=command.out,

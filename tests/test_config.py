@@ -1,0 +1,43 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from scene_experts.config import Data, RunConfig, Train, from_json, to_json
+from scene_experts.errors import InputError
+from scene_experts.recipes import RECIPES
+from scene_experts.schedule import Every
+
+
+@pytest.mark.parametrize("name", list(RECIPES))
+def test_every_recipe_survives_json(name):
+    config = RunConfig(RECIPES[name][1], Data(Path("somewhere"), background=(0.0, 0.5, 1.0)), "a command", True, 7, {"torch": "x"})
+    assert from_json(RunConfig, json.loads(json.dumps(to_json(config)))) == config
+    assert config.train.recipe == name
+
+
+def test_iterations_scale_windows_and_nothing_else():
+    short = replace(RECIPES["moe-gs"][1], iterations=3000).scaled()
+    assert short.growth.adjust == Every(150, 1500, 100) and short.growth.start_stat == 50
+    assert short.scene.decoder.warmup == 150
+    assert short.growth.success_threshold == 0.8 and short.growth.grad_threshold == 0.0002 and short.rates == RECIPES["moe-gs"][1].rates
+    assert replace(short, iterations=30_000).growth.adjust.interval == 100
+    assert RECIPES["moe-gs"][1].scaled() == RECIPES["moe-gs"][1]
+    with pytest.raises(InputError, match="at least 1 iteration"):
+        replace(RECIPES["moe-gs"][1], iterations=0).scaled()
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        ({"iterations": "many"}, "config.iterations"),
+        ({"unheard_of": 1}, "unheard_of"),
+        ({"scene": 3}, "config.scene"),
+        ({"growth": {"scale_clamp": "never"}}, "config.growth.scale_clamp"),
+        ({"scene": {"decoder": {"type": "Transformer"}}}, "config.scene.decoder"),
+    ],
+)
+def test_errors_name_the_place(edit, message):
+    with pytest.raises(InputError, match=message):
+        from_json(Train, {"recipe": "x", **edit})
