@@ -162,8 +162,8 @@ def watch_mean2d(mean2d: Tensor, others: tuple[Tensor, ...], camera: Camera, tot
     if mean2d.requires_grad:
         half = mean2d.new_tensor([camera.width / 2, camera.height / 2])
 
-        def store(gradient: Tensor) -> None:
-            buffer[ids] = gradient.detach() * half
+        def store(gradient: Tensor | None) -> None:  # None: autograd knows the gradient to be zero
+            buffer[ids] = half * 0 if gradient is None else gradient.detach() * half
 
         mean2d.register_hook(store)
     return buffer

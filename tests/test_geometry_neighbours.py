@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from scene_experts.geometry.neighbours import knn_d2, median_neighbour_distance, nearest
+
+
+def cloud(kind: str, n: int = 1500) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(n, 3, generator=generator, dtype=torch.float64)
+    if kind == "duplicates":
+        points[: n // 2] = points[0]
+    if kind == "outliers":
+        points[:7] *= 1e6
+    if kind == "flat":
+        points[:, 2] = 0.5
+    if kind == "lattice":
+        points = torch.randint(0, 9, (n, 3), generator=generator).double()  # many equal distances
+    return points
+
+
+def brute(points: torch.Tensor, k: int) -> torch.Tensor:
+    d2 = (points[:, None] - points[None]).square().sum(-1)
+    d2.fill_diagonal_(float("inf"))
+    return d2.topk(k, dim=1, largest=False).values
+
+
+@pytest.mark.parametrize("kind", ["normal", "duplicates", "outliers", "flat", "lattice"])
+@pytest.mark.parametrize("k", [1, 3, 10])
+def test_same_as_all_pairs(kind: str, k: int) -> None:
+    points = cloud(kind)
+    d2, index = nearest(points, k)
+    torch.testing.assert_close(d2, brute(points, k), rtol=1e-12, atol=0)
+    torch.testing.assert_close((points[index] - points[:, None]).square().sum(-1), d2, rtol=1e-12, atol=0)
+    assert (index != torch.arange(len(points))[:, None]).all()
+    ordered = index.sort(dim=1).values
+    assert (ordered.diff(dim=1) > 0).all()  # no neighbour twice
+
+
+@pytest.mark.parametrize("n", [4, 5, 63, 64, 127, 128, 129, 257, 300])
+def test_every_size_around_the_leaf_boundaries(n: int) -> None:
+    points = cloud("normal", n)
+    torch.testing.assert_close(knn_d2(points), brute(points, 3).mean(1))
+
+
+def test_few_points() -> None:
+    assert knn_d2(torch.zeros(0, 3)).shape == (0,)
+    assert knn_d2(torch.ones(1, 3)).tolist() == [0.0]
+    two = torch.tensor([[0.0, 0, 0], [3, 4, 0]])
+    assert knn_d2(two).tolist() == [25.0, 25.0]
+    three = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
+    assert knn_d2(three).tolist() == [5.0, 2.5, 6.5]
+    assert knn_d2(torch.ones(500, 3)).tolist() == [0.0] * 500
+
+
+def test_lattice_spacing() -> None:
+    axis = torch.arange(12, dtype=torch.float64)
+    grid = torch.cartesian_prod(axis, axis, axis) * 0.25
+    assert knn_d2(grid).tolist() == pytest.approx([0.0625] * len(grid))
+    assert median_neighbour_distance(grid) == pytest.approx(0.25)
+    assert median_neighbour_distance(grid[:1]) == 0.0
