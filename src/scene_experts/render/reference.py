@@ -26,7 +26,7 @@ passes: `clamp_gradient`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -67,7 +67,7 @@ class ReferenceRasterizer:
     antialias: bool = False
     clamp_gradient: bool = False
     tile: int | None = TILE
-    name: str = "reference"
+    name: str = field(default="reference", init=False)
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
         """Draws M Gaussians over `background` [3]; see `types.Render`. A later backward pass overwrites `mean2d_grad`."""
@@ -152,7 +152,7 @@ def visible(means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
     return project(means, quats, scales, camera).radii > 0
 
 
-def watch_mean2d(mean2d: Tensor, others: tuple[Tensor, ...], camera: Camera, total: int, ids: Tensor) -> Tensor:
+def watch_mean2d(mean2d: Tensor, others: tuple[Tensor, ...], camera: Camera, total: int, ids: Tensor | slice) -> Tensor:
     """A buffer [total, 2] of zeros; backward writes d loss / d mean in NDC (pixel gradient times W/2, H/2) of `mean2d` to rows `ids`."""
     buffer = mean2d.new_zeros((total, 2))
     if not torch.is_grad_enabled():
