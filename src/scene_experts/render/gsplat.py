@@ -1,6 +1,6 @@
 """Drawing on CUDA with gsplat (Apache-2.0), called so that its pictures and gradients mean what `reference` defines.
 
-What the adapter settles: pixels, near plane and blur are the reference's; `radii` are the 3 sigma rule whatever extent gsplat bins with (from
+What the adapter settles: near plane and blur are the reference's; `radii` are the 3 sigma rule whatever extent gsplat bins with (from
 1.5 on less for faint Gaussians, and none below opacity 1/255); what has no radius is not drawn; depth is one more colour channel over a
 background of 0; the gradient of the 2D mean is turned from pixels to NDC; the antialias factor is floored at 0.005.
 What stays different with gsplat 1.5.3: alpha is clamped at 0.999 instead of 0.99 (from 1.6 on: 0.99); a pixel stops at T <= 1e-4 instead of
