@@ -65,7 +65,7 @@ def colours(xyz: Array) -> Array:
     return np.take_along_axis(np.stack(paints), nearest[None, ..., None], 0)[0]
 
 
-def _hits(origin: Array, rays: Array) -> Array:
+def hits(origin: Array, rays: Array) -> Array:
     """Distance along `rays` [..., 3] from `origin` [3] to the scene, inf where it is missed."""
     with np.errstate(divide="ignore", invalid="ignore"):
         t = -origin[2] / rays[..., 2]
@@ -94,7 +94,7 @@ def picture(lens: Lens, world_to_cam: Array, scale: float, background: tuple[flo
     R, t = world_to_cam[:3, :3], world_to_cam[:3, 3]
     origin = -(R.T @ t) / scale
     rays = np.stack((u, v, np.ones_like(u)), -1) @ R  # rows of R are the camera's axes in the world
-    depth = _hits(origin, rays)
+    depth = hits(origin, rays)
     hit = np.isfinite(depth)
     seen = colours(origin + np.where(hit, depth, 1.0)[..., None] * rays)
     out = np.where(hit[..., None], seen, np.array(background))

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_data_lens import LENSES
 
 from scene_experts.data.colmap import Model, Posed, find_model, read_model, write_model
 from scene_experts.errors import InputError
+from test_data_lens import LENSES
 
 
 def model() -> Model:
@@ -87,7 +87,12 @@ def test_75_thousand_points_in_well_under_a_second_or_two(tmp_path: Path) -> Non
     made, count = model(), 75_000
     rng = np.random.default_rng(0)
     made = replace(
-        made, ids=np.arange(count), xyz=rng.random((count, 3)), rgb=np.zeros((count, 3), np.uint8), error=np.zeros(count), images=made.images
+        made,
+        ids=np.arange(count),
+        xyz=rng.random((count, 3)),
+        rgb=np.zeros((count, 3), np.uint8),
+        error=np.zeros(count),
+        images=made.images,
     )
     write_model(tmp_path, made)
     start = time.process_time()
@@ -170,7 +175,9 @@ def test_no_cameras_and_no_images(tmp_path: Path) -> None:
         read_model(tmp_path)
 
 
-@pytest.mark.parametrize("bad", [{"quaternion": (float("nan"), 0.0, 0.0, 1.0)}, {"translation": (0.0, float("inf"), 0.0)}, {"quaternion": (0.0,) * 4}])
+@pytest.mark.parametrize(
+    "bad", [{"quaternion": (float("nan"), 0.0, 0.0, 1.0)}, {"translation": (0.0, float("inf"), 0.0)}, {"quaternion": (0.0,) * 4}]
+)
 def test_poses_that_are_not_finite(tmp_path: Path, bad: dict) -> None:
     made = model()
     write_model(tmp_path, replace(made, images=(replace(made.images[0], **bad), *made.images[1:])))

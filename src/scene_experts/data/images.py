@@ -109,11 +109,11 @@ def decode(source: Source) -> tuple[Tensor, Tensor | None]:
     outside = None
     if source.lens.distorted:
         rgb = _remap(rgb, source.lens)
-        mask = None if mask is None else _remap(mask, source.lens)
+        mask = None if mask is None else _remap(_sized(mask, (source.lens.width, source.lens.height)), source.lens)
         outside = _outside(source.lens)
     if rgb.size != source.size:
         rgb = rgb.resize(source.size, Image.Resampling.BICUBIC)
-    weights = [_resized(m, source.size) for m in (mask, outside) if m is not None]
+    weights = [np.asarray(_sized(m, source.size)) for m in (mask, outside) if m is not None]
     pixels = np.asarray(rgb)
     if rgb.mode == "RGBA":
         alpha = pixels[..., 3]
@@ -137,8 +137,9 @@ def _product(weights: list[NDArray[np.uint8]]) -> Tensor | None:
     return torch.from_numpy(np.rint(out).astype(np.uint8))
 
 
-def _resized(mask: Image.Image, size: Size) -> NDArray[np.uint8]:
-    return np.asarray(mask if mask.size == size else mask.resize(size, Image.Resampling.BILINEAR))
+def _sized(mask: Image.Image, size: Size) -> Image.Image:
+    """`mask` at `size`: the share of each new pixel that counts."""
+    return mask if mask.size == size else mask.resize(size, Image.Resampling.BOX)
 
 
 def _pixels(source: Source) -> Image.Image:
@@ -165,7 +166,7 @@ def _to_8_bit(image: Image.Image) -> Image.Image:
 
 
 def _mask_file(source: Source) -> Image.Image | None:
-    """The mask file as L, at the size of the photograph."""
+    """The mask file as L, at its own size."""
     if source.mask is None:
         return None
     with _open(source.mask) as image:
@@ -173,10 +174,8 @@ def _mask_file(source: Source) -> Image.Image | None:
             out = image.getchannel("A") if image.mode == "RGBA" and image.convert("L").getextrema() == (0, 0) else image.convert("L")
         except (OSError, ValueError, SyntaxError) as error:
             raise _unreadable(source.mask, error) from error
-    if source.turn and out.size != (source.lens.width, source.lens.height):
-        out = ImageOps.exif_transpose(out)
-    size = (source.lens.width, source.lens.height)
-    return out if out.size == size else out.resize(size, Image.Resampling.BILINEAR)
+    upright = source.turn and (out.width > out.height) != (source.lens.width > source.lens.height)
+    return ImageOps.exif_transpose(out) if upright else out
 
 
 @functools.lru_cache(maxsize=2)  # neighbours in a capture share their camera

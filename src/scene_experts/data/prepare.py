@@ -183,7 +183,7 @@ def random_points(capture: Capture, count: int = 10_000, seed: int = 0) -> Captu
     """The capture with `count` near-grey points spread uniformly, in place of any it has.
 
     NeRF-synthetic scenes: the cube [-1.3, 1.3]^3 of their own frame, as 3DGS does. Others: the box of the training cameras and of what lies
-    one extent in front of each, which holds the subject both of all-round and of forward-facing captures.
+    one and a half extents in front of each, which holds the subject both of all-round and of forward-facing captures.
     """
     rng = np.random.default_rng(seed)
     if capture.kind == "blender":
@@ -192,7 +192,7 @@ def random_points(capture: Capture, count: int = 10_000, seed: int = 0) -> Captu
         views = [capture.views[i] for i in capture.train]
         eyes = centres(views)
         ahead = torch.stack([v.camera.world_to_cam[2, :3].double() for v in views])
-        both = torch.cat((eyes, eyes + ahead * capture.extent))
+        both = torch.cat((eyes, eyes + 1.5 * capture.extent * ahead))
         corners = torch.stack((both.amin(0), both.amax(0)))
     xyz = corners[0] + torch.from_numpy(rng.random((count, 3))) * (corners[1] - corners[0])
     grey = torch.from_numpy(rng.integers(118, 138, (count, 3)).astype(np.uint8))

@@ -1,0 +1,52 @@
+"""Images and masks are found by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from scene_experts.data.match import absent_error, find_mask, match_images
+
+
+def touch(root: Path, *names: str) -> None:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+
+
+def test_exact_names_with_folders_and_dots(tmp_path: Path) -> None:
+    touch(tmp_path, "left/a.1.jpg", "left/a.2.jpg", "right/a.1.jpg")
+    names = ["left/a.1.jpg", "left/a.2.jpg", "right/a.1.jpg"]
+    match = match_images(tmp_path, names)
+    assert match.found == {name: tmp_path / name for name in names} and not match.warnings and not match.absent
+
+
+def test_another_extension_when_there_is_one_choice(tmp_path: Path) -> None:
+    touch(tmp_path, "a.png", "b.png", "b.webp")
+    match = match_images(tmp_path, ["a.JPG", "b.JPG"])
+    assert match.found == {"a.JPG": tmp_path / "a.png"} and match.absent == ("b.JPG",)
+    assert "1 images found under another extension (first: a.JPG -> a.png)" in match.warnings
+
+
+def test_flattened_folders_when_base_names_are_unique(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg", "b.jpg")
+    match = match_images(tmp_path, ["images/a.jpg", "x/b.jpg", "y/b.jpg"])
+    assert match.found == {"images/a.jpg": tmp_path / "a.jpg"} and match.absent == ("x/b.jpg", "y/b.jpg")
+    assert "another folder" in match.warnings[0]
+
+
+def test_nothing_there(tmp_path: Path) -> None:
+    match = match_images(tmp_path / "none", ["a.jpg"])
+    assert match.absent == ("a.jpg",)
+    text = str(absent_error(tmp_path, ["a.jpg", "b.jpg"], match.absent))
+    assert "expected 2 images" in text and "found 1 of them absent (first: a.jpg)" in text and "--images" in text
+
+
+@pytest.mark.parametrize("mask", ["masks/s/a.jpg", "masks/s/a.jpg.png", "masks/s/a.png", "images/s/a.mask.png", "images/s/a_mask.png"])
+def test_masks_under_every_name(tmp_path: Path, mask: str) -> None:
+    touch(tmp_path, "images/s/a.jpg")
+    image = tmp_path / "images/s/a.jpg"
+    assert find_mask(tmp_path, "s/a.jpg", image) is None
+    touch(tmp_path, mask)
+    assert find_mask(tmp_path, "s/a.jpg", image) == tmp_path / mask
