@@ -1,0 +1,65 @@
+"""What `scene-experts eval RUN` does: open the run, load its capture, evaluate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from scene_experts import run_folder
+from scene_experts.evaluate.run import About, evaluate
+
+if TYPE_CHECKING:
+    from scene_experts.render import Rasterizer
+
+
+def evaluate_run(
+    run: Path,
+    device: str,
+    rasterize: Rasterizer,
+    *,
+    data: Path | None = None,
+    views: Literal["test", "train"] = "test",
+    step: int | None = None,
+    lpips: bool = True,
+    lpips_weights: Path | None = None,
+    download: bool = False,
+) -> dict[str, Any]:
+    """Evaluate the newest checkpoint of a run folder (or the one at `step`) on its capture, which `data` may say has moved.
+
+    The rasteriser's antialiasing follows the run's recipe where it can. Raises InputError for anything that does not fit.
+    """
+    opened = run_folder.open_run(run, device, step)
+    if hasattr(rasterize, "antialias") and rasterize.antialias != opened.cfg.antialias:
+        rasterize = replace(rasterize, antialias=opened.cfg.antialias)  # type: ignore[type-var]
+    where = opened.config.data if data is None else replace(opened.config.data, path=data)
+    capture = run_folder.load_capture(where, opened.cfg.seed)
+    about = About(
+        recipe=opened.config.train.recipe,
+        iterations=opened.cfg.iterations,
+        seed=opened.cfg.seed,
+        train_seconds=opened.seconds,
+        versions=opened.config.versions,
+    )
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    try:
+        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task("opening", total=None)
+            return evaluate(
+                opened.scene,
+                capture,
+                rasterize,
+                run,
+                step=opened.step,
+                views=views,
+                lpips=lpips,
+                lpips_weights=lpips_weights,
+                download=download,
+                about=about,
+                progress=lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
+            )
+    finally:
+        capture.images.close()

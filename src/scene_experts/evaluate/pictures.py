@@ -1,0 +1,107 @@
+"""The pictures of an evaluation on disk: renders, photographs, errors and the three beside each other, as 8-bit PNG."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from scene_experts.errors import InputError
+from scene_experts.io import write_atomic
+
+FOLDERS = ("renders", "gt", "errors", "side_by_side", "masks")
+WORST = 0.25  # mean absolute error over RGB that is drawn brightest; the same for all views, so that they compare
+GAP, BAR = 4, 22  # px between the pictures, and of the caption above them
+# evenly spaced, dark to light
+HEAT = ((0, 0, 0), (40, 12, 84), (120, 28, 109), (200, 64, 62), (246, 141, 32), (252, 206, 80), (255, 255, 236))
+PAPER, INK = (255, 255, 255), (40, 40, 40)
+
+
+def to_8bit(image: Tensor) -> np.ndarray:
+    """[H, W, 3] RGB -> uint8: clamped to [0, 1], x * 255 + 0.5, truncated."""
+    return (image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+
+
+def from_8bit(pixels: np.ndarray) -> Tensor:
+    """uint8 [...] -> float32 / 255."""
+    return torch.from_numpy(np.ascontiguousarray(pixels)).float() / 255.0
+
+
+def file_names(views: Iterable[str]) -> dict[str, str]:
+    """The picture's relative name for each view's: the extension becomes .png, and is kept before it where two views differ by it alone."""
+    views = list(views)
+    plain = {view: str(PurePosixPath(view.replace("\\", "/")).with_suffix("")) for view in views}
+    folded = [name.casefold() for name in plain.values()]  # some file systems ignore case
+    return {view: f"{name if folded.count(name.casefold()) == 1 else view}.png" for view, name in plain.items()}
+
+
+def clear(folder: Path) -> None:
+    """Remove the pictures of an earlier evaluation."""
+    for name in FOLDERS:
+        shutil.rmtree(folder / name, ignore_errors=True)
+
+
+def write(path: Path, pixels: np.ndarray) -> None:
+    """Write uint8 [H, W, 3] or [H, W] as PNG, atomically."""
+    write_atomic(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG", compress_level=3))
+
+
+def read(path: Path, mode: str = "RGB") -> np.ndarray:
+    """The uint8 pixels of a picture. Raises InputError where it is gone or unreadable."""
+    try:
+        with Image.open(path) as picture:
+            return np.asarray(picture.convert(mode))
+    except OSError as error:
+        raise InputError(f"expected a picture at {path}, found none that can be read ({error}); evaluate again") from error
+
+
+def heat(error: np.ndarray) -> np.ndarray:
+    """Errors [H, W] in colours, uint8 [H, W, 3]: black at 0, white at `WORST` and beyond."""
+    place = np.clip(error / WORST, 0, 1) * (len(HEAT) - 1)
+    stops = np.asarray(HEAT, dtype=np.float32)
+    return np.stack([np.interp(place, np.arange(len(HEAT)), stops[:, c]) for c in range(3)], axis=-1).round().astype(np.uint8)
+
+
+def error_map(render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """The mean absolute difference over RGB in colours; where the mask counts nothing, black."""
+    error = np.abs(render.astype(np.float32) - photo.astype(np.float32)).mean(axis=2) / 255
+    return heat(error if mask is None else error * (mask.astype(np.float32) / 255))
+
+
+def side_by_side(photo: np.ndarray, render: np.ndarray, errors: np.ndarray, captions: tuple[str, str, str]) -> np.ndarray:
+    """Photograph, render and errors in a row with thin gaps, each under its caption."""
+    h, w = photo.shape[:2]
+    sheet = Image.new("RGB", (3 * w + 2 * GAP, BAR + h), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    for i, (pixels, caption) in enumerate(zip((photo, render, errors), captions)):
+        left = i * (w + GAP)
+        sheet.paste(Image.fromarray(pixels), (left, BAR))
+        draw.text((left + 4, BAR // 2), caption, fill=INK, font=_font(draw, caption, w - 8), anchor="lm")
+    _scale(draw, 3 * w + 2 * GAP, w)
+    return np.asarray(sheet)
+
+
+def _font(draw: ImageDraw.ImageDraw, text: str, room: int) -> ImageFont.ImageFont | ImageFont.FreeTypeFont:
+    """The largest type of 8 to 13 px in which `text` fits; Pillow's bitmap type where it was built without FreeType."""
+    font = ImageFont.load_default(13)
+    for size in range(13, 7, -1):
+        font = ImageFont.load_default(size)
+        if draw.textlength(text, font=font) <= room:
+            break
+    return font
+
+
+def _scale(draw: ImageDraw.ImageDraw, right: int, width: int) -> None:
+    """The colours from 0 to `WORST` at the right end of the caption bar, where there is room beside the caption."""
+    length = min(90, width // 4)
+    if length < 40:
+        return
+    colours = heat(np.linspace(0, WORST, length)[None])[0]
+    for x, colour in enumerate(colours):
+        draw.line([(right - length + x, 5), (right - length + x, BAR - 6)], fill=tuple(int(c) for c in colour))
+    draw.rectangle([right - length - 1, 4, right - 1, BAR - 5], outline=INK)

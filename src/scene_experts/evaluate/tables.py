@@ -1,0 +1,230 @@
+"""Tables of several results beside each other, and beside the paper's numbers: for terminals, Markdown and CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from scene_experts.errors import InputError
+from scene_experts.io import read_json
+
+Format = Literal["table", "markdown", "csv"]
+PROTOCOL = {  # what must be equal before scores may be compared: key in results.json, name, option that sets it
+    "capture": ("capture", "--data"),
+    "resolution": ("resolution", "--resolution"),
+    "mean_pixels": ("picture size", "--resolution"),
+    "split": ("split", "--split"),
+    "views": ("views", "--views"),
+    "view_count": ("number of views", "--max-views"),
+    "masked": ("use of masks", "--data"),
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """One figure of a results file. `best`: which end is better, 0 where neither is."""
+
+    title: str
+    path: tuple[str, ...]
+    digits: int = 0
+    factor: float = 1.0
+    best: int = 0
+
+    def value(self, results: dict[str, Any]) -> float | None:
+        found: Any = results
+        for key in self.path:
+            found = found.get(key) if isinstance(found, dict) else None
+        return None if found is None else float(found) * self.factor
+
+    def text(self, value: float | None) -> str:
+        return "-" if value is None else f"{value:,.{self.digits}f}" if abs(value) >= 10_000 else f"{value:.{self.digits}f}"
+
+
+COLUMNS = (
+    Column("PSNR", ("psnr",), 2, best=1),
+    Column("SSIM", ("ssim",), 3, best=1),
+    Column("LPIPS", ("lpips",), 3, best=-1),
+    Column("LPIPS (3DGS)", ("lpips_3dgs",), 3, best=-1),
+    Column("LPIPS (Alex)", ("lpips_alex",), 3, best=-1),
+    Column("MB", ("size", "MB"), 1, best=-1),
+    Column("anchors", ("anchors",)),
+    Column("active %", ("activation_ratio",), 1, 100.0),
+    Column("sharpness", ("sharpness", "ratio"), 2),
+    Column("FPS", ("fps", "fps"), 1, best=1),
+    Column("train s", ("train_seconds",)),
+)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells as text, with the best of each column known by (row, column)."""
+
+    titles: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    best: frozenset[tuple[int, int]] = frozenset()
+    notes: tuple[str, ...] = ()
+
+
+def load_results(run: Path, views: str = "test") -> dict[str, Any]:
+    """results.json of a run folder. Raises InputError where the run was not evaluated."""
+    path = run / ("results.json" if views == "test" else f"results_{views}.json")
+    if run.is_file():
+        path = run
+    if not path.is_file():
+        raise InputError(f"expected an evaluated run with {path.name} in {run}, found none; run `scene-experts eval {run}` first")
+    results = read_json(path, "results file")
+    if not isinstance(results, dict) or "psnr" not in results:
+        raise InputError(f"expected results of `scene-experts eval` in {path}, found something else; evaluate the run again")
+    return results
+
+
+def check_protocol(names: Sequence[str], results: Sequence[dict[str, Any]]) -> None:
+    """Raises InputError naming the first difference in what was scored: resolution alone moves PSNR by up to half a dB."""
+    for name, other in zip(names[1:], results[1:]):
+        for key, (what, option) in PROTOCOL.items():
+            if other.get(key) != results[0].get(key):
+                raise InputError(
+                    f"expected runs with the same {what}, found {results[0].get(key)} in {names[0]} and {other.get(key)} in {name}; "
+                    f"repeat one with the other's {option}, or add --mixed to see them beside each other all the same"
+                )
+
+
+def table(names: Sequence[str], results: Sequence[dict[str, Any]], columns: Sequence[Column] = COLUMNS) -> Table:
+    """One row per result. A column that no result has is left out; what is absent is "-" with its reason in the notes."""
+    values = [[column.value(result) for column in columns] for result in results]
+    used = [j for j in range(len(columns)) if any(row[j] is not None for row in values)]
+    best: set[tuple[int, int]] = set()
+    for place, j in enumerate(used):
+        texts = {i: columns[j].text(row[j]) for i, row in enumerate(values) if row[j] is not None}
+        if columns[j].best and len(texts) > 1:
+            winner = max(texts, key=lambda i: columns[j].best * (values[i][j] or 0.0))
+            best |= {(i, place + 1) for i, text in texts.items() if text == texts[winner]}
+    rows = tuple((name, *(columns[j].text(row[j]) for j in used)) for name, row in zip(names, values))
+    return Table(("run", *(columns[j].title for j in used)), rows, frozenset(best), _notes(results))
+
+
+def _notes(results: Sequence[dict[str, Any]]) -> tuple[str, ...]:
+    """Why scores are absent, each reason once with the scores it explains."""
+    reasons: dict[str, list[str]] = {}
+    for result in results:
+        for metric, reason in (result.get("absent") or {}).items():
+            if metric not in (known := reasons.setdefault(reason, [])):
+                known.append(metric)
+    return tuple(f"{', '.join(metrics)} absent: {reason}" for reason, metrics in reasons.items())
+
+
+def to_markdown(table: Table) -> str:
+    """A Markdown table, the best of each column bold, notes below."""
+    rows = [[f"**{cell}**" if (i, j) in table.best else cell for j, cell in enumerate(row)] for i, row in enumerate(table.rows)]
+    lines = ["| " + " | ".join(table.titles) + " |", "|---|" + "---:|" * (len(table.titles) - 1)]
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join(lines + ["", *table.notes] if table.notes else lines) + "\n"
+
+
+def to_csv(table: Table) -> str:
+    """Comma-separated values with a header; absent values are empty."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(table.titles)
+    writer.writerows([row[0], *("" if cell == "-" else cell.replace(",", "") for cell in row[1:])] for row in table.rows)
+    return out.getvalue()
+
+
+def to_rich(table: Table, title: str | None = None) -> RichTable:
+    """For a terminal, the best of each column bold."""
+    drawn = RichTable(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
+    for j, name in enumerate(table.titles):
+        drawn.add_column(name, justify="left" if j == 0 else "right", no_wrap=j > 0)
+    for i, row in enumerate(table.rows):
+        drawn.add_row(*(f"[bold]{cell}[/bold]" if (i, j) in table.best else cell for j, cell in enumerate(row)))
+    return drawn
+
+
+def row_names(runs: Sequence[Path], results: Sequence[dict[str, Any]]) -> list[str]:
+    """The recipe where it tells the runs apart, else the run folder's name with it."""
+    recipes = [str(result.get("recipe") or run.name) for run, result in zip(runs, results)]
+    if len(set(recipes)) == len(recipes):
+        return recipes
+    return [f"{run.name} ({recipe})" for run, recipe in zip(runs, recipes)]
+
+
+def compare_runs(runs: Sequence[Path], format: Format, mixed: bool, console: Console, paper: str | None = None) -> Table:
+    """Print one table of several evaluated runs, and of the paper's numbers for the data set `paper` below them.
+
+    Raises InputError where they were scored on different captures, resolutions or splits, unless `mixed`.
+    """
+    if not runs:
+        raise InputError("expected at least one run folder, found none; name the folders that `scene-experts train --out` wrote")
+    results = [load_results(Path(run)) for run in runs]
+    names = row_names([Path(run) for run in runs], results)
+    if not mixed:
+        check_protocol(names, results)
+    else:
+        names = [f"{name} on {result.get('capture')}, {result.get('resolution')}" for name, result in zip(names, results)]
+    published = paper_results(paper) if paper else {}
+    made = table([*names, *published], [*results, *published.values()])
+    if format == "table":
+        console.print(to_rich(made, None if mixed else _title(results[0])))
+        for note in made.notes:
+            console.print(note, markup=False, soft_wrap=True)
+    else:
+        console.print(to_markdown(made) if format == "markdown" else to_csv(made), markup=False, highlight=False, soft_wrap=True, end="")
+    return made
+
+
+def print_results(results: dict[str, Any], console: Console, run: Path) -> None:
+    """Print what an evaluation found and where its pictures are."""
+
+    def say(line: str) -> None:
+        console.print(line, markup=False, soft_wrap=True)
+
+    suffix = "" if results["views"] == "test" else f"_{results['views']}"
+    made = table([str(results.get("recipe") or run.name)], [results])
+    console.print(to_rich(made, _title(results)))
+    for note in made.notes:
+        say(note)
+    for attribute, shares in results["experts"].items():
+        named, values = ("share", shares["share"]) if shares["share"] else ("mean gate", shares["mean_gate"])
+        say(f"experts, {attribute}: {named} {' '.join(f'{v:.0%}' for v in values)}, gate entropy {shares['entropy']:.2f}")
+    fps = results["fps"]
+    say(f"drawing: {fps['decode_ms']:.1f} ms decode + {fps['raster_ms']:.1f} ms raster on {fps['device']}")
+    say(f"wrote {run / f'results{suffix}.json'} and pictures in {run / results['views'] / 'side_by_side'}")
+
+
+def _title(results: dict[str, Any]) -> str:
+    """What the scores of a table are of."""
+    return f"{results['capture']}: {results['view_count']} {results['views']} views ({results['split']}), {results['resolution']}"
+
+
+@cache
+def paper() -> dict[str, Any]:
+    """The MoE-GS paper's tables as data (paper.yaml)."""
+    return yaml.safe_load(files("scene_experts.evaluate").joinpath("paper.yaml").read_text())
+
+
+def paper_results(dataset: str) -> dict[str, dict[str, Any]]:
+    """The paper's rows for a data set of its tables 1 and 2, by "<method> (paper)", shaped like results.json.
+
+    Its LPIPS is in the convention of 3DGS and stands under lpips_3dgs. Raises InputError for a data set it has no table of.
+    """
+    tables = {**_datasets("table1"), **_datasets("table2")}
+    if dataset not in tables:
+        raise InputError(f"expected a data set of the paper ({', '.join(tables)}), found {dataset}; name one of those")
+    out = {}
+    for method, (psnr, ssim, lpips, megabytes) in tables[dataset].items():
+        out[f"{method} (paper)"] = {"psnr": psnr, "ssim": ssim, "lpips_3dgs": lpips, "size": {"MB": megabytes}}
+    return out
+
+
+def _datasets(name: str) -> dict[str, dict[str, list[float]]]:
+    return {dataset: rows for dataset, rows in paper()[name].items() if dataset != "columns"}

@@ -1,0 +1,132 @@
+"""Tables: what is compared, what is refused, how it is written."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from scene_experts.errors import InputError
+from scene_experts.evaluate import tables
+
+
+def results(recipe: str, psnr: float, **other: Any) -> dict[str, Any]:
+    return {
+        "recipe": recipe,
+        "capture": "yard",
+        "resolution": "as-is",
+        "mean_pixels": 5000,
+        "split": "mod8",
+        "views": "test",
+        "view_count": 9,
+        "masked": False,
+        "psnr": psnr,
+        "ssim": 0.9,
+        "lpips": 0.2,
+        "lpips_3dgs": 0.19,
+        "lpips_alex": None,
+        "absent": {"lpips_alex": "no weights: run this"},
+        "size": {"MB": 1.25},
+        "anchors": 12345,
+        "activation_ratio": 0.365,
+        "sharpness": {"ratio": 0.93},
+        "fps": {"fps": 20.0, "decode_ms": 10.0, "raster_ms": 40.0, "device": "cpu"},
+        "train_seconds": 100.0,
+        "experts": {"color": {"share": [0.6, 0.4], "mean_gate": [0.5, 0.5], "entropy": 0.97}},
+        **other,
+    }
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> list[Path]:
+    out = []
+    for name, value in (("a", results("scaffold-gs", 27.123)), ("b", results("moe-gs", 27.456))):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "results.json").write_text(json.dumps(value))
+        out.append(tmp_path / name)
+    return out
+
+
+def printed(runs: list[Path], format: tables.Format = "table", mixed: bool = False, paper: str | None = None) -> str:
+    console = Console(file=io.StringIO(), width=200)
+    tables.compare_runs(runs, format, mixed, console, paper)
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_markdown(runs: list[Path]) -> None:
+    lines = printed(runs, "markdown").splitlines()
+    assert lines[0].startswith("| run | PSNR | SSIM | LPIPS | LPIPS (3DGS) | MB |")
+    assert lines[2].startswith("| scaffold-gs | 27.12 | **0.900** |") and lines[3].startswith("| moe-gs | **27.46** |")
+    assert "12,345" in lines[2] and "36.5" in lines[2] and lines[1].count("---") == lines[0].count("|") - 1
+    assert lines[-1] == "lpips_alex absent: no weights: run this"
+
+
+def test_csv_is_plain_numbers(runs: list[Path]) -> None:
+    rows = list(csv.DictReader(io.StringIO(printed(runs, "csv"))))
+    assert [r["run"] for r in rows] == ["scaffold-gs", "moe-gs"]
+    assert float(rows[0]["PSNR"]) == 27.12 and float(rows[0]["anchors"]) == 12345
+
+
+def test_terminal(runs: list[Path]) -> None:
+    text = printed(runs)
+    assert "yard: 9 test views (mod8), as-is" in text and "27.46" in text and "lpips_alex absent: no weights: run this" in text
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "option"),
+    [
+        ("capture", "garden", "--data"),
+        ("resolution", "cap1600", "--resolution"),
+        ("split", "first:31", "--split"),
+        ("view_count", 8, "--max-views"),
+    ],
+)
+def test_refuses_other_protocols(runs: list[Path], key: str, value: Any, option: str) -> None:
+    (runs[1] / "results.json").write_text(json.dumps(results("moe-gs", 28.0, **{key: value})))
+    with pytest.raises(InputError, match=f"{option}.*--mixed"):
+        printed(runs)
+    assert "moe-gs on" in printed(runs, mixed=True)
+
+
+def test_not_evaluated(tmp_path: Path, runs: list[Path]) -> None:
+    with pytest.raises(InputError, match="scene-experts eval"):
+        printed([*runs, tmp_path])
+    (tmp_path / "results.json").write_text("[1]")
+    with pytest.raises(InputError, match="something else"):
+        printed([tmp_path])
+    with pytest.raises(InputError, match="at least one"):
+        printed([])
+
+
+def test_equal_recipes_are_told_apart_by_folder(runs: list[Path]) -> None:
+    (runs[1] / "results.json").write_text(json.dumps(results("scaffold-gs", 27.0)))
+    text = printed(runs, "markdown")
+    assert "| a (scaffold-gs) |" in text and "| b (scaffold-gs) |" in text
+
+
+def test_beside_the_paper(runs: list[Path]) -> None:
+    lines = printed(runs, "markdown", paper="DeepBlending").splitlines()
+    row = next(line for line in lines if line.startswith("| MoE-GS (paper)"))
+    assert [cell.strip(" *") for cell in row.split("|")][2:7] == ["30.64", "0.905", "-", "0.264", "55.4"]
+    with pytest.raises(InputError, match="BungeeNeRF"):
+        printed(runs, paper="nowhere")
+
+
+def test_paper_numbers() -> None:
+    assert tables.paper()["table2"]["BungeeNeRF"]["MoE-GS"] == [28.64, 0.925, 0.089, 161.6]
+    assert tables.paper()["table3"]["Scaffold-GS"]["DeepBlending"] == 41.0
+    for dataset in ("MipNeRF360", "DeepBlending", "TanksAndTemples", "BungeeNeRF"):
+        assert len(tables.paper_results(dataset)) == 5
+
+
+def test_print_results(tmp_path: Path) -> None:
+    console = Console(file=io.StringIO(), width=200)
+    tables.print_results(results("moe-gs", 27.5), console, tmp_path)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "27.50" in text and "experts, color: share 60% 40%, gate entropy 0.97" in text
+    assert "10.0 ms decode + 40.0 ms raster on cpu" in text and str(tmp_path / "results.json") in text
