@@ -1,0 +1,100 @@
+"""Files appear whole or not at all, and every failure is one sentence."""
+
+import os
+import resource
+import stat
+
+import pytest
+
+from scene_experts.errors import InputError, RunError
+from scene_experts.io import read_json, write_atomic, write_bytes, write_json
+
+
+def names(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_bytes_into_folders_that_do_not_exist_yet(tmp_path):
+    write_bytes(tmp_path / "a" / "b" / "c.bin", b"\0\1")
+    assert (tmp_path / "a" / "b" / "c.bin").read_bytes() == b"\0\1" and names(tmp_path / "a" / "b") == ["c.bin"]
+
+
+def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path):
+    path = tmp_path / "x"
+    path.write_text("old")
+
+    def write(temporary):
+        assert path.read_text() == "old" and temporary.parent == path.parent
+        temporary.write_text("new")
+        assert path.read_text() == "old"
+
+    write_atomic(path, write)
+    assert path.read_text() == "new" and names(tmp_path) == ["x"]
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), OSError("only a text")])
+def test_a_failed_write_is_a_run_error_and_leaves_the_old_file(tmp_path, error):
+    path = tmp_path / "x"
+    path.write_text("old")
+
+    def write(temporary):
+        temporary.write_text("half")
+        raise error
+
+    with pytest.raises(RunError, match=f"cannot write .*{error.strerror or error}; free some space"):
+        write_atomic(path, write)
+    assert path.read_text() == "old" and names(tmp_path) == ["x"]
+
+
+def test_a_bug_while_writing_is_not_hidden_and_leaves_nothing(tmp_path):
+    with pytest.raises(ZeroDivisionError):
+        write_atomic(tmp_path / "x", lambda temporary: 1 / 0)
+    assert names(tmp_path) == []
+
+
+def test_a_full_disk(tmp_path):
+    write_bytes(tmp_path / "x", b"old")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(RunError, match=r"cannot write .*x: "):
+            write_bytes(tmp_path / "x", bytes(2000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (tmp_path / "x").read_bytes() == b"old" and names(tmp_path) == ["x"]
+
+
+def test_a_folder_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match="choose another folder with --out"):
+        write_bytes(tmp_path / "file" / "x", b"")
+
+
+def test_permissions_follow_the_umask(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_bytes(tmp_path / "x", b"")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "x").stat().st_mode) == 0o640
+
+
+def test_json_both_ways(tmp_path):
+    value = {"a": [1, 2.5, None, True], "é": {"b": "c"}}
+    write_json(tmp_path / "x.json", value)
+    assert read_json(tmp_path / "x.json", "thing") == value
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(tmp_path / "x.json", float("nan"))
+    assert read_json(tmp_path / "x.json", "thing") == value
+
+
+@pytest.mark.parametrize("data", [b"", b"{", b'{"a": 1', b"\xff\xfe\x00"])
+def test_unreadable_json(tmp_path, data):
+    (tmp_path / "x.json").write_bytes(data)
+    with pytest.raises(InputError, match=r"expected a run configuration in JSON at .*x.json"):
+        read_json(tmp_path / "x.json", "run configuration")
+
+
+def test_absent_json(tmp_path):
+    with pytest.raises(InputError, match=r"expected a run configuration at .*x.json, found no such file"):
+        read_json(tmp_path / "x.json", "run configuration")
