@@ -15,6 +15,7 @@ from PIL import Image
 from scene_experts.data.capture import load
 from scene_experts.data.colmap import read_model, write_model
 from scene_experts.data.lens import Lens
+from scene_experts.data.summary import neighbour_distance
 from scene_experts.errors import InputError
 from synthetic import Synthetic, make_capture, picture
 from test_data_lens import LENSES
@@ -146,6 +147,11 @@ def test_the_summary_is_json_and_true(made: Synthetic) -> None:
     d = torch.cdist(capture.points.xyz, capture.points.xyz).fill_diagonal_(9e9).amin(1).median()
     assert said["median_neighbour_distance"] == pytest.approx(float(d), rel=1e-6)
     assert any("2 test views" in w for w in said["warnings"]) and any("3 sizes" in w for w in said["warnings"])
+
+
+def test_neighbour_distances_of_many_points_are_sampled() -> None:
+    xyz = torch.rand((4000, 3), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert neighbour_distance(xyz, exact=1000) == pytest.approx(neighbour_distance(xyz), rel=0.1)
 
 
 def test_fewer_views(made: Synthetic) -> None:

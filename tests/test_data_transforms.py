@@ -86,8 +86,6 @@ def test_shared_intrinsics_and_an_angle_of_view(tmp_path: Path) -> None:
 
 
 def test_a_smaller_image_folder(tmp_path: Path) -> None:
-    from PIL import Image
-
     make_nerfstudio(tmp_path, views=3, size=(48, 32), points=50, mixed_sizes=False)
     (tmp_path / "images_2").mkdir()
     for path in (tmp_path / "images").iterdir():
@@ -95,6 +93,18 @@ def test_a_smaller_image_folder(tmp_path: Path) -> None:
     full, half = load(tmp_path), load(tmp_path, images="images_2")
     assert (half.views[0].camera.width, half.views[0].camera.height) == (24, 16)
     torch.testing.assert_close(half.views[0].camera.K[:2], full.views[0].camera.K[:2] / 2)
+
+
+@pytest.mark.parametrize("place", ["masks/view_001.png", "masks/view_001.png.png", "images/view_001_mask.png", "stencils/one.png"])
+def test_masks_of_nerfstudio(tmp_path: Path, place: str) -> None:
+    made = make_nerfstudio(tmp_path, views=2, size=(48, 32), points=50)
+    (tmp_path / place).parent.mkdir(exist_ok=True)
+    Image.fromarray(np.zeros(made.images["view_001.png"].shape[:2], np.uint8)).save(tmp_path / place)
+    if place.startswith("stencils"):
+        edit(tmp_path / "transforms.json", lambda m: m["frames"][1].update(mask_path=place))
+    capture = load(tmp_path)
+    mask = capture.frame(1).mask
+    assert mask is not None and not mask.any() and capture.frame(0).mask is None
 
 
 def test_blender_split_pose_and_background(tmp_path: Path) -> None:

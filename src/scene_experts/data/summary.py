@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 
+import torch
+from torch import Tensor
+
 from scene_experts.data.views import Capture
 from scene_experts.geometry.neighbours import median_neighbour_distance
 
@@ -30,7 +33,7 @@ def summarise(capture: Capture) -> dict:
         "undistorted": sum(s.lens.distorted for s in sources),
         "masks": sum(s.mask is not None for s in sources),
         "points": 0 if points is None else len(points.xyz),
-        "median_neighbour_distance": None if points is None else median_neighbour_distance(points.xyz),
+        "median_neighbour_distance": None if points is None else neighbour_distance(points.xyz),
         "extent": capture.extent,
         "near": capture.views[0].camera.near,
         "world": {"scale": capture.world.scale, "shift": list(capture.world.shift)},
@@ -39,3 +42,17 @@ def summarise(capture: Capture) -> dict:
         "decoded_bytes": sum(s.size[0] * s.size[1] * 3 for s in sources),
         "warnings": list(capture.warnings),
     }
+
+
+def neighbour_distance(xyz: Tensor, exact: int = 100_000) -> float:
+    """Median distance from a point to its nearest other point; beyond `exact` points that of 256 random ones, so that it stays quick."""
+    if len(xyz) <= exact:
+        return median_neighbour_distance(xyz)
+    pick = torch.randperm(len(xyz), generator=torch.Generator().manual_seed(0))[:256]
+    nearest = []
+    for part in pick.split(16):
+        squared = sum((xyz[part, None, axis] - xyz[None, :, axis]) ** 2 for axis in range(3))
+        assert isinstance(squared, Tensor)
+        squared[torch.arange(len(part)), part] = float("inf")
+        nearest.append(squared.amin(1))
+    return float(torch.cat(nearest).sqrt().median())

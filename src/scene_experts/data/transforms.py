@@ -62,7 +62,7 @@ def read_nerfstudio(root: Path, images: str | None) -> Found:
         name, image = _image(root, _text(frame, i, path), images)
         lens = _lens(meta, frame, path)
         given = root / str(frame["mask_path"]) if frame.get("mask_path") else None
-        mask = given if given is not None and given.is_file() else find_mask(root, name, image) if image else None
+        mask = given if given is not None and given.is_file() else find_mask(root, _inside(name), image) if image else None
         held = frame.get("file_path") in set(meta.get("test_filenames") or ())
         angle = float({**meta, **frame}.get("camera_angle_x") or 0)
         if lens is None and not 0 < angle < math.pi:
@@ -99,6 +99,11 @@ def _image(root: Path, file_path: str, images: str | None) -> tuple[str, Path | 
         if (root / candidate).is_file():
             return candidate, root / candidate
     return name, None
+
+
+def _inside(name: str) -> str:
+    """`name` without its first folder (masks/0001.png belongs to images/0001.png)."""
+    return name.partition("/")[2] or name
 
 
 def _present(root: Path, posed: list[tuple[Path | None, Posed]], warnings: list[str]) -> list[Posed]:
