@@ -29,7 +29,7 @@ def to_8bit(image: Tensor) -> np.ndarray:
 
 def from_8bit(pixels: np.ndarray) -> Tensor:
     """uint8 [...] -> float32 / 255."""
-    return torch.from_numpy(np.ascontiguousarray(pixels)).float() / 255.0
+    return torch.from_numpy(pixels).float() / 255.0
 
 
 def file_names(views: Iterable[str]) -> dict[str, str]:
@@ -55,7 +55,7 @@ def read(path: Path, mode: str = "RGB") -> np.ndarray:
     """The uint8 pixels of a picture. Raises InputError where it is gone or unreadable."""
     try:
         with Image.open(path) as picture:
-            return np.asarray(picture.convert(mode))
+            return np.array(picture.convert(mode))
     except OSError as error:
         raise InputError(f"expected a picture at {path}, found none that can be read ({error}); evaluate again") from error
 
