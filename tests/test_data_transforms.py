@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
