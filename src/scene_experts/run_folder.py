@@ -91,6 +91,7 @@ def load_capture(data: Data, seed: int = 0) -> Capture:
         images=data.images,
         resolution=data.resolution,
         split=data.split,
+        missing=data.missing,
         normalise=data.normalise,
         init=data.init,
         max_views=data.max_views,
