@@ -146,7 +146,7 @@ def digest(tensors: dict[str, Tensor]) -> str:
     for name in sorted(tensors):
         value = tensors[name]
         sha.update(f"{name}\0{value.dtype}\0{list(value.shape)}\0".encode())
-        sha.update(value.contiguous().reshape(-1).view(torch.uint8).numpy())
+        sha.update(value.contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return sha.hexdigest()
 
 
