@@ -110,3 +110,13 @@ def test_pictures_too_small_for_a_network() -> None:
     perceptual = Perceptual({net: Lpips(net, random_tensors(net)) for net in ("vgg", "alex")})
     found = perceptual(*pair(20, 20))
     assert set(found) == {"lpips", "lpips_3dgs"} and "at least 31 px" in perceptual.absent["lpips_alex"]
+
+
+@pytest.mark.gpu
+def test_scores_on_cuda_are_those_on_the_cpu() -> None:
+    networks = {net: Lpips(net, random_tensors(net)) for net in ("vgg", "alex")}
+    image, target = pair(64, 80)
+    here = metrics.score(image, target, None, Perceptual(networks))
+    there = metrics.score(image.cuda(), target.cuda(), None, Perceptual({net: network.to("cuda") for net, network in networks.items()}))
+    assert there == pytest.approx(here, rel=1e-4)
+    assert torch.backends.cudnn.allow_tf32  # as it was

@@ -7,6 +7,8 @@ rest of the render is replaced by the photograph, and what dissimilarity is left
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -111,10 +113,22 @@ class Perceptual:
 
 def score(image: Tensor, target: Tensor, mask: Tensor | None, perceptual: Perceptual) -> dict[str, float]:
     """Every score of one view, and the sharpness of render and photograph."""
-    return {
-        "psnr": psnr(image, target, mask),
-        "ssim": ssim(image, target, mask),
-        **perceptual(image, target, mask),
-        "sharpness": sharpness(image, mask),
-        "sharpness_photo": sharpness(target, mask),
-    }
+    with _full_precision():
+        return {
+            "psnr": psnr(image, target, mask),
+            "ssim": ssim(image, target, mask),
+            **perceptual(image, target, mask),
+            "sharpness": sharpness(image, mask),
+            "sharpness_photo": sharpness(target, mask),
+        }
+
+
+@contextmanager
+def _full_precision() -> Iterator[None]:
+    """Convolutions in float32 on CUDA too: cuDNN rounds their inputs to 10 bits (TF32) by default, which moves SSIM and LPIPS."""
+    before = torch.backends.cudnn.allow_tf32
+    torch.backends.cudnn.allow_tf32 = False
+    try:
+        yield
+    finally:
+        torch.backends.cudnn.allow_tf32 = before

@@ -81,19 +81,23 @@ def side_by_side(photo: np.ndarray, render: np.ndarray, errors: np.ndarray, capt
     for i, (pixels, caption) in enumerate(zip((photo, render, errors), captions)):
         left = i * (w + GAP)
         sheet.paste(Image.fromarray(pixels), (left, BAR))
-        draw.text((left + 4, BAR // 2), caption, fill=INK, font=_font(draw, caption, w - 8), anchor="lm")
+        text, font = _fit(draw, caption, w - 8)
+        draw.text((left + 4, BAR // 2), text, fill=INK, font=font, anchor="lm")
     _scale(draw, 3 * w + 2 * GAP, w)
     return np.asarray(sheet)
 
 
-def _font(draw: ImageDraw.ImageDraw, text: str, room: int) -> ImageFont.ImageFont | ImageFont.FreeTypeFont:
-    """The largest type of 8 to 13 px in which `text` fits; Pillow's bitmap type where it was built without FreeType."""
-    font = ImageFont.load_default(13)
-    for size in range(13, 7, -1):
-        font = ImageFont.load_default(size)
-        if draw.textlength(text, font=font) <= room:
-            break
-    return font
+def _fit(draw: ImageDraw.ImageDraw, text: str, room: int) -> tuple[str, ImageFont.ImageFont | ImageFont.FreeTypeFont]:
+    """`text` in the largest type of 9 to 13 px in which it fits, without its last parts (two spaces apart) where it never does."""
+    parts, font = text.split("  "), ImageFont.load_default(9)
+    while True:
+        for size in range(13, 8, -1):
+            font = ImageFont.load_default(size)
+            if draw.textlength("  ".join(parts), font=font) <= room:
+                return "  ".join(parts), font
+        if len(parts) == 1:
+            return "", font
+        parts.pop()
 
 
 def _scale(draw: ImageDraw.ImageDraw, right: int, width: int) -> None:
