@@ -70,7 +70,8 @@ def evaluate(
     tell = progress or (lambda *_: None)
     device = next(iter(scene.table.params.values())).device
     background = torch.tensor(capture.background, dtype=torch.float32, device=device)
-    perceptual = Perceptual.find(lpips_weights, device, fetch=download) if lpips else Perceptual.off()
+    fetching = lambda have, total: tell("fetching LPIPS weights, MiB", have >> 20, total >> 20)  # noqa: E731
+    perceptual = Perceptual.find(lpips_weights, device, fetch=download, progress=fetching) if lpips else Perceptual.off()
     names = pictures.file_names(capture.views[i].name for i in chosen)
     cameras = [capture.views[i].camera.to(device) for i in chosen]
     folder = out / views

