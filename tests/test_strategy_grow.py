@@ -41,7 +41,8 @@ def slow_growth(scene: AnchorScene, rule: GrowAnchors):
                 if count <= 40 or g < rule.grad_threshold * 2**level:
                     continue
                 point = table.facts["xyz"][a].double() + (table.params["offsets"][a, k] * table.params["log_scaling"][a, :3].exp()).double()
-                cell = tuple(math.floor(float(x) / (VOXEL * factor) + 0.5) for x in point)
+                fine = (math.floor(float(x.detach()) / VOXEL + 0.5) for x in point)
+                cell = tuple((2 * i + factor) // (2 * factor) for i in fine)
                 if cell not in occupied:
                     fresh.setdefault(cell, []).append(table.params["feature"][a].detach())
         for cell, features in fresh.items():
@@ -137,7 +138,7 @@ def test_scale_clamp(clamp, limit):
     scene = make()
     scene.table.params["log_scaling"].data.fill_(9.0)
     GrowAnchors(scale_clamp=clamp).prune(scene)
-    values = scene.table.params["log_scaling"]
+    values = scene.table.params["log_scaling"].detach()
     assert values[:, :3].min() == 9.0 and values[:, 3:].max() == pytest.approx(limit)
 
 

@@ -128,9 +128,9 @@ class GrowAnchors:
         """
         if len(points) == 0:
             return None
-        cells = torch.floor(points / (scene.voxel * factor) + 0.5)
-        inside = (cells.abs() * factor < AXIS_LIMIT - factor).all(1)  # an offset that ran away founds nothing
-        cells, parents, g = cells[inside].long(), parents[inside], g[inside]
+        fine = torch.floor(points / scene.voxel + 0.5)  # rounded once; coarser cells follow in integers, as the anchors' own do
+        inside = (fine.abs() < AXIS_LIMIT - factor).all(1)  # an offset that ran away founds nothing
+        cells, parents, g = coarsen(fine[inside].long(), factor), parents[inside], g[inside]
         if len(cells) == 0:
             return None
         keys, group = torch.unique(pack(cells), return_inverse=True)
