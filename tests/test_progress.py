@@ -1,0 +1,27 @@
+import io
+from pathlib import Path
+
+from rich.console import Console
+
+from scene_experts.progress import Progress, clock
+from scene_experts.strategy.grow import Edit
+from scene_experts.train import Adjusted, Finished, Saved, Started, Stepped, Stopped
+
+
+def test_a_log_file_gets_plain_lines():
+    out = io.StringIO()
+    with Progress(Console(file=out, width=200), every=0.0) as show:
+        show(Started(0, 200, 1234))
+        show(Stepped(10, {"l1": 0.05, "dssim": 0.02}, 21.5, 1300, 800, 4000, 0.61, 1.0, {}))
+        show(Adjusted(100, Edit(10, 0, 1310, capped=True)))
+        show(Saved(200, Path("a/b")))
+        show(Finished(200, 75.0))
+        show(Stopped(100, "SIGINT"))
+    text = out.getvalue()
+    for part in ("1,234 anchors", "10/200", "l1 0.0500", "PSNR 21.50", "anchors 1,300", "active 61 %", "it/s", "left", "cap on anchors", "1:15"):
+        assert part in text, part
+    assert "--resume" in text and "\x1b" not in text
+
+
+def test_clock():
+    assert [clock(s) for s in (0, 59.6, 61, 3661)] == ["0:00", "1:00", "1:01", "1:01:01"]

@@ -1,0 +1,32 @@
+import torch
+
+from scene_experts.strategy import observe
+from scene_experts.table import Table
+from scene_experts.types import Decoded, Gaussians, Render
+
+K = 3
+
+
+def view(rows, raw, source, radii, grad) -> tuple[Decoded, Render]:
+    m = len(source)
+    g = Gaussians(torch.zeros(m, 3), torch.zeros(m, 4), torch.zeros(m, 3), torch.zeros(m), torch.zeros(m, 3), torch.tensor(source))
+    render = Render(torch.zeros(2, 2, 3), torch.zeros(2, 2), torch.zeros(2, 2), torch.tensor(radii, dtype=torch.int32), torch.tensor(grad))
+    return Decoded(g, torch.tensor(rows), torch.tensor(raw), {}), render
+
+
+def test_counts_follow_the_rule_over_two_views():
+    table = Table({"a": torch.zeros(4, 1)}, {})
+    observe.start(table, K)
+    # anchors 1 and 3 seen; slots 1:0, 1:2 and 3:1 positive; 1:2 missed the picture (radius 0)
+    observe.observe(
+        table, *view([1, 3], [[0.5, -0.2, 0.1], [-0.1, 0.7, -1.0]], [3, 5, 10], [4, 0, 2], [[3.0, 4.0], [9.0, 9.0], [0.0, 2.0]])
+    )
+    observe.observe(table, *view([1], [[0.25, -1.0, -1.0]], [3], [7], [[0.0, 1.0]]))
+    torch.testing.assert_close(table.stats["visits"], torch.tensor([0.0, 2, 0, 1]))
+    torch.testing.assert_close(table.stats["opacity"], torch.tensor([0.0, 0.85, 0, 0.7]))
+    assert table.stats["grad"].reshape(-1)[[3, 5, 10]].tolist() == [6.0, 0.0, 2.0]  # norms 5 + 1, nothing, 2
+    assert table.stats["count"].reshape(-1)[[3, 5, 10]].tolist() == [2.0, 0.0, 1.0]
+    assert table.stats["grad"].sum() == 8 and table.stats["count"].sum() == 3
+    observe.stop(table)
+    assert not table.stats
+    observe.stop(table)  # twice is fine
