@@ -23,13 +23,13 @@ inline V operator-(V a, V b) { return {_mm512_sub_ps(a.v, b.v)}; }
 inline V operator*(V a, V b) { return {_mm512_mul_ps(a.v, b.v)}; }
 inline V operator/(V a, V b) { return {_mm512_div_ps(a.v, b.v)}; }
 inline V fma(V a, V b, V c) { return {_mm512_fmadd_ps(a.v, b.v, c.v)}; }  // a b + c
-// The maskz forms compile to the plain instructions; GCC 12's plain max and min warn about their own headers.
+// The maskz forms compile to the plain instructions; GCC 12's plain forms of some warn about their own headers.
 inline V max(V a, V b) { return {_mm512_maskz_max_ps(0xffff, a.v, b.v)}; }
 inline V min(V a, V b) { return {_mm512_maskz_min_ps(0xffff, a.v, b.v)}; }
 inline V greater(V a, V b, V yes, V no) { return {_mm512_mask_blend_ps(_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ), no.v, yes.v)}; }
 inline V square_root(V a) { return {_mm512_sqrt_ps(a.v)}; }
-inline V nearest(V a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC)}; }
-inline V times_two_to(V a, V n) { return {_mm512_scalef_ps(a.v, n.v)}; }  // n integral
+inline V nearest(V a) { return {_mm512_maskz_roundscale_ps(0xffff, a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC)}; }
+inline V times_two_to(V a, V n) { return {_mm512_maskz_scalef_ps(0xffff, a.v, n.v)}; }  // n integral
 inline float sum(V a) {
   float part[16];  // _mm512_reduce_add_ps makes GCC 12 warn about its own headers
   _mm512_storeu_ps(part, a.v);

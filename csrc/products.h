@@ -1,0 +1,116 @@
+// The two small matrix products of the decode, on row-major blocks that stay in the first-level cache.
+//   product:     C[m][n] = (bias[n] or 0) + sum_k A[m][k] B[k][n]
+//   accumulate:  C[p][n] += sum_m A[m][p] B[m][n]
+// n runs along the registers and must be a multiple of 16; m is rounded up to TILE_STEP in product and p in accumulate, so A and C need
+// that many rows (columns of A in accumulate) of room, whose content does not matter.
+#pragma once
+#include "lanes.h"
+
+namespace se {
+
+#if defined(__AVX512F__) || defined(__aarch64__)
+constexpr int TILE = 12, TILE_STEP = 4;  // TILE x 2 registers of sums, with room for the operands among 32
+#else
+constexpr int TILE = 6, TILE_STEP = 2;
+#endif
+constexpr int SLACK = TILE;
+
+// Sums of TILE rows by `wide` registers; a compile-time stride (0: given at run time) lets one pointer address all rows of A.
+template <int rows, int wide, int fixed>
+inline void product_tile(const float* a, int a_stride, const float* b, int b_stride, int k, const float* bias, float* c, int c_stride) {
+  const int64_t stride = fixed ? fixed : a_stride;
+  V sums[rows][wide];
+  for (int j = 0; j < wide; ++j) {
+    const V start = bias ? load(bias + j * LANES) : all(0.f);
+#pragma GCC unroll 12
+    for (int i = 0; i < rows; ++i) sums[i][j] = start;
+  }
+  for (int t = 0; t < k; ++t) {
+    V right[wide];
+#pragma GCC unroll 2
+    for (int j = 0; j < wide; ++j) right[j] = load(b + t * static_cast<int64_t>(b_stride) + j * LANES);
+#pragma GCC unroll 12
+    for (int i = 0; i < rows; ++i) {
+      const V left = all(a[i * stride + t]);
+#pragma GCC unroll 2
+      for (int j = 0; j < wide; ++j) sums[i][j] = fma(left, right[j], sums[i][j]);
+    }
+  }
+#pragma GCC unroll 12
+  for (int i = 0; i < rows; ++i)
+#pragma GCC unroll 2
+    for (int j = 0; j < wide; ++j) store(c + i * static_cast<int64_t>(c_stride) + j * LANES, sums[i][j]);
+}
+
+template <int wide, int fixed>
+inline void product_columns(int m, int k, const float* a, int as, const float* b, int bs, const float* bias, float* c, int cs) {
+  int i = 0;
+  for (; i + TILE <= m; i += TILE) product_tile<TILE, wide, fixed>(a + i * as, as, b, bs, k, bias, c + i * cs, cs);
+  if (m - i > 2 * TILE_STEP)
+    product_tile<TILE, wide, fixed>(a + i * as, as, b, bs, k, bias, c + i * cs, cs);
+  else if (m - i > TILE_STEP)
+    product_tile<2 * TILE_STEP, wide, fixed>(a + i * as, as, b, bs, k, bias, c + i * cs, cs);
+  else if (m > i)
+    product_tile<TILE_STEP, wide, fixed>(a + i * as, as, b, bs, k, bias, c + i * cs, cs);
+}
+
+template <int fixed>
+void product_strided(int m, int n, int k, const float* a, int as, const float* b, int bs, const float* bias, float* c, int cs) {
+  int j = 0;
+  for (; j + 2 * LANES <= n; j += 2 * LANES) product_columns<2, fixed>(m, k, a, as, b + j, bs, bias ? bias + j : nullptr, c + j, cs);
+  for (; j + LANES <= n; j += LANES) product_columns<1, fixed>(m, k, a, as, b + j, bs, bias ? bias + j : nullptr, c + j, cs);
+}
+
+inline void product(int m, int n, int k, const float* a, int as, const float* b, int bs, const float* bias, float* c, int cs) {
+  switch (as) {
+    case 16: return product_strided<16>(m, n, k, a, as, b, bs, bias, c, cs);
+    case 32: return product_strided<32>(m, n, k, a, as, b, bs, bias, c, cs);
+    case 48: return product_strided<48>(m, n, k, a, as, b, bs, bias, c, cs);
+    case 80: return product_strided<80>(m, n, k, a, as, b, bs, bias, c, cs);
+    default: return product_strided<0>(m, n, k, a, as, b, bs, bias, c, cs);
+  }
+}
+
+template <int columns, int wide>
+inline void accumulate_tile(int m, const float* a, int as, const float* b, int bs, float* c, int cs) {
+  V sums[columns][wide];
+#pragma GCC unroll 12
+  for (int i = 0; i < columns; ++i)
+#pragma GCC unroll 2
+    for (int j = 0; j < wide; ++j) sums[i][j] = load(c + i * cs + j * LANES);
+  for (int t = 0; t < m; ++t, a += as, b += bs) {
+    V right[wide];
+#pragma GCC unroll 2
+    for (int j = 0; j < wide; ++j) right[j] = load(b + j * LANES);
+#pragma GCC unroll 12
+    for (int i = 0; i < columns; ++i) {
+      const V left = all(a[i]);
+#pragma GCC unroll 2
+      for (int j = 0; j < wide; ++j) sums[i][j] = fma(left, right[j], sums[i][j]);
+    }
+  }
+#pragma GCC unroll 12
+  for (int i = 0; i < columns; ++i)
+#pragma GCC unroll 2
+    for (int j = 0; j < wide; ++j) store(c + i * cs + j * LANES, sums[i][j]);
+}
+
+template <int wide>
+inline void accumulate_columns(int m, int p, const float* a, int as, const float* b, int bs, float* c, int cs) {
+  int i = 0;
+  for (; i + TILE <= p; i += TILE) accumulate_tile<TILE, wide>(m, a + i, as, b, bs, c + i * cs, cs);
+  if (p - i > 2 * TILE_STEP)
+    accumulate_tile<TILE, wide>(m, a + i, as, b, bs, c + i * cs, cs);
+  else if (p - i > TILE_STEP)
+    accumulate_tile<2 * TILE_STEP, wide>(m, a + i, as, b, bs, c + i * cs, cs);
+  else if (p > i)
+    accumulate_tile<TILE_STEP, wide>(m, a + i, as, b, bs, c + i * cs, cs);
+}
+
+inline void accumulate(int m, int p, int n, const float* a, int as, const float* b, int bs, float* c, int cs) {
+  int j = 0;
+  for (; j + 2 * LANES <= n; j += 2 * LANES) accumulate_columns<2>(m, p, a, as, b + j, bs, c + j, cs);
+  for (; j + LANES <= n; j += LANES) accumulate_columns<1>(m, p, a, as, b + j, bs, c + j, cs);
+}
+
+}  // namespace se
