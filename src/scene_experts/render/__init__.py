@@ -1,0 +1,85 @@
+"""Rasterisers behind one protocol, and the choice among them.
+
+`reference` (plain torch, slow) defines the picture; `cpu` (compiled) and `gsplat` (CUDA) draw the same one fast.
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from scene_experts import native
+from scene_experts.errors import InputError
+from scene_experts.types import Camera, Gaussians, Render
+
+NAMES = ("auto", "reference", "cpu", "gsplat")
+
+
+class Rasterizer(Protocol):
+    """Draws Gaussians; every backend gives the picture, depth, radii and gradients that `types.Render` describes."""
+
+    @property
+    def name(self) -> str:
+        """One of NAMES without `auto`."""
+        ...
+
+    def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
+        """Draws M Gaussians over `background` [3]; a later backward pass overwrites the picture's `mean2d_grad`."""
+        ...
+
+    def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
+        """Whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] would be drawn (3 sigma radius > 0), [A] bool."""
+        ...
+
+
+def choose(name: str, device: torch.device | str, antialias: bool = False, deterministic: bool = False) -> Rasterizer:
+    """The rasteriser called `name` for tensors on `device`.
+
+    `auto`: gsplat on CUDA where it can be imported, the compiled one on the CPU where it loads, else the reference, with one warning.
+    `antialias` multiplies opacities by the share of the 2D Gaussian's area that the 0.3 px blur left (Mip-Splatting's compensation).
+    `deterministic`: bit-identical gradients from run to run, where the backend can. Raises InputError for what cannot be had.
+    """
+    device = torch.device(device)
+    if name == "auto":
+        name = _best(device)
+    if name == "cpu":
+        from scene_experts.render.cpu import CpuRasterizer
+
+        if device.type != "cpu":
+            raise InputError(f"the rasteriser `cpu` draws tensors on the CPU, not on {device}: choose `gsplat` or `reference`")
+        return CpuRasterizer(antialias=antialias, deterministic=deterministic)
+    if name == "gsplat":
+        from scene_experts.render.gsplat import GsplatRasterizer
+
+        if device.type != "cuda":
+            raise InputError(f"the rasteriser `gsplat` draws tensors on CUDA, not on {device}: choose `cpu` or `reference`")
+        return GsplatRasterizer(antialias=antialias)
+    if name == "reference":
+        from scene_experts.render.reference import ReferenceRasterizer
+
+        return ReferenceRasterizer(antialias=antialias)
+    raise InputError(f"there is no rasteriser `{name}`: choose one of {', '.join(NAMES)}")
+
+
+def _best(device: torch.device) -> str:
+    if device.type == "cuda":
+        from scene_experts.render.gsplat import available
+
+        reason = available()
+        if reason is None:
+            return "gsplat"
+        _warn(reason)
+    elif native.load() is not None:
+        return "cpu"
+    else:
+        _warn(native.why_not() or "the compiled CPU library cannot be used")
+    return "reference"
+
+
+@functools.cache
+def _warn(reason: str) -> None:
+    warnings.warn(f"the slow reference rasteriser is in use, some hundred times slower than the fast ones: {reason}", stacklevel=4)

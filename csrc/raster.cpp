@@ -1,0 +1,121 @@
+// The C interface of the rasteriser. Every call returns 0, or 1 when memory ran out.
+#include "raster.h"
+
+#include <algorithm>
+#include <mutex>
+#include <new>
+
+#include "export.h"
+
+namespace se::raster {
+namespace {
+
+// States go back here when their graph is gone, so that the next picture finds its memory already mapped.
+class Spare {
+ public:
+  std::unique_ptr<State> take() {
+    std::lock_guard lock(mutex_);
+    if (free_.empty()) return std::make_unique<State>();
+    std::unique_ptr<State> state = std::move(free_.back());
+    free_.pop_back();
+    return state;
+  }
+  void give(std::unique_ptr<State> state) {
+    std::lock_guard lock(mutex_);
+    if (free_.size() < 2) free_.push_back(std::move(state));
+  }
+  void clear() {
+    std::lock_guard lock(mutex_);
+    free_.clear();
+  }
+
+ private:
+  std::mutex mutex_;
+  std::vector<std::unique_ptr<State>> free_;
+};
+
+Spare& spare() {
+  static Spare* instance = new Spare;  // never destroyed: graphs may outlive static destructors at interpreter exit
+  return *instance;
+}
+
+}  // namespace
+}  // namespace se::raster
+
+using namespace se::raster;
+
+struct SeRasterForward {
+  CameraArgs camera;
+  int32_t antialias, threads;
+  int64_t m;
+  Inputs in;
+  const float* background;  // [3]
+  Outputs out;
+  int32_t* radii;  // [m]
+};
+
+struct SeRasterBackward {
+  int32_t deterministic, threads;
+  Inputs in;
+  const float* background;
+  Upstream up;
+  Gradients out;
+};
+
+// `state` null: nothing is kept for backward; else *state must be given to se_raster_release once.
+SE_EXPORT int se_raster_forward(const SeRasterForward* a, void** state) {
+  try {
+    std::unique_ptr<State> s = spare().take();
+    s->camera = a->camera;
+    s->antialias = a->antialias != 0;
+    s->m = a->m;
+    s->tiles_x = (a->camera.width + kTile - 1) / kTile;
+    s->tiles_y = (a->camera.height + kTile - 1) / kTile;
+    project(*s, a->in, a->radii, a->threads);
+    bin(*s, a->threads);
+    blend(*s, a->background, a->out, a->threads);
+    if (state)
+      *state = s.release();
+    else
+      spare().give(std::move(s));
+    return 0;
+  } catch (const std::bad_alloc&) {
+    spare().clear();
+    return 1;
+  }
+}
+
+SE_EXPORT int se_raster_backward(void* state, const SeRasterBackward* a) {
+  try {
+    State& s = *static_cast<State*>(state);
+    // With many workers one row of sums per worker and Gaussian would take more memory than one per pair.
+    const bool slots = a->deterministic || (a->threads > 4 && a->threads * s.visible > s.pairs);
+    const int rows = slots ? 0 : std::max(1, a->threads);
+    blend_backward(s, a->background, a->up, a->out.background, rows, a->threads);
+    project_backward(s, a->in, a->out, rows, a->threads);
+    return 0;
+  } catch (const std::bad_alloc&) {
+    spare().clear();
+    return 1;
+  }
+}
+
+SE_EXPORT void se_raster_release(void* state) {
+  if (state) spare().give(std::unique_ptr<State>(static_cast<State*>(state)));
+}
+
+SE_EXPORT void se_raster_visible(const CameraArgs* camera, const float* means, const float* scales, int64_t m, uint8_t* visible,
+                                 int32_t threads) {
+  project_visible(*camera, means, scales, m, visible, threads);
+}
+
+// Sizes of the last forward pass, for benchmarks: visible Gaussians, (Gaussian, tile) pairs, (Gaussian, block) pairs.
+SE_EXPORT void se_raster_counts(const void* state, int64_t* counts) {
+  const State& s = *static_cast<const State*>(state);
+  counts[0] = s.visible;
+  counts[1] = s.pairs;
+  counts[2] = 0;
+  for (int t = 0; t < s.tiles(); ++t)
+    for (uint32_t k = 0; k < s.tile_used.data()[t]; ++k)
+      counts[2] += __builtin_popcount(s.masks.data()[s.tile_begin.data()[t] + k]);
+}

@@ -1,0 +1,130 @@
+// What the stages of the CPU rasteriser share. The picture's definition is render/reference.py; here is how it is computed:
+//
+//   project    every Gaussian -> a 64-byte Record (whitened ellipse, colour, depth) and its rectangle of tiles
+//   bin        one radix sort of the visible depths, then a stable scatter into the lists of the 16 x 16 pixel tiles
+//   forward    per tile: which 4 x 4 pixel blocks does each Gaussian touch (exact), then block by block, one block per F16
+//   backward   per tile, front to back again with the stored masks; sums per Gaussian; then the chain rule through the projection
+//
+// Whitened ellipse: with d = centre - pixel, log2 of the Gaussian's value is log_opacity - (l1 dy + l2 dx)^2 - (l3 dx)^2. As a sum of
+// squares it has no cancellation for thin Gaussians, and within a tile it costs two operations per block: for every column x of the tile
+// height[x] = log_opacity - (l3 dx)^2 and slope[x] = l1 (v - tile's centre) + l2 dx are made once, then p = height - (slope - l1 y)^2.
+#pragma once
+#include <cstdint>
+#include <cstdlib>
+#include <memory>
+#include <new>
+#include <vector>
+
+namespace se::raster {
+
+constexpr int kTile = 16;     // pixels
+constexpr int kChunk = 4096;  // Gaussians that one worker projects at a time; a multiple of 16
+constexpr int kBatch = 128;   // Gaussians of a tile worked on at a time, so that they stay in the first-level cache
+constexpr float kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
+constexpr float kMinAlphaLog2 = -7.994353437f;  // log2(1 / 255)
+constexpr float kWhiten = 0.84932180f;          // sqrt(log2(e) / 2)
+
+struct CameraArgs {
+  float view[12];  // rows of [R | t]
+  float fx, fy, cx, cy, near_z;
+  int32_t width, height;
+};
+
+// A Gaussian that reaches the picture; colours and ellipse first, as blending reads them.
+struct alignas(64) Record {
+  float l1, r, g, b, z, u, v, log_opacity, l2, l3, spare[6];
+};
+static_assert(sizeof(Record) == 64);
+
+struct Rect {  // tiles, end exclusive
+  uint16_t x0, y0, x1, y1;
+};
+
+// Sums over pixels for one Gaussian, W = d loss / d power at a pixel: W, W dx, W dy, W dx^2, W dx dy, W dy^2, then colour and depth.
+struct alignas(64) Sums {
+  float x[16];
+};
+enum { kS, kSx, kSy, kSxx, kSxy, kSyy, kRed, kGreen, kBlue, kDepth };
+
+// Uninitialised memory that only grows, aligned to cache lines.
+template <class T>
+class Buffer {
+ public:
+  T* get(size_t n) {
+    if (n > size_) {
+      data_.reset();
+      size_ = 0;
+      const size_t grown = n + n / 8;
+      data_.reset(static_cast<T*>(::operator new(grown * sizeof(T) + 64, std::align_val_t(64))));
+      size_ = grown;
+    }
+    return data_.get();
+  }
+  T* data() const { return data_.get(); }
+  size_t bytes() const { return size_ * sizeof(T); }
+
+ private:
+  struct Free {
+    void operator()(T* p) const { ::operator delete(p, std::align_val_t(64)); }
+  };
+  std::unique_ptr<T[], Free> data_;
+  size_t size_ = 0;
+};
+
+// Everything of one picture that backward needs, and the scratch memory of the stages; reused from picture to picture.
+struct State {
+  CameraArgs camera{};
+  int64_t m = 0, visible = 0, pairs = 0;
+  int tiles_x = 0, tiles_y = 0;
+  bool antialias = false;
+
+  Buffer<Record> records;         // [chunk-aligned m]; chunk c holds its visible ones from c * kChunk on
+  Buffer<Rect> rects;             // same places
+  Buffer<uint16_t> group_mask;    // [m / 16] which of sixteen neighbours are visible
+  Buffer<uint32_t> group_first;   // [m / 16] place of the first of them
+  Buffer<uint32_t> chunk_count;   // [chunks]
+  Buffer<uint32_t> keys, order;   // [visible] depth bits and places, in the end near to far
+  Buffer<uint32_t> keys2, order2;
+  Buffer<uint32_t> histogram;
+  Buffer<uint32_t> tile_begin;    // [tiles + 1] into `list`
+  Buffer<uint32_t> tile_used;     // [tiles] how many of its list a tile looked at before all its pixels had stopped
+  Buffer<uint32_t> list;          // [pairs] places, per tile near to far
+  Buffer<uint16_t> masks;         // [pairs] which of a tile's sixteen blocks the Gaussian touches
+  Buffer<float> transmittance;    // [tiles * 256] what is left at the end, in block order
+  Buffer<Sums> sums;              // backward: one row per place and worker, or (deterministic) per pair
+  Buffer<uint32_t> slots;         // deterministic backward: first row of each place
+  Buffer<double> background;      // backward: [tiles * 3]
+
+  int tiles() const { return tiles_x * tiles_y; }
+  int64_t places() const { return (m + kChunk - 1) / kChunk * kChunk; }
+};
+
+struct Inputs {
+  const float *means, *quats, *scales, *opacities, *colors;  // [m, 3] [m, 4] [m, 3] [m] [m, 3]
+};
+
+struct Outputs {
+  float *image, *alpha, *depth;  // [H, W, 3] [H, W] [H, W]
+};
+
+struct Upstream {
+  const float *image, *depth;                 // the pictures that forward made
+  const float *g_image, *g_alpha, *g_depth;   // their gradients; null: zero
+};
+
+struct Gradients {
+  float *means, *quats, *scales, *opacities, *colors, *mean2d, *background;
+};
+
+// Projects all; fills records, rects, groups, keys and order per chunk, and radii [m].
+void project(State& s, const Inputs& in, int32_t* radii, int threads);
+// Radii alone, of unrotated Gaussians.
+void project_visible(const CameraArgs& camera, const float* means, const float* scales, int64_t m, uint8_t* visible, int threads);
+// Sorts by depth and fills the tiles' lists.
+void bin(State& s, int threads);
+void blend(State& s, const float* background, const Outputs& out, int threads);
+// Fills `sums` and the background's gradient; returns the number of rows that hold one Gaussian's sums (0: slots per pair).
+void blend_backward(State& s, const float* background, const Upstream& up, float* g_background, int rows, int threads);
+void project_backward(State& s, const Inputs& in, const Gradients& out, int rows, int threads);
+
+}  // namespace se::raster

@@ -1,0 +1,99 @@
+// Front-to-back blending, one 4 x 4 block of pixels per F16.
+#include <algorithm>
+
+#include "pool.h"
+#include "raster_tile.h"
+
+namespace se::raster {
+namespace {
+
+struct Pixels {  // a tile's pixels in block order
+  alignas(64) float through[256], left[256], color[3][256], depth[256];
+};
+
+// Blends the batch's list into one block; returns whether any pixel still lets light through.
+// `through` runs on past the stop (it only falls); `left` keeps the value before it.
+bool blend_block(const Batch& batch, int count, int block, Pixels& px, const Exp2& exp2) {
+  const F16 y = block_y(block / 4), limit = bcast(kMinAlphaLog2), most = bcast(kMaxAlpha), stop = bcast(kMinTransmittance);
+  const F16 one = bcast(1.0f);
+  const int at = block * 16, column = block % 4;
+  F16 through = load(px.through + at), left = load(px.left + at), depth = load(px.depth + at);
+  F16 red = load(px.color[0] + at), green = load(px.color[1] + at), blue = load(px.color[2] + at);
+  bool alive = true;
+  for (int i = 0; i < count && alive; i += 4) {
+    F16 alpha[4];
+    for (int k = 0; k < 4; ++k) {
+      const F16 p = log_alpha(batch, batch.list[i + k], column, y);
+      alpha[k] = min_keep(ge(p, limit), exp2(p), most);
+    }
+    for (int k = 0; k < 4; ++k) {
+      const float* head = batch.head[batch.list[i + k]];
+      const F16 next = through * (one - alpha[k]);
+      const M16 drawn = ge(next, stop);
+      const F16 weight = mul_keep(drawn, through, alpha[k]);
+      left = select(drawn, next, left);
+      through = next;
+      red = fma(weight, bcast(head[1]), red);
+      green = fma(weight, bcast(head[2]), green);
+      blue = fma(weight, bcast(head[3]), blue);
+      depth = fma(weight, bcast(head[4]), depth);
+    }
+    alive = any(ge(through, stop));
+  }
+  store(px.through + at, through), store(px.left + at, left), store(px.depth + at, depth);
+  store(px.color[0] + at, red), store(px.color[1] + at, green), store(px.color[2] + at, blue);
+  return alive;
+}
+
+void finish(State& s, int number, const Tile& tile, Pixels& px, const float* background, const Outputs& out) {
+  std::copy(px.left, px.left + 256, s.transmittance.data() + number * 256);
+  for (int k = 0; k < 256; k += 16) {
+    const F16 left = load(px.left + k);
+    for (int c = 0; c < 3; ++c) store(px.color[c] + k, fma(left, bcast(background[c]), load(px.color[c] + k)));
+    store(px.left + k, bcast(1.0f) - left);
+  }
+  store_tile<3>(out.image, s.camera, tile, px.color);
+  store_tile<1>(out.alpha, s.camera, tile, &px.left);
+  store_tile<1>(out.depth, s.camera, tile, &px.depth);
+}
+
+void blend_tile(State& s, int number, Batch& batch, const float* background, const Outputs& out, const Exp2& exp2) {
+  const Tile tile = tile_at(s, number);
+  Pixels px;
+  inside(s.camera, tile, px.through);
+  std::copy(px.through, px.through + 256, px.left);
+  std::fill(&px.color[0][0], &px.color[0][0] + 768, 0.0f);
+  std::fill(px.depth, px.depth + 256, 0.0f);
+  uint32_t alive = 0;
+  for (int b = 0; b < 16; ++b) alive |= (px.through[16 * b] > 0.0f ? 1u : 0u) << b;  // a block's first pixel is inside if any is
+  const uint32_t begin = s.tile_begin.data()[number], end = s.tile_begin.data()[number + 1];
+  uint32_t at = begin;
+  while (at < end && alive) {
+    const int n = static_cast<int>(std::min<uint32_t>(kBatch, end - at));
+    const uint32_t* places = s.list.data() + at;
+    batch.load_rows(s.records.data(), places, n, tile);
+    batch.touch_blocks(s.records.data(), places, n, tile);
+    for (int k = 0; k < n; ++k) s.masks.data()[at + k] = static_cast<uint16_t>(batch.masks[k] & alive);
+    for (uint32_t blocks = alive; blocks; blocks &= blocks - 1) {
+      const int b = __builtin_ctz(blocks);
+      const int count = batch.block_list(n, b);
+      if (count > 0 && !blend_block(batch, count, b, px, exp2)) alive &= ~(1u << b);
+    }
+    at += static_cast<uint32_t>(n);
+  }
+  s.tile_used.data()[number] = at - begin;
+  finish(s, number, tile, px, background, out);
+}
+
+}  // namespace
+
+void blend(State& s, const float* background, const Outputs& out, int threads) {
+  s.transmittance.get(static_cast<size_t>(s.tiles()) * 256);
+  parallel_for(s.tiles(), 2, threads, [&](int64_t begin, int64_t end, int) {
+    thread_local Batch batch;
+    const Exp2 exp2;
+    for (int64_t t = begin; t < end; ++t) blend_tile(s, static_cast<int>(t), batch, background, out, exp2);
+  });
+}
+
+}  // namespace se::raster

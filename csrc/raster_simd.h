@@ -1,0 +1,29 @@
+// The one vector type of the rasteriser: F16, sixteen floats, either the 4 x 4 pixels of a block or sixteen Gaussians; M16 is its mask.
+// Each instruction set implements the same functions (in one register, two, or four), so the algorithms are written once:
+//   load store bcast bcast4 (four floats, repeated), + - * /, fma(a, b, c) = a b + c, fnma = c - a b, min max sqrt ceil floor,
+//   ge gt & |, select(m, a, b), keep(m, a) = a or 0, mul_keep, min_keep, bits any, store_int (truncated),
+//   Exp2 (relative error below 4e-7; anything where p < -126), reciprocal (to rounding), split_exponent, transpose (16 x 16),
+//   append(list, base, m): writes base + lane for each set lane (up to 16 entries are touched), returns how many, test_bit.
+#pragma once
+#if defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512BW__)
+#include "raster_simd_avx512.h"
+#elif defined(__AVX2__) && defined(__FMA__)
+#include "raster_simd_avx2.h"
+#else
+#include "raster_simd_portable.h"
+#endif
+
+namespace se {
+
+// log2(a) for normal a > 0 (absolute error about one rounding of the result).
+inline F16 log2(F16 a) {
+  F16 m, e;
+  split_exponent(a, m, e);
+  const F16 one = bcast(1.0f), s = (m - one) / (m + one), s2 = s * s;  // log2 m = 2 / ln 2 * atanh s, |s| <= 0.2
+  F16 q = fma(s2, bcast(0.43905754f), bcast(0.57639673f));
+  q = fma(s2, q, bcast(0.96180218f));
+  q = fma(s2, q, bcast(2.88539007f));
+  return fma(s, q, e);
+}
+
+}  // namespace se

@@ -1,0 +1,151 @@
+// Sixteen floats in two AVX2 registers; see raster_simd.h for what each function promises.
+#pragma once
+#include <immintrin.h>
+
+#include <cstdint>
+
+namespace se {
+
+struct F16 {
+  __m256 lo, hi;
+};
+struct M16 {
+  __m256 lo, hi;
+};
+
+inline F16 load(const float* p) { return {_mm256_loadu_ps(p), _mm256_loadu_ps(p + 8)}; }
+inline void store(float* p, F16 a) {
+  _mm256_storeu_ps(p, a.lo);
+  _mm256_storeu_ps(p + 8, a.hi);
+}
+inline F16 bcast(float x) { return {_mm256_set1_ps(x), _mm256_set1_ps(x)}; }
+inline F16 bcast4(const float* p) {
+  const __m256 v = _mm256_broadcast_ps(reinterpret_cast<const __m128*>(p));
+  return {v, v};
+}
+#define SE_BOTH(name, op) \
+  inline F16 name(F16 a, F16 b) { return {op(a.lo, b.lo), op(a.hi, b.hi)}; }
+SE_BOTH(operator+, _mm256_add_ps)
+SE_BOTH(operator-, _mm256_sub_ps)
+SE_BOTH(operator*, _mm256_mul_ps)
+SE_BOTH(operator/, _mm256_div_ps)
+SE_BOTH(min, _mm256_min_ps)
+SE_BOTH(max, _mm256_max_ps)
+#undef SE_BOTH
+inline F16 fma(F16 a, F16 b, F16 c) { return {_mm256_fmadd_ps(a.lo, b.lo, c.lo), _mm256_fmadd_ps(a.hi, b.hi, c.hi)}; }
+inline F16 fnma(F16 a, F16 b, F16 c) { return {_mm256_fnmadd_ps(a.lo, b.lo, c.lo), _mm256_fnmadd_ps(a.hi, b.hi, c.hi)}; }
+inline F16 sqrt(F16 a) { return {_mm256_sqrt_ps(a.lo), _mm256_sqrt_ps(a.hi)}; }
+inline F16 ceil(F16 a) { return {_mm256_ceil_ps(a.lo), _mm256_ceil_ps(a.hi)}; }
+inline F16 floor(F16 a) { return {_mm256_floor_ps(a.lo), _mm256_floor_ps(a.hi)}; }
+inline M16 ge(F16 a, F16 b) { return {_mm256_cmp_ps(a.lo, b.lo, _CMP_GE_OQ), _mm256_cmp_ps(a.hi, b.hi, _CMP_GE_OQ)}; }
+inline M16 gt(F16 a, F16 b) { return {_mm256_cmp_ps(a.lo, b.lo, _CMP_GT_OQ), _mm256_cmp_ps(a.hi, b.hi, _CMP_GT_OQ)}; }
+inline M16 operator&(M16 a, M16 b) { return {_mm256_and_ps(a.lo, b.lo), _mm256_and_ps(a.hi, b.hi)}; }
+inline M16 operator|(M16 a, M16 b) { return {_mm256_or_ps(a.lo, b.lo), _mm256_or_ps(a.hi, b.hi)}; }
+inline F16 select(M16 m, F16 a, F16 b) { return {_mm256_blendv_ps(b.lo, a.lo, m.lo), _mm256_blendv_ps(b.hi, a.hi, m.hi)}; }
+inline F16 keep(M16 m, F16 a) { return {_mm256_and_ps(m.lo, a.lo), _mm256_and_ps(m.hi, a.hi)}; }
+inline F16 mul_keep(M16 m, F16 a, F16 b) { return keep(m, a * b); }
+inline F16 min_keep(M16 m, F16 a, F16 b) { return keep(m, min(a, b)); }
+inline uint32_t bits(M16 m) { return static_cast<uint32_t>(_mm256_movemask_ps(m.lo) | _mm256_movemask_ps(m.hi) << 8); }
+inline bool any(M16 m) { return _mm256_movemask_ps(_mm256_or_ps(m.lo, m.hi)) != 0; }
+inline void store_int(int32_t* p, F16 a) {
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), _mm256_cvttps_epi32(a.lo));
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(p + 8), _mm256_cvttps_epi32(a.hi));
+}
+
+// 2^p as a quintic on [-1/2, 1/2]; 1.5 * 2^23 puts the nearest integer in the low bits of a float's mantissa.
+struct Exp2 {
+  static __m256 half(__m256 p) {
+    const __m256 magic = _mm256_set1_ps(12582912.0f);
+    const __m256 rounded = _mm256_add_ps(p, magic);
+    const __m256 f = _mm256_sub_ps(p, _mm256_sub_ps(rounded, magic));
+    __m256 q = _mm256_fmadd_ps(f, _mm256_set1_ps(1.3264738e-3f), _mm256_set1_ps(9.6715130e-3f));
+    q = _mm256_fmadd_ps(f, q, _mm256_set1_ps(5.5507336e-2f));
+    q = _mm256_fmadd_ps(f, q, _mm256_set1_ps(2.4022242e-1f));
+    q = _mm256_fmadd_ps(f, q, _mm256_set1_ps(6.9314698e-1f));
+    q = _mm256_fmadd_ps(f, q, _mm256_set1_ps(1.0f));
+    return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(q), _mm256_slli_epi32(_mm256_castps_si256(rounded), 23)));
+  }
+  F16 operator()(F16 p) const { return {half(p.lo), half(p.hi)}; }
+};
+
+inline F16 reciprocal(F16 a) {
+  const F16 r{_mm256_rcp_ps(a.lo), _mm256_rcp_ps(a.hi)}, one = bcast(1.0f);
+  const F16 s = fma(r, fnma(a, r, one), r);  // 12 bits, then 23
+  return s;
+}
+
+inline void split_exponent_half(__m256 a, __m256& m, __m256& e) {
+  const __m256i b = _mm256_castps_si256(a);
+  const __m256i shifted = _mm256_sub_epi32(b, _mm256_set1_epi32(0x3f400000));  // 0.75
+  const __m256i k = _mm256_srai_epi32(shifted, 23);
+  e = _mm256_cvtepi32_ps(k);
+  m = _mm256_castsi256_ps(_mm256_sub_epi32(b, _mm256_slli_epi32(k, 23)));
+}
+// a = m * 2^e with m in [0.75, 1.5)
+inline void split_exponent(F16 a, F16& m, F16& e) {
+  split_exponent_half(a.lo, m.lo, e.lo);
+  split_exponent_half(a.hi, m.hi, e.hi);
+}
+
+inline int append(uint16_t* list, int base, M16 m) {
+  // For each of 256 masks the byte positions of the set lanes' 16-bit numbers, packed to the front.
+  static const auto table = [] {
+    struct { alignas(16) uint8_t x[256][16]; } t{};
+    for (int mask = 0; mask < 256; ++mask) {
+      int at = 0;
+      for (int lane = 0; lane < 8; ++lane)
+        if (mask >> lane & 1) {
+          t.x[mask][at++] = static_cast<uint8_t>(2 * lane);
+          t.x[mask][at++] = static_cast<uint8_t>(2 * lane + 1);
+        }
+    }
+    return t;
+  }();
+  const uint32_t all = bits(m);
+  const __m128i lane = _mm_add_epi16(_mm_setr_epi16(0, 1, 2, 3, 4, 5, 6, 7), _mm_set1_epi16(static_cast<int16_t>(base)));
+  const __m128i lo = _mm_shuffle_epi8(lane, _mm_load_si128(reinterpret_cast<const __m128i*>(table.x[all & 255])));
+  const __m128i hi =
+      _mm_shuffle_epi8(_mm_add_epi16(lane, _mm_set1_epi16(8)), _mm_load_si128(reinterpret_cast<const __m128i*>(table.x[all >> 8])));
+  _mm_storeu_si128(reinterpret_cast<__m128i*>(list), lo);
+  const int first = __builtin_popcount(all & 255);
+  _mm_storeu_si128(reinterpret_cast<__m128i*>(list + first), hi);
+  return first + __builtin_popcount(all >> 8);
+}
+
+// Lanes whose 16-bit word has bit `b` set.
+inline M16 test_bit(const uint16_t* words, int b) {
+  const __m256i bit = _mm256_set1_epi32(1 << b);
+  const __m256i lo = _mm256_cvtepu16_epi32(_mm_loadu_si128(reinterpret_cast<const __m128i*>(words)));
+  const __m256i hi = _mm256_cvtepu16_epi32(_mm_loadu_si128(reinterpret_cast<const __m128i*>(words + 8)));
+  return {_mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(lo, bit), bit)),
+          _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(hi, bit), bit))};
+}
+
+inline void transpose8(__m256 (&r)[8]) {
+  __m256 t[8], s[8];
+  for (int i = 0; i < 4; ++i) {
+    t[2 * i] = _mm256_unpacklo_ps(r[2 * i], r[2 * i + 1]);
+    t[2 * i + 1] = _mm256_unpackhi_ps(r[2 * i], r[2 * i + 1]);
+  }
+  for (int i = 0; i < 2; ++i)
+    for (int h = 0; h < 2; ++h) {
+      s[4 * i + 2 * h] = _mm256_shuffle_ps(t[4 * i + h], t[4 * i + 2 + h], 0x44);
+      s[4 * i + 2 * h + 1] = _mm256_shuffle_ps(t[4 * i + h], t[4 * i + 2 + h], 0xee);
+    }
+  for (int k = 0; k < 4; ++k) {
+    r[k] = _mm256_permute2f128_ps(s[k], s[4 + k], 0x20);
+    r[4 + k] = _mm256_permute2f128_ps(s[k], s[4 + k], 0x31);
+  }
+}
+
+inline void transpose(F16 (&r)[16]) {
+  __m256 a[8], b[8], c[8], d[8];
+  for (int i = 0; i < 8; ++i) a[i] = r[i].lo, b[i] = r[i].hi, c[i] = r[8 + i].lo, d[i] = r[8 + i].hi;
+  transpose8(a);
+  transpose8(b);
+  transpose8(c);
+  transpose8(d);
+  for (int i = 0; i < 8; ++i) r[i] = {a[i], c[i]}, r[8 + i] = {b[i], d[i]};
+}
+
+}  // namespace se

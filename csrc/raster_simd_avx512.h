@@ -1,0 +1,122 @@
+// Sixteen floats in one AVX-512 register; see raster_simd.h for what each function promises.
+#pragma once
+#include <immintrin.h>
+
+#include <cstdint>
+
+namespace se {
+
+struct F16 {
+  __m512 v;
+};
+struct M16 {
+  __mmask16 m;
+};
+
+inline F16 load(const float* p) { return {_mm512_loadu_ps(p)}; }
+inline void store(float* p, F16 a) { _mm512_storeu_ps(p, a.v); }
+inline F16 bcast(float x) { return {_mm512_set1_ps(x)}; }
+inline F16 bcast4(const float* p) { return {_mm512_broadcast_f32x4(_mm_loadu_ps(p))}; }
+inline F16 operator+(F16 a, F16 b) { return {_mm512_add_ps(a.v, b.v)}; }
+inline F16 operator-(F16 a, F16 b) { return {_mm512_sub_ps(a.v, b.v)}; }
+inline F16 operator*(F16 a, F16 b) { return {_mm512_mul_ps(a.v, b.v)}; }
+inline F16 operator/(F16 a, F16 b) { return {_mm512_div_ps(a.v, b.v)}; }
+inline F16 fma(F16 a, F16 b, F16 c) { return {_mm512_fmadd_ps(a.v, b.v, c.v)}; }
+inline F16 fnma(F16 a, F16 b, F16 c) { return {_mm512_fnmadd_ps(a.v, b.v, c.v)}; }
+inline F16 min(F16 a, F16 b) { return {_mm512_min_ps(a.v, b.v)}; }
+inline F16 max(F16 a, F16 b) { return {_mm512_max_ps(a.v, b.v)}; }
+inline F16 sqrt(F16 a) { return {_mm512_sqrt_ps(a.v)}; }
+inline F16 ceil(F16 a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC)}; }
+inline F16 floor(F16 a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
+inline M16 ge(F16 a, F16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
+inline M16 gt(F16 a, F16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)}; }
+inline M16 operator&(M16 a, M16 b) { return {_kand_mask16(a.m, b.m)}; }
+inline M16 operator|(M16 a, M16 b) { return {_kor_mask16(a.m, b.m)}; }
+inline F16 select(M16 m, F16 a, F16 b) { return {_mm512_mask_blend_ps(m.m, b.v, a.v)}; }
+inline F16 keep(M16 m, F16 a) { return {_mm512_maskz_mov_ps(m.m, a.v)}; }
+inline F16 mul_keep(M16 m, F16 a, F16 b) { return {_mm512_maskz_mul_ps(m.m, a.v, b.v)}; }
+inline F16 min_keep(M16 m, F16 a, F16 b) { return {_mm512_maskz_min_ps(m.m, a.v, b.v)}; }
+inline uint32_t bits(M16 m) { return m.m; }
+inline bool any(M16 m) { return m.m != 0; }
+inline void store_int(int32_t* p, F16 a) { _mm512_storeu_si512(p, _mm512_cvttps_epi32(a.v)); }
+
+// 2^p: nearest multiple of 1/32 from a table held in two registers, the rest from a quadratic; 1.5 * 2^18 puts the multiple in the low
+// bits of a float's mantissa, and the table's entries are short of the exponent that those bits carry over.
+struct Exp2 {
+  __m512 lo, hi;
+  Exp2() {
+    alignas(64) static const auto table = [] {
+      struct { int32_t x[32]; } t{};
+      for (int i = 0; i < 32; ++i) {
+        const float power = static_cast<float>(__builtin_exp2(i / 32.0));
+        __builtin_memcpy(&t.x[i], &power, 4);
+        t.x[i] -= i << 18;
+      }
+      return t;
+    }();
+    lo = _mm512_load_ps(reinterpret_cast<const float*>(table.x));
+    hi = _mm512_load_ps(reinterpret_cast<const float*>(table.x + 16));
+  }
+  F16 operator()(F16 p) const {
+    const __m512 magic = _mm512_set1_ps(393216.0f);  // 1.5 * 2^18
+    const __m512 rounded = _mm512_add_ps(p.v, magic);
+    const __m512 f = _mm512_sub_ps(p.v, _mm512_sub_ps(rounded, magic));
+    const __m512i index = _mm512_castps_si512(rounded);
+    const __m512 entry = _mm512_permutex2var_ps(lo, index, hi);
+    const __m512 scale = _mm512_castsi512_ps(_mm512_add_epi32(_mm512_castps_si512(entry), _mm512_slli_epi32(index, 18)));
+    const __m512 q = _mm512_fmadd_ps(f, _mm512_set1_ps(0.2402265f), _mm512_set1_ps(0.69314718f));
+    return {_mm512_mul_ps(scale, _mm512_fmadd_ps(q, f, _mm512_set1_ps(1.0f)))};
+  }
+};
+
+inline F16 reciprocal(F16 a) {
+  const __m512 r = _mm512_rcp14_ps(a.v);
+  return {_mm512_fmadd_ps(r, _mm512_fnmadd_ps(a.v, r, _mm512_set1_ps(1.0f)), r)};
+}
+
+// a = m * 2^e with m in [0.75, 1.5)
+inline void split_exponent(F16 a, F16& m, F16& e) {
+  m.v = _mm512_getmant_ps(a.v, _MM_MANT_NORM_p75_1p5, _MM_MANT_SIGN_src);
+  const __m512 up = _mm512_getexp_ps(a.v);  // floor(log2 a)
+  const __m512 mant = _mm512_getmant_ps(a.v, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_src);
+  e.v = _mm512_mask_add_ps(up, _mm512_cmp_ps_mask(mant, _mm512_set1_ps(1.5f), _CMP_GE_OQ), up, _mm512_set1_ps(1.0f));
+}
+
+inline int append(uint16_t* list, int base, M16 m) {
+  const __m512i lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  const __m512i index = _mm512_maskz_compress_epi32(m.m, _mm512_add_epi32(lane, _mm512_set1_epi32(base)));
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(list), _mm512_cvtepi32_epi16(index));
+  return __builtin_popcount(m.m);
+}
+
+// Lanes whose 16-bit word has bit `b` set.
+inline M16 test_bit(const uint16_t* words, int b) {
+  const __m512i w = _mm512_cvtepu16_epi32(_mm256_loadu_si256(reinterpret_cast<const __m256i*>(words)));
+  return {_mm512_test_epi32_mask(w, _mm512_set1_epi32(1 << b))};
+}
+
+inline void transpose(F16 (&r)[16]) {
+  __m512 t[16];
+  for (int i = 0; i < 8; ++i) {
+    t[2 * i] = _mm512_unpacklo_ps(r[2 * i].v, r[2 * i + 1].v);
+    t[2 * i + 1] = _mm512_unpackhi_ps(r[2 * i].v, r[2 * i + 1].v);
+  }
+  __m512 s[16];
+  for (int i = 0; i < 4; ++i) {
+    for (int h = 0; h < 2; ++h) {
+      const __m512d a = _mm512_castps_pd(t[4 * i + h]), b = _mm512_castps_pd(t[4 * i + 2 + h]);
+      s[4 * i + 2 * h] = _mm512_castpd_ps(_mm512_unpacklo_pd(a, b));
+      s[4 * i + 2 * h + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(a, b));
+    }
+  }
+  for (int k = 0; k < 4; ++k) {
+    const __m512 a = _mm512_shuffle_f32x4(s[k], s[4 + k], 0x88), b = _mm512_shuffle_f32x4(s[k], s[4 + k], 0xdd);
+    const __m512 c = _mm512_shuffle_f32x4(s[8 + k], s[12 + k], 0x88), d = _mm512_shuffle_f32x4(s[8 + k], s[12 + k], 0xdd);
+    r[k].v = _mm512_shuffle_f32x4(a, c, 0x88);
+    r[8 + k].v = _mm512_shuffle_f32x4(a, c, 0xdd);
+    r[4 + k].v = _mm512_shuffle_f32x4(b, d, 0x88);
+    r[12 + k].v = _mm512_shuffle_f32x4(b, d, 0xdd);
+  }
+}
+
+}  // namespace se

@@ -1,0 +1,144 @@
+// Sixteen floats in four 16-byte vectors of the compiler (SSE2, NEON, or scalars); see raster_simd.h for what each function promises.
+#pragma once
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+namespace se {
+
+typedef float V4 __attribute__((vector_size(16)));
+typedef int32_t I4 __attribute__((vector_size(16)));
+
+struct F16 {
+  V4 v[4];
+};
+struct M16 {
+  I4 v[4];
+};
+
+#define SE_EACH for (int i = 0; i < 4; ++i)
+inline F16 load(const float* p) {
+  F16 r;
+  std::memcpy(&r, p, 64);
+  return r;
+}
+inline void store(float* p, F16 a) { std::memcpy(p, &a, 64); }
+inline F16 bcast(float x) {
+  const V4 v = {x, x, x, x};
+  return {{v, v, v, v}};
+}
+inline F16 bcast4(const float* p) {
+  V4 v;
+  std::memcpy(&v, p, 16);
+  return {{v, v, v, v}};
+}
+#define SE_ALL(T, expression) \
+  T r;                        \
+  SE_EACH r.v[i] = expression; \
+  return r
+inline F16 operator+(F16 a, F16 b) { SE_ALL(F16, a.v[i] + b.v[i]); }
+inline F16 operator-(F16 a, F16 b) { SE_ALL(F16, a.v[i] - b.v[i]); }
+inline F16 operator*(F16 a, F16 b) { SE_ALL(F16, a.v[i] * b.v[i]); }
+inline F16 operator/(F16 a, F16 b) { SE_ALL(F16, a.v[i] / b.v[i]); }
+#if defined(__aarch64__) || defined(__FMA__)
+inline V4 fma4(V4 a, V4 b, V4 c) {
+  V4 r;
+  for (int k = 0; k < 4; ++k) r[k] = __builtin_fmaf(a[k], b[k], c[k]);
+  return r;
+}
+#else
+inline V4 fma4(V4 a, V4 b, V4 c) { return a * b + c; }
+#endif
+inline F16 fma(F16 a, F16 b, F16 c) { SE_ALL(F16, fma4(a.v[i], b.v[i], c.v[i])); }
+inline F16 fnma(F16 a, F16 b, F16 c) { SE_ALL(F16, fma4(-a.v[i], b.v[i], c.v[i])); }
+inline F16 min(F16 a, F16 b) { SE_ALL(F16, a.v[i] < b.v[i] ? a.v[i] : b.v[i]); }
+inline F16 max(F16 a, F16 b) { SE_ALL(F16, a.v[i] > b.v[i] ? a.v[i] : b.v[i]); }
+inline M16 ge(F16 a, F16 b) { SE_ALL(M16, a.v[i] >= b.v[i]); }
+inline M16 gt(F16 a, F16 b) { SE_ALL(M16, a.v[i] > b.v[i]); }
+inline M16 operator&(M16 a, M16 b) { SE_ALL(M16, a.v[i] & b.v[i]); }
+inline M16 operator|(M16 a, M16 b) { SE_ALL(M16, a.v[i] | b.v[i]); }
+inline F16 select(M16 m, F16 a, F16 b) { SE_ALL(F16, (V4)((m.v[i] & (I4)a.v[i]) | (~m.v[i] & (I4)b.v[i]))); }
+inline F16 keep(M16 m, F16 a) { SE_ALL(F16, (V4)(m.v[i] & (I4)a.v[i])); }
+inline F16 mul_keep(M16 m, F16 a, F16 b) { return keep(m, a * b); }
+inline F16 min_keep(M16 m, F16 a, F16 b) { return keep(m, min(a, b)); }
+inline F16 sqrt(F16 a) {
+  F16 r;
+  SE_EACH for (int k = 0; k < 4; ++k) r.v[i][k] = __builtin_sqrtf(a.v[i][k]);
+  return r;
+}
+inline F16 ceil(F16 a) {
+  F16 r;
+  SE_EACH for (int k = 0; k < 4; ++k) r.v[i][k] = __builtin_ceilf(a.v[i][k]);
+  return r;
+}
+inline F16 floor(F16 a) {
+  F16 r;
+  SE_EACH for (int k = 0; k < 4; ++k) r.v[i][k] = __builtin_floorf(a.v[i][k]);
+  return r;
+}
+inline uint32_t bits(M16 m) {
+  uint32_t r = 0;
+  SE_EACH {
+    const I4 weight = {1 << 0, 1 << 1, 1 << 2, 1 << 3};
+    const I4 b = m.v[i] & weight;
+    r |= static_cast<uint32_t>(b[0] | b[1] | b[2] | b[3]) << (4 * i);
+  }
+  return r;
+}
+inline bool any(M16 m) {
+  const I4 o = (m.v[0] | m.v[1]) | (m.v[2] | m.v[3]);
+  return (o[0] | o[1] | o[2] | o[3]) != 0;
+}
+inline void store_int(int32_t* p, F16 a) {
+  for (int k = 0; k < 16; ++k) p[k] = static_cast<int32_t>(a.v[k / 4][k % 4]);
+}
+
+// 2^p as a quintic on [-1/2, 1/2]; 1.5 * 2^23 puts the nearest integer in the low bits of a float's mantissa.
+struct Exp2 {
+  F16 operator()(F16 p) const {
+    const F16 magic = bcast(12582912.0f);
+    const F16 rounded = p + magic, f = p - (rounded - magic);
+    F16 q = fma(f, bcast(1.3264738e-3f), bcast(9.6715130e-3f));
+    q = fma(f, q, bcast(5.5507336e-2f));
+    q = fma(f, q, bcast(2.4022242e-1f));
+    q = fma(f, q, bcast(6.9314698e-1f));
+    q = fma(f, q, bcast(1.0f));
+    SE_ALL(F16, (V4)((I4)q.v[i] + ((I4)rounded.v[i] << 23)));
+  }
+};
+
+inline F16 reciprocal(F16 a) { return bcast(1.0f) / a; }
+
+// a = m * 2^e with m in [0.75, 1.5)
+inline void split_exponent(F16 a, F16& m, F16& e) {
+  SE_EACH {
+    const I4 b = (I4)a.v[i], k = (b - 0x3f400000) >> 23;
+    for (int j = 0; j < 4; ++j) e.v[i][j] = static_cast<float>(k[j]);
+    m.v[i] = (V4)(b - (k << 23));
+  }
+}
+
+inline int append(uint16_t* list, int base, M16 m) {
+  int at = 0;
+  for (uint32_t left = bits(m); left; left &= left - 1) list[at++] = static_cast<uint16_t>(base + __builtin_ctz(left));
+  return at;
+}
+
+// Lanes whose 16-bit word has bit `b` set.
+inline M16 test_bit(const uint16_t* words, int b) {
+  M16 r;
+  for (int k = 0; k < 16; ++k) r.v[k / 4][k % 4] = -(words[k] >> b & 1);
+  return r;
+}
+
+inline void transpose(F16 (&r)[16]) {
+  float t[16][16], s[16][16];
+  for (int i = 0; i < 16; ++i) store(t[i], r[i]);
+  for (int i = 0; i < 16; ++i)
+    for (int j = 0; j < 16; ++j) s[j][i] = t[i][j];
+  for (int i = 0; i < 16; ++i) r[i] = load(s[i]);
+}
+#undef SE_EACH
+#undef SE_ALL
+
+}  // namespace se

@@ -1,0 +1,177 @@
+"""The fast CPU rasteriser: the picture that reference.py defines, and all its gradients, from the compiled library (csrc/raster*).
+
+Float32 on the CPU. The quaternions are used as passed (not normalised here), as in the reference.
+Two correct rasterisers may differ by up to 4e-3 in single pixels, where an alpha lies within rounding of 1/255 or a transmittance within
+rounding of its stop; compare means and quantiles.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from ctypes import POINTER, Structure, c_float, c_int32, c_int64, c_void_p
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scene_experts import native
+from scene_experts.errors import InputError, RunError
+from scene_experts.types import Camera, Gaussians, Render
+
+
+class _Camera(Structure):
+    _fields_ = [
+        ("view", c_float * 12),
+        ("fx", c_float),
+        ("fy", c_float),
+        ("cx", c_float),
+        ("cy", c_float),
+        ("near", c_float),
+        ("width", c_int32),
+        ("height", c_int32),
+    ]
+
+
+_INPUTS = [(name, c_void_p) for name in ("means", "quats", "scales", "opacities", "colors")]
+
+
+class _Forward(Structure):
+    _fields_ = [
+        ("camera", _Camera),
+        ("antialias", c_int32),
+        ("threads", c_int32),
+        ("m", c_int64),
+        *_INPUTS,
+        *[(name, c_void_p) for name in ("background", "image", "alpha", "depth", "radii")],
+    ]
+
+
+class _Backward(Structure):
+    _fields_ = [
+        ("deterministic", c_int32),
+        ("threads", c_int32),
+        *_INPUTS,
+        *[(name, c_void_p) for name in ("background", "image", "depth", "g_image", "g_alpha", "g_depth")],
+        *[(f"d_{name}", c_void_p) for name in ("means", "quats", "scales", "opacities", "colors", "mean2d", "background")],
+    ]
+
+
+@dataclass(frozen=True)
+class CpuRasterizer:
+    """Draws Gaussians on the CPU with the compiled library.
+
+    `deterministic`: gradients are bit-identical from run to run and for any number of threads, on one machine and instruction set (pictures
+    always are). `level`: the instruction set, one of `native.LEVELS` (None: the best here). `threads`: None is torch's own setting.
+    Raises InputError where the library cannot be loaded.
+    """
+
+    antialias: bool = False
+    deterministic: bool = False
+    level: str | None = None
+    threads: int | None = None
+    name: str = "cpu"
+
+    def __post_init__(self) -> None:
+        _library(self.level)
+
+    def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
+        """Draws M Gaussians over `background` [3]; see `types.Render`. A later backward pass overwrites `mean2d_grad`."""
+        inputs = (g.means, g.quats, g.scales, g.opacities, g.colors)
+        _check(inputs)
+        mean2d_grad = torch.zeros((len(g), 2))
+        image, alpha, depth, radii = _Draw.apply(*inputs, background, self, camera, mean2d_grad)
+        return Render(image, alpha, depth, radii, mean2d_grad)
+
+    @torch.no_grad()
+    def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
+        """Whether round-axis Gaussians at `means` [A, 3] with `scales` [A, 3] would be drawn (radius > 0), [A] bool (Scaffold-GS)."""
+        means, scales = _plain(means), _plain(scales)
+        out = torch.empty(len(means), dtype=torch.bool)
+        where = [native.pointer(t) for t in (means, scales, out)]
+        _library(self.level).se_raster_visible(ctypes.byref(_camera(camera)), where[0], where[1], len(means), where[2], self._threads())
+        return out
+
+    def _threads(self) -> int:
+        return max(1, self.threads if self.threads is not None else native.threads())
+
+
+class _Kept:
+    """Memory of the library that one picture's backward pass needs; given back when the graph is gone, whether backward ran or not."""
+
+    def __init__(self, library: ctypes.CDLL, address: int) -> None:
+        self.library, self.address = library, address
+
+    def __del__(self) -> None:
+        self.library.se_raster_release(c_void_p(self.address))
+
+
+class _Draw(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means, quats, scales, opacities, colors, background, how: CpuRasterizer, camera: Camera, mean2d_grad):
+        plain = [_plain(t) for t in (means, quats, scales, opacities, colors, background)]
+        size = (camera.height, camera.width)
+        image, alpha, depth = torch.empty((*size, 3)), torch.empty(size), torch.empty(size)
+        radii = torch.empty(len(means), dtype=torch.int32)
+        library = _library(how.level)
+        out = [native.pointer(t).value for t in (image, alpha, depth, radii)]
+        args = _Forward(_camera(camera), how.antialias, how._threads(), len(means), *[native.pointer(t).value for t in plain], *out)
+        state = c_void_p()
+        keep = any(ctx.needs_input_grad)
+        if library.se_raster_forward(ctypes.byref(args), ctypes.byref(state) if keep else None):
+            raise RunError(f"drawing {len(means)} Gaussians ran out of memory: train with fewer Gaussians or smaller pictures")
+        ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)
+        if keep:
+            ctx.state = _Kept(library, state.value or 0)
+            ctx.how, ctx.mean2d_grad = how, mean2d_grad
+            ctx.save_for_backward(*plain, image, depth)
+        return image, alpha, depth, radii
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grad_outputs: Tensor | None):
+        *plain, image, depth = ctx.saved_tensors
+        up = [image, depth] + [None if g is None else _plain(g) for g in grad_outputs[:3]]  # of image, alpha, depth; None: zero
+        outputs = [torch.empty_like(t) for t in plain[:5]] + [ctx.mean2d_grad, torch.empty(3)]
+        how: CpuRasterizer = ctx.how
+        tensors = [*plain, *up, *outputs]
+        args = _Backward(how.deterministic, how._threads(), *[native.pointer(t).value for t in tensors])
+        if ctx.state.library.se_raster_backward(c_void_p(ctx.state.address), ctypes.byref(args)):
+            raise RunError("the backward pass of the picture ran out of memory: train with fewer Gaussians or smaller pictures")
+        return *outputs[:5], outputs[6], None, None, None
+
+
+@functools.cache
+def _library(level: str | None) -> ctypes.CDLL:
+    library = native.load(level)
+    if library is None:
+        why = native.why_not() if level is None else f"no compiled CPU library for the instruction set {level!r} is installed"
+        raise InputError(f"{why}; or choose the slow rasteriser `reference`")
+    library.se_raster_forward.argtypes = [POINTER(_Forward), POINTER(c_void_p)]
+    library.se_raster_backward.argtypes = [c_void_p, POINTER(_Backward)]
+    library.se_raster_release.argtypes = [c_void_p]
+    library.se_raster_release.restype = None
+    library.se_raster_visible.argtypes = [POINTER(_Camera), c_void_p, c_void_p, c_int64, c_void_p, c_int32]
+    library.se_raster_visible.restype = None
+    return library
+
+
+def _camera(camera: Camera) -> _Camera:
+    rows = [value for row in camera.world_to_cam[:3].tolist() for value in row]
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    return _Camera((c_float * 12)(*rows), fx, fy, cx, cy, camera.near, camera.width, camera.height)
+
+
+def _check(inputs: tuple[Tensor, ...]) -> None:
+    count = len(inputs[0])
+    for tensor, name, width in zip(inputs, ("means", "quats", "scales", "opacities", "colors"), (3, 4, 3, None, 3), strict=True):
+        expected = (count,) if width is None else (count, width)
+        found = tuple(tensor.shape)
+        if found != expected or tensor.device.type != "cpu":
+            raise InputError(f"the CPU rasteriser needs {name} of shape {expected} on the CPU, not {found} on {tensor.device}")
+
+
+def _plain(tensor: Tensor) -> Tensor:
+    return tensor.detach().to(device="cpu", dtype=torch.float32).contiguous()
