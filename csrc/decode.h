@@ -86,11 +86,25 @@ struct Group {
   const int *anchor, *slot;  // [n]: index in the chunk; place among the anchor's k (dense: the expert)
 };
 
+// The slots of a chunk that are drawn, in order.
+struct Drawn {
+  int count;
+  const int *anchor, *slot;  // [count], anchor within the chunk
+};
+
+// Short rows: a loop in place instead of a call of memmove.
+inline void copy_row(const float* from, int n, float* to) {
+  int i = 0;
+  for (; i + LANES <= n; i += LANES) store(to + i, load(from + i));
+  for (; i < n; ++i) to[i] = from[i];
+}
+
 // A block of at least `floats` floats that belongs to the calling thread and to `use` until the next call with the same `use`.
 float* scratch(int use, int64_t floats);
-enum Use { USE_Z, USE_BLOCK, USE_LOGITS, USE_MIXED, USE_HIDDEN, USE_OUT, USE_GRADIENT, USE_FEATURE, USE_SCALING, USE_LISTS, USES };
+enum Use { USE_Z, USE_BLOCK, USE_LOGITS, USE_MIXED, USE_HIDDEN, USE_OUT, USE_GRADIENT, USE_FEATURE, USE_SCALING, USE_LISTS, USE_DRAWN, USES };
 
 void gather(const Decode& d, const Sizes& s, Chunk& chunk);
+Drawn drawn(const Decode& d, const Chunk& chunk);
 std::vector<Group> groups(const Head& head, const Chunk& chunk, int* lists);  // lists [2][n * max(1, k or E)]
 void block_inputs(const Chunk& chunk, const Sizes& s, const Group& g, int from, int n, float* to);
 void hidden(const Packed::Expert& e, const Sizes& s, int head, int n, const float* z, float* h);

@@ -49,48 +49,56 @@ class Backward {
     std::fill_n(logits_, int64_t(chunk.n) * s_.Rp, 0.f);
     for (int i = 0; i < 3; ++i) head(chunk, i);
     if (s_.R) router(chunk);
-    for (int a = 0; a < chunk.n; ++a) std::copy_n(feature_ + int64_t(a) * s_.Fp, s_.F, d_.d_feature + d_.rows[begin + a] * s_.F);
+    for (int a = 0; a < chunk.n; ++a) copy_row(feature_ + int64_t(a) * s_.Fp, s_.F, d_.d_feature + d_.rows[begin + a] * s_.F);
   }
 
  private:
   // Gradients of the emitted Gaussians -> of the mixed outputs, the log-scaling and the offsets.
   void gaussians(const Chunk& chunk) {
     const int K = static_cast<int>(d_.K);
-    float* size = scratch(USE_SCALING, 6 * CHUNK + LANES);
+    float* size = scratch(USE_SCALING, 18 * CHUNK + 2 * LANES);
+    float *to_scaling = size + 6 * CHUNK + LANES, *inverse = to_scaling + 6 * CHUNK;
     scaling(d_, chunk, size);
-    int64_t at = d_.starts[chunk.begin / CHUNK];
+    for (int j = 0; j < 6 * chunk.n; j += LANES) store(inverse + j, all(1.f) / load(size + j));
+    std::fill_n(to_scaling, 6 * chunk.n, 0.f);
     for (int a = 0; a < chunk.n; ++a) {
-      const int64_t anchor = chunk.begin + a, row = d_.rows[anchor];
+      const int64_t anchor = chunk.begin + a;
       if (d_.ascending) clear_gap(anchor);
-      const float *raw = d_.raw + anchor * K, *l = size + 6 * a;
-      float *to_raw = mixed_[0] + int64_t(a) * s_.Op[0], *to_offset = d_.d_offsets + row * 3 * K;
-      float* to_scaling = d_.d_log_scaling + row * 6;
-      std::fill_n(to_offset, 3 * K, 0.f);
-      float sums[6] = {};
-      for (int slot = 0; slot < K; ++slot) {
-        to_raw[slot] = d_.d_raw ? d_.d_raw[anchor * K + slot] : 0.f;
-        if (raw[slot] > 0.f) gaussian(a, slot, at++, row, l, sums, to_raw, to_offset);
-        if (d_.heads[0].single()) to_raw[slot] *= 1.f - raw[slot] * raw[slot];
-      }
-      std::copy_n(sums, 6, to_scaling);
+      std::fill_n(d_.d_offsets + d_.rows[anchor] * 3 * K, 3 * K, 0.f);
+      if (d_.d_raw) copy_row(d_.d_raw + anchor * K, K, mixed_[0] + int64_t(a) * s_.Op[0]);
     }
+    const int64_t first = d_.starts[chunk.begin / CHUNK];
+    const Drawn all_drawn = drawn(d_, chunk);
+    for (int i = 0; i < all_drawn.count; ++i) {
+      const int a = all_drawn.anchor[i];
+      gaussian(a, all_drawn.slot[i], first + i, d_.rows[chunk.begin + a], size + 6 * a, inverse + 6 * a, to_scaling + 6 * a);
+    }
+    if (d_.heads[0].single())
+      for (int a = 0; a < chunk.n; ++a)
+        for (int slot = 0; slot < K; ++slot) {
+          const float sigma = d_.raw[(chunk.begin + a) * K + slot];
+          mixed_[0][int64_t(a) * s_.Op[0] + slot] *= 1.f - sigma * sigma;
+        }
+    for (int a = 0; a < chunk.n; ++a)
+      for (int j = 0; j < 6; ++j) d_.d_log_scaling[d_.rows[chunk.begin + a] * 6 + j] = to_scaling[6 * a + j];
   }
 
-  void gaussian(int a, int slot, int64_t at, int64_t row, const float* l, float* sums, float* to_raw, float* to_offset) {
+  void gaussian(int a, int slot, int64_t at, int64_t row, const float* l, const float* per_l, float* to_scaling) {
     float* to_cov = mixed_[1] + int64_t(a) * s_.Op[1] + COV * slot;
     float* to_color = mixed_[2] + int64_t(a) * s_.Op[2] + 3 * slot;
-    if (d_.d_opacities) to_raw[slot] += d_.d_opacities[at];
+    const int64_t offset = (row * d_.K + slot) * 3;
+    if (d_.d_opacities) mixed_[0][int64_t(a) * s_.Op[0] + slot] += d_.d_opacities[at];
     if (d_.d_means)
       for (int j = 0; j < 3; ++j) {
         const float g = d_.d_means[3 * at + j] * l[j];
-        to_offset[3 * slot + j] = g;
-        sums[j] += g * d_.offsets[(row * d_.K + slot) * 3 + j];
+        d_.d_offsets[offset + j] = g;
+        to_scaling[j] += g * d_.offsets[offset + j];
       }
     if (d_.d_scales)
       for (int j = 0; j < 3; ++j) {
         const float scale = d_.scales[3 * at + j], g = d_.d_scales[3 * at + j] * scale;
-        sums[3 + j] += g;
-        to_cov[j] = g * (1.f - scale / l[3 + j]);
+        to_scaling[3 + j] += g;
+        to_cov[j] = g * (1.f - scale * per_l[3 + j]);
       }
     if (d_.d_quats) {
       const float *q = d_.quats + 4 * at, *g = d_.d_quats + 4 * at, inverse = d_.per_length[at];

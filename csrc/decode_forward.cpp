@@ -117,49 +117,40 @@ Chunk chunk_at(const Decode& d, const Sizes& s, int64_t begin, int64_t end) {
   return chunk;
 }
 
-// The Gaussians of one chunk from its mixed outputs, written from index `at` on.
-void emit(const Decode& d, const Sizes& s, const Chunk& chunk, const float* cov, const float* color, int64_t at) {
+void sigmoid_all(float* x, int64_t count) {
+  int64_t i = 0;
+  for (; i + LANES <= count; i += LANES) store(x + i, sigmoid(load(x + i)));
+  if (i == count) return;
+  float tail[LANES] = {};
+  std::copy(x + i, x + count, tail);
+  store(tail, sigmoid(load(tail)));
+  std::copy_n(tail, count - i, x + i);
+}
+
+// The Gaussians of one chunk from its mixed outputs, written from index `first` on.
+void emit(const Decode& d, const Sizes& s, const Chunk& chunk, const float* cov, const float* color, int64_t first) {
   const int K = static_cast<int>(d.K);
   float* size = scratch(USE_SCALING, 6 * CHUNK + LANES);
   scaling(d, chunk, size);
-  const int64_t first = at;
-  for (int a = 0; a < chunk.n; ++a) {
+  const Drawn all_drawn = drawn(d, chunk);
+  float *means = d.means + 3 * first, *quats = d.quats + 4 * first, *scales = d.scales + 3 * first, *colors = d.colors + 3 * first;
+  for (int i = 0; i < all_drawn.count; ++i) {
+    const int a = all_drawn.anchor[i], slot = all_drawn.slot[i];
     const int64_t row = d.rows[chunk.begin + a];
-    const float *raw = d.raw + (chunk.begin + a) * K, *x = d.xyz + row * 3, *offset = d.offsets + row * K * 3, *l = size + 6 * a;
-    for (int slot = 0; slot < K; ++slot) {
-      if (!(raw[slot] > 0.f)) continue;
-      const float *y = cov + int64_t(a) * s.Op[1] + COV * slot, *c = color + int64_t(a) * s.Op[2] + 3 * slot;
-      d.opacities[at] = raw[slot];
-      d.source[at] = row * K + slot;
-      for (int j = 0; j < 3; ++j) {
-        d.means[3 * at + j] = x[j] + offset[3 * slot + j] * l[j];
-        d.colors[3 * at + j] = c[j];
-        d.scales[3 * at + j] = y[j];
-      }
-      const float length = std::sqrt(y[3] * y[3] + y[4] * y[4] + y[5] * y[5] + y[6] * y[6]), inverse = 1.f / std::max(length, 1e-12f);
-      for (int j = 0; j < 4; ++j) d.quats[4 * at + j] = y[3 + j] * inverse;
-      d.per_length[at] = inverse;
-      ++at;
-    }
+    const float *x = d.xyz + row * 3, *offset = d.offsets + (row * K + slot) * 3, *l = size + 6 * a;
+    const float *y = cov + int64_t(a) * s.Op[1] + COV * slot, *c = color + int64_t(a) * s.Op[2] + 3 * slot;
+    d.opacities[first + i] = d.raw[(chunk.begin + a) * K + slot];
+    d.source[first + i] = row * K + slot;
+    for (int j = 0; j < 3; ++j) means[3 * i + j] = x[j] + offset[j] * l[j];
+    for (int j = 0; j < 3; ++j) colors[3 * i + j] = c[j];
+    for (int j = 0; j < 3; ++j) scales[3 * i + j] = y[j];
+    const float length = std::sqrt(y[3] * y[3] + y[4] * y[4] + y[5] * y[5] + y[6] * y[6]), inverse = 1.f / std::max(length, 1e-12f);
+    for (int j = 0; j < 4; ++j) quats[4 * i + j] = y[3 + j] * inverse;
+    d.per_length[first + i] = inverse;
   }
-  float* scale = d.scales + 3 * first;
-  const int64_t count = 3 * (at - first);
-  int64_t i = 0;
-  for (; i + LANES <= count; i += LANES) store(scale + i, sigmoid(load(scale + i)));
-  if (i < count) {
-    float tail[LANES] = {};
-    std::copy(scale + i, scale + count, tail);
-    store(tail, sigmoid(load(tail)));
-    std::copy_n(tail, count - i, scale + i);
-  }
-  for (int a = 0; a < chunk.n; ++a) {
-    const float *raw = d.raw + (chunk.begin + a) * K, *l = size + 6 * a + 3;
-    for (int slot = 0; slot < K; ++slot) {
-      if (!(raw[slot] > 0.f)) continue;
-      for (int j = 0; j < 3; ++j) scale[j] *= l[j];
-      scale += 3;
-    }
-  }
+  sigmoid_all(scales, 3 * int64_t(all_drawn.count));
+  for (int i = 0; i < all_drawn.count; ++i)
+    for (int j = 0; j < 3; ++j) scales[3 * i + j] *= size[6 * all_drawn.anchor[i] + 3 + j];
 }
 
 }  // namespace

@@ -54,13 +54,26 @@ void gather(const Decode& d, const Sizes& s, Chunk& chunk) {
     const int64_t row = d.rows[chunk.begin + a];
     float* z = chunk.z + int64_t(a) * s.Z;
     const float *f = d.feature + row * s.F, *x = d.xyz + row * 3;
-    std::copy_n(f, s.F, z);
+    copy_row(f, s.F, z);
     const float v[3] = {x[0] - d.camera[0], x[1] - d.camera[1], x[2] - d.camera[2]};
     const float distance = std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), inverse = 1.f / std::max(distance, 1e-12f);
     for (int c = 0; c < 3; ++c) z[s.F + c] = v[c] * inverse;
     z[s.F + 3] = 1.f;
     z[s.F + 4] = distance;
   }
+}
+
+Drawn drawn(const Decode& d, const Chunk& chunk) {
+  const int K = static_cast<int>(d.K), room = chunk.n * K + 1;
+  int* anchor = reinterpret_cast<int*>(scratch(USE_DRAWN, 2 * int64_t(room)));
+  int *slot = anchor + room, count = 0;
+  const float* raw = d.raw + chunk.begin * K;
+  for (int a = 0; a < chunk.n; ++a)
+    for (int k = 0; k < K; ++k) {  // no branch: which slots are drawn is as good as random
+      anchor[count] = a, slot[count] = k;
+      count += raw[a * K + k] > 0.f;
+    }
+  return {count, anchor, slot};
 }
 
 std::vector<Group> groups(const Head& head, const Chunk& chunk, int* lists) {
@@ -82,10 +95,11 @@ std::vector<Group> groups(const Head& head, const Chunk& chunk, int* lists) {
     if (place[e + 1]) found.push_back({e, place[e + 1], lists + place[e], lists + n * k + place[e]});
     place[e + 1] += place[e];
   }
-  for (int i = 0; i < n * k; ++i) {
-    const int to = place[chosen[i]]++;
-    lists[to] = i / k, lists[n * k + to] = i % k;
-  }
+  for (int a = 0; a < n; ++a)
+    for (int slot = 0; slot < k; ++slot) {
+      const int to = place[chosen[a * k + slot]]++;
+      lists[to] = a, lists[n * k + to] = slot;
+    }
   return found;
 }
 
@@ -114,7 +128,8 @@ void activate(int head, float* y, int n) {
 }
 
 void scaling(const Decode& d, const Chunk& chunk, float* to) {
-  for (int a = 0; a < chunk.n; ++a) std::copy_n(d.log_scaling + d.rows[chunk.begin + a] * 6, 6, to + 6 * a);
+  for (int a = 0; a < chunk.n; ++a)
+    for (int j = 0; j < 6; ++j) to[6 * a + j] = d.log_scaling[d.rows[chunk.begin + a] * 6 + j];
   for (int i = 0; i < 6 * chunk.n; i += LANES) store(to + i, exponential(load(to + i)));
 }
 

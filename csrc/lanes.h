@@ -31,11 +31,11 @@ inline V square_root(V a) { return {_mm512_sqrt_ps(a.v)}; }
 inline V nearest(V a) { return {_mm512_maskz_roundscale_ps(0xffff, a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC)}; }
 inline V times_two_to(V a, V n) { return {_mm512_maskz_scalef_ps(0xffff, a.v, n.v)}; }  // n integral
 inline float sum(V a) {
-  float part[16];  // _mm512_reduce_add_ps makes GCC 12 warn about its own headers
-  _mm512_storeu_ps(part, a.v);
-  for (int step = 8; step > 0; step /= 2)
-    for (int i = 0; i < step; ++i) part[i] += part[i + step];
-  return part[0];
+  const __m256 high = _mm256_castpd_ps(_mm512_maskz_extractf64x4_pd(0xf, _mm512_castps_pd(a.v), 1));
+  const __m256 o = _mm256_add_ps(_mm512_castps512_ps256(a.v), high);
+  const __m128 h = _mm_add_ps(_mm256_castps256_ps128(o), _mm256_extractf128_ps(o, 1));
+  const __m128 q = _mm_add_ps(h, _mm_movehl_ps(h, h));
+  return _mm_cvtss_f32(_mm_add_ss(q, _mm_movehdup_ps(q)));
 }
 #elif defined(__AVX2__)
 constexpr int LANES = 8;

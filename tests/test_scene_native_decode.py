@@ -56,7 +56,7 @@ def oracle(rows, columns, camera, heads, with_dist):
                 continue
             logits = h.router_w @ f + (0 if h.router_b is None else h.router_b)
             g = logits.softmax(0)
-            picked = range(len(g)) if h.k is None else sorted(range(len(g)), key=lambda e: (-float(logits[e].detach()), e))[: h.k]  # noqa: B023
+            picked = range(len(g)) if h.k is None else sorted(range(len(g)), key=lambda e: (-float(logits[e].detach()), e))[: h.k]
             y[a] = sum(g[e] / sum(g[j] for j in picked) * expert(e) for e in picked)
             gates[a].append(g)
             chosen[a].append(list(picked))
@@ -179,7 +179,7 @@ def test_builds_agree_and_threads_change_nothing(level, case, monkeypatch):
     monkeypatch.setattr(native, "load", lambda: library)
     found = []
     for threads in (1, 3):
-        monkeypatch.setattr(native, "threads", lambda: threads)  # noqa: B023
+        monkeypatch.setattr(native, "threads", lambda n=threads: n)
         found.append(run_native(*data))
     compare(found[0][0].colors, best[0].colors.double(), name="colors")
     for name, gradient in found[0][3].items():
@@ -246,7 +246,7 @@ def test_what_does_not_fit_is_refused():
     call = lambda rows=rows, with_dist=with_dist, heads=heads, **c: native_decode.decode(  # noqa: E731
         rows, *[(columns | c)[n] for n in ("xyz", "feature", "log_scaling", "offsets")], camera.float(), heads, with_dist
     )
-    with pytest.raises(ValueError, match="color.w1"):
+    with pytest.raises(ValueError, match=r"color\.w1"):
         call(with_dist={"opacity": False, "cov": False, "color": True})
     with pytest.raises(ValueError, match="float32"):
         call(feature=columns["feature"].double())

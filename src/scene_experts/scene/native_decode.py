@@ -70,9 +70,9 @@ def decode(
     """Gaussians of positive opacity in the order of (row, slot), raw opacities [A, K], and routing of the heads that have a router.
 
     rows [A] int64, each at most once; xyz [N, 3], feature [N, F], log_scaling [N, 6], offsets [N, K, 3], camera_position [3]; heads and
-    with_dist by attribute ("opacity", "cov", "color"), D = F + 3 (+ 1 with the distance). All float32 on the CPU. Differentiable in feature,
-    log_scaling, offsets and every tensor of the heads; not in xyz and the camera. Raises ValueError for shapes that do not fit, IndexError
-    for rows outside of the table.
+    with_dist by attribute ("opacity", "cov", "color"), D = F + 3 (+ 1 with the distance). All float32 on the CPU. Differentiable in
+    feature, log_scaling, offsets and every tensor of the heads; not in xyz and the camera. Raises ValueError for shapes that do not fit,
+    IndexError for rows outside of the table.
     """
     found = [heads[a] for a in ATTRIBUTES]
     distance = tuple(int(with_dist[a]) for a in ATTRIBUTES)
