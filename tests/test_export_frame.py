@@ -61,3 +61,14 @@ def test_decoded_gaussians_are_the_same_after_the_move(sees_distance):
     assert moved_networks["opacity"] is network
     back = frame.networks_from_input(moved_networks, names, WORLD.scale, F)
     torch.testing.assert_close(back["color"], network)
+
+
+@pytest.mark.parametrize("voxel", [0.001, 0.0137, 3.3])
+def test_a_voxel_size_that_nothing_says_is_found_again(voxel):
+    g = torch.Generator().manual_seed(2)
+    cells = torch.randint(-3000, 3000, (4000, 3), generator=g)
+    found = frame.recover_voxel(frame.cell_positions(cells, voxel))
+    assert found == pytest.approx(voxel, rel=1e-6)
+    assert torch.equal(frame.cells_of(frame.cell_positions(cells, voxel), found), cells)
+    assert frame.recover_voxel(torch.randn(1000, 3, generator=g)) is None
+    assert frame.recover_voxel(torch.ones(3, 3)) is None and frame.recover_voxel(torch.zeros(0, 3)) is None

@@ -74,7 +74,7 @@ def test_a_published_folder(tmp_path, split):
         assert torch.equal(n["w2"][0], module[2].weight) and torch.equal(n["b2"][0], module[2].bias)
         assert all(value.dtype == torch.float32 and len(value) == 1 for value in n.values())
     assert torch.equal(networks["appearance"]["table"], codes.embedding.weight)
-    assert facts["iteration"] == 30_000 and facts["kind"] == "scaffold-gs" and facts["K"] == 10 and facts["F"] == 32
+    assert facts["iteration"] == 30_000 and facts["kind"] == "scaffold" and facts["K"] == 10 and facts["F"] == 32
     assert facts["voxel_size"] == 0.01 and facts["add_dist"] == () and facts["appearance_dim"] == 16 and facts["scene"] is None
 
 

@@ -42,6 +42,28 @@ def cells_of(xyz: Tensor, voxel: float, origin: tuple[float, float, float] = (0.
     return cells.to(torch.int64) if off <= min(0.25, 1e-3 + 4e-7 * reach) else None
 
 
+def recover_voxel(xyz: Tensor) -> float | None:
+    """The edge of the lattice (origin 0) on which positions [N, 3] lie, where files do not say it; None where none is found.
+
+    The least gap between the different values of an axis is nearly always one cell; it is then fitted to all positions and checked.
+    """
+    guesses = []
+    for axis in range(3):
+        values = xyz[:, axis].double().unique()
+        gaps = values.diff()
+        gaps = gaps[gaps > 4e-6 * float(values.abs().max())] if len(values) > 1 else gaps
+        guesses += [float(gaps.min())] if len(gaps) else []
+    if not guesses:
+        return None
+    edge, flat = min(guesses), xyz.double().flatten()
+    for reach in flat.abs().sort().values[torch.linspace(0, len(flat) - 1, 32).long()].tolist():  # near ones first: their cells are sure
+        near = flat[flat.abs() <= reach]
+        cells = (near / edge).round()
+        if bool(cells.any()):
+            edge = float((near * cells).sum() / (cells * cells).sum())
+    return edge if cells_of(xyz, edge) is not None else None
+
+
 def anchors_to_input(anchors: dict[str, Tensor], world: World) -> dict[str, Tensor]:
     """Anchors in the input frame and unit: xyz and log_scaling change, the other columns are passed on."""
     return anchors | {

@@ -84,7 +84,7 @@ def read_scaffold_folder(path: Path, iteration: int | None = None) -> tuple[dict
     """Anchors, networks and facts of a result folder, published or ours, in the frame of its files.
 
     anchors: as `ply.read_anchor_ply`.  networks: by attribute, stacked (see `networks`), with feature_bank and appearance where present.
-    facts: iteration, K, F, kind ("scaffold-gs" or "octree-gs"), add_dist (attributes whose network is wider than feature and direction: the
+    facts: iteration, K, F, kind ("scaffold" or "octree"), add_dist (attributes whose network is wider than feature and direction: the
     distance, and in Octree-GS perhaps the level), appearance_dim, voxel_size (input unit; None when nothing says it, 0 or less when it was
     automatic), cfg (cfg_args), scene (our sidecar or None).
     Raises InputError for whatever is absent, damaged or does not fit.
@@ -102,7 +102,7 @@ def read_scaffold_folder(path: Path, iteration: int | None = None) -> tuple[dict
         "iteration": int(match[1]) if match else None,
         "K": K,
         "F": F,
-        "kind": "octree-gs" if "level" in anchors else "scaffold-gs",
+        "kind": "octree" if "level" in anchors else "scaffold",
         "voxel_size": scene["voxel_size"]["input"] if scene else cfg.get("voxel_size"),
         "cfg": cfg,
         "scene": scene,
@@ -114,7 +114,7 @@ def _inputs(networks: dict[str, Network], facts: dict[str, Any], where: str) -> 
     """What the networks take beside feature and direction, read off their widths; InputError where the widths do not fit the anchors."""
     K, F = facts["K"], facts["F"]
     appearance = networks["appearance"]["table"].shape[1] if "appearance" in networks else 0
-    most = 2 if facts["kind"] == "octree-gs" else 1
+    most = 2 if facts["kind"] == "octree" else 1
     add_dist = []
     for attribute, channels in zip(ATTRIBUTES, (1, 7, 3)):
         network = networks[attribute]
@@ -180,5 +180,4 @@ def _cfg(sidecar: dict[str, Any]) -> dict[str, Any]:
         "add_opacity_dist": dist["opacity"],
         "add_cov_dist": dist["cov"],
         "add_color_dist": dist["color"],
-        **sidecar.get("cfg", {}),
     }

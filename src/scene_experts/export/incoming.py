@@ -1,0 +1,139 @@
+"""Files to runs: a run folder made of a published Scaffold-GS result, of one of ours, or of a compact file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scene_experts import checkpoint, run_folder
+from scene_experts.config import Data, RunConfig, Train, from_json
+from scene_experts.data.views import Capture, World
+from scene_experts.errors import InputError
+from scene_experts.export.compact import Compact, read_compact
+from scene_experts.export.frame import (
+    Network,
+    anchors_from_input,
+    cell_positions,
+    cells_of,
+    lattice_to_input,
+    networks_from_input,
+    recover_voxel,
+)
+from scene_experts.export.scaffold import read_scaffold_folder
+from scene_experts.recipes import scaffold_gs
+from scene_experts.scene.anchors import ATTRIBUTES, Anchors
+from scene_experts.scene.mlp import Plain
+
+
+@dataclass(frozen=True)
+class _Read:
+    """What a file holds, in the input frame."""
+
+    anchors: dict[str, Tensor]
+    cells: Tensor | None  # None: on no lattice that is known
+    voxel: float  # input unit
+    networks: dict[str, Network]
+    add_dist: tuple[str, ...]
+    step: int
+    scene: dict[str, Any] | None  # our description
+
+
+def import_result(source: Path, data: Data, out: Path, iteration: int | None = None) -> Capture:
+    """Make the run folder `out` (configuration and checkpoint) of a published Scaffold-GS result folder, of ours, or of a compact file.
+
+    A published result is in its capture's own units, so its capture is read with --normalise none. Ours must meet the world it was trained
+    in. Returns the capture in that world. Raises InputError for what cannot be rendered here (levels, feature bank, appearance codes) and
+    for captures that do not fit.
+    """
+    read = _read(Path(source), iteration)
+    if read.scene is None:
+        data = replace(data, normalise="none")
+    capture = run_folder.load_capture(data)
+    capture.images.close()
+    if read.scene is not None:
+        _check_world(world_in(read.scene), capture.world)
+        capture = replace(capture, world=world_in(read.scene))
+    voxel = float(read.scene["voxel_size"]["trained"]) if read.scene else read.voxel
+    tensors = run_tensors(read.anchors, read.cells, read.networks, read.add_dist, voxel, capture.world)
+    cfg = _config(read)
+    config = RunConfig(cfg, data, f"import {Path(source).name}", versions=run_folder.versions())
+    run_folder.prepare(out, config, resume=False)
+    extent = float((read.scene or {}).get("extent", capture.extent))
+    meta = {"recipe": cfg.recipe, "step": read.step, "seconds": 0.0, "voxel": voxel, "extent": extent, "config": "imported"}
+    checkpoint.save(out / "checkpoints", read.step, tensors, meta)
+    return capture
+
+
+def run_tensors(
+    anchors: dict[str, Tensor], cells: Tensor | None, networks: dict[str, Network], add_dist: tuple[str, ...], voxel: float, world: World
+) -> dict[str, Tensor]:
+    """The tensors of a checkpoint, in the trained world, from anchors and networks in the input frame.
+
+    voxel: edge of the lattice in trained units.  cells: None for anchors on no lattice that is known; they cannot grow or be packed.
+    """
+    moved = anchors_from_input(anchors, world)
+    place = {"cell": torch.zeros(len(moved["xyz"]), 3, dtype=torch.int64), "xyz": moved["xyz"]}
+    if cells is not None:
+        place = {"cell": cells, "xyz": cell_positions(cells, voxel)}
+    trained = networks_from_input(networks, add_dist, world.scale, moved["feature"].shape[1])
+    out = {f"params.{name}": moved[name] for name in ("feature", "offsets", "log_scaling")}
+    out |= {f"facts.{name}": value for name, value in place.items()}
+    return out | {f"network.{a}.{name}": value for a, n in trained.items() for name, value in n.items()}
+
+
+def compact_anchors(file: Compact) -> dict[str, Tensor]:
+    """The anchors' columns of a compact file, in the input frame."""
+    return {"xyz": file.xyz, "feature": file.feature, "offsets": file.offsets, "log_scaling": file.log_scaling}
+
+
+def world_in(sidecar: dict[str, Any]) -> World:
+    """The world that our description of a scene states."""
+    x, y, z = (float(v) for v in sidecar["world"]["shift"])
+    return World(float(sidecar["world"]["scale"]), (x, y, z))
+
+
+def _read(source: Path, iteration: int | None) -> _Read:
+    """A compact file, or a result folder."""
+    if source.is_file():
+        c = read_compact(source)
+        add_dist = tuple(a for a in ATTRIBUTES if c.sidecar["add_dist"][a])
+        return _Read(compact_anchors(c), c.cells, c.voxel, c.networks, add_dist, int(c.sidecar["step"]), c.sidecar)
+    anchors, networks, facts = read_scaffold_folder(source, iteration)
+    extra = {"feature_bank", "appearance"} & networks.keys()
+    if facts["kind"] == "octree" or extra:
+        what = "levels of detail" if not extra else " and ".join(sorted(extra)).replace("_", " ")
+        raise InputError(f"expected a plain Scaffold-GS result in {source}, found one with {what}, which is not read yet; train it here")
+    scene = facts["scene"]
+    voxel, origin = float(facts["voxel_size"] or 0.0), (0.0, 0.0, 0.0)
+    if scene is not None:
+        voxel, origin = lattice_to_input(float(scene["voxel_size"]["trained"]), world_in(scene))
+    elif voxel <= 0:  # it was automatic and is written nowhere
+        voxel = recover_voxel(anchors["xyz"]) or 0.0
+    cells = cells_of(anchors["xyz"], voxel, origin) if voxel > 0 else None
+    return _Read(anchors, cells, voxel, networks, facts["add_dist"], int(facts["iteration"] or 30_000), scene)
+
+
+def _config(read: _Read) -> Train:
+    """The recipe: the one our description holds, else Scaffold-GS with the numbers that the files show."""
+    if read.scene is not None and "train" in read.scene:
+        return from_json(Train, read.scene["train"], "train")
+    network = read.networks["opacity"]
+    depth = 2 + sum(name.startswith("middle.") and name.endswith(".weight") for name in network)
+    K, F = read.anchors["offsets"].shape[1], read.anchors["feature"].shape[1]
+    scene = Anchors(K=K, F=F, hidden=network["w1"].shape[1], add_dist=read.add_dist, voxel_size=read.voxel, decoder=Plain(depth))
+    return replace(scaffold_gs, scene=scene, iterations=read.step)
+
+
+def _check_world(trained: World, found: World) -> None:
+    """Raises InputError unless the capture is read into the world the scene was trained in (to rounding)."""
+    pairs = [(trained.scale, found.scale), *zip(trained.shift, found.shift)]
+    reach = max(1.0, *(abs(s) for s in trained.shift))
+    if any(abs(a - b) > 1e-5 * (abs(a) if i == 0 else reach) for i, (a, b) in enumerate(pairs)):
+        raise InputError(
+            f"expected the capture in the world of the scene (scale {trained.scale:.6g}, shift {trained.shift}), found scale "
+            f"{found.scale:.6g}, shift {found.shift}; use the capture, --split, --normalise and --max-views it was trained with"
+        )

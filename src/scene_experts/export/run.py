@@ -1,0 +1,182 @@
+"""Trained runs to files: the Scaffold-GS layout and the compact file, in the capture's own frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scene_experts import run_folder
+from scene_experts.config import Data, to_json
+from scene_experts.data.views import Capture, World
+from scene_experts.errors import InputError
+from scene_experts.evaluate.metrics import psnr
+from scene_experts.export.cameras import write_cameras
+from scene_experts.export.compact import Compact, Sizes, read_compact, write_compact
+from scene_experts.export.frame import (
+    Network,
+    anchors_to_input,
+    lattice_to_input,
+    networks_to_input,
+)
+from scene_experts.export.incoming import compact_anchors, run_tensors, world_in
+from scene_experts.export.incoming import import_result as import_files
+from scene_experts.export.scaffold import SIDECAR, describe, read_sidecar, write_scaffold_folder
+from scene_experts.io import write_bytes
+from scene_experts.render import Rasterizer
+from scene_experts.run_folder import OpenRun
+from scene_experts.scene.anchors import ATTRIBUTES, AnchorScene
+from scene_experts.scene.experts import MixtureHead
+from scene_experts.train import scene_from
+
+COMPACT = "scene.compact"
+_LATTICE_TOLERANCE = 1e-3  # voxels
+
+
+def write_layout(run: OpenRun, capture: Capture, out: Path | None = None) -> Path:
+    """Write point_cloud/iteration_<step>/, cameras.json and cfg_args below `out` (the run folder); returns the iteration's folder."""
+    out = out or run.path
+    folder = _write_anchors(run, capture.world, out)
+    write_cameras(out / "cameras.json", capture)
+    return folder
+
+
+def export_run(run: Path, format: str, out: Path | None = None, step: int | None = None, rasterize: Rasterizer | None = None) -> list[str]:
+    """Write the newest checkpoint of a run (or the one at `step`) as "anchors" (the Scaffold-GS layout) or "compact"; says what it wrote.
+
+    out: folder for anchors, file or folder for compact; inside the run folder by default.
+    rasterize: what to draw the held-out views with, to say what a compact file costs in PSNR; None leaves that out.
+    """
+    opened = run_folder.open_run(run, "cpu", step)
+    anchors = len(opened.scene.table)
+    if format == "anchors":
+        out = out or run
+        folder = _write_anchors(opened, world_of(opened), out)
+        if out != run and (run / "cameras.json").is_file():
+            write_bytes(out / "cameras.json", (run / "cameras.json").read_bytes())
+        size = sum(p.stat().st_size for p in folder.iterdir())
+        return [f"wrote {folder}", f"{anchors:,} anchors, {size / 1e6:.2f} MB with networks, in the capture's own frame"]
+    path = out or run / COMPACT
+    path = path / COMPACT if path.is_dir() else path
+    sizes = write_compact_run(opened, world_of(opened), path)
+    lines = [f"wrote {path}", f"{anchors:,} anchors, {sizes.per_anchor:.1f} bytes an anchor, {sizes.total / 1e6:.2f} MB with networks"]
+    if rasterize is not None:
+        lines.append(_cost_line(opened, path, rasterize))
+    return lines
+
+
+def _cost_line(run: OpenRun, path: Path, rasterize: Rasterizer) -> str:
+    capture = run_folder.load_capture(run.config.data, run.config.train.seed)
+    try:
+        if not capture.test:
+            return "no view is held out: the cost in PSNR was not measured"
+        before, after = psnr_cost(run, capture, path, rasterize)
+    finally:
+        capture.images.close()
+    return f"PSNR of {len(capture.test)} held-out views {before:.3f} dB, from this file {after:.3f} dB ({after - before:+.3f})"
+
+
+def psnr_cost(run: OpenRun, capture: Capture, path: Path, rasterize: Rasterizer) -> tuple[float, float]:
+    """Mean PSNR (dB, 8-bit pictures) of the held-out views drawn from the run and from its compact file."""
+    if getattr(rasterize, "antialias", run.cfg.antialias) != run.cfg.antialias:
+        rasterize = replace(rasterize, antialias=run.cfg.antialias)  # type: ignore[type-var]
+    scenes = (run.scene, scene_of_compact(run, read_compact(path), capture.world))
+    totals = [0.0, 0.0]
+    with torch.no_grad():
+        for index in capture.test:
+            camera, frame = capture.views[index].camera, capture.frame(index)
+            for i, scene in enumerate(scenes):
+                decoded = scene(camera, run.step, False, rasterize.visible)
+                image = rasterize(decoded.gaussians, camera, torch.tensor(capture.background)).image
+                picture = (image.clamp(0, 1) * 255).round() / 255
+                totals[i] += psnr(picture, frame.rgb.float() / 255, frame.mask)
+    return totals[0] / len(capture.test), totals[1] / len(capture.test)
+
+
+def scene_of_compact(run: OpenRun, file: Compact, world: World) -> AnchorScene:
+    """The scene that a compact file holds, in the world and with the configuration of the run it was written from."""
+    tensors = run_tensors(compact_anchors(file), file.cells, file.networks, run.scene.config.add_dist, run.scene.voxel, world)
+    scene = scene_from(run.cfg, tensors, {"voxel": run.scene.voxel, "extent": run.scene.extent})
+    return scene.eval()
+
+
+def write_compact_run(run: OpenRun, world: World, path: Path) -> Sizes:
+    """Write the compact file of an opened run. Raises InputError where the anchors are not on a lattice."""
+    scene = run.scene
+    cells, xyz = scene.table.facts["cell"], scene.table.facts["xyz"]
+    if len(cells):
+        away = float((cells.double() * scene.voxel - xyz.double()).abs().max())
+        if away > _LATTICE_TOLERANCE * scene.voxel + 1e-6 * float(xyz.abs().max()):
+            raise InputError("expected anchors on a lattice of known voxel size for a compact file, found others; use --format anchors")
+    found = anchors_to_input(_anchors(scene), world)
+    voxel, origin = lattice_to_input(scene.voxel, world)
+    columns = (found["feature"], found["log_scaling"], found["offsets"])
+    return write_compact(path, cells, voxel, origin, *columns, _networks_in_input(scene, world), sidecar_of(run, world))
+
+
+def _write_anchors(run: OpenRun, world: World, out: Path) -> Path:
+    anchors = anchors_to_input(_anchors(run.scene), world)
+    return write_scaffold_folder(out, run.step, anchors, _networks_in_input(run.scene, world), sidecar_of(run, world))
+
+
+def _anchors(scene: AnchorScene) -> dict[str, Tensor]:
+    """The anchors' columns in the trained world."""
+    return {"xyz": scene.table.facts["xyz"].cpu(), **{k: v.detach().cpu() for k, v in scene.table.params.items()}}
+
+
+def _networks(scene: AnchorScene) -> dict[str, Network]:
+    """The networks' tensors by attribute, in trained units."""
+    out: dict[str, Network] = {a: {} for a in ATTRIBUTES}
+    for name, value in scene.network_tensors().items():
+        attribute, _, rest = name.partition(".")
+        out[attribute][rest] = value.detach().cpu()
+    return out
+
+
+def _networks_in_input(scene: AnchorScene, world: World) -> dict[str, Network]:
+    return networks_to_input(_networks(scene), scene.config.add_dist, world.scale, scene.config.F)
+
+
+def sidecar_of(run: OpenRun, world: World) -> dict[str, Any]:
+    """The description of an opened run: `scaffold.describe` with the whole configuration, the capture's path left out."""
+    scene, networks = run.scene, _networks(run.scene)
+    k = {a: head.k(run.step) for a, head in scene.heads.items() if isinstance(head, MixtureHead)}
+    return describe(
+        recipe=run.config.train.recipe,
+        networks=networks,
+        k=k,
+        K=scene.K,
+        F=scene.config.F,
+        add_dist=scene.config.add_dist,
+        voxel_size=scene.voxel,
+        scale=world.scale,
+        shift=world.shift,
+        step=run.step,
+        extra={"extent": scene.extent, "train": to_json(run.config.train), "data": _settings(run.config.data)},
+    )
+
+
+def _settings(data: Data) -> dict[str, Any]:
+    """How a capture was read, without where it lies."""
+    return {name: value for name, value in to_json(data).items() if name != "path"}
+
+
+def world_of(run: OpenRun) -> World:
+    """The world a run was trained in: from the description beside its exported anchors, else from its capture."""
+    for path in sorted((run.path / "point_cloud").glob(f"iteration_*/{SIDECAR}"), key=lambda p: p.stat().st_mtime, reverse=True):
+        found = read_sidecar(path)
+        if found.get("data") == _settings(run.config.data):
+            return world_in(found)
+    capture = run_folder.load_capture(run.config.data, run.config.train.seed)
+    capture.images.close()
+    return capture.world
+
+
+def import_result(source: Path, data: Data, out: Path, iteration: int | None = None) -> Path:
+    """Make the run folder `out` of a result folder or compact file (`incoming.import_result`), with its layout; returns it."""
+    capture = import_files(source, data, out, iteration)
+    write_layout(run_folder.open_run(out), capture)
+    return out

@@ -1,0 +1,128 @@
+"""Published Scaffold-GS results become runs: drawn with their own anchors and networks, or refused in one sentence."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from scene_experts import checkpoint, run_folder
+from scene_experts.config import Data
+from scene_experts.errors import InputError
+from scene_experts.export.frame import cell_positions
+from scene_experts.export.networks import write_torchscript
+from scene_experts.export.ply import read_vertices, write_anchor_ply, write_vertices
+from scene_experts.export.run import export_run, import_result
+from scene_experts.render import choose
+from scene_experts.scene.anchors import Anchors, AnchorScene
+from scene_experts.scene.mlp import Plain
+from scene_experts.table import Table
+from scene_experts.train import resume
+from synthetic import make_capture
+
+VOXEL = 0.0173
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("capture"), views=8).folder
+
+
+def published(root: Path, cfg: str | None = f"Namespace(voxel_size={VOXEL})", depth: int = 2) -> AnchorScene:
+    """A folder as Scaffold-GS leaves it, and the scene in it: anchors on the floor, of the capture's own unit."""
+    torch.manual_seed(0)
+    cells = torch.unique(torch.cat([torch.randint(-80, 80, (900, 2)), torch.randint(-2, 3, (900, 1))], 1), dim=0)
+    n = len(cells)
+    a = {"feature": torch.randn(n, 32), "offsets": torch.randn(n, 10, 3), "log_scaling": torch.randn(n, 6) * 0.3 - 3}
+    xyz = cell_positions(cells, VOXEL)
+    scene = AnchorScene(Anchors(decoder=Plain(depth)), Table(a, {"cell": cells, "xyz": xyz}), VOXEL, 5.0)
+    folder = root / "point_cloud" / "iteration_30000"
+    write_anchor_ply(folder / "point_cloud.ply", xyz, a["offsets"], a["feature"], a["log_scaling"])
+    networks = {}
+    for name, value in scene.network_tensors().items():
+        networks.setdefault(name.partition(".")[0], {})[name.partition(".")[2]] = value
+    write_torchscript(folder, networks)
+    if cfg:
+        (root / "cfg_args").write_text(cfg)
+    return scene
+
+
+def picture(scene, capture, step):
+    rasterize = choose("auto", "cpu")
+    camera = capture.views[0].camera
+    with torch.no_grad():
+        decoded = scene(camera, step, False, rasterize.visible)
+        return rasterize(decoded.gaussians, camera, torch.tensor(capture.background)).image
+
+
+@pytest.mark.parametrize(
+    ("cfg", "depth"),
+    [(f"Namespace(voxel_size={VOXEL})", 2), ("Namespace(voxel_size=0)", 2), (None, 3)],
+    ids=["given", "automatic", "no cfg_args"],
+)
+def test_a_published_result_draws_as_it_is(tmp_path, folder, cfg, depth):
+    scene = published(tmp_path / "result", cfg, depth)
+    out = import_result(tmp_path / "result", Data(folder), tmp_path / "run")
+    opened = run_folder.open_run(out)
+    assert opened.config.data.normalise == "none" and opened.step == 30_000 and opened.config.train.recipe == "scaffold-gs"
+    capture = run_folder.load_capture(opened.config.data)
+    wanted, found = picture(scene, capture, 30_000), picture(opened.scene, capture, 30_000)
+    assert wanted.std() > 0.05, "the picture shows something"
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-4)
+    assert opened.scene.voxel == pytest.approx(VOXEL, rel=1e-6)
+    assert torch.equal(opened.scene.table.facts["cell"], scene.table.facts["cell"])
+    lines = export_run(out, "compact", rasterize=choose("auto", "cpu"))
+    assert "bytes an anchor" in lines[1] and "PSNR" in lines[2]
+    capture.images.close()
+
+
+def test_positions_on_no_lattice_are_drawn_but_not_packed(tmp_path, folder):
+    published(tmp_path / "result", None)
+    path = tmp_path / "result" / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    torch.manual_seed(1)
+    n = 300
+    write_anchor_ply(path, torch.randn(n, 3), torch.randn(n, 10, 3), torch.randn(n, 32), torch.randn(n, 6) - 3)
+    out = import_result(tmp_path / "result", Data(folder), tmp_path / "run")
+    assert len(run_folder.open_run(out).scene.table) == n
+    with pytest.raises(InputError, match="expected anchors on a lattice"):
+        export_run(out, "compact")
+    assert export_run(out, "anchors", tmp_path / "again")
+
+
+def test_an_imported_run_cannot_be_resumed(tmp_path, folder):
+    published(tmp_path / "result")
+    out = import_result(tmp_path / "result", Data(folder), tmp_path / "run")
+    with pytest.raises(InputError, match="trained with other settings"):
+        resume(run_folder.open_run(out).cfg, out / "checkpoints", "cpu")
+    with pytest.raises(InputError, match="found checkpoints"):
+        import_result(tmp_path / "result", Data(folder), out)
+
+
+def test_another_world_is_refused(tmp_path, folder):
+    published(tmp_path / "result")
+    out = import_result(tmp_path / "result", Data(folder), tmp_path / "run")
+    with pytest.raises(InputError, match=r"expected the capture in the world of the scene .* --normalise"):
+        import_result(out, Data(folder, normalise="extent"), tmp_path / "other")
+    assert checkpoint.latest(tmp_path / "other" / "checkpoints") is None
+
+
+def test_what_cannot_be_drawn_is_refused(tmp_path, folder):
+    root = tmp_path / "result"
+    published(root)
+    iteration = root / "point_cloud" / "iteration_30000"
+    bank = nn.Sequential(nn.Linear(4, 32), nn.ReLU(), nn.Linear(32, 3))
+    torch.save(bank.state_dict(), iteration / "feature_bank_mlp.pt")
+    with pytest.raises(InputError, match="found one with feature bank"):
+        import_result(root, Data(folder), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(InputError, match="expected a Scaffold-GS result"):
+        import_result(tmp_path / "absent", Data(folder), tmp_path / "run")
+    (iteration / "feature_bank_mlp.pt").unlink()
+    plain = read_vertices(iteration / "point_cloud.ply")
+    write_vertices(iteration / "point_cloud.ply", {**plain, "level": plain["x"] * 0, "extra_level": plain["x"] * 0, "info": plain["x"] * 0})
+    with pytest.raises(InputError, match="found one with levels of detail"):
+        import_result(root, Data(folder), tmp_path / "run")
+    write_vertices(iteration / "point_cloud.ply", plain)
+    with pytest.raises(InputError, match="expected the folder of a capture"):
+        import_result(root, replace(Data(folder), path=tmp_path / "absent"), tmp_path / "run")
