@@ -74,7 +74,10 @@ def main() -> None:
     parser.add_argument("--seen", type=float, default=0.7, help="share of the table that the camera sees")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--only", default="", help="run the cases whose name contains this")
+    parser.add_argument("--level", choices=native.LEVELS, help="which build of the library; the best of this processor by default")
     args = parser.parse_args()
+    if args.level:
+        native.levels = lambda: (args.level,)
     if native.load() is None:
         raise SystemExit(native.why_not())
     pose = torch.eye(4)

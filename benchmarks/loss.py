@@ -39,7 +39,10 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=800)
     parser.add_argument("--height", type=int, default=544)
     parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--level", choices=native.LEVELS, help="which build of the library; the best of this processor by default")
     args = parser.parse_args()
+    if args.level:
+        native.levels = lambda: (args.level,)
     if native.load() is None:
         raise SystemExit(native.why_not())
     torch.manual_seed(0)

@@ -113,7 +113,7 @@ void block_inputs(const Chunk& chunk, const Sizes& s, const Group& g, int from, 
 void hidden(const Packed::Expert& e, const Sizes& s, int head, int n, const float* z, float* h) {
   const int Hp = s.Hp[head];
   product(n, Hp, s.inputs[head], z, s.Z, e.w1t.data(), Hp, nullptr, h, Hp);
-  for (int i = 0; i < n * Hp; i += LANES) store(h + i, max(load(h + i), all(0.f)));
+  for (int i = 0; i < n * Hp; i += LANES) store(h + i, max(all(0.f), load(h + i)));  // in this order NaN stays NaN
 }
 
 void outputs(const Packed::Expert& e, const Sizes& s, int head, int n, const float* h, float* y) {

@@ -119,9 +119,9 @@ inline V times_two_to(V a, V n) { return {std::ldexp(a.v, static_cast<int>(n.v))
 inline float sum(V a) { return a.v; }
 #endif
 
-// e^x to 2 ulp, x clamped to [-87, 87].
+// e^x to 2 ulp, x clamped to [-87, 87]. max and min return their second operand where one is no number, so NaN stays NaN.
 inline V exponential(V x) {
-  x = min(max(x, all(-87.f)), all(87.f));
+  x = min(all(87.f), max(all(-87.f), x));
   const V n = nearest(x * all(1.44269504088896f));
   V r = fma(n, all(-0.693145751953125f), x);
   r = fma(n, all(-1.42860682e-6f), r);

@@ -131,22 +131,22 @@ def test_a_picture_without_pixels_costs_nothing():
 def test_volume_and_hinge():
     scales = torch.tensor([[1.0, 2, 3], [2, 2, 0.5]], requires_grad=True)
     volume(scales).backward()
-    assert float(volume(scales)) == 4.0
+    assert volume(scales).item() == 4.0
     torch.testing.assert_close(scales.grad, torch.tensor([[3.0, 1.5, 1], [0.5, 0.5, 2]]))
     empty = torch.zeros(0, 3, requires_grad=True)
     volume(empty).backward()
-    assert float(volume(empty)) == 0.0 and empty.grad.shape == (0, 3)
+    assert volume(empty).item() == 0.0 and empty.grad.shape == (0, 3)
     positive = torch.full((4, 10), 0.3, requires_grad=True)
     opacity_hinge(positive).backward()
-    assert float(opacity_hinge(positive)) == 0.0 and not positive.grad.any()
+    assert opacity_hinge(positive).item() == 0.0 and not positive.grad.any()
     negative = torch.full((4, 10), -0.3, requires_grad=True)
     opacity_hinge(negative).backward()
-    assert float(opacity_hinge(negative)) == pytest.approx(0.3)
+    assert opacity_hinge(negative).item() == pytest.approx(0.3)
     torch.testing.assert_close(negative.grad, torch.full((4, 10), -1 / 40))
     assert float(opacity_hinge(torch.full((2, 2), 0.1), tau=0.25)) == pytest.approx(0.15)
     nobody = torch.zeros(0, 10, requires_grad=True)
     opacity_hinge(nobody).backward()
-    assert float(opacity_hinge(nobody)) == 0.0
+    assert opacity_hinge(nobody).item() == 0.0
 
 
 def routed(E, k, crowded, n=1000):
@@ -189,7 +189,7 @@ def test_sparse_balance_pushes_mass_off_crowded_experts_and_through_the_gates_al
     empty = torch.zeros(0, 5, requires_grad=True)
     value = load_sparse(empty, torch.zeros(0, 2, dtype=torch.long)) + load_dense(empty)
     value.backward()
-    assert float(value) == 0.0
+    assert value.item() == 0.0
 
 
 def scene(routing=None, M=6, opacity=-0.5):

@@ -230,6 +230,14 @@ def test_tiny_opacities_keep_their_sign():
     compare(raw, exact)
 
 
+def test_broken_features_break_values_not_memory():
+    rows, columns, camera, heads, with_dist = problem()
+    columns["feature"][::3] = float("nan")
+    columns["feature"][1::3] = float("inf")
+    _, raw, routing, _ = run_native(rows, columns, camera, heads, with_dist)
+    assert all(((r.chosen >= 0) & (r.chosen < 3)).all() for r in routing.values()) and raw.isfinite().any() and raw.isnan().any()
+
+
 def test_without_gradients():
     rows, columns, camera, heads, with_dist = problem()
     columns, heads = single_precision(columns, heads)
