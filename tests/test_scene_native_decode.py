@@ -167,7 +167,7 @@ def test_value_and_gradient_are_the_equations(case):
         assert (r.chosen is None) == (heads[a].k is None)
         assert r.chosen is None or torch.equal(r.chosen, chosen[a])
     for name, leaf in named.items():
-        compare(gradients[name], torch.zeros_like(leaf) if leaf.grad is None else leaf.grad, 2e-5, f"gradient of {name}")
+        compare(gradients[name], torch.zeros_like(leaf) if leaf.grad is None else leaf.grad, 1e-5, f"gradient of {name}")
 
 
 @pytest.mark.parametrize("case", ["top-2", "dense", "plain", "paper's sizes, several chunks", "odd sizes"])
@@ -183,7 +183,7 @@ def test_builds_agree_and_threads_change_nothing(level, case, monkeypatch):
         found.append(run_native(*data))
     compare(found[0][0].colors, best[0].colors.double(), name="colors")
     for name, gradient in found[0][3].items():
-        compare(gradient, best[3][name].double(), 2e-5, name)
+        compare(gradient, best[3][name].double(), 1e-5, name)
         assert torch.equal(gradient, found[1][3][name]), name
 
 
@@ -230,7 +230,10 @@ def test_tiny_opacities_keep_their_sign():
     compare(raw, exact)
 
 
-def test_broken_features_break_values_not_memory():
+@pytest.mark.parametrize("level", LEVELS)
+def test_broken_features_break_values_not_memory(level, monkeypatch):
+    library = native.load(level)
+    monkeypatch.setattr(native, "load", lambda: library)
     rows, columns, camera, heads, with_dist = problem()
     columns["feature"][::3] = float("nan")
     columns["feature"][1::3] = float("inf")
