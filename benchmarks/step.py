@@ -101,10 +101,14 @@ def main() -> None:
             best[name] = {k: min(v, best[name].get(k, v)) for k, v in times.items()}
             training.scene.load_state_dict(state)
     for name in made:
-        print(f"{name}: {args.anchors:,} anchors, {drawn[name]:,} Gaussians drawn, {width}x{height}, {args.threads} threads, raster {rasterize.name}")
+        print(
+            f"{name}: {args.anchors:,} anchors, {drawn[name]:,} Gaussians drawn, {width}x{height}, {args.threads} threads, raster {rasterize.name}"
+        )
         for part, seconds in best[name].items():
             print(f"  {part:<14} {1e3 * seconds:7.1f} ms")
-        print(f"  {'whole step':<14} {1e3 * whole[name]:7.1f} ms = {whole[name] / alone[name]:.2f} x raster alone ({1e3 * alone[name]:.1f} ms)")
+        print(
+            f"  {'whole step':<14} {1e3 * whole[name]:7.1f} ms = {whole[name] / alone[name]:.2f} x raster alone ({1e3 * alone[name]:.1f} ms)"
+        )
     if {"moe-gs", "scaffold-gs"} <= set(made):
         print(f"moe-gs step / scaffold-gs step: {whole['moe-gs'] / whole['scaffold-gs']:.2f}")
 

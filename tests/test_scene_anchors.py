@@ -80,7 +80,9 @@ def test_every_gaussian_follows_the_formula(add_dist):
     assert decoded.raw_opacity.shape == (len(decoded.rows), 10)
 
 
-@pytest.mark.parametrize("name", ["scaffold-gs", "moe-gs", "moe-gs-dist", "moe-gs-e4-top1", "moe-gs-e3-dense", "scaffold-gs-depth4", "moe-gs-posrouter"])
+@pytest.mark.parametrize(
+    "name", ["scaffold-gs", "moe-gs", "moe-gs-dist", "moe-gs-e4-top1", "moe-gs-e3-dense", "scaffold-gs-depth4", "moe-gs-posrouter"]
+)
 @pytest.mark.parametrize("step", [1, 1501])
 @pytest.mark.skipif(native.load() is None, reason="the native library is not built here")
 def test_native_and_composed_decode_agree_in_value_and_gradient(name, step):
@@ -99,7 +101,11 @@ def test_native_and_composed_decode_agree_in_value_and_gradient(name, step):
     for a, b in zip(v1, v2):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
     for a, b in zip(g1, g2):
-        assert (a is None or not a.any()) if b is None else torch.linalg.norm((torch.zeros_like(b) if a is None else a) - b) <= 1e-4 * (torch.linalg.norm(b) + 1e-6)
+        assert (
+            (a is None or not a.any())
+            if b is None
+            else torch.linalg.norm((torch.zeros_like(b) if a is None else a) - b) <= 1e-4 * (torch.linalg.norm(b) + 1e-6)
+        )
 
 
 def test_load_scope_all_balances_every_anchor():

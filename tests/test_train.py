@@ -146,7 +146,9 @@ def test_a_view_that_sees_nothing_trains_on(folder):
         pose = view.camera.world_to_cam.clone()
         pose[:3, 3] += torch.tensor([0.0, 0.0, -1000.0])
         away.append(replace(view, camera=replace(view.camera, world_to_cam=pose)))
-    steps = [e for e in events(config(), folder, world=replace(capture, views=tuple(away)), stop_at=5, log_every=1) if isinstance(e, Stepped)]
+    steps = [
+        e for e in events(config(), folder, world=replace(capture, views=tuple(away)), stop_at=5, log_every=1) if isinstance(e, Stepped)
+    ]
     capture.images.close()
     assert len(steps) == 5 and all(math.isfinite(v) for e in steps for v in e.terms.values()) and steps[-1].gaussians == 0
 

@@ -226,13 +226,16 @@ class ExportCommand:
     out: Path | None = None
     """File or folder to write; inside the run folder by default."""
     step: int | None = None
+    measure: bool = True
+    """Render the held-out views before and after, and say what a compact file costs in PSNR."""
 
 
 def export(args: list[str]) -> int:
     from scene_experts.export.run import export_run
 
     command = tyro.cli(ExportCommand, prog=f"{PROG} export", args=args)
-    for line in export_run(command.run, command.format, command.out, command.step):
+    rasterize = backend("cpu", "auto", False, False)[1] if command.measure else None
+    for line in export_run(command.run, command.format, command.out, command.step, rasterize):
         print(line)
     return 0
 
