@@ -224,3 +224,15 @@ def test_the_window_of_the_opacity_hinge():
     w = Weights(opacity=0.1, opacity_from=10, opacity_until=20)
     on = [step for step in (9, 10, 20, 21) if "opacity" in terms(*scene(), w, step)]
     assert on == [10, 20] and "opacity" in terms(*scene(), w)
+
+
+def test_hinge_scopes():
+    raw = torch.tensor([[-1.0, 0.5], [-0.5, -0.5], [0.1, 0.2]])
+    g = Gaussians(torch.zeros(3, 3), torch.zeros(3, 4), torch.zeros(3, 3), torch.zeros(3), torch.zeros(3, 3), torch.tensor([9, 14, 15]))
+    radii = torch.tensor([3, 0, 2], dtype=torch.int32)
+    render = Render(torch.zeros(4, 4, 3), torch.zeros(4, 4), torch.zeros(4, 4), radii, torch.zeros(3, 2))
+    decoded = Decoded(g, torch.tensor([4, 6, 7]), raw, {}, scene_opacity=torch.full((8, 2), -0.25))
+    value = lambda scope: float(terms(decoded, render, torch.zeros(4, 4, 3), Weights(opacity=1.0, opacity_scope=scope))["opacity"])  # noqa: E731
+    assert value("visible") == pytest.approx(2.0 / 6)
+    assert value("rendered_anchors") == pytest.approx(1.0 / 4)  # anchors 4 and 7 have a slot with radius > 0
+    assert value("all") == pytest.approx(0.25)

@@ -153,6 +153,11 @@ def test_aligned_quaternions_do_not_cancel():
     assert h(x, f, 1)[0].abs().max() == 0.0  # they cancel without it
 
 
+def test_top_1_warns(caplog):
+    Experts(top_k=1).build("opacity", D, H, 10, F)
+    assert "does not train the routers" in caplog.text
+
+
 def test_nonsense_is_refused():
     with pytest.raises(ValueError, match="top_k between 1"):
         Experts(num=2, top_k=3).build("color", D, H, OUT, F)

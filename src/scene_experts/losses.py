@@ -35,6 +35,8 @@ class Weights:
     """Weight of the load balance (eq. 6, 7)."""
     tau: float = 0.0
     """Opacity below which the hinge pulls."""
+    opacity_scope: Literal["visible", "rendered_anchors", "all"] = "visible"
+    """Whose opacities the hinge sees: all K of every visible anchor, of anchors with a drawn Gaussian, or of every anchor of the scene."""
     load_reduce: Literal["sum", "mean"] = "sum"
     """Over the attributes that have experts."""
     load_phase: Literal["exclusive", "both"] = "exclusive"
@@ -62,9 +64,8 @@ def terms(
         out["dssim"] = dssim_term
     if w.scale != 0:
         out["volume"] = w.scale * volume(decoded.gaussians.scales)
-    on = step is None or (step >= w.opacity_from and (w.opacity_until is None or step <= w.opacity_until))
-    if w.opacity != 0 and on and decoded.raw_opacity is not None:
-        out["opacity"] = w.opacity * opacity_hinge(decoded.raw_opacity, w.tau)
+    if hinge_is_on(w, step) and decoded.raw_opacity is not None:
+        out["opacity"] = w.opacity * opacity_hinge(hinge_opacities(decoded, render, w), w.tau)
     if w.load != 0 and decoded.routing:
         out["load"] = w.load * load(decoded.routing, w)
     return out
@@ -165,6 +166,25 @@ class _Photometric(torch.autograd.Function):
         if by_l1 != by_dssim:  # the stored sum holds both terms in equal parts; L1's share is cheap to make again
             out = torch.add(out, (x - y).sign_(), alpha=(by_l1 - by_dssim) * ctx.l1_weight / x.numel())
         return out, None, None
+
+
+def hinge_is_on(w: Weights, step: int | None) -> bool:
+    """Whether the opacity hinge acts at `step` (None: its window is ignored)."""
+    return w.opacity != 0 and (step is None or (step >= w.opacity_from and (w.opacity_until is None or step <= w.opacity_until)))
+
+
+def hinge_opacities(decoded: Decoded, render: Render, w: Weights) -> Tensor:
+    """The raw opacities [.., K] that the hinge sees under `w.opacity_scope`. "all" expects them in `decoded.scene_opacity`."""
+    assert decoded.raw_opacity is not None
+    if w.opacity_scope == "visible":
+        return decoded.raw_opacity
+    if w.opacity_scope == "all":
+        if decoded.scene_opacity is None:
+            raise ValueError("expected decoded.scene_opacity for the hinge over all anchors, found none")
+        return decoded.scene_opacity
+    K = decoded.raw_opacity.shape[1]
+    drawn = torch.div(decoded.gaussians.source[render.radii > 0], K, rounding_mode="floor")
+    return decoded.raw_opacity[torch.isin(decoded.rows, drawn)]
 
 
 def volume(scales: Tensor) -> Tensor:

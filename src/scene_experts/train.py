@@ -19,7 +19,7 @@ from scene_experts import checkpoint
 from scene_experts.config import RunConfig, Train, to_json
 from scene_experts.data.capture import Capture
 from scene_experts.errors import InputError
-from scene_experts.losses import terms
+from scene_experts.losses import hinge_is_on, terms
 from scene_experts.render import Rasterizer
 from scene_experts.scene.anchors import AnchorScene
 from scene_experts.strategy.grow import Edit
@@ -254,6 +254,8 @@ def iterate(
     mask = None if frame.mask is None else frame.mask.to(run.device)
     background = torch.rand(3, generator=training.views) if cfg.random_background else torch.tensor(capture.background)
     decoded = scene(camera, training.step, True, rasterize.visible)
+    if cfg.loss.opacity_scope == "all" and hinge_is_on(cfg.loss, training.step):
+        decoded = replace(decoded, scene_opacity=scene.scene_opacity(camera, training.step))
     render = rasterize(decoded.gaussians, camera, background.to(run.device))
     parts = terms(decoded, render, target, cfg.loss, training.step, mask)
     loss = torch.stack(list(parts.values())).sum()

@@ -112,3 +112,4 @@ class Decoded:
     rows: Tensor  # [A] int64, rows of the table that were decoded
     raw_opacity: Tensor | None  # [A, K] before masking; None for explicit scenes
     routing: dict[str, Routing]  # by attribute; empty without experts
+    scene_opacity: Tensor | None = None  # [N, K] of every anchor, seen or not; only where the objective asks for it

@@ -174,6 +174,13 @@ class AnchorScene(nn.Module):
         )
         return Decoded(gaussians, rows, raw, routing)
 
+    def scene_opacity(self, camera: Camera, step: int) -> Tensor:
+        """Raw opacities [N, K] of every anchor from `camera`, whether it sees them or not."""
+        everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
+        feature, direction, distance = self.inputs(everyone, camera)
+        x = torch.cat([feature, direction] + ([distance] if "opacity" in self.config.add_dist else []), dim=1)
+        return self.heads["opacity"](x, feature, step, self.table.facts["xyz"] / self.extent)[0]
+
     def routing(self, step: int) -> dict[str, Routing]:
         """Routing of every anchor, by attribute: it does not depend on the camera."""
         feature, position = self.table.params["feature"], self.table.facts["xyz"] / self.extent

@@ -8,6 +8,7 @@ The losses that keep experts in use, L_load^S and L_load^D (eq. 6, 7), are in `l
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,6 +18,9 @@ from torch.nn import functional
 
 from scene_experts.scene.mlp import ACTIVATIONS, MLP, HeadWeights, linear_init
 from scene_experts.types import Routing
+
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,8 @@ class Experts:
             raise ValueError(f"expected top_k between 1 and the number of experts ({self.num}), found {self.top_k}")
         if self.num == 1 or attribute not in self.attributes:
             return MLP(attribute, inputs, hidden, outputs)
+        if self.top_k == 1 and self.router.renormalise and attribute == self.attributes[0]:
+            log.warning("with top_k 1 and renormalised weights the picture does not train the routers; only L_load does")
         return MixtureHead(self, attribute, inputs, hidden, outputs, feature)
 
 

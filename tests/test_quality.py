@@ -1,0 +1,75 @@
+"""Short real trainings on shipped data: the held-out score must not fall below what five seeds gave, and growth must pay.
+
+The record is made by this file: SCENE_EXPERTS_RECORD=1 python -m pytest tests/test_quality.py
+"""
+
+import json
+import os
+import statistics
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from scene_experts.config import Data, RunConfig
+from scene_experts.data.capture import load
+from scene_experts.evaluate.metrics import psnr
+from scene_experts.recipes import RECIPES
+from scene_experts.render import choose
+from scene_experts.train import Run, Training, train
+from synthetic import make_capture
+
+GOLDEN = Path(__file__).parent / "golden" / "quality.json"
+BRIGHTON = Path(__file__).parents[1] / "demo" / "brighton"
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    coloured = make_capture(tmp_path_factory.mktemp("coloured"), views=24)
+    loaded = {"brighton": load(BRIGHTON, resolution="factor:2"), "coloured": load(coloured.folder)}
+    yield loaded
+    for capture in loaded.values():
+        capture.images.close()
+
+
+def held_out(capture, recipe: str, seed: int = 0, grow: bool = True, monkeypatch=None) -> float:
+    """Mean PSNR of the held-out views after a whole schedule of 800 iterations."""
+    cfg = replace(RECIPES[recipe][1], iterations=800, seed=seed)
+    cfg = replace(cfg, growth=replace(cfg.growth, enabled=grow))
+    rasterize, last = choose("auto", "cpu", deterministic=True), {}
+
+    class Kept(Training):
+        def __init__(self, *args):
+            super().__init__(*args)
+            last["scene"] = self.scene
+
+    monkeypatch.setattr("scene_experts.train.Training", Kept)
+    for _ in train(cfg, Run(RunConfig(cfg, Data(capture.root))), capture, rasterize):
+        pass
+    with torch.no_grad():
+        scores = []
+        for i in capture.test:
+            camera, frame = capture.views[i].camera, capture.frame(i)
+            image = rasterize(last["scene"](camera, 800, False, rasterize.visible).gaussians, camera, torch.tensor(capture.background)).image
+            scores.append(psnr(image.clamp(0, 1), frame.rgb.float() / 255, frame.mask))
+    return statistics.mean(scores)
+
+
+@pytest.mark.parametrize("name", ["brighton", "coloured"])
+@pytest.mark.parametrize("recipe", ["scaffold-gs", "moe-gs"])
+def test_held_out_psnr_stays_within_three_sigma_of_the_recorded_seeds(name, recipe, captures, monkeypatch):
+    key = f"{recipe} on {name}"
+    if os.environ.get("SCENE_EXPERTS_RECORD"):
+        record = json.loads(GOLDEN.read_text()) if GOLDEN.exists() else {}
+        record[key] = [round(held_out(captures[name], recipe, seed, monkeypatch=monkeypatch), 4) for seed in range(5)]
+        GOLDEN.parent.mkdir(exist_ok=True)
+        GOLDEN.write_text(json.dumps(record, indent=1) + "\n")
+    seeds = json.loads(GOLDEN.read_text())[key]
+    floor = statistics.mean(seeds) - 3 * statistics.stdev(seeds)
+    assert held_out(captures[name], recipe, monkeypatch=monkeypatch) >= floor - 1e-3
+
+
+def test_growth_pays(captures, monkeypatch):
+    with_growth = held_out(captures["brighton"], "moe-gs", monkeypatch=monkeypatch)
+    assert with_growth > held_out(captures["brighton"], "moe-gs", grow=False, monkeypatch=monkeypatch) + 0.05
