@@ -5,6 +5,12 @@
 #include <mutex>
 #include <new>
 
+#if defined(__unix__) || defined(__APPLE__)
+#include <time.h>
+#else
+#include <chrono>
+#endif
+
 #include "export.h"
 
 namespace se::raster {
@@ -39,6 +45,31 @@ Spare& spare() {
   return *instance;
 }
 
+// Processor time of this thread where the system tells, so that a busy machine does not blur a benchmark.
+double now() {
+#if defined(__unix__) || defined(__APPLE__)
+  timespec t;
+  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
+  return static_cast<double>(t.tv_sec) + 1e-9 * static_cast<double>(t.tv_nsec);
+#else
+  return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+#endif
+}
+
+class Stages {
+ public:
+  explicit Stages(double* seconds) : seconds_(seconds), last_(now()) {}
+  void done() {
+    const double time = now();
+    *seconds_++ = time - last_;
+    last_ = time;
+  }
+
+ private:
+  double* seconds_;
+  double last_;
+};
+
 }  // namespace
 }  // namespace se::raster
 
@@ -71,9 +102,13 @@ SE_EXPORT int se_raster_forward(const SeRasterForward* a, void** state) {
     s->m = a->m;
     s->tiles_x = (a->camera.width + kTile - 1) / kTile;
     s->tiles_y = (a->camera.height + kTile - 1) / kTile;
+    Stages stages(s->seconds);
     project(*s, a->in, a->radii, a->threads);
+    stages.done();
     bin(*s, a->threads);
+    stages.done();
     blend(*s, a->background, a->out, a->threads);
+    stages.done();
     if (state)
       *state = s.release();
     else
@@ -91,8 +126,11 @@ SE_EXPORT int se_raster_backward(void* state, const SeRasterBackward* a) {
     // With many workers one row of sums per worker and Gaussian would take more memory than one per pair.
     const bool slots = a->deterministic || (a->threads > 4 && a->threads * s.visible > s.pairs);
     const int rows = slots ? 0 : std::max(1, a->threads);
+    Stages stages(s.seconds + 3);
     blend_backward(s, a->background, a->up, a->out.background, rows, a->threads);
+    stages.done();
     project_backward(s, a->in, a->out, rows, a->threads);
+    stages.done();
     return 0;
   } catch (const std::bad_alloc&) {
     spare().clear();
@@ -109,13 +147,13 @@ SE_EXPORT void se_raster_visible(const CameraArgs* camera, const float* means, c
   project_visible(*camera, means, scales, m, visible, threads);
 }
 
-// Sizes of the last forward pass, for benchmarks: visible Gaussians, (Gaussian, tile) pairs, (Gaussian, block) pairs.
-SE_EXPORT void se_raster_counts(const void* state, int64_t* counts) {
+// For benchmarks: [visible Gaussians, (Gaussian, tile) pairs, (Gaussian, block) pairs drawn] and the stages' seconds.
+SE_EXPORT void se_raster_counts(const void* state, int64_t* counts, double* seconds) {
   const State& s = *static_cast<const State*>(state);
-  counts[0] = s.visible;
-  counts[1] = s.pairs;
-  counts[2] = 0;
+  int64_t blocks = 0;
   for (int t = 0; t < s.tiles(); ++t)
     for (uint32_t k = 0; k < s.tile_used.data()[t]; ++k)
-      counts[2] += __builtin_popcount(s.masks.data()[s.tile_begin.data()[t] + k]);
+      blocks += __builtin_popcount(s.masks.data()[s.tile_begin.data()[t] + k]);
+  counts[0] = s.visible, counts[1] = s.pairs, counts[2] = blocks;
+  std::copy(s.seconds, s.seconds + 5, seconds);
 }

@@ -19,7 +19,10 @@ namespace se::raster {
 
 constexpr int kTile = 16;     // pixels
 constexpr int kChunk = 4096;  // Gaussians that one worker projects at a time; a multiple of 16
-constexpr int kBatch = 128;   // Gaussians of a tile worked on at a time, so that they stay in the first-level cache
+#ifndef SE_BATCH
+#define SE_BATCH 128
+#endif
+constexpr int kBatch = SE_BATCH;   // Gaussians of a tile worked on at a time, so that they stay in the first-level cache
 constexpr float kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
 constexpr float kMinAlphaLog2 = -7.994353437f;  // log2(1 / 255)
 constexpr float kWhiten = 0.84932180f;          // sqrt(log2(e) / 2)
@@ -91,11 +94,18 @@ struct State {
   Buffer<uint32_t> list;          // [pairs] places, per tile near to far
   Buffer<uint16_t> masks;         // [pairs] which of a tile's sixteen blocks the Gaussian touches
   Buffer<float> transmittance;    // [tiles * 256] what is left at the end, in block order
+  Buffer<float> checkpoints;      // [batches * 256] what is left before each batch but a tile's first, see checkpoint()
   Buffer<Sums> sums;              // backward: one row per place and worker, or (deterministic) per pair
   Buffer<uint32_t> slots;         // deterministic backward: first row of each place
   Buffer<double> background;      // backward: [tiles * 3]
 
+  double seconds[5] = {};  // processor time of the calling thread: project, bin, blend, blend backward, project backward
+
   int tiles() const { return tiles_x * tiles_y; }
+  // Where a tile's batches keep their checkpoints: no two tiles share one, and no table is needed.
+  float* checkpoint(int tile, int batch) const {
+    return checkpoints.data() + (static_cast<int64_t>(tile_begin.data()[tile]) / kBatch + tile + batch) * 256;
+  }
   int64_t places() const { return (m + kChunk - 1) / kChunk * kChunk; }
 };
 
@@ -108,8 +118,7 @@ struct Outputs {
 };
 
 struct Upstream {
-  const float *image, *depth;                 // the pictures that forward made
-  const float *g_image, *g_alpha, *g_depth;   // their gradients; null: zero
+  const float *image, *alpha, *depth;  // gradients of the outputs; null: zero
 };
 
 struct Gradients {

@@ -1,7 +1,8 @@
-// Backward blending, front to back like forward: with s_i = colour_i . g (and depth), the light behind Gaussian i is
-// rest_i = sum_{j > i} w_j s_j + T_final (...), which starts as the picture's own value and loses w_i s_i at each step, so
-//   d loss / d alpha_i = T_i s_i - rest_i / (1 - alpha_i),   W_i = alpha_i d loss / d alpha_i = d loss / d power_i.
-// All gradients of the ellipse are six moments of W over the pixels; sixteen Gaussians are buffered and reduced together, one per lane.
+// Backward blending. With s_i = colour_i . g (and depth) and behind_i what is seen behind Gaussian i, weighted alike,
+//   behind_(i-1) = alpha_i s_i + (1 - alpha_i) behind_i,   W_i = w_i (s_i - behind_i) = d loss / d power_i,   w_i = T_i alpha_i,
+// so nothing is divided and nothing cancels: for each batch, last one first, a pass near to far makes alpha_i and w_i from the checkpoint
+// that forward left, and a pass far to near makes W_i. All gradients of the ellipse are six moments of W over the pixels; sixteen Gaussians
+// are reduced together, one per lane.
 #include <algorithm>
 #include <cstring>
 
@@ -12,19 +13,20 @@ namespace se::raster {
 namespace {
 
 struct Pixels {
-  alignas(64) float through[256], rest[256], color[3][256], depth[256];  // color, depth: upstream gradients
+  alignas(64) float through[256], behind[256], color[3][256], depth[256];  // color, depth: upstream gradients
 };
 
 struct Work {
   Batch batch;
-  Sums sums[kBatch + 1];
+  F16 alpha[kBatch + 16], w[kBatch + 16];  // of one block's list
 };
 
-// Adds the sixteen Gaussians' sums over one block. `w`: T alpha, `W`: see above, each [16 Gaussians] of one block's pixels.
+// Adds the sixteen Gaussians' sums over one block. `weights` (w) and W are rows of pixels.
 template <bool Depth>
-void reduce(Work& work, const uint16_t* index, F16 (&w)[16], F16 (&W)[16], const Pixels& px, int block, const Tile& tile) {
-  F16 out[16];
+void reduce(Batch& batch, int first, const F16* weights, F16 (&W)[16], const Pixels& px, int block, const Tile& tile) {
+  F16 out[16], w[16];
   const int at = block * 16;
+  std::copy(weights, weights + 16, w);
   transpose(w);
   F16 red = bcast(0.0f), green = red, blue = red, depth = red;
   for (int l = 0; l < 16; ++l) {
@@ -52,10 +54,8 @@ void reduce(Work& work, const uint16_t* index, F16 (&w)[16], F16 (&W)[16], const
   const F16 mxy = fma(three, row1[3] - row1[0], row1[2] - row1[1]) * quarter;
 
   // To moments about each Gaussian's centre.
-  alignas(64) float u[16], v[16];
-  for (int k = 0; k < 16; ++k) u[k] = work.batch.head[index[k]][5], v[k] = work.batch.head[index[k]][6];
-  const F16 dx = load(u) - bcast(tile.centre_x + 4.0f * static_cast<float>(block % 4) - 6.0f);
-  const F16 dy = load(v) - bcast(tile.centre_y + 4.0f * static_cast<float>(block / 4) - 6.0f);
+  const F16 dx = load(batch.list_u + first) - bcast(tile.centre_x + 4.0f * static_cast<float>(block % 4) - 6.0f);
+  const F16 dy = load(batch.list_v + first) - bcast(tile.centre_y + 4.0f * static_cast<float>(block / 4) - 6.0f);
   const F16 sx = dx * m - mx, sy = dy * m - my;
   out[kS] = m, out[kSx] = sx, out[kSy] = sy;
   out[kSxx] = fma(dx, sx - mx, mxx);
@@ -64,90 +64,96 @@ void reduce(Work& work, const uint16_t* index, F16 (&w)[16], F16 (&W)[16], const
   for (int k = 10; k < 16; ++k) out[k] = bcast(0.0f);
   transpose(out);
   for (int k = 0; k < 16; ++k) {
-    float* sums = work.sums[index[k]].x;
+    float* sums = batch.row(batch.list[first + k]).sums;
     store(sums, load(sums) + out[k]);
   }
 }
 
-template <bool Depth>
-void block_backward(Work& work, int count, int block, Pixels& px, const Tile& tile, const Exp2& exp2) {
+// alpha and w of the block's list, near to far; returns how many until all pixels had stopped.
+int weigh(Work& work, int count, int block, const float* checkpoint, const Exp2& exp2) {
   const Batch& batch = work.batch;
   const F16 y = block_y(block / 4), limit = bcast(kMinAlphaLog2), most = bcast(kMaxAlpha), stop = bcast(kMinTransmittance);
-  const F16 one = bcast(1.0f), zero = bcast(0.0f);
-  const int at = block * 16, column = block % 4;
-  F16 through = load(px.through + at), rest = load(px.rest + at);
-  const F16 red = load(px.color[0] + at), green = load(px.color[1] + at), blue = load(px.color[2] + at), depth = load(px.depth + at);
-  for (int first = 0; first < count; first += 16) {
-    F16 w[16], W[16];
-    const uint16_t* index = batch.list + first;
-    const int group = std::min(16, count - first);
-    int i = 0;
-    for (; i < group; i += 4) {
-      F16 alpha[4];
-      M16 smooth[4];
-      for (int k = 0; k < 4; ++k) {
-        const F16 p = log_alpha(batch, index[i + k], column, y), value = exp2(p);
-        alpha[k] = min_keep(ge(p, limit), value, most);
-        smooth[k] = gt(most, alpha[k]);
-      }
-      for (int k = 0; k < 4; ++k) {
-        const float* head = batch.head[index[i + k]];
-        const F16 clear = one - alpha[k], next = through * clear;
-        const M16 drawn = ge(next, stop);
-        w[i + k] = mul_keep(drawn, through, alpha[k]);
-        F16 s = fma(red, bcast(head[1]), fma(green, bcast(head[2]), blue * bcast(head[3])));
-        if constexpr (Depth) s = fma(depth, bcast(head[4]), s);
-        const F16 seen = w[i + k] * s;
-        rest = rest - seen;
-        W[i + k] = keep(drawn & smooth[k], fnma(rest, alpha[k] * reciprocal(clear), seen));
-        through = next;
-      }
+  const F16 one = bcast(1.0f);
+  const int column = block % 4;
+  F16 through = load(checkpoint + block * 16);
+  int i = 0;
+  for (bool alive = true; i < count && alive; i += 4) {
+    F16 alpha[4];
+    for (int k = 0; k < 4; ++k) {
+      const F16 p = log_alpha(batch.row(batch.list[i + k]), column, y);
+      alpha[k] = min_keep(ge(p, limit), exp2(p), most);
     }
-    for (; i < 16; ++i) w[i] = zero, W[i] = zero;
-    reduce<Depth>(work, index, w, W, px, block, tile);
-    if (!any(ge(through, stop))) break;
+    for (int k = 0; k < 4; ++k) {
+      const F16 next = through * (one - alpha[k]);
+      const M16 drawn = ge(next, stop);
+      work.w[i + k] = mul_keep(drawn, through, alpha[k]);
+      work.alpha[i + k] = keep(drawn, alpha[k]);
+      through = next;
+    }
+    alive = any(ge(through, stop));
   }
-  store(px.through + at, through), store(px.rest + at, rest);
+  return i;
 }
 
-// Upstream gradients of a tile in block order, the starting value of `rest`, and the background's gradient.
+template <bool Depth>
+void block_backward(Work& work, int count, int block, const float* checkpoint, Pixels& px, const Tile& tile, const Exp2& exp2) {
+  Batch& batch = work.batch;
+  count = weigh(work, count, block, checkpoint, exp2);
+  const F16 most = bcast(kMaxAlpha), zero = bcast(0.0f);
+  const int at = block * 16;
+  F16 behind = load(px.behind + at);
+  const F16 red = load(px.color[0] + at), green = load(px.color[1] + at), blue = load(px.color[2] + at), depth = load(px.depth + at);
+  for (int i = count; i < (count + 15) / 16 * 16; ++i) work.w[i] = work.alpha[i] = zero;
+  for (int first = (count - 1) / 16 * 16; first >= 0; first -= 16) {
+    F16 W[16];
+    for (int i = 15; i >= 0; --i) {
+      const Row& row = batch.row(batch.list[first + i]);
+      F16 s = fma(red, bcast(row.r), fma(green, bcast(row.g), blue * bcast(row.b)));
+      if constexpr (Depth) s = fma(depth, bcast(row.z), s);
+      const F16 more = s - behind, alpha = work.alpha[first + i];
+      W[i] = mul_keep(gt(most, alpha), work.w[first + i], more);
+      behind = fma(alpha, more, behind);
+    }
+    reduce<Depth>(batch, first, work.w + first, W, px, block, tile);
+  }
+  store(px.behind + at, behind);
+}
+
+// Upstream gradients of a tile in block order, what is seen behind everything, and the background's gradient.
 void begin_tile(State& s, int number, const Tile& tile, const float* background, const Upstream& up, Pixels& px) {
-  alignas(64) float image[3][256], depth[256], alpha[256];
-  (void)background;
-  if (up.g_image) {
-    load_tile<3>(up.g_image, s.camera, tile, px.color);
-    load_tile<3>(up.image, s.camera, tile, image);
-  } else {
-    std::memset(px.color, 0, sizeof px.color);
-    std::memset(image, 0, sizeof image);
-  }
-  if (up.g_depth) {
-    load_tile<1>(up.g_depth, s.camera, tile, &px.depth);
-    load_tile<1>(up.depth, s.camera, tile, &depth);
-  } else {
-    std::memset(px.depth, 0, sizeof px.depth);
-    std::memset(depth, 0, sizeof depth);
-  }
-  if (up.g_alpha)
-    load_tile<1>(up.g_alpha, s.camera, tile, &alpha);
+  const auto read = [&](const float* picture, float (*planes)[256]) {
+    if (picture)
+      load_tile<1>(picture, s.camera, tile, planes);
+    else
+      std::memset(planes, 0, 256 * sizeof(float));
+  };
+  if (up.image)
+    load_tile<3>(up.image, s.camera, tile, px.color);
   else
-    std::memset(alpha, 0, sizeof alpha);
+    std::memset(px.color, 0, sizeof px.color);
+  read(up.depth, &px.depth);
+  alignas(64) float alpha[1][256];
+  read(up.alpha, alpha);
   inside(s.camera, tile, px.through);
   const float* left = s.transmittance.data() + number * 256;
-  double total[3] = {0, 0, 0};
+  F16 total[3] = {bcast(0.0f), bcast(0.0f), bcast(0.0f)};
   for (int k = 0; k < 256; k += 16) {
-    F16 rest = load(px.depth + k) * load(depth + k);
+    F16 behind = bcast(0.0f) - load(alpha[0] + k);
     const F16 l = load(left + k);
     for (int c = 0; c < 3; ++c) {
       const F16 g = load(px.color[c] + k);
-      rest = fma(g, load(image[c] + k), rest);
-      alignas(64) float product[16];
-      store(product, g * l);
-      for (float value : product) total[c] += value;
+      behind = fma(g, bcast(background[c]), behind);
+      total[c] = fma(g, l, total[c]);
     }
-    store(px.rest + k, fnma(l, load(alpha + k), rest));
+    store(px.behind + k, behind);
   }
-  for (int c = 0; c < 3; ++c) s.background.data()[number * 3 + c] = total[c];
+  for (int c = 0; c < 3; ++c) {
+    alignas(64) float lane[16];
+    store(lane, total[c]);
+    double sum = 0;
+    for (const float value : lane) sum += value;
+    s.background.data()[number * 3 + c] = sum;
+  }
 }
 
 // Where a batch's sums go: added to the worker's own rows, or (slots) stored in the row of this Gaussian and tile.
@@ -158,11 +164,11 @@ struct Sink {
     const Rect r = s.rects.data()[place];
     return s.sums.data()[s.slots.data()[place] + static_cast<uint32_t>((tile.y - r.y0) * (r.x1 - r.x0) + tile.x - r.x0)];
   }
-  void add(uint32_t place, const Tile& tile, const Sums& sums) const {
+  void add(uint32_t place, const Tile& tile, const float* sums) const {
     if (own)
-      store(own[place].x, load(own[place].x) + load(sums.x));
+      store(own[place].x, load(own[place].x) + load(sums));
     else
-      store(slot(place, tile).x, load(sums.x));
+      store(slot(place, tile).x, load(sums));
   }
 };
 
@@ -171,23 +177,27 @@ void tile_backward(State& s, int number, Work& work, const float* background, co
   const Tile tile = tile_at(s, number);
   Pixels px;
   begin_tile(s, number, tile, background, up, px);
-  const uint32_t begin = s.tile_begin.data()[number], end = begin + s.tile_used.data()[number];
+  const uint32_t begin = s.tile_begin.data()[number], used = s.tile_used.data()[number], end = begin + used;
   Batch& batch = work.batch;
-  for (uint32_t at = begin; at < end; at += kBatch) {
+  for (int index = static_cast<int>((used + kBatch - 1) / kBatch) - 1; index >= 0; --index) {
+    const uint32_t at = begin + static_cast<uint32_t>(index) * kBatch;
     const int n = static_cast<int>(std::min<uint32_t>(kBatch, end - at));
-    const uint32_t* places = s.list.data() + at;
-    batch.load_rows(s.records.data(), places, n, tile);
-    std::copy(s.masks.data() + at, s.masks.data() + at + n, batch.masks);
-    std::fill(batch.masks + n, batch.masks + std::min(kBatch, (n + 15) / 16 * 16), static_cast<uint16_t>(0));
-    std::memset(work.sums, 0, static_cast<size_t>(n) * sizeof(Sums));
+    const uint32_t* from = s.list.data() + at;
+    batch.load_rows(s.records.data(), from, n, 0, tile);
     uint32_t touched = 0;
-    for (int k = 0; k < n; ++k) touched |= batch.masks[k];
+    for (int k = 0; k < n; ++k) {
+      batch.masks[k] = s.masks.data()[at + k];
+      touched |= s.masks.data()[at + k];
+      store(batch.rows[k].sums, bcast(0.0f));
+    }
+    for (int k = n; k < (n + 15) / 16 * 16; ++k) batch.masks[k] = 0;
+    const float* checkpoint = index > 0 ? s.checkpoint(number, index) : px.through;
     for (; touched; touched &= touched - 1) {
       const int b = __builtin_ctz(touched);
-      block_backward<Depth>(work, batch.block_list(n, b), b, px, tile, exp2);
+      block_backward<Depth>(work, batch.list_block<true>(n, b), b, checkpoint, px, tile, exp2);
     }
     for (int k = 0; k < n; ++k)
-      if (!sink.own || batch.masks[k]) sink.add(places[k], tile, work.sums[k]);
+      if (!sink.own || batch.masks[k]) sink.add(from[k], tile, batch.rows[k].sums);
   }
   if (!sink.own)
     for (uint32_t at = end; at < s.tile_begin.data()[number + 1]; ++at)
@@ -231,7 +241,7 @@ void blend_backward(State& s, const float* background, const Upstream& up, float
     const Exp2 exp2;
     const Sink sink{s, rows ? s.sums.data() + worker * s.places() : nullptr};
     for (int64_t t = begin; t < end; ++t) {
-      if (up.g_depth)
+      if (up.depth)
         tile_backward<true>(s, static_cast<int>(t), work, background, up, sink, exp2);
       else
         tile_backward<false>(s, static_cast<int>(t), work, background, up, sink, exp2);

@@ -21,22 +21,23 @@ bool blend_block(const Batch& batch, int count, int block, Pixels& px, const Exp
   F16 red = load(px.color[0] + at), green = load(px.color[1] + at), blue = load(px.color[2] + at);
   bool alive = true;
   for (int i = 0; i < count && alive; i += 4) {
+    const Row* row[4];
     F16 alpha[4];
     for (int k = 0; k < 4; ++k) {
-      const F16 p = log_alpha(batch, batch.list[i + k], column, y);
+      row[k] = &batch.row(batch.list[i + k]);
+      const F16 p = log_alpha(*row[k], column, y);
       alpha[k] = min_keep(ge(p, limit), exp2(p), most);
     }
     for (int k = 0; k < 4; ++k) {
-      const float* head = batch.head[batch.list[i + k]];
       const F16 next = through * (one - alpha[k]);
       const M16 drawn = ge(next, stop);
       const F16 weight = mul_keep(drawn, through, alpha[k]);
       left = select(drawn, next, left);
       through = next;
-      red = fma(weight, bcast(head[1]), red);
-      green = fma(weight, bcast(head[2]), green);
-      blue = fma(weight, bcast(head[3]), blue);
-      depth = fma(weight, bcast(head[4]), depth);
+      red = fma(weight, bcast(row[k]->r), red);
+      green = fma(weight, bcast(row[k]->g), green);
+      blue = fma(weight, bcast(row[k]->b), blue);
+      depth = fma(weight, bcast(row[k]->z), depth);
     }
     alive = any(ge(through, stop));
   }
@@ -70,13 +71,14 @@ void blend_tile(State& s, int number, Batch& batch, const float* background, con
   uint32_t at = begin;
   while (at < end && alive) {
     const int n = static_cast<int>(std::min<uint32_t>(kBatch, end - at));
-    const uint32_t* places = s.list.data() + at;
-    batch.load_rows(s.records.data(), places, n, tile);
-    batch.touch_blocks(s.records.data(), places, n, tile);
+    const uint32_t* from = s.list.data() + at;
+    if (at > begin) std::copy(px.through, px.through + 256, s.checkpoint(number, static_cast<int>((at - begin) / kBatch)));
+    batch.load_rows(s.records.data(), from, n, static_cast<int>(std::min<uint32_t>(24, end - at - static_cast<uint32_t>(n))), tile);
+    batch.touch_blocks(s.records.data(), from, n, tile);
     for (int k = 0; k < n; ++k) s.masks.data()[at + k] = static_cast<uint16_t>(batch.masks[k] & alive);
     for (uint32_t blocks = alive; blocks; blocks &= blocks - 1) {
       const int b = __builtin_ctz(blocks);
-      const int count = batch.block_list(n, b);
+      const int count = batch.list_block<false>(n, b);
       if (count > 0 && !blend_block(batch, count, b, px, exp2)) alive &= ~(1u << b);
     }
     at += static_cast<uint32_t>(n);
@@ -89,6 +91,7 @@ void blend_tile(State& s, int number, Batch& batch, const float* background, con
 
 void blend(State& s, const float* background, const Outputs& out, int threads) {
   s.transmittance.get(static_cast<size_t>(s.tiles()) * 256);
+  s.checkpoints.get(static_cast<size_t>(s.pairs / kBatch + s.tiles() + 1) * 256);
   parallel_for(s.tiles(), 2, threads, [&](int64_t begin, int64_t end, int) {
     thread_local Batch batch;
     const Exp2 exp2;

@@ -87,39 +87,52 @@ inline void split_exponent(F16 a, F16& m, F16& e) {
   split_exponent_half(a.hi, m.hi, e.hi);
 }
 
-inline int append(uint16_t* list, int base, M16 m) {
-  // For each of 256 masks the byte positions of the set lanes' 16-bit numbers, packed to the front.
-  static const auto table = [] {
-    struct { alignas(16) uint8_t x[256][16]; } t{};
-    for (int mask = 0; mask < 256; ++mask) {
-      int at = 0;
-      for (int lane = 0; lane < 8; ++lane)
-        if (mask >> lane & 1) {
-          t.x[mask][at++] = static_cast<uint8_t>(2 * lane);
-          t.x[mask][at++] = static_cast<uint8_t>(2 * lane + 1);
-        }
-    }
+// For each of 256 masks the numbers of its set lanes, packed to the front.
+struct Packing {
+  alignas(32) int32_t lane[256][8];
+};
+inline const Packing& packing() {
+  static const Packing table = [] {
+    Packing t{};
+    for (int mask = 0; mask < 256; ++mask)
+      for (int lane = 0, at = 0; lane < 8; ++lane)
+        if (mask >> lane & 1) t.lane[mask][at++] = lane;
     return t;
   }();
-  const uint32_t all = bits(m);
-  const __m128i lane = _mm_add_epi16(_mm_setr_epi16(0, 1, 2, 3, 4, 5, 6, 7), _mm_set1_epi16(static_cast<int16_t>(base)));
-  const __m128i lo = _mm_shuffle_epi8(lane, _mm_load_si128(reinterpret_cast<const __m128i*>(table.x[all & 255])));
-  const __m128i hi =
-      _mm_shuffle_epi8(_mm_add_epi16(lane, _mm_set1_epi16(8)), _mm_load_si128(reinterpret_cast<const __m128i*>(table.x[all >> 8])));
-  _mm_storeu_si128(reinterpret_cast<__m128i*>(list), lo);
-  const int first = __builtin_popcount(all & 255);
-  _mm_storeu_si128(reinterpret_cast<__m128i*>(list + first), hi);
-  return first + __builtin_popcount(all >> 8);
+  return table;
 }
 
-// Lanes whose 16-bit word has bit `b` set.
-inline M16 test_bit(const uint16_t* words, int b) {
-  const __m256i bit = _mm256_set1_epi32(1 << b);
-  const __m256i lo = _mm256_cvtepu16_epi32(_mm_loadu_si128(reinterpret_cast<const __m128i*>(words)));
-  const __m256i hi = _mm256_cvtepu16_epi32(_mm_loadu_si128(reinterpret_cast<const __m128i*>(words + 8)));
-  return {_mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(lo, bit), bit)),
-          _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(hi, bit), bit))};
+inline void compress(float* to, F16 a, M16 m) {
+  const Packing& table = packing();
+  const uint32_t lo = static_cast<uint32_t>(_mm256_movemask_ps(m.lo)), hi = static_cast<uint32_t>(_mm256_movemask_ps(m.hi));
+  const auto pack = [&](__m256 v, uint32_t mask) {
+    return _mm256_permutevar8x32_ps(v, _mm256_load_si256(reinterpret_cast<const __m256i*>(table.lane[mask])));
+  };
+  _mm256_storeu_ps(to, pack(a.lo, lo));
+  _mm256_storeu_ps(to + __builtin_popcount(lo), pack(a.hi, hi));
 }
+
+inline M16 test_bit(const int32_t* words, int b) {
+  const __m256i bit = _mm256_set1_epi32(1 << b);
+  const auto half = [&](const int32_t* p) {
+    const __m256i w = _mm256_load_si256(reinterpret_cast<const __m256i*>(p));
+    return _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(w, bit), bit));
+  };
+  return {half(words), half(words + 8)};
+}
+
+struct Words {
+  __m256i lo = _mm256_setzero_si256(), hi = lo;
+  void set(M16 m, int b) {
+    const __m256i bit = _mm256_set1_epi32(1 << b);
+    lo = _mm256_or_si256(lo, _mm256_and_si256(_mm256_castps_si256(m.lo), bit));
+    hi = _mm256_or_si256(hi, _mm256_and_si256(_mm256_castps_si256(m.hi), bit));
+  }
+  void store(int32_t* p) const {
+    _mm256_store_si256(reinterpret_cast<__m256i*>(p), lo);
+    _mm256_store_si256(reinterpret_cast<__m256i*>(p + 8), hi);
+  }
+};
 
 inline void transpose8(__m256 (&r)[8]) {
   __m256 t[8], s[8];

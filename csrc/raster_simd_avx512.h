@@ -40,33 +40,30 @@ inline uint32_t bits(M16 m) { return m.m; }
 inline bool any(M16 m) { return m.m != 0; }
 inline void store_int(int32_t* p, F16 a) { _mm512_storeu_si512(p, _mm512_cvttps_epi32(a.v)); }
 
-// 2^p: nearest multiple of 1/32 from a table held in two registers, the rest from a quadratic; 1.5 * 2^18 puts the multiple in the low
-// bits of a float's mantissa, and the table's entries are short of the exponent that those bits carry over.
+// 2^p: nearest multiple of 1/16 from a table held in a register, the rest from a quadratic; 1.5 * 2^19 puts the multiple in the low bits
+// of a float's mantissa, and the table's entries are short of the exponent that those bits carry over.
 struct Exp2 {
-  __m512 lo, hi;
+  __m512 table;
   Exp2() {
-    alignas(64) static const auto table = [] {
-      struct { int32_t x[32]; } t{};
-      for (int i = 0; i < 32; ++i) {
-        const float power = static_cast<float>(__builtin_exp2(i / 32.0));
-        __builtin_memcpy(&t.x[i], &power, 4);
-        t.x[i] -= i << 18;
-      }
-      return t;
-    }();
-    lo = _mm512_load_ps(reinterpret_cast<const float*>(table.x));
-    hi = _mm512_load_ps(reinterpret_cast<const float*>(table.x + 16));
+    alignas(64) int32_t entry[16];
+    for (int i = 0; i < 16; ++i) {
+      const float power = static_cast<float>(__builtin_exp2(i / 16.0));
+      __builtin_memcpy(&entry[i], &power, 4);
+      entry[i] -= i << 19;
+    }
+    table = _mm512_load_ps(reinterpret_cast<const float*>(entry));
   }
   F16 operator()(F16 p) const {
-    const __m512 magic = _mm512_set1_ps(393216.0f);  // 1.5 * 2^18
+    const __m512 magic = _mm512_set1_ps(786432.0f);  // 1.5 * 2^19
     const __m512 rounded = _mm512_add_ps(p.v, magic);
     const __m512 f = _mm512_sub_ps(p.v, _mm512_sub_ps(rounded, magic));
     const __m512i index = _mm512_castps_si512(rounded);
-    const __m512 entry = _mm512_permutex2var_ps(lo, index, hi);
-    const __m512 scale = _mm512_castsi512_ps(_mm512_add_epi32(_mm512_castps_si512(entry), _mm512_slli_epi32(index, 18)));
-    const __m512 q = _mm512_fmadd_ps(f, _mm512_set1_ps(0.2402265f), _mm512_set1_ps(0.69314718f));
+    const __m512i entry = _mm512_castps_si512(_mm512_permutexvar_ps(index, table));
+    const __m512 scale = _mm512_castsi512_ps(_mm512_add_epi32(entry, _mm512_slli_epi32(index, 19)));
+    const __m512 q = _mm512_fmadd_ps(f, _mm512_set1_ps(kQuadratic), _mm512_set1_ps(kLinear));
     return {_mm512_mul_ps(scale, _mm512_fmadd_ps(q, f, _mm512_set1_ps(1.0f)))};
   }
+  static constexpr float kLinear = 0.69318771f, kQuadratic = 0.24022643f;  // least largest relative error on [-1/32, 1/32]
 };
 
 inline F16 reciprocal(F16 a) {
@@ -82,18 +79,17 @@ inline void split_exponent(F16 a, F16& m, F16& e) {
   e.v = _mm512_mask_add_ps(up, _mm512_cmp_ps_mask(mant, _mm512_set1_ps(1.5f), _CMP_GE_OQ), up, _mm512_set1_ps(1.0f));
 }
 
-inline int append(uint16_t* list, int base, M16 m) {
-  const __m512i lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-  const __m512i index = _mm512_maskz_compress_epi32(m.m, _mm512_add_epi32(lane, _mm512_set1_epi32(base)));
-  _mm256_storeu_si256(reinterpret_cast<__m256i*>(list), _mm512_cvtepi32_epi16(index));
-  return __builtin_popcount(m.m);
+inline void compress(float* to, F16 a, M16 m) { _mm512_storeu_ps(to, _mm512_maskz_compress_ps(m.m, a.v)); }
+
+inline M16 test_bit(const int32_t* words, int b) {
+  return {_mm512_test_epi32_mask(_mm512_load_si512(words), _mm512_set1_epi32(1 << b))};
 }
 
-// Lanes whose 16-bit word has bit `b` set.
-inline M16 test_bit(const uint16_t* words, int b) {
-  const __m512i w = _mm512_cvtepu16_epi32(_mm256_loadu_si256(reinterpret_cast<const __m256i*>(words)));
-  return {_mm512_test_epi32_mask(w, _mm512_set1_epi32(1 << b))};
-}
+struct Words {
+  __m512i v = _mm512_setzero_si512();
+  void set(M16 m, int b) { v = _mm512_mask_or_epi32(v, m.m, v, _mm512_set1_epi32(1 << b)); }
+  void store(int32_t* p) const { _mm512_store_si512(p, v); }
+};
 
 inline void transpose(F16 (&r)[16]) {
   __m512 t[16];

@@ -118,18 +118,25 @@ inline void split_exponent(F16 a, F16& m, F16& e) {
   }
 }
 
-inline int append(uint16_t* list, int base, M16 m) {
-  int at = 0;
-  for (uint32_t left = bits(m); left; left &= left - 1) list[at++] = static_cast<uint16_t>(base + __builtin_ctz(left));
-  return at;
+inline void compress(float* to, F16 a, M16 m) {
+  for (uint32_t left = bits(m); left; left &= left - 1) {
+    const int k = __builtin_ctz(left);
+    *to++ = a.v[k / 4][k % 4];
+  }
 }
 
-// Lanes whose 16-bit word has bit `b` set.
-inline M16 test_bit(const uint16_t* words, int b) {
+inline M16 test_bit(const int32_t* words, int b) {
   M16 r;
-  for (int k = 0; k < 16; ++k) r.v[k / 4][k % 4] = -(words[k] >> b & 1);
+  std::memcpy(&r, words, 64);
+  SE_EACH r.v[i] = -(r.v[i] >> b & 1);
   return r;
 }
+
+struct Words {
+  M16 w{};
+  void set(M16 m, int b) { SE_EACH w.v[i] |= m.v[i] & (1 << b); }
+  void store(int32_t* p) const { std::memcpy(p, &w, 64); }
+};
 
 inline void transpose(F16 (&r)[16]) {
   float t[16][16], s[16][16];

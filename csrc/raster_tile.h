@@ -3,6 +3,7 @@
 // Block b of a tile is 4 x 4 pixels, column b % 4, row b / 4; lane l of its F16 is the pixel in column l % 4, row l / 4. Coordinates are
 // relative to the tile's centre. Both directions of the blending run `alpha` on the same numbers, so they agree to the last bit.
 #pragma once
+#include <algorithm>
 #include <cstring>
 
 #include "raster.h"
@@ -15,27 +16,47 @@ struct Tile {
   float centre_x, centre_y;  // px
 };
 
+// One Gaussian of a batch, as the tile's blocks read it.
+struct alignas(64) Row {
+  float height[16], slope[16];  // by column of the tile, see raster.h
+  float l1, r, g, b, z, spare[11];
+  float sums[16];  // backward: what blocks have added up so far
+};
+
 struct Batch {
-  // One row beyond the end is a Gaussian that draws nothing, which fills up lists to whole groups.
-  alignas(64) float height[kBatch + 1][16];
-  alignas(64) float slope[kBatch + 1][16];
-  alignas(32) float head[kBatch + 1][8];  // the first half of the record: l1, r, g, b, z, u, v, log_opacity
-  alignas(64) uint16_t masks[kBatch];
-  alignas(64) uint16_t list[kBatch + 32];
+  Row rows[kBatch + 1];  // one beyond the end is a Gaussian that draws nothing, which fills up lists to whole groups
+  alignas(64) int32_t masks[kBatch];
+  alignas(64) float u[kBatch], v[kBatch];
+  alignas(64) int32_t places[kBatch];  // bytes from `rows` to each row
+  // The current block's Gaussians, near to far: bytes from `rows`, and centres.
+  alignas(64) int32_t list[kBatch + 32];
+  alignas(64) float list_u[kBatch + 32], list_v[kBatch + 32];
 
   Batch() {
-    for (int k = 0; k < 16; ++k) height[kBatch][k] = -1000.0f, slope[kBatch][k] = 0.0f;
-    for (float& value : head[kBatch]) value = 0.0f;
+    Row& blank = rows[kBatch];
+    for (float& height : blank.height) height = -1000.0f;
+    for (float& slope : blank.slope) slope = 0.0f;
+    blank.l1 = blank.r = blank.g = blank.b = blank.z = 0.0f;
+    for (int k = 0; k < kBatch; ++k) places[k] = k * static_cast<int32_t>(sizeof(Row)), u[k] = v[k] = 0.0f;
   }
 
-  void load_rows(const Record* records, const uint32_t* places, int n, const Tile& tile);
-  void touch_blocks(const Record* records, const uint32_t* places, int n, const Tile& tile);
+  const Row& row(int32_t place) const { return *reinterpret_cast<const Row*>(reinterpret_cast<const char*>(rows) + place); }
+  Row& row(int32_t place) { return *reinterpret_cast<Row*>(reinterpret_cast<char*>(rows) + place); }
 
-  // The Gaussians of the batch that touch block b, near to far, filled up to a multiple of 16; returns how many without the filling.
-  int block_list(int n, int b) {
+  void load_rows(const Record* records, const uint32_t* from, int n, int ahead, const Tile& tile);
+  void touch_blocks(const Record* records, const uint32_t* from, int n, const Tile& tile);
+
+  // Lists the Gaussians of the batch that touch block b, filled up to a multiple of 16; returns how many without the filling.
+  template <bool Centres>
+  int list_block(int n, int b) {
     int count = 0;
-    for (int i = 0; i < n; i += 16) count += append(list + count, i, test_bit(masks + i, b));
-    for (int k = 0; k < 16; ++k) list[count + k] = kBatch;
+    for (int i = 0; i < n; i += 16) {
+      const M16 m = test_bit(masks + i, b);
+      compress(reinterpret_cast<float*>(list + count), load(reinterpret_cast<const float*>(places + i)), m);
+      if constexpr (Centres) compress(list_u + count, load(u + i), m), compress(list_v + count, load(v + i), m);
+      count += __builtin_popcount(bits(m));
+    }
+    for (int k = 0; k < 16; ++k) list[count + k] = kBatch * static_cast<int32_t>(sizeof(Row));
     return count;
   }
 };
@@ -52,24 +73,28 @@ inline F16 block_y(int block_row) {
   return load(y) + bcast(4.0f * static_cast<float>(block_row));
 }
 
-inline void Batch::load_rows(const Record* records, const uint32_t* places, int n, const Tile& tile) {
+// `ahead`: how many of the tile's Gaussians follow, so that they can be fetched early.
+inline void Batch::load_rows(const Record* records, const uint32_t* from, int n, int ahead, const Tile& tile) {
   const F16 columns = load(lane_x());
   for (int k = 0; k < n; ++k) {
-    const Record& r = records[places[k]];
+    __builtin_prefetch(&records[from[std::min(k + 24, n + ahead - 1)]]);
+    const Record& r = records[from[k]];
+    Row& row = rows[k];
     const F16 dx = bcast(r.u - tile.centre_x) - columns, f = bcast(r.l3) * dx;
-    store(height[k], fnma(f, f, bcast(r.log_opacity)));
-    store(slope[k], fma(bcast(r.l2), dx, bcast(r.l1 * (r.v - tile.centre_y))));
-    std::memcpy(head[k], &r, 32);
+    store(row.height, fnma(f, f, bcast(r.log_opacity)));
+    store(row.slope, fma(bcast(r.l2), dx, bcast(r.l1 * (r.v - tile.centre_y))));
+    std::memcpy(&row.l1, &r, 32);
+    u[k] = r.u, v[k] = r.v;
   }
 }
 
 // Exact test of ellipse against block: the least distance over the box of its pixel centres lies on one of the two sides that face the
 // centre, and on a side it is where the ellipse is tangent to it, or at its end. Sixteen Gaussians per lane.
-inline void Batch::touch_blocks(const Record* records, const uint32_t* places, int n, const Tile& tile) {
+inline void Batch::touch_blocks(const Record* records, const uint32_t* from, int n, const Tile& tile) {
   const F16 zero = bcast(0.0f);
   for (int i = 0; i < n; i += 16) {
     F16 c[16];
-    for (int k = 0; k < 16; ++k) c[k] = load(&records[places[i + k < n ? i + k : n - 1]].l1);
+    for (int k = 0; k < 16; ++k) c[k] = load(&records[from[i + k < n ? i + k : n - 1]].l1);
     transpose(c);
     const F16 l1 = c[0], l2 = c[8], l3 = c[9], U = c[5] - bcast(tile.centre_x), V = c[6] - bcast(tile.centre_y);
     const F16 limit = c[7] - bcast(kMinAlphaLog2 - 1e-3f);  // the slack covers rounding
@@ -84,26 +109,22 @@ inline void Batch::touch_blocks(const Record* records, const uint32_t* places, i
       near_f2[k] = f * f, near_e[k] = l2 * dx, best_y[k] = per_x * dx;
       far_e[k] = l1 * dy, best_x[k] = per_y * dy;
     }
-    alignas(64) uint32_t of_block[16];
+    Words words;
     for (int b = 0; b < 16; ++b) {
       const int x = b % 4, y = b / 4;
       const F16 e1 = fma(l1, min(max(best_y[x], lo_y[y]), hi_y[y]), near_e[x]);
       const F16 dx = min(max(best_x[y], lo_x[x]), hi_x[x]), e2 = fma(l2, dx, far_e[y]), f2 = l3 * dx;
-      of_block[b] = bits(ge(limit, min(fma(e1, e1, near_f2[x]), fma(e2, e2, f2 * f2))));
+      words.set(ge(limit, min(fma(e1, e1, near_f2[x]), fma(e2, e2, f2 * f2))), b);
     }
-    // 16 blocks x 16 Gaussians of bits, turned around.
-    for (int k = 0; k < 16; ++k) {
-      uint32_t mask = 0;
-      for (int b = 0; b < 16; ++b) mask |= (of_block[b] >> k & 1) << b;
-      masks[i + k] = static_cast<uint16_t>(i + k < n ? mask : 0);
-    }
+    words.store(masks + i);
   }
+  for (int k = n; k < (n + 15) / 16 * 16; ++k) masks[k] = 0;
 }
 
 // alpha before the cut at kMaxAlpha is exp2 of this; below kMinAlphaLog2 it is not drawn.
-inline F16 log_alpha(const Batch& batch, int index, int block_column, F16 y) {
-  const F16 e = fnma(bcast(batch.head[index][0]), y, bcast4(batch.slope[index] + 4 * block_column));
-  return fnma(e, e, bcast4(batch.height[index] + 4 * block_column));
+inline F16 log_alpha(const Row& row, int block_column, F16 y) {
+  const F16 e = fnma(bcast(row.l1), y, bcast4(row.slope + 4 * block_column));
+  return fnma(e, e, bcast4(row.height + 4 * block_column));
 }
 
 // [channels, 16 blocks, 16 lanes] of a tile from a picture [H, W, channels]; 0 outside.

@@ -56,4 +56,6 @@ if __name__ == "__main__":
     try:
         main()
     except subprocess.CalledProcessError as error:
-        sys.exit(f"could not prepare the environment: `{' '.join(map(str, error.cmd))}` failed (see above); check the network and try again")
+        sys.exit(
+            f"could not prepare the environment: `{' '.join(map(str, error.cmd))}` failed (see above); check the network and try again"
+        )

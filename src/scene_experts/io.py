@@ -58,4 +58,6 @@ def read_json(path: Path, what: str) -> Any:
     except FileNotFoundError as error:
         raise InputError(f"expected a {what} at {path}, found no such file; check the path") from error
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"expected a {what} in JSON at {path}, found something unreadable ({error}); restore or remove the file") from error
+        raise InputError(
+            f"expected a {what} in JSON at {path}, found something unreadable ({error}); restore or remove the file"
+        ) from error

@@ -33,7 +33,7 @@ def evaluate_run(
     The rasteriser's antialiasing follows the run's recipe where it can. Raises InputError for anything that does not fit.
     """
     opened = run_folder.open_run(run, device, step)
-    if hasattr(rasterize, "antialias") and rasterize.antialias != opened.cfg.antialias:
+    if getattr(rasterize, "antialias", opened.cfg.antialias) != opened.cfg.antialias:
         rasterize = replace(rasterize, antialias=opened.cfg.antialias)  # type: ignore[type-var]
     where = opened.config.data if data is None else replace(opened.config.data, path=data)
     capture = run_folder.load_capture(where, opened.cfg.seed)

@@ -53,7 +53,7 @@ class _Backward(Structure):
         ("deterministic", c_int32),
         ("threads", c_int32),
         *_INPUTS,
-        *[(name, c_void_p) for name in ("background", "image", "depth", "g_image", "g_alpha", "g_depth")],
+        *[(name, c_void_p) for name in ("background", "g_image", "g_alpha", "g_depth")],
         *[(f"d_{name}", c_void_p) for name in ("means", "quats", "scales", "opacities", "colors", "mean2d", "background")],
     ]
 
@@ -126,14 +126,14 @@ class _Draw(torch.autograd.Function):
         if keep:
             ctx.state = _Kept(library, state.value or 0)
             ctx.how, ctx.mean2d_grad = how, mean2d_grad
-            ctx.save_for_backward(*plain, image, depth)
+            ctx.save_for_backward(*plain)
         return image, alpha, depth, radii
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor | None):
-        *plain, image, depth = ctx.saved_tensors
-        up = [image, depth] + [None if g is None else _plain(g) for g in grad_outputs[:3]]  # of image, alpha, depth; None: zero
+    def backward(ctx: Any, *grad_outputs: Tensor | None):  # pyright: ignore[reportIncompatibleMethodOverride]
+        plain = ctx.saved_tensors
+        up = [None if g is None else _plain(g) for g in grad_outputs[:3]]  # of image, alpha, depth; None: zero
         outputs = [torch.empty_like(t) for t in plain[:5]] + [ctx.mean2d_grad, torch.empty(3)]
         how: CpuRasterizer = ctx.how
         tensors = [*plain, *up, *outputs]

@@ -29,6 +29,7 @@ from scene_experts.table import Table
 from scene_experts.types import Camera, Decoded, Gaussians, Points, Routing
 
 ATTRIBUTES = ("opacity", "cov", "color")
+VoxelChoice = Literal["neighbours", "squared_median", "median_nn"]
 EPS = 1e-12  # keeps directions and quaternions finite where their length is 0
 
 
@@ -46,7 +47,7 @@ class Anchors:
     """Attributes whose networks also see the distance to the camera."""
     voxel_size: float = 0.0
     """Edge of the finest lattice in trained world units; 0 takes `voxel_rule`."""
-    voxel_rule: Literal["neighbours", "squared_median", "median_nn"] = "neighbours"
+    voxel_rule: VoxelChoice = "neighbours"
     """neighbours: a quarter of the median neighbour distance; the others are Scaffold-GS's rule as coded and as documented."""
     quat_align: bool = False
     """Flip each expert's quaternion into the hemisphere of the anchor's first expert before mixing (composed decode only)."""
@@ -211,7 +212,7 @@ class AnchorScene(nn.Module):
         return {f"{a}.{name}": p for a in ATTRIBUTES for name, p in self.heads[a].named_parameters()}  # type: ignore[attr-defined]
 
 
-def voxel_size(points: Tensor, rule: str) -> float:
+def voxel_size(points: Tensor, rule: VoxelChoice) -> float:
     """The lattice's edge by rule, from points [P, 3] in trained world units."""
     if rule == "neighbours":
         return 0.25 * median_neighbour_distance(points)
