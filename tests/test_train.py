@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from scene_experts.data.capture import load
 from scene_experts.errors import InputError
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
+from scene_experts.scene.experts import Experts
 from scene_experts.train import Adjusted, Finished, Previewed, Run, Saved, Started, Stepped, Stopped, anchor_cap, train
 from synthetic import make_capture
 
@@ -105,11 +107,16 @@ def test_the_unit_of_a_capture_does_not_matter(scale, folder, tmp_path):
 
 
 @pytest.mark.parametrize("recipe", ["scaffold-gs", "moe-gs"])
-def test_losses_follow_the_golden_curve(recipe, folder, request):
-    """The first 100 iterations at a fixed seed. Recorded by this test with SCENE_EXPERTS_RECORD=1; rtol 1e-3 across machines."""
-    import os
-
-    curve = [sum(e.terms.values()) for e in events(config(recipe), folder, stop_at=100, log_every=5) if isinstance(e, Stepped)]
+def test_losses_follow_the_golden_curve(recipe, tmp_path):
+    """The first 100 iterations at a fixed seed, Top-k from the 51st, in float64 by the reference parts, so that machines agree to 1e-3:
+    in float32 Adam turns the rounding of another instruction set into 1 % within these iterations. Recorded by this test with
+    SCENE_EXPERTS_RECORD=1."""
+    cfg = RECIPES[recipe][1]
+    if isinstance(cfg.scene.decoder, Experts):
+        cfg = replace(cfg, scene=replace(cfg.scene, decoder=replace(cfg.scene.decoder, warmup=50)))
+    folder = make_capture(tmp_path, views=8, size=(48, 32), points=400).folder
+    seen = events(cfg, folder, rasterizer="reference", stop_at=100, log_every=5, dtype=torch.float64)
+    curve = [sum(e.terms.values()) for e in seen if isinstance(e, Stepped)]
     path = GOLDEN / f"{recipe}.json"
     if os.environ.get("SCENE_EXPERTS_RECORD"):
         path.parent.mkdir(exist_ok=True)

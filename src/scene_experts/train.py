@@ -36,6 +36,7 @@ class Run:
     config: RunConfig
     out: Path | None = None  # the run folder; None keeps nothing
     device: str = "cpu"
+    dtype: torch.dtype = torch.float32  # float64 with the reference rasteriser shows what rounding does; not for real trainings
     resume: bool = False
     save_every: int = 5000  # iterations between checkpoints; the last iteration is always saved
     preview_every: int = 0  # iterations between pictures of one held-out view; 0: none
@@ -115,14 +116,14 @@ class Training:
         scene.table.attach(self.optimizer)
 
     @classmethod
-    def start(cls, cfg: Train, capture: Capture, device: str) -> Training:
+    def start(cls, cfg: Train, capture: Capture, device: str, dtype: torch.dtype = torch.float32) -> Training:
         """A fresh training of `cfg` (already scaled) on a capture. Raises InputError when the capture has no points or no training view."""
         if capture.points is None:
             raise InputError("expected 3D points in the capture, found none; use --init random, or run structure from motion again")
         if not capture.train:
             raise InputError("expected at least one training view, found none; choose another --split")
         torch.manual_seed(cfg.seed)
-        return cls(cfg, to_device(AnchorScene.from_points(cfg.scene, capture.points, capture.extent), device))
+        return cls(cfg, to_device(AnchorScene.from_points(cfg.scene, capture.points, capture.extent), device, dtype))
 
     def next_view(self, train: tuple[int, ...], ahead: int = 3) -> tuple[int, list[int]]:
         """The next training view and the few after it: each view once per epoch, in random order."""
@@ -196,10 +197,10 @@ def scene_from(cfg: Train, tensors: dict[str, Tensor], meta: dict) -> AnchorScen
     return scene
 
 
-def to_device(scene: AnchorScene, device: str) -> AnchorScene:
-    """The scene with all its tensors on `device`."""
-    scene = scene.to(device)
-    scene.table.facts = {k: v.to(device) for k, v in scene.table.facts.items()}
+def to_device(scene: AnchorScene, device: str, dtype: torch.dtype | None = None) -> AnchorScene:
+    """The scene with all its tensors on `device`, and its real ones of `dtype` where one is given."""
+    scene = scene.to(device, dtype)
+    scene.table.facts = {k: v.to(device, dtype if v.is_floating_point() else None) for k, v in scene.table.facts.items()}
     return scene
 
 
@@ -213,7 +214,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     cfg = cfg.scaled()
     folder = run.out / "checkpoints" if run.out else None
     training = resume(cfg, folder, run.device) if run.resume and folder else None
-    training = training or Training.start(cfg, capture, run.device)
+    training = training or Training.start(cfg, capture, run.device, run.dtype)
     total = min(cfg.iterations, run.config.stop_at or cfg.iterations)
     yield Started(training.step, total, len(training.scene.table))
     saved = training.step
@@ -248,15 +249,15 @@ def iterate(
     training.set_rates()
     index, following = training.next_view(capture.train)
     capture.images.prefetch(following)
-    camera = capture.views[index].camera.to(run.device)
+    camera = capture.views[index].camera.to(run.device, run.dtype)
     frame = capture.frame(index)
-    target = frame.rgb.to(run.device).float() / 255.0
-    mask = None if frame.mask is None else frame.mask.to(run.device)
+    target = frame.rgb.to(run.device, run.dtype) / 255.0
+    mask = None if frame.mask is None else frame.mask.to(run.device, run.dtype)
     background = torch.rand(3, generator=training.views) if cfg.random_background else torch.tensor(capture.background)
     decoded = scene(camera, training.step, True, rasterize.visible)
     if cfg.loss.opacity_scope == "all" and hinge_is_on(cfg.loss, training.step):
         decoded = replace(decoded, scene_opacity=scene.scene_opacity(camera, training.step))
-    render = rasterize(decoded.gaussians, camera, background.to(run.device))
+    render = rasterize(decoded.gaussians, camera, background.to(run.device, run.dtype))
     parts = terms(decoded, render, target, cfg.loss, training.step, mask)
     loss = torch.stack(list(parts.values())).sum()
     if loss.requires_grad:
@@ -296,9 +297,9 @@ def stepped(training: Training, decoded: Decoded, render: Render, parts: dict[st
 def preview(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Previewed:
     """A picture of one held-out view (a training view where none is held out)."""
     index = (capture.test or capture.train)[0]
-    camera = capture.views[index].camera.to(run.device)
+    camera = capture.views[index].camera.to(run.device, run.dtype)
     decoded = training.scene(camera, training.step, False, rasterize.visible)
-    picture = rasterize(decoded.gaussians, camera, torch.tensor(capture.background, device=run.device)).image
+    picture = rasterize(decoded.gaussians, camera, torch.tensor(capture.background, device=run.device, dtype=run.dtype)).image
     return Previewed(training.step, index, picture.clamp(0, 1).cpu())
 
 
