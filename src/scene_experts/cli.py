@@ -23,7 +23,16 @@ COMMANDS = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0 done, 1 failed, 2 unusable input."""
-    args = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return dispatch(list(sys.argv[1:] if argv is None else argv))
+    except BrokenPipeError:  # the reader (`| head`) has seen enough
+        with suppress(OSError, ValueError):
+            sys.stdout.close()
+        return 0
+
+
+def dispatch(args: list[str]) -> int:
+    """Run a command and turn its errors into a sentence and an exit code."""
     if not args or args[0] in ("-h", "--help", "help"):
         print(usage())
         return 0 if args else 2
@@ -50,10 +59,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
-    except BrokenPipeError:
-        with suppress(OSError):
-            sys.stdout.close()
-        return 0
 
 
 def entry() -> None:
