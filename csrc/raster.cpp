@@ -152,8 +152,10 @@ SE_EXPORT void se_raster_counts(const void* state, int64_t* counts, double* seco
   const State& s = *static_cast<const State*>(state);
   int64_t blocks = 0;
   for (int t = 0; t < s.tiles(); ++t)
-    for (uint32_t k = 0; k < s.tile_used.data()[t]; ++k)
-      blocks += __builtin_popcount(s.masks.data()[s.tile_begin.data()[t] + k]);
+    for (int left = static_cast<int>(s.tile_used.data()[t]), k = 0; left > 0; left -= kBatch, ++k)
+      for (int b = 0; b < 16; ++b)
+        for (int i = 0; i < left && i < kBatch; i += 16)
+          blocks += __builtin_popcount(s.masks.data()[(s.batch(t, k) * 16 + b) * (kBatch / 16) + i / 16]);
   counts[0] = s.visible, counts[1] = s.pairs, counts[2] = blocks;
   std::copy(s.seconds, s.seconds + 5, seconds);
 }

@@ -15,21 +15,28 @@
 #include <new>
 #include <vector>
 
+#if defined(__linux__)
+#include <sys/mman.h>
+#elif defined(_WIN32)
+#include <malloc.h>
+#endif
+
 namespace se::raster {
 
 constexpr int kTile = 16;     // pixels
 constexpr int kChunk = 4096;  // Gaussians that one worker projects at a time; a multiple of 16
 #ifndef SE_BATCH
-#define SE_BATCH 128
+#define SE_BATCH 256
 #endif
 constexpr int kBatch = SE_BATCH;   // Gaussians of a tile worked on at a time, so that they stay in the first-level cache
+constexpr int kAhead = 32;    // how many of a tile's Gaussians ahead memory is fetched; this many entries follow the last list
 constexpr float kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
 constexpr float kMinAlphaLog2 = -7.994353437f;  // log2(1 / 255)
 constexpr float kWhiten = 0.84932180f;          // sqrt(log2(e) / 2)
 
 struct CameraArgs {
   float view[12];  // rows of [R | t]
-  float fx, fy, cx, cy, near_z;
+  float fx, fy, cx, cy, near_plane;
   int32_t width, height;
 };
 
@@ -49,7 +56,7 @@ struct alignas(64) Sums {
 };
 enum { kS, kSx, kSy, kSxx, kSxy, kSyy, kRed, kGreen, kBlue, kDepth };
 
-// Uninitialised memory that only grows, aligned to cache lines.
+// Uninitialised memory that only grows. Large pieces ask for huge pages: their random reads would miss the translation cache otherwise.
 template <class T>
 class Buffer {
  public:
@@ -58,7 +65,7 @@ class Buffer {
       data_.reset();
       size_ = 0;
       const size_t grown = n + n / 8;
-      data_.reset(static_cast<T*>(::operator new(grown * sizeof(T) + 64, std::align_val_t(64))));
+      data_.reset(static_cast<T*>(allocate(grown * sizeof(T))));
       size_ = grown;
     }
     return data_.get();
@@ -67,8 +74,33 @@ class Buffer {
   size_t bytes() const { return size_ * sizeof(T); }
 
  private:
+  static constexpr size_t kHuge = size_t{1} << 21;
+  static void* allocate(size_t bytes) {
+    if (bytes < kHuge) return allocate_aligned(bytes, 64);
+    void* p = allocate_aligned(bytes, kHuge);
+#if defined(__linux__)
+    madvise(p, bytes, MADV_HUGEPAGE);
+#endif
+    return p;
+  }
+  static void* allocate_aligned(size_t bytes, size_t alignment) {
+    const size_t rounded = (bytes + alignment) / alignment * alignment;
+#if defined(_WIN32)
+    void* p = _aligned_malloc(rounded, alignment);
+#else
+    void* p = std::aligned_alloc(alignment, rounded);
+#endif
+    if (!p) throw std::bad_alloc();
+    return p;
+  }
   struct Free {
-    void operator()(T* p) const { ::operator delete(p, std::align_val_t(64)); }
+    void operator()(T* p) const {
+#if defined(_WIN32)
+      _aligned_free(p);
+#else
+      std::free(p);
+#endif
+    }
   };
   std::unique_ptr<T[], Free> data_;
   size_t size_ = 0;
@@ -92,9 +124,9 @@ struct State {
   Buffer<uint32_t> tile_begin;    // [tiles + 1] into `list`
   Buffer<uint32_t> tile_used;     // [tiles] how many of its list a tile looked at before all its pixels had stopped
   Buffer<uint32_t> list;          // [pairs] places, per tile near to far
-  Buffer<uint16_t> masks;         // [pairs] which of a tile's sixteen blocks the Gaussian touches
+  Buffer<uint16_t> masks;         // [batches, 16 blocks, kBatch / 16] which of a tile's blocks a Gaussian touches, see batch()
   Buffer<float> transmittance;    // [tiles * 256] what is left at the end, in block order
-  Buffer<float> checkpoints;      // [batches * 256] what is left before each batch but a tile's first, see checkpoint()
+  Buffer<float> checkpoints;      // [batches * 256] what is left before each batch but a tile's first, see batch()
   Buffer<Sums> sums;              // backward: one row per place and worker, or (deterministic) per pair
   Buffer<uint32_t> slots;         // deterministic backward: first row of each place
   Buffer<double> background;      // backward: [tiles * 3]
@@ -102,10 +134,9 @@ struct State {
   double seconds[5] = {};  // processor time of the calling thread: project, bin, blend, blend backward, project backward
 
   int tiles() const { return tiles_x * tiles_y; }
-  // Where a tile's batches keep their checkpoints: no two tiles share one, and no table is needed.
-  float* checkpoint(int tile, int batch) const {
-    return checkpoints.data() + (static_cast<int64_t>(tile_begin.data()[tile]) / kBatch + tile + batch) * 256;
-  }
+  // A number for each batch of each tile: no two share one, and no table is needed.
+  int64_t batch(int tile, int index) const { return static_cast<int64_t>(tile_begin.data()[tile]) / kBatch + tile + index; }
+  size_t batches() const { return static_cast<size_t>(pairs / kBatch + tiles() + 1); }
   int64_t places() const { return (m + kChunk - 1) / kChunk * kChunk; }
 };
 

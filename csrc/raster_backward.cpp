@@ -18,12 +18,13 @@ struct Pixels {
 
 struct Work {
   Batch batch;
-  F16 alpha[kBatch + 16], w[kBatch + 16];  // of one block's list
+  F16 alpha[kBatch + 16], w[kBatch + 16];            // of one block's list
+  alignas(64) float centre[2 * kBatch + 32];  // u, v of each, px
 };
 
 // Adds the sixteen Gaussians' sums over one block. `weights` (w) and W are rows of pixels.
 template <bool Depth>
-void reduce(Batch& batch, int first, const F16* weights, F16 (&W)[16], const Pixels& px, int block, const Tile& tile) {
+void reduce(Work& work, int first, const F16* weights, F16 (&W)[16], const Pixels& px, int block, const Tile& tile) {
   F16 out[16], w[16];
   const int at = block * 16;
   std::copy(weights, weights + 16, w);
@@ -54,8 +55,10 @@ void reduce(Batch& batch, int first, const F16* weights, F16 (&W)[16], const Pix
   const F16 mxy = fma(three, row1[3] - row1[0], row1[2] - row1[1]) * quarter;
 
   // To moments about each Gaussian's centre.
-  const F16 dx = load(batch.list_u + first) - bcast(tile.centre_x + 4.0f * static_cast<float>(block % 4) - 6.0f);
-  const F16 dy = load(batch.list_v + first) - bcast(tile.centre_y + 4.0f * static_cast<float>(block / 4) - 6.0f);
+  F16 u, v;
+  load_pairs(work.centre + 2 * first, u, v);
+  const F16 dx = u - bcast(tile.centre_x + 4.0f * static_cast<float>(block % 4) - 6.0f);
+  const F16 dy = v - bcast(tile.centre_y + 4.0f * static_cast<float>(block / 4) - 6.0f);
   const F16 sx = dx * m - mx, sy = dy * m - my;
   out[kS] = m, out[kSx] = sx, out[kSy] = sy;
   out[kSxx] = fma(dx, sx - mx, mxx);
@@ -64,23 +67,25 @@ void reduce(Batch& batch, int first, const F16* weights, F16 (&W)[16], const Pix
   for (int k = 10; k < 16; ++k) out[k] = bcast(0.0f);
   transpose(out);
   for (int k = 0; k < 16; ++k) {
-    float* sums = batch.row(batch.list[first + k]).sums;
+    float* sums = work.batch.row(work.batch.list.place[first + k]).sums;
     store(sums, load(sums) + out[k]);
   }
 }
 
 // alpha and w of the block's list, near to far; returns how many until all pixels had stopped.
-int weigh(Work& work, int count, int block, const float* checkpoint, const Exp2& exp2) {
+int weigh(Work& work, int block, const float* checkpoint, const Exp2& exp2) {
   const Batch& batch = work.batch;
   const F16 y = block_y(block / 4), limit = bcast(kMinAlphaLog2), most = bcast(kMaxAlpha), stop = bcast(kMinTransmittance);
   const F16 one = bcast(1.0f);
   const int column = block % 4;
   F16 through = load(checkpoint + block * 16);
   int i = 0;
-  for (bool alive = true; i < count && alive; i += 4) {
+  for (bool alive = true; i < batch.list.count && alive; i += 4) {
     F16 alpha[4];
     for (int k = 0; k < 4; ++k) {
-      const F16 p = log_alpha(batch.row(batch.list[i + k]), column, y);
+      const Row& row = batch.row(batch.list.place[i + k]);
+      std::memcpy(work.centre + 2 * (i + k), &row.u, 8);
+      const F16 p = log_alpha(row, column, y);
       alpha[k] = min_keep(ge(p, limit), exp2(p), most);
     }
     for (int k = 0; k < 4; ++k) {
@@ -96,10 +101,10 @@ int weigh(Work& work, int count, int block, const float* checkpoint, const Exp2&
 }
 
 template <bool Depth>
-void block_backward(Work& work, int count, int block, const float* checkpoint, Pixels& px, const Tile& tile, const Exp2& exp2) {
-  Batch& batch = work.batch;
-  count = weigh(work, count, block, checkpoint, exp2);
-  const F16 most = bcast(kMaxAlpha), zero = bcast(0.0f);
+void block_backward(Work& work, int block, const float* checkpoint, Pixels& px, const Tile& tile, const Exp2& exp2) {
+  const Batch& batch = work.batch;
+  const int count = weigh(work, block, checkpoint, exp2);
+  const F16 most = bcast(kMaxAlpha), zero = bcast(0.0f), one = bcast(1.0f);
   const int at = block * 16;
   F16 behind = load(px.behind + at);
   const F16 red = load(px.color[0] + at), green = load(px.color[1] + at), blue = load(px.color[2] + at), depth = load(px.depth + at);
@@ -107,38 +112,35 @@ void block_backward(Work& work, int count, int block, const float* checkpoint, P
   for (int first = (count - 1) / 16 * 16; first >= 0; first -= 16) {
     F16 W[16];
     for (int i = 15; i >= 0; --i) {
-      const Row& row = batch.row(batch.list[first + i]);
+      const Row& row = batch.row(batch.list.place[first + i]);
       F16 s = fma(red, bcast(row.r), fma(green, bcast(row.g), blue * bcast(row.b)));
       if constexpr (Depth) s = fma(depth, bcast(row.z), s);
-      const F16 more = s - behind, alpha = work.alpha[first + i];
-      W[i] = mul_keep(gt(most, alpha), work.w[first + i], more);
-      behind = fma(alpha, more, behind);
+      const F16 alpha = work.alpha[first + i];
+      W[i] = mul_keep(gt(most, alpha), work.w[first + i], s - behind);
+      behind = fma(one - alpha, behind, alpha * s);  // the one chain from Gaussian to Gaussian: a single step long
     }
-    reduce<Depth>(batch, first, work.w + first, W, px, block, tile);
+    reduce<Depth>(work, first, work.w + first, W, px, block, tile);
   }
   store(px.behind + at, behind);
 }
 
 // Upstream gradients of a tile in block order, what is seen behind everything, and the background's gradient.
 void begin_tile(State& s, int number, const Tile& tile, const float* background, const Upstream& up, Pixels& px) {
-  const auto read = [&](const float* picture, float (*planes)[256]) {
+  const auto read = [&](const float* picture, auto& planes) {
     if (picture)
-      load_tile<1>(picture, s.camera, tile, planes);
+      load_tile(picture, s.camera, tile, planes);
     else
-      std::memset(planes, 0, 256 * sizeof(float));
+      std::memset(planes, 0, sizeof planes);
   };
-  if (up.image)
-    load_tile<3>(up.image, s.camera, tile, px.color);
-  else
-    std::memset(px.color, 0, sizeof px.color);
-  read(up.depth, &px.depth);
-  alignas(64) float alpha[1][256];
+  alignas(64) float alpha[256];
+  read(up.image, px.color);
+  read(up.depth, px.depth);
   read(up.alpha, alpha);
   inside(s.camera, tile, px.through);
   const float* left = s.transmittance.data() + number * 256;
   F16 total[3] = {bcast(0.0f), bcast(0.0f), bcast(0.0f)};
   for (int k = 0; k < 256; k += 16) {
-    F16 behind = bcast(0.0f) - load(alpha[0] + k);
+    F16 behind = bcast(0.0f) - load(alpha + k);
     const F16 l = load(left + k);
     for (int c = 0; c < 3; ++c) {
       const F16 g = load(px.color[c] + k);
@@ -183,21 +185,22 @@ void tile_backward(State& s, int number, Work& work, const float* background, co
     const uint32_t at = begin + static_cast<uint32_t>(index) * kBatch;
     const int n = static_cast<int>(std::min<uint32_t>(kBatch, end - at));
     const uint32_t* from = s.list.data() + at;
-    batch.load_rows(s.records.data(), from, n, 0, tile);
-    uint32_t touched = 0;
+    batch.load_rows(s.records.data(), from, n, tile);
     for (int k = 0; k < n; ++k) {
-      batch.masks[k] = s.masks.data()[at + k];
-      touched |= s.masks.data()[at + k];
+      if (sink.own) __builtin_prefetch(&sink.own[from[k]], 1);
       store(batch.rows[k].sums, bcast(0.0f));
     }
-    for (int k = n; k < (n + 15) / 16 * 16; ++k) batch.masks[k] = 0;
-    const float* checkpoint = index > 0 ? s.checkpoint(number, index) : px.through;
-    for (; touched; touched &= touched - 1) {
-      const int b = __builtin_ctz(touched);
-      block_backward<Depth>(work, batch.list_block<true>(n, b), b, checkpoint, px, tile, exp2);
+    const int64_t number_of_batch = s.batch(number, index);
+    const Touched& touched = *reinterpret_cast<const Touched*>(s.masks.data() + number_of_batch * kBatch);
+    const float* checkpoint = index > 0 ? s.checkpoints.data() + number_of_batch * 256 : px.through;
+    uint16_t any[kGroups] = {};
+    for (int b = 0; b < 16; ++b) {
+      for (int i = 0; i < kGroups; ++i) any[i] |= touched[b][i];
+      batch.list_block(touched[b], n);
+      if (batch.list.count > 0) block_backward<Depth>(work, b, checkpoint, px, tile, exp2);
     }
     for (int k = 0; k < n; ++k)
-      if (!sink.own || batch.masks[k]) sink.add(from[k], tile, batch.rows[k].sums);
+      if (!sink.own || any[k / 16] >> k % 16 & 1) sink.add(from[k], tile, batch.rows[k].sums);
   }
   if (!sink.own)
     for (uint32_t at = end; at < s.tile_begin.data()[number + 1]; ++at)

@@ -13,18 +13,18 @@ struct Pixels {  // a tile's pixels in block order
 
 // Blends the batch's list into one block; returns whether any pixel still lets light through.
 // `through` runs on past the stop (it only falls); `left` keeps the value before it.
-bool blend_block(const Batch& batch, int count, int block, Pixels& px, const Exp2& exp2) {
+bool blend_block(const Batch& batch, int block, Pixels& px, const Exp2& exp2) {
   const F16 y = block_y(block / 4), limit = bcast(kMinAlphaLog2), most = bcast(kMaxAlpha), stop = bcast(kMinTransmittance);
   const F16 one = bcast(1.0f);
   const int at = block * 16, column = block % 4;
   F16 through = load(px.through + at), left = load(px.left + at), depth = load(px.depth + at);
   F16 red = load(px.color[0] + at), green = load(px.color[1] + at), blue = load(px.color[2] + at);
   bool alive = true;
-  for (int i = 0; i < count && alive; i += 4) {
+  for (int i = 0; i < batch.list.count && alive; i += 4) {
     const Row* row[4];
     F16 alpha[4];
     for (int k = 0; k < 4; ++k) {
-      row[k] = &batch.row(batch.list[i + k]);
+      row[k] = &batch.row(batch.list.place[i + k]);
       const F16 p = log_alpha(*row[k], column, y);
       alpha[k] = min_keep(ge(p, limit), exp2(p), most);
     }
@@ -53,9 +53,9 @@ void finish(State& s, int number, const Tile& tile, Pixels& px, const float* bac
     for (int c = 0; c < 3; ++c) store(px.color[c] + k, fma(left, bcast(background[c]), load(px.color[c] + k)));
     store(px.left + k, bcast(1.0f) - left);
   }
-  store_tile<3>(out.image, s.camera, tile, px.color);
-  store_tile<1>(out.alpha, s.camera, tile, &px.left);
-  store_tile<1>(out.depth, s.camera, tile, &px.depth);
+  store_tile(out.image, s.camera, tile, px.color);
+  store_tile(out.alpha, s.camera, tile, px.left);
+  store_tile(out.depth, s.camera, tile, px.depth);
 }
 
 void blend_tile(State& s, int number, Batch& batch, const float* background, const Outputs& out, const Exp2& exp2) {
@@ -72,14 +72,18 @@ void blend_tile(State& s, int number, Batch& batch, const float* background, con
   while (at < end && alive) {
     const int n = static_cast<int>(std::min<uint32_t>(kBatch, end - at));
     const uint32_t* from = s.list.data() + at;
-    if (at > begin) std::copy(px.through, px.through + 256, s.checkpoint(number, static_cast<int>((at - begin) / kBatch)));
-    batch.load_rows(s.records.data(), from, n, static_cast<int>(std::min<uint32_t>(24, end - at - static_cast<uint32_t>(n))), tile);
-    batch.touch_blocks(s.records.data(), from, n, tile);
-    for (int k = 0; k < n; ++k) s.masks.data()[at + k] = static_cast<uint16_t>(batch.masks[k] & alive);
-    for (uint32_t blocks = alive; blocks; blocks &= blocks - 1) {
-      const int b = __builtin_ctz(blocks);
-      const int count = batch.list_block<false>(n, b);
-      if (count > 0 && !blend_block(batch, count, b, px, exp2)) alive &= ~(1u << b);
+    const int64_t number_of_batch = s.batch(number, static_cast<int>((at - begin) / kBatch));
+    if (at > begin) std::copy(px.through, px.through + 256, s.checkpoints.data() + number_of_batch * 256);
+    Touched& touched = *reinterpret_cast<Touched*>(s.masks.data() + number_of_batch * kBatch);
+    batch.load_rows(s.records.data(), from, n, tile);
+    touch_blocks(s.records.data(), from, n, tile, touched);
+    for (int b = 0; b < 16; ++b) {
+      if (!(alive >> b & 1)) {
+        std::fill(touched[b], touched[b] + kGroups, static_cast<uint16_t>(0));
+        continue;
+      }
+      batch.list_block(touched[b], n);
+      if (batch.list.count > 0 && !blend_block(batch, b, px, exp2)) alive &= ~(1u << b);
     }
     at += static_cast<uint32_t>(n);
   }
@@ -91,7 +95,8 @@ void blend_tile(State& s, int number, Batch& batch, const float* background, con
 
 void blend(State& s, const float* background, const Outputs& out, int threads) {
   s.transmittance.get(static_cast<size_t>(s.tiles()) * 256);
-  s.checkpoints.get(static_cast<size_t>(s.pairs / kBatch + s.tiles() + 1) * 256);
+  s.checkpoints.get(s.batches() * 256);
+  s.masks.get(s.batches() * kBatch);
   parallel_for(s.tiles(), 2, threads, [&](int64_t begin, int64_t end, int) {
     thread_local Batch batch;
     const Exp2 exp2;

@@ -61,7 +61,7 @@ struct Projection {
                  fma(bcast(c.view[4 * k + 1]), mean[1], fma(bcast(c.view[4 * k + 2]), mean[2], bcast(c.view[4 * k + 3]))));
     };
     vx = row(0), vy = row(1), vz = row(2);
-    front = gt(vz, bcast(c.near_z));
+    front = gt(vz, bcast(c.near_plane));
     rz = bcast(1.0f) / select(front, vz, bcast(1.0f));
     const F16 x = vx * rz, y = vy * rz;
     u = fma(bcast(c.fx), x, bcast(c.cx));

@@ -3,8 +3,7 @@
 //   load store bcast bcast4 (four floats, repeated), + - * /, fma(a, b, c) = a b + c, fnma = c - a b, min max sqrt ceil floor,
 //   ge gt & |, select(m, a, b), keep(m, a) = a or 0, mul_keep, min_keep, bits any, store_int (truncated),
 //   Exp2 (relative error below 4e-7; anything where p < -126), reciprocal (to rounding), split_exponent, transpose (16 x 16),
-//   compress(to, a, m): a's set lanes packed to the front (up to 16 places are written),
-//   Words: one number per lane of which bits are set with a mask; test_bit(words, b): the lanes whose stored number has bit b.
+//   load_pairs(p, a, b): p[0] p[2] ... and p[1] p[3] ...
 #pragma once
 #if defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512BW__)
 #include "raster_simd_avx512.h"

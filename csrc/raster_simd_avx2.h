@@ -87,52 +87,16 @@ inline void split_exponent(F16 a, F16& m, F16& e) {
   split_exponent_half(a.hi, m.hi, e.hi);
 }
 
-// For each of 256 masks the numbers of its set lanes, packed to the front.
-struct Packing {
-  alignas(32) int32_t lane[256][8];
-};
-inline const Packing& packing() {
-  static const Packing table = [] {
-    Packing t{};
-    for (int mask = 0; mask < 256; ++mask)
-      for (int lane = 0, at = 0; lane < 8; ++lane)
-        if (mask >> lane & 1) t.lane[mask][at++] = lane;
-    return t;
-  }();
-  return table;
-}
-
-inline void compress(float* to, F16 a, M16 m) {
-  const Packing& table = packing();
-  const uint32_t lo = static_cast<uint32_t>(_mm256_movemask_ps(m.lo)), hi = static_cast<uint32_t>(_mm256_movemask_ps(m.hi));
-  const auto pack = [&](__m256 v, uint32_t mask) {
-    return _mm256_permutevar8x32_ps(v, _mm256_load_si256(reinterpret_cast<const __m256i*>(table.lane[mask])));
+inline void load_pairs(const float* p, F16& first, F16& second) {
+  const auto half = [](const float* q, __m256& even, __m256& odd) {
+    const __m256 a = _mm256_loadu_ps(q), b = _mm256_loadu_ps(q + 8);
+    const auto in_order = [](__m256 v) { return _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(v), 0xd8)); };
+    even = in_order(_mm256_shuffle_ps(a, b, 0x88));
+    odd = in_order(_mm256_shuffle_ps(a, b, 0xdd));
   };
-  _mm256_storeu_ps(to, pack(a.lo, lo));
-  _mm256_storeu_ps(to + __builtin_popcount(lo), pack(a.hi, hi));
+  half(p, first.lo, second.lo);
+  half(p + 16, first.hi, second.hi);
 }
-
-inline M16 test_bit(const int32_t* words, int b) {
-  const __m256i bit = _mm256_set1_epi32(1 << b);
-  const auto half = [&](const int32_t* p) {
-    const __m256i w = _mm256_load_si256(reinterpret_cast<const __m256i*>(p));
-    return _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(w, bit), bit));
-  };
-  return {half(words), half(words + 8)};
-}
-
-struct Words {
-  __m256i lo = _mm256_setzero_si256(), hi = lo;
-  void set(M16 m, int b) {
-    const __m256i bit = _mm256_set1_epi32(1 << b);
-    lo = _mm256_or_si256(lo, _mm256_and_si256(_mm256_castps_si256(m.lo), bit));
-    hi = _mm256_or_si256(hi, _mm256_and_si256(_mm256_castps_si256(m.hi), bit));
-  }
-  void store(int32_t* p) const {
-    _mm256_store_si256(reinterpret_cast<__m256i*>(p), lo);
-    _mm256_store_si256(reinterpret_cast<__m256i*>(p + 8), hi);
-  }
-};
 
 inline void transpose8(__m256 (&r)[8]) {
   __m256 t[8], s[8];

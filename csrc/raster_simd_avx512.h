@@ -79,17 +79,12 @@ inline void split_exponent(F16 a, F16& m, F16& e) {
   e.v = _mm512_mask_add_ps(up, _mm512_cmp_ps_mask(mant, _mm512_set1_ps(1.5f), _CMP_GE_OQ), up, _mm512_set1_ps(1.0f));
 }
 
-inline void compress(float* to, F16 a, M16 m) { _mm512_storeu_ps(to, _mm512_maskz_compress_ps(m.m, a.v)); }
-
-inline M16 test_bit(const int32_t* words, int b) {
-  return {_mm512_test_epi32_mask(_mm512_load_si512(words), _mm512_set1_epi32(1 << b))};
+inline void load_pairs(const float* p, F16& first, F16& second) {
+  const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+  const __m512 a = _mm512_loadu_ps(p), b = _mm512_loadu_ps(p + 16);
+  first.v = _mm512_permutex2var_ps(a, even, b);
+  second.v = _mm512_permutex2var_ps(a, _mm512_add_epi32(even, _mm512_set1_epi32(1)), b);
 }
-
-struct Words {
-  __m512i v = _mm512_setzero_si512();
-  void set(M16 m, int b) { v = _mm512_mask_or_epi32(v, m.m, v, _mm512_set1_epi32(1 << b)); }
-  void store(int32_t* p) const { _mm512_store_si512(p, v); }
-};
 
 inline void transpose(F16 (&r)[16]) {
   __m512 t[16];

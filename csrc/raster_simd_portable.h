@@ -118,25 +118,9 @@ inline void split_exponent(F16 a, F16& m, F16& e) {
   }
 }
 
-inline void compress(float* to, F16 a, M16 m) {
-  for (uint32_t left = bits(m); left; left &= left - 1) {
-    const int k = __builtin_ctz(left);
-    *to++ = a.v[k / 4][k % 4];
-  }
+inline void load_pairs(const float* p, F16& first, F16& second) {
+  for (int k = 0; k < 16; ++k) first.v[k / 4][k % 4] = p[2 * k], second.v[k / 4][k % 4] = p[2 * k + 1];
 }
-
-inline M16 test_bit(const int32_t* words, int b) {
-  M16 r;
-  std::memcpy(&r, words, 64);
-  SE_EACH r.v[i] = -(r.v[i] >> b & 1);
-  return r;
-}
-
-struct Words {
-  M16 w{};
-  void set(M16 m, int b) { SE_EACH w.v[i] |= m.v[i] & (1 << b); }
-  void store(int32_t* p) const { std::memcpy(p, &w, 64); }
-};
 
 inline void transpose(F16 (&r)[16]) {
   float t[16][16], s[16][16];

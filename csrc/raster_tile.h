@@ -14,52 +14,80 @@ namespace se::raster {
 struct Tile {
   int x, y;          // in tiles
   float centre_x, centre_y;  // px
+  bool whole;        // inside the picture to its last pixel
 };
 
 // One Gaussian of a batch, as the tile's blocks read it.
 struct alignas(64) Row {
-  float height[16], slope[16];  // by column of the tile, see raster.h
-  float l1, r, g, b, z, spare[11];
-  float sums[16];  // backward: what blocks have added up so far
+  float height[16], slope[16];                        // by column of the tile, see raster.h
+  float l1, r, g, b, z, u, v, log_opacity, spare[8];  // the first half of the record
+  float sums[16];                                     // backward: what blocks have added up so far
+};
+static_assert(sizeof(Row) == 256);
+
+constexpr int kGroups = kBatch / 16;
+using Touched = uint16_t[16][kGroups];  // for each block one bit per Gaussian of the batch
+
+// The Gaussians of a batch that touch one block, near to far, filled up to a multiple of 16.
+struct List {
+  uint16_t place[kBatch + 32];  // bytes from the batch's first row, divided by eight
+  int count;                    // without the filling
 };
 
 struct Batch {
-  Row rows[kBatch + 1];  // one beyond the end is a Gaussian that draws nothing, which fills up lists to whole groups
-  alignas(64) int32_t masks[kBatch];
-  alignas(64) float u[kBatch], v[kBatch];
-  alignas(64) int32_t places[kBatch];  // bytes from `rows` to each row
-  // The current block's Gaussians, near to far: bytes from `rows`, and centres.
-  alignas(64) int32_t list[kBatch + 32];
-  alignas(64) float list_u[kBatch + 32], list_v[kBatch + 32];
+  Row rows[kBatch + 1];  // one beyond the end is a Gaussian that draws nothing, which fills up lists
+  List list;             // of the current block
 
   Batch() {
     Row& blank = rows[kBatch];
     for (float& height : blank.height) height = -1000.0f;
     for (float& slope : blank.slope) slope = 0.0f;
-    blank.l1 = blank.r = blank.g = blank.b = blank.z = 0.0f;
-    for (int k = 0; k < kBatch; ++k) places[k] = k * static_cast<int32_t>(sizeof(Row)), u[k] = v[k] = 0.0f;
+    blank.l1 = blank.r = blank.g = blank.b = blank.z = blank.u = blank.v = 0.0f;
   }
 
-  const Row& row(int32_t place) const { return *reinterpret_cast<const Row*>(reinterpret_cast<const char*>(rows) + place); }
-  Row& row(int32_t place) { return *reinterpret_cast<Row*>(reinterpret_cast<char*>(rows) + place); }
+  const Row& row(uint16_t place) const { return *reinterpret_cast<const Row*>(reinterpret_cast<const char*>(rows) + place * size_t{8}); }
+  Row& row(uint16_t place) { return *reinterpret_cast<Row*>(reinterpret_cast<char*>(rows) + place * size_t{8}); }
 
-  void load_rows(const Record* records, const uint32_t* from, int n, int ahead, const Tile& tile);
-  void touch_blocks(const Record* records, const uint32_t* from, int n, const Tile& tile);
-
-  // Lists the Gaussians of the batch that touch block b, filled up to a multiple of 16; returns how many without the filling.
-  template <bool Centres>
-  int list_block(int n, int b) {
-    int count = 0;
-    for (int i = 0; i < n; i += 16) {
-      const M16 m = test_bit(masks + i, b);
-      compress(reinterpret_cast<float*>(list + count), load(reinterpret_cast<const float*>(places + i)), m);
-      if constexpr (Centres) compress(list_u + count, load(u + i), m), compress(list_v + count, load(v + i), m);
-      count += __builtin_popcount(bits(m));
-    }
-    for (int k = 0; k < 16; ++k) list[count + k] = kBatch * static_cast<int32_t>(sizeof(Row));
-    return count;
-  }
+  void load_rows(const Record* records, const uint32_t* from, int n, const Tile& tile);
+  void list_block(const uint16_t* touched, int n);
 };
+
+constexpr int kPlace = sizeof(Row) / 8;
+
+// For each mask of eight Gaussians the places of the set ones, packed to the front.
+struct Packing {
+  alignas(16) uint16_t place[256][8];
+};
+inline const Packing& packing() {
+  static const Packing table = [] {
+    Packing t{};
+    for (int mask = 0; mask < 256; ++mask)
+      for (int lane = 0, at = 0; lane < 8; ++lane)
+        if (mask >> lane & 1) t.place[mask][at++] = static_cast<uint16_t>(lane * kPlace);
+    return t;
+  }();
+  return table;
+}
+
+inline void Batch::list_block(const uint16_t* touched, int n) {
+  typedef uint16_t U8 __attribute__((vector_size(16)));
+  const Packing& table = packing();
+  int count = 0;
+  const auto add = [&](uint32_t mask, int first) {
+    U8 places;
+    std::memcpy(&places, table.place[mask], 16);
+    places += static_cast<uint16_t>(first * kPlace);
+    std::memcpy(list.place + count, &places, 16);
+    count += __builtin_popcount(mask);
+  };
+  for (int i = 0; i < n; i += 16) {
+    const uint32_t mask = touched[i / 16];
+    add(mask & 255, i);
+    add(mask >> 8, i + 8);
+  }
+  for (int k = 0; k < 16; ++k) list.place[count + k] = kBatch * kPlace;
+  list.count = count;
+}
 
 inline const float* lane_x() {
   alignas(64) static const float x[16] = {-7.5f, -6.5f, -5.5f, -4.5f, -3.5f, -2.5f, -1.5f, -.5f, .5f, 1.5f, 2.5f, 3.5f, 4.5f, 5.5f, 6.5f, 7.5f};
@@ -73,24 +101,22 @@ inline F16 block_y(int block_row) {
   return load(y) + bcast(4.0f * static_cast<float>(block_row));
 }
 
-// `ahead`: how many of the tile's Gaussians follow, so that they can be fetched early.
-inline void Batch::load_rows(const Record* records, const uint32_t* from, int n, int ahead, const Tile& tile) {
+inline void Batch::load_rows(const Record* records, const uint32_t* from, int n, const Tile& tile) {
   const F16 columns = load(lane_x());
   for (int k = 0; k < n; ++k) {
-    __builtin_prefetch(&records[from[std::min(k + 24, n + ahead - 1)]]);
+    __builtin_prefetch(&records[from[k + kAhead]]);
     const Record& r = records[from[k]];
     Row& row = rows[k];
     const F16 dx = bcast(r.u - tile.centre_x) - columns, f = bcast(r.l3) * dx;
     store(row.height, fnma(f, f, bcast(r.log_opacity)));
     store(row.slope, fma(bcast(r.l2), dx, bcast(r.l1 * (r.v - tile.centre_y))));
     std::memcpy(&row.l1, &r, 32);
-    u[k] = r.u, v[k] = r.v;
   }
 }
 
 // Exact test of ellipse against block: the least distance over the box of its pixel centres lies on one of the two sides that face the
 // centre, and on a side it is where the ellipse is tangent to it, or at its end. Sixteen Gaussians per lane.
-inline void Batch::touch_blocks(const Record* records, const uint32_t* from, int n, const Tile& tile) {
+inline void touch_blocks(const Record* records, const uint32_t* from, int n, const Tile& tile, Touched& touched) {
   const F16 zero = bcast(0.0f);
   for (int i = 0; i < n; i += 16) {
     F16 c[16];
@@ -99,26 +125,23 @@ inline void Batch::touch_blocks(const Record* records, const uint32_t* from, int
     const F16 l1 = c[0], l2 = c[8], l3 = c[9], U = c[5] - bcast(tile.centre_x), V = c[6] - bcast(tile.centre_y);
     const F16 limit = c[7] - bcast(kMinAlphaLog2 - 1e-3f);  // the slack covers rounding
     const F16 per_x = zero - l2 / l1, per_y = zero - l1 * l2 / fma(l2, l2, l3 * l3);
-    F16 lo_x[4], hi_x[4], near_f2[4], near_e[4], best_y[4], lo_y[4], hi_y[4], far_e[4], best_x[4];
-    for (int k = 0; k < 4; ++k) {
-      const float at = 4.0f * static_cast<float>(k);
-      lo_x[k] = U - bcast(at - 4.5f), hi_x[k] = U - bcast(at - 7.5f);
-      lo_y[k] = V - bcast(at - 4.5f), hi_y[k] = V - bcast(at - 7.5f);
-      const F16 dx = min(max(zero, lo_x[k]), hi_x[k]), dy = min(max(zero, lo_y[k]), hi_y[k]);
-      const F16 f = l3 * dx;
-      near_f2[k] = f * f, near_e[k] = l2 * dx, best_y[k] = per_x * dx;
-      far_e[k] = l1 * dy, best_x[k] = per_y * dy;
+    F16 lo_y[4], hi_y[4], far_e[4], best_x[4];
+    for (int y = 0; y < 4; ++y) {
+      lo_y[y] = V - bcast(4.0f * static_cast<float>(y) - 4.5f), hi_y[y] = lo_y[y] + bcast(3.0f);
+      const F16 dy = min(max(zero, lo_y[y]), hi_y[y]);
+      far_e[y] = l1 * dy, best_x[y] = per_y * dy;
     }
-    Words words;
-    for (int b = 0; b < 16; ++b) {
-      const int x = b % 4, y = b / 4;
-      const F16 e1 = fma(l1, min(max(best_y[x], lo_y[y]), hi_y[y]), near_e[x]);
-      const F16 dx = min(max(best_x[y], lo_x[x]), hi_x[x]), e2 = fma(l2, dx, far_e[y]), f2 = l3 * dx;
-      words.set(ge(limit, min(fma(e1, e1, near_f2[x]), fma(e2, e2, f2 * f2))), b);
+    const uint32_t valid = n - i < 16 ? (1u << (n - i)) - 1 : 0xffffu;
+    for (int x = 0; x < 4; ++x) {
+      const F16 lo_x = U - bcast(4.0f * static_cast<float>(x) - 4.5f), hi_x = lo_x + bcast(3.0f);
+      const F16 dx = min(max(zero, lo_x), hi_x), f = l3 * dx, near_f2 = f * f, near_e = l2 * dx, best_y = per_x * dx;
+      for (int y = 0; y < 4; ++y) {
+        const F16 e1 = fma(l1, min(max(best_y, lo_y[y]), hi_y[y]), near_e);
+        const F16 there = min(max(best_x[y], lo_x), hi_x), e2 = fma(l2, there, far_e[y]), f2 = l3 * there;
+        touched[4 * y + x][i / 16] = static_cast<uint16_t>(bits(ge(limit, min(fma(e1, e1, near_f2), fma(e2, e2, f2 * f2)))) & valid);
+      }
     }
-    words.store(masks + i);
   }
-  for (int k = n; k < (n + 15) / 16 * 16; ++k) masks[k] = 0;
 }
 
 // alpha before the cut at kMaxAlpha is exp2 of this; below kMinAlphaLog2 it is not drawn.
@@ -127,39 +150,71 @@ inline F16 log_alpha(const Row& row, int block_column, F16 y) {
   return fnma(e, e, bcast4(row.height + 4 * block_column));
 }
 
-// [channels, 16 blocks, 16 lanes] of a tile from a picture [H, W, channels]; 0 outside.
-template <int Channels>
-inline void load_tile(const float* picture, const CameraArgs& c, const Tile& tile, float (*planes)[256]) {
+// Four pixels of three interleaved channels, apart and together again.
+inline void split_rgb(const float* p, float* r, float* g, float* b) {
+  for (int i = 0; i < 4; ++i) r[i] = p[3 * i], g[i] = p[3 * i + 1], b[i] = p[3 * i + 2];
+}
+inline void join_rgb(float* p, const float* r, const float* g, const float* b) {
+  for (int i = 0; i < 4; ++i) p[3 * i] = r[i], p[3 * i + 1] = g[i], p[3 * i + 2] = b[i];
+}
+
+// Calls whole(offset in the picture, place in block order) for four neighbours at a time where the tile lies inside the picture,
+// else one(...) for single pixels.
+template <class Whole, class One>
+inline void each_pixel(const CameraArgs& c, const Tile& tile, Whole&& whole, One&& one) {
   const int width = std::min(kTile, c.width - tile.x * kTile), height = std::min(kTile, c.height - tile.y * kTile);
-  if (width < kTile || height < kTile) std::memset(planes, 0, Channels * 256 * sizeof(float));
   for (int j = 0; j < height; ++j) {
-    const float* row = picture + (static_cast<int64_t>(tile.y * kTile + j) * c.width + tile.x * kTile) * Channels;
-    for (int i = 0; i < width; ++i) {
-      const int at = (j / 4 * 4 + i / 4) * 16 + j % 4 * 4 + i % 4;
-      for (int k = 0; k < Channels; ++k) planes[k][at] = row[i * Channels + k];
-    }
+    const int64_t row = static_cast<int64_t>(tile.y * kTile + j) * c.width + tile.x * kTile;
+    const int at = j / 4 * 64 + j % 4 * 4;
+    int i = 0;
+    for (; i + 4 <= width; i += 4) whole(row + i, at + 4 * i);
+    for (; i < width; ++i) one(row + i, at + i / 4 * 16 + i % 4);
   }
 }
 
-template <int Channels>
-inline void store_tile(float* picture, const CameraArgs& c, const Tile& tile, const float (*planes)[256]) {
-  const int width = std::min(kTile, c.width - tile.x * kTile), height = std::min(kTile, c.height - tile.y * kTile);
-  for (int j = 0; j < height; ++j) {
-    float* row = picture + (static_cast<int64_t>(tile.y * kTile + j) * c.width + tile.x * kTile) * Channels;
-    for (int i = 0; i < width; ++i) {
-      const int at = (j / 4 * 4 + i / 4) * 16 + j % 4 * 4 + i % 4;
-      for (int k = 0; k < Channels; ++k) row[i * Channels + k] = planes[k][at];
-    }
-  }
+// [channels][16 blocks, 16 lanes] of a tile from a picture [H, W, channels]; 0 outside.
+inline void load_tile(const float* picture, const CameraArgs& c, const Tile& tile, float (&plane)[256]) {
+  if (!tile.whole) std::memset(plane, 0, sizeof plane);
+  each_pixel(
+      c, tile, [&](int64_t from, int to) { std::memcpy(plane + to, picture + from, 16); },
+      [&](int64_t from, int to) { plane[to] = picture[from]; });
+}
+
+inline void load_tile(const float* picture, const CameraArgs& c, const Tile& tile, float (&planes)[3][256]) {
+  if (!tile.whole) std::memset(planes, 0, sizeof planes);
+  each_pixel(
+      c, tile, [&](int64_t from, int to) { split_rgb(picture + 3 * from, planes[0] + to, planes[1] + to, planes[2] + to); },
+      [&](int64_t from, int to) {
+        for (int k = 0; k < 3; ++k) planes[k][to] = picture[3 * from + k];
+      });
+}
+
+inline void store_tile(float* picture, const CameraArgs& c, const Tile& tile, const float (&plane)[256]) {
+  each_pixel(
+      c, tile, [&](int64_t to, int from) { std::memcpy(picture + to, plane + from, 16); },
+      [&](int64_t to, int from) { picture[to] = plane[from]; });
+}
+
+inline void store_tile(float* picture, const CameraArgs& c, const Tile& tile, const float (&planes)[3][256]) {
+  each_pixel(
+      c, tile, [&](int64_t to, int from) { join_rgb(picture + 3 * to, planes[0] + from, planes[1] + from, planes[2] + from); },
+      [&](int64_t to, int from) {
+        for (int k = 0; k < 3; ++k) picture[3 * to + k] = planes[k][from];
+      });
 }
 
 inline Tile tile_at(const State& s, int number) {
   const int x = number % s.tiles_x, y = number / s.tiles_x;
-  return {x, y, static_cast<float>(x * kTile + kTile / 2), static_cast<float>(y * kTile + kTile / 2)};
+  const bool whole = (x + 1) * kTile <= s.camera.width && (y + 1) * kTile <= s.camera.height;
+  return {x, y, static_cast<float>(x * kTile + kTile / 2), static_cast<float>(y * kTile + kTile / 2), whole};
 }
 
 // 1 for pixels inside the picture, 0 for the rest of a tile at the edge.
 inline void inside(const CameraArgs& c, const Tile& tile, float (&one)[256]) {
+  if (tile.whole) {
+    std::fill(one, one + 256, 1.0f);
+    return;
+  }
   for (int k = 0; k < 256; ++k) {
     const int block = k / 16, lane = k % 16;
     const int x = tile.x * kTile + block % 4 * 4 + lane % 4, y = tile.y * kTile + block / 4 * 4 + lane / 4;
