@@ -240,7 +240,7 @@ void blend_backward(State& s, const float* background, const Upstream& up, float
   prepare_sums(s, rows, threads);
   double* total = s.background.get(static_cast<size_t>(s.tiles()) * 3);
   parallel_for(s.tiles(), 2, threads, [&](int64_t begin, int64_t end, int worker) {
-    thread_local Work work;
+    Work& work = scratch<Work>();
     const Exp2 exp2;
     const Sink sink{s, rows ? s.sums.data() + worker * s.places() : nullptr};
     for (int64_t t = begin; t < end; ++t) {

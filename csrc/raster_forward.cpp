@@ -98,7 +98,7 @@ void blend(State& s, const float* background, const Outputs& out, int threads) {
   s.checkpoints.get(s.batches() * 256);
   s.masks.get(s.batches() * kBatch);
   parallel_for(s.tiles(), 2, threads, [&](int64_t begin, int64_t end, int) {
-    thread_local Batch batch;
+    Batch& batch = scratch<Batch>();
     const Exp2 exp2;
     for (int64_t t = begin; t < end; ++t) blend_tile(s, static_cast<int>(t), batch, background, out, exp2);
   });

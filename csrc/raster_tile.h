@@ -34,24 +34,6 @@ struct List {
   int count;                    // without the filling
 };
 
-struct Batch {
-  Row rows[kBatch + 1];  // one beyond the end is a Gaussian that draws nothing, which fills up lists
-  List list;             // of the current block
-
-  Batch() {
-    Row& blank = rows[kBatch];
-    for (float& height : blank.height) height = -1000.0f;
-    for (float& slope : blank.slope) slope = 0.0f;
-    blank.l1 = blank.r = blank.g = blank.b = blank.z = blank.u = blank.v = 0.0f;
-  }
-
-  const Row& row(uint16_t place) const { return *reinterpret_cast<const Row*>(reinterpret_cast<const char*>(rows) + place * size_t{8}); }
-  Row& row(uint16_t place) { return *reinterpret_cast<Row*>(reinterpret_cast<char*>(rows) + place * size_t{8}); }
-
-  void load_rows(const Record* records, const uint32_t* from, int n, const Tile& tile);
-  void list_block(const uint16_t* touched, int n);
-};
-
 constexpr int kPlace = sizeof(Row) / 8;
 
 // For each mask of eight Gaussians the places of the set ones, packed to the front.
@@ -69,9 +51,27 @@ inline const Packing& packing() {
   return table;
 }
 
+struct Batch {
+  Row rows[kBatch + 1];  // one beyond the end is a Gaussian that draws nothing, which fills up lists
+  List list;             // of the current block
+  const Packing& table = packing();
+
+  Batch() {
+    Row& blank = rows[kBatch];
+    for (float& height : blank.height) height = -1000.0f;
+    for (float& slope : blank.slope) slope = 0.0f;
+    blank.l1 = blank.r = blank.g = blank.b = blank.z = blank.u = blank.v = 0.0f;
+  }
+
+  const Row& row(uint16_t place) const { return *reinterpret_cast<const Row*>(reinterpret_cast<const char*>(rows) + place * size_t{8}); }
+  Row& row(uint16_t place) { return *reinterpret_cast<Row*>(reinterpret_cast<char*>(rows) + place * size_t{8}); }
+
+  void load_rows(const Record* records, const uint32_t* from, int n, const Tile& tile);
+  void list_block(const uint16_t* touched, int n);
+};
+
 inline void Batch::list_block(const uint16_t* touched, int n) {
   typedef uint16_t U8 __attribute__((vector_size(16)));
-  const Packing& table = packing();
   int count = 0;
   const auto add = [&](uint32_t mask, int first) {
     U8 places;
@@ -201,6 +201,13 @@ inline void store_tile(float* picture, const CameraArgs& c, const Tile& tile, co
       [&](int64_t to, int from) {
         for (int k = 0; k < 3; ++k) picture[3 * to + k] = planes[k][from];
       });
+}
+
+// One T per thread, made at its first use. (A plain thread_local object in a shared library is found anew at each access, in inner loops.)
+template <class T>
+T& scratch() {
+  thread_local const std::unique_ptr<T> own = std::make_unique<T>();
+  return *own;
 }
 
 inline Tile tile_at(const State& s, int number) {
