@@ -56,6 +56,12 @@ def dispatch(args: list[str]) -> int:
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except BrokenPipeError:
+        raise
+    except OSError as error:  # what no part foresaw: a file without permission, a drive that went away
+        place = f" at {error.filename}" if error.filename else ""
+        print(f"error: expected a file or folder that can be used{place}, found: {error.strerror or error}; check it", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130

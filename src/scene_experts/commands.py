@@ -17,7 +17,7 @@ from rich.console import Console
 from scene_experts import run_folder
 from scene_experts import train as training
 from scene_experts.cli import COMMANDS, PROG
-from scene_experts.config import Data, RunConfig, Train
+from scene_experts.config import Data, RunConfig, Train, check, expect_at_least
 from scene_experts.data.capture import Capture
 from scene_experts.data.report import show
 from scene_experts.errors import InputError
@@ -77,20 +77,21 @@ class TrainCommand:
 
 def train(args: list[str]) -> int:
     command = parse_train(args)
+    check_settings(command)
     console = Console(highlight=False)
     device, rasterize = backend(command.device, command.rasterizer, command.cfg.antialias, command.deterministic)
+    line = shlex.join([PROG, "train", *args])
+    config = RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, run_folder.versions())
+    run_folder.check(command.out, config, command.resume, command.overwrite)
     capture = run_folder.load_capture(command.data, command.cfg.seed)
     for warning in capture.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    line = shlex.join([PROG, "train", *args])
-    config = RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, run_folder.versions())
-    run_folder.prepare(command.out, config, command.resume, command.overwrite)
     run = Run(
         config=config,
         out=command.out,
         device=device,
         resume=command.resume,
-        save_every=max(1, command.save_every),
+        save_every=command.save_every,
         preview_every=command.preview_every,
         max_memory=command.max_memory,
     )
@@ -120,6 +121,14 @@ def parse_train(args: list[str]) -> TrainCommand:
     return tyro.extras.overridable_config_cli(defaults, args=args, prog=f"{PROG} train")
 
 
+def check_settings(command: TrainCommand) -> None:
+    """Raises InputError for settings that no training can have."""
+    stop_at = 1 if command.stop_at is None else command.stop_at
+    numbers = [("--save-every", command.save_every, 1), ("--preview-every", command.preview_every, 0), ("--stop-at", stop_at, 1)]
+    expect_at_least([*numbers, ("--max-memory", command.max_memory, 0)])
+    check(command.cfg)
+
+
 def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasterizer, console: Console) -> int:
     """Train, show and record; Ctrl-C and SIGTERM save and end the run."""
 
@@ -132,6 +141,8 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
     try:
         with Recorder(command.out, command.tensorboard, capture) as record, Progress(console) as progress:
             for event in training.train(command.cfg, run, capture, rasterize):
+                if isinstance(event, training.Started):  # what can fail before the first iteration has not: now the folder may change
+                    run_folder.prepare(command.out, run.config, command.resume, command.overwrite)
                 record(event)
                 progress(event)
     finally:

@@ -13,8 +13,9 @@ import tyro
 
 from scene_experts.errors import InputError
 from scene_experts.losses import Weights
-from scene_experts.scene.anchors import Anchors, Rates
+from scene_experts.scene.anchors import ATTRIBUTES, Anchors, Rates
 from scene_experts.scene.experts import Experts
+from scene_experts.schedule import Rate
 from scene_experts.strategy.grow import GrowAnchors
 
 SCHEDULE = 30_000  # the iterations that all schedule constants are written for
@@ -93,6 +94,32 @@ class RunConfig:
     deterministic: bool = False
     stop_at: int | None = None
     versions: dict[str, str] = field(default_factory=dict)
+
+
+def check(cfg: Train) -> None:
+    """Raises InputError, naming the flag, for settings that no training can have."""
+    scene, decoder = cfg.scene, cfg.scene.decoder
+    numbers: list[tuple[str, float, float]] = [
+        ("--iterations", cfg.iterations, 1),
+        ("--seed", cfg.seed, 0),
+        ("--max-anchors", cfg.max_anchors, 0),
+    ]
+    numbers += [(f"--scene.{name}", getattr(scene, name), 1) for name in ("K", "F", "hidden")]
+    expect_at_least([*numbers, ("--scene.voxel-size", scene.voxel_size, 0), ("--growth.adjust.interval", cfg.growth.adjust.interval, 1)])
+    unknown = {*scene.add_dist, *(decoder.attributes if isinstance(decoder, Experts) else ())} - set(ATTRIBUTES)
+    if unknown:
+        raise InputError(f"expected attributes among {', '.join(ATTRIBUTES)}, found {', '.join(sorted(unknown))}; correct the flag")
+    for name, rate in vars(cfg.rates).items():
+        if isinstance(rate, Rate) and not (rate.first > 0 < rate.last or rate.first == rate.last == 0):
+            flag = f"--rates.{name.replace('_', '-')}"
+            raise InputError(f"expected {flag} to run between two rates above 0, or to be 0 throughout, found {rate.first} and {rate.last}")
+
+
+def expect_at_least(numbers: list[tuple[str, float, float]]) -> None:
+    """Raises InputError for the first (flag, value, least) whose value is below."""
+    for flag, value, least in numbers:
+        if not value >= least:
+            raise InputError(f"expected {flag} of at least {least}, found {value}; give a larger number or leave it out")
 
 
 def to_json(value: Any) -> Any:

@@ -21,13 +21,14 @@ class Recorder:
     def __init__(self, out: Path, tensorboard: bool, capture: Capture) -> None:
         self.out, self.capture = out, capture
         self.path = out / "metrics.jsonl"
+        self.writer: Any = None  # makes the board when the run starts, so that one that cannot start leaves nothing behind
         self.board: Any = None
         if tensorboard:
             try:
                 from torch.utils.tensorboard import SummaryWriter
             except ImportError as error:
                 raise InputError("expected TensorBoard for --tensorboard, found none; pip install 'scene-experts[tensorboard]'") from error
-            self.board = SummaryWriter(str(out / "tensorboard"))
+            self.writer = SummaryWriter
 
     def __enter__(self) -> Recorder:
         return self
@@ -40,6 +41,8 @@ class Recorder:
         match event:
             case Started():
                 self.truncate(event.step)
+                if self.writer:
+                    self.board = self.writer(str(self.out / "tensorboard"))
             case Stepped():
                 self.line({**asdict(event)})
                 if self.board:

@@ -9,7 +9,10 @@ RUN/previews/, RUN/test/, RUN/results.json, RUN/per_view.json
 
 from __future__ import annotations
 
+import json
+import math
 import platform
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -50,28 +53,65 @@ def versions() -> dict[str, str]:
     }
 
 
+def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -> None:
+    """Raises InputError where a run may not go to `out`: over another run, or on from one of another recipe, capture or numbers.
+
+    Changes nothing on disk.
+    """
+    place = next(p for p in (out, *out.absolute().parents) if p.exists())
+    if not place.is_dir():
+        raise InputError(f"expected a folder for the run at {out}, found a file at {place}; choose another --out")
+    try:
+        json.dumps(to_json(config), allow_nan=False)
+    except ValueError:
+        raise InputError("expected finite numbers in every setting, found nan or infinity; correct the flag") from None
+    if resume and overwrite:
+        raise InputError("expected --resume (go on) or --overwrite (begin anew), found both; leave one out")
+    if resume and not (out / "config.json").is_file():
+        raise InputError(f"expected an earlier run to resume in {out}, found none; leave out --resume to begin one, or correct --out")
+    if resume:
+        _check_same(out, read_config(out), config)
+    elif not overwrite and any((out / "checkpoints").glob("ckpt_*.safetensors")):
+        raise InputError(
+            f"expected a new or empty run folder, found checkpoints in {out}; "
+            f"add --resume to go on, --overwrite to begin anew, or choose another --out"
+        )
+
+
+def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
+    """Whether a run can go on with `config`: everything that changes its numbers as it was; the capture may have moved."""
+    if found.train.recipe != config.train.recipe:
+        raise InputError(
+            f"expected a run of '{config.train.recipe}' to resume in {out}, found one of '{found.train.recipe}'; "
+            f"use `train {found.train.recipe}` or another --out"
+        )
+    old = to_json(replace(found.data, path=Path())) | to_json(found.train)
+    new = to_json(replace(config.data, path=Path())) | to_json(config.train)
+    other = _difference(old, new)
+    if other:
+        raise InputError(
+            f"expected the settings that the run in {out} began with, found other settings: {other}; "
+            f"resume with the run's own flags, or choose another --out"
+        )
+
+
+def _difference(old: object, new: object, where: str = "") -> str:
+    """The first place where two trees of plain values differ, as "loss.load was 0.01, is now 0.5", or nothing."""
+    if isinstance(old, dict) and isinstance(new, dict) and old.keys() == new.keys():
+        return next((found for key in old if (found := _difference(old[key], new[key], f"{where}.{key}".lstrip(".")))), "")
+    return "" if old == new else f"{where} was {old}, is now {new}"
+
+
 def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -> None:
-    """Make `out` ready for a run: refuses to write over another one, and to resume a run of another recipe or capture."""
-    path = out / "config.json"
-    if overwrite and not resume:
-        for old in [*(out / "checkpoints").glob("ckpt_*.safetensors"), out / "results.json", out / "per_view.json", path]:
+    """Make `out` ready for a run that `check` admits: an overwritten run's checkpoints and results go, config.json is written."""
+    check(out, config, resume, overwrite)
+    if overwrite:
+        results = [out / f"{name}{suffix}.json" for name in ("results", "per_view") for suffix in ("", "_train")]
+        for old in [*(out / "checkpoints").glob("ckpt_*.safetensors"), *results, out / "scene.compact", out / "config.json"]:
             old.unlink(missing_ok=True)
-    if path.exists():
-        found = read_config(out)
-        if not resume and checkpoint.latest(out / "checkpoints") is not None:
-            raise InputError(
-                f"expected a new or empty run folder, found checkpoints in {out}; add --resume to go on, --overwrite to begin anew, or choose another --out"
-            )
-        if resume and found.train.recipe != config.train.recipe:
-            raise InputError(
-                f"expected a run of '{config.train.recipe}' to resume in {out}, found one of '{found.train.recipe}'; "
-                f"use `train {found.train.recipe}` or another --out"
-            )
-        if resume and replace(found.data, path=Path()) != replace(config.data, path=Path()):
-            raise InputError(
-                f"expected the capture settings the run in {out} began with, found other ones; use the same --resolution, --split, ..."
-            )
-    write_json(path, {"format": FORMAT, **to_json(config)})
+        for sidecar in (out / "point_cloud").glob("iteration_*/scene.json"):  # a later iteration's would be taken for the new run's
+            shutil.rmtree(sidecar.parent, ignore_errors=True)
+    write_json(out / "config.json", {"format": FORMAT, **to_json(config)})
 
 
 def read_config(run: Path) -> RunConfig:
@@ -86,6 +126,8 @@ def read_config(run: Path) -> RunConfig:
 
 def load_capture(data: Data, seed: int = 0) -> Capture:
     """The capture that `data` describes."""
+    if data.background and not all(math.isfinite(v) and 0 <= v <= 1 for v in data.background):
+        raise InputError(f"expected --background as three numbers between 0 and 1, found {list(data.background)}; correct them")
     return captures.load(
         data.path,
         images=data.images,
@@ -106,6 +148,8 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     config = read_config(run)
     folder = run / "checkpoints"
     path = checkpoint.latest(folder) if step is None else folder / f"ckpt_{step:06d}.safetensors"
+    if path is None and any(folder.glob("ckpt_*.safetensors")):
+        raise InputError(f"expected a whole checkpoint in {folder}, found only damaged ones; copy one back or train again")
     if path is None or not path.is_file():
         raise InputError(
             f"expected a checkpoint in {folder}, found none{'' if step is None else f' at step {step}'}; train first, or use --resume"

@@ -45,7 +45,10 @@ def probe(path: Path) -> tuple[Size, Size]:
     """Stored size of the image at `path` and its size with the EXIF orientation applied. Reads the header only."""
     with _open(path) as image:
         size = image.size
-        turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)
+        try:
+            turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)
+        except (OSError, ValueError, SyntaxError) as error:  # PNG keeps EXIF behind the pixels: a file cut short fails here
+            raise _unreadable(path, error) from error
     return size, (size[1], size[0]) if turned else size
 
 
@@ -59,7 +62,7 @@ def _open(path: Path) -> Image.Image:
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:
-    return InputError(f"expected a readable image at {path}, found {error}; replace it or remove it from the capture")
+    return InputError(f"expected a readable image at {path}, found one that is not ({error}); replace it or remove it from the capture")
 
 
 def target_size(policy: str, size: Size) -> Size:

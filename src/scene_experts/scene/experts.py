@@ -16,9 +16,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from scene_experts.errors import InputError
 from scene_experts.scene.mlp import ACTIVATIONS, MLP, HeadWeights, linear_init
 from scene_experts.types import Routing
-
 
 log = logging.getLogger(__name__)
 
@@ -59,8 +59,10 @@ class Experts:
     router: Router = Router()
 
     def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> MixtureHead | MLP:
+        if self.num < 1:
+            raise InputError(f"expected at least 1 expert, found {self.num}; give a larger number")
         if self.top_k is not None and not 1 <= self.top_k <= self.num:
-            raise ValueError(f"expected top_k between 1 and the number of experts ({self.num}), found {self.top_k}")
+            raise InputError(f"expected top_k between 1 and the number of experts ({self.num}), found {self.top_k}; change one of them")
         if self.num == 1 or attribute not in self.attributes:
             return MLP(attribute, inputs, hidden, outputs)
         if self.top_k == 1 and self.router.renormalise and attribute == self.attributes[0]:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from scene_experts.errors import InputError
 from scene_experts.types import Routing
 
 ACTIVATIONS = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid}  # the last layer of each attribute
@@ -68,7 +69,7 @@ class MLP(nn.Module):
     def __init__(self, attribute: str, inputs: int, hidden: int, outputs: int, depth: int = 2) -> None:
         super().__init__()
         if depth < 2:
-            raise ValueError(f"expected a depth of at least 2 linear layers, found {depth}")
+            raise InputError(f"expected a depth of at least 2 linear layers, found {depth}; give a larger number")
         self.attribute = attribute
         self.w1 = linear_init((1, hidden, inputs), inputs)
         self.b1 = linear_init((1, hidden), inputs)
