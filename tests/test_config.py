@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from scene_experts.config import Data, RunConfig, Train, from_json, to_json
+from scene_experts.config import Data, RunConfig, Train, check, expect_at_least, from_json, to_json
 from scene_experts.errors import InputError
 from scene_experts.recipes import RECIPES
-from scene_experts.schedule import Every
+from scene_experts.schedule import Every, Rate
 
 
 @pytest.mark.parametrize("name", list(RECIPES))
@@ -41,3 +41,26 @@ def test_iterations_scale_windows_and_nothing_else():
 def test_errors_name_the_place(edit, message):
     with pytest.raises(InputError, match=message):
         from_json(Train, {"recipe": "x", **edit})
+
+
+@pytest.mark.parametrize("name", list(RECIPES))
+def test_recipes_are_possible(name):
+    check(RECIPES[name][1])
+
+
+def test_impossible_settings_name_their_flag():
+    moe = RECIPES["moe-gs"][1]
+    wrong = {
+        "--iterations of at least 1, found 0": replace(moe, iterations=0),
+        "--scene.F of at least 1": replace(moe, scene=replace(moe.scene, F=0)),
+        "opacity, cov, color, found colour": replace(moe, scene=replace(moe.scene, add_dist=("cov", "colour"))),
+        "color, found depth": replace(moe, scene=replace(moe.scene, decoder=replace(moe.scene.decoder, attributes=("depth",)))),
+        "--rates.log-scaling": replace(moe, rates=replace(moe.rates, log_scaling=Rate(0.01, 0.0))),
+        "--growth.adjust.interval": replace(moe, growth=replace(moe.growth, adjust=replace(moe.growth.adjust, interval=0))),
+    }
+    for said, cfg in wrong.items():
+        with pytest.raises(InputError, match=said):
+            check(cfg)
+    check(replace(moe, rates=replace(moe.rates, feature=Rate(0.0, 0.0))))
+    with pytest.raises(InputError, match="--x of at least 0, found nan"):
+        expect_at_least([("--x", float("nan"), 0)])

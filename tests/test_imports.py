@@ -44,3 +44,11 @@ def test_a_file_imports_its_own_layer_or_lower(path):
     assert me in RANK, f"{me} has no layer: add it to LAYERS and to docs/architecture.md"
     wrong = {m for m in imported(path) if part(m) in RANK and RANK[part(m)] > RANK[me]}
     assert not wrong, f"{relative} (layer {RANK[me]}) imports from above: {wrong}"
+
+
+def test_every_source_file_has_its_test_file():
+    tests = Path(__file__).parent
+    for path in SOURCE.rglob("*.py"):
+        says_something = any(isinstance(node, (ast.FunctionDef, ast.ClassDef)) for node in ast.walk(ast.parse(path.read_text())))
+        name = "_".join(part for part in path.relative_to(SOURCE).with_suffix("").parts if part != "__init__")
+        assert not says_something or (tests / f"test_{name}.py").is_file(), path

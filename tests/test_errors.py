@@ -1,0 +1,39 @@
+"""Each way to end badly has its exit code and leaves one line on stderr."""
+
+import errno
+import os
+
+import pytest
+
+from scene_experts import cli, commands
+from scene_experts.errors import InputError, RunError
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (InputError("expected a, found b; do c"), 2, "error: expected a, found b; do c\n"),
+        (RunError("cannot write x: full; free some space"), 1, "error: cannot write x: full; free some space\n"),
+        (PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/x"), 1, "at /x, found: Permission denied; check it\n"),
+        (KeyboardInterrupt(), 130, "stopped\n"),
+    ],
+)
+def test_exit_codes(error, code, said, monkeypatch, capsys):
+    def fail(args):
+        raise error
+
+    monkeypatch.setitem(commands.HANDLERS, "info", fail)
+    assert cli.main(["info"]) == code
+    out, err = capsys.readouterr()
+    assert out == "" and err.endswith(said) and err.count("\n") == 1
+
+
+def test_neither_is_the_other_and_a_fault_of_ours_is_not_hidden(monkeypatch):
+    assert not issubclass(InputError, RunError) and not issubclass(RunError, InputError)
+
+    def fault(args):
+        raise ZeroDivisionError
+
+    monkeypatch.setitem(commands.HANDLERS, "info", fault)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["info"])
