@@ -52,6 +52,23 @@ def test_help_is_what_was_reviewed(capsys):
     assert code == 0 and out == path.read_text()
 
 
+HELP = ["info", "train moe-gs", "train scaffold-gs", "eval", "compare", "export", "import", "doctor"]
+
+
+@pytest.mark.parametrize("command", HELP)
+def test_the_flags_of_every_command_are_what_was_reviewed(command, capsys, monkeypatch):
+    """Names alone, sorted: the layout of the help is tyro's and changes with it. Recorded with SCENE_EXPERTS_RECORD=1."""
+    monkeypatch.setenv("COLUMNS", "200")
+    code, out, _ = run(capsys, *command.split(), "--help")
+    found = sorted(set(re.findall(r"(?<![\w`-])--[a-zA-Z][\w.-]*", out)))
+    path = GOLDEN / "flags.json"
+    record = json.loads(path.read_text()) if path.exists() else {}
+    if os.environ.get("SCENE_EXPERTS_RECORD"):
+        path.write_text(json.dumps(record | {command: found}, indent=1) + "\n")
+        record[command] = found
+    assert code == 0 and found == record[command]
+
+
 def test_help_and_version_do_not_load_torch():
     probe = "import sys, scene_experts.cli as c; c.main(['--help']); c.main(['--version']); sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", probe], capture_output=True, check=False).returncode == 0

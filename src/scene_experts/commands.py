@@ -95,7 +95,7 @@ def train(args: list[str]) -> int:
         preview_every=command.preview_every,
         max_memory=command.max_memory,
     )
-    console.print(f"{config.train.recipe} on {capture.name} ({len(capture.train)} views), {device}, rasteriser {rasterize.name}")
+    console.print(f"{config.train.recipe} on {capture.name} ({len(capture.train)} views), {device}, rasteriser {rasterize.name}", soft_wrap=True)
     return follow(command, run, capture, rasterize, console)
 
 
@@ -154,8 +154,8 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
         from scene_experts.run_folder import open_run
 
         folder = write_layout(open_run(command.out), capture)
-        console.print(f"wrote {folder}")
-        console.print(f"next: {PROG} eval {command.out}")
+        console.print(f"wrote {folder}", soft_wrap=True)
+        console.print(f"next: {PROG} eval {command.out}", soft_wrap=True)
     return 0
 
 
