@@ -18,7 +18,8 @@ def test_a_log_file_gets_plain_lines():
         show(Finished(200, 75.0))
         show(Stopped(100, "SIGINT"))
     text = out.getvalue()
-    for part in ("1,234 anchors", "10/200", "l1 0.0500", "PSNR 21.50", "anchors 1,300", "active 61 %", "it/s", "left", "cap on anchors", "1:15"):
+    parts = ("1,234 anchors", "10/200", "l1 0.0500", "PSNR 21.50", "anchors 1,300", "active 61 %", "it/s", "left", "cap on anchors", "1:15")
+    for part in parts:
         assert part in text, part
     assert "--resume" in text and "\x1b" not in text
 

@@ -46,10 +46,8 @@ def test_channels_come_out_in_the_order_they_went_in(name):
     if name == "cpu" and native.load() is None:
         pytest.skip(str(native.why_not()))
     camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 5], [0, 20, 11], [0, 0, 1]]), 24, 16)
-    one = Gaussians(
-        torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.1), torch.ones(1), torch.tensor([[0.9, 0.5, 0.1]]),
-        torch.zeros(1, dtype=torch.int64),
-    )  # fmt: skip
+    place, turn, colour = torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[0.9, 0.5, 0.1]])
+    one = Gaussians(place, turn, torch.full((1, 3), 0.1), torch.ones(1), colour, torch.zeros(1, dtype=torch.int64))
     picture = choose(name, "cpu")(one, camera, torch.tensor([0.0, 0.1, 0.2])).image
     brightest = torch.nonzero(picture[..., 0] == picture[..., 0].max())[0]
     assert brightest[0] in (10, 11) and brightest[1] in (4, 5), "row about cy, column about cx"

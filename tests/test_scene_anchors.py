@@ -149,7 +149,7 @@ def test_rates_by_group():
 def test_switches_the_native_decode_does_not_cover_fall_back_or_are_refused():
     odd = Anchors(decoder=Experts(router=Router(detach_feature=True)))
     assert scene(odd, n=4).native_weights(1) is None
-    with pytest.raises(InputError, match="--scene.decode auto"):
+    with pytest.raises(InputError, match=r"--scene\.decode auto"):
         scene(replace(odd, quat_align=True, decode="native"), n=4).native_weights(1)
 
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch.nn import functional
 
+from scene_experts.errors import InputError
 from scene_experts.scene.experts import Experts, MixtureHead, Router, top_k
 from scene_experts.scene.mlp import MLP, Plain
 
@@ -159,5 +160,7 @@ def test_top_1_warns(caplog):
 
 
 def test_nonsense_is_refused():
-    with pytest.raises(ValueError, match="top_k between 1"):
+    with pytest.raises(InputError, match="top_k between 1"):
         Experts(num=2, top_k=3).build("color", D, H, OUT, F)
+    with pytest.raises(InputError, match="at least 1 expert"):
+        Experts(num=0).build("color", D, H, OUT, F)

@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from scene_experts.errors import InputError
 from scene_experts.scene.mlp import ACTIVATIONS, MLP, Plain, linear_init
 
 
@@ -9,7 +10,8 @@ def test_equals_a_torch_sequential(attribute):
     torch.manual_seed(0)
     mlp = MLP(attribute, 35, 32, 20)
     layers = torch.nn.Sequential(torch.nn.Linear(35, 32), torch.nn.ReLU(), torch.nn.Linear(32, 20))
-    layers.load_state_dict({"0.weight": mlp.w1[0].detach(), "0.bias": mlp.b1[0].detach(), "2.weight": mlp.w2[0].detach(), "2.bias": mlp.b2[0].detach()})
+    tensors = {"0.weight": mlp.w1, "0.bias": mlp.b1, "2.weight": mlp.w2, "2.bias": mlp.b2}
+    layers.load_state_dict({name: value[0].detach() for name, value in tensors.items()})
     x = torch.randn(7, 35)
     y, routing = mlp(x, x[:, :32], 1)
     torch.testing.assert_close(y, ACTIVATIONS[attribute](layers(x)))
@@ -22,7 +24,7 @@ def test_depth_adds_square_layers_that_kernels_do_not_cover():
     assert sum(p.numel() for p in deep.parameters()) == 2142 + 3 * (32 * 32 + 32)
     assert deep(torch.randn(4, 35), torch.randn(4, 32), 1)[0].shape == (4, 30)
     assert Plain().build("color", 35, 32, 30, 32).weights(1).k is None
-    with pytest.raises(ValueError, match="at least 2"):
+    with pytest.raises(InputError, match="at least 2"):
         Plain(depth=1).build("color", 35, 32, 30, 32)
 
 

@@ -14,7 +14,9 @@ def test_a_shorter_training_scales_the_window_and_keeps_the_interval():
     assert Every(1500, 15_000, 100).scaled(0.1) == Every(150, 1500, 100)
 
 
-@pytest.mark.parametrize(("rate", "expected"), [(Rate(0.01, 0.0001), 1.0e-3), (Rate(0.002, 0.00002), 2.0e-4), (Rate(0.008, 0.00005), 6.3246e-4)])
+@pytest.mark.parametrize(
+    ("rate", "expected"), [(Rate(0.01, 0.0001), 1.0e-3), (Rate(0.002, 0.00002), 2.0e-4), (Rate(0.008, 0.00005), 6.3246e-4)]
+)
 def test_rates_half_way(rate, expected):
     assert rate.at(15_000, 30_000) == pytest.approx(expected, rel=1e-4)
 

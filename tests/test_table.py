@@ -6,7 +6,9 @@ from scene_experts.table import Table
 
 def make(n=4):
     torch.manual_seed(0)
-    return Table({"a": torch.randn(n, 2), "b": torch.randn(n, 3, 2)}, {"cell": torch.arange(n * 3).reshape(n, 3)}, {"seen": torch.arange(n).float()})
+    return Table(
+        {"a": torch.randn(n, 2), "b": torch.randn(n, 3, 2)}, {"cell": torch.arange(n * 3).reshape(n, 3)}, {"seen": torch.arange(n).float()}
+    )
 
 
 def adam(table):

@@ -95,7 +95,8 @@ def train(args: list[str]) -> int:
         preview_every=command.preview_every,
         max_memory=command.max_memory,
     )
-    console.print(f"{config.train.recipe} on {capture.name} ({len(capture.train)} views), {device}, rasteriser {rasterize.name}", soft_wrap=True)
+    what = f"{config.train.recipe} on {capture.name} ({len(capture.train)} views)"
+    console.print(f"{what}, {device}, rasteriser {rasterize.name}", soft_wrap=True)
     return follow(command, run, capture, rasterize, console)
 
 
