@@ -34,7 +34,12 @@ def read(path: Path) -> Cloud:
     """The cloud and first camera of an .npz file."""
     with np.load(path, allow_pickle=False) as data:
         return Cloud(
-            data["means3d"].astype(np.float64), data["colors"] / 255.0, data["viewmats"][0], data["Ks"][0], int(data["width"]), int(data["height"])
+            data["means3d"].astype(np.float64),
+            data["colors"] / 255.0,
+            data["viewmats"][0],
+            data["Ks"][0],
+            int(data["width"]),
+            int(data["height"]),
         )
 
 

@@ -152,10 +152,8 @@ SE_EXPORT void se_raster_counts(const void* state, int64_t* counts, double* seco
   const State& s = *static_cast<const State*>(state);
   int64_t blocks = 0;
   for (int t = 0; t < s.tiles(); ++t)
-    for (int left = static_cast<int>(s.tile_used.data()[t]), k = 0; left > 0; left -= kBatch, ++k)
-      for (int b = 0; b < 16; ++b)
-        for (int i = 0; i < left && i < kBatch; i += 16)
-          blocks += __builtin_popcount(s.masks.data()[(s.batch(t, k) * 16 + b) * (kBatch / 16) + i / 16]);
+    for (int k = 0; k < static_cast<int>((s.tile_used.data()[t] + kBatch - 1) / kBatch); ++k)
+      for (int b = 0; b < 16; ++b) blocks += s.drawn.data()[s.batch(t, k) * 16 + b];
   counts[0] = s.visible, counts[1] = s.pairs, counts[2] = blocks;
   std::copy(s.seconds, s.seconds + 5, seconds);
 }

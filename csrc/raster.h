@@ -125,6 +125,7 @@ struct State {
   Buffer<uint32_t> tile_used;     // [tiles] how many of its list a tile looked at before all its pixels had stopped
   Buffer<uint32_t> list;          // [pairs] places, per tile near to far
   Buffer<uint16_t> masks;         // [batches, 16 blocks, kBatch / 16] which of a tile's blocks a Gaussian touches, see batch()
+  Buffer<uint16_t> drawn;         // [batches, 16 blocks] how many of those were blended before all the block's pixels had stopped
   Buffer<float> transmittance;    // [tiles * 256] what is left at the end, in block order
   Buffer<float> checkpoints;      // [batches * 256] what is left before each batch but a tile's first, see batch()
   Buffer<Sums> sums;              // backward: one row per place and worker, or (deterministic) per pair

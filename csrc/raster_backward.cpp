@@ -18,8 +18,7 @@ struct Pixels {
 
 struct Work {
   Batch batch;
-  F16 alpha[kBatch + 16], w[kBatch + 16];            // of one block's list
-  alignas(64) float centre[2 * kBatch + 32];  // u, v of each, px
+  F16 alpha[kBatch + 16], w[kBatch + 16];  // of one block's list
 };
 
 // Adds the sixteen Gaussians' sums over one block. `weights` (w) and W are rows of pixels.
@@ -29,14 +28,13 @@ void reduce(Work& work, int first, const F16* weights, F16 (&W)[16], const Pixel
   const int at = block * 16;
   std::copy(weights, weights + 16, w);
   transpose(w);
-  F16 red = bcast(0.0f), green = red, blue = red, depth = red;
-  for (int l = 0; l < 16; ++l) {
-    red = fma(w[l], bcast(px.color[0][at + l]), red);
-    green = fma(w[l], bcast(px.color[1][at + l]), green);
-    blue = fma(w[l], bcast(px.color[2][at + l]), blue);
-    if constexpr (Depth) depth = fma(w[l], bcast(px.depth[at + l]), depth);
-  }
-  out[kRed] = red, out[kGreen] = green, out[kBlue] = blue, out[kDepth] = depth;
+  const auto weighted = [&](const float* g) {  // two sums side by side: half as long a chain
+    F16 even = w[0] * bcast(g[0]), odd = w[1] * bcast(g[1]);
+    for (int l = 2; l < 16; l += 2) even = fma(w[l], bcast(g[l]), even), odd = fma(w[l + 1], bcast(g[l + 1]), odd);
+    return even + odd;
+  };
+  out[kRed] = weighted(px.color[0] + at), out[kGreen] = weighted(px.color[1] + at), out[kBlue] = weighted(px.color[2] + at);
+  out[kDepth] = Depth ? weighted(px.depth + at) : bcast(0.0f);
 
   // Moments about the block's centre in half pixels, -3 -1 1 3: by rows first, then over the rows.
   transpose(W);
@@ -55,8 +53,11 @@ void reduce(Work& work, int first, const F16* weights, F16 (&W)[16], const Pixel
   const F16 mxy = fma(three, row1[3] - row1[0], row1[2] - row1[1]) * quarter;
 
   // To moments about each Gaussian's centre.
+  Row* rows[16];
+  const float* centre[16];
+  for (int k = 0; k < 16; ++k) rows[k] = &work.batch.row(work.batch.list.place[first + k]), centre[k] = &rows[k]->u;
   F16 u, v;
-  load_pairs(work.centre + 2 * first, u, v);
+  load_pairs(centre, u, v);
   const F16 dx = u - bcast(tile.centre_x + 4.0f * static_cast<float>(block % 4) - 6.0f);
   const F16 dy = v - bcast(tile.centre_y + 4.0f * static_cast<float>(block / 4) - 6.0f);
   const F16 sx = dx * m - mx, sy = dy * m - my;
@@ -67,27 +68,22 @@ void reduce(Work& work, int first, const F16* weights, F16 (&W)[16], const Pixel
   for (int k = 10; k < 16; ++k) out[k] = bcast(0.0f);
   transpose(out);
   for (int k = 0; k < 16; ++k) {
-    float* sums = work.batch.row(work.batch.list.place[first + k]).sums;
+    float* sums = rows[k]->sums;
     store(sums, load(sums) + out[k]);
   }
 }
 
-// alpha and w of the block's list, near to far; returns how many until all pixels had stopped.
-int weigh(Work& work, int block, const float* checkpoint, const Exp2& exp2) {
+// alpha and w of the first `count` of the block's list, near to far.
+void weigh(Work& work, int count, int block, const float* checkpoint, const Exp2& exp2) {
   const Batch& batch = work.batch;
-  const F16 y = block_y(block / 4), limit = bcast(kMinAlphaLog2), most = bcast(kMaxAlpha), stop = bcast(kMinTransmittance);
-  const F16 one = bcast(1.0f);
+  const F16 y = block_y(block / 4), stop = bcast(kMinTransmittance), one = bcast(1.0f);
   const int column = block % 4;
   F16 through = load(checkpoint + block * 16);
-  int i = 0;
-  for (bool alive = true; i < batch.list.count && alive; i += 4) {
+  for (int i = 0; i < count; i += 4) {
+    const Row* row[4];
     F16 alpha[4];
-    for (int k = 0; k < 4; ++k) {
-      const Row& row = batch.row(batch.list.place[i + k]);
-      std::memcpy(work.centre + 2 * (i + k), &row.u, 8);
-      const F16 p = log_alpha(row, column, y);
-      alpha[k] = min_keep(ge(p, limit), exp2(p), most);
-    }
+    for (int k = 0; k < 4; ++k) row[k] = &batch.row(batch.list.place[i + k]);
+    alphas(row, column, y, exp2, alpha);
     for (int k = 0; k < 4; ++k) {
       const F16 next = through * (one - alpha[k]);
       const M16 drawn = ge(next, stop);
@@ -95,15 +91,13 @@ int weigh(Work& work, int block, const float* checkpoint, const Exp2& exp2) {
       work.alpha[i + k] = keep(drawn, alpha[k]);
       through = next;
     }
-    alive = any(ge(through, stop));
   }
-  return i;
 }
 
 template <bool Depth>
-void block_backward(Work& work, int block, const float* checkpoint, Pixels& px, const Tile& tile, const Exp2& exp2) {
+void block_backward(Work& work, int count, int block, const float* checkpoint, Pixels& px, const Tile& tile, const Exp2& exp2) {
   const Batch& batch = work.batch;
-  const int count = weigh(work, block, checkpoint, exp2);
+  weigh(work, count, block, checkpoint, exp2);
   const F16 most = bcast(kMaxAlpha), zero = bcast(0.0f), one = bcast(1.0f);
   const int at = block * 16;
   F16 behind = load(px.behind + at);
@@ -193,11 +187,13 @@ void tile_backward(State& s, int number, Work& work, const float* background, co
     const int64_t number_of_batch = s.batch(number, index);
     const Touched& touched = *reinterpret_cast<const Touched*>(s.masks.data() + number_of_batch * kBatch);
     const float* checkpoint = index > 0 ? s.checkpoints.data() + number_of_batch * 256 : px.through;
+    const uint16_t* drawn = s.drawn.data() + number_of_batch * 16;  // multiples of 4: the lists are filled up
     uint16_t any[kGroups] = {};
     for (int b = 0; b < 16; ++b) {
+      if (!drawn[b]) continue;
       for (int i = 0; i < kGroups; ++i) any[i] |= touched[b][i];
       batch.list_block(touched[b], n);
-      if (batch.list.count > 0) block_backward<Depth>(work, b, checkpoint, px, tile, exp2);
+      block_backward<Depth>(work, drawn[b], b, checkpoint, px, tile, exp2);
     }
     for (int k = 0; k < n; ++k)
       if (!sink.own || any[k / 16] >> k % 16 & 1) sink.add(from[k], tile, batch.rows[k].sums);

@@ -11,23 +11,20 @@ struct Pixels {  // a tile's pixels in block order
   alignas(64) float through[256], left[256], color[3][256], depth[256];
 };
 
-// Blends the batch's list into one block; returns whether any pixel still lets light through.
+// Blends the batch's list into one block, as long as any pixel lets light through; returns how many of the list that took.
 // `through` runs on past the stop (it only falls); `left` keeps the value before it.
-bool blend_block(const Batch& batch, int block, Pixels& px, const Exp2& exp2) {
-  const F16 y = block_y(block / 4), limit = bcast(kMinAlphaLog2), most = bcast(kMaxAlpha), stop = bcast(kMinTransmittance);
+int blend_block(const Batch& batch, int block, Pixels& px, const Exp2& exp2, bool& alive) {
+  const F16 y = block_y(block / 4), stop = bcast(kMinTransmittance);
   const F16 one = bcast(1.0f);
   const int at = block * 16, column = block % 4;
   F16 through = load(px.through + at), left = load(px.left + at), depth = load(px.depth + at);
   F16 red = load(px.color[0] + at), green = load(px.color[1] + at), blue = load(px.color[2] + at);
-  bool alive = true;
-  for (int i = 0; i < batch.list.count && alive; i += 4) {
+  int i = 0;
+  for (alive = true; i < batch.list.count && alive; i += 4) {
     const Row* row[4];
     F16 alpha[4];
-    for (int k = 0; k < 4; ++k) {
-      row[k] = &batch.row(batch.list.place[i + k]);
-      const F16 p = log_alpha(*row[k], column, y);
-      alpha[k] = min_keep(ge(p, limit), exp2(p), most);
-    }
+    for (int k = 0; k < 4; ++k) row[k] = &batch.row(batch.list.place[i + k]);
+    alphas(row, column, y, exp2, alpha);
     for (int k = 0; k < 4; ++k) {
       const F16 next = through * (one - alpha[k]);
       const M16 drawn = ge(next, stop);
@@ -43,7 +40,7 @@ bool blend_block(const Batch& batch, int block, Pixels& px, const Exp2& exp2) {
   }
   store(px.through + at, through), store(px.left + at, left), store(px.depth + at, depth);
   store(px.color[0] + at, red), store(px.color[1] + at, green), store(px.color[2] + at, blue);
-  return alive;
+  return i;
 }
 
 void finish(State& s, int number, const Tile& tile, Pixels& px, const float* background, const Outputs& out) {
@@ -75,15 +72,17 @@ void blend_tile(State& s, int number, Batch& batch, const float* background, con
     const int64_t number_of_batch = s.batch(number, static_cast<int>((at - begin) / kBatch));
     if (at > begin) std::copy(px.through, px.through + 256, s.checkpoints.data() + number_of_batch * 256);
     Touched& touched = *reinterpret_cast<Touched*>(s.masks.data() + number_of_batch * kBatch);
+    uint16_t* drawn = s.drawn.data() + number_of_batch * 16;
     batch.load_rows(s.records.data(), from, n, tile);
     touch_blocks(s.records.data(), from, n, tile, touched);
     for (int b = 0; b < 16; ++b) {
-      if (!(alive >> b & 1)) {
-        std::fill(touched[b], touched[b] + kGroups, static_cast<uint16_t>(0));
-        continue;
-      }
+      drawn[b] = 0;
+      if (!(alive >> b & 1)) continue;
       batch.list_block(touched[b], n);
-      if (batch.list.count > 0 && !blend_block(batch, b, px, exp2)) alive &= ~(1u << b);
+      if (batch.list.count == 0) continue;
+      bool still;
+      drawn[b] = static_cast<uint16_t>(blend_block(batch, b, px, exp2, still));
+      if (!still) alive &= ~(1u << b);
     }
     at += static_cast<uint32_t>(n);
   }
@@ -96,7 +95,7 @@ void blend_tile(State& s, int number, Batch& batch, const float* background, con
 void blend(State& s, const float* background, const Outputs& out, int threads) {
   s.transmittance.get(static_cast<size_t>(s.tiles()) * 256);
   s.checkpoints.get(s.batches() * 256);
-  s.masks.get(s.batches() * kBatch);
+  s.masks.get(s.batches() * kBatch), s.drawn.get(s.batches() * 16);
   parallel_for(s.tiles(), 2, threads, [&](int64_t begin, int64_t end, int) {
     Batch& batch = scratch<Batch>();
     const Exp2 exp2;

@@ -3,7 +3,7 @@
 //   load store bcast bcast4 (four floats, repeated), + - * /, fma(a, b, c) = a b + c, fnma = c - a b, min max sqrt ceil floor,
 //   ge gt & |, select(m, a, b), keep(m, a) = a or 0, mul_keep, min_keep, bits any, store_int (truncated),
 //   Exp2 (relative error below 4e-7; anything where p < -126), reciprocal (to rounding), split_exponent, transpose (16 x 16),
-//   load_pairs(p, a, b): p[0] p[2] ... and p[1] p[3] ...
+//   load_pairs(p, a, b): p[0][0] p[1][0] ... and p[0][1] p[1][1] ...
 #pragma once
 #if defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512BW__)
 #include "raster_simd_avx512.h"

@@ -6,6 +6,8 @@
 
 namespace se {
 
+constexpr int kSideBySide = 1;  // there are too few registers for more
+
 struct F16 {
   __m256 lo, hi;
 };
@@ -65,7 +67,10 @@ struct Exp2 {
     q = _mm256_fmadd_ps(f, q, _mm256_set1_ps(1.0f));
     return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(q), _mm256_slli_epi32(_mm256_castps_si256(rounded), 23)));
   }
-  F16 operator()(F16 p) const { return {half(p.lo), half(p.hi)}; }
+  template <int N>
+  void operator()(F16 (&p)[N]) const {
+    for (int k = 0; k < N; ++k) p[k] = {half(p[k].lo), half(p[k].hi)};
+  }
 };
 
 inline F16 reciprocal(F16 a) {
@@ -87,15 +92,21 @@ inline void split_exponent(F16 a, F16& m, F16& e) {
   split_exponent_half(a.hi, m.hi, e.hi);
 }
 
-inline void load_pairs(const float* p, F16& first, F16& second) {
-  const auto half = [](const float* q, __m256& even, __m256& odd) {
-    const __m256 a = _mm256_loadu_ps(q), b = _mm256_loadu_ps(q + 8);
+inline void load_pairs(const float* const (&p)[16], F16& first, F16& second) {
+  const auto four = [&](int k) {
+    const auto two = [&](int j) {
+      return _mm_loadh_pd(_mm_load_sd(reinterpret_cast<const double*>(p[j])), reinterpret_cast<const double*>(p[j + 1]));
+    };
+    return _mm256_castpd_ps(_mm256_insertf128_pd(_mm256_castpd128_pd256(two(k)), two(k + 2), 1));
+  };
+  const auto half = [&](int k, __m256& even, __m256& odd) {
+    const __m256 a = four(k), b = four(k + 4);
     const auto in_order = [](__m256 v) { return _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(v), 0xd8)); };
     even = in_order(_mm256_shuffle_ps(a, b, 0x88));
     odd = in_order(_mm256_shuffle_ps(a, b, 0xdd));
   };
-  half(p, first.lo, second.lo);
-  half(p + 16, first.hi, second.hi);
+  half(0, first.lo, second.lo);
+  half(8, first.hi, second.hi);
 }
 
 inline void transpose8(__m256 (&r)[8]) {

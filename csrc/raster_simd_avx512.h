@@ -6,6 +6,8 @@
 
 namespace se {
 
+constexpr int kSideBySide = 4;  // Gaussians whose exponentials are computed together
+
 struct F16 {
   __m512 v;
 };
@@ -53,15 +55,21 @@ struct Exp2 {
     }
     table = _mm512_load_ps(reinterpret_cast<const float*>(entry));
   }
-  F16 operator()(F16 p) const {
+  // Several at a time, step by step: the processor then finds independent work next to each other.
+  template <int N>
+  void operator()(F16 (&p)[N]) const {
     const __m512 magic = _mm512_set1_ps(786432.0f);  // 1.5 * 2^19
-    const __m512 rounded = _mm512_add_ps(p.v, magic);
-    const __m512 f = _mm512_sub_ps(p.v, _mm512_sub_ps(rounded, magic));
-    const __m512i index = _mm512_castps_si512(rounded);
-    const __m512i entry = _mm512_castps_si512(_mm512_permutexvar_ps(index, table));
-    const __m512 scale = _mm512_castsi512_ps(_mm512_add_epi32(entry, _mm512_slli_epi32(index, 19)));
-    const __m512 q = _mm512_fmadd_ps(f, _mm512_set1_ps(kQuadratic), _mm512_set1_ps(kLinear));
-    return {_mm512_mul_ps(scale, _mm512_fmadd_ps(q, f, _mm512_set1_ps(1.0f)))};
+    const __m512 linear = _mm512_set1_ps(kLinear), quadratic = _mm512_set1_ps(kQuadratic), one = _mm512_set1_ps(1.0f);
+    __m512 rounded[N], f[N], q[N];
+    __m512i scale[N];
+    for (int k = 0; k < N; ++k) rounded[k] = _mm512_add_ps(p[k].v, magic);
+    for (int k = 0; k < N; ++k) scale[k] = _mm512_castps_si512(_mm512_permutexvar_ps(_mm512_castps_si512(rounded[k]), table));
+    for (int k = 0; k < N; ++k) f[k] = _mm512_sub_ps(rounded[k], magic);
+    for (int k = 0; k < N; ++k) f[k] = _mm512_sub_ps(p[k].v, f[k]);
+    for (int k = 0; k < N; ++k) scale[k] = _mm512_add_epi32(scale[k], _mm512_slli_epi32(_mm512_castps_si512(rounded[k]), 19));
+    for (int k = 0; k < N; ++k) q[k] = _mm512_fmadd_ps(f[k], quadratic, linear);
+    for (int k = 0; k < N; ++k) q[k] = _mm512_fmadd_ps(q[k], f[k], one);
+    for (int k = 0; k < N; ++k) p[k].v = _mm512_mul_ps(_mm512_castsi512_ps(scale[k]), q[k]);
   }
   static constexpr float kLinear = 0.69318771f, kQuadratic = 0.24022643f;  // least largest relative error on [-1/32, 1/32]
 };
@@ -79,9 +87,17 @@ inline void split_exponent(F16 a, F16& m, F16& e) {
   e.v = _mm512_mask_add_ps(up, _mm512_cmp_ps_mask(mant, _mm512_set1_ps(1.5f), _CMP_GE_OQ), up, _mm512_set1_ps(1.0f));
 }
 
-inline void load_pairs(const float* p, F16& first, F16& second) {
+inline void load_pairs(const float* const (&p)[16], F16& first, F16& second) {
+  __m512d quarter[4];
+  for (int i = 0; i < 4; ++i) {
+    const auto two = [&](int k) {
+      return _mm_loadh_pd(_mm_load_sd(reinterpret_cast<const double*>(p[k])), reinterpret_cast<const double*>(p[k + 1]));
+    };
+    quarter[i] = _mm512_castpd256_pd512(_mm256_insertf128_pd(_mm256_castpd128_pd256(two(4 * i)), two(4 * i + 2), 1));
+  }
+  const __m512 a = _mm512_castpd_ps(_mm512_insertf64x4(quarter[0], _mm512_castpd512_pd256(quarter[1]), 1));
+  const __m512 b = _mm512_castpd_ps(_mm512_insertf64x4(quarter[2], _mm512_castpd512_pd256(quarter[3]), 1));
   const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
-  const __m512 a = _mm512_loadu_ps(p), b = _mm512_loadu_ps(p + 16);
   first.v = _mm512_permutex2var_ps(a, even, b);
   second.v = _mm512_permutex2var_ps(a, _mm512_add_epi32(even, _mm512_set1_epi32(1)), b);
 }

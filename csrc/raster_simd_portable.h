@@ -9,6 +9,8 @@ namespace se {
 typedef float V4 __attribute__((vector_size(16)));
 typedef int32_t I4 __attribute__((vector_size(16)));
 
+constexpr int kSideBySide = 1;  // there are too few registers for more
+
 struct F16 {
   V4 v[4];
 };
@@ -95,7 +97,7 @@ inline void store_int(int32_t* p, F16 a) {
 
 // 2^p as a quintic on [-1/2, 1/2]; 1.5 * 2^23 puts the nearest integer in the low bits of a float's mantissa.
 struct Exp2 {
-  F16 operator()(F16 p) const {
+  static F16 single(F16 p) {
     const F16 magic = bcast(12582912.0f);
     const F16 rounded = p + magic, f = p - (rounded - magic);
     F16 q = fma(f, bcast(1.3264738e-3f), bcast(9.6715130e-3f));
@@ -104,6 +106,10 @@ struct Exp2 {
     q = fma(f, q, bcast(6.9314698e-1f));
     q = fma(f, q, bcast(1.0f));
     SE_ALL(F16, (V4)((I4)q.v[i] + ((I4)rounded.v[i] << 23)));
+  }
+  template <int N>
+  void operator()(F16 (&p)[N]) const {
+    for (int k = 0; k < N; ++k) p[k] = single(p[k]);
   }
 };
 
@@ -118,8 +124,8 @@ inline void split_exponent(F16 a, F16& m, F16& e) {
   }
 }
 
-inline void load_pairs(const float* p, F16& first, F16& second) {
-  for (int k = 0; k < 16; ++k) first.v[k / 4][k % 4] = p[2 * k], second.v[k / 4][k % 4] = p[2 * k + 1];
+inline void load_pairs(const float* const (&p)[16], F16& first, F16& second) {
+  for (int k = 0; k < 16; ++k) first.v[k / 4][k % 4] = p[k][0], second.v[k / 4][k % 4] = p[k][1];
 }
 
 inline void transpose(F16 (&r)[16]) {

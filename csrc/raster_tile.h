@@ -102,14 +102,14 @@ inline F16 block_y(int block_row) {
 }
 
 inline void Batch::load_rows(const Record* records, const uint32_t* from, int n, const Tile& tile) {
-  const F16 columns = load(lane_x());
+  const F16 columns = load(lane_x()) + bcast(tile.centre_x), centre_y = bcast(tile.centre_y);
   for (int k = 0; k < n; ++k) {
     __builtin_prefetch(&records[from[k + kAhead]]);
     const Record& r = records[from[k]];
     Row& row = rows[k];
-    const F16 dx = bcast(r.u - tile.centre_x) - columns, f = bcast(r.l3) * dx;
+    const F16 dx = bcast(r.u) - columns, f = bcast(r.l3) * dx, ly = bcast(r.l1) * (bcast(r.v) - centre_y);
     store(row.height, fnma(f, f, bcast(r.log_opacity)));
-    store(row.slope, fma(bcast(r.l2), dx, bcast(r.l1 * (r.v - tile.centre_y))));
+    store(row.slope, fma(bcast(r.l2), dx, ly));
     std::memcpy(&row.l1, &r, 32);
   }
 }
@@ -144,18 +144,55 @@ inline void touch_blocks(const Record* records, const uint32_t* from, int n, con
   }
 }
 
-// alpha before the cut at kMaxAlpha is exp2 of this; below kMinAlphaLog2 it is not drawn.
-inline F16 log_alpha(const Row& row, int block_column, F16 y) {
-  const F16 e = fnma(bcast(row.l1), y, bcast4(row.slope + 4 * block_column));
-  return fnma(e, e, bcast4(row.height + 4 * block_column));
+// Alpha of four Gaussians at a block's pixels; 0 where it is below 1/255.
+inline void alphas(const Row* const (&row)[4], int block_column, F16 y, const Exp2& exp2, F16 (&alpha)[4]) {
+  constexpr int N = kSideBySide;
+  const F16 limit = bcast(kMinAlphaLog2), most = bcast(kMaxAlpha);
+  for (int i = 0; i < 4; i += N) {
+    F16 e[N], p[N];
+    M16 drawn[N];
+    for (int k = 0; k < N; ++k) e[k] = fnma(bcast(row[i + k]->l1), y, bcast4(row[i + k]->slope + 4 * block_column));
+    for (int k = 0; k < N; ++k) p[k] = fnma(e[k], e[k], bcast4(row[i + k]->height + 4 * block_column));
+    for (int k = 0; k < N; ++k) drawn[k] = ge(p[k], limit);
+    exp2(p);
+    for (int k = 0; k < N; ++k) alpha[i + k] = min_keep(drawn[k], p[k], most);
+  }
 }
 
 // Four pixels of three interleaved channels, apart and together again.
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_shufflevector)
+#define SE_SHUFFLE __builtin_shufflevector
+#endif
+#endif
+typedef float Four __attribute__((vector_size(16)));
+
 inline void split_rgb(const float* p, float* r, float* g, float* b) {
+#if defined(SE_SHUFFLE)
+  Four x, y, z;  // r0 g0 b0 r1, g1 b1 r2 g2, b2 r3 g3 b3
+  std::memcpy(&x, p, 16), std::memcpy(&y, p + 4, 16), std::memcpy(&z, p + 8, 16);
+  const Four low = SE_SHUFFLE(x, y, 1, 2, 4, 5), high = SE_SHUFFLE(y, z, 2, 3, 5, 6);  // g0 b0 g1 b1, r2 g2 r3 g3
+  const Four red = SE_SHUFFLE(x, high, 0, 3, 4, 6), green = SE_SHUFFLE(low, high, 0, 2, 5, 7), blue = SE_SHUFFLE(low, z, 1, 3, 4, 7);
+  std::memcpy(r, &red, 16), std::memcpy(g, &green, 16), std::memcpy(b, &blue, 16);
+#else
   for (int i = 0; i < 4; ++i) r[i] = p[3 * i], g[i] = p[3 * i + 1], b[i] = p[3 * i + 2];
+#endif
 }
+
 inline void join_rgb(float* p, const float* r, const float* g, const float* b) {
+#if defined(SE_SHUFFLE)
+  Four red, green, blue;
+  std::memcpy(&red, r, 16), std::memcpy(&green, g, 16), std::memcpy(&blue, b, 16);
+  const Four rg = SE_SHUFFLE(red, green, 0, 4, 1, 5), gb = SE_SHUFFLE(green, blue, 1, 5, 2, 6), br = SE_SHUFFLE(blue, red, 0, 5, 2, 7);
+  const Four x = SE_SHUFFLE(rg, br, 0, 1, 4, 5);               // r0 g0 b0 r1
+  const Four middle = SE_SHUFFLE(red, green, 2, 6, 3, 7);      // r2 g2 r3 g3
+  const Four y = SE_SHUFFLE(gb, middle, 0, 1, 4, 5);           // g1 b1 r2 g2
+  const Four end = SE_SHUFFLE(middle, blue, 2, 3, 7, 7);       // r3 g3 b3 b3
+  const Four z = SE_SHUFFLE(br, end, 2, 4, 5, 6);              // b2 r3 g3 b3
+  std::memcpy(p, &x, 16), std::memcpy(p + 4, &y, 16), std::memcpy(p + 8, &z, 16);
+#else
   for (int i = 0; i < 4; ++i) p[3 * i] = r[i], p[3 * i + 1] = g[i], p[3 * i + 2] = b[i];
+#endif
 }
 
 // Calls whole(offset in the picture, place in block order) for four neighbours at a time where the tile lies inside the picture,
