@@ -57,6 +57,9 @@ def test_impossible_settings_name_their_flag():
         "color, found depth": replace(moe, scene=replace(moe.scene, decoder=replace(moe.scene.decoder, attributes=("depth",)))),
         "--rates.log-scaling": replace(moe, rates=replace(moe.rates, log_scaling=Rate(0.01, 0.0))),
         "--growth.adjust.interval": replace(moe, growth=replace(moe.growth, adjust=replace(moe.growth.adjust, interval=0))),
+        "--growth.hierarchy-factor of at least 2": replace(moe, growth=replace(moe.growth, hierarchy_factor=0)),
+        "--seed of at most": replace(moe, seed=2**63 - 1),
+        "--scene.decoder.warmup": replace(moe, scene=replace(moe.scene, decoder=replace(moe.scene.decoder, warmup=-1))),
     }
     for said, cfg in wrong.items():
         with pytest.raises(InputError, match=said):

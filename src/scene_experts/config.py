@@ -19,6 +19,7 @@ from scene_experts.schedule import Rate
 from scene_experts.strategy.grow import GrowAnchors
 
 SCHEDULE = 30_000  # the iterations that all schedule constants are written for
+LARGEST_SEED = 2**63 - 2  # torch takes signed 64 bits, and growth draws from the seed after this one
 
 
 @dataclass(frozen=True)
@@ -98,14 +99,20 @@ class RunConfig:
 
 def check(cfg: Train) -> None:
     """Raises InputError, naming the flag, for settings that no training can have."""
-    scene, decoder = cfg.scene, cfg.scene.decoder
+    scene, decoder, growth = cfg.scene, cfg.scene.decoder, cfg.growth
     numbers: list[tuple[str, float, float]] = [
         ("--iterations", cfg.iterations, 1),
         ("--seed", cfg.seed, 0),
         ("--max-anchors", cfg.max_anchors, 0),
     ]
     numbers += [(f"--scene.{name}", getattr(scene, name), 1) for name in ("K", "F", "hidden")]
-    expect_at_least([*numbers, ("--scene.voxel-size", scene.voxel_size, 0), ("--growth.adjust.interval", cfg.growth.adjust.interval, 1)])
+    numbers += [("--scene.voxel-size", scene.voxel_size, 0), ("--growth.adjust.interval", growth.adjust.interval, 1)]
+    numbers += [("--growth.hierarchy-factor", growth.hierarchy_factor, 2), ("--growth.max-anchors", growth.max_anchors, 0)]
+    if isinstance(decoder, Experts):
+        numbers += [("--scene.decoder.warmup", decoder.warmup, 0), ("--scene.decoder.router.noise-std", decoder.router.noise_std, 0)]
+    expect_at_least(numbers)
+    if cfg.seed > LARGEST_SEED:
+        raise InputError(f"expected --seed of at most {LARGEST_SEED}, found {cfg.seed}; give a smaller number")
     unknown = {*scene.add_dist, *(decoder.attributes if isinstance(decoder, Experts) else ())} - set(ATTRIBUTES)
     if unknown:
         raise InputError(f"expected attributes among {', '.join(ATTRIBUTES)}, found {', '.join(sorted(unknown))}; correct the flag")
