@@ -157,3 +157,18 @@ def test_new_rows_have_the_columns_of_the_table():
     made = scene(Anchors(), n=5)
     made.table.append(made.new_rows(torch.tensor([[16, 0, -16]]), 0.16, torch.ones(1, 32)))
     assert len(made.table) == 6 and float(made.table.params["log_scaling"][5, 0].detach()) == pytest.approx(math.log(0.16))
+
+
+def test_coinciding_points_still_have_a_voxel_size():
+    spread = torch.rand(10, 3, dtype=torch.float64)
+    assert voxel_size(torch.cat([spread] + [spread[:1]] * 30), "neighbours") > 0
+    with pytest.raises(InputError, match="two different points"):
+        voxel_size(spread[:1].repeat(5, 1), "neighbours")
+
+
+def test_the_native_decode_refuses_heads_it_has_no_code_for():
+    if native.load() is None:
+        pytest.skip("no compiled library")
+    wanted = Anchors(decode="native", decoder=Experts(mix="pre_activation"))
+    with pytest.raises(InputError, match=r"--scene\.decode auto"):
+        scene(wanted)(camera(), 1, True, EVERYTHING)

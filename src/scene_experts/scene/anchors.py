@@ -133,7 +133,10 @@ class AnchorScene(nn.Module):
                 raise InputError(f"expected a scene that the native decode covers, found {why}; use --scene.decode auto")
             return None
         weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
-        return None if any(w is None for w in weights.values()) else weights  # type: ignore[return-value]
+        without = next((a for a, w in weights.items() if w is None), None)
+        if without and self.config.decode == "native":
+            raise InputError(f"expected a {without} head that the native decode covers, found switches it has no code for; use --scene.decode auto")
+        return None if without else weights  # type: ignore[return-value]
 
     def inputs(self, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
         """Feature [A, F], unit direction camera -> anchor [A, 3], distance [A, 1]."""
@@ -213,10 +216,11 @@ class AnchorScene(nn.Module):
 
 
 def voxel_size(points: Tensor, rule: VoxelChoice) -> float:
-    """The lattice's edge by rule, from points [P, 3] in trained world units."""
-    if rule == "neighbours":
-        return 0.25 * median_neighbour_distance(points)
-    return auto_voxel(points, rule)
+    """The lattice's edge by rule, from points [P, 3] in trained world units. Raises InputError if no two points differ."""
+    if rule != "neighbours":
+        return auto_voxel(points, rule)
+    spacing = median_neighbour_distance(points)
+    return 0.25 * spacing if spacing > 0 else auto_voxel(points, "median_nn", 0.25)  # more than half of the points coincide
 
 
 @dataclass(frozen=True)
