@@ -164,3 +164,16 @@ def test_growth_leaves_networks_and_their_adam_state_alone():
     GrowAnchors().prune(scene)
     for name, tensor in scene.network_tensors().items():
         assert torch.equal(tensor, networks[name]) and float(optimizer.state[tensor]["step"]) == 1
+
+
+def test_the_anchors_miss_the_step_of_an_adjustment_even_without_a_change():
+    scene = make()
+    for name in ("count", "grad"):
+        scene.table.stats[name].zero_()
+    for p in scene.table.params.values():
+        p.grad = torch.ones_like(p)
+    rule = GrowAnchors()
+    assert rule.update(scene, 1550, torch.Generator()) is None and all(p.grad is not None for p in scene.table.params.values())
+    edit = rule.update(scene, 1600, torch.Generator())
+    assert edit is not None and edit.grown == edit.pruned == 0
+    assert all(p.grad is None for p in scene.table.params.values())

@@ -76,6 +76,8 @@ class GrowAnchors:
             return None
         grown, capped = self.grow(scene, generator)
         pruned = self.prune(scene)
+        for column in scene.table.params.values():
+            column.grad = None  # Scaffold-GS's anchors miss the step of an adjustment, whether it changed a row or not
         return Edit(grown, pruned, len(scene.table), capped)
 
     def cell_factors(self) -> list[int]:
