@@ -53,3 +53,8 @@ def test_channels_come_out_in_the_order_they_went_in(name):
     assert brightest[0] in (10, 11) and brightest[1] in (4, 5), "row about cy, column about cx"
     assert picture[10, 4, 0] > 0.7 and 0.4 < picture[10, 4, 1] < 0.5 and picture[10, 4, 2] < 0.15
     torch.testing.assert_close(picture[0, -1], torch.tensor([0.0, 0.1, 0.2]))
+
+
+def test_gsplat_says_that_it_is_not_deterministic():
+    with pytest.warns(UserWarning, match="--device cpu"):
+        assert choose("gsplat", "cuda", deterministic=True).name == "gsplat"

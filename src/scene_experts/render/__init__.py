@@ -57,6 +57,8 @@ def choose(name: str, device: torch.device | str, antialias: bool = False, deter
 
         if device.type != "cuda":
             raise InputError(f"the rasteriser `gsplat` draws tensors on CUDA, not on {device}: choose `cpu` or `reference`")
+        if deterministic:
+            warnings.warn("gsplat adds up gradients in no fixed order: only --device cpu gives bit-identical results", stacklevel=2)
         return GsplatRasterizer(antialias=antialias)
     if name == "reference":
         from scene_experts.render.reference import ReferenceRasterizer
