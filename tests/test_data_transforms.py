@@ -166,3 +166,11 @@ def test_broken_json(tmp_path: Path) -> None:
     (tmp_path / "transforms_train.json").write_text("{")
     with pytest.raises(InputError, match="JSON"):
         load(tmp_path, init="random")
+
+
+def test_auto_takes_the_split_that_the_file_names(tmp_path: Path) -> None:
+    make_nerfstudio(tmp_path, views=5, size=(24, 16), points=50)
+    edit(tmp_path / "transforms.json", lambda m: m.update(test_filenames=["images/view_001.png", "images/view_003.png"]))
+    capture = load(tmp_path)
+    assert (capture.split, capture.test, capture.train) == ("files", (1, 3), (0, 2, 4))
+    assert load(tmp_path, split="mod8").test == (0,)

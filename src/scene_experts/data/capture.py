@@ -42,7 +42,7 @@ def load(
 
     images: folder of the photographs, relative to `path`, e.g. "images_4"; intrinsics follow the size found there.
     resolution: "auto" (= "cap1600"), "as-is", "cap1600", "factor:N", "longest:N", or "inria:N" (the folder images_N as it is).
-    split: "auto" (files for NeRF-synthetic, else mod8), "modN", "first:N", "none", "files".
+    split: "auto" (files for NeRF-synthetic and where transforms.json names test views, else mod8), "modN", "first:N", "none", "files".
     normalise: "extent" trains in a world centred on the mean training camera with extent 5; "none" in the capture's own.
     init: "points" needs 3D points; "random" replaces them by random ones.
     ignore_principal_point: believe that it is at the image centre (parity with the original code only).
@@ -59,7 +59,7 @@ def load(
     if max_views is not None:
         capture = prepare.at_most(capture, max_views)
     capture = prepare.drop_outlier_views(capture)
-    auto = "files" if found.kind == "blender" else "mod8"
+    auto = "files" if found.kind == "blender" or capture.test else "mod8"
     capture = prepare.measured(prepare.hold_out(capture, auto if split == "auto" else split))
     if normalise == "extent":
         capture = prepare.normalised(capture)
