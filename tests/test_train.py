@@ -15,7 +15,22 @@ from scene_experts.errors import InputError
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.experts import Experts
-from scene_experts.train import Adjusted, Finished, Previewed, Run, Saved, Started, Stepped, Stopped, anchor_cap, train
+from scene_experts.train import (
+    Adjusted,
+    Finished,
+    Previewed,
+    Run,
+    Saved,
+    Started,
+    Stepped,
+    Stopped,
+    Training,
+    anchor_cap,
+    iterate,
+    stepped,
+    train,
+    used_bytes,
+)
 from synthetic import make_capture
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -166,3 +181,42 @@ def test_random_background_and_another_configuration_on_resume(folder, tmp_path)
         list(events(config(), folder, tmp_path, stop_at=6, resume=True))
     with pytest.raises(InputError, match="scaffold-gs"):
         list(events(config("scaffold-gs"), folder, tmp_path, stop_at=6, resume=True))
+
+
+def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count(folder):
+    capture = load(folder)
+    training = Training.start(config().scaled(), capture, "cpu")
+    run = Run(RunConfig(config(), Data(folder)))
+    done = iterate(training, run, capture, choose("auto", "cpu"))
+    capture.images.close()
+    half = torch.zeros_like(done.target[..., 0])
+    half[:, : half.shape[1] // 2] = 1
+    columns = half[0] > 0
+    mse = float((done.render.image.detach().clamp(0, 1) - done.target)[:, columns].square().mean())
+    assert stepped(training, replace(done, mask=half)).psnr == pytest.approx(-10 * math.log10(mse), rel=1e-5)
+    assert stepped(training, done).psnr != pytest.approx(-10 * math.log10(mse), rel=1e-5)
+
+
+def test_steps_tell_the_balance_of_the_experts(folder):
+    steps = [e for e in events(config(), folder, stop_at=60, log_every=1) if isinstance(e, Stepped)]  # dense to iteration 30
+    for e in steps:
+        assert set(e.balance) == set(e.entropy) == {"opacity", "cov", "color"}
+        assert all(1 - 1e-5 <= v <= 5 for v in e.balance.values()) or e.step > 30
+        assert all(0 <= v <= 1 + 1e-6 for v in e.entropy.values())
+    dense, sparse = steps[29], steps[30]
+    assert sum(dense.balance.values()) == pytest.approx(dense.terms["load"] / 0.01, rel=1e-4)
+    assert sum(sparse.balance.values()) == pytest.approx(sparse.terms["load"] / 0.01 / 2, rel=1e-4)
+
+
+def test_resuming_on_other_views_is_refused(folder, tmp_path):
+    list(events(config(), folder, tmp_path, stop_at=3))
+    capture = load(folder)
+    with pytest.raises(InputError, match="other views"):
+        list(events(config(), folder, tmp_path, world=replace(capture, train=capture.train[:2]), stop_at=6, resume=True))
+    capture.images.close()
+
+
+def test_memory_is_counted_where_the_scene_is(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 12345)
+    assert used_bytes(torch.device("cuda")) == 12345
+    assert used_bytes(torch.device("cpu")) > 1 << 20

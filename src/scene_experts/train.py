@@ -19,7 +19,7 @@ from scene_experts import checkpoint
 from scene_experts.config import RunConfig, Train, to_json
 from scene_experts.data.capture import Capture
 from scene_experts.errors import InputError
-from scene_experts.losses import hinge_is_on, terms
+from scene_experts.losses import hinge_is_on, load_dense, load_sparse, terms
 from scene_experts.render import Rasterizer
 from scene_experts.scene.anchors import AnchorScene
 from scene_experts.strategy.grow import Edit
@@ -41,7 +41,7 @@ class Run:
     save_every: int = 5000  # iterations between checkpoints; the last iteration is always saved
     preview_every: int = 0  # iterations between pictures of one held-out view; 0: none
     log_every: int = 10  # iterations between Stepped events
-    max_memory: float = 0.0  # GiB of resident memory at which growth stops; 0: no cap
+    max_memory: float = 0.0  # GiB of memory (resident, or reserved on the GPU) at which growth stops; 0: no cap
     keep: int = 2  # checkpoints kept
     stop: list[str] = field(default_factory=list)  # put a reason here (a signal handler does) to save and stop
 
@@ -57,13 +57,15 @@ class Started:
 class Stepped:
     step: int
     terms: dict[str, float]  # weighted, by name
-    psnr: float  # of the training view, dB
+    psnr: float  # of the training view where its mask counts, dB
     anchors: int
     visible: int  # anchors this view decoded
     gaussians: int  # of them drawn
     active: float  # share of decoded Gaussians with positive opacity
     seconds: float  # of training so far, without saving and previews
     routing: dict[str, list[float]]  # mean share of assignments per expert, by attribute
+    balance: dict[str, float] = field(default_factory=dict)  # L_load^S / k, or L_load^D while dense, by attribute: 1 is perfect balance
+    entropy: dict[str, float] = field(default_factory=dict)  # of the gates, by attribute: 1 all experts alike, 0 one alone
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,18 @@ class Finished:
 
 
 Event = Started | Stepped | Adjusted | Previewed | Saved | Stopped | Finished
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """What one iteration saw and did."""
+
+    decoded: Decoded
+    render: Render
+    terms: dict[str, Tensor]
+    target: Tensor  # [H, W, 3]
+    mask: Tensor | None  # [H, W]
+    edit: Edit | None
 
 
 class Training:
@@ -146,6 +160,8 @@ class Training:
                 for key, value in self.optimizer.state.get(parameter, {}).items():
                     out[f"adam.{group['name']}.{i}.{key}"] = value
         out |= {"rng.torch": torch.get_rng_state(), "rng.views": self.views.get_state(), "rng.growth": self.growth.get_state()}
+        if table.facts["xyz"].is_cuda:
+            out["rng.cuda"] = torch.cuda.get_rng_state(table.facts["xyz"].device)
         out["queue"] = torch.tensor(self.queue, dtype=torch.int64)
         return out
 
@@ -177,6 +193,8 @@ class Training:
                 if state:
                     training.optimizer.state[parameter] = {k: v.to(device) for k, v in state.items()}
         torch.set_rng_state(tensors["rng.torch"])
+        if "rng.cuda" in tensors and table.facts["xyz"].is_cuda:
+            torch.cuda.set_rng_state(tensors["rng.cuda"], table.facts["xyz"].device)
         training.views.set_state(tensors["rng.views"])
         training.growth.set_state(tensors["rng.growth"])
         training.queue = tensors["queue"].tolist()
@@ -214,19 +232,21 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     cfg = cfg.scaled()
     folder = run.out / "checkpoints" if run.out else None
     training = resume(cfg, folder, run.device) if run.resume and folder else None
+    if training and not set(training.queue) <= set(capture.train):
+        raise InputError("expected the capture that this run was trained on, found one of other views; resume with the run's own --data")
     training = training or Training.start(cfg, capture, run.device, run.dtype)
     total = min(cfg.iterations, run.config.stop_at or cfg.iterations)
     yield Started(training.step, total, len(training.scene.table))
     saved = training.step
     while training.step < total and not run.stop:
         began = time.perf_counter()
-        decoded, render, parts, target, edit = iterate(training, run, capture, rasterize)
+        done = iterate(training, run, capture, rasterize)
         training.seconds += time.perf_counter() - began
         step = training.step
-        if edit is not None:
-            yield Adjusted(step, edit)
+        if done.edit is not None:
+            yield Adjusted(step, done.edit)
         if step % run.log_every == 0 or step == total:
-            yield stepped(training, decoded, render, parts, target)
+            yield stepped(training, done)
         if run.preview_every and (step % run.preview_every == 0 or step == total):
             yield preview(training, run, capture, rasterize)
         if folder and (step % run.save_every == 0 or step == total):
@@ -240,9 +260,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
         yield Finished(training.step, training.seconds)
 
 
-def iterate(
-    training: Training, run: Run, capture: Capture, rasterize: Rasterizer
-) -> tuple[Decoded, Render, dict[str, Tensor], Tensor, Edit | None]:
+def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Iteration:
     """One iteration, in the paper's order: rates, view, decode, draw, losses, gradients, density control, Adam."""
     cfg, scene = training.cfg, training.scene
     training.step += 1
@@ -267,29 +285,40 @@ def iterate(
     edit = growth.update(scene, training.step, training.growth)
     training.optimizer.step()
     training.optimizer.zero_grad(set_to_none=True)
-    return decoded, render, parts, target, edit
+    return Iteration(decoded, render, parts, target, mask, edit)
 
 
-def stepped(training: Training, decoded: Decoded, render: Render, parts: dict[str, Tensor], target: Tensor) -> Stepped:
+@torch.no_grad()
+def stepped(training: Training, done: Iteration) -> Stepped:
     """The figures of the iteration just made."""
-    mse = float((render.image.detach().clamp(0, 1) - target).square().mean())
+    decoded = done.decoded
+    weight = torch.ones_like(done.target[..., 0]) if done.mask is None else done.mask
+    error = (done.render.image.clamp(0, 1) - done.target).square().mean(2)
+    mse = float((error * weight).sum() / weight.sum().clamp_min(1e-12))
     raw = decoded.raw_opacity
-    shares = {}
+    shares, balance, entropy = {}, {}, {}
     for attribute, r in decoded.routing.items():
-        share = r.gates.detach().mean(0)
-        if r.chosen is not None:
-            share = torch.bincount(r.chosen.reshape(-1), minlength=r.gates.shape[1]) / max(r.chosen.numel(), 1)
+        A, E = r.gates.shape
+        if r.chosen is None:
+            share, value = r.gates.sum(0) / max(A, 1), load_dense(r.gates)
+        else:
+            k = r.chosen.shape[1]
+            share, value = torch.bincount(r.chosen.reshape(-1), minlength=E) / max(A * k, 1), load_sparse(r.gates, r.chosen) / k
+        balance[attribute] = float(value)
+        entropy[attribute] = float(torch.special.entr(r.gates).sum()) / max(A, 1) / math.log(E)
         shares[attribute] = [round(float(c), 4) for c in share]
     return Stepped(
         step=training.step,
-        terms={k: float(v.detach()) for k, v in parts.items()},
+        terms={k: float(v) for k, v in done.terms.items()},
         psnr=-10.0 * math.log10(max(mse, 1e-10)),
         anchors=len(training.scene.table),
         visible=len(decoded.rows),
         gaussians=len(decoded.gaussians),
-        active=float((raw.detach() > 0).float().mean()) if raw is not None and raw.numel() else 0.0,
+        active=float((raw > 0).float().mean()) if raw is not None and raw.numel() else 0.0,
         seconds=training.seconds,
         routing=shares,
+        balance=balance,
+        entropy=entropy,
     )
 
 
@@ -322,19 +351,21 @@ def resume(cfg: Train, folder: Path, device: str) -> Training | None:
 
 
 def anchor_cap(scene: AnchorScene, cap: int, max_memory: float) -> int:
-    """The cap on anchors now: the user's own, and what still fits below `max_memory` GiB of resident memory (0: no cap)."""
+    """The cap on anchors now: the user's own, and what still fits below `max_memory` GiB (0: no cap); see `used_bytes`."""
     if max_memory <= 0:
         return cap
     n = len(scene.table)
     columns = scene.table.columns().values()
     per_anchor = sum(v.element_size() * v[0].numel() * (4 if v.requires_grad else 1) for v in columns) + 4 * (2 + 2 * scene.K)
-    left = max_memory * 2**30 - resident_bytes()
+    left = max_memory * 2**30 - used_bytes(scene.table.facts["xyz"].device)
     room = max(0, int(left / (2 * per_anchor)))  # twice: a row edit holds old and new columns at once
     return min(n + room, cap) if cap else max(n + room, 1)
 
 
-def resident_bytes() -> int:
-    """Resident memory of this process, bytes; 0 where the system does not tell."""
+def used_bytes(device: torch.device) -> int:
+    """Memory that this process holds, bytes: of the GPU for a CUDA device, else resident; 0 where the system does not tell."""
+    if device.type == "cuda":
+        return torch.cuda.memory_reserved(device)
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
