@@ -135,7 +135,9 @@ class AnchorScene(nn.Module):
         weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
         without = next((a for a, w in weights.items() if w is None), None)
         if without and self.config.decode == "native":
-            raise InputError(f"expected a {without} head that the native decode covers, found switches it has no code for; use --scene.decode auto")
+            raise InputError(
+                f"expected a {without} head that the native decode covers, found switches it has no code for; use --scene.decode auto"
+            )
         return None if without else weights  # type: ignore[return-value]
 
     def inputs(self, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
