@@ -182,3 +182,18 @@ def test_a_signal_saves_and_ends_cleanly(number, capture, tmp_path):
     again = [*args, "--resume", "--stop-at", str(step + 5)]
     done = subprocess.run(again, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0 and f"resumed at iteration {step:,}" in done.stdout, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 1 byte\nmore")])
+def test_too_little_memory_is_one_sentence(error, capsys, monkeypatch):
+    from scene_experts import commands
+
+    def fail(args):
+        raise error
+
+    monkeypatch.setitem(commands.HANDLERS, "info", fail)
+    code, _, err = run(capsys, "info", "x")
+    assert code == 1 and err.startswith("error: expected enough memory") and err.count("\n") == 1
+    monkeypatch.setitem(commands.HANDLERS, "info", lambda args: (_ for _ in ()).throw(RuntimeError("a fault of ours")))
+    with pytest.raises(RuntimeError, match="a fault of ours"):
+        cli.main(["info"])

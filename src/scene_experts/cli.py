@@ -62,9 +62,22 @@ def dispatch(args: list[str]) -> int:
         place = f" at {error.filename}" if error.filename else ""
         print(f"error: expected a file or folder that can be used{place}, found: {error.strerror or error}; check it", file=sys.stderr)
         return 1
+    except (MemoryError, RuntimeError) as error:
+        if not out_of_memory(error):
+            raise
+        why = str(error).partition("\n")[0] or "no memory left"
+        advice = "lower --max-anchors or --resolution (a saved training goes on with --resume)"
+        print(f"error: expected enough memory, found too little ({why}); {advice}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
+
+
+def out_of_memory(error: Exception) -> bool:
+    """Whether an error is torch's or Python's way to say that an allocation failed. torch has a type of its own for the GPU alone."""
+    text = str(error).lower()
+    return isinstance(error, MemoryError) or "out of memory" in text or "allocate memory" in text
 
 
 def entry() -> None:
