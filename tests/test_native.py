@@ -50,3 +50,12 @@ def test_pointers():
     assert not native.pointer(None).value
     with pytest.raises(AssertionError):
         native.pointer(torch.zeros(4, 4).t()[1:])
+
+
+@pytest.mark.parametrize(
+    ("capability", "expected"),
+    [("AVX512", native.LEVELS), ("AVX2", ("avx2", "portable")), ("DEFAULT", ("portable",)), ("SVE256", ("portable",))],
+)
+def test_levels_follow_the_processor(monkeypatch, capability, expected):
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    assert native.levels() == expected
