@@ -1,8 +1,8 @@
 """A whole training step (decode, raster, loss, backward, density statistics, optimiser) beside the rasteriser's own forward + backward.
 
-Usage: python benchmarks/step.py [--recipes moe-gs scaffold-gs] [--gaussians 100000] [--size 800 544] [--threads 2]
-The scene is random anchors in front of one camera, as many as give the asked number of drawn Gaussians. Prints minima over interleaved rounds, the
-share of each part, and the ratios that docs/performance.md quotes.
+Usage: python benchmarks/step.py [--recipes moe-gs scaffold-gs] [--anchors 20000] [--size 800 544] [--threads 2]
+The scene is random anchors in front of one camera. Prints minima over interleaved rounds, the time of each part, and the ratios that
+docs/performance.md quotes.
 """
 
 from __future__ import annotations
@@ -101,14 +101,12 @@ def main() -> None:
             best[name] = {k: min(v, best[name].get(k, v)) for k, v in times.items()}
             training.scene.load_state_dict(state)
     for name in made:
-        print(
-            f"{name}: {args.anchors:,} anchors, {drawn[name]:,} Gaussians drawn, {width}x{height}, {args.threads} threads, raster {rasterize.name}"
-        )
+        size = f"{width}x{height}, {args.threads} threads, raster {rasterize.name}"
+        print(f"{name}: {args.anchors:,} anchors, {drawn[name]:,} Gaussians drawn, {size}")
         for part, seconds in best[name].items():
             print(f"  {part:<14} {1e3 * seconds:7.1f} ms")
-        print(
-            f"  {'whole step':<14} {1e3 * whole[name]:7.1f} ms = {whole[name] / alone[name]:.2f} x raster alone ({1e3 * alone[name]:.1f} ms)"
-        )
+        against = f"{whole[name] / alone[name]:.2f} x raster alone ({1e3 * alone[name]:.1f} ms)"
+        print(f"  {'whole step':<14} {1e3 * whole[name]:7.1f} ms = {against}")
     if {"moe-gs", "scaffold-gs"} <= set(made):
         print(f"moe-gs step / scaffold-gs step: {whole['moe-gs'] / whole['scaffold-gs']:.2f}")
 

@@ -1,8 +1,13 @@
+import os
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+
+# One thread, here and in the commands that tests start: small tensors gain nothing from more, and on a busy machine lose much.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+torch.set_num_threads(1)
 
 sys.path.insert(0, str(Path(__file__).parent))  # tests import tests/synthetic.py
 

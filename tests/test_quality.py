@@ -51,7 +51,8 @@ def held_out(capture, recipe: str, seed: int = 0, grow: bool = True, monkeypatch
         scores = []
         for i in capture.test:
             camera, frame = capture.views[i].camera, capture.frame(i)
-            image = rasterize(last["scene"](camera, 800, False, rasterize.visible).gaussians, camera, torch.tensor(capture.background)).image
+            decoded = last["scene"](camera, 800, False, rasterize.visible)
+            image = rasterize(decoded.gaussians, camera, torch.tensor(capture.background)).image
             scores.append(psnr(image.clamp(0, 1), frame.rgb.float() / 255, frame.mask))
     return statistics.mean(scores)
 
