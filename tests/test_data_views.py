@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import torch
 
+from scene_experts.data.capture import load
 from scene_experts.data.views import World
 from scene_experts.types import Camera
-from synthetic import look_at
+from synthetic import look_at, make_capture
 
 WORLD = World(3.5, (10.0, -20.0, 0.5))
 
@@ -43,3 +47,17 @@ def test_worlds_compose() -> None:
     second = World(0.2, (1.0, 2.0, 3.0))
     torch.testing.assert_close(WORLD.then(second.shift, second.scale).from_input(xyz), second.from_input(WORLD.from_input(xyz)))
     assert World().identity and not WORLD.identity
+
+
+def test_a_fingerprint_follows_the_views_their_sizes_and_the_split_not_the_place(tmp_path: Path) -> None:
+    for name in ("here", "there"):
+        make_capture(tmp_path / name, views=5, size=(24, 16), points=20)
+    one = load(tmp_path / "here").fingerprint()
+    assert load(tmp_path / "there").fingerprint() == one
+    capture = load(tmp_path / "there")
+    others = [
+        load(tmp_path / "there", resolution="factor:2"),
+        load(tmp_path / "there", split="none"),
+        replace(capture, views=capture.views[1:]),
+    ]
+    assert len({one, *(c.fingerprint() for c in others)}) == 4

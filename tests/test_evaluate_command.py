@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from scene_experts.config import Data, RunConfig
+from scene_experts.errors import InputError
 from scene_experts.evaluate import command
 from scene_experts.recipes import RECIPES
 
@@ -25,8 +26,8 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
     config = RunConfig(cfg, Data(Path("old"), split="mod:4"), versions={"torch": "x"})
     closed: list[bool] = []
     seen: dict[str, Any] = {}
-    opened = SimpleNamespace(config=config, cfg=cfg.scaled(), scene="scene", step=250, seconds=9.0)
-    capture = SimpleNamespace(images=SimpleNamespace(close=lambda: closed.append(True)))
+    opened = SimpleNamespace(config=config, cfg=cfg.scaled(), scene="scene", step=250, seconds=9.0, capture="a")
+    capture = SimpleNamespace(root="new", fingerprint=lambda: "a", images=SimpleNamespace(close=lambda: closed.append(True)))
 
     def load(data: Data, seed: int) -> Any:
         seen["data"] = data
@@ -47,3 +48,6 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert seen["step"] == 250 and seen["views"] == "train" and not seen["lpips"]
     about = seen["about"]
     assert (about.recipe, about.iterations, about.seed, about.train_seconds, about.versions) == ("moe-gs", 300, 4, 9.0, {"torch": "x"})
+    opened.capture = "b"
+    with pytest.raises(InputError, match="other views in new"):
+        command.evaluate_run(tmp_path, "cpu", Raster(), lpips=False)  # type: ignore[arg-type]

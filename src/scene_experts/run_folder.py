@@ -41,6 +41,7 @@ class OpenRun:
     scene: AnchorScene
     step: int
     seconds: float  # of training
+    capture: str = ""  # fingerprint of the capture it was trained on; empty where nothing says it
 
 
 def versions() -> dict[str, str]:
@@ -159,4 +160,4 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     cfg = config.train.scaled()
     scene = to_device(scene_from(cfg, tensors, meta), device)
     scene.eval()
-    return OpenRun(run, config, cfg, scene, int(meta["step"]), float(meta["seconds"]))
+    return OpenRun(run, config, cfg, scene, int(meta["step"]), float(meta["seconds"]), meta.get("capture", ""))

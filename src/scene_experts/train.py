@@ -122,6 +122,7 @@ class Training:
         self.step = 0
         self.seconds = 0.0
         self.queue: list[int] = []
+        self.capture = ""  # its fingerprint
         self.views = torch.Generator().manual_seed(cfg.seed)
         self.growth = torch.Generator().manual_seed(cfg.seed + 1)
         groups = [{"params": params, "name": name, "lr": 0.0} for name, params in scene.rate_groups().items()]
@@ -173,6 +174,7 @@ class Training:
             "voxel": self.scene.voxel,
             "extent": self.scene.extent,
             "config": config_hash(self.cfg),
+            "capture": self.capture,
         }
 
     @classmethod
@@ -198,7 +200,7 @@ class Training:
         training.views.set_state(tensors["rng.views"])
         training.growth.set_state(tensors["rng.growth"])
         training.queue = tensors["queue"].tolist()
-        training.step, training.seconds = int(meta["step"]), float(meta["seconds"])
+        training.step, training.seconds, training.capture = int(meta["step"]), float(meta["seconds"]), meta.get("capture", "")
         return training
 
 
@@ -232,9 +234,10 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     cfg = cfg.scaled()
     folder = run.out / "checkpoints" if run.out else None
     training = resume(cfg, folder, run.device) if run.resume and folder else None
-    if training and not set(training.queue) <= set(capture.train):
-        raise InputError("expected the capture that this run was trained on, found one of other views; resume with the run's own --data")
+    if training and training.capture not in ("", capture.fingerprint()):
+        raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
     training = training or Training.start(cfg, capture, run.device, run.dtype)
+    training.capture = capture.fingerprint()
     total = min(cfg.iterations, run.config.stop_at or cfg.iterations)
     yield Started(training.step, total, len(training.scene.table))
     saved = training.step

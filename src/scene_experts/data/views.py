@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -99,6 +101,11 @@ class Capture:
         """The pixels of view `index`. Raises InputError where the file cannot be read."""
         rgb, mask = self.images.get(index)
         return Frame(rgb, None if mask is None else mask.float() / 255)
+
+    def fingerprint(self) -> str:
+        """A short hash of the views' names and sizes and of the split, by which a run knows its capture again wherever it lies."""
+        seen = [[(v.name, v.camera.width, v.camera.height) for v in self.views], self.train, self.test]
+        return hashlib.sha256(json.dumps(seen).encode()).hexdigest()[:16]
 
     def summary(self) -> dict:
         """What was detected, as plain values for printing and for results (see `data.summary`)."""

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from scene_experts import run_folder
+from scene_experts.errors import InputError
 from scene_experts.evaluate.run import About, evaluate
 
 if TYPE_CHECKING:
@@ -37,6 +38,8 @@ def evaluate_run(
         rasterize = replace(rasterize, antialias=opened.cfg.antialias)  # type: ignore[type-var]
     where = opened.config.data if data is None else replace(opened.config.data, path=data)
     capture = run_folder.load_capture(where, opened.cfg.seed)
+    if opened.capture and opened.capture != capture.fingerprint():
+        raise InputError(f"expected the capture that {run} was trained on, found other views in {capture.root}; give the right --data")
     about = About(
         recipe=opened.config.train.recipe,
         iterations=opened.cfg.iterations,
