@@ -82,7 +82,7 @@ class Data:
     ignore_principal_point: bool = False
     """Pretend the principal point is the image centre, as the reference code bases do (parity only)."""
     background: tuple[float, float, float] | None = None
-    """RGB in [0, 1] behind the scene; None takes the capture kind's own (black)."""
+    """RGB in [0, 1] behind the scene; None takes the capture kind's own (black; white for NeRF-synthetic)."""
 
 
 @dataclass(frozen=True)
