@@ -130,3 +130,10 @@ def test_print_results(tmp_path: Path) -> None:
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "27.50" in text and "experts, color: share 60% 40%, gate entropy 0.97" in text
     assert "10.0 ms decode + 40.0 ms raster on cpu" in text and str(tmp_path / "results.json") in text
+
+
+def test_a_table_tells_a_shorter_training_from_one_cut_off() -> None:
+    short, cut = results("moe-gs", 27.0, step=7000, iterations=7000), results("moe-gs", 26.0, step=7000, iterations=30_000)
+    made = tables.table(["short", "cut"], [short, cut])
+    place = made.titles.index("steps")
+    assert made.titles[place + 1] == "of" and [row[place : place + 2] for row in made.rows] == [("7000", "7000"), ("7000", "30,000")]

@@ -61,6 +61,8 @@ COLUMNS = (
     Column("active %", ("activation_ratio",), 1, 100.0),
     Column("sharpness", ("sharpness", "ratio"), 2),
     Column("FPS", ("fps", "fps"), 1, best=1),
+    Column("steps", ("step",)),
+    Column("of", ("iterations",)),  # the schedule's length: fewer steps are a training cut off early, which is not a shorter one
     Column("train s", ("train_seconds",)),
 )
 
