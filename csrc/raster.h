@@ -3,7 +3,8 @@
 //   project    every Gaussian -> a 64-byte Record (whitened ellipse, colour, depth) and its rectangle of tiles
 //   bin        one radix sort of the visible depths, then a stable scatter into the lists of the 16 x 16 pixel tiles
 //   forward    per tile: which 4 x 4 pixel blocks does each Gaussian touch (exact), then block by block, one block per F16
-//   backward   per tile, front to back again with the stored masks; sums per Gaussian; then the chain rule through the projection
+//   backward   per tile, batch by batch from the last, from checkpoints that forward left; sums per Gaussian; then the chain rule through
+//              the projection
 //
 // Whitened ellipse: with d = centre - pixel, log2 of the Gaussian's value is log_opacity - (l1 dy + l2 dx)^2 - (l3 dx)^2. As a sum of
 // squares it has no cancellation for thin Gaussians, and within a tile it costs two operations per block: for every column x of the tile
@@ -25,10 +26,7 @@ namespace se::raster {
 
 constexpr int kTile = 16;     // pixels
 constexpr int kChunk = 4096;  // Gaussians that one worker projects at a time; a multiple of 16
-#ifndef SE_BATCH
-#define SE_BATCH 256
-#endif
-constexpr int kBatch = SE_BATCH;   // Gaussians of a tile worked on at a time, so that they stay in the first-level cache
+constexpr int kBatch = 256;   // Gaussians of a tile worked on at a time: fewer make the blocks' lists short, more leave the cache
 constexpr int kAhead = 32;    // how many of a tile's Gaussians ahead memory is fetched; this many entries follow the last list
 constexpr float kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
 constexpr float kMinAlphaLog2 = -7.994353437f;  // log2(1 / 255)
@@ -71,7 +69,6 @@ class Buffer {
     return data_.get();
   }
   T* data() const { return data_.get(); }
-  size_t bytes() const { return size_ * sizeof(T); }
 
  private:
   static constexpr size_t kHuge = size_t{1} << 21;

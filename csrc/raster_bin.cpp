@@ -43,8 +43,8 @@ int64_t gather(State& s, uint32_t& low, uint32_t& high) {
 }
 
 // One stable counting pass on kDigit bits of (key - low) >> shift.
-void pass(State& s, const uint32_t* keys, const uint32_t* order, uint32_t* keys_out, uint32_t* order_out, int64_t n, uint32_t low, int shift,
-          int parts, int threads) {
+void pass(State& s, const uint32_t* keys, const uint32_t* order, uint32_t* keys_out, uint32_t* order_out, int64_t n, uint32_t low,
+          int shift, int parts, int threads) {
   uint32_t* histogram = s.histogram.get(static_cast<size_t>(parts) * kRadix);
   const auto digit = [&](uint32_t key) { return ((key - low) >> shift) & (kRadix - 1); };
   parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) {

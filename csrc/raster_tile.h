@@ -90,7 +90,8 @@ inline void Batch::list_block(const uint16_t* touched, int n) {
 }
 
 inline const float* lane_x() {
-  alignas(64) static const float x[16] = {-7.5f, -6.5f, -5.5f, -4.5f, -3.5f, -2.5f, -1.5f, -.5f, .5f, 1.5f, 2.5f, 3.5f, 4.5f, 5.5f, 6.5f, 7.5f};
+  alignas(64) static const float x[16] = {-7.5f, -6.5f, -5.5f, -4.5f, -3.5f, -2.5f, -1.5f, -0.5f,
+                                          0.5f,  1.5f,  2.5f,  3.5f,  4.5f,  5.5f,  6.5f,  7.5f};
   return x;
 }
 

@@ -211,7 +211,8 @@ extern "C" void peer_backward(void* state, const Camera* camera, int64_t m, cons
     geometry(cam, means + 3 * i, quats + 4 * i, scales + 3 * i, g);
     const float *q = quats + 4 * i, *scale = scales + 3 * i, *dc = &d_conic[3 * i];
     // d / d cov = -conic (d / d conic) conic
-    const float r0 = p.a * dc[0] + p.b * dc[1], r1 = p.a * dc[1] + p.b * dc[2], q0 = p.b * dc[0] + p.c * dc[1], q1 = p.b * dc[1] + p.c * dc[2];
+    const float r0 = p.a * dc[0] + p.b * dc[1], r1 = p.a * dc[1] + p.b * dc[2];
+    const float q0 = p.b * dc[0] + p.c * dc[1], q1 = p.b * dc[1] + p.c * dc[2];
     const float gxx = -(r0 * p.a + r1 * p.b), gxy = -(r0 * p.b + r1 * p.c), gyy = -(q0 * p.b + q1 * p.c);
     float dA[6], dT[6], dR[9];
     for (int k = 0; k < 3; ++k) {
