@@ -139,3 +139,13 @@ def test_a_capture_is_read_as_the_run_says(tmp_path):
     for wrong in ((0.0, 0.0, 2.0), (float("nan"), 0.0, 0.0)):
         with pytest.raises(InputError, match="--background as three numbers between 0 and 1"):
             run_folder.load_capture(Data(tmp_path, background=wrong))
+
+
+def test_near_of_the_users_choice(tmp_path):
+    folder = make_capture(tmp_path, views=4, size=(24, 16), points=60).folder
+    for near, expected in ((None, 0.1), (0.03, 0.03)):
+        capture = run_folder.load_capture(Data(folder, near=near))
+        capture.images.close()
+        assert {round(v.camera.near, 6) for v in capture.views} == {expected}
+    with pytest.raises(InputError, match="--near"):
+        run_folder.load_capture(Data(folder, near=0.0))

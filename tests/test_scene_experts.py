@@ -164,3 +164,8 @@ def test_nonsense_is_refused():
         Experts(num=2, top_k=3).build("color", D, H, OUT, F)
     with pytest.raises(InputError, match="at least 1 expert"):
         Experts(num=0).build("color", D, H, OUT, F)
+
+
+def test_with_distance_the_three_plain_networks_sum_to_7182():
+    shapes = [("opacity", 10), ("cov", 70), ("color", 30)]
+    assert sum(p.numel() for a, o in shapes for p in Plain().build(a, 36, 32, o, 32).parameters()) == 7182

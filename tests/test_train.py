@@ -11,7 +11,7 @@ import torch
 
 from scene_experts.config import Data, RunConfig
 from scene_experts.data.capture import load
-from scene_experts.errors import InputError
+from scene_experts.errors import InputError, RunError
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.experts import Experts
@@ -220,3 +220,21 @@ def test_memory_is_counted_where_the_scene_is(monkeypatch):
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 12345)
     assert used_bytes(torch.device("cuda")) == 12345
     assert used_bytes(torch.device("cpu")) > 1 << 20
+
+
+def test_losses_that_are_no_numbers_end_the_run_and_keep_its_checkpoint(folder, tmp_path, monkeypatch):
+    list(events(config(), folder, tmp_path, stop_at=5))
+    before = final(tmp_path)
+
+    def broken(decoded, render, target, weights, step, mask):
+        return {"l1": render.image.mean() * (math.nan if step > 8 else 1.0)}
+
+    monkeypatch.setattr("scene_experts.train.terms", broken)
+    with pytest.raises(RunError, match="expected finite losses, found l1 = nan at iteration 9"):
+        list(events(config(), folder, tmp_path, stop_at=60, log_every=1, resume=True))
+    same(before, final(tmp_path))
+
+
+def test_more_anchors_than_the_cap_to_start_with_is_said(folder):
+    with pytest.raises(InputError, match="at most 100 anchors to start with"):
+        list(events(config(max_anchors=100), folder, stop_at=1))

@@ -79,6 +79,8 @@ class Data:
     """Start from the capture's 3D points, or from random ones."""
     max_views: int | None = None
     """Use at most this many views, evenly spread."""
+    near: float | None = None
+    """Nearest depth that is drawn, in trained units; None: min(0.2, 0.02 R). 0.2 is what the reference code bases use in any unit."""
     ignore_principal_point: bool = False
     """Pretend the principal point is the image centre, as the reference code bases do (parity only)."""
     background: tuple[float, float, float] | None = None

@@ -37,7 +37,7 @@ class Progress:
             case Started():
                 self.total, self.first, self.began = event.total, event.step, time.perf_counter()
                 verb = f"resumed at iteration {event.step:,}" if event.step else "started"
-                self.say(f"{verb}: {event.anchors:,} anchors, {event.total:,} iterations")
+                self.say(f"{verb}: {event.anchors:,} anchors on a lattice of {event.voxel:.3g}, {event.total:,} iterations")
             case Stepped():
                 self.step(event)
             case Adjusted():

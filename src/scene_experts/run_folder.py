@@ -129,7 +129,9 @@ def load_capture(data: Data, seed: int = 0) -> Capture:
     """The capture that `data` describes."""
     if data.background and not all(math.isfinite(v) and 0 <= v <= 1 for v in data.background):
         raise InputError(f"expected --background as three numbers between 0 and 1, found {list(data.background)}; correct them")
-    return captures.load(
+    if data.near is not None and not 0 < data.near < math.inf:
+        raise InputError(f"expected --near as a positive length, found {data.near}; leave it out for min(0.2, 0.02 R)")
+    capture = captures.load(
         data.path,
         images=data.images,
         resolution=data.resolution,
@@ -142,6 +144,9 @@ def load_capture(data: Data, seed: int = 0) -> Capture:
         background=data.background,
         seed=seed,
     )
+    if data.near is None:
+        return capture
+    return replace(capture, views=tuple(replace(v, camera=replace(v.camera, near=data.near)) for v in capture.views))
 
 
 def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun:

@@ -18,7 +18,7 @@ from torch import Tensor
 from scene_experts import checkpoint
 from scene_experts.config import RunConfig, Train, to_json
 from scene_experts.data.capture import Capture
-from scene_experts.errors import InputError
+from scene_experts.errors import InputError, RunError
 from scene_experts.losses import hinge_is_on, load_dense, load_sparse, terms
 from scene_experts.render import Rasterizer
 from scene_experts.scene.anchors import AnchorScene
@@ -51,6 +51,7 @@ class Started:
     step: int  # 0, or where the run resumes
     total: int  # the last iteration of this run
     anchors: int
+    voxel: float = 0.0  # edge of the finest lattice cell, trained world units
 
 
 @dataclass(frozen=True)
@@ -138,6 +139,10 @@ class Training:
         if not capture.train:
             raise InputError("expected at least one training view, found none; choose another --split")
         torch.manual_seed(cfg.seed)
+        cap, points = cfg.growth.max_anchors, len(capture.points.xyz)
+        if cap and cap < points and (n := len(AnchorScene.from_points(cfg.scene, capture.points, capture.extent).table)) > cap:
+            raise InputError(f"expected at most {cap:,} anchors to start with, found {n:,}; raise --max-anchors or --scene.voxel-size")
+        torch.manual_seed(cfg.seed)
         return cls(cfg, to_device(AnchorScene.from_points(cfg.scene, capture.points, capture.extent), device, dtype))
 
     def next_view(self, train: tuple[int, ...], ahead: int = 3) -> tuple[int, list[int]]:
@@ -224,6 +229,16 @@ def to_device(scene: AnchorScene, device: str, dtype: torch.dtype | None = None)
     return scene
 
 
+def check_finite(event: Stepped) -> None:
+    """Raises RunError when the losses are no longer numbers: nothing is saved over the last good checkpoint."""
+    bad = [name for name, value in event.terms.items() if not math.isfinite(value)]
+    if bad:
+        raise RunError(
+            f"expected finite losses, found {', '.join(bad)} = {event.terms[bad[0]]} at iteration {event.step}; "
+            "the last checkpoint is intact: look at the capture with `scene-experts info`, or lower the learning rates (--rates...)"
+        )
+
+
 def config_hash(cfg: Train) -> str:
     """A short hash of everything in the configuration."""
     return hashlib.sha256(json.dumps(to_json(cfg), sort_keys=True).encode()).hexdigest()[:16]
@@ -239,7 +254,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     training = training or Training.start(cfg, capture, run.device, run.dtype)
     training.capture = capture.fingerprint()
     total = min(cfg.iterations, run.config.stop_at or cfg.iterations)
-    yield Started(training.step, total, len(training.scene.table))
+    yield Started(training.step, total, len(training.scene.table), training.scene.voxel)
     saved = training.step
     while training.step < total and not run.stop:
         began = time.perf_counter()
@@ -249,7 +264,9 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
         if done.edit is not None:
             yield Adjusted(step, done.edit)
         if step % run.log_every == 0 or step == total:
-            yield stepped(training, done)
+            seen = stepped(training, done)
+            check_finite(seen)
+            yield seen
         if run.preview_every and (step % run.preview_every == 0 or step == total):
             yield preview(training, run, capture, rasterize)
         if folder and (step % run.save_every == 0 or step == total):
