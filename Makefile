@@ -11,6 +11,9 @@ DEMO_OUT ?= runs/demo
 # Short of iterations, structure pays more than brightness: a larger weight of 1 - SSIM gives a sharper picture at the same PSNR.
 DEMO_FLAGS ?= --iterations $(DEMO_ITERATIONS) --loss.dssim 0.8
 
+# as the package sets it when it is imported before torch, which the benchmark scripts do not
+export OMP_WAIT_POLICY ?= passive
+
 .PHONY: demo test lint bench env lpips clean
 
 env: $(STAMP)
