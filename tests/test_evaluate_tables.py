@@ -137,3 +137,15 @@ def test_a_table_tells_a_shorter_training_from_one_cut_off() -> None:
     made = tables.table(["short", "cut"], [short, cut])
     place = made.titles.index("steps")
     assert made.titles[place + 1] == "of" and [row[place : place + 2] for row in made.rows] == [("7000", "7000"), ("7000", "30,000")]
+
+
+@pytest.mark.parametrize("width", [10, 40, 80, 200])
+def test_no_cell_is_cut_in_a_narrow_terminal(runs: list[Path], width: int) -> None:
+    console = Console(file=io.StringIO(), width=width)
+    made = tables.compare_runs(runs, "table", False, console)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert all(cell in text for cell in made.titles + made.rows[0] + made.rows[1]) and "\u2026" not in text
+    lines = [line.rstrip() for line in text.splitlines()]
+    straight = any(line.startswith("run ") and "PSNR" in line for line in lines)
+    assert straight == (width == 200)
+    assert width < 40 or max(map(len, lines)) <= max(width, len(made.notes[0]))  # prose is wrapped by the terminal

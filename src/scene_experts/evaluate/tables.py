@@ -14,6 +14,7 @@ from typing import Any, Literal
 import yaml
 from rich.console import Console
 from rich.table import Table as RichTable
+from rich.text import Text
 
 from scene_experts.errors import InputError
 from scene_experts.io import read_json
@@ -142,14 +143,27 @@ def to_csv(table: Table) -> str:
     return out.getvalue()
 
 
-def to_rich(table: Table, title: str | None = None) -> RichTable:
-    """For a terminal, the best of each column bold."""
-    drawn = RichTable(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
+def to_rich(table: Table, width: int) -> RichTable:
+    """For a terminal `width` characters wide, the best of each column bold. Where that is too narrow, runs are columns; no cell is cut."""
+    turned = Table(
+        (table.titles[0], *(row[0] for row in table.rows)),
+        tuple(zip(table.titles[1:], *(row[1:] for row in table.rows))),
+        frozenset((j - 1, i + 1) for i, j in table.best),
+    )
+    if _width(table) > width and _width(turned) < _width(table):
+        table = turned
+    fixed = _width(table) if _width(table) > width else None  # lines longer than the terminal rather than cells with "..."
+    drawn = RichTable(box=None, pad_edge=False, header_style="bold", width=fixed)
     for j, name in enumerate(table.titles):
-        drawn.add_column(name, justify="left" if j == 0 else "right", no_wrap=j > 0)
+        drawn.add_column(name, justify="left" if j == 0 else "right", no_wrap=True)
     for i, row in enumerate(table.rows):
-        drawn.add_row(*(f"[bold]{cell}[/bold]" if (i, j) in table.best else cell for j, cell in enumerate(row)))
+        drawn.add_row(*(Text(cell, "bold" if (i, j) in table.best else "") for j, cell in enumerate(row)))
     return drawn
+
+
+def _width(table: Table) -> int:
+    """Characters of the longest line: the widest cell of each column, two blanks between columns."""
+    return sum(max(map(len, column)) + 2 for column in zip(table.titles, *table.rows)) - 2
 
 
 def row_names(runs: Sequence[Path], results: Sequence[dict[str, Any]]) -> list[str]:
@@ -176,7 +190,9 @@ def compare_runs(runs: Sequence[Path], format: Format, mixed: bool, console: Con
     published = paper_results(paper) if paper else {}
     made = table([*names, *published], [*results, *published.values()])
     if format == "table":
-        console.print(to_rich(made, None if mixed else _title(results[0])))
+        if not mixed:
+            console.print(_title(results[0]), markup=False, soft_wrap=True)
+        console.print(to_rich(made, console.width), crop=False)
         for note in made.notes:
             console.print(note, markup=False, soft_wrap=True)
     else:
@@ -192,7 +208,8 @@ def print_results(results: dict[str, Any], console: Console, run: Path) -> None:
 
     suffix = "" if results["views"] == "test" else f"_{results['views']}"
     made = table([str(results.get("recipe") or run.name)], [results])
-    console.print(to_rich(made, _title(results)))
+    say(_title(results))
+    console.print(to_rich(made, console.width), crop=False)
     for note in made.notes:
         say(note)
     for attribute, shares in results["experts"].items():
