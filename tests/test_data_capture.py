@@ -232,3 +232,8 @@ def test_paths_that_are_no_captures(made: Synthetic, tmp_path: Path) -> None:
         load(made.folder / "images/view_000.png")
     with pytest.raises(InputError, match="expected a capture in"):
         load(tmp_path)
+    shutil.copytree(made.folder / "images", tmp_path / "images")
+    with pytest.raises(InputError, match="found 10 photographs without camera poses; run `colmap automatic_reconstructor"):
+        load(tmp_path)
+    with pytest.raises(InputError, match="found 10 photographs without camera poses; move them"):
+        load(tmp_path / "images")

@@ -14,7 +14,7 @@ from scene_experts.data import colmap, prepare, transforms
 from scene_experts.data.found import Colour, Found, Posed
 from scene_experts.data.images import Source, check_policy, probe
 from scene_experts.data.lens import Lens, pinhole_of, without_principal_point
-from scene_experts.data.match import absent_error, find_mask, match_images
+from scene_experts.data.match import EXTENSIONS, absent_error, find_mask, match_images
 from scene_experts.data.store import ImageStore
 from scene_experts.data.views import Capture, Frame, View, World
 from scene_experts.errors import InputError
@@ -89,10 +89,19 @@ def _read(root: Path, images: str | None, background: Colour | None, missing: st
         return transforms.read_blender(root, background)
     if (root / "transforms.json").is_file():
         return transforms.read_nerfstudio(root, images)
-    raise InputError(
-        f"expected a capture in {root} (COLMAP's sparse/0 beside images, transforms_train.json or transforms.json), found none of them; "
-        f"point to the folder that holds them"
-    )
+    raise _no_capture(root)
+
+
+def _no_capture(root: Path) -> InputError:
+    """Why a folder is no capture, and what to do: photographs alone need poses first."""
+    expected = f"expected a capture in {root} (COLMAP's sparse/0 beside images, transforms_train.json or transforms.json), found"
+    for folder in (root, root / "images"):
+        photos = sum(p.suffix.lower() in EXTENSIONS for p in folder.iterdir()) if folder.is_dir() else 0
+        if photos:
+            move = "" if folder != root else "move them into its folder images and "
+            steps = f"{move}run `colmap automatic_reconstructor --workspace_path {root} --image_path {root / 'images'} --dense 0`"
+            return InputError(f"{expected} {photos} photographs without camera poses; {steps}")
+    return InputError(f"{expected} none of them; point to the folder that holds them")
 
 
 def _read_colmap(root: Path, images: str, missing: str) -> Found:
