@@ -51,7 +51,7 @@ def test_a_run_opens_at_its_newest_or_a_chosen_checkpoint(run, trained):
     for name, value in trained.scene.network_tensors().items():
         assert torch.equal(opened.scene.network_tensors()[name], value)
     assert run_folder.open_run(run, step=10).step == 10
-    with pytest.raises(InputError, match="none at step 15"):
+    with pytest.raises(InputError, match="checkpoint at step 15"):
         run_folder.open_run(run, step=15)
 
 

@@ -156,10 +156,11 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     path = checkpoint.latest(folder) if step is None else folder / f"ckpt_{step:06d}.safetensors"
     if path is None and any(folder.glob("ckpt_*.safetensors")):
         raise InputError(f"expected a whole checkpoint in {folder}, found only damaged ones; copy one back or train again")
-    if path is None or not path.is_file():
-        raise InputError(
-            f"expected a checkpoint in {folder}, found none{'' if step is None else f' at step {step}'}; train first, or use --resume"
-        )
+    if path is None:
+        raise InputError(f"expected a checkpoint in {folder}, found none; train first, or use --resume")
+    if not path.is_file():
+        kept = ", ".join(str(int(p.stem[5:])) for p in sorted(folder.glob("ckpt_*.safetensors")) if p.stem[5:].isdigit()) or "none"
+        raise InputError(f"expected a checkpoint at step {step} in {folder}, found {kept}; give one of those, or leave --step out")
     tensors, meta = checkpoint.load(path)
     checkpoint.expect(meta, recipe=config.train.recipe)
     cfg = config.train.scaled()
