@@ -1,4 +1,4 @@
-"""Short real trainings on shipped data: the held-out score must not fall below what five seeds gave, and growth must pay.
+"""Short real trainings on shipped data: the held-out score must not fall below what five seeds gave, and growth must improve the fit.
 
 The record is made by this file: SCENE_EXPERTS_RECORD=1 python -m pytest tests/test_quality.py
 """
@@ -72,7 +72,8 @@ def test_held_out_psnr_stays_within_three_sigma_of_the_recorded_seeds(name, reci
 
 
 def test_growth_pays(captures, monkeypatch):
-    """On the training views: the three held-out ones of so small a capture cannot tell (they differ by less than the seeds do)."""
+    """A weaker claim than it should be: on the training views. On brighton's three held-out views growth does not pay within 800 iterations
+    (19.92 dB with, 20.11 dB without at seed 0; seeds spread by 0.17 dB), as docs/results.md says."""
     brighton = captures["brighton"]
     with_growth = held_out(brighton, "moe-gs", monkeypatch=monkeypatch, views="train")
     without = held_out(brighton, "moe-gs", grow=False, monkeypatch=monkeypatch, views="train")

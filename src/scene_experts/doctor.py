@@ -159,11 +159,11 @@ def lpips() -> Check:
 
 
 def viewer() -> Check:
-    return _package("viser", "viewer", "the browser viewer")
+    return _package("viser", "viewer", "the browser viewer, which no command uses yet")
 
 
 def sfm() -> Check:
-    return _package("pycolmap", "sfm", "turning photographs into captures")
+    return _package("pycolmap", "sfm", "turning photographs into captures, which no command does yet")
 
 
 def tensorboard() -> Check:
