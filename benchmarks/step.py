@@ -17,8 +17,8 @@ from scene_experts.losses import terms
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.anchors import AnchorScene
+from scene_experts.state import Training
 from scene_experts.strategy import observe
-from scene_experts.train import Training
 from scene_experts.types import Camera, Points
 
 

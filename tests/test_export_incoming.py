@@ -17,8 +17,8 @@ from scene_experts.export.run import export_run, import_result
 from scene_experts.render import choose
 from scene_experts.scene.anchors import Anchors, AnchorScene
 from scene_experts.scene.mlp import Plain
+from scene_experts.state import resume
 from scene_experts.table import Table
-from scene_experts.train import resume
 from synthetic import make_capture
 
 VOXEL = 0.0173

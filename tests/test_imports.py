@@ -15,7 +15,7 @@ LAYERS = [
     {"data", "render", "scene", "losses"},
     {"strategy"},
     {"config"},
-    {"recipes", "train"},
+    {"recipes", "events", "state", "train"},
     {"run_folder", "progress", "record"},
     {"evaluate", "export", "view", "doctor"},
     {"cli", "commands", "__main__"},

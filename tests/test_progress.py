@@ -3,9 +3,9 @@ from pathlib import Path
 
 from rich.console import Console
 
+from scene_experts.events import Adjusted, Finished, Saved, Started, Stepped, Stopped
 from scene_experts.progress import Progress, clock
 from scene_experts.strategy.grow import Edit
-from scene_experts.train import Adjusted, Finished, Saved, Started, Stepped, Stopped
 
 
 def test_a_log_file_gets_plain_lines():

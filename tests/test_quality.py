@@ -17,7 +17,8 @@ from scene_experts.data.capture import load
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
-from scene_experts.train import Run, Training, train
+from scene_experts.state import Training
+from scene_experts.train import Run, train
 from synthetic import make_capture
 
 GOLDEN = Path(__file__).parent / "golden" / "quality.json"

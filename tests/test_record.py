@@ -5,9 +5,9 @@ import torch
 from PIL import Image
 
 from scene_experts.errors import RunError
+from scene_experts.events import Adjusted, Previewed, Started, Stepped
 from scene_experts.record import Recorder
 from scene_experts.strategy.grow import Edit
-from scene_experts.train import Adjusted, Previewed, Started, Stepped
 
 
 def step(i: int) -> Stepped:

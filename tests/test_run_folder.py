@@ -12,7 +12,7 @@ from scene_experts.config import Data, RunConfig
 from scene_experts.data.capture import load
 from scene_experts.errors import InputError
 from scene_experts.recipes import RECIPES
-from scene_experts.train import Training
+from scene_experts.state import Training
 from synthetic import make_capture
 
 CFG = replace(RECIPES["moe-gs"][1], iterations=300)

@@ -12,25 +12,12 @@ import torch
 from scene_experts.config import Data, RunConfig
 from scene_experts.data.capture import load
 from scene_experts.errors import InputError, RunError
+from scene_experts.events import Adjusted, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.experts import Experts
-from scene_experts.train import (
-    Adjusted,
-    Finished,
-    Previewed,
-    Run,
-    Saved,
-    Started,
-    Stepped,
-    Stopped,
-    Training,
-    anchor_cap,
-    iterate,
-    stepped,
-    train,
-    used_bytes,
-)
+from scene_experts.state import Training
+from scene_experts.train import Run, anchor_cap, iterate, stepped, train, used_bytes
 from synthetic import make_capture
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -11,10 +11,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from scene_experts.errors import InputError
+from scene_experts.errors import InputError, expect_at_least
 from scene_experts.losses import Weights
-from scene_experts.scene.anchors import ATTRIBUTES, Anchors, Rates
-from scene_experts.scene.experts import Experts
+from scene_experts.scene.anchors import Anchors, Rates
 from scene_experts.schedule import Rate
 from scene_experts.strategy.grow import GrowAnchors
 
@@ -46,9 +45,6 @@ class Train:
         if self.iterations < 1:
             raise InputError(f"expected at least 1 iteration, found {self.iterations}; use --iterations 30000")
         factor = self.iterations / SCHEDULE
-        decoder = self.scene.decoder
-        if isinstance(decoder, Experts):
-            decoder = replace(decoder, warmup=round(decoder.warmup * factor))
         until = self.loss.opacity_until
         loss = replace(
             self.loss,
@@ -56,7 +52,7 @@ class Train:
             opacity_until=None if until is None else round(until * factor),
         )
         growth = replace(self.growth.scaled(factor), max_anchors=self.max_anchors or self.growth.max_anchors)
-        return replace(self, scene=replace(self.scene, decoder=decoder), loss=loss, growth=growth)
+        return replace(self, scene=self.scene.scaled(factor), loss=loss, growth=growth)
 
 
 @dataclass(frozen=True)
@@ -101,34 +97,15 @@ class RunConfig:
 
 def check(cfg: Train) -> None:
     """Raises InputError, naming the flag, for settings that no training can have."""
-    scene, decoder, growth = cfg.scene, cfg.scene.decoder, cfg.growth
-    numbers: list[tuple[str, float, float]] = [
-        ("--iterations", cfg.iterations, 1),
-        ("--seed", cfg.seed, 0),
-        ("--max-anchors", cfg.max_anchors, 0),
-    ]
-    numbers += [(f"--scene.{name}", getattr(scene, name), 1) for name in ("K", "F", "hidden")]
-    numbers += [("--scene.voxel-size", scene.voxel_size, 0), ("--growth.adjust.interval", growth.adjust.interval, 1)]
-    numbers += [("--growth.hierarchy-factor", growth.hierarchy_factor, 2), ("--growth.max-anchors", growth.max_anchors, 0)]
-    if isinstance(decoder, Experts):
-        numbers += [("--scene.decoder.warmup", decoder.warmup, 0), ("--scene.decoder.router.noise-std", decoder.router.noise_std, 0)]
-    expect_at_least(numbers)
+    expect_at_least([("--iterations", cfg.iterations, 1), ("--seed", cfg.seed, 0), ("--max-anchors", cfg.max_anchors, 0)])
     if cfg.seed > LARGEST_SEED:
         raise InputError(f"expected --seed of at most {LARGEST_SEED}, found {cfg.seed}; give a smaller number")
-    unknown = {*scene.add_dist, *(decoder.attributes if isinstance(decoder, Experts) else ())} - set(ATTRIBUTES)
-    if unknown:
-        raise InputError(f"expected attributes among {', '.join(ATTRIBUTES)}, found {', '.join(sorted(unknown))}; correct the flag")
+    cfg.scene.check()
+    cfg.growth.check()
     for name, rate in vars(cfg.rates).items():
         if isinstance(rate, Rate) and not (rate.first > 0 < rate.last or rate.first == rate.last == 0):
             flag = f"--rates.{name.replace('_', '-')}"
             raise InputError(f"expected {flag} to run between two rates above 0, or to be 0 throughout, found {rate.first} and {rate.last}")
-
-
-def expect_at_least(numbers: list[tuple[str, float, float]]) -> None:
-    """Raises InputError for the first (flag, value, least) whose value is below."""
-    for flag, value, least in numbers:
-        if not value >= least:
-            raise InputError(f"expected {flag} of at least {least}, found {value}; give a larger number or leave it out")
 
 
 def to_json(value: Any) -> Any:

@@ -7,3 +7,10 @@ class InputError(Exception):
 
 class RunError(Exception):
     """Something failed while working on good input (a full disk, an interrupted write). The command line exits with code 1."""
+
+
+def expect_at_least(numbers: list[tuple[str, float, float]]) -> None:
+    """Raises InputError for the first (flag, value, least) whose value is below."""
+    for flag, value, least in numbers:
+        if not value >= least:
+            raise InputError(f"expected {flag} of at least {least}, found {value}; give a larger number or leave it out")

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from scene_experts.train import Adjusted, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
+from scene_experts.events import Adjusted, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
 
 
 class Progress:

@@ -11,8 +11,8 @@ from PIL import Image
 
 from scene_experts.data.capture import Capture
 from scene_experts.errors import InputError, RunError
+from scene_experts.events import Adjusted, Event, Previewed, Started, Stepped
 from scene_experts.io import write_atomic
-from scene_experts.train import Adjusted, Event, Previewed, Started, Stepped
 
 
 class Recorder:

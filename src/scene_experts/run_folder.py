@@ -25,8 +25,8 @@ from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.errors import InputError
 from scene_experts.io import read_json, write_json
-from scene_experts.scene.anchors import AnchorScene
-from scene_experts.train import scene_from, to_device
+from scene_experts.scene import Scene
+from scene_experts.state import scene_from, to_device
 
 FORMAT = 1
 
@@ -38,7 +38,7 @@ class OpenRun:
     path: Path
     config: RunConfig
     cfg: Train  # scaled
-    scene: AnchorScene
+    scene: Scene
     step: int
     seconds: float  # of training
     capture: str = ""  # fingerprint of the capture it was trained on; empty where nothing says it

@@ -28,7 +28,7 @@ from scene_experts.types import Camera, Decoded, Render
 if TYPE_CHECKING:
     from scene_experts.data.capture import Capture
     from scene_experts.render import Rasterizer
-    from scene_experts.scene.anchors import AnchorScene
+    from scene_experts.scene import Scene
 
 FORMAT = 1
 Progress = Callable[[str, int, int], None]  # what is being done, how far, of how many
@@ -46,7 +46,7 @@ class About:
 
 
 def evaluate(
-    scene: AnchorScene,
+    scene: Scene,
     capture: Capture,
     rasterize: Rasterizer,
     out: Path,
@@ -117,7 +117,7 @@ EMPTY = {
 
 @torch.no_grad()
 def _draw(
-    scene: AnchorScene,
+    scene: Scene,
     capture: Capture,
     rasterize: Rasterizer,
     index: int,
@@ -203,7 +203,7 @@ def _means(per_view: dict[str, dict[str, Any]], perceptual: Perceptual) -> dict[
     }
 
 
-def sizes(scene: AnchorScene) -> dict[str, Any]:
+def sizes(scene: Scene) -> dict[str, Any]:
     """Bytes of the scene on disk in the Scaffold-GS layout (float32 rows: 316 B an anchor for K = 10, F = 32) and of its networks."""
     params, n = scene.table.params, len(scene.table)
     values = 3 + 3 + 3 * scene.K + params["feature"].shape[1] + 1 + 6 + 4  # position, normal, offsets, feature, opacity, scaling, rotation
@@ -213,7 +213,7 @@ def sizes(scene: AnchorScene) -> dict[str, Any]:
     return {"ply_bytes": ply, "network_bytes": networks, "total_bytes": total, "MB": total / 1e6, "MiB": total / 2**20}
 
 
-def _scene_facts(scene: AnchorScene, step: int) -> dict[str, Any]:
+def _scene_facts(scene: Scene, step: int) -> dict[str, Any]:
     n = len(scene.table)
     return {
         "size": sizes(scene),

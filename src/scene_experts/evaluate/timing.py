@@ -15,7 +15,7 @@ from scene_experts.types import Camera
 
 if TYPE_CHECKING:
     from scene_experts.render import Rasterizer
-    from scene_experts.scene.anchors import AnchorScene
+    from scene_experts.scene import Scene
 
 WARM_UP = 5  # first frames that do not count
 MOST_VIEWS = 32  # enough for a median
@@ -34,9 +34,7 @@ class Speed:
 
 
 @torch.no_grad()
-def measure(
-    scene: AnchorScene, cameras: Sequence[Camera], step: int, rasterize: Rasterizer, background: Tensor, budget: float = 10.0
-) -> Speed:
+def measure(scene: Scene, cameras: Sequence[Camera], step: int, rasterize: Rasterizer, background: Tensor, budget: float = 10.0) -> Speed:
     """Draw up to 32 of `cameras` (on the scene's device), each once or more after the warm-up; stop early after `budget` seconds."""
     every = max(1, -(-len(cameras) // MOST_VIEWS))
     chosen = cameras[::every]

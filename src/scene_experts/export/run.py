@@ -30,7 +30,7 @@ from scene_experts.render import Rasterizer
 from scene_experts.run_folder import OpenRun
 from scene_experts.scene.anchors import ATTRIBUTES, AnchorScene
 from scene_experts.scene.experts import MixtureHead
-from scene_experts.train import scene_from
+from scene_experts.state import scene_from
 
 COMPACT = "scene.compact"
 _LATTICE_TOLERANCE = 1e-3  # voxels
@@ -98,14 +98,14 @@ def psnr_cost(run: OpenRun, capture: Capture, path: Path, rasterize: Rasterizer)
 
 def scene_of_compact(run: OpenRun, file: Compact, world: World) -> AnchorScene:
     """The scene that a compact file holds, in the world and with the configuration of the run it was written from."""
-    tensors = run_tensors(compact_anchors(file), file.cells, file.networks, run.scene.config.add_dist, run.scene.voxel, world)
-    scene = scene_from(run.cfg, tensors, {"voxel": run.scene.voxel, "extent": run.scene.extent})
-    return scene.eval()
+    old = anchors_of(run)
+    tensors = run_tensors(compact_anchors(file), file.cells, file.networks, old.config.add_dist, old.voxel, world)
+    return scene_from(run.cfg, tensors, old.meta()).eval()
 
 
 def write_compact_run(run: OpenRun, world: World, path: Path) -> Sizes:
     """Write the compact file of an opened run. Raises InputError where the anchors are not on a lattice."""
-    scene = run.scene
+    scene = anchors_of(run)
     cells, xyz = scene.table.facts["cell"], scene.table.facts["xyz"]
     if len(cells):
         away = float((cells.double() * scene.voxel - xyz.double()).abs().max())
@@ -118,8 +118,9 @@ def write_compact_run(run: OpenRun, world: World, path: Path) -> Sizes:
 
 
 def _write_anchors(run: OpenRun, world: World, out: Path) -> Path:
-    anchors = anchors_to_input(_anchors(run.scene), world)
-    return write_scaffold_folder(out, run.step, anchors, _networks_in_input(run.scene, world), sidecar_of(run, world))
+    scene = anchors_of(run)
+    anchors = anchors_to_input(_anchors(scene), world)
+    return write_scaffold_folder(out, run.step, anchors, _networks_in_input(scene, world), sidecar_of(run, world))
 
 
 def _anchors(scene: AnchorScene) -> dict[str, Tensor]:
@@ -142,7 +143,8 @@ def _networks_in_input(scene: AnchorScene, world: World) -> dict[str, Network]:
 
 def sidecar_of(run: OpenRun, world: World) -> dict[str, Any]:
     """The description of an opened run: `scaffold.describe` with the whole configuration, the capture's path left out."""
-    scene, networks = run.scene, _networks(run.scene)
+    scene = anchors_of(run)
+    networks = _networks(scene)
     k = {a: head.k(run.step) for a, head in scene.heads.items() if isinstance(head, MixtureHead)}
     return describe(
         recipe=run.config.train.recipe,
@@ -162,6 +164,13 @@ def sidecar_of(run: OpenRun, world: World) -> dict[str, Any]:
 def _settings(data: Data) -> dict[str, Any]:
     """How a capture was read, without where it lies."""
     return {name: value for name, value in to_json(data).items() if name != "path"}
+
+
+def anchors_of(run: OpenRun) -> AnchorScene:
+    """The run's scene, which must be one of anchors. Raises InputError where it is none."""
+    if not isinstance(run.scene, AnchorScene):
+        raise InputError(f"expected a scene of anchors, found a run of '{run.config.train.recipe}', which has none; use another --format")
+    return run.scene
 
 
 def world_of(run: OpenRun) -> World:

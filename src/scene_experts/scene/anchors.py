@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from scene_experts import native
-from scene_experts.errors import InputError
+from scene_experts.errors import InputError, expect_at_least
 from scene_experts.geometry.neighbours import knn_d2, median_neighbour_distance
 from scene_experts.geometry.voxel import auto_voxel, to_lattice, unique_cells
 from scene_experts.scene import native_decode
@@ -55,6 +55,27 @@ class Anchors:
     """Which implementation decodes: the fused native one where it covers the scene, or the composed torch form."""
     decoder: Plain | Experts = Plain()
 
+    def start(self, points: Points, extent: float) -> AnchorScene:
+        """One anchor per occupied voxel of the point cloud."""
+        return AnchorScene.from_points(self, points, extent)
+
+    def load(self, table: Table, meta: dict[str, Any]) -> AnchorScene:
+        """The scene of a checkpoint, its networks fresh."""
+        return AnchorScene(self, table, float(meta["voxel"]), float(meta["extent"]))
+
+    def scaled(self, factor: float) -> Anchors:
+        """The same in a training `factor` times as long."""
+        return replace(self, decoder=self.decoder.scaled(factor))
+
+    def check(self) -> None:
+        """Raises InputError for settings that no training can have."""
+        expect_at_least([(f"--scene.{name}", getattr(self, name), 1) for name in ("K", "F", "hidden")])
+        expect_at_least([("--scene.voxel-size", self.voxel_size, 0)])
+        self.decoder.check()
+        unknown = {*self.add_dist, *getattr(self.decoder, "attributes", ())} - set(ATTRIBUTES)
+        if unknown:
+            raise InputError(f"expected attributes among {', '.join(ATTRIBUTES)}, found {', '.join(sorted(unknown))}; correct the flag")
+
 
 class AnchorScene(nn.Module):
     """N anchors and three decoder heads. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], offsets [N,K,3], log_scaling [N,6]."""
@@ -73,6 +94,9 @@ class AnchorScene(nn.Module):
     @property
     def K(self) -> int:
         return self.config.K
+
+    def meta(self) -> dict[str, Any]:
+        return {"voxel": self.voxel, "extent": self.extent}
 
     @classmethod
     def from_points(cls, config: Anchors, points: Points, extent: float) -> AnchorScene:

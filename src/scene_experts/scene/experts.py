@@ -9,14 +9,14 @@ The losses that keep experts in use, L_load^S and L_load^D (eq. 6, 7), are in `l
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scene_experts.errors import InputError
+from scene_experts.errors import InputError, expect_at_least
 from scene_experts.scene.mlp import ACTIVATIONS, MLP, HeadWeights, linear_init
 from scene_experts.types import Routing
 
@@ -57,6 +57,14 @@ class Experts:
     form: Literal["fast", "masked"] = "fast"
     """How torch computes Top-k: anchors gathered per expert, or all experts with zero weights (the slow, obvious reference)."""
     router: Router = Router()
+
+    def scaled(self, factor: float) -> Experts:
+        """The same in a training `factor` times as long: the dense warm-up scales."""
+        return replace(self, warmup=round(self.warmup * factor))
+
+    def check(self) -> None:
+        """Raises InputError for numbers that no training can have."""
+        expect_at_least([("--scene.decoder.warmup", self.warmup, 0), ("--scene.decoder.router.noise-std", self.router.noise_std, 0)])
 
     def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> MixtureHead | MLP:
         if self.num < 1:

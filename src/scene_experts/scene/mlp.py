@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scene_experts.errors import InputError
+from scene_experts.errors import InputError, expect_at_least
 from scene_experts.types import Routing
 
 ACTIVATIONS = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid}  # the last layer of each attribute
@@ -58,6 +58,14 @@ class Plain:
     """One network per attribute, as in Scaffold-GS. `depth` counts linear layers (the paper's Figure 7 goes to 6)."""
 
     depth: int = 2
+
+    def scaled(self, factor: float) -> Plain:
+        """It has no schedule."""
+        return self
+
+    def check(self) -> None:
+        """Raises InputError for a network without a hidden layer."""
+        expect_at_least([("--scene.decoder.depth", self.depth, 2)])
 
     def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> MLP:
         return MLP(attribute, inputs, hidden, outputs, self.depth)

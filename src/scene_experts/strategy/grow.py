@@ -14,23 +14,14 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from scene_experts.errors import expect_at_least
 from scene_experts.geometry.voxel import AXIS_LIMIT, coarsen, in_set, pack, scatter_max
 from scene_experts.scene.anchors import AnchorScene
 from scene_experts.schedule import Every
-from scene_experts.strategy import observe
+from scene_experts.strategy import Edit, observe
 from scene_experts.types import Decoded, Render
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Edit:
-    """What one adjustment did."""
-
-    grown: int
-    pruned: int
-    anchors: int
-    capped: bool = False  # the cap on anchors held some back
 
 
 @dataclass(frozen=True)
@@ -59,6 +50,19 @@ class GrowAnchors:
     def scaled(self, factor: float) -> GrowAnchors:
         """The same in a training `factor` times as long: windows scale; interval, gates and thresholds stay."""
         return replace(self, start_stat=round(self.start_stat * factor), adjust=self.adjust.scaled(factor))
+
+    def check(self) -> None:
+        """Raises InputError for numbers that no training can have."""
+        expect_at_least(
+            [
+                ("--growth.adjust.interval", self.adjust.interval, 1),
+                ("--growth.hierarchy-factor", self.hierarchy_factor, 2),
+                ("--growth.max-anchors", self.max_anchors, 0),
+            ]
+        )
+
+    def finish(self, scene: AnchorScene, step: int, rates: dict[str, float], generator: torch.Generator) -> None:
+        """Nothing is left to do after the optimiser's step."""
 
     def observe(self, scene: AnchorScene, decoded: Decoded, render: Render, step: int) -> None:
         """Count one view, after its backward pass."""

@@ -1,0 +1,67 @@
+"""What a training tells its listeners: the terminal, the run folder, a viewer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from torch import Tensor
+
+from scene_experts.strategy import Edit
+
+
+@dataclass(frozen=True)
+class Started:
+    step: int  # 0, or where the run resumes
+    total: int  # the last iteration of this run
+    anchors: int
+    voxel: float = 0.0  # edge of the finest lattice cell, trained world units
+
+
+@dataclass(frozen=True)
+class Stepped:
+    step: int
+    terms: dict[str, float]  # weighted, by name
+    psnr: float  # of the training view where its mask counts, dB
+    anchors: int
+    visible: int  # anchors this view decoded
+    gaussians: int  # of them drawn
+    active: float  # share of decoded Gaussians with positive opacity
+    seconds: float  # of training so far, without saving and previews
+    routing: dict[str, list[float]]  # mean share of assignments per expert, by attribute
+    balance: dict[str, float] = field(default_factory=dict)  # L_load^S / k, or L_load^D while dense, by attribute: 1 is perfect balance
+    entropy: dict[str, float] = field(default_factory=dict)  # of the gates, by attribute: 1 all experts alike, 0 one alone
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    step: int
+    edit: Edit
+
+
+@dataclass(frozen=True)
+class Previewed:
+    step: int
+    view: int
+    picture: Tensor  # [H, W, 3]
+
+
+@dataclass(frozen=True)
+class Saved:
+    step: int
+    path: Path
+
+
+@dataclass(frozen=True)
+class Stopped:
+    step: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Finished:
+    step: int
+    seconds: float
+
+
+Event = Started | Stepped | Adjusted | Previewed | Saved | Stopped | Finished
