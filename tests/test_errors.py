@@ -6,7 +6,7 @@ import os
 import pytest
 
 from scene_experts import cli, commands
-from scene_experts.errors import InputError, RunError
+from scene_experts.errors import InputError, RunError, nearest
 
 
 @pytest.mark.parametrize(
@@ -19,10 +19,10 @@ from scene_experts.errors import InputError, RunError
     ],
 )
 def test_exit_codes(error, code, said, monkeypatch, capsys):
-    def fail(args):
+    def fail(*_):
         raise error
 
-    monkeypatch.setitem(commands.HANDLERS, "info", fail)
+    monkeypatch.setattr(commands, "run", fail)
     assert cli.main(["info"]) == code
     out, err = capsys.readouterr()
     assert out == "" and err.endswith(said) and err.count("\n") == 1
@@ -31,9 +31,14 @@ def test_exit_codes(error, code, said, monkeypatch, capsys):
 def test_neither_is_the_other_and_a_fault_of_ours_is_not_hidden(monkeypatch):
     assert not issubclass(InputError, RunError) and not issubclass(RunError, InputError)
 
-    def fault(args):
+    def fault(*_):
         raise ZeroDivisionError
 
-    monkeypatch.setitem(commands.HANDLERS, "info", fault)
+    monkeypatch.setattr(commands, "run", fault)
     with pytest.raises(ZeroDivisionError):
         cli.main(["info"])
+
+
+def test_a_word_like_a_known_one_is_hinted_at():
+    assert nearest("exprt", ["export", "eval"]) == "; did you mean 'export'?"
+    assert nearest("zzz", ["export", "eval"]) == ""

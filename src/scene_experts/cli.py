@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
-from scene_experts.errors import InputError, RunError
+from scene_experts.errors import InputError, RunError, nearest
 
 PROG = "scene-experts"
 COMMANDS = {
@@ -43,13 +43,16 @@ def dispatch(args: list[str]) -> int:
         return 0
     command, rest = args[0], args[1:]
     if command not in COMMANDS:
-        print(f"error: expected one of {', '.join(COMMANDS)}, found '{command}'; see {PROG} --help", file=sys.stderr)
+        print(
+            f"error: expected one of {', '.join(COMMANDS)}, found '{command}'{nearest(command, COMMANDS)}; see {PROG} --help",
+            file=sys.stderr,
+        )
         return 2
     logging.basicConfig(level=logging.WARNING, format="warning: %(message)s")
     try:
         from scene_experts import commands  # imports torch: not needed for the help above
 
-        return commands.HANDLERS[command](rest)
+        return commands.run(command, rest)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -1,5 +1,8 @@
 """The two ways a command ends badly. Every message says what was expected, what was found and what to do, in one sentence."""
 
+import difflib
+from collections.abc import Iterable
+
 
 class InputError(Exception):
     """The user's input (a capture, a run folder, a flag) cannot be used. The command line exits with code 2."""
@@ -14,3 +17,9 @@ def expect_at_least(numbers: list[tuple[str, float, float]]) -> None:
     for flag, value, least in numbers:
         if not value >= least:
             raise InputError(f"expected {flag} of at least {least}, found {value}; give a larger number or leave it out")
+
+
+def nearest(word: str, words: Iterable[str]) -> str:
+    """A hint at the known words most like an unknown one: "; did you mean 'moe-gs'?", or nothing."""
+    like = difflib.get_close_matches(word, list(words), 3, 0.6)
+    return f"; did you mean {' or '.join(repr(found) for found in like)}?" if like else ""

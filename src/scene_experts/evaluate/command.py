@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,6 +16,8 @@ from scene_experts.evaluate.run import About, evaluate
 
 if TYPE_CHECKING:
     from scene_experts.render import Rasterizer
+
+SAY_EVERY = 15.0  # seconds between lines where there is no terminal
 
 
 def evaluate_run(
@@ -47,9 +50,18 @@ def evaluate_run(
         train_seconds=opened.seconds,
         versions=opened.config.versions,
     )
+    console = Console(stderr=True)
+    said = [time.monotonic()]
+
+    def tell(what: str, done: int, total: int) -> None:
+        bar.update(task, description=what, completed=done, total=total)
+        if not console.is_terminal and time.monotonic() - said[0] > SAY_EVERY:  # a log shows no bar: a line now and then
+            said[0] = time.monotonic()
+            console.print(f"{what}: {done} of {total}", highlight=False)
+
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     try:
-        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        with Progress(*columns, console=console, transient=True) as bar:
             task = bar.add_task("opening", total=None)
             return evaluate(
                 opened.scene,
@@ -62,7 +74,7 @@ def evaluate_run(
                 lpips_weights=lpips_weights,
                 download=download,
                 about=about,
-                progress=lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
+                progress=tell,
             )
     finally:
         capture.images.close()

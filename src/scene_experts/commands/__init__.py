@@ -1,0 +1,22 @@
+"""The commands, a function each: flags in, exit code out. The only place a device is chosen."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+HANDLERS: dict[str, tuple[str, str]] = {
+    "info": ("inspect", "info"),
+    "train": ("train", "train"),
+    "eval": ("evaluate", "evaluate"),
+    "compare": ("evaluate", "compare"),
+    "export": ("files", "export"),
+    "import": ("files", "import_"),
+    "doctor": ("inspect", "doctor"),
+}
+"""Module of this package and function, by command: only the modules of the command that runs are imported."""
+
+
+def run(command: str, args: list[str]) -> int:
+    """Run a command of HANDLERS; returns its exit code."""
+    module, function = HANDLERS[command]
+    return getattr(import_module(f"{__name__}.{module}"), function)(args)

@@ -1,0 +1,32 @@
+"""Commands that look and change nothing: info, doctor."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from scene_experts import run_folder
+from scene_experts.cli import COMMANDS, PROG
+from scene_experts.commands.shared import positional
+from scene_experts.config import Data
+from scene_experts.data.report import show
+
+
+def info(args: list[str]) -> int:
+    data = tyro.cli(
+        Annotated[Data, tyro.conf.arg(name="")],
+        prog=f"{PROG} info",
+        args=positional(args, "--data"),
+        description="Say what a capture holds.",
+    )
+    show(run_folder.load_capture(data), Console(highlight=False))
+    return 0
+
+
+def doctor(args: list[str]) -> int:
+    from scene_experts import doctor as checks
+
+    tyro.cli(lambda: None, prog=f"{PROG} doctor", args=args, description=COMMANDS["doctor"])
+    return checks.run(Console(highlight=False))

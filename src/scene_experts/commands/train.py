@@ -1,0 +1,140 @@
+"""`scene-experts train`: flags to a training, its events to the terminal and the run folder."""
+
+from __future__ import annotations
+
+import shlex
+import signal
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from scene_experts import run_folder
+from scene_experts import train as training
+from scene_experts.cli import PROG
+from scene_experts.commands.shared import Device, Raster, backend
+from scene_experts.config import Data, RunConfig, Train, check
+from scene_experts.data.capture import Capture
+from scene_experts.errors import InputError, expect_at_least, nearest
+from scene_experts.events import Started
+from scene_experts.progress import Progress
+from scene_experts.recipes import RECIPES
+from scene_experts.record import Recorder
+from scene_experts.render import Rasterizer
+from scene_experts.train import Run
+
+
+@dataclass(frozen=True)
+class TrainCommand:
+    """Train a scene."""
+
+    data: Annotated[Data, tyro.conf.arg(name="")]
+    out: Annotated[Path, tyro.conf.arg(aliases=["-m"])]
+    """Run folder to write."""
+    cfg: Annotated[Train, tyro.conf.arg(name="")]
+    overwrite: bool = False
+    """Begin anew in a run folder that holds an earlier run, whose checkpoints are removed."""
+    resume: bool = False
+    """Go on from the run's newest whole checkpoint."""
+    stop_at: int | None = None
+    """Stop at this iteration of the unchanged schedule (--iterations rescales it instead)."""
+    deterministic: bool = False
+    """Bit-identical results on one machine, resumed or not; a little slower."""
+    device: Device = "auto"
+    rasterizer: Raster = "auto"
+    save_every: int = 5000
+    """Iterations between checkpoints."""
+    preview_every: int = 1000
+    """Iterations between pictures of a held-out view in RUN/previews; 0 for none."""
+    max_memory: float = 0.0
+    """GiB of resident memory at which growth stops; 0 for no cap."""
+    tensorboard: bool = False
+    """Write RUN/tensorboard too (pip install 'scene-experts[tensorboard]')."""
+
+
+def train(args: list[str]) -> int:
+    command = parse_train(args)
+    check_settings(command)
+    console = Console(highlight=False)
+    device, rasterize = backend(command.device, command.rasterizer, command.cfg.antialias, command.deterministic)
+    line = shlex.join([PROG, "train", *args])
+    config = RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, run_folder.versions())
+    run_folder.check(command.out, config, command.resume, command.overwrite)
+    capture = run_folder.load_capture(command.data, command.cfg.seed)
+    for warning in capture.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    run = Run(
+        config=config,
+        out=command.out,
+        device=device,
+        resume=command.resume,
+        save_every=command.save_every,
+        preview_every=command.preview_every,
+        max_memory=command.max_memory,
+    )
+    what = f"{config.train.recipe} on {capture.name} ({len(capture.train)} views)"
+    console.print(f"{what}, {device}, rasteriser {rasterize.name}", soft_wrap=True)
+    return follow(command, run, capture, rasterize, console)
+
+
+def parse_train(args: list[str]) -> TrainCommand:
+    """The recipe and its flags. Every recipe is a subcommand whose defaults are its numbers."""
+    if args and not args[0].startswith("-") and args[0] not in RECIPES:
+        raise InputError(f"expected a recipe ({', '.join(RECIPES)}), found '{args[0]}'{nearest(args[0], RECIPES)}; see {PROG} train --help")
+    chosen = {args[0]: RECIPES[args[0]]} if args and args[0] in RECIPES else RECIPES
+    defaults = {
+        name: (text, TrainCommand(data=Data(path=tyro.MISSING), out=tyro.MISSING, cfg=cfg))  # type: ignore[arg-type]
+        for name, (text, cfg) in chosen.items()
+    }
+    if len(defaults) == 1:
+        ((name, (text, default)),) = defaults.items()
+        return tyro.cli(
+            TrainCommand,
+            default=default,
+            args=args[1:],
+            prog=f"{PROG} train {name}",
+            description=text,
+            config=(tyro.conf.AvoidSubcommands,),
+        )
+    return tyro.extras.overridable_config_cli(defaults, args=args, prog=f"{PROG} train")
+
+
+def check_settings(command: TrainCommand) -> None:
+    """Raises InputError for settings that no training can have."""
+    stop_at = 1 if command.stop_at is None else command.stop_at
+    numbers = [("--save-every", command.save_every, 1), ("--preview-every", command.preview_every, 0), ("--stop-at", stop_at, 1)]
+    expect_at_least([*numbers, ("--max-memory", command.max_memory, 0)])
+    check(command.cfg)
+
+
+def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasterizer, console: Console) -> int:
+    """Train, show and record; Ctrl-C and SIGTERM save and end the run."""
+
+    def stop(number: int, _: object) -> None:
+        if run.stop:
+            raise KeyboardInterrupt  # a second signal does not wait
+        run.stop.append(signal.Signals(number).name)
+
+    previous = {s: signal.signal(s, stop) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with Recorder(command.out, command.tensorboard, capture) as record, Progress(console) as progress:
+            for event in training.train(command.cfg, run, capture, rasterize):
+                if isinstance(event, Started):  # what can fail before the first iteration has not: now the folder may change
+                    run_folder.prepare(command.out, run.config, command.resume, command.overwrite)
+                record(event)
+                progress(event)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+        capture.images.close()
+    if not run.stop:
+        from scene_experts.export.run import write_layout
+        from scene_experts.run_folder import open_run
+
+        folder = write_layout(open_run(command.out), capture)
+        console.print(f"wrote {folder}", soft_wrap=True)
+        console.print(f"next: {PROG} eval {command.out}", soft_wrap=True)
+    return 128 + signal.Signals[run.stop[0]] if run.stop else 0  # saved, but not whole: `train && eval` must not go on

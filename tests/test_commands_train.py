@@ -1,0 +1,44 @@
+"""From the flags of `train` to what the loop is given."""
+
+from pathlib import Path
+
+import pytest
+
+from scene_experts.commands.train import check_settings, parse_train
+from scene_experts.errors import InputError
+from scene_experts.recipes import RECIPES
+
+PLACES = ["--data", "c", "--out", "r"]
+
+
+@pytest.mark.parametrize("recipe", list(RECIPES))
+def test_a_recipe_without_flags_is_the_recipe(recipe):
+    made = parse_train([recipe, *PLACES])
+    assert made.cfg == RECIPES[recipe][1] and (made.data.path, made.out) == (Path("c"), Path("r"))
+    check_settings(made)
+
+
+@pytest.mark.parametrize(
+    ("flag", "value"),
+    [
+        ("--stop-at", "0"),
+        ("--save-every", "0"),
+        ("--preview-every", "-1"),
+        ("--max-memory", "-1"),
+        ("--max-memory", "nan"),
+        ("--iterations", "0"),
+        ("--seed", "-1"),
+        ("--max-anchors", "-1"),
+        ("--scene.K", "0"),
+        ("--scene.voxel-size", "-0.1"),
+        ("--growth.adjust.interval", "0"),
+    ],
+)
+def test_numbers_no_training_can_have_name_their_flag(flag, value):
+    with pytest.raises(InputError, match=f"expected {flag} of at least"):
+        check_settings(parse_train(["moe-gs", *PLACES, flag, value]))
+
+
+def test_an_unknown_recipe_names_the_nearest():
+    with pytest.raises(InputError, match="did you mean 'moe-gs'"):
+        parse_train(["moegs", *PLACES])
