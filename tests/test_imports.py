@@ -11,13 +11,13 @@ SOURCE = Path(scene_experts.__path__[0])
 LAYERS = [
     {"errors", "io", "native", "types", "__init__"},
     {"geometry"},
-    {"table", "schedule", "checkpoint"},
+    {"table", "schedule", "checkpoint", "optim"},
     {"data", "render", "scene", "losses"},
     {"strategy"},
     {"config"},
     {"recipes", "events", "state", "train"},
     {"run_folder", "progress", "record"},
-    {"evaluate", "export", "view", "doctor"},
+    {"evaluate", "export", "view", "doctor", "bench"},
     {"cli", "commands", "__main__"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -13,6 +13,7 @@ from scene_experts import checkpoint
 from scene_experts.config import Train, to_json
 from scene_experts.data.capture import Capture
 from scene_experts.errors import InputError
+from scene_experts.optim import Adam
 from scene_experts.scene import Scene
 from scene_experts.table import Table
 
@@ -28,9 +29,9 @@ class Training:
         self.capture = ""  # its fingerprint
         self.views = torch.Generator().manual_seed(cfg.seed)
         self.growth = torch.Generator().manual_seed(cfg.seed + 1)
-        groups = [{"params": params, "name": name, "lr": 0.0} for name, params in scene.rate_groups().items()]
-        fused = all(p.device.type in ("cpu", "cuda") and p.dtype == torch.float32 for g in groups for p in g["params"])
-        self.optimizer = torch.optim.Adam(groups, lr=0.0, betas=(0.9, 0.999), eps=1e-15, fused=fused)
+        columns = scene.table.params
+        named = scene.rate_groups().items()
+        self.optimizer = Adam([{"params": params, "name": name, "lr": 0.0, "by_row": name in columns} for name, params in named])
         scene.table.attach(self.optimizer)
 
     @classmethod
