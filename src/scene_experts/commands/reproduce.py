@@ -1,0 +1,126 @@
+"""`scene-experts reproduce`: the paper's tables and figures from runs that are made, continued or reused."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from scene_experts.cli import PROG
+from scene_experts.data.obtain import captures_dir
+from scene_experts.errors import InputError, RunError, expect_at_least, nearest
+from scene_experts.reproduce import report, store
+from scene_experts.reproduce.experiments import EXPERIMENTS, Experiment
+from scene_experts.reproduce.plan import Scale, Scene, Spec, own_scenes, paper_scenes, specs
+from scene_experts.reproduce.run import Runner
+
+
+@dataclass(frozen=True)
+class ReproduceCommand:
+    """Make the paper's tables and figures: runs what is missing, goes on with what was interrupted, reuses what is done."""
+
+    experiments: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """table1, table2, table3, table4, fig1b, fig3, fig5, fig6, fig7, appendix, or all."""
+    captures: tuple[Path, ...] = ()
+    """Your own captures, in place of the paper's scenes."""
+    data: Path | None = None
+    """Folder with the paper's scenes, as `scene-experts download --to` leaves them; by default where it puts them."""
+    scenes: tuple[str, ...] = ()
+    """Only these scenes."""
+    out: Path = Path("reproduce")
+    """Folder for tables, figures and records of runs."""
+    runs: Path | None = None
+    """Folder for run folders; OUT/runs by default."""
+    scale: float = 1.0
+    """1 is the paper's size; less shortens the schedule and the longest side (of 1,600 px) together."""
+    iterations: int | None = None
+    """Length of each training, in place of what --scale gives."""
+    resolution: str | None = None
+    """Resolution policy (as-is, longest:PX, ...), in place of what --scale gives."""
+    seeds: tuple[int, ...] = (0,)
+    workers: int = 1
+    """Runs at a time, each in a process of its own."""
+    devices: tuple[str, ...] = ()
+    """CUDA devices to share among the workers, by index."""
+    recipes: tuple[str, ...] = ()
+    """Only the rows of these recipes."""
+    discard: bool = False
+    """Remove each run folder once its record is written."""
+    adopt: tuple[Path, ...] = ()
+    """Run folders made elsewhere, to count as done where they are exactly what is asked for."""
+    dry_run: bool = False
+    """Say what would run, and run nothing."""
+
+
+def reproduce(args: list[str]) -> int:
+    command = tyro.cli(ReproduceCommand, prog=f"{PROG} reproduce", args=args)
+    expect_at_least([("--workers", command.workers, 1), *(("--seeds", seed, 0) for seed in command.seeds)])
+    chosen = experiments_of(command)
+    scenes = scenes_of(command)
+    scale = Scale.of(command.scale, command.iterations, command.resolution)
+    wanted = specs(chosen, scenes, command.seeds or (0,), scale)
+    if command.recipes:
+        wanted = [spec for spec in wanted if spec.recipe in command.recipes]
+    records, runs = command.out / "records", command.runs or command.out / "runs"
+    console = Console(highlight=False)
+    say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
+    for run in command.adopt:
+        say(f"adopted {report.adopt(run, records)}")
+    if command.dry_run:
+        done = store.load(records)
+        for spec in wanted:
+            say(f"{'done   ' if store.find(done, spec) else 'to run '} {spec.label}")
+        return 0
+    figure5 = set(EXPERIMENTS["fig5"].rows.values()) if any(e.name == "fig5" for e in chosen) else set()
+
+    def draw(spec: Spec, folder: Path) -> None:
+        if spec.recipe in figure5 and spec.seed == min(command.seeds or (0,)):
+            report.expert_strip(spec, folder, command.out)
+
+    runner = Runner(runs, records, command.workers, command.devices, command.discard, say, draw)
+    previous = {s: signal.signal(s, lambda *_: runner.end()) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        failures = runner.make(wanted)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    keys = {spec.key for spec in specs(chosen, scenes, command.seeds or (0,), scale)}  # others are of another size or protocol
+    for spec in wanted:  # pictures of runs that were done before this figure was asked for
+        if not (command.out / f"fig5_{spec.scene.name}.png").is_file() and (spec.folder(runs) / "results.json").is_file():
+            draw(spec, spec.folder(runs))
+    for path in report.write(command.out, chosen, scenes, [r for r in store.load(records) if r.key in keys]):
+        say(f"wrote {path}")
+    if runner.stop.is_set():
+        say("stopped; give the same command again to go on")
+        return 130
+    if failures:
+        lines = "; ".join(f"{f.spec.label}: {f.why} ({f.log})" for f in failures)
+        raise RunError(f"expected {len(wanted)} runs to end well, found {len(failures)} that failed, the rest is done: {lines}")
+    return 0
+
+
+def experiments_of(command: ReproduceCommand) -> list[Experiment]:
+    """Raises InputError for a name that is no experiment."""
+    if not command.experiments:
+        raise InputError(f"expected what to reproduce ({', '.join(EXPERIMENTS)}, or all), found nothing; name one or more")
+    names = list(EXPERIMENTS) if "all" in command.experiments else list(command.experiments)
+    for name in names:
+        if name not in EXPERIMENTS:
+            hint = nearest(name, EXPERIMENTS)
+            raise InputError(f"expected one of {', '.join(EXPERIMENTS)} or all, found '{name}'{hint}; correct the name")
+    return [EXPERIMENTS[name] for name in names]
+
+
+def scenes_of(command: ReproduceCommand) -> list[Scene]:
+    """The captures to run on: the user's own, or those of the paper that are there."""
+    root = command.data or captures_dir()
+    scenes = own_scenes(command.captures) if command.captures else paper_scenes(root)
+    unknown = set(command.scenes) - {s.name for s in scenes}
+    if unknown or not scenes:
+        what = ", ".join(sorted(unknown)) or "the paper's scenes"
+        raise InputError(f"expected {what} in {root}, found none; fetch scenes with `{PROG} download`, or give --captures DIR...")
+    return [s for s in scenes if not command.scenes or s.name in command.scenes]

@@ -1,0 +1,54 @@
+"""Pictures of single experts: the anchors that an expert decodes, drawn alone (what the MoE-GS paper's Figure 5 shows)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from scene_experts.types import Camera, Decoded, Gaussians
+
+if TYPE_CHECKING:
+    from scene_experts.render import Rasterizer
+    from scene_experts.scene import Scene
+
+
+def keep(gaussians: Gaussians, mask: Tensor) -> Gaussians:
+    """The Gaussians where `mask` [M] (bool) is true, in order."""
+    rows = mask.nonzero().squeeze(1)
+    return replace(gaussians, **{name: value.index_select(0, rows) for name, value in vars(gaussians).items()})
+
+
+def chosen_by(decoded: Decoded, attribute: str, K: int) -> Tensor:
+    """[M, E] bool: whether an expert was chosen for the anchor of a Gaussian. While the mixture is dense: the largest gate alone."""
+    routing = decoded.routing[attribute]
+    experts = routing.gates.shape[1]
+    chosen = routing.gates.argmax(1, keepdim=True) if routing.chosen is None else routing.chosen
+    by_row = torch.zeros(len(decoded.rows), experts, dtype=torch.bool, device=chosen.device).scatter_(1, chosen, True)
+    place = torch.searchsorted(decoded.rows, torch.div(decoded.gaussians.source, K, rounding_mode="floor"))  # rows come in order
+    return by_row.index_select(0, place)
+
+
+@torch.no_grad()
+def alone(
+    scene: Scene, camera: Camera, step: int, rasterize: Rasterizer, background: Tensor, attribute: str = "color"
+) -> tuple[Tensor, list[Tensor]]:
+    """The whole picture [H, W, 3] and one per expert of `attribute`, each of the Gaussians of anchors routed to it.
+
+    With Top-2 every anchor is in two pictures. Raises KeyError where the attribute has no experts.
+    """
+    decoded = scene(camera, step, False, rasterize.visible)
+    mine = chosen_by(decoded, attribute, scene.K)
+    draw = lambda gaussians: rasterize(gaussians, camera, background).image.clamp(0, 1)  # noqa: E731
+    return draw(decoded.gaussians), [draw(keep(decoded.gaussians, mine[:, e])) for e in range(mine.shape[1])]
+
+
+def strip(pictures: Sequence[Tensor], gap: int = 4) -> Tensor:
+    """Pictures of one height beside each other, [H, W', 3], a white gap between them."""
+    height = pictures[0].shape[0]
+    white = torch.ones(height, gap, 3)
+    parts = [part for picture in pictures for part in (white, picture.cpu())]
+    return torch.cat(parts[1:], dim=1)

@@ -1,0 +1,1 @@
+"""The paper's tables and figures, from runs that are made, continued or reused."""

@@ -1,0 +1,151 @@
+"""The paper's claims as a checklist: what it says, what our runs measured, and whether that confirms, contradicts or leaves it open."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from scene_experts.reproduce.experiments import ROUTINGS
+from scene_experts.reproduce.statistics import Difference, Verdict, difference, mean
+from scene_experts.reproduce.store import Record
+
+
+@dataclass(frozen=True)
+class Finding:
+    claim: str
+    verdict: Verdict | None  # None: no runs to judge by
+    measured: str
+
+
+def check(records: Sequence[Record]) -> list[Finding]:
+    """Every claim, judged on the records at hand."""
+    by = {recipe: [r for r in records if r.recipe == recipe] for recipe in {r.recipe for r in records}}
+    get: Callable[[str], list[Record]] = lambda name: by.get(name, [])  # noqa: E731
+    out = [
+        better("MoE-GS has more PSNR than Scaffold-GS", get("moe-gs"), get("scaffold-gs")),
+        size("MoE-GS is at most as large as Scaffold-GS", get("moe-gs"), get("scaffold-gs")),
+        better("MoE-GS has more PSNR than 3DGS", get("moe-gs"), get("3dgs")),
+        better("MoE-GS has more PSNR than Octree-GS", get("moe-gs"), get("octree-gs")),
+        better("MoE-GS has more PSNR than SAGS", get("moe-gs"), get("sags")),
+        better("experts help: MoE-GS over 'w/o MoE'", get("moe-gs"), get("scaffold-gs-opacity")),
+        better("the curriculum helps: MoE-GS over 'w/o CL'", get("moe-gs"), get("moe-gs-no-cl")),
+        better("L_load helps: MoE-GS over 'w/o L_load'", get("moe-gs"), get("moe-gs-no-load")),
+        better("L_opacity helps: MoE-GS over 'w/o L_opacity'", get("moe-gs"), get("moe-gs-no-opacity")),
+        better("L_opacity helps Scaffold-GS alone", get("scaffold-gs-opacity"), get("scaffold-gs")),
+        activation(get("scaffold-gs"), get("scaffold-gs-opacity")),
+        balance(get("moe-gs-e3-top2"), get("moe-gs-e3-no-load")),
+        experts(by),
+        dense(by),
+        depth(by),
+        better("the position in the router does not help", get("moe-gs-posrouter"), get("moe-gs"), no_gain=True),
+    ]
+    return out
+
+
+def better(claim: str, a: list[Record], b: list[Record], no_gain: bool = False) -> Finding:
+    """A has more PSNR than B, paired; with `no_gain`, that A is not better than B."""
+    d = difference(a, b)
+    if d is None:
+        return Finding(claim, None, "no runs")
+    return Finding(claim, opposite(d.verdict(1)) if no_gain else d.verdict(1), describe(d))
+
+
+def opposite(verdict: Verdict) -> Verdict:
+    return "contradicted" if verdict == "confirmed" else "confirmed" if verdict == "contradicted" else "undecided"
+
+
+def describe(d: Difference, unit: str = "dB") -> str:
+    return (
+        f"{d.mean:+.2f} {unit} (95 % interval {d.low:+.2f} to {d.high:+.2f}; "
+        f"{d.captures} captures, {d.views} views, {d.seeds} seed{'s' if d.seeds > 1 else ''})"
+    )
+
+
+def common(a: list[Record], b: list[Record]) -> tuple[list[Record], list[Record]]:
+    """The records of both that stand for the same captures and seeds."""
+    both = {(r.scene, r.seed) for r in a} & {(r.scene, r.seed) for r in b}
+    return [r for r in a if (r.scene, r.seed) in both], [r for r in b if (r.scene, r.seed) in both]
+
+
+def size(claim: str, a: list[Record], b: list[Record]) -> Finding:
+    a, b = common(a, b)
+    ours, theirs = mean(a, "size_mb"), mean(b, "size_mb")
+    if ours is None or theirs is None:
+        return Finding(claim, None, "no runs")
+    verdict: Verdict = "confirmed" if ours.value <= 1.01 * theirs.value else "contradicted"
+    return Finding(claim, verdict, f"{ours.value:.1f} MB against {theirs.value:.1f} MB (1 % is called equal)")
+
+
+def activation(plain: list[Record], hinged: list[Record]) -> Finding:
+    claim = "L_opacity raises the share of active Gaussians from 35 - 41 % to 63 - 71 %"
+    plain, hinged = common(plain, hinged)
+    low, high = mean(plain, "active_percent"), mean(hinged, "active_percent")
+    if low is None or high is None:
+        return Finding(claim, None, "no runs")
+    inside = 35 <= low.value <= 41 and 63 <= high.value <= 71
+    verdict: Verdict = "confirmed" if inside else "undecided" if high.value > low.value else "contradicted"
+    words = "as the paper has it" if inside else "it rises, from and to other levels" if high.value > low.value else "it does not rise"
+    return Finding(claim, verdict, f"{low.value:.1f} % to {high.value:.1f} %: {words}")
+
+
+def spread(record: Record, attribute: str = "cov") -> float | None:
+    """The largest share of any expert, times the number of experts: 1 is perfect balance."""
+    found = record.results.get("experts", {}).get(attribute)
+    shares = (found or {}).get("share") or (found or {}).get("mean_gate")
+    return max(shares) * len(shares) if shares else None
+
+
+def balance(loaded: list[Record], free: list[Record]) -> Finding:
+    claim = "L_load balances the experts (covariance, three experts)"
+    loaded, free = common(loaded, free)
+    with_load = [s for r in loaded if (s := spread(r)) is not None]
+    without = [s for r in free if (s := spread(r)) is not None]
+    if not with_load or not without:
+        return Finding(claim, None, "no runs")
+    a, b = float(np.mean(with_load)), float(np.mean(without))
+    measured = f"the busiest expert has {a:.2f} times its fair share with it, {b:.2f} without"
+    return Finding(claim, "confirmed" if a < b else "contradicted", measured)
+
+
+def experts(by: dict[str, list[Record]]) -> Finding:
+    claim = "PSNR rises with the number of experts, for every routing (Figure 6)"
+    found = [difference(by.get(f"moe-gs-e5-{r}", []), by.get(f"moe-gs-e2-{r}", [])) for r in ROUTINGS]
+    pairs = [(r, d) for r, d in zip(ROUTINGS, found) if d is not None]
+    if not pairs:
+        return Finding(claim, None, "no runs")
+    return Finding(claim, together([d.verdict(1) for _, d in pairs]), "; ".join(f"{r}: five over two {describe(d)}" for r, d in pairs))
+
+
+def dense(by: dict[str, list[Record]]) -> Finding:
+    claim = "Top-2 with five experts is close to dense (within 0.1 dB)"
+    d = difference(by.get("moe-gs-e5-top2", []), by.get("moe-gs-e5-dense", []))
+    if d is None:
+        return Finding(claim, None, "no runs")
+    verdict: Verdict = "confirmed" if d.low > -0.1 else "contradicted" if d.high < -0.1 else "undecided"
+    return Finding(claim, verdict, describe(d))
+
+
+def depth(by: dict[str, list[Record]]) -> Finding:
+    claim = "more linear layers do not help Scaffold-GS (Figure 7)"
+    base = by.get("scaffold-gs-depth2", [])
+    found = [(n, difference(by.get(f"scaffold-gs-depth{n}", []), base)) for n in (3, 4, 5, 6)]
+    pairs = [(n, d) for n, d in found if d is not None]
+    if not pairs:
+        return Finding(claim, None, "no runs")
+    verdicts: list[Verdict] = [opposite(d.verdict(1)) for _, d in pairs]
+    return Finding(claim, together(verdicts), "; ".join(f"{n} over 2: {describe(d)}" for n, d in pairs))
+
+
+def together(verdicts: Sequence[Verdict]) -> Verdict:
+    """One verdict for a claim in several parts: contradicted by any, confirmed by all."""
+    if "contradicted" in verdicts:
+        return "contradicted"
+    return "confirmed" if all(v == "confirmed" for v in verdicts) else "undecided"
+
+
+def to_markdown(findings: Sequence[Finding]) -> str:
+    lines = ["| claim | verdict | measured |", "|---|---|---|"]
+    lines += [f"| {f.claim} | {f.verdict or 'not run'} | {f.measured} |" for f in findings]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,123 @@
+"""The paper's charts from our records: Figures 1(b), 3, 6 and 7, as PNG and SVG."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from scene_experts.errors import InputError
+from scene_experts.io import write_bytes
+from scene_experts.reproduce.experiments import ROUTINGS, Experiment
+from scene_experts.reproduce.statistics import mean
+from scene_experts.reproduce.store import Record
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # told apart by colour-blind readers
+
+
+def canvas(columns: int = 1, width: float = 6.4, height: float = 3.8) -> tuple[Any, Any]:
+    """A figure and its axes. Raises InputError without matplotlib."""
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise InputError("expected matplotlib to draw figures, found none; pip install 'scene-experts[plots]'") from error
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot.subplots(1, columns, figsize=(width * columns**0.8, height), layout="constrained", squeeze=False)
+
+
+def save(figure: Any, path: Path) -> list[Path]:
+    """Write PNG and SVG beside each other, each whole or not at all."""
+    from matplotlib import pyplot
+
+    out = []
+    for ending in ("png", "svg"):
+        stream = io.BytesIO()
+        figure.savefig(stream, format=ending, dpi=160, metadata={"Date": None} if ending == "svg" else None)
+        write_bytes(path.with_suffix(f".{ending}"), stream.getvalue())
+        out.append(path.with_suffix(f".{ending}"))
+    pyplot.close(figure)
+    return out
+
+
+def of_recipe(records: Sequence[Record], recipe: str, scene: str | None = None) -> list[Record]:
+    return [r for r in records if r.recipe == recipe and (scene is None or r.scene == scene)]
+
+
+def relative_psnr(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str], path: Path) -> list[Path]:
+    """Figure 1(b): PSNR relative to 3DGS in percent, scenes in order of Scaffold-GS's anchors."""
+    anchors = {s: m.value for s in scenes if (m := mean(of_recipe(records, "scaffold-gs", s), "anchors"))}
+    base = {s: m.value for s in scenes if (m := mean(of_recipe(records, "3dgs", s), "psnr"))}
+    shown = sorted((s for s in scenes if s in anchors and s in base), key=lambda s: anchors[s])
+    if not shown:
+        return []
+    figure, axes = canvas(width=max(6.4, 0.9 * len(shown)))
+    others = [(name, recipe) for name, recipe in experiment.rows.items() if recipe != "3dgs"]
+    for i, (name, recipe) in enumerate(others):
+        found = [(j, m.value) for j, s in enumerate(shown) if (m := mean(of_recipe(records, recipe, s), "psnr"))]
+        xs = [j + (i - (len(others) - 1) / 2) * 0.38 for j, _ in found]
+        axes[0, 0].bar(xs, [100 * (v / base[shown[j]] - 1) for j, v in found], 0.36, color=COLOURS[i], label=name)
+    axes[0, 0].axhline(0, color="black", linewidth=0.8)
+    axes[0, 0].set_xticks(range(len(shown)), [f"{s}\n{anchors[s] / 1000:.0f}k" for s in shown])
+    axes[0, 0].set(ylabel="PSNR relative to 3DGS, %", xlabel="scene, by anchors of Scaffold-GS")
+    axes[0, 0].legend()
+    return save(figure, path)
+
+
+def shares(experiment: Experiment, records: Sequence[Record], scene: str, path: Path, attribute: str = "cov") -> list[Path]:
+    """Figure 3: share of the assignments per expert over training, one panel per row."""
+    found = [(name, of_recipe(records, recipe, scene)) for name, recipe in experiment.rows.items()]
+    found = [(name, min(rows, key=lambda r: r.seed)) for name, rows in found if rows]
+    if not found:
+        return []
+    figure, axes = canvas(len(found))
+    for axis, (name, record) in zip(axes[0], found):
+        points = [(c["step"], c["routing"][attribute]) for c in record.curves if attribute in c.get("routing", {})]
+        for e in range(len(points[0][1]) if points else 0):
+            axis.plot([s for s, _ in points], [100 * v[e] for _, v in points], color=COLOURS[e], label=f"expert {e + 1}")
+        warmup = getattr(record.config.train.scaled().scene, "decoder", None)
+        axis.axvline(getattr(warmup, "warmup", 0), color="grey", linestyle=":", linewidth=1)
+        axis.set(title=f"{name} ({scene})", xlabel="iteration", ylabel=f"share of {attribute} assignments, %", ylim=(0, 100))
+        axis.legend()
+    return save(figure, path)
+
+
+def cost(experiment: Experiment, records: Sequence[Record], path: Path) -> list[Path]:
+    """Figure 6: PSNR against training time; a line per routing, a point per number of experts."""
+    figure, axes = canvas()
+    drawn = False
+    for i, routing in enumerate(ROUTINGS):
+        points = []
+        for num in (2, 3, 4, 5):
+            rows = of_recipe(records, f"moe-gs-e{num}-{routing}")
+            psnr, seconds = mean(rows, "psnr"), mean(rows, "train_seconds")
+            if psnr and seconds:
+                points.append((seconds.value / 60, psnr.value, num))
+        if points:
+            drawn = True
+            axes[0, 0].plot([p[0] for p in points], [p[1] for p in points], "o-", color=COLOURS[i], label=routing)
+            for x, y, num in points:
+                axes[0, 0].annotate(str(num), (x, y), textcoords="offset points", xytext=(5, 4), fontsize=8)
+    axes[0, 0].set(xlabel="training, minutes (mean over scenes)", ylabel="PSNR, dB", title="numbers: experts")
+    if not drawn:
+        return []
+    axes[0, 0].legend()
+    return save(figure, path)
+
+
+def layers(experiment: Experiment, records: Sequence[Record], path: Path) -> list[Path]:
+    """Figure 7: scores of Scaffold-GS against the number of linear layers."""
+    columns = [("psnr", "PSNR, dB"), ("ssim", "SSIM"), ("lpips_3dgs", "LPIPS")]
+    figure, axes = canvas(len(columns), width=4.2)
+    drawn = False
+    for axis, (column, title) in zip(axes[0], columns):
+        found = [(int(name.split()[0]), mean(of_recipe(records, recipe), column)) for name, recipe in experiment.rows.items()]
+        points = [(n, m) for n, m in found if m is not None]
+        if points:
+            drawn = True
+            spreads = [m.spread or 0.0 for _, m in points]
+            axis.errorbar([n for n, _ in points], [m.value for _, m in points], spreads, fmt="o-", color=COLOURS[0], capsize=3)
+        axis.set(xlabel="linear layers", ylabel=title, xticks=[n for n, _ in found])
+    return save(figure, path) if drawn else []

@@ -1,0 +1,136 @@
+"""Which runs an experiment needs, each with everything that changes its numbers, and how short a smaller experiment is."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from scene_experts.config import SCHEDULE, Data, Train, to_json
+from scene_experts.data import catalog
+from scene_experts.data.obtain import present
+from scene_experts.errors import InputError
+from scene_experts.recipes import RECIPES
+from scene_experts.reproduce.experiments import Experiment
+
+FULL_SIDE = 1600  # the longest side of the paper's protocol, px
+COLLECTIONS = {"mipnerf360": "MipNeRF360", "tandt": "TanksAndTemples", "db": "DeepBlending", "bungeenerf": "BungeeNeRF"}
+OWN = "captures"  # the name of the user's own captures among the data sets
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A capture to train on. `options`: what its protocol sets in Data (resolution, split, normalise, ...)."""
+
+    name: str
+    dataset: str
+    path: Path
+    options: dict[str, Any] = field(default_factory=dict, hash=False)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How large an experiment is: iterations of the rescaled schedule, and the picture's size (None: as the protocol says)."""
+
+    iterations: int = SCHEDULE
+    resolution: str | None = None
+
+    @classmethod
+    def of(cls, scale: float, iterations: int | None = None, resolution: str | None = None) -> Scale:
+        """`scale` in (0, 1] shortens the schedule and the longest side together; the other two override it. Raises InputError."""
+        if not 0 < scale <= 1:
+            raise InputError(f"expected --scale above 0 and at most 1, found {scale}; 1 is the paper's own size")
+        if iterations is not None and iterations < 1:
+            raise InputError(f"expected --iterations of at least 1, found {iterations}; give a larger number or leave it out")
+        smaller = f"longest:{max(16, round(FULL_SIDE * scale))}" if scale < 1 else None
+        return cls(iterations or max(1, round(SCHEDULE * scale)), resolution or smaller)
+
+
+@dataclass(frozen=True)
+class Spec:
+    """One run: a recipe on a scene with a seed."""
+
+    scene: Scene
+    recipe: str
+    seed: int
+    scale: Scale
+
+    @property
+    def train(self) -> Train:
+        return replace(RECIPES[self.recipe][1], iterations=self.scale.iterations, seed=self.seed)
+
+    @property
+    def data(self) -> Data:
+        options = dict(self.scene.options)
+        if self.scale.resolution:
+            options["resolution"] = self.scale.resolution
+        return Data(path=self.scene.path, **options)
+
+    @property
+    def key(self) -> str:
+        """A short hash of everything that changes the run's numbers but the place of the capture."""
+        return identity(self.scene.name, self.train, self.data)
+
+    @property
+    def label(self) -> str:
+        return f"{self.recipe} on {self.scene.name}, seed {self.seed}"
+
+    def folder(self, root: Path) -> Path:
+        """Where its run folder is: readable, and never that of another configuration."""
+        return root / self.scene.name / self.recipe / f"seed{self.seed}-{self.key}"
+
+    def arguments(self, out: Path) -> list[str]:
+        """The arguments of `scene-experts train` that make it."""
+        args = ["train", self.recipe, "--data", str(self.scene.path), "--out", str(out)]
+        args += ["--iterations", str(self.scale.iterations), "--seed", str(self.seed), "--preview-every", "0"]
+        for name, value in vars(self.data).items():
+            if name != "path" and value != getattr(Data(path=self.scene.path), name):
+                args += [f"--{name.replace('_', '-')}", str(value)]
+        return args
+
+
+def identity(scene: str, train: Train, data: Data) -> str:
+    """The hash that names a run: scene, recipe with all numbers, how the capture is read; not where it lies."""
+    settings = {k: v for k, v in to_json(data).items() if k != "path"}
+    text = json.dumps([scene, to_json(train), settings], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def own_scenes(captures: Sequence[Path]) -> list[Scene]:
+    """The user's captures as scenes of one data set. Raises InputError where two have one name or one is not there."""
+    scenes = [Scene(path.resolve().name, OWN, path) for path in captures]
+    for scene in scenes:
+        if not scene.path.is_dir():
+            raise InputError(f"expected a capture folder at {scene.path}, found none; correct --captures")
+        if sum(other.name == scene.name for other in scenes) > 1:
+            raise InputError(f"expected captures of different names, found several called '{scene.name}'; rename or link one of them")
+    return scenes
+
+
+def paper_scenes(root: Path) -> list[Scene]:
+    """The paper's scenes that lie below `root`, each with the paper's protocol; trained in their own units, as the paper's code does."""
+    found = []
+    for scene in catalog.SCENES:
+        if present(root, scene):
+            options = {"resolution": scene.resolution, "split": scene.split, "normalise": "none"}
+            found.append(Scene(scene.name, COLLECTIONS[scene.collection.key], root / scene.path, options))
+    return found
+
+
+def specs(experiments: Iterable[Experiment], scenes: Sequence[Scene], seeds: Sequence[int], scale: Scale) -> list[Spec]:
+    """The runs that experiments need, each once: seed by seed, so that a whole first table stands early.
+
+    A user's own captures stand for every data set; the paper's scenes serve the experiments that name them.
+    """
+    wanted: dict[Spec, None] = {}
+    for seed in seeds:
+        for experiment in experiments:
+            for scene in scenes:
+                if scene.dataset != OWN and not experiment.shows(scene.dataset, scene.name):
+                    continue
+                for recipe in experiment.rows.values():
+                    wanted[Spec(scene, recipe, seed, scale)] = None
+    return list(wanted)

@@ -1,0 +1,94 @@
+"""Writes what an experiment shows: its tables and figures, the claims, and one page that leads to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from scene_experts import run_folder
+from scene_experts.evaluate import expert_pictures, pictures
+from scene_experts.evaluate.tables import Table
+from scene_experts.io import write_bytes
+from scene_experts.render import choose
+from scene_experts.reproduce import claims, figures, store, tables
+from scene_experts.reproduce.experiments import Experiment
+from scene_experts.reproduce.plan import OWN, Scene, Spec
+from scene_experts.reproduce.store import Record
+
+
+def write(out: Path, experiments: Sequence[Experiment], scenes: Sequence[Scene], records: Sequence[Record]) -> list[Path]:
+    """Write every experiment's files below `out`; returns them. Records of other scenes are not counted."""
+    wanted = {scene.name for scene in scenes}
+    records = [r for r in records if r.scene in wanted]
+    written: list[Path] = []
+    page = ["# Reproduced", ""]
+    for experiment in experiments:
+        made = [*write_tables(out, experiment, scenes, records), *write_figures(out, experiment, scenes, records)]
+        if experiment.name == "fig5":
+            made += sorted(out.glob("fig5_*.png"))
+        written += made
+        page += [f"## {experiment.title}", "", ", ".join(f"[{p.name}]({p.name})" for p in made), ""]
+        page += [f"![{p.stem}]({p.name})\n" for p in made if p.suffix == ".png"]
+    page += ["## The paper's claims", "", claims.to_markdown(claims.check(records))]
+    page += ["Differences are paired over views and seeds; the interval is a bootstrap over both within these captures.", ""]
+    path = out / "README.md"
+    write_bytes(path, "\n".join(page).encode())
+    return [*written, path]
+
+
+def write_tables(out: Path, experiment: Experiment, scenes: Sequence[Scene], records: Sequence[Record]) -> list[Path]:
+    """An experiment's tables: one per data set, and its first column scene by scene."""
+    made: dict[str, Table] = {}
+    datasets = list(dict.fromkeys(s.dataset for s in scenes if s.dataset == OWN or s.dataset in experiment.datasets))
+    for dataset in datasets:
+        allowed = None if dataset == OWN else experiment.scenes_of(dataset)
+        names = [s.name for s in scenes if s.dataset == dataset and (allowed is None or s.name in allowed)]
+        done = [name for name in names if any(r.scene == name and r.recipe in experiment.rows.values() for r in records)]
+        if done:
+            made[f"{dataset}: means over {', '.join(done)}"] = tables.by_dataset(experiment, records, dataset, done)
+            made[f"{dataset}: scene by scene"] = tables.by_scene(experiment, records, done)
+    out_paths = []
+    for ending, text in tables.write_all(experiment.title, made).items() if made else ():
+        path = out / f"{experiment.name}.{ending}"
+        write_bytes(path, text.encode())
+        out_paths.append(path)
+    return out_paths
+
+
+def write_figures(out: Path, experiment: Experiment, scenes: Sequence[Scene], records: Sequence[Record]) -> list[Path]:
+    """The charts of a figure (nothing for a table, or where no run is done)."""
+    names = [s.name for s in scenes]
+    if experiment.name == "fig1b":
+        return figures.relative_psnr(experiment, records, names, out / "fig1b")
+    if experiment.name == "fig3":
+        return [path for name in names for path in figures.shares(experiment, records, name, out / f"fig3_{name}")]
+    if experiment.name == "fig6":
+        return figures.cost(experiment, records, out / "fig6")
+    if experiment.name == "fig7":
+        return figures.layers(experiment, records, out / "fig7")
+    return []
+
+
+def expert_strip(spec: Spec, run: Path, out: Path, attribute: str = "color") -> Path:
+    """Figure 5 of one run: the first held-out view whole, then each expert's anchors alone; as OUT/fig5_<scene>.png."""
+    opened = run_folder.open_run(run)
+    capture = run_folder.load_capture(replace(opened.config.data, path=spec.scene.path), spec.seed)
+    try:
+        index = (capture.test or capture.train)[0]
+        rasterize = choose("auto", "cpu", antialias=opened.cfg.antialias)
+        background = torch.tensor(capture.background)
+        whole, each = expert_pictures.alone(opened.scene, capture.views[index].camera, opened.step, rasterize, background, attribute)
+    finally:
+        capture.images.close()
+    path = out / f"fig5_{spec.scene.name}.png"
+    pictures.write(path, pictures.to_8bit(expert_pictures.strip([whole, *each])))
+    return path
+
+
+def adopt(run: Path, folder: Path) -> Path:
+    """Keep the record of a run folder that something else made. Its scene is the name of its capture."""
+    scene = Path(run_folder.read_config(run).data.path).resolve().name
+    return store.write(folder, store.of_run(run, scene))

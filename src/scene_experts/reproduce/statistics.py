@@ -1,0 +1,90 @@
+"""Means over scenes with their spread over seeds, and differences between recipes paired over views and seeds."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from scene_experts.reproduce.store import Record
+
+DRAWS = 4000
+Verdict = Literal["confirmed", "contradicted", "undecided"]
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A mean over scenes; `spread` is the standard deviation of that mean over seeds (None with one seed)."""
+
+    value: float
+    spread: float | None
+    seeds: int
+    scenes: tuple[str, ...]
+
+
+def mean(records: Sequence[Record], column: str) -> Mean | None:
+    """Mean over scenes of a column, per seed, then over the seeds that have every scene. None where nothing has it."""
+    found = {(r.seed, r.scene): value for r in records if (value := r.value(column)) is not None}
+    if not found:
+        return None
+    scenes = sorted({scene for _, scene in found})
+    by_seed = {
+        seed: [found[seed, scene] for scene in scenes] for seed in {s for s, _ in found} if all((seed, scene) in found for scene in scenes)
+    }
+    if not by_seed:  # no seed has every scene: the scenes' own means, and no spread
+        own = [statistics.fmean(v for (_, s), v in found.items() if s == scene) for scene in scenes]
+        return Mean(statistics.fmean(own), None, 0, tuple(scenes))
+    means = [statistics.fmean(values) for values in by_seed.values()]
+    return Mean(statistics.fmean(means), statistics.stdev(means) if len(means) > 1 else None, len(means), tuple(scenes))
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A - B: the mean over captures with its 95 % interval, from differences paired over views and seeds."""
+
+    mean: float
+    low: float
+    high: float
+    captures: int
+    seeds: int
+    views: int
+
+    def verdict(self, sign: int) -> Verdict:
+        """Whether A - B has the claimed sign (+1 or -1), its opposite, or may be either."""
+        low, high = (self.low, self.high) if sign > 0 else (-self.high, -self.low)
+        return "confirmed" if low > 0 else "contradicted" if high < 0 else "undecided"
+
+
+def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -> Difference | None:
+    """Differences of a per-view metric between two recipes, on the captures, seeds and views that both have.
+
+    The interval is a bootstrap within captures: views and seeds are drawn anew, captures stay, so it speaks of these captures alone.
+    None where nothing pairs.
+    """
+    theirs = {(r.scene, r.seed): r for r in b}
+    blocks: dict[str, dict[int, dict[str, float]]] = {}
+    for record in a:
+        other = theirs.get((record.scene, record.seed))
+        if other is None:
+            continue
+        views = [v for v in record.per_view if metric in record.per_view[v] and metric in other.per_view.get(v, {})]
+        if views:
+            paired = {v: record.per_view[v][metric] - other.per_view[v][metric] for v in views}
+            blocks.setdefault(record.scene, {})[record.seed] = paired
+    if not blocks:
+        return None
+    random = np.random.default_rng(0)
+    drawn, centres = np.zeros(DRAWS), []
+    for seeds in blocks.values():
+        common = sorted(set.intersection(*(set(views) for views in seeds.values())))
+        grid = np.array([[views[v] for v in common] for views in seeds.values()])  # [S, V]
+        centres.append(grid.mean())
+        s = random.integers(0, grid.shape[0], (DRAWS, grid.shape[0]))
+        v = random.integers(0, grid.shape[1], (DRAWS, grid.shape[1]))
+        drawn += grid[s[:, :, None], v[:, None, :]].mean((1, 2)) / len(blocks)
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    views = sum(len(next(iter(seeds.values()))) for seeds in blocks.values())
+    return Difference(float(np.mean(centres)), float(low), float(high), len(blocks), max(map(len, blocks.values())), views)

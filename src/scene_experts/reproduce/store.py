@@ -1,0 +1,137 @@
+"""What is kept of a run: one JSON record with its configuration, results, scores per view and how its experts were used over training.
+
+Records are small and say everything a table or figure needs, so they can be committed where run folders and checkpoints cannot.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scene_experts.config import RunConfig, from_json, to_json
+from scene_experts.errors import InputError
+from scene_experts.io import read_json, write_json
+from scene_experts.reproduce.plan import Spec, identity
+
+FORMAT = 1
+POINTS = 60  # samples of a curve over training
+PER_VIEW = ("psnr", "ssim", "lpips", "lpips_3dgs", "activation_ratio", "gaussians_rendered")
+
+
+@dataclass(frozen=True)
+class Record:
+    """One finished run."""
+
+    scene: str
+    config: RunConfig
+    results: dict[str, Any]
+    per_view: dict[str, dict[str, Any]]
+    curves: list[dict[str, Any]]  # step, seconds, anchors, active, routing of some iterations
+
+    @property
+    def key(self) -> str:
+        return identity(self.scene, self.config.train, self.config.data)
+
+    @property
+    def recipe(self) -> str:
+        return self.config.train.recipe
+
+    @property
+    def seed(self) -> int:
+        return self.config.train.seed
+
+    def value(self, column: str) -> float | None:
+        """A column of a table: psnr, ssim, lpips_3dgs, size_mb, active_percent, train_seconds, ..."""
+        r = self.results
+        if column == "size_mb":
+            return r["size"]["MB"]
+        if column == "active_percent":
+            return None if r.get("activation_ratio") is None else 100 * r["activation_ratio"]
+        return r.get(column)
+
+
+def of_run(run: Path, scene: str) -> Record:
+    """The record of an evaluated run folder. Raises InputError where it is not whole."""
+    for name in ("config.json", "results.json", "per_view.json"):
+        if not (run / name).is_file():
+            raise InputError(f"expected an evaluated run with {name} in {run}, found none; run `scene-experts eval {run}` first")
+    config = read_json(run / "config.json", "run configuration")
+    config.pop("format", None)
+    views = read_json(run / "per_view.json", "scores by view")
+    return Record(
+        scene=scene,
+        config=from_json(RunConfig, config),
+        results=read_json(run / "results.json", "results file"),
+        per_view={name: {k: facts[k] for k in PER_VIEW if facts.get(k) is not None} for name, facts in views.items()},
+        curves=curves(run / "metrics.jsonl"),
+    )
+
+
+def curves(path: Path) -> list[dict[str, Any]]:
+    """At most POINTS lines of a training's metrics, evenly spread, the last one among them."""
+    lines = []
+    for line in path.read_text().splitlines() if path.is_file() else []:
+        try:
+            found = json.loads(line)
+        except ValueError:
+            continue  # cut off by a crash
+        if isinstance(found, dict) and "psnr" in found:
+            lines.append({k: found[k] for k in ("step", "seconds", "psnr", "anchors", "active", "routing", "entropy") if k in found})
+    if len(lines) <= POINTS:
+        return lines
+    return [lines[round(i * (len(lines) - 1) / (POINTS - 1))] for i in range(POINTS)]
+
+
+def path_of(store: Path, record: Record) -> Path:
+    return store / record.scene / record.recipe / f"seed{record.seed}-{record.key}.json"
+
+
+def write(store: Path, record: Record) -> Path:
+    """Write a record, with hashes of its configuration and its results."""
+    config = to_json(record.config)
+    config["data"]["path"] = record.scene  # where the capture lay is nobody's business
+    config["command"] = ""
+    value = {
+        "format": FORMAT,
+        "scene": record.scene,
+        "key": record.key,
+        "config_sha256": digest(config),
+        "results_sha256": digest(record.results),
+        "config": config,
+        "results": record.results,
+        "per_view": record.per_view,
+        "curves": record.curves,
+    }
+    path = path_of(store, record)
+    write_json(path, value)
+    return path
+
+
+def read(path: Path) -> Record:
+    """A record file. Raises InputError where it is none, or was changed by hand."""
+    value = read_json(path, "record of a run")
+    if not isinstance(value, dict) or value.get("format") != FORMAT:
+        raise InputError(f"expected a record of a run (format {FORMAT}) in {path}, found something else; remove it and reproduce again")
+    for part in ("config", "results"):
+        if digest(value[part]) != value[f"{part}_sha256"]:
+            raise InputError(f"expected {part} as they were written in {path}, found them changed; remove it and reproduce again")
+    config = from_json(RunConfig, value["config"])
+    return Record(value["scene"], config, value["results"], value["per_view"], value["curves"])
+
+
+def load(store: Path) -> list[Record]:
+    """Every record below a folder, in order of their paths."""
+    return [read(path) for path in sorted(store.glob("*/*/seed*.json"))]
+
+
+def digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def find(records: list[Record], spec: Spec) -> Record | None:
+    """The record of exactly this run, if it is done."""
+    key = spec.key
+    return next((r for r in records if r.key == key), None)

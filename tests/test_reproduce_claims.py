@@ -1,0 +1,53 @@
+"""The checklist: each claim judged from records whose answer is known."""
+
+from records import record
+from scene_experts.reproduce.claims import check, to_markdown
+
+
+def found(records):
+    return {f.claim: f for f in check(records)}
+
+
+def get(records, word):
+    return next(f for claim, f in found(records).items() if word in claim)
+
+
+def test_without_runs_nothing_is_claimed():
+    findings = check([])
+    assert len(findings) >= 16 and all(f.verdict is None for f in findings)
+    assert to_markdown(findings).count("not run") == len(findings)
+
+
+def test_more_psnr_at_equal_size():
+    runs = [record("moe-gs", psnr=30.4, mb=9.0), record("scaffold-gs", psnr=30.0)]
+    assert get(runs, "more PSNR than Scaffold-GS").verdict == "confirmed"
+    assert get(runs, "at most as large").verdict == "confirmed"
+    runs = [record("moe-gs", psnr=29.0, mb=12.0), record("scaffold-gs", psnr=30.0)]
+    assert get(runs, "more PSNR than Scaffold-GS").verdict == "contradicted" and get(runs, "at most as large").verdict == "contradicted"
+
+
+def test_activation_is_judged_by_its_levels():
+    pair = lambda low, high: [record("scaffold-gs", active=low), record("scaffold-gs-opacity", active=high)]  # noqa: E731
+    assert get(pair(0.37, 0.65), "share of active").verdict == "confirmed"
+    assert get(pair(0.55, 0.85), "share of active").verdict == "undecided"
+    assert get(pair(0.55, 0.5), "share of active").verdict == "contradicted"
+
+
+def test_balance_is_the_busiest_experts_share():
+    even = {"experts": {"cov": {"share": [0.34, 0.33, 0.33], "mean_gate": []}}}
+    lone = {"experts": {"cov": {"share": [0.9, 0.05, 0.05], "mean_gate": []}}}
+    runs = [record("moe-gs-e3-top2", **even), record("moe-gs-e3-no-load", **lone)]
+    assert get(runs, "balances").verdict == "confirmed" and "1.02" in get(runs, "balances").measured
+
+
+def test_depth_that_helps_contradicts():
+    flat = [record("scaffold-gs-depth2", psnr=30.0), record("scaffold-gs-depth3", psnr=29.5)]
+    assert get(flat, "linear layers").verdict == "confirmed"
+    assert get([*flat, record("scaffold-gs-depth4", psnr=31.0)], "linear layers").verdict == "contradicted"
+
+
+def test_number_of_experts_and_top_2_near_dense():
+    runs = [record(f"moe-gs-e{n}-{r}", psnr=29 + 0.1 * n) for n in (2, 5) for r in ("top1", "top2", "dense")]
+    assert get(runs, "rises with the number").verdict == "confirmed"
+    assert get(runs, "close to dense").verdict == "confirmed"
+    assert get([record("moe-gs-posrouter", psnr=31), record("moe-gs")], "position").verdict == "contradicted"

@@ -1,0 +1,81 @@
+"""Plans: each run once, named by everything that changes its numbers."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from scene_experts.commands.train import parse_train
+from scene_experts.data import catalog
+from scene_experts.errors import InputError
+from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS
+from scene_experts.reproduce.plan import COLLECTIONS, OWN, Scale, Scene, Spec, own_scenes, paper_scenes, specs
+
+FOX = Scene("fox", OWN, Path("captures/fox"))
+
+
+def test_a_run_that_several_tables_need_is_made_once():
+    found = specs([EXPERIMENTS["table3"], EXPERIMENTS["table4"]], [FOX], [0, 1], Scale())
+    assert len(found) == len(set(found)) == 2 * 6  # scaffold-gs, its opacity form (both tables), four MoE rows
+    assert [s.seed for s in found] == [0] * 6 + [1] * 6
+
+
+def test_the_papers_scenes_serve_the_experiments_that_name_them():
+    scenes = [Scene("truck", "TanksAndTemples", Path("truck")), Scene("rome", "BungeeNeRF", Path("rome"))]
+    assert {s.scene.name for s in specs([EXPERIMENTS["table3"]], scenes, [0], Scale())} == {"truck"}
+
+
+def test_the_arguments_make_the_run_that_the_key_names(tmp_path):
+    spec = Spec(replace(FOX, options={"split": "none"}), "moe-gs", 3, Scale.of(0.1))
+    made = parse_train(spec.arguments(tmp_path)[1:])
+    assert made.cfg == spec.train and made.data == spec.data and made.out == tmp_path
+    assert (made.cfg.iterations, made.data.resolution, made.data.split) == (3000, "longest:160", "none")
+
+
+def test_what_changes_numbers_changes_the_key_and_the_place_does_not():
+    spec = Spec(FOX, "moe-gs", 0, Scale())
+    others = [
+        replace(spec, seed=1),
+        replace(spec, recipe="scaffold-gs"),
+        replace(spec, scale=Scale(7000)),
+        replace(spec, scale=Scale(resolution="longest:400")),
+        replace(spec, scene=replace(FOX, name="kermit")),
+        replace(spec, scene=replace(FOX, options={"normalise": "none"})),
+    ]
+    assert len({spec.key, *(o.key for o in others)}) == 7
+    assert replace(spec, scene=replace(FOX, path=Path("/elsewhere/fox"))).key == spec.key
+
+
+def test_scale():
+    assert Scale.of(1.0) == Scale(30_000, None)
+    assert Scale.of(0.25) == Scale(7500, "longest:400")
+    assert Scale.of(0.25, 3000, "as-is") == Scale(3000, "as-is")
+    for wrong in (0.0, 1.5, float("nan")):
+        with pytest.raises(InputError, match="--scale"):
+            Scale.of(wrong)
+    with pytest.raises(InputError, match="--iterations"):
+        Scale.of(1.0, 0)
+
+
+def test_own_captures_need_folders_and_names_of_their_own(tmp_path):
+    (tmp_path / "a" / "fox").mkdir(parents=True)
+    (tmp_path / "b" / "fox").mkdir(parents=True)
+    assert own_scenes([tmp_path / "a" / "fox"])[0].name == "fox"
+    with pytest.raises(InputError, match="different names"):
+        own_scenes([tmp_path / "a" / "fox", tmp_path / "b" / "fox"])
+    with pytest.raises(InputError, match="capture folder"):
+        own_scenes([tmp_path / "none"])
+
+
+def test_the_papers_scenes_are_found_with_their_protocol(tmp_path):
+    for name in ("images", "sparse"):
+        (tmp_path / "mipnerf360" / "garden" / name).mkdir(parents=True)
+    (scene,) = paper_scenes(tmp_path)
+    assert (scene.name, scene.dataset, scene.options["resolution"]) == ("garden", "MipNeRF360", "inria:4")
+    spec = Spec(scene, "moe-gs", 0, Scale())
+    made = parse_train(spec.arguments(tmp_path / "run")[1:])
+    assert made.data == spec.data and made.data.normalise == "none"
+
+
+def test_the_catalog_and_the_experiments_know_the_same_scenes():
+    assert {s.name: COLLECTIONS[s.collection.key] for s in catalog.SCENES} == {s: d for d, scenes in DATASETS.items() for s in scenes}

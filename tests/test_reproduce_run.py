@@ -1,0 +1,75 @@
+"""The runner: skips, resumes, fails one by one, stops."""
+
+from pathlib import Path
+
+import pytest
+
+from records import record
+from scene_experts.config import RunConfig, to_json
+from scene_experts.io import write_json
+from scene_experts.reproduce import store
+from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec
+from scene_experts.reproduce.run import Runner, last_line
+
+
+def spec(recipe="moe-gs", seed=0, scene="fox"):
+    return Spec(Scene(scene, OWN, Path("captures") / scene), recipe, seed, Scale(3000))
+
+
+class Fake(Runner):
+    """Writes what the commands would; recipes in `broken` fail in training."""
+
+    def command(self, args, slot, log):
+        self.calls.append(args)  # type: ignore[attr-defined]
+        if args[0] == "train":
+            if args[1] in self.broken:  # type: ignore[attr-defined]
+                log.write_text("starting\nerror: expected luck, found none; try again\n")
+                return 1
+            folder = Path(args[args.index("--out") + 1])
+            made = spec(args[1], int(args[args.index("--seed") + 1]))
+            write_json(folder / "config.json", {"format": 1, **to_json(RunConfig(made.train, made.data))})
+            return 0
+        folder = Path(args[1])
+        write_json(folder / "results.json", record().results)
+        write_json(folder / "per_view.json", record().per_view)
+        return 0
+
+
+@pytest.fixture
+def runner(tmp_path):
+    made = Fake(tmp_path / "runs", tmp_path / "records", say=lambda _: None)
+    made.calls, made.broken = [], set()  # type: ignore[attr-defined]
+    return made
+
+
+def test_what_is_done_is_not_done_again(runner):
+    assert runner.make([spec(), spec(seed=1)]) == [] and len(runner.calls) == 4
+    assert runner.make([spec(), spec(seed=1), spec("scaffold-gs")]) == [] and len(runner.calls) == 6
+    assert len(store.load(runner.records)) == 3
+
+
+def test_one_failure_does_not_lose_the_rest(runner):
+    runner.broken, runner.workers = {"moe-gs"}, 2
+    failures = runner.make([spec(), spec("scaffold-gs")])
+    assert [f.spec.recipe for f in failures] == ["moe-gs"] and "expected luck" in failures[0].why
+    assert [r.recipe for r in store.load(runner.records)] == ["scaffold-gs"]
+    assert "expected luck" in last_line(failures[0].log)
+
+
+def test_a_run_without_a_whole_checkpoint_begins_anew(runner):
+    folder = spec().folder(runner.runs)
+    (folder / "checkpoints").mkdir(parents=True)
+    (folder / "config.json").write_text("torn")
+    assert runner.make([spec()]) == [] and "--resume" not in runner.calls[0]
+
+
+def test_run_folders_go_when_asked_after_what_else_is_taken(runner):
+    seen = []
+    runner.discard, runner.after = True, lambda made, folder: seen.append((made.recipe, folder.is_dir()))
+    runner.make([spec()])
+    assert seen == [("moe-gs", True)] and not spec().folder(runner.runs).exists() and len(store.load(runner.records)) == 1
+
+
+def test_nothing_begins_after_a_stop(runner):
+    runner.end()
+    assert runner.make([spec()]) == [] and runner.calls == []

@@ -1,0 +1,52 @@
+"""Means, spreads and paired differences against numbers worked out by hand."""
+
+import math
+
+import pytest
+
+from records import record
+from scene_experts.reproduce.statistics import difference, mean
+
+
+def test_mean_over_scenes_spread_over_seeds():
+    runs = [record(scene=s, seed=k, psnr=p, views=1) for s, k, p in (("a", 0, 30), ("b", 0, 20), ("a", 1, 32), ("b", 1, 22))]
+    found = mean(runs, "psnr")
+    assert found is not None and found.value == 26 and found.spread == pytest.approx(math.sqrt(2)) and found.seeds == 2
+    one = mean(runs[:2], "psnr")
+    assert one is not None and (one.value, one.spread, one.seeds) == (25, None, 1)
+    assert mean([], "psnr") is None and mean(runs, "nothing") is None
+
+
+def test_a_seed_that_lacks_a_scene_does_not_move_the_mean():
+    runs = [record(scene=s, seed=k, psnr=p, views=1) for s, k, p in (("a", 0, 30), ("b", 0, 20), ("a", 1, 99))]
+    found = mean(runs, "psnr")
+    assert found is not None and found.value == 25 and found.seeds == 1
+
+
+def test_equal_gains_on_every_view_leave_no_doubt():
+    a = [record("moe-gs", scene=s, seed=k, psnr=30.5) for s in "xy" for k in (0, 1)]
+    b = [record("scaffold-gs", scene=s, seed=k, psnr=30.0) for s in "xy" for k in (0, 1)]
+    d = difference(a, b)
+    assert d is not None and d.mean == pytest.approx(0.5) and d.low == pytest.approx(0.5) and d.high == pytest.approx(0.5)
+    assert (d.captures, d.seeds, d.views) == (2, 2, 8)
+    assert (d.verdict(1), d.verdict(-1)) == ("confirmed", "contradicted")
+
+
+def test_gains_here_and_losses_there_are_undecided():
+    a, b = record("moe-gs"), record("scaffold-gs")
+    for view, gain in zip(a.per_view, (1.0, -1.0, 0.9, -0.9)):
+        a.per_view[view]["psnr"] += gain
+    d = difference([a], [b])
+    assert d is not None and abs(d.mean) < 1e-9 and d.low < 0 < d.high and d.verdict(1) == "undecided"
+
+
+def test_the_interval_is_that_of_the_mean_of_the_views():
+    a, b = record("moe-gs", views=400), record("scaffold-gs", views=400)
+    for i, view in enumerate(a.per_view):
+        a.per_view[view]["psnr"] += 1.0 if i % 2 else -1.0
+    d = difference([a], [b])
+    assert d is not None and d.high - d.low == pytest.approx(2 * 1.96 / math.sqrt(400), rel=0.1)
+
+
+def test_only_what_both_have_is_paired():
+    assert difference([record(seed=0)], [record("scaffold-gs", seed=1)]) is None

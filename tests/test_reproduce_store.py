@@ -1,0 +1,60 @@
+"""Records: written, found again, refused when changed by hand."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from records import record
+from scene_experts.errors import InputError
+from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec
+from scene_experts.reproduce.store import POINTS, curves, find, load, of_run, read, write
+
+
+def test_a_record_comes_back_as_it_was_without_the_place_of_the_capture(tmp_path):
+    made = record()
+    made = replace(made, config=replace(made.config, data=replace(made.config.data, path=Path("/home/someone/fox")), command="secret"))
+    path = write(tmp_path, made)
+    assert "someone" not in path.read_text() and "secret" not in path.read_text()
+    back = read(path)
+    assert (back.key, back.results, back.per_view, back.curves) == (made.key, made.results, made.per_view, made.curves)
+    assert [r.key for r in load(tmp_path)] == [made.key]
+
+
+def test_a_run_is_found_by_its_spec(tmp_path):
+    spec = Spec(Scene("fox", OWN, Path("anywhere/fox")), "moe-gs", 0, Scale(3000))
+    assert find([record(seed=1), record()], spec) is not None
+    assert find([record(seed=1), record(iterations=7000)], spec) is None
+
+
+def test_changed_figures_are_refused(tmp_path):
+    path = write(tmp_path, record())
+    value = json.loads(path.read_text())
+    value["results"]["psnr"] = 99.0
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match="expected results as they were written"):
+        read(path)
+    path.write_text("{}")
+    with pytest.raises(InputError, match="expected a record"):
+        read(path)
+
+
+def test_a_folder_without_results_is_refused(tmp_path):
+    with pytest.raises(InputError, match="expected an evaluated run"):
+        of_run(tmp_path, "fox")
+
+
+def test_curves_keep_the_ends_and_skip_torn_lines(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    lines = [json.dumps({"step": s, "psnr": 1.0, "terms": {}}) for s in range(1, 1001)] + ['{"grown": 1, "step": 5}', '{"step": 99']
+    path.write_text("\n".join(lines))
+    found = curves(path)
+    assert len(found) == POINTS and (found[0]["step"], found[-1]["step"]) == (1, 1000) and "terms" not in found[0]
+    assert curves(tmp_path / "none") == []
+
+
+def test_columns():
+    made = record(mb=12.0, active=0.5)
+    assert [made.value(c) for c in ("size_mb", "active_percent", "psnr", "unknown")] == [12.0, 50.0, 31.5, None]
+    assert replace(made, results={**made.results, "activation_ratio": None}).value("active_percent") is None

@@ -1,0 +1,47 @@
+"""Tables: ours beside the paper's, spreads, best cells, notes; LaTeX that escapes."""
+
+from records import record
+from scene_experts.reproduce.experiments import EXPERIMENTS
+from scene_experts.reproduce.tables import by_dataset, by_scene, escape, published, to_latex, write_all
+
+TABLE4, TABLE3 = EXPERIMENTS["table4"], EXPERIMENTS["table3"]
+
+
+def runs():
+    out = [record("moe-gs", "truck", seed, psnr=24 + seed, views=1, iterations=30_000) for seed in (0, 1)]
+    return [*out, record("scaffold-gs-opacity", "truck", 0, psnr=23.0, views=1, mb=8.0)]
+
+
+def test_ours_stand_beside_the_papers():
+    table = by_dataset(TABLE4, runs(), "TanksAndTemples", ["truck"])
+    assert table.titles[:5] == ("", "PSNR", "SSIM", "LPIPS", "MB") and table.titles[5] == "PSNR (paper)"
+    rows = {row[0]: row for row in table.rows}
+    assert rows["MoE-GS"][1] == "24.50 ± 0.71" and rows["MoE-GS"][5] == "24.61"
+    assert rows["wo_MoE"][1] == "23.00" and rows["wo_CL"][1] == "-" and rows["wo_CL"][5] == "24.42"
+    assert (list(rows).index("MoE-GS"), 1) in table.best and (list(rows).index("wo_MoE"), 4) in table.best
+    assert any("wo_CL: no run" in note for note in table.notes) and "3,000, 30,000 iterations" in table.notes[0]
+
+
+def test_own_captures_have_no_published_numbers():
+    assert published(TABLE4, "captures") == {}
+    assert len(by_dataset(TABLE4, runs(), "captures", ["truck"]).titles) == 5
+
+
+def test_table_3_is_of_one_column():
+    assert published(TABLE3, "DeepBlending") == {"Scaffold-GS": [41.0], "Scaffold-GS+L_opacity": [70.5]}
+    table = by_dataset(TABLE3, [record("scaffold-gs", "playroom", active=0.4)], "DeepBlending", ["playroom"])
+    assert table.rows[0] == ("Scaffold-GS", "40.0", "41.0") and not table.best
+
+
+def test_scene_by_scene():
+    table = by_scene(TABLE4, runs(), ["truck", "train"])
+    assert table.titles == ("PSNR", "truck", "train") and dict(zip([r[0] for r in table.rows], table.rows))["MoE-GS"][2] == "-"
+
+
+def test_the_three_files():
+    table = by_dataset(TABLE4, runs(), "TanksAndTemples", ["truck"])
+    files = write_all("Table 4", {"T&T": table})
+    assert files["md"].startswith("# Table 4") and "| MoE-GS |" in files["md"].replace("**", "")
+    assert "wo_MoE,23.00" in files["csv"]
+    assert r"wo\_CL" in to_latex(table, "T&T") and r"\caption{T\&T}" in to_latex(table, "T&T") and r"$\pm$" in files["tex"]
+    assert escape("50 %") == r"50 \%"
