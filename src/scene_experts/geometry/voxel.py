@@ -36,6 +36,8 @@ def coarsen(cells: Tensor, m: int) -> Tensor:
     """Cells m times as large: floor((i + m/2) / m) in integers, so halves go up; for m = 1 the cells themselves."""
     if m < 1:
         raise ValueError(f"the factor between cell sizes must be at least 1, found {m}")
+    if m & (m - 1) == 0:
+        return (2 * cells + m) >> m.bit_length()  # the same, several times faster
     return torch.div(2 * cells + m, 2 * m, rounding_mode="floor")
 
 
@@ -64,8 +66,14 @@ def unique_cells(cells: Tensor) -> tuple[Tensor, Tensor]:
 
 def in_set(keys: Tensor, others: Tensor) -> Tensor:
     """Whether each of `keys` [N] occurs among `others` [M] (any order, repeats allowed), [N] bool."""
-    if not others.numel():
+    if not others.numel() or not keys.numel():
         return torch.zeros_like(keys, dtype=torch.bool)
+    if len(keys) < len(others):  # sort the few, look the many up
+        ordered, place = keys.unique(return_inverse=True)
+        at = torch.searchsorted(ordered, others).clamp_max(len(ordered) - 1)
+        hit = torch.zeros_like(ordered, dtype=torch.bool)
+        hit[at[ordered[at] == others]] = True
+        return hit[place]
     ordered = others.sort().values
     at = torch.searchsorted(ordered, keys).clamp_max(len(ordered) - 1)
     return ordered[at] == keys

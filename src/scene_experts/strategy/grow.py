@@ -19,6 +19,7 @@ from scene_experts.geometry.voxel import AXIS_LIMIT, coarsen, in_set, pack, scat
 from scene_experts.scene.anchors import AnchorScene
 from scene_experts.schedule import Every
 from scene_experts.strategy import Edit, observe
+from scene_experts.table import Table
 from scene_experts.types import Decoded, Render
 
 log = logging.getLogger(__name__)
@@ -92,67 +93,39 @@ class GrowAnchors:
     @torch.no_grad()
     def grow(self, scene: AnchorScene, generator: torch.Generator) -> tuple[int, bool]:
         """Found anchors where gradients are large. Returns how many, and whether the cap held some back."""
-        table = scene.table
-        stats, born = table.stats, len(table)
+        table, stats = scene.table, scene.table.stats
         gate = self.adjust.interval * self.success_threshold * 0.5  # 40 of 100
-        eligible = stats["count"] > gate
-        g = torch.where(stats["count"] > 0, stats["grad"] / stats["count"].clamp_min(1), 0.0)
-        scaling = table.params["log_scaling"][:, None, :3].exp()
-        points = table.facts["xyz"].double()[:, None] + (table.params["offsets"] * scaling).double()  # [N, K, 3]
-        capped = False
+        eligible = (stats["count"].view(-1) > gate).nonzero().squeeze(1)  # flat slots, row * K + k
+        g = stats["grad"].view(-1).index_select(0, eligible) / stats["count"].view(-1).index_select(0, eligible).clamp_min(1)
+        strong = (g >= self.grad_threshold).nonzero().squeeze(1)  # the first threshold is the lowest
+        slots, g = eligible.index_select(0, strong), g.index_select(0, strong)
+        parents = torch.div(slots, scene.K, rounding_mode="floor")
+        points = slot_points(table, slots, parents)
+        cells, rows, born, capped = table.facts["cell"], [], 0, False
         for level, factor in enumerate(self.cell_factors()):
-            if self.parity_level_skip and level > 0 and len(table) == born:
+            if self.parity_level_skip and level > 0 and not born:
                 continue
-            threshold = self.grad_threshold * (self.hierarchy_factor // 2) ** level
-            candidates = (g >= threshold) & eligible
+            chosen = g >= self.grad_threshold * (self.hierarchy_factor // 2) ** level
             if self.elimination:
-                draw = torch.rand(g.shape, generator=generator).to(g.device)
-                candidates &= draw > 0.5 ** (level + 1)
-            found = self.empty_cells(scene, points[candidates], candidates.nonzero()[:, 0], g[candidates], factor)
+                draw = torch.rand(stats["grad"].shape, generator=generator).view(-1).to(g.device)
+                chosen &= draw.index_select(0, slots) > 0.5 ** (level + 1)
+            found = empty_cells(scene, cells, points[chosen], parents[chosen], g[chosen], factor)
             if found is None:
                 continue
-            cells, feature, strength = found
-            if self.max_anchors and len(table) + len(cells) > self.max_anchors:
+            new, feature, strength = found
+            if self.max_anchors and len(table) + born + len(new) > self.max_anchors:
                 capped = True
-                room = max(0, self.max_anchors - len(table))
+                room = max(0, self.max_anchors - len(table) - born)
                 best = strength.argsort(descending=True, stable=True)[:room].sort().values
-                cells, feature = cells[best], feature[best]
-            if len(cells):
-                table.append(scene.new_rows(cells * factor, scene.voxel * factor, feature))
+                new, feature = new[best], feature[best]
+            if len(new):
+                rows.append(scene.new_rows(new * factor, scene.voxel * factor, feature))
+                cells, born = torch.cat([cells, rows[-1]["cell"]]), born + len(new)
         for name in ("grad", "count"):
-            stats = table.stats[name]
-            stats[:born] = torch.where(eligible, 0.0, stats[:born])
-        return len(table) - born, capped
-
-    def empty_cells(
-        self, scene: AnchorScene, points: Tensor, parents: Tensor, g: Tensor, factor: int
-    ) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Cells (in units of `factor` voxels) that candidate points [P, 3] fall into and no anchor holds.
-
-        Returns cells [n, 3] int64, features [n, F] (element-wise maximum over the parents of all points in the cell) and the
-        largest gradient [n].
-        """
-        if len(points) == 0:
-            return None
-        fine = torch.floor(points / scene.voxel + 0.5)  # rounded once; coarser cells follow in integers, as the anchors' own do
-        inside = (fine.abs() < AXIS_LIMIT - factor).all(1)  # an offset that ran away founds nothing
-        cells, parents, g = coarsen(fine[inside].long(), factor), parents[inside], g[inside]
-        if len(cells) == 0:
-            return None
-        keys, group = torch.unique(pack(cells), return_inverse=True)
-        taken = in_set(keys, pack(coarsen(scene.table.facts["cell"], factor)))
-        free = (~taken).nonzero().squeeze(1)
-        if len(free) == 0:
-            return None
-        slot = torch.full_like(keys, -1)
-        slot[free] = torch.arange(len(free), device=keys.device)
-        target = slot[group]
-        mine = (target >= 0).nonzero().squeeze(1)
-        target, parents = target[mine], parents[mine]
-        feature = scatter_max(scene.table.params["feature"].index_select(0, parents), target, len(free))
-        strength = scatter_max(g[mine, None], target, len(free)).squeeze(1)
-        first = torch.full((len(free),), len(cells), device=keys.device).scatter_reduce(0, target, mine, "amin")
-        return cells.index_select(0, first), feature, strength
+            stats[name].view(-1).index_fill_(0, eligible, 0.0)
+        if rows:
+            table.append({name: torch.cat([row[name] for row in rows]) for name in rows[0]})
+        return born, capped
 
     @torch.no_grad()
     def prune(self, scene: AnchorScene) -> int:
@@ -168,3 +141,40 @@ class GrowAnchors:
         if self.scale_clamp != "off":
             table.params["log_scaling"][:, 3:].clamp_(max=0.05 if self.scale_clamp == "log0.05" else math.log(0.05))
         return pruned
+
+
+def slot_points(table: Table, slots: Tensor, rows: Tensor) -> Tensor:
+    """Where the Gaussians of flat `slots` [P] of anchors `rows` [P] are, [P, 3] float64."""
+    scaling = table.params["log_scaling"][:, :3].exp().index_select(0, rows)
+    offsets = table.params["offsets"].view(-1, 3).index_select(0, slots)
+    return table.facts["xyz"].index_select(0, rows).double() + (offsets * scaling).double()
+
+
+def empty_cells(
+    scene: AnchorScene, taken: Tensor, points: Tensor, parents: Tensor, g: Tensor, factor: int
+) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Cells (in units of `factor` voxels) that candidate points [P, 3] fall into and none of the `taken` fine cells [N, 3] is in.
+
+    Returns cells [n, 3] int64, features [n, F] (element-wise maximum over the parents of all points in the cell) and the
+    largest gradient [n]; None for no cell.
+    """
+    if len(points) == 0:
+        return None
+    fine = torch.floor(points / scene.voxel + 0.5)  # rounded once; coarser cells follow in integers, as the anchors' own do
+    inside = (fine.abs() < AXIS_LIMIT - factor).all(1)  # an offset that ran away founds nothing
+    cells, parents, g = coarsen(fine[inside].long(), factor), parents[inside], g[inside]
+    if len(cells) == 0:
+        return None
+    keys, group = torch.unique(pack(cells), return_inverse=True)
+    free = (~in_set(keys, pack(coarsen(taken, factor)))).nonzero().squeeze(1)
+    if len(free) == 0:
+        return None
+    slot = torch.full_like(keys, -1)
+    slot[free] = torch.arange(len(free), device=keys.device)
+    target = slot[group]
+    mine = (target >= 0).nonzero().squeeze(1)
+    target, parents = target[mine], parents[mine]
+    feature = scatter_max(scene.table.params["feature"].index_select(0, parents), target, len(free))
+    strength = scatter_max(g[mine, None], target, len(free)).squeeze(1)
+    first = torch.full((len(free),), len(cells), device=keys.device).scatter_reduce(0, target, mine, "amin")
+    return cells.index_select(0, first), feature, strength
