@@ -172,17 +172,6 @@ def test_arrays_are_read(tmp_path: Path, protocol: int) -> None:
     assert np.array_equal(weights.read_arrays(tmp_path / "x")["a"]["b"], tree["a"]["b"])
 
 
-def test_cache_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.undo()
-    monkeypatch.setattr(weights.sys, "platform", "linux")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert weights.cache_dir() == tmp_path / "scene-experts"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    assert weights.cache_dir() == Path.home() / ".cache" / "scene-experts"
-    monkeypatch.setattr(weights.sys, "platform", "darwin")
-    assert weights.cache_dir() == Path.home() / "Library" / "Caches" / "scene-experts"
-
-
 def test_packages_are_not_imported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.undo()
     package = tmp_path / "lpips_probe"

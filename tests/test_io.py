@@ -3,9 +3,11 @@
 import os
 import resource
 import stat
+from pathlib import Path
 
 import pytest
 
+from scene_experts import io
 from scene_experts.errors import InputError, RunError
 from scene_experts.io import read_json, write_atomic, write_bytes, write_json
 
@@ -98,3 +100,13 @@ def test_unreadable_json(tmp_path, data):
 def test_absent_json(tmp_path):
     with pytest.raises(InputError, match=r"expected a run configuration at .*x.json, found no such file"):
         read_json(tmp_path / "x.json", "run configuration")
+
+
+def test_cache_folders(monkeypatch, tmp_path):
+    monkeypatch.setattr(io.sys, "platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert io.cache_dir() == tmp_path / "scene-experts"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert io.cache_dir() == Path.home() / ".cache" / "scene-experts"
+    monkeypatch.setattr(io.sys, "platform", "darwin")
+    assert io.cache_dir() == Path.home() / "Library" / "Caches" / "scene-experts"

@@ -60,7 +60,7 @@ class Data:
     """Which capture, and how it is read."""
 
     path: Annotated[Path, tyro.conf.arg(name="data", aliases=["-s"])]
-    """Folder of the capture: a COLMAP folder (images/, sparse/0/) or one with transforms*.json."""
+    """Folder of the capture: a COLMAP folder (images/, sparse/0/) or one with transforms*.json; or catalog:SCENE, fetched by `download`."""
     images: str | None = None
     """Image folder inside the capture, e.g. images_4."""
     resolution: Annotated[str, tyro.conf.arg(aliases=["-r"])] = "auto"

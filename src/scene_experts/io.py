@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -30,14 +31,30 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
         write(temporary)
         with temporary.open("rb+") as stream:
             os.fsync(stream.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
+        temporary.chmod(new_file_mode(0o666))
         os.replace(temporary, path)
     except OSError as error:
         raise RunError(f"cannot write {path}: {error.strerror or error}; free some space or choose another folder with --out") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def new_file_mode(most: int) -> int:
+    """The permissions of a new file or folder: `most` less what this process's umask takes away; temporaries are made with fewer."""
+    umask = os.umask(0)
+    os.umask(umask)
+    return most & ~umask
+
+
+def cache_dir() -> Path:
+    """This user's cache folder of the project."""
+    if sys.platform == "win32":
+        root = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        root = Path.home() / "Library" / "Caches"
+    else:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return root / "scene-experts"
 
 
 def write_bytes(path: Path, data: bytes) -> None:

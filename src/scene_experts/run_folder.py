@@ -23,6 +23,7 @@ from scene_experts import checkpoint
 from scene_experts.config import Data, RunConfig, Train, from_json, to_json
 from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
+from scene_experts.data.obtain import resolve
 from scene_experts.errors import InputError
 from scene_experts.io import read_json, write_json
 from scene_experts.scene import Scene
@@ -123,6 +124,12 @@ def read_config(run: Path) -> RunConfig:
     if not isinstance(value, dict) or value.pop("format", None) != FORMAT:
         raise InputError(f"expected a run configuration of format {FORMAT} in {run}, found another; train it again with this version")
     return from_json(RunConfig, value)
+
+
+def named(data: Data) -> Data:
+    """`data` with `catalog:SCENE` replaced by the scene's folder and, where they are "auto", the paper's resolution and split."""
+    path, resolution, split = resolve(data.path, data.resolution, data.split)
+    return replace(data, path=path, resolution=resolution, split=split)
 
 
 def load_capture(data: Data, seed: int = 0) -> Capture:

@@ -11,6 +11,7 @@ import tyro
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import backend
 from scene_experts.config import Data
+from scene_experts.run_folder import named
 
 
 @dataclass(frozen=True)
@@ -54,5 +55,5 @@ def import_(args: list[str]) -> int:
     from scene_experts.export.run import import_result
 
     command = tyro.cli(ImportCommand, prog=f"{PROG} import", args=args)
-    print(f"wrote {import_result(command.source, command.data, command.out, command.iteration)}")
+    print(f"wrote {import_result(command.source, named(command.data), command.out, command.iteration)}")
     return 0

