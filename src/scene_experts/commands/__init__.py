@@ -11,6 +11,10 @@ HANDLERS: dict[str, tuple[str, str]] = {
     "compare": ("evaluate", "compare"),
     "export": ("files", "export"),
     "import": ("files", "import_"),
+    "reproduce": ("reproduce", "reproduce"),
+    "bench": ("bench", "bench"),
+    "catalog": ("catalog", "catalog"),
+    "download": ("catalog", "download"),
     "doctor": ("inspect", "doctor"),
 }
 """Module of this package and function, by command: only the modules of the command that runs are imported."""

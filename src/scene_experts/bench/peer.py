@@ -1,0 +1,69 @@
+"""The scalar peer: the per-pixel algorithm of 3DGS (Kerbl et al. 2023) as it is published, in plain C++ on one thread."""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from scene_experts import native
+from scene_experts.bench.measure import Clock
+from scene_experts.render import cpu
+from scene_experts.types import Camera, Gaussians
+
+NAME = "scalar C++ peer"
+WHY_NOT = "the scalar C++ peer is not installed: install a C++20 compiler (g++ or clang++) and run `pip install .` again"
+
+
+def path(level: str) -> Path | None:
+    """Where the peer with the flags of the library for `level` is installed, or None."""
+    beside = native.path(level)
+    candidate = beside.with_name(beside.name.replace("se_", "peer_", 1)) if beside else None
+    return candidate if candidate is not None and candidate.is_file() else None
+
+
+def load(level: str | None) -> Peer | None:
+    """The peer compiled for the same instruction set as the library at `level` (None: there is no library), or None."""
+    where = path(level) if level else None
+    return Peer(ctypes.CDLL(str(where))) if where else None
+
+
+class Peer:
+    """Draws and differentiates with the scalar code; keeps the state of its last picture."""
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        library.peer_new.restype = ctypes.c_void_p
+        library.peer_free.argtypes = [ctypes.c_void_p]
+        library.peer_composited.restype = ctypes.c_int64
+        library.peer_clock_hz.restype = ctypes.c_double
+        self._library, self._state = library, ctypes.c_void_p(library.peer_new())
+
+    def __del__(self) -> None:
+        self._library.peer_free(self._state)
+
+    @property
+    def pairs(self) -> int:
+        """The (pixel, Gaussian) pairs blended into the last picture."""
+        return self._library.peer_composited(self._state)
+
+    def clock_hz(self) -> float:
+        """Core cycles a second, from a loop of dependent additions."""
+        return self._library.peer_clock_hz()
+
+    def draw(self, g: Gaussians, camera: Camera, upstream: Tensor, clock: Clock) -> tuple[float, float, Tensor, Tensor]:
+        """Seconds forward, seconds backward, the picture [H, W, 3] over black, and the gradient of the means [M, 3].
+
+        upstream: gradient of the loss in the picture, [H, W, 3].
+        """
+        args = cpu._camera(camera)
+        inputs = [g.means, g.quats, g.scales, g.opacities, g.colors]
+        image, background = torch.empty((camera.height, camera.width, 3)), torch.zeros(3)
+        outputs = [torch.empty_like(t) for t in inputs]
+        head = [self._state, ctypes.byref(args), ctypes.c_int64(len(g))]
+        start = clock()
+        self._library.peer_forward(*head, *[native.pointer(t) for t in [*inputs, background, image]])
+        middle = clock()
+        self._library.peer_backward(*head, *[native.pointer(t) for t in [*inputs[:3], background, upstream, *outputs]])
+        return middle - start, clock() - middle, image, outputs[0]

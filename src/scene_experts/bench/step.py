@@ -1,0 +1,162 @@
+"""A whole training step on a scene made in code, part by part, and how all of it scales with threads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from scene_experts.bench import raster
+from scene_experts.bench.machine import Machine, multiply_adds
+from scene_experts.bench.measure import Clock, Figure, Missing, Result, Subject, clock_for, least
+from scene_experts.losses import terms
+from scene_experts.recipes import RECIPES
+from scene_experts.render import Rasterizer, choose
+from scene_experts.render.cpu import CpuRasterizer
+from scene_experts.scene.anchors import AnchorScene
+from scene_experts.state import Training
+from scene_experts.types import Camera, Points
+
+MIXTURE, BASELINE = "moe-gs", "scaffold-gs"
+GROUP, THREADS = "whole step", "threads"
+AT = 2000  # the iteration that is measured: after the warm-up of the experts, statistics on
+PARTS = ("cull + decode", "raster", "loss", "backward", "statistics", "adam")
+
+
+@dataclass(frozen=True)
+class Work:
+    """A training in the middle of its schedule, and the view it is at."""
+
+    training: Training
+    camera: Camera
+    rasterize: Rasterizer
+    target: Tensor  # [H, W, 3]
+
+    def __call__(self, clock: Clock) -> tuple[float, ...]:
+        """One step; returns the seconds of PARTS. The scene is put back, so every step is the same."""
+        training, scene = self.training, self.training.scene
+        before = {k: v.detach().clone() for k, v in scene.network_tensors().items()}
+        times = [clock()]
+        training.step = AT
+        training.set_rates()
+        decoded = scene(self.camera, AT, True, self.rasterize.visible)
+        times.append(clock())
+        render = self.rasterize(decoded.gaussians, self.camera, torch.zeros(3))
+        times.append(clock())
+        loss = torch.stack(list(terms(decoded, render, self.target, training.cfg.loss, AT).values())).sum()
+        times.append(clock())
+        loss.backward()
+        times.append(clock())
+        training.cfg.growth.observe(scene, decoded, render, AT)  # type: ignore[arg-type]
+        times.append(clock())
+        training.optimizer.step()
+        training.optimizer.zero_grad(set_to_none=True)
+        times.append(clock())
+        self._put_back(before)
+        return tuple(b - a for a, b in pairwise(times))
+
+    @torch.no_grad()
+    def _put_back(self, networks: dict[str, Tensor]) -> None:
+        """The columns move by a learning rate a step, which changes nothing measured; the networks decide how much is drawn."""
+        for name, value in self.training.scene.network_tensors().items():
+            value.copy_(networks[name])
+
+    @torch.no_grad()
+    def drawn(self) -> int:
+        """Gaussians that the view shows."""
+        return len(self.training.scene(self.camera, AT, False, self.rasterize.visible).gaussians)
+
+
+def work(recipe: str, anchors: int, width: int, height: int, rasterize: Rasterizer | None = None, seen: float = 0.5) -> Work:
+    """Random anchors, the share `seen` of them filling the picture of one camera, the rest behind it.
+
+    Networks are as initialised; features are random, so that anchors choose different experts.
+    """
+    torch.manual_seed(0)
+    cfg = RECIPES[recipe][1]
+    depth = 3 + 5 * torch.rand(anchors)
+    depth[round(anchors * seen) :] *= -1
+    side = (torch.rand(anchors, 2) - 0.5) * torch.tensor([1.0, height / width])
+    xyz = torch.cat([side * depth[:, None].abs(), depth[:, None]], 1).double()
+    K = torch.tensor([[width * 1.0, 0, width / 2], [0, width * 1.0, height / 2], [0, 0, 1.0]])
+    config = replace(cfg.scene, voxel_size=1e-4)
+    scene = AnchorScene.from_points(config, Points(xyz, torch.zeros(anchors, 3, dtype=torch.uint8)), 5.0)
+    scene.table.params["feature"].data.normal_()
+    scene.table.params["offsets"].data.normal_(0, 0.5)
+    camera = Camera(torch.eye(4), K, width, height, 0.2)
+    return Work(Training(replace(cfg, scene=config), scene), camera, rasterize or choose("auto", "cpu"), torch.rand(height, width, 3))
+
+
+def figures(anchors: int, width: int, height: int, machine: Machine, seconds: float) -> list[Result]:
+    """The parts of a step of the mixture, the whole of it beside one of the baseline, and Adam beside the memory it must move."""
+    subjects: dict[str, Subject] = {recipe: work(recipe, anchors, width, height) for recipe in (MIXTURE, BASELINE)}
+    with torch_threads(machine.threads):
+        best = least(subjects, seconds, clock_for(machine.threads))
+    mixture: Work = subjects[MIXTURE]  # type: ignore[assignment]
+    group = f"{GROUP} of {MIXTURE}, {machine.threads} thread(s)"
+    note = f"{round(anchors / 2):,} visible of {anchors:,} anchors, {mixture.drawn():,} Gaussians, {width}x{height}"
+    out: list[Result] = [Figure(group, part, 1e3 * s, "ms") for part, s in zip(PARTS, best[MIXTURE], strict=True)]
+    total, base = sum(best[MIXTURE]), sum(best[BASELINE])
+    out.append(Figure(group, "whole step", 1e3 * total, "ms", f"one of {BASELINE}, same anchors", base / total, note))
+    if machine.copied:
+        moved = 28 * sum(p.numel() for g in mixture.training.optimizer.param_groups for p in g["params"])
+        share = 100 * moved / machine.copied / best[MIXTURE][PARTS.index("adam")]
+        out.append(
+            Figure(group, "adam, share of one thread's memory bound", share, "%", note=f"{moved / 1e6:.0f} MB at the rate of a copy")
+        )
+    return out
+
+
+def scaling(scene: raster.Picture, machine: Machine, seconds: float) -> list[Result]:
+    """What all threads gain over one: a pure arithmetic loop, the rasteriser, a whole step. Wall time."""
+    if machine.threads < 2:
+        return [Missing(THREADS, "gain of threads", "one core or one thread: run with --threads 2 or more where there are cores")]
+    if machine.level is None:
+        return [Missing(THREADS, "gain of threads", "the compiled CPU library is not installed")]
+    n, wall = machine.threads, clock_for(machine.threads)
+    step = work(MIXTURE, len(scene.gaussians) * 2 // 5, scene.camera.width, scene.camera.height)
+
+    def stepped(threads: int, clock: Clock) -> tuple[float, ...]:
+        with torch_threads(threads):
+            return step(clock)
+
+    subjects: dict[str, Subject] = {}
+    for threads in (1, n):
+        rasterize = CpuRasterizer(level=machine.level, threads=threads)
+        subjects[f"rasteriser {threads}"] = partial(raster.draw, rasterize, scene)
+        subjects[f"step {threads}"] = partial(stepped, threads)
+        subjects[f"arithmetic {threads}"] = partial(_arithmetic, machine.level, threads)
+    best = {name: sum(parts) for name, parts in least(subjects, seconds, wall).items()}
+    group, out = f"gain of {n} threads over one (wall time)", []
+    for name in ("arithmetic", "rasteriser", "step"):
+        gain = best[f"{name} 1"] / best[f"{name} {n}"] if best[f"{name} {n}"] else None
+        if gain is None:
+            out.append(Missing(group, "pure arithmetic", "this build of the library has no arithmetic loop"))
+            continue
+        known = best["arithmetic 1"] > 0 and name != "arithmetic"
+        against = gain * best[f"arithmetic {n}"] / best["arithmetic 1"] if known else None
+        label = {"arithmetic": "pure arithmetic", "step": f"whole step of {MIXTURE}"}.get(name, name)
+        out.append(Figure(group, label, gain, "x", "pure arithmetic" if known else "", against))
+    return out
+
+
+def _arithmetic(level: str, threads: int, clock: Clock) -> tuple[float]:
+    """Seconds of 10^9 multiply-adds; 0 where the library has no such loop."""
+    rate = multiply_adds(level, threads, 0.0, clock)
+    return (1e9 / rate if rate else 0.0,)
+
+
+@contextmanager
+def torch_threads(threads: int) -> Iterator[None]:
+    """Torch's own setting, which native code follows, put back afterwards."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,34 @@
+"""A whole step on a made scene: the same step each time, every part timed."""
+
+from dataclasses import replace
+
+import torch
+
+from scene_experts.bench import machine, raster, step
+from scene_experts.bench.measure import Missing, clock_for
+
+
+def test_half_of_the_anchors_are_seen_and_a_step_leaves_the_networks_as_they_were():
+    work = step.work(step.MIXTURE, 200, 64, 48)
+    before = {k: v.detach().clone() for k, v in work.training.scene.network_tensors().items()}
+    times = work(clock_for(2))
+    assert len(times) == len(step.PARTS) and min(times) >= 0
+    assert all(torch.equal(v, before[k]) for k, v in work.training.scene.network_tensors().items())
+    assert work.training.optimizer.state and work.training.scene.table.stats["visits"].sum() == 100
+    assert work.drawn() > 100
+
+
+def test_figures_of_a_step():
+    here = replace(machine.describe(1), copied=1e9)
+    found = {f.name: f for f in step.figures(100, 48, 32, here, 0.0)}
+    whole = found["whole step"]
+    assert whole.ratio > 0 and step.BASELINE in whole.peer
+    assert sum(found[part].value for part in step.PARTS) <= whole.value * 1.001
+
+
+def test_gain_of_threads():
+    scene = raster.picture(200, 48, 32)
+    assert isinstance(step.scaling(scene, machine.describe(1), 0.0)[0], Missing)
+    threads = torch.get_num_threads()
+    found = step.scaling(scene, machine.describe(2), 0.0)
+    assert all(isinstance(f, Missing) or f.value > 0 for f in found) and torch.get_num_threads() == threads
