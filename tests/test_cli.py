@@ -52,7 +52,7 @@ def test_help_is_what_was_reviewed(capsys):
     assert code == 0 and out == path.read_text()
 
 
-HELP = ["info", "train moe-gs", "train scaffold-gs", "eval", "compare", "export", "import", "catalog", "download", "doctor"]
+HELP = ["info", "train moe-gs", "train scaffold-gs", "eval", "compare", "export", "import", "bench", "catalog", "download", "doctor"]
 
 
 @pytest.mark.parametrize("command", HELP)
@@ -74,7 +74,7 @@ def test_help_and_version_do_not_load_torch():
     assert subprocess.run([sys.executable, "-c", probe], capture_output=True, check=False).returncode == 0
 
 
-@pytest.mark.parametrize("command", ["info", "train", "eval", "compare", "export", "import", "catalog", "download", "doctor"])
+@pytest.mark.parametrize("command", ["info", "train", "eval", "compare", "export", "import", "bench", "catalog", "download", "doctor"])
 def test_every_command_has_help(command, capsys):
     code, out, _ = run(capsys, command, "--help")
     assert code == 0 and f"scene-experts {command}" in out

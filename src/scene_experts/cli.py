@@ -18,6 +18,7 @@ COMMANDS = {
     "export": "write a trained scene as anchor PLY or compact file",
     "import": "make a run folder of a published Scaffold-GS result or of a compact file",
     "reproduce": "the paper's tables and figures, from runs made or reused",
+    "bench": "how fast this machine is, in a minute: each part beside a named peer",
     "catalog": "the paper's 17 scenes: sources, sizes, licences, what is on this machine",
     "download": "fetch scenes of the catalog: continued, checked, unpacked",
     "doctor": "which backends work here, why not, what to install",

@@ -12,6 +12,7 @@ HANDLERS: dict[str, tuple[str, str]] = {
     "export": ("files", "export"),
     "import": ("files", "import_"),
     "reproduce": ("reproduce", "reproduce"),
+    "bench": ("bench", "bench"),
     "catalog": ("catalog", "catalog"),
     "download": ("catalog", "download"),
     "doctor": ("inspect", "doctor"),
