@@ -105,6 +105,17 @@ def test_when_the_source_is_gone_the_archive_is_put_there_by_hand(server: Server
     assert json.loads((tmp_path / "archives" / "checksums.json").read_text())["both.zip"]["bytes"] == len(data)
 
 
+def test_a_damaged_download_is_not_what_later_ones_are_compared_with(server: Server, tmp_path: Path) -> None:
+    whole = server.files["/both.zip"]
+    server.files["/both.zip"] = whole[:-30]
+    with pytest.raises(RunError, match=r"found a damaged one .*; remove it and run the command again"):
+        get(scenes(server), tmp_path)
+    assert not (tmp_path / "archives" / "checksums.json").exists()
+    (tmp_path / "archives" / "both.zip").unlink()
+    server.files["/both.zip"] = whole
+    get(scenes(server), tmp_path)
+
+
 def test_a_scene_put_there_by_hand_is_taken(server: Server, tmp_path: Path) -> None:
     truck = scenes(server)[0]
     (tmp_path / "pair" / "truck" / "images").mkdir(parents=True)

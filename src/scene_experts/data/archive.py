@@ -57,8 +57,9 @@ def members(archive: Path) -> Iterator[list[Member]]:
         with tarfile.open(archive) as opened:
             yield [_from_tar(opened, info) for info in opened.getmembers()]
     except (*_DAMAGE, EOFError, NotImplementedError) as error:
+        reason = str(error).partition("\n")[0].rstrip(":")
         raise RunError(
-            f"expected a whole zip or tar archive at {archive}, found a damaged one ({error}); remove it and run the command again"
+            f"expected a whole zip or tar archive at {archive}, found a damaged one ({reason}); remove it and run the command again"
         ) from error
 
 

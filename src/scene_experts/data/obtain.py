@@ -69,10 +69,11 @@ def obtain(
         if scene not in missing:
             say(f"{scene.name} is at {root / scene.path}")
     for archive in dict.fromkeys(scene.collection.archive for scene in missing):
-        path, digest = _archive(archive, root, mirrors, say, progress)
+        path, digest, url = _archive(archive, root, mirrors, say, progress)
         for scene in missing:
             if scene.collection.archive == archive:
                 _unpack(scene, path, digest, root, say, progress)
+                _record(root, archive, digest, url)  # not before it has shown to be whole: later ones are compared with it
         if not keep:
             path.unlink()
 
@@ -105,13 +106,13 @@ def _unpack(scene: Scene, archive: Path, digest: str, root: Path, say: Say, prog
     say(f"{scene.name}: {out.files} files, {out.bytes / 1e6:,.0f} MB at {into}")
 
 
-def _archive(archive: Archive, root: Path, mirrors: Sequence[str], say: Say, progress: Progress | None) -> tuple[Path, str]:
-    """The archive's file and its SHA-256, fetched unless it is there already."""
+def _archive(archive: Archive, root: Path, mirrors: Sequence[str], say: Say, progress: Progress | None) -> tuple[Path, str, str]:
+    """The archive's file, its SHA-256 and where it was fetched from; nothing where it is there already."""
     path = root / "archives" / archive.name
     known = _recorded(root).get(archive.name, {})
     digest = archive.sha256 or known.get("sha256")
     if path.is_file():
-        return path, _verified(archive, path, known, root, say)
+        return path, _verified(archive, path, known, root, say), known.get("from", "")
     urls = [m if m.endswith(archive.name) else f"{m.rstrip('/')}/{archive.name}" for m in mirrors]
     told = (lambda done, total: progress(archive.name, done, total)) if progress else None
     got = fetch(
@@ -119,14 +120,13 @@ def _archive(archive: Archive, root: Path, mirrors: Sequence[str], say: Say, pro
     )
     if not digest:
         say(f"{archive.name}: SHA-256 {got.sha256} (none is published; later downloads are compared with this one)")
-    _record(root, archive, got.sha256, got.bytes, got.url)
-    return path, got.sha256
+    return path, got.sha256, got.url
 
 
 def _verified(archive: Archive, path: Path, known: dict, root: Path, say: Say) -> str:
     """The SHA-256 of an archive that is there, from this tool or put there by hand; only a new or changed file is read for it."""
-    size = path.stat().st_size
-    if known and known.get("bytes") == size and known.get("changed") == path.stat().st_mtime_ns:
+    about = path.stat()
+    if known and known.get("bytes") == about.st_size and known.get("changed") == about.st_mtime_ns:
         return str(known["sha256"])
     found = sha256(path)
     digest = archive.sha256 or known.get("sha256")
@@ -136,7 +136,6 @@ def _verified(archive: Archive, path: Path, known: dict, root: Path, say: Say) -
             + ("" if archive.sha256 else f" (or, if its owner published a new version, remove its entry in {_record_file(root)})")
         )
     say(f"using {path}")
-    _record(root, archive, found, size, "")
     return found
 
 
@@ -160,7 +159,9 @@ def _recorded(root: Path) -> dict[str, dict]:
     return found
 
 
-def _record(root: Path, archive: Archive, digest: str, size: int, url: str) -> None:
-    changed = (root / "archives" / archive.name).stat().st_mtime_ns
-    entry = {"sha256": digest, "bytes": size, "changed": changed, "from": url, "when": datetime.now(UTC).isoformat(timespec="seconds")}
-    write_json(_record_file(root), {**_recorded(root), archive.name: entry})
+def _record(root: Path, archive: Archive, digest: str, url: str) -> None:
+    about, known = (root / "archives" / archive.name).stat(), _recorded(root)
+    entry = {"sha256": digest, "bytes": about.st_size, "changed": about.st_mtime_ns, "from": url}
+    if {k: known.get(archive.name, {}).get(k) for k in entry} != entry:
+        when = datetime.now(UTC).isoformat(timespec="seconds")
+        write_json(_record_file(root), {**known, archive.name: {**entry, "when": when}})
