@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from scene_experts.strategy import observe
@@ -30,3 +31,28 @@ def test_counts_follow_the_rule_over_two_views():
     observe.stop(table)
     assert not table.stats
     observe.stop(table)  # twice is fine
+
+
+@pytest.mark.parametrize("K", [1, 4, 10, 33])
+def test_the_compiled_form_gives_the_bits_of_the_plain_one(K):
+    if observe._library() is None:
+        pytest.skip("no compiled library")
+    generator = torch.Generator().manual_seed(K)
+    n, rows = 3000, torch.arange(1, 3000, 2)
+    raw = torch.randn(len(rows), K, generator=generator)
+    keep = (raw > 0).view(-1).nonzero().squeeze(1)
+    source = rows[keep // K] * K + keep % K
+    empty = torch.empty(0)
+    decoded = Decoded(Gaussians(empty, empty, empty, empty, empty, source), rows, raw, {})
+    radii = torch.randint(-1, 4, (len(source),), dtype=torch.int32, generator=generator)
+    size = 10.0 ** torch.empty(len(source), 1).uniform_(-9, 0, generator=generator)
+    render = Render(empty, empty, empty, radii, torch.randn(len(source), 2, generator=generator) * size)
+    tables = []
+    for plain in (False, True):
+        table = Table({"a": torch.zeros(n, 1)}, {})
+        observe.start(table, K)
+        for _ in range(3):
+            observe._by_torch(table.stats, decoded, render) if plain else observe.observe(table, decoded, render)
+        tables.append(table.stats)
+    exact = torch.backends.cpu.get_cpu_capability().startswith("AVX")
+    assert all(torch.equal(tables[0][k], tables[1][k]) if exact else torch.allclose(tables[0][k], tables[1][k]) for k in observe.STATS)

@@ -6,8 +6,13 @@ Statistics of a table ([N] or [N, K]): `visits` views that saw the anchor; `opac
 
 from __future__ import annotations
 
-import torch
+import ctypes
+import functools
 
+import torch
+from torch import Tensor
+
+from scene_experts import native
 from scene_experts.table import Table
 from scene_experts.types import Decoded, Render
 
@@ -29,8 +34,26 @@ def stop(table: Table) -> None:
 
 @torch.no_grad()
 def observe(table: Table, decoded: Decoded, render: Render) -> None:
-    """Add one view, after its backward pass. A slot counts when its opacity is positive and its splat touched the picture."""
-    stats, rows = table.stats, decoded.rows
+    """Add one view, after its backward pass. A slot counts when its opacity is positive and its splat touched the picture.
+
+    Rows and slots of a view are each at most once, so the compiled library adds them in parallel; the bits are the same without it.
+    """
+    assert decoded.raw_opacity is not None
+    raw, library = decoded.raw_opacity.detach(), _library()
+    columns = [table.stats[name] for name in STATS]
+    parts = [*columns, raw, render.mean2d_grad]
+    if library is None or not all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in parts):
+        return _by_torch(table.stats, decoded, render)
+    visits, opacity, grad, count = (native.pointer(t) for t in columns)
+    rows, radii, source = (t.contiguous() for t in (decoded.rows, render.radii.int(), decoded.gaussians.source))
+    library.se_observe_rows(native.pointer(rows), native.pointer(raw), len(rows), raw.shape[1], visits, opacity, native.threads())
+    drawn = [native.pointer(t) for t in (radii, render.mean2d_grad, source)]
+    library.se_observe_drawn(*drawn, len(source), grad, count, native.threads())
+
+
+def _by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:
+    """The same in plain torch, for any device and dtype."""
+    rows = decoded.rows
     assert decoded.raw_opacity is not None
     stats["visits"].index_add_(0, rows, torch.ones_like(rows, dtype=stats["visits"].dtype))
     stats["opacity"].index_add_(0, rows, decoded.raw_opacity.detach().clamp_min(0).sum(1))
@@ -39,3 +62,15 @@ def observe(table: Table, decoded: Decoded, render: Render) -> None:
     norms = render.mean2d_grad.index_select(0, drawn).norm(dim=1)
     stats["grad"].view(-1).index_add_(0, source, norms)
     stats["count"].view(-1).index_add_(0, source, torch.ones_like(norms))
+
+
+@functools.cache
+def _library() -> ctypes.CDLL | None:
+    library = native.load()
+    if library is None or not hasattr(library, "se_observe_rows"):  # built before this file was
+        return None
+    P, L, I = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32  # noqa: E741
+    library.se_observe_rows.argtypes = [P, P, L, L, P, P, I]
+    library.se_observe_drawn.argtypes = [P, P, P, L, P, P, I]
+    library.se_observe_rows.restype = library.se_observe_drawn.restype = None
+    return library

@@ -1,0 +1,54 @@
+// Density statistics of one view, added to the table's counts in one pass; the sums in torch's order, so that both give the same bits.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "export.h"
+#include "pool.h"
+
+namespace {
+constexpr int64_t kRows = 1024, kDrawn = 8192;  // what a worker takes at a time
+
+// Sum of max(0, x[k]) over K < 512 values: eight lanes in four strands, strands added up, then the rest and the lanes one by one.
+float positive_sum(const float* x, int64_t K) {
+  if (K < 8) {
+    float part[4] = {};
+    const int64_t whole = K / 4 * 4;
+    for (int64_t k = 0; k < K; ++k) part[k < whole ? k % 4 : 0] += std::max(x[k], 0.f);
+    return ((part[0] + part[1]) + part[2]) + part[3];
+  }
+  float lanes[4][8] = {};
+  const int64_t vectors = K / 8, whole = vectors / 4 * 4;
+  for (int64_t v = 0; v < vectors; ++v)
+    for (int j = 0; j < 8; ++j) lanes[v < whole ? v % 4 : 0][j] += std::max(x[8 * v + j], 0.f);
+  float sum = 0.f;
+  for (int64_t k = 8 * vectors; k < K; ++k) sum += std::max(x[k], 0.f);
+  for (int j = 0; j < 8; ++j) sum += ((lanes[0][j] + lanes[1][j]) + lanes[2][j]) + lanes[3][j];
+  return sum;
+}
+}  // namespace
+
+// rows [A], each once; raw [A, K] -> visits [N], opacity [N].
+SE_EXPORT void se_observe_rows(const int64_t* rows, const float* raw, int64_t count, int64_t K, float* visits, float* opacity,
+                               int32_t threads) {
+  se::parallel_for(count, kRows, threads, [&](int64_t begin, int64_t end, int) {
+    for (int64_t a = begin; a < end; ++a) {
+      const float sum = positive_sum(raw + a * K, K);
+      visits[rows[a]] += 1.f;
+      opacity[rows[a]] += sum;
+    }
+  });
+}
+
+// radii [M], gradient [M, 2], source [M], each slot once -> grad and count of the slots of what was drawn.
+SE_EXPORT void se_observe_drawn(const int32_t* radii, const float* gradient, const int64_t* source, int64_t count, float* grad,
+                                float* counted, int32_t threads) {
+  se::parallel_for(count, kDrawn, threads, [&](int64_t begin, int64_t end, int) {
+    for (int64_t i = begin; i < end; ++i) {
+      if (radii[i] <= 0) continue;
+      const float x = gradient[2 * i], y = gradient[2 * i + 1];
+      grad[source[i]] += std::sqrt(std::fma(y, y, x * x));
+      counted[source[i]] += 1.f;
+    }
+  });
+}
