@@ -18,7 +18,7 @@ CAMERA = Camera(torch.eye(4), torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1
 def started(recipe: str) -> Scene:
     torch.manual_seed(0)
     points = Points(torch.randn(200, 3, dtype=torch.float64) + torch.tensor([0.0, 0, 4]), torch.full((200, 3), 128, dtype=torch.uint8))
-    return RECIPES[recipe][1].scene.start(points, 5.0)
+    return RECIPES[recipe][1].scene.start(points, 5.0, [CAMERA])
 
 
 @pytest.mark.parametrize("recipe", METHODS)

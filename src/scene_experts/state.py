@@ -42,7 +42,7 @@ class Training:
         if not capture.train:
             raise InputError("expected at least one training view, found none; choose another --split")
         torch.manual_seed(cfg.seed)
-        scene = cfg.scene.start(capture.points, capture.extent)
+        scene = cfg.scene.start(capture.points, capture.extent, [capture.views[i].camera for i in capture.train])
         cap, n = cfg.growth.max_anchors, len(scene.table)
         if 0 < cap < n:
             raise InputError(f"expected at most {cap:,} anchors to start with, found {n:,}; raise --max-anchors or --scene.voxel-size")

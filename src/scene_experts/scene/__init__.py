@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -56,8 +56,8 @@ class Scene(Protocol):
 class SceneConfig(Protocol):
     """What a scene is made of: a frozen dataclass, whose fields are the recipe's flags under --scene."""
 
-    def start(self, points: Points, extent: float) -> Scene:
-        """A new scene from a point cloud."""
+    def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> Scene:
+        """A new scene from a point cloud and the training views' cameras; scenes that need no cameras do without."""
         ...
 
     def load(self, table: Table, meta: dict[str, Any]) -> Scene:

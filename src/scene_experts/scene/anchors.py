@@ -8,7 +8,7 @@ mu = x_v + O_v * exp(l_v)[0:3]  (paper eq. 2). Anchors never move; `strategy.gro
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -55,7 +55,7 @@ class Anchors:
     """Which implementation decodes: the fused native one where it covers the scene, or the composed torch form."""
     decoder: Plain | Experts = Plain()
 
-    def start(self, points: Points, extent: float) -> AnchorScene:
+    def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
         """One anchor per occupied voxel of the point cloud."""
         return AnchorScene.from_points(self, points, extent)
 
