@@ -9,6 +9,7 @@ HANDLERS: dict[str, tuple[str, str]] = {
     "train": ("train", "train"),
     "eval": ("evaluate", "evaluate"),
     "compare": ("evaluate", "compare"),
+    "render": ("render", "render"),
     "export": ("files", "export"),
     "import": ("files", "import_"),
     "reproduce": ("reproduce", "reproduce"),
