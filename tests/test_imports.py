@@ -15,7 +15,7 @@ LAYERS = [
     {"data", "render", "scene", "losses"},
     {"strategy"},
     {"config"},
-    {"recipes", "events", "state", "train"},
+    {"recipes", "events", "memory", "state", "train"},
     {"run_folder", "progress", "record"},
     {"evaluate", "export", "reproduce", "view", "doctor", "bench"},
     {"cli", "commands", "__main__"},

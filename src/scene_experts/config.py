@@ -39,6 +39,8 @@ class Train:
     """Another background colour every iteration."""
     max_anchors: int = 0
     """Stop growing at this many anchors; 0 is no cap."""
+    sparse_adam: bool = False
+    """Move only what a view decoded (gsplat's SelectiveAdam): faster where views see a small part; changes results."""
 
     def scaled(self) -> Train:
         """The same with every window of the schedule in iterations of this training (x iterations / 30,000)."""
