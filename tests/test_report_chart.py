@@ -5,7 +5,23 @@ import re
 
 import pytest
 
-from scene_experts.report.chart import BOTTOM, HEIGHT, LEFT, MOST, RIGHT, TOP, WIDTH, Line, bars, label, lines, smoothed, thinned, ticks
+from scene_experts.report.chart import (
+    BOTTOM,
+    HEIGHT,
+    LEFT,
+    MOST,
+    RIGHT,
+    TOP,
+    WIDTH,
+    Line,
+    bars,
+    label,
+    lines,
+    log_ticks,
+    smoothed,
+    thinned,
+    ticks,
+)
 
 
 def points(svg):
@@ -45,7 +61,9 @@ def test_thinning_keeps_means_and_smoothing_lags():
 
 def test_ticks_are_round():
     assert ticks(0, 10) == [0, 2, 4, 6, 8, 10] and ticks(0.03, 0.09) == pytest.approx([0.04, 0.06, 0.08])
-    assert [label(v) for v in (0.05, 7000, 30_000, 2_500_000)] == ["0.05", "7000", "30k", "2.5M"]
+    assert [label(v) for v in (0.05, 2e-5, 7000, 30_000, 2_500_000)] == ["0.05", "2e-5", "7000", "30k", "2.5M"]
+    assert [10**v for v in log_ticks(-2.2, -0.9)] == pytest.approx([0.01, 0.02, 0.05, 0.1])
+    assert len(log_ticks(-9, 3)) <= 7
 
 
 def test_bars_are_as_wide_as_the_shares():

@@ -37,7 +37,7 @@ def lines(title: str, series: Sequence[Line], unit: str = "", log: bool = False)
     to_y = lambda y: HEIGHT - BOTTOM - (y - y0) / max(y1 - y0, 1e-12) * (HEIGHT - BOTTOM - TOP)  # noqa: E731
     parts = [f"<figure><figcaption>{escape(title)}{f', {escape(unit)}' if unit else ''}</figcaption>"]
     parts.append(f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">')
-    for y in ticks(y0, y1):
+    for y in log_ticks(y0, y1) if log else ticks(y0, y1):
         text = label(10**y if log else y)
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{to_y(y):.1f}" y2="{to_y(y):.1f}"/>')
         parts.append(f'<text x="{LEFT - 5}" y="{to_y(y) + 4:.1f}" text-anchor="end">{text}</text>')
@@ -103,7 +103,18 @@ def ticks(low: float, high: float, count: int = 5) -> list[float]:
     return [first + i * step for i in range(int((high - first) / step) + 1)]
 
 
+def log_ticks(low: float, high: float) -> list[float]:
+    """Logarithms of round numbers between two logarithms: 1, 2, 5 a decade, or every so many decades where there are many."""
+    decades = range(math.floor(low), math.ceil(high) + 1)
+    every = max(1, math.ceil(len(decades) / 6))
+    factors = (1, 2, 5) if len(decades) <= 3 else (1,)
+    found = [e + math.log10(m) for e in decades[::every] for m in factors]
+    return [value for value in found if low <= value <= high]
+
+
 def label(value: float) -> str:
     if abs(value) >= 1_000_000:
         return f"{value / 1e6:g}M"
+    if 0 < abs(value) < 1e-3:
+        return f"{value:.0e}".replace("e-0", "e-")
     return f"{value / 1e3:g}k" if abs(value) >= 10_000 else f"{round(value, 10):.4g}"
