@@ -107,7 +107,7 @@ def log_ticks(low: float, high: float) -> list[float]:
     """Logarithms of round numbers between two logarithms: 1, 2, 5 a decade, or every so many decades where there are many."""
     decades = range(math.floor(low), math.ceil(high) + 1)
     every = max(1, math.ceil(len(decades) / 6))
-    factors = (1, 2, 5) if len(decades) <= 3 else (1,)
+    factors = (1, 2, 5) if len(decades) <= 4 else (1,)
     found = [e + math.log10(m) for e in decades[::every] for m in factors]
     return [value for value in found if low <= value <= high]
 
