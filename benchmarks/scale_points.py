@@ -151,8 +151,12 @@ def draw(rows: Rows, scene: raster.Picture, loss: bool) -> list[Row]:
     with torch.no_grad():
         rows.add("raster, no gradient", lambda: rasterize(scene.gaussians, scene.camera, torch.zeros(3)))
     if loss:
-        image = scene.upstream.clone().requires_grad_()
-        rows.add("loss with gradient", lambda: torch.stack(photometric(image, 1 - scene.upstream, 0.2)).sum().backward())
+        target = 1 - scene.upstream
+
+        def gradient() -> None:
+            torch.stack(photometric(scene.upstream.clone().requires_grad_(), target, 0.2)).sum().backward()
+
+        rows.add("loss with gradient", gradient)
     return rows.rows
 
 
