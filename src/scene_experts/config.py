@@ -14,8 +14,11 @@ import tyro
 from scene_experts.errors import InputError, expect_at_least
 from scene_experts.losses import Weights
 from scene_experts.scene.anchors import Anchors, Rates
+from scene_experts.scene.explicit import Explicit, ExplicitRates
 from scene_experts.schedule import Rate
 from scene_experts.strategy.grow import GrowAnchors
+from scene_experts.strategy.mcmc import MCMC
+from scene_experts.strategy.split_clone import SplitClone
 
 SCHEDULE = 30_000  # the iterations that all schedule constants are written for
 LARGEST_SEED = 2**63 - 2  # torch takes signed 64 bits, and growth draws from the seed after this one
@@ -26,10 +29,10 @@ class Train:
     """A recipe with its numbers."""
 
     recipe: tyro.conf.Suppress[str]
-    scene: Anchors = Anchors()
+    scene: Anchors | Explicit = Anchors()
     loss: Weights = Weights()
-    growth: GrowAnchors = GrowAnchors()
-    rates: Rates = Rates()
+    growth: GrowAnchors | SplitClone | MCMC = GrowAnchors()
+    rates: Rates | ExplicitRates = Rates()
     iterations: int = SCHEDULE
     """Length of the training. Another length rescales the whole schedule (learning rates, densification windows, warm-up)."""
     seed: int = 0

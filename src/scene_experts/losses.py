@@ -43,6 +43,10 @@ class Weights:
     """exclusive: eq. 7 while dense, eq. 6 after; both: their sum after."""
     load_normalise_by_k: bool = False
     """Divide eq. 6 by k, so that perfect balance is 1 for every k."""
+    mean_opacity: float = 0.0
+    """Weight of the mean opacity over all explicit Gaussians (3DGS-MCMC)."""
+    mean_size: float = 0.0
+    """Weight of the mean scale over all explicit Gaussians and axes (3DGS-MCMC)."""
     opacity_from: int = 0
     """First iteration with the opacity hinge."""
     opacity_until: int | None = None
@@ -66,6 +70,12 @@ def terms(
         out["volume"] = w.scale * volume(decoded.gaussians.scales)
     if hinge_is_on(w, step) and decoded.raw_opacity is not None:
         out["opacity"] = w.opacity * opacity_hinge(hinge_opacities(decoded, render, w), w.tau)
+    if decoded.population is not None:
+        logits, log_scales = decoded.population
+        if w.mean_opacity != 0:
+            out["mean_opacity"] = w.mean_opacity * (logits.sigmoid().sum() / max(logits.numel(), 1))
+        if w.mean_size != 0:
+            out["mean_size"] = w.mean_size * (log_scales.exp().sum() / max(log_scales.numel(), 1))
     if w.load != 0 and decoded.routing:
         out["load"] = w.load * load(decoded.routing, w)
     return out

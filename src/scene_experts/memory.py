@@ -62,7 +62,7 @@ def anchor_cap(scene: Scene, cap: int, max_memory: float, largest: Largest) -> i
         return cap
     n = len(scene.table)
     share = largest.gaussians / max(n, 1)
-    left = max_memory * 2**30 - used_bytes(scene.table.facts["xyz"].device) - frame_bytes(largest.gaussians, largest.pixels)
+    left = max_memory * 2**30 - used_bytes(scene.table.device) - frame_bytes(largest.gaussians, largest.pixels)
     room = max(0, int(left / (2 * row_bytes(scene) + share * gaussian_bytes())))  # twice: a row edit holds old and new columns at once
     return min(n + room, cap) if cap else max(n + room, 1)
 

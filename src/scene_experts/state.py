@@ -75,8 +75,8 @@ class Training:
                 for key, value in self.optimizer.state.get(parameter, {}).items():
                     out[f"adam.{group['name']}.{i}.{key}"] = value
         out |= {"rng.torch": torch.get_rng_state(), "rng.views": self.views.get_state(), "rng.growth": self.growth.get_state()}
-        if table.facts["xyz"].is_cuda:
-            out["rng.cuda"] = torch.cuda.get_rng_state(table.facts["xyz"].device)
+        if table.device.type == "cuda":
+            out["rng.cuda"] = torch.cuda.get_rng_state(table.device)
         out["queue"] = torch.tensor(self.queue, dtype=torch.int64)
         return out
 
@@ -108,8 +108,8 @@ class Training:
                 if state:
                     training.optimizer.state[parameter] = {k: v.to(device) for k, v in state.items()}
         torch.set_rng_state(tensors["rng.torch"])
-        if "rng.cuda" in tensors and table.facts["xyz"].is_cuda:
-            torch.cuda.set_rng_state(tensors["rng.cuda"], table.facts["xyz"].device)
+        if "rng.cuda" in tensors and table.device.type == "cuda":
+            torch.cuda.set_rng_state(tensors["rng.cuda"], table.device)
         training.views.set_state(tensors["rng.views"])
         training.growth.set_state(tensors["rng.growth"])
         training.queue = tensors["queue"].tolist()
@@ -139,6 +139,8 @@ def to_device(scene: Scene, device: str, dtype: torch.dtype | None = None) -> Sc
 
 LATER = {
     "sparse_adam": False,
+    "loss.mean_opacity": 0.0,
+    "loss.mean_size": 0.0,
     "rates.appearance": {"type": "Rate", "first": 0.05, "last": 0.0005},
     "rates.mix": {"type": "Rate", "first": 0.01, "last": 0.00001},
     "scene.appearance": 0,

@@ -99,9 +99,9 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     training.step += 1
     training.set_rates()
     index, following = training.next_view(capture.train)
-    capture.images.prefetch(following)
     camera = capture.views[index].camera.to(run.device, run.dtype)
     frame = capture.frame(index)
+    capture.images.prefetch(following)
     target = frame.rgb.to(run.device, run.dtype).div_(255.0)
     mask = None if frame.mask is None else frame.mask.to(run.device, run.dtype)
     background = torch.rand(3, generator=training.views) if cfg.random_background else torch.tensor(capture.background)
@@ -129,7 +129,8 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
 def rows_to_move(cfg: Train, decoded: Decoded) -> Tensor | None:
     """The rows of the table that Adam moves: those decoded, under `sparse_adam`; None for all, also where the objective reaches all."""
     seen = len(decoded.rows)
-    everywhere = decoded.scene_opacity is not None or any(len(r.gates) != seen for r in decoded.routing.values())
+    everywhere = decoded.scene_opacity is not None or (decoded.population is not None and (cfg.loss.mean_opacity or cfg.loss.mean_size))
+    everywhere = everywhere or any(len(r.gates) != seen for r in decoded.routing.values())
     return decoded.rows if cfg.sparse_adam and not everywhere else None
 
 
