@@ -56,7 +56,7 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
         assert torch.equal(a[name], b[name]), name
 
 
-@pytest.mark.parametrize("recipe", ["scaffold-gs", "moe-gs"])
+@pytest.mark.parametrize("recipe", ["scaffold-gs", "moe-gs", "octree-gs", "octree-moe-gs", "scaffold-gs-bank"])
 def test_resumed_equals_uninterrupted_bit_for_bit_while_rows_come_and_go(recipe, folder, tmp_path):
     cfg = config(recipe)
     edits = [e for e in events(cfg, folder, tmp_path / "whole", stop_at=120) if isinstance(e, Adjusted)]
@@ -108,7 +108,7 @@ def test_the_unit_of_a_capture_does_not_matter(scale, folder, tmp_path):
         assert x.keys() == y.keys() and all(y[k] == pytest.approx(x[k], rel=2e-3, abs=1e-6) for k in x)
 
 
-@pytest.mark.parametrize("recipe", ["scaffold-gs", "moe-gs"])
+@pytest.mark.parametrize("recipe", ["scaffold-gs", "moe-gs", "octree-gs", "octree-moe-gs", "scaffold-gs-bank"])
 def test_losses_follow_the_golden_curve(recipe, tmp_path):
     """The first 100 iterations at a fixed seed, Top-k from the 51st, in float64 by the reference parts, so that machines agree to 1e-3:
     in float32 Adam turns the rounding of another instruction set into 1 % within these iterations. Recorded by this test with

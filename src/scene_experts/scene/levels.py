@@ -37,9 +37,13 @@ class Levels:
         """Edge of a cell of `level`."""
         return self.edge / self.fork**level
 
+    def units(self, points: Tensor, level: int) -> Tensor:
+        """Points [P, 3] in cells of `level`, float64; rounded, the cells they fall into."""
+        return (points.double() - torch.tensor(self.origin, dtype=torch.float64, device=points.device)) / self.size(level)
+
     def cells(self, points: Tensor, level: int) -> Tensor:
         """Cells [P, 3] int64 of `level` that points [P, 3] fall into."""
-        return to_lattice(points.double() - points.new_tensor(self.origin, dtype=torch.float64), self.size(level))
+        return to_lattice(self.units(points, level), 1.0)
 
     def positions(self, cells: Tensor, level: int) -> Tensor:
         """Centres [n, 3] float64 of cells of `level`."""
