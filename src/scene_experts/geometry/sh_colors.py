@@ -64,8 +64,8 @@ class _Colors(torch.autograd.Function):
 
 
 @functools.cache
-def _library() -> ctypes.CDLL | None:
-    library = native.load()
+def _library(level: str | None = None) -> ctypes.CDLL | None:
+    library = native.load(level)
     if library is None or not hasattr(library, "se_sh_forward"):  # built before this file was
         return None
     P, L, I = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32
