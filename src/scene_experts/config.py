@@ -15,10 +15,12 @@ from scene_experts.errors import InputError, expect_at_least
 from scene_experts.losses import Weights
 from scene_experts.scene.anchors import Anchors, Rates
 from scene_experts.scene.explicit import Explicit, ExplicitRates
+from scene_experts.scene.graph_points import GraphPoints, GraphRates
 from scene_experts.scene.select import Octree
 from scene_experts.schedule import Rate
 from scene_experts.strategy.grow import GrowAnchors
 from scene_experts.strategy.grow_octree import GrowOctree
+from scene_experts.strategy.grow_points import GrowPoints
 from scene_experts.strategy.mcmc import MCMC
 from scene_experts.strategy.split_clone import SplitClone
 
@@ -31,10 +33,10 @@ class Train:
     """A recipe with its numbers."""
 
     recipe: tyro.conf.Suppress[str]
-    scene: Anchors | Explicit = Anchors()
+    scene: Anchors | Explicit | GraphPoints = Anchors()
     loss: Weights = Weights()
-    growth: GrowAnchors | GrowOctree | SplitClone | MCMC = GrowAnchors()
-    rates: Rates | ExplicitRates = Rates()
+    growth: GrowAnchors | GrowOctree | GrowPoints | SplitClone | MCMC = GrowAnchors()
+    rates: Rates | ExplicitRates | GraphRates = Rates()
     iterations: int = SCHEDULE
     """Length of the training. Another length rescales the whole schedule (learning rates, densification windows, warm-up)."""
     seed: int = 0
@@ -117,6 +119,9 @@ def check(cfg: Train) -> None:
             f"expected anchors on levels and growth by level together, found {type(cfg.growth).__name__} on a scene "
             f"{'with' if levels else 'without'} levels; use the octree recipes"
         )
+    graph = [isinstance(part, kind) for part, kind in ((cfg.scene, GraphPoints), (cfg.growth, GrowPoints), (cfg.rates, GraphRates))]
+    if any(graph) and not all(graph):
+        raise InputError("expected a scene, growth and rates of graph points together, found some of another method; use the recipe sags")
     for name, rate in vars(cfg.rates).items():
         if isinstance(rate, Rate) and not (rate.first > 0 < rate.last or rate.first == rate.last == 0):
             flag = f"--rates.{name.replace('_', '-')}"

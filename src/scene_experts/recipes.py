@@ -1,7 +1,7 @@
 """The methods and ablations of the paper, a few lines each. No other source file knows a recipe by name.
 
 3DGS: Kerbl et al., SIGGRAPH 2023.  3DGS-MCMC: Kheradmand et al., NeurIPS 2024.
-Scaffold-GS: Lu et al., CVPR 2024.  Octree-GS: Ren et al., 2024.
+Scaffold-GS: Lu et al., CVPR 2024.  Octree-GS: Ren et al., 2024.  SAGS: Ververas et al., ECCV 2024.
 MoE-GS: Fu et al., "Scene Experts", AAAI 2026; tables and figures below are that paper's.
 """
 
@@ -14,10 +14,12 @@ from scene_experts.losses import Weights
 from scene_experts.scene.anchors import Anchors
 from scene_experts.scene.experts import Experts, Router
 from scene_experts.scene.explicit import Explicit, ExplicitRates
+from scene_experts.scene.graph_points import GraphPoints, GraphRates
 from scene_experts.scene.mix import FeatureBank
 from scene_experts.scene.mlp import Plain
 from scene_experts.scene.select import Octree
 from scene_experts.strategy.grow_octree import GrowOctree
+from scene_experts.strategy.grow_points import GrowPoints
 from scene_experts.strategy.mcmc import MCMC
 from scene_experts.strategy.split_clone import SplitClone
 
@@ -46,6 +48,7 @@ gs_mcmc = replace(
     loss=Weights(scale=0.0, mean_opacity=0.01, mean_size=0.01),
     growth=MCMC(),
 )
+sags = Train(recipe="sags", scene=GraphPoints(), loss=Weights(scale=0.0), growth=GrowPoints(), rates=GraphRates())
 
 
 def _moe(name: str, *, loss: Weights = moe_gs.loss, add_dist: tuple[str, ...] = (), **experts: object) -> Train:
@@ -67,6 +70,7 @@ RECIPES: dict[str, tuple[str, Train]] = {
         "Octree-GS with five experts per attribute, Top-2 after a dense warm-up (published nowhere)",
         replace(octree_gs, recipe="octree-moe-gs", scene=replace(octree_gs.scene, decoder=moe_gs.scene.decoder), loss=moe_gs.loss),
     ),
+    "sags": ("SAGS: points with a graph over them and a hash grid, denser where the surface is flat", sags),
     "scaffold-gs-bank": ("Scaffold-GS with its feature bank", _scaffold("scaffold-gs-bank", mix=FeatureBank())),
     "scaffold-gs-opacity": (
         "Scaffold-GS with the opacity hinge: the paper's 'w/o MoE' (Table 4) and Table 3, row 2",

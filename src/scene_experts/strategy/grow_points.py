@@ -1,0 +1,39 @@
+"""Growing and pruning graph points (SAGS): Scaffold-GS's rules with one Gaussian a row, whose place a network gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from torch import Tensor
+
+from scene_experts.scene.graph_points import GraphScene
+from scene_experts.strategy.grow import GrowAnchors
+from scene_experts.types import Decoded, Render
+
+
+@dataclass(frozen=True)
+class GrowPoints(GrowAnchors):
+    """As for anchors, but for what counts as a visit and for the sizes, which nothing clamps."""
+
+    success_threshold: float = 0.6
+    scale_clamp: Literal["log0.05", "linear0.05", "off"] = "off"
+    visits: Literal["drawn", "seen"] = "drawn"
+    """drawn: a view counts only for points that it drew, so that a point never drawn is never removed (SAGS); seen: for all it decoded."""
+
+    def observe(self, scene: Any, decoded: Decoded, render: Render, step: int) -> None:
+        """Count one view, after its backward pass."""
+        super().observe(scene, self.counted(decoded, render), render, step)
+
+    def counted(self, decoded: Decoded, render: Render) -> Decoded:
+        """`decoded` as far as its rows count as visited."""
+        if self.visits == "seen":
+            return decoded
+        drawn = (render.radii > 0).nonzero().squeeze(1)
+        opacity = decoded.gaussians.opacities.detach().index_select(0, drawn)
+        return replace(decoded, rows=decoded.gaussians.source.index_select(0, drawn), raw_opacity=opacity[:, None])
+
+    def points(self, scene: Any, slots: Tensor, parents: Tensor) -> Tensor:
+        """Where the Gaussians of rows [P] are, [P, 3] float64."""
+        assert isinstance(scene, GraphScene)
+        return scene.slot_points(parents)
