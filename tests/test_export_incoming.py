@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import nn
 
 from scene_experts import checkpoint, run_folder
 from scene_experts.config import Data
@@ -16,6 +15,7 @@ from scene_experts.export.ply import read_vertices, write_anchor_ply, write_vert
 from scene_experts.export.run import export_run, import_result
 from scene_experts.render import choose
 from scene_experts.scene.anchors import Anchors, AnchorScene
+from scene_experts.scene.mix import FeatureBank
 from scene_experts.scene.mlp import Plain
 from scene_experts.state import resume
 from scene_experts.table import Table
@@ -111,18 +111,62 @@ def test_what_cannot_be_drawn_is_refused(tmp_path, folder):
     root = tmp_path / "result"
     published(root)
     iteration = root / "point_cloud" / "iteration_30000"
-    bank = nn.Sequential(nn.Linear(4, 32), nn.ReLU(), nn.Linear(32, 3))
-    torch.save(bank.state_dict(), iteration / "feature_bank_mlp.pt")
-    with pytest.raises(InputError, match="found one with feature bank"):
+    torch.save({"embedding.weight": torch.zeros(99, 0)}, iteration / "embedding_appearance.pt")
+    with pytest.raises(InputError, match="expected 99 training views"):
         import_result(root, Data(folder), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+    (iteration / "embedding_appearance.pt").unlink()
     with pytest.raises(InputError, match="expected a Scaffold-GS result"):
         import_result(tmp_path / "absent", Data(folder), tmp_path / "run")
-    (iteration / "feature_bank_mlp.pt").unlink()
     plain = read_vertices(iteration / "point_cloud.ply")
     write_vertices(iteration / "point_cloud.ply", {**plain, "level": plain["x"] * 0, "extra_level": plain["x"] * 0, "info": plain["x"] * 0})
-    with pytest.raises(InputError, match="found one with levels of detail"):
+    with pytest.raises(InputError, match="cell edge and the distance of Octree-GS"):
         import_result(root, Data(folder), tmp_path / "run")
     write_vertices(iteration / "point_cloud.ply", plain)
     with pytest.raises(InputError, match="expected the folder of a capture"):
         import_result(root, replace(Data(folder), path=tmp_path / "absent"), tmp_path / "run")
+
+
+def test_a_published_feature_bank_and_codes_are_drawn(tmp_path, folder):
+    torch.manual_seed(1)
+    capture = run_folder.load_capture(Data(folder, normalise="none"))
+    wanted = published(tmp_path / "result")
+    iteration = tmp_path / "result" / "point_cloud" / "iteration_30000"
+    config = replace(wanted.config, mix=FeatureBank(), appearance=4)
+    scene = AnchorScene(config, wanted.table, VOXEL, 5.0, views=capture.train)
+    networks = {a: dict(scene.heads[a].named_parameters()) for a in ("opacity", "cov", "color")}
+    write_torchscript(
+        iteration, {**networks, "feature_bank": dict(scene.mix.named_parameters()), "appearance": {"table": scene.codes.table}}
+    )
+    opened = run_folder.open_run(import_result(tmp_path / "result", Data(folder), tmp_path / "run"))
+    assert opened.scene.config.appearance == 4 and opened.scene.codes.views == tuple(capture.train)
+    for index in (capture.train[1], capture.test[0]):
+        camera, draw = capture.views[index].camera, choose("auto", "cpu")
+        with torch.no_grad():
+            a, b = (s(camera, 1, False, draw.visible).gaussians for s in (scene, opened.scene))
+        torch.testing.assert_close(a.colors, b.colors, rtol=0, atol=1e-5)
+        torch.testing.assert_close(a.opacities, b.opacities, rtol=0, atol=1e-5)
+    capture.images.close()
+
+
+def test_a_published_octree_draws_the_levels_its_distances_ask_for(tmp_path, folder):
+    scene = published(tmp_path / "result")
+    path = tmp_path / "result" / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    torch.manual_seed(2)
+    n, edge, standard, origin = 800, 0.4, 6.0, torch.tensor([-3.0, -3.0, -3.0])
+    level = torch.randint(0, 3, (n,))
+    cell = torch.stack([torch.randint(0, 15 * 2 ** int(j), (3,)) for j in level])
+    xyz = origin + cell * (edge / 2**level)[:, None]
+    info, extra = torch.zeros(n), torch.rand(n)
+    info[0], info[1] = edge, standard
+    columns = {"level": level, "extra_level": extra, "info": info}
+    write_anchor_ply(path, xyz, torch.randn(n, 10, 3), torch.randn(n, 32), torch.randn(n, 6) * 0.3 - 3, columns)
+    opened = run_folder.open_run(import_result(tmp_path / "result", Data(folder), tmp_path / "run"))
+    table, camera = opened.scene.table, run_folder.load_capture(opened.config.data).views[0].camera
+    for j in range(3):  # the same lattice, counted from an anchor of level 0
+        off = table.facts["cell"][level == j] - cell[level == j]
+        assert (off == off[0]).all()
+    r = (xyz + (edge / 2 / 2**level)[:, None] - camera.position).norm(dim=1)
+    asked = (torch.log2(standard / r) + extra).round().clamp(0, 2)
+    assert opened.scene.select(table, camera, 30_000, False).tolist() == (level <= asked).nonzero().squeeze(1).tolist()
+    assert opened.config.train.recipe == "octree-gs" and opened.scene.heads["color"].w1.shape == scene.heads["color"].w1.shape

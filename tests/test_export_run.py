@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from scene_experts import run_folder
-from scene_experts.config import Data, RunConfig
+from scene_experts.config import Data, RunConfig, Train
 from scene_experts.errors import InputError
 from scene_experts.export.compact import read_compact
 from scene_experts.export.ply import read_anchor_ply
@@ -17,6 +17,7 @@ from scene_experts.export.run import export_run, import_result, psnr_cost, world
 from scene_experts.export.scaffold import read_scaffold_folder
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
+from scene_experts.scene.mix import FeatureBank
 from scene_experts.train import Run, train
 from synthetic import make_capture
 
@@ -30,7 +31,7 @@ def folder(tmp_path_factory) -> Path:
 
 def trained(recipe: str, folder: Path, out: Path) -> run_folder.OpenRun:
     """A short run that has passed its warm-up, written out as `train` does; the distance is an input so that units show."""
-    base = RECIPES[recipe][1]
+    base = with_extras(recipe)
     cfg = replace(base, iterations=300, scene=replace(base.scene, add_dist=("color", "cov")))
     config = RunConfig(cfg, Data(folder), stop_at=STEPS)
     run_folder.prepare(out, config, resume=False)
@@ -43,7 +44,13 @@ def trained(recipe: str, folder: Path, out: Path) -> run_folder.OpenRun:
     return opened
 
 
-@pytest.fixture(scope="module", params=["scaffold-gs", "moe-gs"])
+def with_extras(recipe: str) -> Train:
+    """The recipe's configuration; a name ending in "+" adds a feature bank and appearance codes."""
+    cfg = RECIPES[recipe.rstrip("+")][1]
+    return replace(cfg, scene=replace(cfg.scene, mix=FeatureBank(), appearance=8)) if recipe.endswith("+") else cfg
+
+
+@pytest.fixture(scope="module", params=["scaffold-gs", "moe-gs", "scaffold-gs+", "moe-gs+", "octree-gs"])
 def run(request, folder, tmp_path_factory) -> run_folder.OpenRun:
     return trained(request.param, folder, tmp_path_factory.mktemp(request.param))
 
@@ -81,13 +88,21 @@ def test_the_distance_column_is_in_the_input_unit(run):
     networks = read_scaffold_folder(run.path)[1]
     world = world_of(run)
     trained_w1 = run.scene.network_tensors()["color.w1"].detach()
-    torch.testing.assert_close(networks["color"]["w1"][..., -1], trained_w1[..., -1] * world.scale)
-    assert torch.equal(networks["color"]["w1"][..., :-1], trained_w1[..., :-1])
+    torch.testing.assert_close(networks["color"]["w1"][..., 35], trained_w1[..., 35] * world.scale)
+    others = [i for i in range(trained_w1.shape[2]) if i != 35]
+    assert torch.equal(networks["color"]["w1"][..., others], trained_w1[..., others])
     assert torch.equal(networks["opacity"]["w1"], run.scene.network_tensors()["opacity.w1"].detach())
+
+
+def packable(run) -> None:
+    if hasattr(run.scene.select, "lattices"):
+        pytest.skip("levels of detail have no compact form")
 
 
 @pytest.mark.parametrize("form", ["anchors", "compact"])
 def test_written_and_read_back_it_draws_the_same_picture(run, tmp_path, form):
+    if form == "compact":
+        packable(run)
     target = tmp_path / "out" if form == "anchors" else tmp_path / "file"
     lines = export_run(run.path, form, target)
     assert str(target) in lines[0] and "anchors" in lines[1]
@@ -104,6 +119,7 @@ def test_written_and_read_back_it_draws_the_same_picture(run, tmp_path, form):
 
 
 def test_the_cost_of_the_compact_file_is_measured_and_small(run, tmp_path):
+    packable(run)
     lines = export_run(run.path, "compact", tmp_path / "file", rasterize=choose("auto", "cpu"))
     before, after, change = (float(x) for x in re.search(r"views ([\d.]+) dB.* ([\d.]+) dB \(([-+][\d.]+)\)", lines[2]).groups())
     assert change == pytest.approx(after - before, abs=0.0011) and abs(change) < 0.05
@@ -113,6 +129,7 @@ def test_the_cost_of_the_compact_file_is_measured_and_small(run, tmp_path):
 
 
 def test_defaults_lie_in_the_run_folder(run):
+    packable(run)
     assert export_run(run.path, "compact")[0] == f"wrote {run.path / 'scene.compact'}"
     assert read_compact(run.path / "scene.compact").sidecar["recipe"] == run.config.train.recipe
     assert export_run(run.path, "anchors")[0].endswith(f"iteration_{STEPS}")
@@ -132,7 +149,20 @@ def test_the_world_without_an_earlier_export_comes_from_the_capture(folder, tmp_
 
 
 def test_anchors_off_the_lattice_cannot_be_packed(run, tmp_path):
+    packable(run)
     opened = run_folder.open_run(run.path)
     opened.scene.table.facts["xyz"] = opened.scene.table.facts["xyz"] + 0.4 * opened.scene.voxel
     with pytest.raises(InputError, match="on a lattice of known voxel size"):
         write_compact_run(opened, world_of(opened), tmp_path / "file")
+
+
+def test_levels_of_detail_are_written_with_their_columns_and_not_packed(folder, tmp_path):
+    opened = trained("octree-moe-gs", folder, tmp_path / "run")
+    with pytest.raises(InputError, match="levels of detail"):
+        export_run(opened.path, "compact")
+    path = opened.path / "point_cloud" / f"iteration_{STEPS}" / "point_cloud.ply"
+    found, scale = read_anchor_ply(path), world_of(opened).scale
+    levels, facts = opened.scene.select.lattices, opened.scene.table.facts
+    assert torch.equal(found["level"], facts["level"]) and torch.equal(found["extra_level"], facts["extra_level"])
+    assert found["info"][:3].tolist() == pytest.approx([levels.edge / scale, levels.standard / scale, 0.0])
+    assert path.stat().st_size - 316 * len(facts["level"]) < 4000  # 316 bytes an anchor and a header

@@ -218,6 +218,7 @@ def _scene_facts(scene: Scene, step: int) -> dict[str, Any]:
     return {
         "size": sizes(scene),
         "anchors": n,
+        **({"anchors_by_level": scene.table.facts["level"].bincount().tolist()} if "level" in scene.table.facts else {}),
         "gaussians": n * scene.K,
         "experts": {attribute: asdict(found) for attribute, found in expert_shares(scene, step).items()},
     }

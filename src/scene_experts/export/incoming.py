@@ -14,6 +14,7 @@ from scene_experts.config import Data, RunConfig, Train, from_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
 from scene_experts.export.compact import Compact, read_compact
+from scene_experts.export.extras import level_facts, levels_in, published_levels, trained_names
 from scene_experts.export.frame import (
     Network,
     anchors_from_input,
@@ -24,8 +25,10 @@ from scene_experts.export.frame import (
     recover_voxel,
 )
 from scene_experts.export.scaffold import read_scaffold_folder
-from scene_experts.recipes import scaffold_gs
+from scene_experts.recipes import octree_gs, scaffold_gs
 from scene_experts.scene.anchors import ATTRIBUTES, Anchors
+from scene_experts.scene.levels import Levels
+from scene_experts.scene.mix import FeatureBank
 from scene_experts.scene.mlp import Plain
 
 
@@ -46,8 +49,7 @@ def import_result(source: Path, data: Data, out: Path, iteration: int | None = N
     """Make the run folder `out` (configuration and checkpoint) of a published Scaffold-GS result folder, of ours, or of a compact file.
 
     A published result is in its capture's own units, so its capture is read with --normalise none. Ours must meet the world it was trained
-    in. Returns the capture in that world. Raises InputError for what cannot be rendered here (levels, feature bank, appearance codes) and
-    for captures that do not fit.
+    in. Returns the capture in that world. Raises InputError for what cannot be rendered here and for captures that do not fit.
     """
     read = _read(Path(source), iteration)
     if read.scene is None:
@@ -58,28 +60,52 @@ def import_result(source: Path, data: Data, out: Path, iteration: int | None = N
         _check_world(world_in(read.scene), capture.world)
         capture = replace(capture, world=world_in(read.scene))
     voxel = float(read.scene["voxel_size"]["trained"]) if read.scene else read.voxel
-    tensors = run_tensors(read.anchors, read.cells, read.networks, read.add_dist, voxel, capture.world)
+    plain = _plain_values(read, capture)
+    levels = levels_in(plain)
+    tensors = run_tensors(read.anchors, read.cells, read.networks, read.add_dist, voxel, capture.world, levels, read.scene is not None)
     cfg = _config(read)
     config = RunConfig(cfg, data, f"import {Path(source).name}", versions=run_folder.versions())
     run_folder.prepare(out, config, resume=False)
     extent = float((read.scene or {}).get("extent", capture.extent))
-    meta = {"recipe": cfg.recipe, "step": read.step, "seconds": 0.0, "voxel": voxel, "extent": extent, "config": "imported"}
+    voxel = levels.size(levels.count - 1) if levels else voxel
+    meta = {"recipe": cfg.recipe, "step": read.step, "seconds": 0.0, **plain, "voxel": voxel, "extent": extent, "config": "imported"}
     checkpoint.save(out / "checkpoints", read.step, tensors, meta)
     return capture
 
 
+def _plain_values(read: _Read, capture: Capture) -> dict[str, Any]:
+    """What a checkpoint must say of levels and appearance codes: from our description, or from the files and the capture."""
+    if read.scene is not None:
+        return dict(read.scene.get("scene", {}))
+    out: dict[str, Any] = {}
+    if "level" in read.anchors:
+        out["levels"] = published_levels(read.anchors, [capture.views[i].camera for i in capture.train]).meta()
+    if "appearance" in read.networks:
+        codes = len(read.networks["appearance"]["table"])
+        if codes != len(capture.train):
+            raise InputError(
+                f"expected {codes} training views, one for each appearance code, found {len(capture.train)}; choose another --split"
+            )
+        out["views"] = list(capture.train)
+    return out
+
+
 def run_tensors(
-    anchors: dict[str, Tensor], cells: Tensor | None, networks: dict[str, Network], add_dist: tuple[str, ...], voxel: float, world: World
-) -> dict[str, Tensor]:
+    anchors: dict[str, Tensor], cells: Tensor | None, networks: dict[str, Network], add_dist: tuple[str, ...], voxel: float, world: World,
+    levels: Levels | None = None, exact: bool = True,
+) -> dict[str, Tensor]:  # fmt: skip
     """The tensors of a checkpoint, in the trained world, from anchors and networks in the input frame.
 
     voxel: edge of the lattice in trained units.  cells: None for anchors on no lattice that is known; they cannot grow or be packed.
+    levels: the lattices of anchors with a level, in trained units; exact: their positions follow from their cells.
     """
     moved = anchors_from_input(anchors, world)
     place = {"cell": torch.zeros(len(moved["xyz"]), 3, dtype=torch.int64), "xyz": moved["xyz"]}
     if cells is not None:
         place = {"cell": cells, "xyz": cell_positions(cells, voxel)}
-    trained = networks_from_input(networks, add_dist, world.scale, moved["feature"].shape[1])
+    if levels is not None:
+        place = level_facts(levels, moved, exact)
+    trained = networks_from_input(trained_names(networks, world.scale), add_dist, world.scale, moved["feature"].shape[1])
     out = {f"params.{name}": moved[name] for name in ("feature", "offsets", "log_scaling")}
     out |= {f"facts.{name}": value for name, value in place.items()}
     return out | {f"network.{a}.{name}": value for a, n in trained.items() for name, value in n.items()}
@@ -103,12 +129,14 @@ def _read(source: Path, iteration: int | None) -> _Read:
         add_dist = tuple(a for a in ATTRIBUTES if c.sidecar["add_dist"][a])
         return _Read(compact_anchors(c), c.cells, c.voxel, c.networks, add_dist, int(c.sidecar["step"]), c.sidecar)
     anchors, networks, facts = read_scaffold_folder(source, iteration)
-    extra = {"feature_bank", "appearance"} & networks.keys()
-    if facts["kind"] == "octree" or extra:
-        what = "levels of detail" if not extra else " and ".join(sorted(extra)).replace("_", " ")
-        raise InputError(f"expected a plain Scaffold-GS result in {source}, found one with {what}, which is not read yet; train it here")
-    scene = facts["scene"]
+    scene, spare = facts["scene"], {a: n["w1"].shape[2] - facts["F"] - 3 for a, n in networks.items() if a in ATTRIBUTES}
+    if max(spare["opacity"], spare["cov"], spare["color"] - facts["appearance_dim"]) > 1:
+        raise InputError(
+            f"expected networks that see feature, direction and distance in {source}, found ones that see the level too; train it here"
+        )
     voxel, origin = float(facts["voxel_size"] or 0.0), (0.0, 0.0, 0.0)
+    if facts["kind"] == "octree":  # its lattices are told by its own columns
+        return _Read(anchors, None, voxel, networks, facts["add_dist"], int(facts["iteration"] or 40_000), scene)
     if scene is not None:
         voxel, origin = lattice_to_input(float(scene["voxel_size"]["trained"]), world_in(scene))
     elif voxel <= 0:  # it was automatic and is written nowhere
@@ -124,7 +152,13 @@ def _config(read: _Read) -> Train:
     network = read.networks["opacity"]
     depth = 2 + sum(name.startswith("middle.") and name.endswith(".weight") for name in network)
     K, F = read.anchors["offsets"].shape[1], read.anchors["feature"].shape[1]
-    scene = Anchors(K=K, F=F, hidden=network["w1"].shape[1], add_dist=read.add_dist, voxel_size=read.voxel, decoder=Plain(depth))
+    scene = Anchors(K=K, F=F, hidden=network["w1"].shape[1], add_dist=read.add_dist, voxel_size=max(read.voxel, 0.0), decoder=Plain(depth))
+    if "feature_bank" in read.networks:
+        scene = replace(scene, mix=FeatureBank(read.networks["feature_bank"]["w1"].shape[1]))
+    if "appearance" in read.networks:
+        scene = replace(scene, appearance=read.networks["appearance"]["table"].shape[1])
+    if "level" in read.anchors:
+        return replace(octree_gs, scene=replace(scene, select=octree_gs.scene.select), iterations=read.step)  # type: ignore[union-attr]
     return replace(scaffold_gs, scene=scene, iterations=read.step)
 
 

@@ -26,34 +26,52 @@ FILES = {"opacity": "opacity_mlp.pt", "cov": "cov_mlp.pt", "color": "color_mlp.p
 EXTRA_FILES = {"feature_bank": "feature_bank_mlp.pt", "appearance": "embedding_appearance.pt"}
 ACTIVATIONS = {"opacity": "tanh", "cov": "none", "color": "sigmoid"}
 MOE_FILE, MOE_KIND, MOE_FORMAT = "moe.safetensors", "mixture of experts", 1
-_LAYERS = {"tanh": nn.Tanh, "sigmoid": nn.Sigmoid, "none": None}
+_LAYERS = {"tanh": nn.Tanh(), "sigmoid": nn.Sigmoid(), "none": None}
 _RENAMED = {"router_w": "router.weight", "router_b": "router.bias", **{n: f"experts.{n}" for n in ("w1", "b1", "w2", "b2")}}
 
 
 def is_plain(networks: dict[str, Network]) -> bool:
     """Whether every attribute has a single network, as Scaffold-GS does."""
-    return all(len(n["w1"]) == 1 and "router_w" not in n for n in networks.values())
+    return all(len(networks[a]["w1"]) == 1 and "router_w" not in networks[a] for a in ATTRIBUTES)
 
 
 # --- TorchScript --------------------------------------------------------------------------------------------------------------------------
 
 
 def write_torchscript(folder: Path, networks: dict[str, Network]) -> None:
-    """Write opacity_mlp.pt, cov_mlp.pt and color_mlp.pt as traces of Sequential(Linear, ReLU, ..., Linear[, activation])."""
+    """Write opacity_mlp.pt, cov_mlp.pt and color_mlp.pt as traces of Sequential(Linear, ReLU, ..., Linear[, activation]); where present,
+    feature_bank_mlp.pt likewise and embedding_appearance.pt, a trace of a module with an embedding."""
     for attribute, network in networks.items():
+        if attribute == "appearance":
+            _save_trace(folder / EXTRA_FILES[attribute], _Codes(network["table"]), torch.zeros(1, dtype=torch.long))
+            continue
         layers: list[nn.Module] = []
         for weight, bias in _linear_layers(network):
             linear = nn.Linear(weight.shape[1], weight.shape[0])
             linear.load_state_dict({"weight": weight, "bias": bias})
             layers += [nn.ReLU(), linear]
-        last = _LAYERS[ACTIVATIONS[attribute]]
-        module = nn.Sequential(*layers[1:], *([last()] if last else [])).eval()
-        buffer = io.BytesIO()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # torch.jit is deprecated, and the only format their readers know
-            traced = torch.jit.trace(module, (torch.rand(1, network["w1"].shape[2]),))
-            torch.jit.save(traced, buffer)
-        write_bytes(folder / FILES[attribute], buffer.getvalue())
+        last = nn.Softmax(dim=1) if attribute == "feature_bank" else _LAYERS[ACTIVATIONS[attribute]]
+        module = nn.Sequential(*layers[1:], *([last] if last else []))
+        _save_trace(folder / (FILES | EXTRA_FILES)[attribute], module, torch.rand(1, network["w1"].shape[2]))
+
+
+class _Codes(nn.Module):
+    """The embedding of appearance codes under the name that Scaffold-GS's readers expect."""
+
+    def __init__(self, table: Tensor) -> None:
+        super().__init__()
+        self.embedding = nn.Embedding.from_pretrained(table.detach().cpu().float())
+
+    def forward(self, view: Tensor) -> Tensor:
+        return self.embedding(view)
+
+
+def _save_trace(path: Path, module: nn.Module, example: Tensor) -> None:
+    buffer = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # torch.jit is deprecated, and the only format their readers know
+        torch.jit.save(torch.jit.trace(module.eval(), (example,)), buffer)
+    write_bytes(path, buffer.getvalue())
 
 
 def _linear_layers(network: Network) -> list[tuple[Tensor, Tensor]]:

@@ -119,15 +119,18 @@ def write_vertices(path: Path, columns: Mapping[str, NDArray[np.generic]]) -> No
 # --- anchors ------------------------------------------------------------------------------------------------------------------------------
 
 
-def write_anchor_ply(path: Path, xyz: Tensor, offsets: Tensor, feature: Tensor, log_scaling: Tensor) -> None:
+def write_anchor_ply(
+    path: Path, xyz: Tensor, offsets: Tensor, feature: Tensor, log_scaling: Tensor, levels: dict[str, Tensor] | None = None
+) -> None:
     """Write anchors in Scaffold-GS's layout: 79 float32 (316 bytes) an anchor for K = 10, F = 32.
 
     xyz [N, 3], offsets [N, K, 3], feature [N, F], log_scaling [N, 6]. Normals are 0, the inert opacity logit(0.1), rotation the identity.
+    levels: level, extra_level and info [N] take the place of the normals, as in Octree-GS's layout.
     """
     n = len(xyz)
     zero, one = np.zeros(n, np.float32), np.ones(n, np.float32)
     columns: Columns = dict(zip("xyz", _floats(xyz)))
-    columns |= dict.fromkeys(("nx", "ny", "nz"), zero)
+    columns |= {k: _floats(v[:, None])[0] for k, v in levels.items()} if levels else dict.fromkeys(("nx", "ny", "nz"), zero)
     columns |= _numbered("f_offset_", offsets.transpose(1, 2).flatten(1))
     columns |= _numbered("f_anchor_feat_", feature)
     columns["opacity"] = np.full(n, ANCHOR_OPACITY, np.float32)

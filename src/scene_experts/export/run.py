@@ -16,6 +16,7 @@ from scene_experts.errors import InputError
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.export.cameras import write_cameras
 from scene_experts.export.compact import Compact, Sizes, read_compact, write_compact
+from scene_experts.export.extras import extra_networks, level_columns
 from scene_experts.export.frame import (
     Network,
     anchors_to_input,
@@ -30,6 +31,7 @@ from scene_experts.render import Rasterizer
 from scene_experts.run_folder import OpenRun
 from scene_experts.scene.anchors import ATTRIBUTES, AnchorScene
 from scene_experts.scene.experts import MixtureHead
+from scene_experts.scene.select import LevelSelector
 from scene_experts.state import scene_from
 
 COMPACT = "scene.compact"
@@ -106,6 +108,8 @@ def scene_of_compact(run: OpenRun, file: Compact, world: World) -> AnchorScene:
 def write_compact_run(run: OpenRun, world: World, path: Path) -> Sizes:
     """Write the compact file of an opened run. Raises InputError where the anchors are not on a lattice."""
     scene = anchors_of(run)
+    if isinstance(scene.select, LevelSelector):
+        raise InputError(f"expected anchors of one lattice for a compact file, found levels of detail ({run.path}); use --format anchors")
     cells, xyz = scene.table.facts["cell"], scene.table.facts["xyz"]
     if len(cells):
         away = float((cells.double() * scene.voxel - xyz.double()).abs().max())
@@ -119,7 +123,7 @@ def write_compact_run(run: OpenRun, world: World, path: Path) -> Sizes:
 
 def _write_anchors(run: OpenRun, world: World, out: Path) -> Path:
     scene = anchors_of(run)
-    anchors = anchors_to_input(_anchors(scene), world)
+    anchors = anchors_to_input(_anchors(scene), world) | level_columns(scene, world.scale)
     return write_scaffold_folder(out, run.step, anchors, _networks_in_input(scene, world), sidecar_of(run, world))
 
 
@@ -129,16 +133,18 @@ def _anchors(scene: AnchorScene) -> dict[str, Tensor]:
 
 
 def _networks(scene: AnchorScene) -> dict[str, Network]:
-    """The networks' tensors by attribute, in trained units."""
+    """The heads' tensors by attribute, in trained units."""
     out: dict[str, Network] = {a: {} for a in ATTRIBUTES}
     for name, value in scene.network_tensors().items():
         attribute, _, rest = name.partition(".")
-        out[attribute][rest] = value.detach().cpu()
+        if attribute in out:
+            out[attribute][rest] = value.detach().cpu()
     return out
 
 
 def _networks_in_input(scene: AnchorScene, world: World) -> dict[str, Network]:
-    return networks_to_input(_networks(scene), scene.config.add_dist, world.scale, scene.config.F)
+    features = scene.config.mix.width(scene.config.F)
+    return networks_to_input(_networks(scene), scene.config.add_dist, world.scale, features) | extra_networks(scene, world.scale)
 
 
 def sidecar_of(run: OpenRun, world: World) -> dict[str, Any]:
@@ -157,7 +163,14 @@ def sidecar_of(run: OpenRun, world: World) -> dict[str, Any]:
         scale=world.scale,
         shift=world.shift,
         step=run.step,
-        extra={"extent": scene.extent, "train": to_json(run.config.train), "data": _settings(run.config.data)},
+        extra={
+            "appearance_dim": scene.config.appearance,
+            "feature_bank": scene.mix is not None,
+            "extent": scene.extent,
+            "scene": scene.meta(),
+            "train": to_json(run.config.train),
+            "data": _settings(run.config.data),
+        },
     )
 
 

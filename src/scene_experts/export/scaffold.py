@@ -147,16 +147,18 @@ def write_scaffold_folder(
 ) -> Path:
     """Write anchors and networks, in the input frame already (`frame`), to out/point_cloud/iteration_<step>; returns that folder.
 
-    anchors: xyz [N, 3], offsets [N, K, 3], feature [N, F], log_scaling [N, 6].  networks: None writes none.  sidecar: `describe`.
+    anchors: xyz [N, 3], offsets [N, K, 3], feature [N, F], log_scaling [N, 6], and for levels of detail level, extra_level, info [N].
+    networks: None writes none.  sidecar: `describe`.
     Single networks are written as TorchScript, which public readers expect, experts as moe.safetensors. cfg_args is written beside them
     with what those readers look up. Raises RunError when the disk is full.
     """
     folder = Path(out) / "point_cloud" / f"iteration_{step}"
-    write_anchor_ply(folder / "point_cloud.ply", *(anchors[name] for name in ("xyz", "offsets", "feature", "log_scaling")))
+    levels = {name: anchors[name] for name in ("level", "extra_level", "info") if name in anchors}
+    write_anchor_ply(folder / "point_cloud.ply", *(anchors[name] for name in ("xyz", "offsets", "feature", "log_scaling")), levels=levels)
     stale = {MOE_FILE, *FILES.values(), *EXTRA_FILES.values(), "checkpoints.pth"}
     if networks is not None and is_plain(networks):
         write_torchscript(folder, networks)
-        stale -= set(FILES.values())
+        stale -= set(FILES.values()) | {EXTRA_FILES[name] for name in EXTRA_FILES if name in networks}
     elif networks is not None:
         write_moe(folder / MOE_FILE, networks, sidecar)
         stale -= {MOE_FILE}
@@ -175,7 +177,7 @@ def _cfg(sidecar: dict[str, Any]) -> dict[str, Any]:
         "feat_dim": sidecar["F"],
         "n_offsets": sidecar["K"],
         "voxel_size": sidecar["voxel_size"]["input"],
-        "use_feat_bank": False,
+        "use_feat_bank": sidecar.get("feature_bank", False),
         "appearance_dim": sidecar["appearance_dim"],
         "add_opacity_dist": dist["opacity"],
         "add_cov_dist": dist["cov"],
