@@ -1,0 +1,127 @@
+"""Peak memory of a training above the level after import and image cache, beside what it cannot do without.
+
+Usage: python benchmarks/memory.py [--capture demo/buddha] [--recipe moe-gs] [--anchors 400000] [--iterations 60] [--threads 1]
+The capture's points are multiplied by jitter to `anchors` rows, so that a short run has a large table. The run has adjustments
+(rows come and go) and writes checkpoints. Resident memory: its level after the images are decoded, and its highest since (VmHWM).
+Bytes needed: parameters + gradients + both moments, + the largest frame's buffers by `memory.frame_bytes` with its own number of tiles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from scene_experts import memory
+from scene_experts.config import Data, RunConfig
+from scene_experts.data.capture import Capture, load
+from scene_experts.events import Adjusted, Saved
+from scene_experts.recipes import RECIPES
+from scene_experts.render import choose
+from scene_experts.schedule import Every
+from scene_experts.state import Training
+from scene_experts.train import Run, train
+from scene_experts.types import Camera, Gaussians, Points, Render
+
+
+def status(name: str) -> int:
+    """A line of /proc/self/status, bytes."""
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name))
+    return 1024 * int(line.split()[1])
+
+
+class Watched:
+    """A rasteriser that counts the largest frame in bytes."""
+
+    def __init__(self, inner) -> None:
+        self.inner, self.largest, self.text = inner, 0, ""
+        self.name, self.visible = inner.name, inner.visible
+
+    def __call__(self, gaussians: Gaussians, camera: Camera, background: Tensor) -> Render:
+        render = self.inner(gaussians, camera, background)
+        state = getattr(render.image.grad_fn, "state", None)
+        if state is not None:
+            counts, seconds = (ctypes.c_int64 * 3)(), (ctypes.c_double * 5)()
+            state.library.se_raster_counts(ctypes.c_void_p(state.address), counts, seconds)
+            pairs, pixels = counts[1] / max(1, len(gaussians)), camera.width * camera.height
+            size = memory.frame_bytes(len(gaussians), pixels, pairs)
+            if size > self.largest:
+                self.largest = size
+                self.text = f"{len(gaussians):,} Gaussians, {pairs:.1f} tiles each, {camera.width}x{camera.height}"
+        return render
+
+
+def crowded(capture: Capture, anchors: int) -> Capture:
+    """The capture with its points drawn `anchors` times, each with jitter."""
+    assert capture.points is not None
+    generator = torch.Generator().manual_seed(0)
+    at = torch.randint(len(capture.points.xyz), (anchors,), generator=generator)
+    xyz = capture.points.xyz[at]
+    xyz = xyz + 0.02 * capture.extent * torch.randn(xyz.shape, generator=generator, dtype=xyz.dtype)
+    return replace(capture, points=Points(xyz, capture.points.rgb[at]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--capture", type=Path, default=Path("demo/buddha"))
+    parser.add_argument("--recipe", default="moe-gs")
+    parser.add_argument("--anchors", type=int, default=400_000)
+    parser.add_argument("--iterations", type=int, default=60)
+    parser.add_argument("--threads", type=int, default=1)
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    capture = crowded(load(args.capture), args.anchors)
+    for index in capture.train:
+        capture.frame(index)
+    rasterize = Watched(choose("auto", "cpu"))
+    recipe = RECIPES[args.recipe][1]
+    growth = replace(recipe.growth, start_stat=0, adjust=Every(1, 10**6, 25), success_threshold=0.02, grad_threshold=2e-6)
+    cfg = replace(recipe, scene=replace(recipe.scene, voxel_size=1e-4), growth=growth, iterations=30_000, max_anchors=args.anchors * 11 // 10)
+    warm_up(cfg, load(args.capture), rasterize)
+    Path("/proc/self/clear_refs").write_text("5")  # the highest level starts anew
+    level = status("VmRSS")
+    print(f"{args.recipe} on {capture.name}, {args.threads} thread(s); level after import and images {level / 1e6:.0f} MB")
+    with tempfile.TemporaryDirectory() as folder:
+        run = Run(RunConfig(cfg, Data(args.capture), stop_at=args.iterations), out=Path(folder), save_every=args.iterations // 2)
+        needed = rows = 0
+        peak = level
+        for event in train(cfg, run, capture, rasterize):  # type: ignore[arg-type]
+            if status("VmHWM") > peak:
+                peak = status("VmHWM")
+                print(f"  {(peak - level) / 1e6:8.1f} MB above it at {event}"[:150])
+            rows = event.edit.anchors if isinstance(event, Adjusted) else rows
+            if isinstance(event, Saved):
+                needed = 0
+    report(cfg, capture, rows, rasterize, status("VmHWM") - level)
+    capture.images.close()
+
+
+def warm_up(cfg, capture: Capture, rasterize: Watched) -> None:
+    """Two iterations on the capture as it is: libraries, threads and code are in memory afterwards."""
+    from scene_experts.train import iterate
+
+    training = Training.start(replace(cfg, max_anchors=0), capture, "cpu")
+    for _ in range(2):
+        iterate(training, Run(RunConfig(cfg, Data(capture.root))), capture, rasterize)  # type: ignore[arg-type]
+    capture.images.close()
+    rasterize.largest = 0
+
+
+def report(cfg, capture: Capture, rows: int, rasterize: Watched, above: int) -> None:
+    """The parts and the ratio."""
+    scene = Training.start(cfg, capture, "cpu").scene
+    columns = sum(p[:1].numel() for p in scene.table.params.values()) * max(rows, len(scene.table))
+    networks = sum(p.numel() for p in scene.network_tensors().values())
+    state = 4 * 4 * (columns + networks)
+    print(f"rows {max(rows, len(scene.table)):,}: parameters + gradients + moments {state / 1e6:.1f} MB")
+    print(f"largest frame {rasterize.largest / 1e6:.1f} MB ({rasterize.text})")
+    print(f"peak above the level {above / 1e6:.1f} MB = {above / (state + rasterize.largest):.2f} of both (asked for: at most 1.5)")
+
+
+if __name__ == "__main__":
+    main()
