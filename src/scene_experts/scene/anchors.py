@@ -143,7 +143,7 @@ class AnchorScene(nn.Module):
         with_dist = {a: a in self.config.add_dist for a in ATTRIBUTES}
         position = camera.position
         gaussians, raw, routing = native_decode.decode(
-            rows, self.table.facts["xyz"], p["feature"], p["log_scaling"], p["offsets"], position, weights, with_dist
+            rows, self.table.facts["xyz"], p["feature"], p["log_scaling"], p["offsets"], position, weights, with_dist, self.extent
         )
         return Decoded(gaussians, rows, raw, routing)
 
