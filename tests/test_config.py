@@ -34,8 +34,8 @@ def test_iterations_scale_windows_and_nothing_else():
         ({"iterations": "many"}, "config.iterations"),
         ({"unheard_of": 1}, "unheard_of"),
         ({"scene": 3}, "config.scene"),
-        ({"growth": {"scale_clamp": "never"}}, "config.growth.scale_clamp"),
-        ({"scene": {"decoder": {"type": "Transformer"}}}, "config.scene.decoder"),
+        ({"growth": {"type": "GrowAnchors", "scale_clamp": "never"}}, "config.growth.scale_clamp"),
+        ({"scene": {"type": "Anchors", "decoder": {"type": "Transformer"}}}, "config.scene.decoder"),
     ],
 )
 def test_errors_name_the_place(edit, message):

@@ -15,7 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
-from scene_experts.data.images import Source
+from scene_experts.data.images import Source, decode
 from scene_experts.data.lens import Lens
 from scene_experts.data.store import ImageStore, available_bytes
 from scene_experts.errors import InputError
@@ -48,16 +48,40 @@ def threads() -> int:
     return sum(t.name == "scene-experts images" for t in threading.enumerate())
 
 
-def test_least_recently_used_goes_first(tmp_path: Path) -> None:
+def test_what_was_used_last_goes_first(tmp_path: Path) -> None:
     store = ImageStore(sources(tmp_path, 4), cache_bytes=2 * FRAME)
     a = store.get(0)[0]
     store.get(1)
-    assert store.get(0)[0] is a
     store.get(2)  # drops 1
     assert store.get(0)[0] is a and store.used_bytes == 2 * FRAME
     (tmp_path / "1.png").unlink()
     with pytest.raises(InputError, match="no such file"):
         store.get(1)
+
+
+def test_what_comes_next_is_not_dropped(tmp_path: Path) -> None:
+    store = ImageStore(sources(tmp_path, 9), cache_bytes=6 * FRAME)
+    store.get(0)
+    store.prefetch([3, 1])
+    wait(lambda: store.used_bytes == 3 * FRAME)
+    for i in (3, 1):
+        (tmp_path / f"{i}.png").unlink()  # they can only come from memory now
+    for i in (4, 5, 6, 7, 8):
+        store.get(i)
+    for i in (3, 1):
+        np.testing.assert_array_equal(store.get(i)[0], truth(i))
+    store.close()
+
+
+def test_epochs_in_random_order_find_what_the_cache_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded = []
+    store = ImageStore(sources(tmp_path, 20), cache_bytes=10 * FRAME)
+    monkeypatch.setattr("scene_experts.data.store.decode", lambda source: decoded.append(source) or decode(source))
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        for i in rng.permutation(20):
+            store.get(int(i))
+    assert len(decoded) < 0.6 * 400  # half is the least that any rule can do
 
 
 def test_without_room_nothing_is_kept_and_all_still_works(tmp_path: Path) -> None:
@@ -115,7 +139,7 @@ def test_exit_while_busy_is_quiet_and_quick(tmp_path: Path) -> None:
         Image.fromarray(np.random.default_rng(i).integers(0, 256, (300, 300, 3)).astype(np.uint8)).save(tmp_path / f"{i}.png")
     code = f"""
 from pathlib import Path
-from scene_experts.data.images import Source
+from scene_experts.data.images import Source, decode
 from scene_experts.data.lens import Lens
 from scene_experts.data.store import ImageStore
 lens = Lens("PINHOLE", 300, 300, (200.0, 200.0, 150.0, 150.0))

@@ -15,9 +15,9 @@ LAYERS = [
     {"data", "render", "scene", "losses"},
     {"strategy"},
     {"config"},
-    {"recipes", "events", "state", "train"},
+    {"recipes", "events", "memory", "state", "train"},
     {"run_folder", "progress", "record"},
-    {"evaluate", "export", "reproduce", "view", "doctor", "bench"},
+    {"evaluate", "export", "report", "reproduce", "view", "doctor", "bench"},
     {"cli", "commands", "__main__"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

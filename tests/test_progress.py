@@ -4,8 +4,8 @@ from pathlib import Path
 from rich.console import Console
 
 from scene_experts.events import Adjusted, Finished, Saved, Started, Stepped, Stopped
-from scene_experts.progress import Progress, clock
-from scene_experts.strategy.grow import Edit
+from scene_experts.progress import Bar, Progress, clock
+from scene_experts.strategy import Edit
 
 
 def test_a_log_file_gets_plain_lines():
@@ -26,3 +26,14 @@ def test_a_log_file_gets_plain_lines():
 
 def test_clock():
     assert [clock(s) for s in (0, 59.6, 61, 3661)] == ["0:00", "1:00", "1:01", "1:01:01"]
+
+
+def test_a_bar_speaks_in_lines_where_there_is_no_terminal():
+    console = Console(file=io.StringIO(), force_terminal=False)
+    with Bar(console, every=0.0) as tell:
+        tell("rendering", 3, 9)
+    assert console.file.getvalue() == "rendering: 3 of 9\n"  # type: ignore[attr-defined]
+    quiet = Console(file=io.StringIO(), force_terminal=False)
+    with Bar(quiet) as tell:
+        tell("rendering", 3, 9)
+    assert quiet.file.getvalue() == ""  # type: ignore[attr-defined]

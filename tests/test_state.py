@@ -79,3 +79,10 @@ def test_saved_is_found_again_and_none_is_none(capture, tmp_path):
     (next(tmp_path.glob("ckpt_*"))).write_bytes(b"torn")
     with pytest.raises(InputError, match="damaged"):
         resume(training.cfg, tmp_path, "cpu")
+
+
+def test_the_first_checkpoints_still_fit():
+    """Hashes that the first release wrote; a new setting goes into LATER with the value that they were trained with."""
+    first = {"scaffold-gs": "f304f3c44732921f", "moe-gs": "536629188212acee"}
+    assert {name: config_hash(RECIPES[name][1].scaled()) for name in first} == first
+    assert config_hash(replace(RECIPES["moe-gs"][1], sparse_adam=True).scaled()) != first["moe-gs"]

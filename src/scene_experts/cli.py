@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -15,6 +16,8 @@ COMMANDS = {
     "train": "train a scene on a capture",
     "eval": "render and score the held-out views of a run",
     "compare": "one table of several runs",
+    "render": "a camera path through a run, as video or pictures",
+    "report": "one page of runs: curves, views with a slider, experts, commands",
     "export": "write a trained scene as anchor PLY or compact file",
     "import": "make a run folder of a published Scaffold-GS result or of a compact file",
     "reproduce": "the paper's tables and figures, from runs made or reused",
@@ -27,6 +30,9 @@ COMMANDS = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0 done, 1 failed, 2 unusable input."""
+    # Threads that spin while they wait take the cores that they wait for: on a busy machine a step took 5 times as long. OpenMP reads this
+    # when torch is loaded.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         return dispatch(list(sys.argv[1:] if argv is None else argv))
     except BrokenPipeError:  # the reader (`| head`) has seen enough

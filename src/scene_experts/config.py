@@ -14,10 +14,15 @@ import tyro
 from scene_experts.errors import InputError, expect_at_least
 from scene_experts.losses import Weights
 from scene_experts.scene.anchors import Anchors, Rates
+from scene_experts.scene.explicit import Explicit, ExplicitRates
+from scene_experts.scene.select import Octree
 from scene_experts.schedule import Rate
 from scene_experts.strategy.grow import GrowAnchors
+from scene_experts.strategy.grow_octree import GrowOctree
+from scene_experts.strategy.mcmc import MCMC
+from scene_experts.strategy.split_clone import SplitClone
 
-SCHEDULE = 30_000  # the iterations that all schedule constants are written for
+SCHEDULE = 30_000  # the iterations that schedule constants are written for, unless a recipe says otherwise
 LARGEST_SEED = 2**63 - 2  # torch takes signed 64 bits, and growth draws from the seed after this one
 
 
@@ -26,10 +31,10 @@ class Train:
     """A recipe with its numbers."""
 
     recipe: tyro.conf.Suppress[str]
-    scene: Anchors = Anchors()
+    scene: Anchors | Explicit = Anchors()
     loss: Weights = Weights()
-    growth: GrowAnchors = GrowAnchors()
-    rates: Rates = Rates()
+    growth: GrowAnchors | GrowOctree | SplitClone | MCMC = GrowAnchors()
+    rates: Rates | ExplicitRates = Rates()
     iterations: int = SCHEDULE
     """Length of the training. Another length rescales the whole schedule (learning rates, densification windows, warm-up)."""
     seed: int = 0
@@ -39,12 +44,16 @@ class Train:
     """Another background colour every iteration."""
     max_anchors: int = 0
     """Stop growing at this many anchors; 0 is no cap."""
+    sparse_adam: bool = False
+    """Move only what a view decoded (gsplat's SelectiveAdam): faster where views see a small part; changes results."""
+    schedule: tyro.conf.Suppress[int] = SCHEDULE
+    """The iterations that this recipe's windows are written for."""
 
     def scaled(self) -> Train:
-        """The same with every window of the schedule in iterations of this training (x iterations / 30,000)."""
+        """The same with every window of the schedule in iterations of this training (x iterations / schedule)."""
         if self.iterations < 1:
             raise InputError(f"expected at least 1 iteration, found {self.iterations}; use --iterations 30000")
-        factor = self.iterations / SCHEDULE
+        factor = self.iterations / self.schedule
         until = self.loss.opacity_until
         loss = replace(
             self.loss,
@@ -102,6 +111,12 @@ def check(cfg: Train) -> None:
         raise InputError(f"expected --seed of at most {LARGEST_SEED}, found {cfg.seed}; give a smaller number")
     cfg.scene.check()
     cfg.growth.check()
+    levels, grown = isinstance(getattr(cfg.scene, "select", None), Octree), isinstance(cfg.growth, GrowOctree)
+    if levels != grown:
+        raise InputError(
+            f"expected anchors on levels and growth by level together, found {type(cfg.growth).__name__} on a scene "
+            f"{'with' if levels else 'without'} levels; use the octree recipes"
+        )
     for name, rate in vars(cfg.rates).items():
         if isinstance(rate, Rate) and not (rate.first > 0 < rate.last or rate.first == rate.last == 0):
             flag = f"--rates.{name.replace('_', '-')}"

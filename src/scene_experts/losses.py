@@ -43,6 +43,10 @@ class Weights:
     """exclusive: eq. 7 while dense, eq. 6 after; both: their sum after."""
     load_normalise_by_k: bool = False
     """Divide eq. 6 by k, so that perfect balance is 1 for every k."""
+    mean_opacity: float = 0.0
+    """Weight of the mean opacity over all explicit Gaussians (3DGS-MCMC)."""
+    mean_size: float = 0.0
+    """Weight of the mean scale over all explicit Gaussians and axes (3DGS-MCMC)."""
     opacity_from: int = 0
     """First iteration with the opacity hinge."""
     opacity_until: int | None = None
@@ -66,6 +70,12 @@ def terms(
         out["volume"] = w.scale * volume(decoded.gaussians.scales)
     if hinge_is_on(w, step) and decoded.raw_opacity is not None:
         out["opacity"] = w.opacity * opacity_hinge(hinge_opacities(decoded, render, w), w.tau)
+    if decoded.population is not None:
+        logits, log_scales = decoded.population
+        if w.mean_opacity != 0:
+            out["mean_opacity"] = w.mean_opacity * (logits.sigmoid().sum() / max(logits.numel(), 1))
+        if w.mean_size != 0:
+            out["mean_size"] = w.mean_size * (log_scales.exp().sum() / max(log_scales.numel(), 1))
     if w.load != 0 and decoded.routing:
         out["load"] = w.load * load(decoded.routing, w)
     return out
@@ -189,8 +199,43 @@ def hinge_opacities(decoded: Decoded, render: Render, w: Weights) -> Tensor:
 
 def volume(scales: Tensor) -> Tensor:
     """Mean of sx sy sz over Gaussians [M, 3], []: Scaffold-GS's volume regulariser."""
+    if scales.device.type == "cpu" and scales.dtype == torch.float32 and _volume_library() is not None:
+        return _Volume.apply(scales) / max(len(scales), 1)
     x, y, z = scales.unbind(1)
     return (x * y * z).sum() / max(len(scales), 1)
+
+
+class _Volume(torch.autograd.Function):
+    """Sum of sx sy sz, []."""
+
+    @staticmethod
+    def forward(ctx: Any, scales: Tensor) -> Tensor:
+        scales, library = scales.detach().contiguous(), _volume_library()
+        assert library is not None
+        ctx.save_for_backward(scales)
+        partial = torch.empty(library.se_volume_chunks(len(scales)), dtype=torch.float64)
+        library.se_volume(native.pointer(scales), len(scales), native.pointer(partial), native.threads())
+        return partial.sum().float()
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
+        (scales,), library = ctx.saved_tensors, _volume_library()
+        assert library is not None
+        gradient = torch.empty_like(scales)
+        library.se_volume_backward(native.pointer(scales), len(scales), float(upstream[0]), native.pointer(gradient), native.threads())
+        return gradient
+
+
+@cache
+def _volume_library() -> ctypes.CDLL | None:
+    library = native.load()
+    if library is None or not hasattr(library, "se_volume"):  # built before this was
+        return None
+    P, L = ctypes.c_void_p, ctypes.c_int64
+    library.se_volume_chunks.argtypes, library.se_volume_chunks.restype = [L], L
+    library.se_volume.argtypes, library.se_volume.restype = [P, L, P, ctypes.c_int32], None
+    library.se_volume_backward.argtypes, library.se_volume_backward.restype = [P, L, ctypes.c_float, P, ctypes.c_int32], None
+    return library
 
 
 def opacity_hinge(raw_opacity: Tensor, tau: float = 0.0) -> Tensor:

@@ -1,4 +1,4 @@
-"""What a training says on the terminal: one line that renews itself, or plain lines where there is no terminal."""
+"""What a training, and other long work, says on the terminal: a line that renews itself, or plain lines where there is no terminal."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import time
 
 from rich.console import Console
 from rich.live import Live
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as TaskBar
 from rich.text import Text
 
 from scene_experts.events import Adjusted, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
@@ -72,6 +74,32 @@ class Progress:
 
     def say(self, text: str) -> None:
         self.console.print(text, highlight=False, soft_wrap=True)
+
+
+class Bar:
+    """How far a piece of work is: a bar on a terminal, a line now and then elsewhere. Use as a context manager and call it."""
+
+    def __init__(self, console: Console, every: float = 15.0) -> None:
+        """every: seconds between lines where there is no terminal."""
+        self.console, self.every, self.said = console, every, time.monotonic()
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        self.bar = TaskBar(*columns, console=console, transient=True)
+        self.task = self.bar.add_task("opening", total=None)
+
+    def __enter__(self) -> Bar:
+        if self.console.is_terminal:
+            self.bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.console.is_terminal:  # elsewhere it was never started, and would leave an empty line
+            self.bar.stop()
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        self.bar.update(self.task, description=what, completed=done, total=total)
+        if not self.console.is_terminal and time.monotonic() - self.said > self.every:
+            self.said = time.monotonic()
+            self.console.print(f"{what}: {done} of {total}", highlight=False, soft_wrap=True)
 
 
 def clock(seconds: float) -> str:

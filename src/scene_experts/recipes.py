@@ -1,6 +1,8 @@
 """The methods and ablations of the paper, a few lines each. No other source file knows a recipe by name.
 
-Scaffold-GS: Lu et al., CVPR 2024.  MoE-GS: Fu et al., "Scene Experts", AAAI 2026; tables and figures below are that paper's.
+3DGS: Kerbl et al., SIGGRAPH 2023.  3DGS-MCMC: Kheradmand et al., NeurIPS 2024.
+Scaffold-GS: Lu et al., CVPR 2024.  Octree-GS: Ren et al., 2024.
+MoE-GS: Fu et al., "Scene Experts", AAAI 2026; tables and figures below are that paper's.
 """
 
 from __future__ import annotations
@@ -11,7 +13,13 @@ from scene_experts.config import Train
 from scene_experts.losses import Weights
 from scene_experts.scene.anchors import Anchors
 from scene_experts.scene.experts import Experts, Router
+from scene_experts.scene.explicit import Explicit, ExplicitRates
+from scene_experts.scene.mix import FeatureBank
 from scene_experts.scene.mlp import Plain
+from scene_experts.scene.select import Octree
+from scene_experts.strategy.grow_octree import GrowOctree
+from scene_experts.strategy.mcmc import MCMC
+from scene_experts.strategy.split_clone import SplitClone
 
 ALL = ("opacity", "cov", "color")
 
@@ -21,6 +29,22 @@ moe_gs = replace(
     recipe="moe-gs",
     scene=Anchors(decoder=Experts(num=5, top_k=2, warmup=1500)),
     loss=Weights(scale=0.01, opacity=0.01, load=0.01),
+)
+octree_gs = replace(
+    scaffold_gs,
+    recipe="octree-gs",
+    scene=Anchors(decoder=Plain(), select=Octree()),
+    growth=GrowOctree(),
+    iterations=40_000,
+    schedule=40_000,
+)
+gs_3d = Train(recipe="3dgs", scene=Explicit(), loss=Weights(scale=0.0), growth=SplitClone(), rates=ExplicitRates())
+gs_mcmc = replace(
+    gs_3d,
+    recipe="3dgs-mcmc",
+    scene=Explicit(opacity=0.5, size=0.1),
+    loss=Weights(scale=0.0, mean_opacity=0.01, mean_size=0.01),
+    growth=MCMC(),
 )
 
 
@@ -36,6 +60,14 @@ def _scaffold(name: str, **scene: object) -> Train:
 RECIPES: dict[str, tuple[str, Train]] = {
     "scaffold-gs": ("Scaffold-GS: one network per attribute (the baseline)", scaffold_gs),
     "moe-gs": ("MoE-GS: five experts per attribute, Top-2 after a dense warm-up (the paper's main results)", moe_gs),
+    "3dgs": ("3DGS: explicit Gaussians with spherical harmonics, cloned, split and pruned", gs_3d),
+    "3dgs-mcmc": ("3DGS-MCMC: the same Gaussians, relocated and disturbed instead, at most a million of them", gs_mcmc),
+    "octree-gs": ("Octree-GS: anchors on levels of detail, each view using those that its distance asks for", octree_gs),
+    "octree-moe-gs": (
+        "Octree-GS with five experts per attribute, Top-2 after a dense warm-up (published nowhere)",
+        replace(octree_gs, recipe="octree-moe-gs", scene=replace(octree_gs.scene, decoder=moe_gs.scene.decoder), loss=moe_gs.loss),
+    ),
+    "scaffold-gs-bank": ("Scaffold-GS with its feature bank", _scaffold("scaffold-gs-bank", mix=FeatureBank())),
     "scaffold-gs-opacity": (
         "Scaffold-GS with the opacity hinge: the paper's 'w/o MoE' (Table 4) and Table 3, row 2",
         replace(scaffold_gs, recipe="scaffold-gs-opacity", loss=Weights(scale=0.01, opacity=0.01)),

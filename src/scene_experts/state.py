@@ -13,6 +13,7 @@ from scene_experts import checkpoint
 from scene_experts.config import Train, to_json
 from scene_experts.data.capture import Capture
 from scene_experts.errors import InputError
+from scene_experts.memory import Largest
 from scene_experts.optim import Adam
 from scene_experts.scene import Scene
 from scene_experts.table import Table
@@ -24,6 +25,7 @@ class Training:
     def __init__(self, cfg: Train, scene: Scene) -> None:
         self.cfg, self.scene = cfg, scene
         self.step = 0
+        self.largest = Largest()
         self.seconds = 0.0
         self.queue: list[int] = []
         self.capture = ""  # its fingerprint
@@ -73,8 +75,8 @@ class Training:
                 for key, value in self.optimizer.state.get(parameter, {}).items():
                     out[f"adam.{group['name']}.{i}.{key}"] = value
         out |= {"rng.torch": torch.get_rng_state(), "rng.views": self.views.get_state(), "rng.growth": self.growth.get_state()}
-        if table.facts["xyz"].is_cuda:
-            out["rng.cuda"] = torch.cuda.get_rng_state(table.facts["xyz"].device)
+        if table.device.type == "cuda":
+            out["rng.cuda"] = torch.cuda.get_rng_state(table.device)
         out["queue"] = torch.tensor(self.queue, dtype=torch.int64)
         return out
 
@@ -106,8 +108,8 @@ class Training:
                 if state:
                     training.optimizer.state[parameter] = {k: v.to(device) for k, v in state.items()}
         torch.set_rng_state(tensors["rng.torch"])
-        if "rng.cuda" in tensors and table.facts["xyz"].is_cuda:
-            torch.cuda.set_rng_state(tensors["rng.cuda"], table.facts["xyz"].device)
+        if "rng.cuda" in tensors and table.device.type == "cuda":
+            torch.cuda.set_rng_state(tensors["rng.cuda"], table.device)
         training.views.set_state(tensors["rng.views"])
         training.growth.set_state(tensors["rng.growth"])
         training.queue = tensors["queue"].tolist()
@@ -135,9 +137,31 @@ def to_device(scene: Scene, device: str, dtype: torch.dtype | None = None) -> Sc
     return scene
 
 
+LATER = {
+    "sparse_adam": False,
+    "loss.mean_opacity": 0.0,
+    "loss.mean_size": 0.0,
+    "rates.appearance": {"type": "Rate", "first": 0.05, "last": 0.0005},
+    "rates.mix": {"type": "Rate", "first": 0.01, "last": 0.00001},
+    "scene.appearance": 0,
+    "scene.mix": {"type": "OwnFeature"},
+    "scene.select": {"type": "AllAnchors"},
+    "scene.test_appearance": "mean",
+}
+"""Settings that the first checkpoints do not know, with what those were trained with: there they do not count, so such a run resumes."""
+
+
 def config_hash(cfg: Train) -> str:
     """A short hash of everything in the configuration."""
-    return hashlib.sha256(json.dumps(to_json(cfg), sort_keys=True).encode()).hexdigest()[:16]
+    plain = to_json(cfg)
+    for path, value in LATER.items():
+        *above, name = path.split(".")
+        at = plain
+        for part in above:
+            at = at.get(part, {})
+        if name in at and at[name] == value:
+            del at[name]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def save(training: Training, folder: Path, keep: int) -> Path:

@@ -37,6 +37,11 @@ class Table(nn.Module):
                 raise ValueError(f"expected an optimiser group that holds column '{name}' alone, found none")
         self._optimizer = optimizer
 
+    @property
+    def device(self) -> torch.device:
+        """Where the columns are."""
+        return next(iter(self.columns().values())).device
+
     @torch.no_grad()
     def append(self, new: dict[str, Tensor]) -> None:
         """Add rows. `new` has exactly the table's columns; statistics and Adam's moments of the new rows start at zero.
@@ -72,6 +77,18 @@ class Table(nn.Module):
         if value.shape != self.params[name].shape:
             raise ValueError(f"expected shape {tuple(self.params[name].shape)} for column '{name}', found {tuple(value.shape)}")
         self._replace(name, value.clone(), torch.zeros_like)
+
+    @torch.no_grad()
+    def overwrite(self, rows: Tensor, values: dict[str, Tensor], clear: bool = False) -> None:
+        """Overwrite `rows` [R] (each once) of some parameter columns in place; `clear`: their moments, in every column, begin anew."""
+        for name, value in values.items():
+            self.params[name].index_copy_(0, rows, value.to(self.params[name].dtype))
+        if not clear or self._optimizer is None:
+            return
+        for parameter in self.params.values():
+            for item in self._optimizer.state.get(parameter, {}).values():
+                if isinstance(item, Tensor) and item.dim() > 0:
+                    item.index_fill_(0, rows, 0.0)
 
     def _replace(self, name: str, value: Tensor, edit) -> None:
         """Put a fresh parameter (no gradient) in place, moments edited by `edit`: Adam's step counter is kept."""

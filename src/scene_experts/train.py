@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -19,8 +18,8 @@ from scene_experts.data.capture import Capture
 from scene_experts.errors import InputError, RunError
 from scene_experts.events import Adjusted, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.losses import hinge_is_on, load_dense, load_sparse, terms
+from scene_experts.memory import anchor_cap
 from scene_experts.render import Rasterizer
-from scene_experts.scene import Scene
 from scene_experts.state import Training, resume, save
 from scene_experts.strategy import Edit, Strategy
 from scene_experts.types import Decoded, Render
@@ -85,6 +84,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
         if folder and (step % run.save_every == 0 or step == total):
             yield Saved(step, save(training, folder, run.keep))
             saved = step
+        del done  # before the next frame needs its memory
     if folder and saved != training.step:
         yield Saved(training.step, save(training, folder, run.keep))
     if run.stop and training.step < total:
@@ -99,10 +99,10 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     training.step += 1
     training.set_rates()
     index, following = training.next_view(capture.train)
-    capture.images.prefetch(following)
     camera = capture.views[index].camera.to(run.device, run.dtype)
     frame = capture.frame(index)
-    target = frame.rgb.to(run.device, run.dtype) / 255.0
+    capture.images.prefetch(following)
+    target = frame.rgb.to(run.device, run.dtype).div_(255.0)
     mask = None if frame.mask is None else frame.mask.to(run.device, run.dtype)
     background = torch.rand(3, generator=training.views) if cfg.random_background else torch.tensor(capture.background)
     decoded = scene(camera, training.step, True, rasterize.visible)
@@ -113,13 +113,38 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     loss = torch.stack(list(parts.values())).sum()
     if loss.requires_grad:
         loss.backward()
-    strategy: Strategy = cast(Strategy, replace(cfg.growth, max_anchors=anchor_cap(scene, cfg.growth.max_anchors, run.max_memory)))
+    decoded, render, parts = without_graph((decoded, render, parts))
+    del loss
+    training.largest.see(decoded, render)
+    cap = anchor_cap(scene, cfg.growth.max_anchors, run.max_memory, training.largest)
+    strategy: Strategy = cast(Strategy, replace(cfg.growth, max_anchors=cap))
     strategy.observe(scene, decoded, render, training.step)
     edit = strategy.update(scene, training.step, training.growth)
-    training.optimizer.step()
+    training.optimizer.step(rows=rows_to_move(cfg, decoded) if edit is None else None)
     training.optimizer.zero_grad(set_to_none=True)
     strategy.finish(scene, training.step, training.rates(), training.growth)
     return Iteration(decoded, render, parts, target, mask, edit)
+
+
+def rows_to_move(cfg: Train, decoded: Decoded) -> Tensor | None:
+    """The rows of the table that Adam moves: those decoded, under `sparse_adam`; None for all, also where the objective reaches all."""
+    seen = len(decoded.rows)
+    everywhere = decoded.scene_opacity is not None or (decoded.population is not None and (cfg.loss.mean_opacity or cfg.loss.mean_size))
+    everywhere = everywhere or any(len(r.gates) != seen for r in decoded.routing.values())
+    return decoded.rows if cfg.sparse_adam and not everywhere else None
+
+
+def without_graph(value: Any) -> Any:
+    """The same value with every tensor in it cut from its graph, whose buffers go with the last reference to it."""
+    if isinstance(value, Tensor):
+        return value.detach()
+    if isinstance(value, (tuple, list)):
+        return type(value)(without_graph(item) for item in value)
+    if isinstance(value, dict):
+        return {name: without_graph(item) for name, item in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{f.name: without_graph(getattr(value, f.name)) for f in fields(value) if f.init})
+    return value
 
 
 def check_finite(event: Stepped) -> None:
@@ -136,9 +161,8 @@ def check_finite(event: Stepped) -> None:
 def stepped(training: Training, done: Iteration) -> Stepped:
     """The figures of the iteration just made."""
     decoded = done.decoded
-    weight = torch.ones_like(done.target[..., 0]) if done.mask is None else done.mask
-    error = (done.render.image.clamp(0, 1) - done.target).square().mean(2)
-    mse = float((error * weight).sum() / weight.sum().clamp_min(1e-12))
+    error = done.render.image.clamp(0, 1).sub_(done.target).square_()
+    mse = float(error.mean() if done.mask is None else (error.mean(2) * done.mask).sum() / done.mask.sum().clamp_min(1e-12))
     raw = decoded.raw_opacity
     shares, balance, entropy = {}, {}, {}
     for attribute, r in decoded.routing.items():
@@ -174,25 +198,3 @@ def preview(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     decoded = training.scene(camera, training.step, False, rasterize.visible)
     picture = rasterize(decoded.gaussians, camera, torch.tensor(capture.background, device=run.device, dtype=run.dtype)).image
     return Previewed(training.step, index, picture.clamp(0, 1).cpu())
-
-
-def anchor_cap(scene: Scene, cap: int, max_memory: float) -> int:
-    """The cap on anchors now: the user's own, and what still fits below `max_memory` GiB (0: no cap); see `used_bytes`."""
-    if max_memory <= 0:
-        return cap
-    n = len(scene.table)
-    columns = scene.table.columns().values()
-    per_anchor = sum(v.element_size() * v[:1].numel() * (4 if v.requires_grad else 1) for v in columns) + 4 * (2 + 2 * scene.K)
-    left = max_memory * 2**30 - used_bytes(scene.table.facts["xyz"].device)
-    room = max(0, int(left / (2 * per_anchor)))  # twice: a row edit holds old and new columns at once
-    return min(n + room, cap) if cap else max(n + room, 1)
-
-
-def used_bytes(device: torch.device) -> int:
-    """Memory that this process holds, bytes: of the GPU for a CUDA device, else resident; 0 where the system does not tell."""
-    if device.type == "cuda":
-        return torch.cuda.memory_reserved(device)
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError):
-        return 0

@@ -113,3 +113,4 @@ class Decoded:
     raw_opacity: Tensor | None  # [A, K] before masking; None for explicit scenes
     routing: dict[str, Routing]  # by attribute; empty without experts
     scene_opacity: Tensor | None = None  # [N, K] of every anchor, seen or not; only where the objective asks for it
+    population: tuple[Tensor, Tensor] | None = None  # explicit scenes: opacity logits [N], log-scales [N, 3] of every Gaussian, seen or not

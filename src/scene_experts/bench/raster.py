@@ -70,11 +70,11 @@ def figures(scene: Picture, machine: Machine, seconds: float) -> list[Result]:
         missing = Missing(GROUP, "compiled rasteriser", "the compiled CPU library is not installed")
         return [missing, *_lines(REFERENCE, best[REFERENCE], None)]
     fast = best[machine.level]
-    out: list[Result] = [*_lines(f"cpu {machine.level}", fast, (REFERENCE, best[REFERENCE]))]
+    out: list[Result] = [*_lines(machine.level, fast, (REFERENCE, best[REFERENCE]))]
     if scalar is None:
         return [*out, Missing(GROUP, f"against the {peer.NAME}", peer.WHY_NOT)]
-    out += [_ratio(f"cpu {machine.level}", fast, peer.NAME, best[peer.NAME])]
-    out += [_ratio("deterministic", best["deterministic"], f"cpu {machine.level}", fast)]
+    out += [_ratio(machine.level, fast, peer.NAME, best[peer.NAME])]
+    out += [_ratio("deterministic", best["deterministic"], machine.level, fast)]
     return out + _against_arithmetic(sum(fast), scalar.pairs, scene, machine)
 
 
@@ -95,5 +95,5 @@ def _against_arithmetic(seconds: float, pairs: int, scene: Picture, machine: Mac
     if machine.multiply_adds is None:
         return [*out, Missing(GROUP, "share of the arithmetic bound", "this build of the library has no arithmetic loop")]
     bound = pairs * (FORWARD + BACKWARD) / machine.multiply_adds
-    note = f"{FORWARD + BACKWARD} operations a pair at the multiply-add rate: {1e3 * bound:.2f} ms"
+    note = f"{FORWARD + BACKWARD} operations a pair: {1e3 * bound:.2f} ms"
     return [*out, Figure(GROUP, "share of the arithmetic bound", 100 * bound / seconds, "%", note=note)]

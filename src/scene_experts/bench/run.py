@@ -103,8 +103,7 @@ def show(machine: Machine, size: Size, results: list[Result], console: Console) 
     table = Table(box=None, pad_edge=False, show_edge=False)
     table.add_column("", no_wrap=True)
     table.add_column("measured", justify="right", no_wrap=True)
-    table.add_column("times as fast as", overflow="fold")
-    table.add_column("note", style="dim", overflow="fold")
+    table.add_column("times as fast as its peer; note")
     group = ""
     for result in results:
         if result.group != group:
@@ -112,10 +111,11 @@ def show(machine: Machine, size: Size, results: list[Result], console: Console) 
             group = result.group
             table.add_row(f"[bold]{group}[/bold]")
         if isinstance(result, Missing):
-            table.add_row(f"  {result.name}", "-", "", result.why)
+            table.add_row(f"  {result.name}", "-", result.why)
         else:
-            beside = f"{_digits(result.ratio)} x {result.peer}" if result.ratio is not None else ""
-            table.add_row(f"  {result.name}", f"{_digits(result.value)} {result.unit}", beside, result.note)
+            beside = [f"{_digits(result.ratio)} x {result.peer}"] if result.ratio is not None else []
+            notes = "; ".join([*beside, *([result.note] if result.note else [])])
+            table.add_row(f"  {result.name}", f"{_digits(result.value)} {result.unit}", notes)
     console.print(table)
 
 

@@ -9,6 +9,8 @@ HANDLERS: dict[str, tuple[str, str]] = {
     "train": ("train", "train"),
     "eval": ("evaluate", "evaluate"),
     "compare": ("evaluate", "compare"),
+    "render": ("render", "render"),
+    "report": ("report", "report"),
     "export": ("files", "export"),
     "import": ("files", "import_"),
     "reproduce": ("reproduce", "reproduce"),

@@ -37,6 +37,7 @@ class EvalCommand:
 def evaluate(args: list[str]) -> int:
     from scene_experts.evaluate.command import evaluate_run
     from scene_experts.evaluate.tables import print_results
+    from scene_experts.report import page
 
     command = tyro.cli(EvalCommand, prog=f"{PROG} eval", args=args)
     device, rasterize = backend(command.device, command.rasterizer, False, False)
@@ -52,6 +53,8 @@ def evaluate(args: list[str]) -> int:
         download=command.download_lpips,
     )
     print_results(results, Console(highlight=False), command.run)
+    if command.views == "test":
+        print(f"wrote {page.write([command.run])}")
     return 0
 
 

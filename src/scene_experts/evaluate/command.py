@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from scene_experts import run_folder
 from scene_experts.errors import InputError
 from scene_experts.evaluate.run import About, evaluate
+from scene_experts.progress import Bar
 
 if TYPE_CHECKING:
     from scene_experts.render import Rasterizer
-
-SAY_EVERY = 15.0  # seconds between lines where there is no terminal
 
 
 def evaluate_run(
@@ -50,19 +47,8 @@ def evaluate_run(
         train_seconds=opened.seconds,
         versions=opened.config.versions,
     )
-    console = Console(stderr=True)
-    said = [time.monotonic()]
-
-    def tell(what: str, done: int, total: int) -> None:
-        bar.update(task, description=what, completed=done, total=total)
-        if not console.is_terminal and time.monotonic() - said[0] > SAY_EVERY:  # a log shows no bar: a line now and then
-            said[0] = time.monotonic()
-            console.print(f"{what}: {done} of {total}", highlight=False)
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     try:
-        with Progress(*columns, console=console, transient=True) as bar:
-            task = bar.add_task("opening", total=None)
+        with Bar(Console(stderr=True)) as tell:
             return evaluate(
                 opened.scene,
                 capture,

@@ -19,11 +19,13 @@ from torch.nn import functional
 from scene_experts import native
 from scene_experts.errors import InputError, expect_at_least
 from scene_experts.geometry.neighbours import knn_d2, median_neighbour_distance
-from scene_experts.geometry.voxel import auto_voxel, to_lattice, unique_cells
+from scene_experts.geometry.voxel import auto_voxel
 from scene_experts.scene import native_decode
+from scene_experts.scene.appearance import Codes, TestRule, fold
 from scene_experts.scene.experts import Experts, MixtureHead
+from scene_experts.scene.mix import FeatureBank, OwnFeature
 from scene_experts.scene.mlp import CHANNELS, MLP, HeadWeights, Plain
-from scene_experts.scene.select import AllAnchors, Selector, visible_rows
+from scene_experts.scene.select import AllAnchors, Octree, Selector, faded, visible_rows
 from scene_experts.schedule import Rate
 from scene_experts.table import Table
 from scene_experts.types import Camera, Decoded, Gaussians, Points, Routing
@@ -54,24 +56,34 @@ class Anchors:
     decode: Literal["auto", "composed", "native"] = "auto"
     """Which implementation decodes: the fused native one where it covers the scene, or the composed torch form."""
     decoder: Plain | Experts = Plain()
+    select: AllAnchors | Octree = AllAnchors()
+    """Which anchors a camera uses."""
+    mix: OwnFeature | FeatureBank = OwnFeature()
+    """What the decoders see of an anchor's feature."""
+    appearance: int = 0
+    """Size of a code per training view that the colour network sees; 0 is none."""
+    test_appearance: TestRule = "mean"
+    """The code of a view that was not trained on: the mean of all, or (Scaffold-GS's quirk) that of the training view of the same index."""
 
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
         """One anchor per occupied voxel of the point cloud."""
-        return AnchorScene.from_points(self, points, extent)
+        return AnchorScene.from_points(self, points, extent, cameras)
 
     def load(self, table: Table, meta: dict[str, Any]) -> AnchorScene:
         """The scene of a checkpoint, its networks fresh."""
-        return AnchorScene(self, table, float(meta["voxel"]), float(meta["extent"]))
+        return AnchorScene(self, table, float(meta["voxel"]), float(meta["extent"]), self.select.restored(meta), meta.get("views", ()))
 
     def scaled(self, factor: float) -> Anchors:
         """The same in a training `factor` times as long."""
-        return replace(self, decoder=self.decoder.scaled(factor))
+        return replace(self, decoder=self.decoder.scaled(factor), select=self.select.scaled(factor))
 
     def check(self) -> None:
         """Raises InputError for settings that no training can have."""
         expect_at_least([(f"--scene.{name}", getattr(self, name), 1) for name in ("K", "F", "hidden")])
-        expect_at_least([("--scene.voxel-size", self.voxel_size, 0)])
+        expect_at_least([("--scene.voxel-size", self.voxel_size, 0), ("--scene.appearance", self.appearance, 0)])
         self.decoder.check()
+        self.select.check()
+        self.mix.check(self.F)
         unknown = {*self.add_dist, *getattr(self.decoder, "attributes", ())} - set(ATTRIBUTES)
         if unknown:
             raise InputError(f"expected attributes among {', '.join(ATTRIBUTES)}, found {', '.join(sorted(unknown))}; correct the flag")
@@ -80,47 +92,52 @@ class Anchors:
 class AnchorScene(nn.Module):
     """N anchors and three decoder heads. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], offsets [N,K,3], log_scaling [N,6]."""
 
-    def __init__(self, config: Anchors, table: Table, voxel: float, extent: float, select: Selector | None = None) -> None:
-        """voxel: edge of the finest lattice cell; extent: the scene's R; both in trained world units."""
+    def __init__(
+        self, config: Anchors, table: Table, voxel: float, extent: float, select: Selector | None = None, views: Sequence[int] = ()
+    ) -> None:
+        """voxel: edge of the finest lattice cell; extent: the scene's R; both in trained world units. views: the training cameras' ids."""
         super().__init__()
         self.config, self.table, self.voxel, self.extent = config, table, voxel, extent
         self.select = select or AllAnchors()
         heads: dict[str, nn.Module] = {}
         for attribute in ATTRIBUTES:
-            inputs = config.F + 3 + (attribute in config.add_dist)
+            inputs = config.mix.width(config.F) + 3 + (attribute in config.add_dist) + (config.appearance if attribute == "color" else 0)
             heads[attribute] = config.decoder.build(attribute, inputs, config.hidden, config.K * CHANNELS[attribute], config.F)
         self.heads: Mapping[str, MLP | MixtureHead] = nn.ModuleDict(heads)  # type: ignore[assignment]
+        self.mix = config.mix.build(config.F)
+        self.codes = Codes(config.appearance, views, config.test_appearance) if config.appearance else None
 
     @property
     def K(self) -> int:
         return self.config.K
 
     def meta(self) -> dict[str, Any]:
-        return {"voxel": self.voxel, "extent": self.extent}
+        views = {"views": list(self.codes.views)} if self.codes else {}
+        return {"voxel": self.voxel, "extent": self.extent, **self.select.meta(), **views}
 
     @classmethod
-    def from_points(cls, config: Anchors, points: Points, extent: float) -> AnchorScene:
-        """One anchor per occupied voxel of the point cloud. Raises InputError when there are no points."""
+    def from_points(cls, config: Anchors, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
+        """One anchor per occupied voxel of the point cloud (of each level). Raises InputError when there are no points."""
         if len(points.xyz) == 0:
             raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
         voxel = config.voxel_size or voxel_size(points.xyz, config.voxel_rule)
-        cells, _ = unique_cells(to_lattice(points.xyz, voxel))
-        xyz = (cells.double() * voxel).float()
-        scale = knn_d2(xyz.double()).clamp_min(1e-7).sqrt().log().float()
-        n = len(cells)
+        facts, voxel, select = config.select.begin(points.xyz, voxel, cameras)
+        scale = knn_d2(facts["xyz"].float().double()).clamp_min(1e-7).sqrt().log().float()
+        n = len(scale)
         params = {
             "feature": torch.zeros(n, config.F),
             "offsets": torch.zeros(n, config.K, 3),
             "log_scaling": scale[:, None].repeat(1, 6),
         }
-        return cls(config, Table(params, {"cell": cells, "xyz": xyz}), voxel, extent)
+        table = Table(params, {**facts, "xyz": facts["xyz"].float()})
+        return cls(config, table, voxel, extent, select, [c.id for c in cameras])
 
     def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
-        """Rows for anchors born at lattice cells [n, 3] with scaling `size` and features [n, F]; offsets start at 0."""
+        """Rows for anchors born at lattice cells [n, 3] of `level` with scaling `size` and features [n, F]; offsets start at 0."""
         n = len(cells)
+        facts = self.select.places(cells, self.voxel, level)
         return {
-            "cell": cells,
-            "xyz": (cells.double() * self.voxel).to(feature.dtype),
+            **{name: value.to(feature.dtype) if value.is_floating_point() else value for name, value in facts.items()},
             "feature": feature,
             "offsets": feature.new_zeros(n, self.K, 3),
             "log_scaling": feature.new_full((n, 6), math.log(size)),
@@ -129,9 +146,10 @@ class AnchorScene(nn.Module):
     def forward(self, camera: Camera, step: int, training: bool, cull: Callable[[Tensor, Tensor, Camera], Tensor]) -> Decoded:
         """The Gaussians that `camera` sees at `step`. `cull(means, scales, camera)` is the rasteriser's visibility test."""
         table = self.table
-        scales = table.params["log_scaling"].detach()[:, :3].exp()
+        scales = table.params["log_scaling"].detach()[:, :3].contiguous().exp()  # with gaps between its rows exp takes 7 times as long
         rows = visible_rows(self.select(table, camera, step, training), table.facts["xyz"], scales, camera, cull)
         decoded = self.decode(rows, camera, step)
+        decoded = faded(decoded, self.select.fade(table, rows, camera, step, training), len(table), self.K)
         return self.with_global_routing(decoded, step) if training else decoded
 
     def decode(self, rows: Tensor, camera: Camera, step: int) -> Decoded:
@@ -139,6 +157,8 @@ class AnchorScene(nn.Module):
         weights = self.native_weights(step)
         if weights is None:
             return self.decode_composed(rows, camera, step)
+        if self.codes is not None:
+            weights["color"] = fold(weights["color"], self.codes(camera))
         p = self.table.params
         with_dist = {a: a in self.config.add_dist for a in ATTRIBUTES}
         position = camera.position
@@ -150,7 +170,8 @@ class AnchorScene(nn.Module):
     def native_weights(self, step: int) -> dict[str, HeadWeights] | None:
         """The heads' tensors for the native decode, or None where it does not apply (another device or dtype, unusual switches)."""
         feature = self.table.params["feature"]
-        fits = feature.device.type == "cpu" and feature.dtype == torch.float32 and not self.config.quat_align and native.load() is not None
+        fits = feature.device.type == "cpu" and feature.dtype == torch.float32 and native.load() is not None
+        fits = fits and not self.config.quat_align and self.mix is None
         if self.config.decode == "composed" or not fits:
             if self.config.decode == "native":
                 why = native.why_not() or "a device, dtype or switch it has no code for"
@@ -174,12 +195,15 @@ class AnchorScene(nn.Module):
         """The definition, in plain torch: one head call per attribute, then mask, activate and place."""
         p, K = self.table.params, self.K
         feature, direction, distance = self.inputs(rows, camera)
+        seen = feature if self.mix is None else self.mix(self.table, rows, direction, distance)
         position = self.table.facts["xyz"].index_select(0, rows) / self.extent
         out: dict[str, Tensor] = {}
         routing: dict[str, Routing] = {}
         for attribute in ATTRIBUTES:
             head = self.heads[attribute]
-            x = torch.cat([feature, direction] + ([distance] if attribute in self.config.add_dist else []), dim=1)
+            x = torch.cat([seen, direction] + ([distance] if attribute in self.config.add_dist else []), dim=1)
+            if attribute == "color" and self.codes is not None:
+                x = torch.cat([x, self.codes(camera).expand(len(x), -1)], dim=1)
             if attribute == "cov" and self.config.quat_align and isinstance(head, MixtureHead):
                 out[attribute], found = head.aligned(x, feature, step, position, K)
             else:
@@ -208,7 +232,8 @@ class AnchorScene(nn.Module):
         """Raw opacities [N, K] of every anchor from `camera`, whether it sees them or not."""
         everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
         feature, direction, distance = self.inputs(everyone, camera)
-        x = torch.cat([feature, direction] + ([distance] if "opacity" in self.config.add_dist else []), dim=1)
+        seen = feature if self.mix is None else self.mix(self.table, everyone, direction, distance)
+        x = torch.cat([seen, direction] + ([distance] if "opacity" in self.config.add_dist else []), dim=1)
         return self.heads["opacity"](x, feature, step, self.table.facts["xyz"] / self.extent)[0]
 
     def routing(self, step: int) -> dict[str, Routing]:
@@ -234,11 +259,16 @@ class AnchorScene(nn.Module):
             routers = [p for name, p in named.items() if name.startswith("router")]
             if routers:
                 groups[f"{attribute}.router"] = routers
+        if self.mix is not None:
+            groups["mix"] = list(self.mix.parameters())
+        if self.codes is not None:
+            groups["appearance"] = [self.codes.table]
         return groups
 
     def network_tensors(self) -> dict[str, Tensor]:
         """Every tensor of the decoder by name (`opacity.w1`, ...), for files."""
-        return {f"{a}.{name}": p for a in ATTRIBUTES for name, p in self.heads[a].named_parameters()}  # type: ignore[attr-defined]
+        parts: dict[str, Any] = {**self.heads, "mix": self.mix, "appearance": self.codes}
+        return {f"{part}.{name}": p for part, module in parts.items() if module is not None for name, p in module.named_parameters()}
 
 
 def voxel_size(points: Tensor, rule: VoxelChoice) -> float:
@@ -259,6 +289,9 @@ class Rates:
     opacity: Rate = Rate(0.002, 0.00002)
     cov: Rate = Rate(0.004, 0.004)
     color: Rate = Rate(0.008, 0.00005)
+    mix: Rate = Rate(0.01, 0.00001)
+    """The feature bank's network."""
+    appearance: Rate = Rate(0.05, 0.0005)
     router_scale: float = 1.0
     """Routers follow their attribute's rate times this."""
 

@@ -44,11 +44,22 @@ def observe(table: Table, decoded: Decoded, render: Render) -> None:
     parts = [*columns, raw, render.mean2d_grad]
     if library is None or not all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in parts):
         return _by_torch(table.stats, decoded, render)
-    visits, opacity, grad, count = (native.pointer(t) for t in columns)
-    rows, radii, source = (t.contiguous() for t in (decoded.rows, render.radii.int(), decoded.gaussians.source))
+    visits, opacity = native.pointer(table.stats["visits"]), native.pointer(table.stats["opacity"])
+    rows = decoded.rows.contiguous()
     library.se_observe_rows(native.pointer(rows), native.pointer(raw), len(rows), raw.shape[1], visits, opacity, native.threads())
+    observe_drawn(table.stats, decoded, render)
+
+
+@torch.no_grad()
+def observe_drawn(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:
+    """Add to `grad` and `count` (one value a slot) alone what one view drew: all that explicit Gaussians need."""
+    columns, library = [stats["grad"], stats["count"]], _library()
+    parts = [*columns, render.mean2d_grad]
+    if library is None or not all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in parts):
+        return _drawn_by_torch(stats, decoded, render)
+    radii, source = render.radii.int().contiguous(), decoded.gaussians.source.contiguous()
     drawn = [native.pointer(t) for t in (radii, render.mean2d_grad, source)]
-    library.se_observe_drawn(*drawn, len(source), grad, count, native.threads())
+    library.se_observe_drawn(*drawn, len(source), *[native.pointer(t) for t in columns], native.threads())
 
 
 def _by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:
@@ -57,6 +68,10 @@ def _by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> Non
     assert decoded.raw_opacity is not None
     stats["visits"].index_add_(0, rows, torch.ones_like(rows, dtype=stats["visits"].dtype))
     stats["opacity"].index_add_(0, rows, decoded.raw_opacity.detach().clamp_min(0).sum(1))
+    _drawn_by_torch(stats, decoded, render)
+
+
+def _drawn_by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:
     drawn = (render.radii > 0).nonzero().squeeze(1)
     source = decoded.gaussians.source.index_select(0, drawn)
     norms = render.mean2d_grad.index_select(0, drawn).norm(dim=1)
@@ -69,7 +84,7 @@ def _library() -> ctypes.CDLL | None:
     library = native.load()
     if library is None or not hasattr(library, "se_observe_rows"):  # built before this file was
         return None
-    P, L, I = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32  # noqa: E741
+    P, L, I = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32
     library.se_observe_rows.argtypes = [P, P, L, L, P, P, I]
     library.se_observe_drawn.argtypes = [P, P, P, L, P, P, I]
     library.se_observe_rows.restype = library.se_observe_drawn.restype = None

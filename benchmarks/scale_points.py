@@ -1,0 +1,217 @@
+"""What benchmarks/scale.py measures at one size: a function for each axis, each run in a process of its own.
+
+A row is (what, seconds, peak): the least processor time of one thread over a few runs, and the most resident memory while it ran, in bytes
+above the level after imports and a tiny training step, everything that was alive then counted in. Either may be None.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from scene_experts import checkpoint
+from scene_experts.bench import cloud, raster, step
+from scene_experts.bench.measure import clock_for, least
+from scene_experts.config import Data, RunConfig
+from scene_experts.data.capture import load
+from scene_experts.data.colmap import Model, Posed, write_model
+from scene_experts.data.lens import Lens
+from scene_experts.data.views import World
+from scene_experts.export.run import write_compact_run
+from scene_experts.losses import photometric
+from scene_experts.render import choose
+from scene_experts.run_folder import OpenRun
+from scene_experts.state import Training, save
+from scene_experts.strategy import observe
+from scene_experts.types import Gaussians
+
+Row = tuple[str, float | None, int | None]
+WIDTH, HEIGHT = 800, 544
+BUDGET = 1.5  # seconds for the runs of one part, at least two of them
+
+
+def memory(field: str) -> int:
+    """VmRSS (now) or VmHWM (the most since the last `forget_peak`) of this process, bytes."""
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(field))
+    return 1024 * int(line.split()[1])
+
+
+def forget_peak() -> None:
+    """Start VmHWM anew at the memory held now."""
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+class Rows:
+    """Collects rows, above the level of memory at its making."""
+
+    def __init__(self) -> None:
+        step.work(step.MIXTURE, 100, 64, 48)(clock_for(1))  # torch imports more at its first step
+        self.base = memory("VmRSS")
+        self.rows: list[Row] = []
+
+    def add(self, what: str, run: Callable[[], object], again: bool = True) -> None:
+        """Time `run` (once where it changes what it works on) and note the peak."""
+        forget_peak()
+
+        def timed(clock: Callable[[], float]) -> tuple[float]:
+            began = clock()
+            run()
+            return (clock() - began,)
+
+        seconds = least({what: timed}, BUDGET, clock_for(1), None if again else {what: 1})[what][0]
+        self.note(what, seconds)
+
+    def note(self, what: str, seconds: float | None) -> None:
+        self.rows.append((what, seconds, memory("VmHWM") - self.base))
+
+
+def anchors(count: int) -> list[Row]:
+    """A moe-gs training of `count` anchors, half of them visible: its step by parts, an adjustment, saving, loading, export."""
+    rows = Rows()
+    made: list[step.Work] = []
+    rows.add("start from points", lambda: made.append(step.work(step.MIXTURE, count, WIDTH, HEIGHT)), again=False)
+    work = made[0]
+    forget_peak()
+    parts = least({"step": work}, BUDGET, clock_for(1))["step"]
+    rows.rows += [(name, seconds, None) for name, seconds in zip(step.PARTS, parts, strict=True)]
+    rows.note("whole step", sum(parts))
+    held = sum(p.numel() * p.element_size() for g in work.training.optimizer.param_groups for p in g["params"])
+    rows.rows.append(("values, moments and gradients alone", None, 4 * held))
+    statistics(work.training)
+    growth, scene = work.training.cfg.growth, work.training.scene
+    rows.add("adjustment", lambda: growth.update(scene, 1600, work.training.growth), again=False)  # type: ignore[arg-type]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rows.add("save", lambda: save(work.training, folder, 1), again=False)
+        rows.add("load", lambda: restore(work.training, folder), again=False)
+        run = OpenRun(folder, RunConfig(work.training.cfg, Data(folder)), work.training.cfg, scene, step.AT, 0.0)
+        rows.add("export compact", lambda: write_compact_run(run, World(1.0, (0.0, 0.0, 0.0)), folder / "scene.compact"), again=False)
+    return rows.rows
+
+
+def statistics(training: Training) -> None:
+    """Gradients and opacities after which about 1 % of the anchors found others and 2 % die."""
+    table, generator = training.scene.table, torch.Generator().manual_seed(1)
+    observe.start(table, training.scene.K)
+    draw = torch.rand(table.stats["grad"].shape, generator=generator)
+    table.stats["count"].fill_(50.0)
+    table.stats["grad"].copy_(torch.where(draw < 0.002, 50 * 5e-4, 50 * 1e-5))
+    table.stats["visits"].fill_(90.0)
+    table.stats["opacity"].copy_(torch.where(torch.rand(len(table), generator=generator) < 0.02, 0.1, 30.0))
+
+
+def restore(training: Training, folder: Path) -> Training:
+    path = checkpoint.latest(folder)
+    assert path is not None
+    return Training.restore(training.cfg, *checkpoint.load(path), "cpu")
+
+
+def gaussians(count: int) -> list[Row]:
+    """The rasteriser on `count` Gaussians that cover the same garden."""
+    rows = Rows()
+    return draw(rows, covering(count), loss=False)
+
+
+def covering(count: int) -> raster.Picture:
+    """The benchmark scene with every Gaussian split into as many as needed, smaller so that they cover as much."""
+    base = min(count, cloud.POINTS)
+    scene = raster.picture(base, WIDTH, HEIGHT)
+    if count <= base:
+        return scene
+    g, generator = scene.gaussians, torch.Generator().manual_seed(2)
+    rows = torch.arange(count) % base
+    scales = g.scales[rows] * (base / count) ** 0.5
+    means = g.means[rows] + torch.randn(count, 3, generator=generator) * g.scales[rows]
+    split = Gaussians(means, g.quats[rows], scales, g.opacities[rows], g.colors[rows], torch.arange(count))
+    return replace(scene, gaussians=split)
+
+
+def resolution(height: int) -> list[Row]:
+    """100,000 Gaussians and the loss on pictures of 16:9."""
+    return draw(Rows(), raster.picture(100_000, height * 16 // 9 // 2 * 2, height), loss=True)
+
+
+def draw(rows: Rows, scene: raster.Picture, loss: bool) -> list[Row]:
+    """Forward and backward of the rasteriser; L1 + SSIM where asked for."""
+    rasterize = choose("auto", "cpu")
+    forget_peak()
+    parts = least({"draw": lambda clock: raster.draw(rasterize, scene, clock)}, BUDGET, clock_for(1))["draw"]
+    for name, seconds in zip(("raster forward", "raster backward"), parts, strict=True):
+        rows.note(name, seconds)
+    with torch.no_grad():
+        rows.add("raster, no gradient", lambda: rasterize(scene.gaussians, scene.camera, torch.zeros(3)))
+    if loss:
+        target = 1 - scene.upstream
+
+        def gradient() -> None:
+            torch.stack(photometric(scene.upstream.clone().requires_grad_(), target, 0.2)).sum().backward()
+
+        rows.add("loss with gradient", gradient)
+    return rows.rows
+
+
+def views(count: int) -> list[Row]:
+    """A COLMAP capture of `count` photographs (640x424 JPEG) and a cache of 64 MiB: loading it, drawing views, one epoch of frames."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_views(folder, count)
+        rows, kept = Rows(), []
+        rows.add("load capture", lambda: kept.append(load(folder, cache_bytes=64 << 20)), again=False)
+        capture = kept[0]
+        rows.add("fingerprint", capture.fingerprint, again=False)
+        training = Training(*_small(capture))
+        rows.add("view queue, one epoch", lambda: [training.next_view(capture.train) for _ in capture.train], again=False)
+        forget_peak()
+        began = time.process_time()  # the prefetching thread counts too
+        for _ in capture.train:
+            index, following = training.next_view(capture.train)
+            capture.images.prefetch(following)
+            capture.frame(index)
+        rows.note("frames, one epoch", time.process_time() - began)
+        assert capture.images.used_bytes <= 64 << 20
+        capture.images.close()
+    return rows.rows
+
+
+def _small(capture: object) -> tuple:
+    from scene_experts.recipes import RECIPES
+
+    cfg = RECIPES[step.MIXTURE][1].scaled()
+    return cfg, cfg.scene.start(capture.points, capture.extent)  # type: ignore[attr-defined]
+
+
+def write_views(folder: Path, count: int) -> None:
+    """A ring of cameras around 20,000 points; eight different photographs under as many names as needed."""
+    rng = np.random.default_rng(0)
+    (folder / "images").mkdir()
+    smooth = rng.integers(0, 255, (8, 27, 40, 3), dtype=np.uint8)
+    for i in range(8):
+        Image.fromarray(smooth[i]).resize((640, 424), Image.Resampling.BICUBIC).save(folder / "images" / f"view_{i:05d}.jpg", quality=92)
+    posed = []
+    for i in range(count):
+        name = f"view_{i:05d}.jpg"
+        if i >= 8:
+            shutil.copyfile(folder / "images" / f"view_{i % 8:05d}.jpg", folder / "images" / name)
+        half = np.pi * i / count
+        posed.append(Posed(i + 1, name, (float(np.cos(half)), 0.0, float(np.sin(half)), 0.0), (0.0, 0.0, 4.0), 1))
+    xyz = rng.normal(size=(20_000, 3)) * 0.6
+    rgb = rng.integers(0, 255, xyz.shape, dtype=np.uint8)
+    cameras = {1: Lens("PINHOLE", 640, 424, (600.0, 600.0, 320.0, 212.0))}
+    write_model(folder / "sparse" / "0", Model(cameras, tuple(posed), np.arange(1, len(xyz) + 1), xyz, rgb, np.full(len(xyz), 0.5)))
+
+
+AXES: dict[str, Callable[[int], list[Row]]] = {"anchors": anchors, "gaussians": gaussians, "resolution": resolution, "views": views}
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    print(json.dumps(AXES[sys.argv[1]](int(sys.argv[2]))))

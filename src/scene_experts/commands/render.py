@@ -1,0 +1,145 @@
+"""`scene-experts render`: a camera path through a trained scene, as a video or as pictures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+
+from scene_experts import run_folder
+from scene_experts.cli import PROG
+from scene_experts.commands.shared import Device, Raster, backend
+from scene_experts.data.capture import Capture
+from scene_experts.errors import InputError, expect_at_least
+from scene_experts.evaluate.expert_pictures import strip
+from scene_experts.evaluate.pictures import to_8bit
+from scene_experts.progress import Bar
+from scene_experts.types import Camera
+from scene_experts.view import path_files, paths, video
+from scene_experts.view.paint import Look, Mode, paint
+from scene_experts.view.paths import CameraPath
+
+
+@dataclass(frozen=True)
+class RenderCommand:
+    """Render a camera path through a run to a video, or to a folder of PNG files."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+    out: Path | None = None
+    """FILE.mp4 (.mov, .mkv, .webm) or a folder for PNG files; RUN/renders/<path>.mp4 by default."""
+    path: str = "auto"
+    """orbit, spiral, views (through the captured poses), test (each held-out view as photographed), auto (orbit or spiral, as the
+    cameras stand), or a JSON file: ours, or nerfstudio's camera path."""
+    seconds: float = 8.0
+    """Length of orbit, spiral and views."""
+    fps: float | None = None
+    """Frames a second; 24, or what the file says."""
+    size: str | None = None
+    """WIDTHxHEIGHT in px; the training views' by default."""
+    show: tuple[Mode, ...] = ("picture",)
+    """What to show, several beside each other: picture, depth, alpha, experts, entropy, activation."""
+    attribute: Literal["opacity", "cov", "color"] = "color"
+    """Whose experts are shown."""
+    only: tuple[int, ...] = ()
+    """Draw the anchors of these experts alone, counted from 1."""
+    beside: tuple[Path, ...] = ()
+    """Other runs of the same capture to draw beside this one."""
+    save_path: Path | None = None
+    """Write the path as JSON too (nerfstudio's form if the name ends in .nerfstudio.json)."""
+    quality: int = 8
+    """Of the video, 1 to 10."""
+    data: Annotated[Path | None, tyro.conf.arg(aliases=["-s"])] = None
+    """Where the capture is now, if it moved."""
+    step: int | None = None
+    """Checkpoint to draw; the newest by default."""
+    device: Device = "auto"
+    rasterizer: Raster = "auto"
+
+
+def render(args: list[str]) -> int:
+    command = tyro.cli(RenderCommand, prog=f"{PROG} render", args=args)
+    expect_at_least([("--seconds", command.seconds, 0.01), ("--fps", command.fps or 1, 0.1), ("--quality", command.quality, 1)])
+    expect_at_least([("--only", number, 1) for number in command.only])
+    device, rasterize = backend(command.device, command.rasterizer, False, False)
+    opened = [run_folder.open_run(run, device, command.step if run == command.run else None) for run in (command.run, *command.beside)]
+    data = opened[0].config.data if command.data is None else replace(opened[0].config.data, path=command.data)
+    capture = run_folder.load_capture(data, opened[0].cfg.seed)
+    try:
+        for other in opened[1:]:
+            if other.capture and other.capture != opened[0].capture:
+                raise InputError(f"expected runs of one capture, found another in {other.path}; leave it out of --beside")
+        route = path_of(command, capture)
+        out = command.out or command.run / "renders" / f"{Path(command.path).stem}.mp4"
+        if video.is_video(out):
+            video.writer()  # says what is missing before the first frame is drawn
+        if command.save_path:
+            save = path_files.write_nerfstudio if command.save_path.name.endswith(".nerfstudio.json") else path_files.write
+            save(command.save_path, route, capture.world)
+        background = torch.tensor(capture.background, device=device)
+        with Bar(Console(stderr=True)) as tell:
+            frames = drawn(command, opened, route.cameras, rasterize, background, tell)
+            if video.is_video(out):
+                count = video.write_video(out, frames, route.fps, command.quality)
+            else:
+                count = video.write_pictures(out, frames)
+    finally:
+        capture.images.close()
+    print(f"wrote {out} ({count} frames, {count / route.fps:.1f} s)")
+    return 0
+
+
+def drawn(
+    command: RenderCommand, opened: list[Any], cameras: tuple[Camera, ...], rasterize: Any, background: torch.Tensor, tell: Bar
+) -> Iterator[np.ndarray]:
+    """The frames, each as 8-bit RGB: every run in every mode, side by side."""
+    only = tuple(number - 1 for number in command.only) or None
+    for i, camera in enumerate(cameras):
+        camera = camera.to(background.device)
+        tiles = []
+        for run in opened:
+            draw = rasterize
+            if getattr(rasterize, "antialias", run.cfg.antialias) != run.cfg.antialias:
+                draw = replace(rasterize, antialias=run.cfg.antialias)
+            tiles += [paint(run.scene, camera, run.step, draw, background, Look(mode, command.attribute, only)) for mode in command.show]
+        yield to_8bit(strip(tiles) if len(tiles) > 1 else tiles[0])
+        tell("rendering", i + 1, len(cameras))
+
+
+def path_of(command: RenderCommand, capture: Capture) -> CameraPath:
+    """The path that the flags ask for. Raises InputError for one that is none."""
+    size = size_of(command.size)
+    if path_files.is_path_file(command.path):
+        model = paths.lens([v.camera for v in capture.views], size)
+        return path_files.read(Path(command.path), capture.world, model, size, command.fps)
+    fps = command.fps or 24.0
+    if command.path == "test":
+        chosen = capture.test or capture.train
+        return CameraPath(tuple(resized(capture.views[i].camera, size) for i in chosen), command.fps or 2.0)
+    return paths.make(command.path, capture, max(1, round(command.seconds * fps)), size, fps)
+
+
+def resized(camera: Camera, size: tuple[int, int] | None) -> Camera:
+    """The camera at another size, its picture stretched with it."""
+    if size is None:
+        return camera
+    width, height = size
+    factor = torch.tensor([[width / camera.width], [height / camera.height], [1.0]])
+    return replace(camera, K=camera.K * factor, width=width, height=height)
+
+
+def size_of(text: str | None) -> tuple[int, int] | None:
+    """Width and height of "640x360". Raises InputError for anything else."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
+    if not found or not all(16 <= int(v) <= 16384 for v in found.groups()):
+        raise InputError(f"expected --size as WIDTHxHEIGHT between 16 and 16384 px, for example 640x360, found '{text}'; correct it")
+    return int(found[1]), int(found[2])

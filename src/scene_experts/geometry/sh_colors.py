@@ -1,0 +1,75 @@
+"""Colours of Gaussians from their spherical harmonics, with gradients: natively on the CPU, else the torch form of `sh.py`, the oracle.
+
+Gradients reach the harmonics and, through the viewing direction, the positions (as in 3DGS).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scene_experts import native
+from scene_experts.geometry.sh import MAX_DEGREE, sh_to_rgb
+
+
+def sh_colors(means: Tensor, dc: Tensor, rest: Tensor, rows: Tensor | None, position: Tensor, degree: int) -> Tensor:
+    """Colours max(0, harmonics + 0.5), [A, 3], of Gaussians seen from `position` [3].
+
+    means [A, 3] world; dc [N, 3] and rest [N, C - 1, 3] are the harmonics of a table, of which `rows` [A] int64 (each at most once; None:
+    A = N, all in order) belong to `means`. `rest` may hold more than `degree` (0 to 3) uses; the gradient of those is zero, not absent.
+    """
+    if not 0 <= degree <= MAX_DEGREE or rest.shape[1] < (degree + 1) ** 2 - 1:
+        raise ValueError(f"expected a degree of 0 to {MAX_DEGREE} that {rest.shape[1] + 1} coefficients hold, found {degree}")
+    fits = all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in (means, dc, rest))
+    if fits and not position.requires_grad and _library() is not None:
+        return _Colors.apply(means, dc, rest, rows, position, degree)  # type: ignore[return-value]
+    return by_torch(means, dc, rest, rows, position, degree)
+
+
+def by_torch(means: Tensor, dc: Tensor, rest: Tensor, rows: Tensor | None, position: Tensor, degree: int) -> Tensor:
+    """The same in plain torch, for any device and dtype."""
+    sh = torch.cat([dc[:, None], rest], dim=1)
+    return sh_to_rgb(sh if rows is None else sh.index_select(0, rows), means - position.to(means), degree)
+
+
+class _Colors(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, dc: Tensor, rest: Tensor, rows: Tensor | None, position: Tensor, degree: int) -> Tensor:
+        library = _library()
+        assert library is not None
+        rows = None if rows is None else rows.contiguous()
+        position = position.detach().to("cpu", torch.float32).contiguous()
+        out = torch.empty(len(means), 3)
+        inputs = [native.pointer(t) for t in (means.detach(), dc.detach(), rest.detach(), rows)]
+        library.se_sh_forward(*inputs, len(means), rest.shape[1], degree, native.pointer(position), native.pointer(out), native.threads())
+        ctx.save_for_backward(means, dc, rest, rows, position, out)
+        ctx.degree = degree
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, upstream: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        means, dc, rest, rows, position, out = ctx.saved_tensors
+        library = _library()
+        assert library is not None
+        d_means, d_dc, d_rest = torch.empty_like(means), torch.zeros_like(dc), torch.zeros_like(rest)
+        tensors = [means, dc, rest, rows, position, out, upstream.contiguous(), d_means, d_dc, d_rest]
+        where = [native.pointer(None if t is None else t.detach()) for t in tensors]
+        library.se_sh_backward(*where, len(means), rest.shape[1], ctx.degree, native.threads())
+        return d_means, d_dc, d_rest, None, None, None
+
+
+@functools.cache
+def _library(level: str | None = None) -> ctypes.CDLL | None:
+    library = native.load(level)
+    if library is None or not hasattr(library, "se_sh_forward"):  # built before this file was
+        return None
+    P, L, I = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32
+    library.se_sh_forward.argtypes = [P, P, P, P, L, L, I, P, P, I]
+    library.se_sh_backward.argtypes = [P] * 10 + [L, L, I, I]
+    library.se_sh_forward.restype = library.se_sh_backward.restype = None
+    return library

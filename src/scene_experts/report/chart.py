@@ -1,0 +1,120 @@
+"""Line charts and share bars as inline SVG, small enough to read in a page's source."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#b8a800")
+WIDTH, HEIGHT, LEFT, BOTTOM, TOP, RIGHT = 420, 230, 52, 30, 10, 10
+MOST = 400  # points of a line
+
+
+@dataclass(frozen=True)
+class Line:
+    """A named series of (x, y)."""
+
+    name: str
+    points: Sequence[tuple[float, float]]
+
+
+def lines(title: str, series: Sequence[Line], unit: str = "", log: bool = False) -> str:
+    """A chart of several lines over the iterations; empty where no line has two finite points."""
+    shown = []
+    for line in series:
+        points = [(x, y) for x, y in line.points if math.isfinite(x) and math.isfinite(y) and (y > 0 or not log)]
+        if len(points) > 1:
+            shown.append(Line(line.name, thinned(points)))
+    if not shown:
+        return ""
+    xs = [x for line in shown for x, _ in line.points]
+    ys = [math.log10(y) if log else y for line in shown for _, y in line.points]
+    x0, x1 = min(xs), max(xs)
+    y0, y1 = padded(min(ys), max(ys))
+    to_x = lambda x: LEFT + (x - x0) / max(x1 - x0, 1e-12) * (WIDTH - LEFT - RIGHT)  # noqa: E731
+    to_y = lambda y: HEIGHT - BOTTOM - (y - y0) / max(y1 - y0, 1e-12) * (HEIGHT - BOTTOM - TOP)  # noqa: E731
+    parts = [f"<figure><figcaption>{escape(title)}{f', {escape(unit)}' if unit else ''}</figcaption>"]
+    parts.append(f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">')
+    for y in log_ticks(y0, y1) if log else ticks(y0, y1):
+        text = label(10**y if log else y)
+        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{to_y(y):.1f}" y2="{to_y(y):.1f}"/>')
+        parts.append(f'<text x="{LEFT - 5}" y="{to_y(y) + 4:.1f}" text-anchor="end">{text}</text>')
+    for x in ticks(x0, x1, 4):
+        parts.append(f'<text x="{to_x(x):.1f}" y="{HEIGHT - 10}" text-anchor="middle">{label(x)}</text>')
+    for i, line in enumerate(shown):
+        path = " ".join(f"{to_x(x):.1f},{to_y(math.log10(y) if log else y):.1f}" for x, y in line.points)
+        colour = COLOURS[i % len(COLOURS)]
+        parts.append(
+            f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.5"><title>{escape(line.name)}</title></polyline>'
+        )
+    parts.append("</svg>")
+    if len(shown) > 1:
+        parts.append(legend([line.name for line in shown]))
+    return "".join([*parts, "</figure>"])
+
+
+def legend(names: Sequence[str]) -> str:
+    items = [f'<span><i style="background:{COLOURS[i % len(COLOURS)]}"></i>{escape(name)}</span>' for i, name in enumerate(names)]
+    return f'<div class="legend">{"".join(items)}</div>'
+
+
+def bars(title: str, shares: Sequence[float]) -> str:
+    """One bar cut into shares (which sum to 1), each with its percentage."""
+    cells = []
+    for i, share in enumerate(shares):
+        style = f"width:{100 * share:.2f}%;background:{COLOURS[i % len(COLOURS)]}"
+        cells.append(f'<span style="{style}" title="expert {i + 1}: {share:.1%}">{share:.0%}</span>')
+    return f'<div class="bar"><b>{escape(title)}</b><div>{"".join(cells)}</div></div>'
+
+
+def thinned(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """At most MOST points: means of as many equal stretches."""
+    if len(points) <= MOST:
+        return list(points)
+    out = []
+    for i in range(MOST):
+        part = points[i * len(points) // MOST : (i + 1) * len(points) // MOST]
+        out.append((sum(x for x, _ in part) / len(part), sum(y for _, y in part) / len(part)))
+    return out
+
+
+def smoothed(points: Sequence[tuple[float, float]], window: int = 15) -> list[tuple[float, float]]:
+    """A running mean: single views differ more than iterations do."""
+    out, total = [], 0.0
+    for i, (x, y) in enumerate(points):
+        total += y - (points[i - window][1] if i >= window else 0.0)
+        out.append((x, total / min(i + 1, window)))
+    return out
+
+
+def padded(low: float, high: float) -> tuple[float, float]:
+    margin = 0.05 * (high - low) or max(abs(high), 1.0) * 0.05
+    return low - margin, high + margin
+
+
+def ticks(low: float, high: float, count: int = 5) -> list[float]:
+    """Round numbers between two ends."""
+    span = max(high - low, 1e-12)
+    step = 10 ** math.floor(math.log10(span / count))
+    step *= next(m for m in (1, 2, 5, 10) if span / (step * m) <= count)
+    first = math.ceil(low / step) * step
+    return [first + i * step for i in range(int((high - first) / step) + 1)]
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """Logarithms of round numbers between two logarithms: 1, 2, 5 a decade, or every so many decades where there are many."""
+    decades = range(math.floor(low), math.ceil(high) + 1)
+    every = max(1, math.ceil(len(decades) / 6))
+    factors = (1, 2, 5) if len(decades) <= 4 else (1,)
+    found = [e + math.log10(m) for e in decades[::every] for m in factors]
+    return [value for value in found if low <= value <= high]
+
+
+def label(value: float) -> str:
+    if abs(value) >= 1_000_000:
+        return f"{value / 1e6:g}M"
+    if 0 < abs(value) < 1e-3:
+        return f"{value:.0e}".replace("e-0", "e-")
+    return f"{value / 1e3:g}k" if abs(value) >= 10_000 else f"{round(value, 10):.4g}"

@@ -1,0 +1,228 @@
+"""Builds the page from run folders: figures, curves, held-out views with a slider, experts, configuration, the command that repeats it."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from PIL import Image
+
+from scene_experts import run_folder
+from scene_experts.config import RunConfig, to_json
+from scene_experts.errors import InputError
+from scene_experts.evaluate.tables import Table, load_results, table
+from scene_experts.io import read_json, write_bytes
+from scene_experts.report import chart
+from scene_experts.report.chart import Line
+
+NAME = "report.html"
+MOST_VIEWS = 8  # pictures are most of a page's bytes
+LONGEST = 960  # px; larger pictures are made smaller for the page
+QUALITY = 88  # of its JPEGs
+
+
+@dataclass(frozen=True)
+class Source:
+    """What the page says of one run."""
+
+    name: str
+    path: Path
+    config: RunConfig
+    results: dict[str, Any]
+    per_view: dict[str, dict[str, Any]]
+    metrics: list[dict[str, Any]]
+
+
+def write(runs: Sequence[Path], out: Path | None = None) -> Path:
+    """Write the page of evaluated runs; RUN/report.html by default for one. Raises InputError where one was not evaluated."""
+    if not runs:
+        raise InputError("expected at least one run folder, found none; name the folders that `scene-experts train --out` wrote")
+    if out is None and len(runs) > 1:
+        raise InputError("expected --out FILE.html for the page of several runs, found none; give one")
+    sources = named([source(run) for run in runs])
+    path = out or runs[0] / NAME
+    write_bytes(path, page(sources).encode())
+    return path
+
+
+def source(run: Path) -> Source:
+    """Reads a run folder."""
+    config, results = run_folder.read_config(run), load_results(run)
+    per_view = read_json(run / "per_view.json", "scores by view") if (run / "per_view.json").is_file() else {}
+    return Source(config.train.recipe, run, config, results, per_view, metrics(run / "metrics.jsonl"))
+
+
+def named(sources: list[Source]) -> list[Source]:
+    """Names that tell the runs apart: the recipe, with the folder's name where recipes repeat."""
+    names = [s.name for s in sources]
+    if len(set(names)) == len(names):
+        return sources
+    return [Source(f"{s.name} ({s.path.resolve().name})", s.path, s.config, s.results, s.per_view, s.metrics) for s in sources]
+
+
+def metrics(path: Path) -> list[dict[str, Any]]:
+    """The lines of a training's metrics that are whole."""
+    out = []
+    for line in path.read_text().splitlines() if path.is_file() else []:
+        try:
+            found = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(found, dict) and "step" in found:
+            out.append(found)
+    return out
+
+
+def page(sources: Sequence[Source]) -> str:
+    first = sources[0]
+    title = f"{', '.join(s.name for s in sources)} on {first.results.get('capture', '?')}"
+    r = first.results
+    facts = f"{r.get('view_count')} {r.get('views')} views ({r.get('split')}), {r.get('resolution')}, {r.get('step'):,} iterations"
+    views, pictures = held_out(sources)
+    parts = [
+        f"<h1>{escape(title)}</h1><p class='soft'>{escape(facts)}</p>",
+        figures(table([s.name for s in sources], [s.results for s in sources])),
+        "<h2>Held-out views</h2><p class='soft'>Move over a picture, or drag the slider.</p>",
+        f"<div class='views'>{views}</div>" if views else "<p>no pictures in this run folder</p>",
+        "<h2>Training</h2>",
+        f"<div class='charts'>{curves(sources)}</div>",
+        experts(sources),
+        "<h2>Scores by view</h2>",
+        by_view(sources),
+        "<h2>To repeat</h2>",
+        *(command(s) for s in sources),
+        f"<script>const pictures = {json.dumps(pictures)};</script>",
+    ]
+    template = Template(files("scene_experts.report").joinpath("page.html").read_text())
+    return template.safe_substitute(title=escape(title), body="\n".join(parts))
+
+
+def figures(found: Table) -> str:
+    head = "".join(f"<th>{escape(t)}</th>" for t in found.titles)
+    rows = []
+    for i, row in enumerate(found.rows):
+        cells = [f"<td{' class=best' if (i, j) in found.best else ''}>{escape(cell)}</td>" for j, cell in enumerate(row)]
+        rows.append(f"<tr>{''.join(cells)}</tr>")
+    notes = "".join(f"<p class='soft'>{escape(note)}</p>" for note in found.notes)
+    return f"<div class='wide'><table><tr>{head}</tr>{''.join(rows)}</table></div>{notes}"
+
+
+def held_out(sources: Sequence[Source]) -> tuple[str, dict[str, str]]:
+    """The views with their sliders, and every picture they can show as a data address by key."""
+    pictures: dict[str, str] = {}
+    blocks = []
+    names = [name for name in sources[0].per_view if all(name in s.per_view for s in sources)]
+    step = max(1, -(-len(names) // MOST_VIEWS))
+    for n, name in enumerate(names[::step]):
+        options = [("photograph", sources[0].path / "test" / "gt" / sources[0].per_view[name]["file"])]
+        options += [(s.name, s.path / "test" / "renders" / s.per_view[name]["file"]) for s in sources]
+        options += [(f"{s.name}, error", s.path / "test" / "errors" / s.per_view[name]["file"]) for s in sources]
+        present = [(label, path) for label, path in options if path.is_file()]
+        if len(present) < 2:
+            continue
+        for i, (_, path) in enumerate(present):
+            pictures[f"{n}.{i}"] = encoded(path)
+        scores = ", ".join(f"{s.name} {s.per_view[name]['psnr']:.2f} dB" for s in sources if "psnr" in s.per_view[name])
+        pick = [
+            "".join(
+                f"<option value='{n}.{i}'{' selected' if i == wanted else ''}>{escape(label)}</option>"
+                for i, (label, _) in enumerate(present)
+            )
+            for wanted in (0, 1)
+        ]
+        blocks.append(
+            f"<div class='view'><div class='pick'><b>{escape(name)}</b><span class='soft'>{escape(scores)}</span>"
+            f"<label>left <select>{pick[0]}</select></label><label>right <select>{pick[1]}</select></label></div>"
+            f"<div class='stage'><img alt='left'><img class='over' alt='right'><span class='edge'></span></div>"
+            f"<input type='range' min='0' max='100' value='50' aria-label='where the pictures meet'></div>"
+        )
+    return "\n".join(blocks), pictures
+
+
+def encoded(path: Path) -> str:
+    """A picture as a data address: JPEG, at most LONGEST px."""
+    with Image.open(path) as opened:
+        picture = opened.convert("RGB")
+    picture.thumbnail((LONGEST, LONGEST), Image.Resampling.LANCZOS)
+    stream = io.BytesIO()
+    picture.save(stream, format="JPEG", quality=QUALITY)
+    return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
+
+
+def curves(sources: Sequence[Source]) -> str:
+    """Charts over the training: PSNR, losses, anchors, active share, visible anchors, speed."""
+
+    def series(key: str, factor: float = 1.0, smooth: bool = True) -> list[Line]:
+        out = []
+        for s in sources:
+            points = [(m["step"], m[key] * factor) for m in s.metrics if isinstance(m.get(key), (int, float)) and "psnr" in m]
+            out.append(Line(s.name, chart.smoothed(points) if smooth else points))
+        return out
+
+    parts = [chart.lines("PSNR of training views", series("psnr"), "dB")]
+    terms = sorted({t for s in sources for m in s.metrics for t in m.get("terms", {})})
+    for term in terms:
+        lines = [
+            Line(s.name, chart.smoothed([(m["step"], m["terms"][term]) for m in s.metrics if term in m.get("terms", {})])) for s in sources
+        ]
+        parts.append(chart.lines(f"loss: {term}", lines, "weighted, log", log=True))
+    parts += [
+        chart.lines("anchors", series("anchors", smooth=False)),
+        chart.lines("Gaussians drawn", series("gaussians")),
+        chart.lines("active Gaussians", series("active", 100), "%"),
+        chart.lines("training time", series("seconds", 1 / 60, smooth=False), "minutes"),
+    ]
+    return "".join(parts)
+
+
+def experts(sources: Sequence[Source]) -> str:
+    """How anchors are shared: bars at the end, lines over the training, gate entropy. Empty without experts."""
+    bars, charts = [], []
+    for s in sources:
+        for attribute, shares in (s.results.get("experts") or {}).items():
+            values = shares.get("share") or shares.get("mean_gate")
+            if values:
+                bars.append(chart.bars(f"{s.name}: {attribute}", values))
+            routed = [(m["step"], m["routing"][attribute]) for m in s.metrics if attribute in m.get("routing", {})]
+            lines = [Line(f"expert {e + 1}", [(x, 100 * v[e]) for x, v in routed]) for e in range(len(routed[0][1]))] if routed else []
+            charts.append(chart.lines(f"{s.name}: share of {attribute}", lines, "%"))
+        entropy = sorted({a for m in s.metrics for a in m.get("entropy", {})})
+        lines = [Line(a, [(m["step"], m["entropy"][a]) for m in s.metrics if a in m.get("entropy", {})]) for a in entropy]
+        charts.append(chart.lines(f"{s.name}: gate entropy (1: all experts alike)", lines))
+    if not bars:
+        return ""
+    note = "<p class='soft'>Share of the assignments of all anchors (of the gates, while dense); equal shares are perfect balance.</p>"
+    return f"<h2>Experts</h2>{note}{''.join(bars)}<div class='charts'>{''.join(charts)}</div>"
+
+
+def by_view(sources: Sequence[Source]) -> str:
+    rows = []
+    for name in sources[0].per_view:
+        cells = []
+        for s in sources:
+            facts = s.per_view.get(name, {})
+            cells += [
+                f"<td>{facts[k]:.{d}f}</td>" if facts.get(k) is not None else "<td>-</td>"
+                for k, d in (("psnr", 2), ("ssim", 3), ("lpips", 3))
+            ]
+        rows.append(f"<tr><td>{escape(name)}</td>{''.join(cells)}</tr>")
+    head = "".join(f"<th>PSNR {escape(s.name)}</th><th>SSIM</th><th>LPIPS</th>" for s in sources)
+    return f"<div class='wide'><table><tr><th>view</th>{head}</tr>{''.join(rows)}</table></div>"
+
+
+def command(s: Source) -> str:
+    """The exact command, and everything the run was made of."""
+    line = s.config.command or "made by another program; see the configuration"
+    config = json.dumps(to_json(s.config), indent=1)
+    return (
+        f"<p><b>{escape(s.name)}</b></p><pre>{escape(line)}</pre>"
+        f"<details><summary>configuration and versions</summary><pre>{escape(config)}</pre></details>"
+    )

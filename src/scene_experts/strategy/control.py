@@ -1,0 +1,86 @@
+"""What density control of every anchor method has in common: when it counts, when it acts, and which anchors it removes (Scaffold-GS)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, Self
+
+import torch
+
+from scene_experts.errors import expect_at_least
+from scene_experts.scene.anchors import AnchorScene
+from scene_experts.schedule import Every
+from scene_experts.strategy import Edit, observe
+from scene_experts.types import Decoded, Render
+
+
+@dataclass(frozen=True)
+class AnchorControl:
+    """Hyper-parameters of density control; its memory is in `table.stats`. A method adds `grow`."""
+
+    start_stat: int = 500
+    adjust: Every = Every(1500, 15_000, 100)
+    """Adjust at multiples of `interval` strictly inside (start, stop); statistics are kept from start_stat to stop."""
+    grad_threshold: float = 0.0002
+    success_threshold: float = 0.8
+    min_opacity: float = 0.005
+    scale_clamp: Literal["log0.05", "linear0.05", "off"] = "log0.05"
+    """After each adjustment, Gaussian size bounds (log-scaling 3..5) are held below 0.05 in log or linear units."""
+    max_anchors: int = 0
+    """Never more anchors than this; 0 is no cap. The largest gradients go first."""
+    enabled: bool = True
+
+    def scaled(self, factor: float) -> Self:
+        """The same in a training `factor` times as long: windows scale; interval, gates and thresholds stay."""
+        return replace(self, start_stat=round(self.start_stat * factor), adjust=self.adjust.scaled(factor))
+
+    def check(self) -> None:
+        """Raises InputError for numbers that no training can have."""
+        expect_at_least([("--growth.adjust.interval", self.adjust.interval, 1), ("--growth.max-anchors", self.max_anchors, 0)])
+
+    def finish(self, scene: AnchorScene, step: int, rates: dict[str, float], generator: torch.Generator) -> None:
+        """Nothing is left to do after the optimiser's step."""
+
+    def observe(self, scene: AnchorScene, decoded: Decoded, render: Render, step: int) -> None:
+        """Count one view, after its backward pass."""
+        if not self.enabled or not self.start_stat < step < self.adjust.stop:
+            return
+        if "visits" not in scene.table.stats:
+            observe.start(scene.table, scene.K)
+        observe.observe(scene.table, decoded, render)
+
+    def update(self, scene: AnchorScene, step: int, generator: torch.Generator) -> Edit | None:
+        """Grow and prune when due. `generator` draws the random elimination."""
+        if step >= self.adjust.stop:
+            observe.stop(scene.table)
+        if not self.enabled or not self.adjust.due(step) or "visits" not in scene.table.stats:
+            return None
+        grown, capped = self.grow(scene, generator, step)
+        pruned = self.prune(scene)
+        for column in scene.table.params.values():
+            column.grad = None  # Scaffold-GS's anchors miss the step of an adjustment, whether it changed a row or not
+        return Edit(grown, pruned, len(scene.table), capped)
+
+    def grow(self, scene: AnchorScene, generator: torch.Generator, step: int = 0) -> tuple[int, bool]:
+        """Found anchors. Returns how many, and whether the cap held some back."""
+        raise NotImplementedError
+
+    def gate(self) -> float:
+        """Slots drawn more often than this may found anchors: 40 of 100."""
+        return self.adjust.interval * self.success_threshold * 0.5
+
+    @torch.no_grad()
+    def prune(self, scene: AnchorScene) -> int:
+        """Remove anchors seen often enough and found faint; start the count of the well-seen ones anew; clamp sizes."""
+        table = scene.table
+        seen = table.stats["visits"] > self.adjust.interval * self.success_threshold  # 80 of 100
+        faint = seen & (table.stats["opacity"] < self.min_opacity * table.stats["visits"])
+        for name in ("visits", "opacity"):
+            table.stats[name][seen] = 0.0
+        pruned = int(faint.sum())
+        if pruned:
+            table.keep(~faint)
+        if self.scale_clamp != "off":
+            table.params["log_scaling"][:, 3:].clamp_(max=0.05 if self.scale_clamp == "log0.05" else math.log(0.05))
+        return pruned

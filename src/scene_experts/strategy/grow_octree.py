@@ -1,0 +1,100 @@
+"""Growing anchors on the levels of an octree (Octree-GS).
+
+Offsets with a middling mean 2D gradient found anchors on their parent's level, those with a large one on the next finer level. Anchors
+whose gradients are large on average also ask for finer levels from then on. Removal is Scaffold-GS's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from scene_experts.errors import InputError
+from scene_experts.scene.anchors import AnchorScene
+from scene_experts.scene.levels import Levels
+from scene_experts.scene.select import LevelSelector
+from scene_experts.schedule import Every
+from scene_experts.strategy.control import AnchorControl
+from scene_experts.strategy.grow import empty_cells, slot_points, strongest
+
+
+@dataclass(frozen=True)
+class GrowOctree(AnchorControl):
+    """Octree-GS's rule: thresholds rise by u = fork^update_ratio a level."""
+
+    adjust: Every = Every(1500, 25_000, 100)
+    update_ratio: float = 0.2
+    extra_ratio: float = 0.25
+    """Anchors whose mean gradient reaches this part of their level's threshold ask for finer levels."""
+    extra_up: float = 0.01
+    """By so much of a level, each adjustment."""
+    parity_coarse_gate: bool = False
+    """Octree-GS's bug: finer levels grow, and are asked for, before the coarse phase has ended."""
+    parity_extra_level: bool = False
+    """Octree-GS's bug: an anchor is asked about once for every level, and not for its own alone."""
+
+    def check(self) -> None:
+        """Raises InputError for numbers that no training can have."""
+        super().check()
+        if not self.update_ratio >= 0:
+            raise InputError(f"expected --growth.update-ratio of at least 0, found {self.update_ratio}; give a larger number")
+
+    @torch.no_grad()
+    def grow(self, scene: AnchorScene, generator: torch.Generator, step: int = 0) -> tuple[int, bool]:
+        """Found anchors level by level, coarse to fine. Returns how many, and whether the cap held some back."""
+        assert isinstance(scene.select, LevelSelector)
+        table, levels = scene.table, scene.select.lattices
+        refine = self.parity_coarse_gate or not scene.select.coarse(step)
+        eligible, g, mean = self.gradients(table.stats)
+        slots = (g.view(-1) >= self.grad_threshold).nonzero().squeeze(1)  # level 0's threshold is the lowest
+        strength, parents = g.view(-1).index_select(0, slots), torch.div(slots, scene.K, rounding_mode="floor")
+        points, own = slot_points(table, slots, parents), table.facts["level"].index_select(0, parents)
+        cells = [table.facts["cell"][table.facts["level"] == level] for level in range(levels.count)]
+        rows: list[dict[str, Tensor]] = []
+        born, capped = 0, False
+        for level in range(levels.count):
+            low, high = self.threshold(level, levels), self.threshold(level + 1, levels)
+            targets = [(level, (own == level) & (strength >= low) & (strength < high))]
+            if refine and level + 1 < levels.count and len(cells[level + 1]):
+                targets.append((level + 1, (own == level) & (strength >= high)))
+            for target, chosen in targets:
+                place = levels.units(points[chosen], target)
+                found = empty_cells(table.params["feature"], cells[target], place, parents[chosen], strength[chosen], 1)
+                if found is None:
+                    continue
+                keep = levels.wanted(levels.positions(found[0], target).float(), torch.full_like(found[0][:, 0], target))
+                new, feature, force = (t[keep] for t in found)
+                best = strongest(force, self.max_anchors, len(table) + born)
+                capped |= len(best) < len(new)
+                new, feature = new[best], feature[best]
+                if len(new):
+                    feature = feature if target == level else torch.zeros_like(feature)
+                    rows.append(scene.new_rows(new, levels.size(target), feature, target))
+                    cells[target], born = torch.cat([cells[target], new]), born + len(new)
+        if refine:
+            table.facts["extra_level"] = table.facts["extra_level"] + self.extra(mean, table.facts["level"], levels)
+        for name in ("grad", "count"):
+            table.stats[name].masked_fill_(eligible, 0.0)
+        if rows:
+            table.append({name: torch.cat([row[name] for row in rows]) for name in rows[0]})
+        return born, capped
+
+    def gradients(self, stats: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Eligible slots [N, K] (bool), their mean gradients [N, K] (0 elsewhere), and the anchors' means [N] over eligible slots."""
+        eligible = stats["count"] > self.gate()
+        g = torch.where(eligible, stats["grad"] / stats["count"].clamp_min(1), 0.0)
+        return eligible, g, g.sum(1) / (eligible.sum(1) + 1e-6)
+
+    def threshold(self, level: int, levels: Levels) -> float:
+        """The gradient from which slots of `level` found anchors; from the next level's on, they found them there."""
+        return self.grad_threshold * float(levels.fork) ** (self.update_ratio * level)
+
+    def extra(self, mean: Tensor, level: Tensor, levels: Levels) -> Tensor:
+        """What is added [N] to the level that anchors of mean gradient `mean` [N] ask for."""
+        thresholds = self.extra_ratio * mean.new_tensor([self.threshold(i, levels) for i in range(levels.count)])
+        if self.parity_extra_level:
+            times = sum(((mean >= thresholds[int(i)]).to(mean.dtype) for i in level.unique()), start=torch.zeros_like(mean))
+            return self.extra_up * times
+        return self.extra_up * (mean >= thresholds[level]).to(mean.dtype)

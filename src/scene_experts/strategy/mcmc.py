@@ -1,0 +1,145 @@
+"""Density control as sampling (3DGS as Markov chain Monte Carlo, Kheradmand et al. 2024): relocate the dead, add, disturb.
+
+The two regularisers that belong to it are loss weights: `Weights.mean_opacity` and `Weights.mean_size`.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from scene_experts.errors import expect_at_least
+from scene_experts.geometry.rotation import normalise_quats, quat_to_matrix
+from scene_experts.scene.explicit import GaussianScene
+from scene_experts.schedule import Every
+from scene_experts.strategy import Edit
+from scene_experts.types import Decoded, Render
+
+MOST = 51  # Gaussians that one is shared among at most
+_SHARP = 100.0  # how steeply the noise fades with opacity
+
+
+@dataclass(frozen=True)
+class MCMC:
+    """Hyper-parameters of density control by sampling; it keeps no statistics."""
+
+    adjust: Every = Every(500, 25_000, 100)
+    """Relocate and add at multiples of `interval` strictly inside (start, stop)."""
+    min_opacity: float = 0.005
+    """Gaussians this faint are dead: they move to where others are."""
+    growth: float = 1.05
+    """An adjustment adds Gaussians up to this many times those there are."""
+    noise: float = 500_000.0
+    """Size of the noise on positions, times their learning rate; 0 is none."""
+    max_anchors: int = 1_000_000
+    """Never more Gaussians than this; 0 is no cap."""
+    enabled: bool = True
+
+    def scaled(self, factor: float) -> MCMC:
+        """The same in a training `factor` times as long: the window scales; the interval stays."""
+        return replace(self, adjust=self.adjust.scaled(factor))
+
+    def check(self) -> None:
+        """Raises InputError for numbers that no training can have."""
+        expect_at_least(
+            [
+                ("--growth.adjust.interval", self.adjust.interval, 1),
+                ("--growth.growth", self.growth, 1),
+                ("--growth.noise", self.noise, 0),
+                ("--growth.max-anchors", self.max_anchors, 0),
+            ]
+        )
+
+    def observe(self, scene: GaussianScene, decoded: Decoded, render: Render, step: int) -> None:
+        """Nothing is counted."""
+
+    def update(self, scene: GaussianScene, step: int, generator: torch.Generator) -> Edit | None:
+        """Relocate and add when due. `generator` draws who is shared."""
+        if not self.enabled or not self.adjust.due(step) or len(scene.table) == 0:
+            return None
+        self.relocate(scene, generator)
+        grown, capped = self.add(scene, generator)
+        for column in scene.table.params.values():
+            column.grad = None  # as in 3DGS, Gaussians miss the step of an adjustment
+        return Edit(grown, 0, len(scene.table), capped)
+
+    @torch.no_grad()
+    def relocate(self, scene: GaussianScene, generator: torch.Generator) -> int:
+        """Every dead Gaussian becomes a share of a live one, drawn by opacity. Returns how many were dead."""
+        table = scene.table
+        opacity = table.params["raw_opacity"].sigmoid()
+        dead = (opacity <= self.min_opacity).nonzero().squeeze(1)
+        if not 0 < len(dead) < len(table):
+            return 0
+        weight = torch.where(opacity <= self.min_opacity, 0.0, opacity)
+        sources = draw(weight, len(dead), generator)
+        self.share(scene, sources)
+        table.overwrite(dead, {name: column.index_select(0, sources) for name, column in table.params.items()})
+        return len(dead)
+
+    @torch.no_grad()
+    def add(self, scene: GaussianScene, generator: torch.Generator) -> tuple[int, bool]:
+        """Add shares of Gaussians drawn by opacity. Returns how many, and whether the cap held some back."""
+        table, n = scene.table, len(scene.table)
+        wanted = int(self.growth * n)
+        target = min(self.max_anchors, wanted) if self.max_anchors else wanted
+        if target <= n:
+            return 0, target < wanted
+        sources = draw(table.params["raw_opacity"].sigmoid(), target - n, generator)
+        self.share(scene, sources)
+        table.append({name: column.index_select(0, sources) for name, column in table.params.items()})
+        return target - n, target < wanted
+
+    def share(self, scene: GaussianScene, sources: Tensor) -> None:
+        """Make each of the Gaussians `sources` [D] (repeats count) one of as many as were drawn and itself; its moments begin anew."""
+        rows, drawn = sources.unique(return_counts=True)
+        p = scene.table.params
+        opacity = p["raw_opacity"].index_select(0, rows).sigmoid()
+        new, factor = shared(opacity, drawn + 1)
+        new = new.clamp(self.min_opacity, 1 - torch.finfo(torch.float32).eps)
+        log_scales = p["log_scales"].index_select(0, rows) + factor.log()[:, None]
+        scene.table.overwrite(rows, {"raw_opacity": new.logit(), "log_scales": log_scales}, clear=True)
+
+    @torch.no_grad()
+    def finish(self, scene: GaussianScene, step: int, rates: dict[str, float], generator: torch.Generator) -> None:
+        """After the optimiser's step: noise on the positions, shaped like each Gaussian, on faint ones alone."""
+        size = self.noise * rates["means"]
+        if not self.enabled or size == 0:
+            return
+        p = scene.table.params
+        noise = torch.randn(p["means"].shape, generator=generator).to(p["means"])
+        gate = torch.sigmoid(-_SHARP * (p["raw_opacity"].sigmoid() - self.min_opacity))
+        turn = quat_to_matrix(normalise_quats(p["quats"].detach()))
+        along = (turn.transpose(1, 2) @ noise[..., None]).squeeze(-1) * (2 * p["log_scales"]).exp()
+        p["means"] += (turn @ along[..., None]).squeeze(-1) * (gate * size)[:, None]
+
+
+def draw(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """`count` indices [count] drawn with replacement in proportion to `weight` [N] >= 0; some weight must be positive."""
+    total = weight.double().cumsum(0)
+    at = torch.rand(count, generator=generator, dtype=torch.float64).to(total.device) * total[-1]
+    return torch.searchsorted(total, at, right=True).clamp_max_(int(weight.nonzero()[-1]))
+
+
+def shared(opacity: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
+    """Opacity and factor on the scales, both [D], of each of n [D] (at most 51) Gaussians that together look like one of `opacity` [D].
+
+    o' = 1 - (1 - o)^(1/n) and o / Q with Q = sum_{i=1..n} sum_{k=0..i-1} binom(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1) (eq. 9 of the
+    paper). By the hockey-stick identity Q = sum_{j=1..n} binom(n, j) (-1)^(j-1) o'^j / sqrt(j); in float64, as its signs alternate.
+    """
+    n, o = n.clamp(1, MOST), opacity.double()
+    new = 1 - (1 - o) ** (1 / n)
+    powers = new[:, None] ** torch.arange(1, MOST + 1, device=o.device)
+    Q = (powers * _signed_binomials().to(o.device)[n]).sum(1)
+    return new.to(opacity.dtype), (o / Q).to(opacity.dtype)
+
+
+@functools.cache
+def _signed_binomials() -> Tensor:
+    """binom(n, j) (-1)^(j-1) / sqrt(j) for n = 0 .. MOST (rows) and j = 1 .. MOST (columns), float64."""
+    rows = [[math.comb(n, j) * (-1) ** (j - 1) / math.sqrt(j) for j in range(1, MOST + 1)] for n in range(MOST + 1)]
+    return torch.tensor(rows, dtype=torch.float64)

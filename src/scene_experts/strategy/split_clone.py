@@ -1,0 +1,139 @@
+"""Density control of explicit Gaussians (3DGS, Kerbl et al. 2023, section 5): clone, split, prune, reset opacities.
+
+Statistics: `grad` [N] sum of the norms of the 2D-mean gradients (NDC units) over the views that drew the Gaussian, `count` [N] how many.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from scene_experts.errors import InputError, expect_at_least
+from scene_experts.geometry.rotation import normalise_quats, quat_to_matrix
+from scene_experts.scene.explicit import GaussianScene
+from scene_experts.schedule import Every
+from scene_experts.strategy import Edit, observe
+from scene_experts.types import Decoded, Render
+
+SHRINK = 1.6  # a half of a split Gaussian is this much smaller (3DGS: 0.8 N for N = 2 halves)
+
+
+@dataclass(frozen=True)
+class SplitClone:
+    """Hyper-parameters of density control; its memory is in `table.stats`."""
+
+    adjust: Every = Every(500, 15_000, 100)
+    """Adjust at multiples of `interval` strictly inside (start, stop); statistics are kept until stop."""
+    grad_threshold: float = 0.0002
+    """Mean 2D gradient (NDC units) from which a Gaussian is cloned or split."""
+    dense_size: float = 0.01
+    """Share of the scene's extent up to which a Gaussian is cloned; larger ones are split."""
+    min_opacity: float = 0.005
+    """Fainter Gaussians are removed."""
+    max_size: float = 0.1
+    """Share of the scene's extent beyond which Gaussians are removed, after the first reset."""
+    reset: Every = Every(0, 15_000, 3000)
+    """When opacities are pressed down to `reset_opacity`."""
+    reset_opacity: float = 0.01
+    reset_at_start: bool = False
+    """Reset at `adjust.start` too, as 3DGS does for captures on white."""
+    max_anchors: int = 0
+    """Never more Gaussians than this; 0 is no cap. The largest gradients go first."""
+    enabled: bool = True
+
+    def scaled(self, factor: float) -> SplitClone:
+        """The same in a training `factor` times as long: windows and the interval of resets scale; the rest stays."""
+        reset = replace(self.reset.scaled(factor), interval=max(1, round(self.reset.interval * factor)))
+        return replace(self, adjust=self.adjust.scaled(factor), reset=reset)
+
+    def check(self) -> None:
+        """Raises InputError for numbers that no training can have."""
+        intervals = [("--growth.adjust.interval", self.adjust.interval, 1), ("--growth.reset.interval", self.reset.interval, 1)]
+        expect_at_least([*intervals, ("--growth.max-anchors", self.max_anchors, 0)])
+        if not 0 < self.reset_opacity < 1:
+            raise InputError(f"expected --growth.reset-opacity between 0 and 1, found {self.reset_opacity}; correct it")
+
+    def observe(self, scene: GaussianScene, decoded: Decoded, render: Render, step: int) -> None:
+        """Count one view, after its backward pass."""
+        if not self.enabled or step >= self.adjust.stop:
+            return
+        stats = scene.table.stats
+        if "grad" not in stats:
+            like = scene.table.params["raw_opacity"].detach()
+            stats |= {"grad": torch.zeros_like(like), "count": torch.zeros_like(like)}
+        observe.observe_drawn(stats, decoded, render)
+
+    def update(self, scene: GaussianScene, step: int, generator: torch.Generator) -> Edit | None:
+        """Grow, prune and reset when due. `generator` draws where the halves of a split Gaussian go."""
+        table = scene.table
+        if step >= self.adjust.stop:
+            table.stats = {}
+        if not self.enabled:
+            return None
+        edit = None
+        if self.adjust.due(step) and "grad" in table.stats:
+            grown, capped = self.grow(scene, generator)
+            pruned = self.prune(scene, step)
+            for name in ("grad", "count"):
+                table.stats[name].zero_()
+            for column in table.params.values():
+                column.grad = None  # 3DGS's Gaussians miss the step of an adjustment, whether it changed a row or not
+            edit = Edit(grown, pruned, len(table), capped)
+        if self.reset.due(step) or (self.reset_at_start and step == self.adjust.start):
+            self.press_opacities(scene)
+        return edit
+
+    def finish(self, scene: GaussianScene, step: int, rates: dict[str, float], generator: torch.Generator) -> None:
+        """Nothing is left to do after the optimiser's step."""
+
+    @torch.no_grad()
+    def grow(self, scene: GaussianScene, generator: torch.Generator) -> tuple[int, bool]:
+        """Clone small Gaussians with large gradients, split large ones. Returns the rows gained, and whether the cap held some back."""
+        table = scene.table
+        g = table.stats["grad"] / table.stats["count"].clamp_min(1)
+        chosen = (g >= self.grad_threshold).nonzero().squeeze(1)
+        room = max(0, self.max_anchors - len(table)) if self.max_anchors else len(chosen)
+        capped = len(chosen) > room
+        if capped:
+            best = g.index_select(0, chosen).argsort(descending=True, stable=True)[:room]
+            chosen = chosen.index_select(0, best).sort().values
+        if len(chosen) == 0:
+            return 0, capped
+        largest = table.params["log_scales"].index_select(0, chosen).amax(1).exp()
+        small = largest <= self.dense_size * scene.extent
+        halves = split_rows(table.params, chosen[~small], generator)
+        copies = {name: column.index_select(0, chosen[small]) for name, column in table.params.items()}
+        table.append({name: torch.cat([copies[name], halves[name]]) for name in copies})
+        keep = torch.ones(len(table), dtype=torch.bool, device=g.device)
+        keep[chosen[~small]] = False
+        table.keep(keep)
+        return len(chosen), capped
+
+    @torch.no_grad()
+    def prune(self, scene: GaussianScene, step: int) -> int:
+        """Remove faint Gaussians and, after the first reset, huge ones. Returns how many."""
+        p = scene.table.params
+        gone = p["raw_opacity"].sigmoid() < self.min_opacity
+        if step > self.reset.interval:
+            gone |= p["log_scales"].amax(1).exp() > self.max_size * scene.extent
+        if gone.any():
+            scene.table.keep(~gone)
+        return int(gone.sum())
+
+    @torch.no_grad()
+    def press_opacities(self, scene: GaussianScene) -> None:
+        """No opacity above `reset_opacity`; Adam's moments of opacities begin anew."""
+        most = math.log(self.reset_opacity / (1 - self.reset_opacity))
+        scene.table.assign("raw_opacity", scene.table.params["raw_opacity"].detach().clamp_max(most))
+
+
+def split_rows(params: torch.nn.ParameterDict, rows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+    """Two halves of each of the Gaussians `rows` [S], first halves first: drawn from it, 1.6 times smaller, otherwise like it."""
+    halves = {name: torch.cat([column.index_select(0, rows)] * 2) for name, column in params.items()}
+    quats, scales = halves["quats"], halves["log_scales"].exp()
+    draw = torch.randn(scales.shape, generator=generator).to(scales)
+    away = (quat_to_matrix(normalise_quats(quats)) @ (draw * scales)[..., None]).squeeze(-1)
+    return halves | {"means": halves["means"] + away, "log_scales": halves["log_scales"] - math.log(SHRINK)}

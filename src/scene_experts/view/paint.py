@@ -1,0 +1,97 @@
+"""What a picture can show of a scene: its colours, its depth, or how its anchors are shared among the experts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from scene_experts.errors import InputError
+from scene_experts.evaluate.expert_pictures import chosen_by, keep
+from scene_experts.render import Rasterizer
+from scene_experts.scene import Scene
+from scene_experts.types import Camera, Decoded, Gaussians, Render
+
+Mode = Literal["picture", "depth", "alpha", "experts", "entropy", "activation"]
+MODES: tuple[Mode, ...] = ("picture", "depth", "alpha", "experts", "entropy", "activation")
+PALETTE = (  # told apart by colour-blind readers (Okabe and Ito), then darker forms of the same
+    (0.00, 0.45, 0.70), (0.84, 0.37, 0.00), (0.00, 0.62, 0.45), (0.80, 0.47, 0.65), (0.90, 0.62, 0.00), (0.34, 0.71, 0.91),
+    (0.94, 0.89, 0.26), (0.50, 0.50, 0.50), (0.00, 0.27, 0.42), (0.50, 0.22, 0.00), (0.00, 0.37, 0.27), (0.48, 0.28, 0.39),
+    (0.54, 0.37, 0.00), (0.20, 0.43, 0.55), (0.56, 0.53, 0.16), (0.25, 0.25, 0.25),
+)  # fmt: skip
+LOW, MIDDLE, HIGH = (0.05, 0.03, 0.30), (0.75, 0.20, 0.45), (1.00, 0.90, 0.35)  # a dark-to-light ramp
+
+
+@dataclass(frozen=True)
+class Look:
+    """What to show. `attribute`: of which routers; `only`: the experts whose anchors are drawn (None: all)."""
+
+    mode: Mode = "picture"
+    attribute: str = "color"
+    only: tuple[int, ...] | None = None
+
+
+@torch.no_grad()
+def paint(scene: Scene, camera: Camera, step: int, rasterize: Rasterizer, background: Tensor, look: Look = Look()) -> Tensor:
+    """A picture [H, W, 3] in [0, 1]. Raises InputError where the look needs experts and the scene has none."""
+    decoded = scene(camera, step, False, rasterize.visible)
+    gaussians = decoded.gaussians
+    if look.only is not None:
+        mine = chosen_by(needed(decoded, look.attribute), look.attribute, scene.K)
+        wanted = [e for e in look.only if 0 <= e < mine.shape[1]]
+        mask = mine[:, wanted].any(1)
+        gaussians = keep(gaussians, mask)
+    if look.mode in ("experts", "entropy", "activation"):
+        colours = row_colours(decoded, look)
+        place = torch.searchsorted(decoded.rows, torch.div(gaussians.source, scene.K, rounding_mode="floor"))
+        gaussians = replace(gaussians, colors=colours.index_select(0, place))
+    return shown(rasterize(gaussians, camera, background), gaussians, look.mode)
+
+
+def shown(render: Render, gaussians: Gaussians, mode: Mode) -> Tensor:
+    if mode == "alpha":
+        return render.alpha[..., None].expand(-1, -1, 3).clamp(0, 1)
+    if mode == "depth":
+        seen = render.alpha > 0.5
+        z = render.depth / render.alpha.clamp_min(1e-6)
+        if not bool(seen.any()):
+            return torch.zeros_like(render.image)
+        near, far = torch.quantile(z[seen][:: max(1, int(seen.sum()) // 100_000)], torch.tensor([0.02, 0.98], device=z.device)).tolist()
+        inverse = (1 / z.clamp(near, far) - 1 / far) / max(1 / near - 1 / far, 1e-12)  # near is light; equal steps of disparity
+        return torch.where(seen[..., None], ramp(inverse), 0.0)
+    return render.image.clamp(0, 1)
+
+
+def row_colours(decoded: Decoded, look: Look) -> Tensor:
+    """One colour per decoded row [A, 3]."""
+    if look.mode == "activation":
+        if decoded.raw_opacity is None:
+            raise InputError("expected a scene whose opacities a network decides, found explicit Gaussians; show another mode")
+        return ramp((decoded.raw_opacity > 0).to(decoded.raw_opacity.dtype).mean(1))
+    routing = needed(decoded, look.attribute).routing[look.attribute]
+    gates = routing.gates.detach()
+    if look.mode == "entropy":
+        experts = max(gates.shape[1], 2)
+        return ramp(torch.special.entr(gates).sum(1) / torch.log(torch.tensor(float(experts))))
+    weights = gates
+    if routing.chosen is not None:
+        weights = torch.zeros_like(gates).scatter_(1, routing.chosen, gates.gather(1, routing.chosen))
+        weights = weights / weights.sum(1, keepdim=True).clamp_min(1e-12)
+    palette = torch.tensor(PALETTE, dtype=gates.dtype, device=gates.device)[torch.arange(gates.shape[1]) % len(PALETTE)]
+    return weights @ palette
+
+
+def needed(decoded: Decoded, attribute: str) -> Decoded:
+    if attribute not in decoded.routing:
+        known = ", ".join(decoded.routing) or "none: it is no mixture of experts"
+        raise InputError(f"expected a scene with experts of {attribute}, found {known}; choose another mode or attribute")
+    return decoded
+
+
+def ramp(value: Tensor) -> Tensor:
+    """Colours [..., 3] of values in [0, 1], dark to light."""
+    low, middle, high = (torch.tensor(c, dtype=value.dtype, device=value.device) for c in (LOW, MIDDLE, HIGH))
+    v = value.clamp(0, 1)[..., None]
+    return torch.where(v < 0.5, low + (middle - low) * (2 * v), middle + (high - middle) * (2 * v - 1))

@@ -1,0 +1,70 @@
+"""Charts: every point where the axes say it is; nothing where there is nothing to draw."""
+
+import itertools
+import re
+
+import pytest
+
+from scene_experts.report.chart import (
+    BOTTOM,
+    HEIGHT,
+    LEFT,
+    MOST,
+    RIGHT,
+    TOP,
+    WIDTH,
+    Line,
+    bars,
+    label,
+    lines,
+    log_ticks,
+    smoothed,
+    thinned,
+    ticks,
+)
+
+
+def points(svg):
+    return [tuple(map(float, p.split(","))) for p in re.search(r'points="([^"]+)"', svg)[1].split()]  # type: ignore[index]
+
+
+def test_the_ends_of_a_line_are_at_the_ends_of_the_axes():
+    found = points(lines("PSNR", [Line("a", [(0, 10.0), (50, 20.0), (100, 30.0)])], "dB"))
+    assert found[0][0] == LEFT and found[-1][0] == WIDTH - RIGHT
+    assert TOP < found[-1][1] < found[1][1] < found[0][1] < HEIGHT - BOTTOM
+    assert found[1] == (pytest.approx((LEFT + WIDTH - RIGHT) / 2), pytest.approx((found[0][1] + found[2][1]) / 2, abs=0.1))
+
+
+def test_a_log_axis_is_straight_for_powers():
+    ys = [y for _, y in points(lines("loss", [Line("a", [(i, 10.0**-i) for i in range(4)])], log=True))]
+    assert [b - a for a, b in itertools.pairwise(ys)] == pytest.approx([ys[1] - ys[0]] * 3, abs=0.2)
+
+
+def test_nothing_to_draw_is_nothing():
+    assert (
+        lines("x", []) == "" and lines("x", [Line("a", [(1, 1.0)])]) == "" and lines("x", [Line("a", [(1, float("nan")), (2, 1.0)])]) == ""
+    )
+    assert "nan" not in lines("x", [Line("a", [(1, 1.0), (2, float("inf")), (3, 1.0)])])
+
+
+def test_names_are_escaped_and_a_legend_is_only_for_several():
+    one = [(0, 1.0), (1, 2.0)]
+    assert "<b>" not in lines("<b>", [Line("<i>", one)]) and "legend" not in lines("t", [Line("a", one)])
+    assert "legend" in lines("t", [Line("a", one), Line("b", one)])
+
+
+def test_thinning_keeps_means_and_smoothing_lags():
+    many = [(float(i), float(i)) for i in range(4000)]
+    assert len(thinned(many)) == MOST and sum(y for _, y in thinned(many)) / MOST == pytest.approx(1999.5)
+    assert smoothed([(0, 0.0), (1, 2.0), (2, 4.0)], window=2) == [(0, 0.0), (1, 1.0), (2, 3.0)]
+
+
+def test_ticks_are_round():
+    assert ticks(0, 10) == [0, 2, 4, 6, 8, 10] and ticks(0.03, 0.09) == pytest.approx([0.04, 0.06, 0.08])
+    assert [label(v) for v in (0.05, 2e-5, 7000, 30_000, 2_500_000)] == ["0.05", "2e-5", "7000", "30k", "2.5M"]
+    assert [10**v for v in log_ticks(-2.2, -0.9)] == pytest.approx([0.01, 0.02, 0.05, 0.1])
+    assert len(log_ticks(-9, 3)) <= 7
+
+
+def test_bars_are_as_wide_as_the_shares():
+    assert re.findall(r"width:([\d.]+)%", bars("cov", [0.5, 0.3, 0.2])) == ["50.00", "30.00", "20.00"]

@@ -1,0 +1,70 @@
+"""The page: whole, self-contained, of one run and of several."""
+
+import base64
+import io
+import json
+import re
+from dataclasses import replace
+
+import pytest
+from PIL import Image
+
+from records import record
+from scene_experts.config import to_json
+from scene_experts.errors import InputError
+from scene_experts.io import write_json
+from scene_experts.report.page import NAME, write
+
+
+def run(folder, recipe="moe-gs", pictures=True):
+    made = record(recipe, views=3)
+    config = replace(made.config, command=f"scene-experts train {recipe} --data <here> --out run")
+    write_json(folder / "config.json", {"format": 1, **to_json(config)})
+    results = {**made.results, "capture": "fox", "views": "test", "view_count": 3, "split": "mod8", "resolution": "as-is", "step": 3000}
+    write_json(folder / "results.json", results)
+    write_json(folder / "per_view.json", {name: {"file": name, **facts} for name, facts in made.per_view.items()})
+    lines = [
+        {"step": s, "psnr": 20 + s / 10, "terms": {"l1": 0.1}, "anchors": 5, "active": 0.5, "gaussians": 9, "seconds": s} for s in range(9)
+    ]
+    lines += [{"step": 9, "grown": 3, "pruned": 1, "anchors": 7}]
+    lines += [{**lines[5], "step": 10 + s, "routing": {"cov": [0.6, 0.4]}, "entropy": {"cov": 0.9}} for s in range(3)]
+    (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)) + '\n{"torn')
+    if pictures:
+        for kind, colour in (("gt", "red"), ("renders", "blue"), ("errors", "black")):
+            (folder / "test" / kind).mkdir(parents=True)
+            for name in made.per_view:
+                Image.new("RGB", (1200, 600), colour).save(folder / "test" / kind / name)
+    return folder
+
+
+def test_one_run_is_one_file_that_needs_nothing_else(tmp_path):
+    path = write([run(tmp_path)])
+    text = path.read_text()
+    assert path == tmp_path / NAME
+    assert not re.findall(r'(?:src|href)="(?!data:)|https?://|@import', text)
+    for word in ("moe-gs on fox", "30.00", "Held-out views", "gate entropy", "share of cov", "--data &lt;here&gt;", "top_k"):
+        assert word in text, word
+    assert "$title" not in text and "$body" not in text
+    pictures = json.loads(re.search(r"const pictures = (.+);</script>", text)[1])  # type: ignore[index]
+    assert len(pictures) == 3 * 3
+    first = Image.open(io.BytesIO(base64.b64decode(pictures["0.0"].partition(",")[2])))
+    assert first.size == (960, 480) and first.getpixel((5, 5))[0] > 200  # type: ignore[index]
+
+
+def test_several_runs_stand_beside_each_other(tmp_path):
+    runs = [run(tmp_path / "a"), run(tmp_path / "b", "scaffold-gs")]
+    text = write(runs, tmp_path / "both.html").read_text()
+    assert "moe-gs, scaffold-gs on fox" in text and text.count("<option value='0.1'") == 2
+    same = write([tmp_path / "a", run(tmp_path / "c")], tmp_path / "same.html").read_text()
+    assert "moe-gs (a)" in same and "moe-gs (c)" in same
+    with pytest.raises(InputError, match="--out"):
+        write(runs)
+
+
+def test_a_run_without_pictures_or_results(tmp_path):
+    assert "no pictures" in write([run(tmp_path / "a", pictures=False)]).read_text()
+    (tmp_path / "a" / "results.json").unlink()
+    with pytest.raises(InputError, match="expected an evaluated run"):
+        write([tmp_path / "a"])
+    with pytest.raises(InputError, match="at least one"):
+        write([])

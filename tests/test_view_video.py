@@ -1,0 +1,47 @@
+"""Frames to disk: pictures as they are, a video that reads back."""
+
+import numpy as np
+import pytest
+
+from scene_experts.errors import InputError
+from scene_experts.evaluate import pictures
+from scene_experts.view import video
+
+
+def frames(count=6, size=(33, 47)):
+    y, x = np.mgrid[: size[0], : size[1]]
+    return [np.stack([x * 5, y * 7, np.full_like(x, 20 * i)], 2).astype(np.uint8) for i in range(count)]
+
+
+def test_pictures_are_the_frames_and_those_of_a_longer_path_go(tmp_path):
+    assert video.write_pictures(tmp_path, frames(5)) == 5
+    (tmp_path / "mine.png").write_bytes(b"kept")
+    assert video.write_pictures(tmp_path, frames(3)) == 3
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["00000.png", "00001.png", "00002.png", "mine.png"]
+    assert np.array_equal(pictures.read(tmp_path / "00002.png"), frames(3)[2])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="expected a folder"):
+        video.write_pictures(tmp_path / "file", frames(1))
+
+
+def test_a_video_reads_back(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    assert video.write_video(tmp_path / "v.mp4", frames(), 12.0) == 6
+    reader = ffmpeg.read_frames(str(tmp_path / "v.mp4"))
+    meta = next(reader)
+    found = [np.frombuffer(f, np.uint8).reshape(34, 48, 3) for f in reader]
+    assert meta["size"] == (48, 34) and meta["fps"] == 12.0 and len(found) == 6  # odd sizes grow by a pixel
+    assert np.abs(found[0][:33, :47].astype(int) - frames()[0]).mean() < 12
+    assert [p.name for p in tmp_path.iterdir()] == ["v.mp4"]
+
+
+def test_without_an_encoder_the_error_says_what_to_install(monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(InputError, match="video"):
+        video.writer()
+
+
+def test_which_names_are_videos(tmp_path):
+    assert video.is_video(tmp_path / "a.MP4") and not video.is_video(tmp_path / "folder")
