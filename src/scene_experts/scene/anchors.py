@@ -20,7 +20,7 @@ from scene_experts import native
 from scene_experts.errors import InputError, expect_at_least
 from scene_experts.geometry.neighbours import knn_d2, median_neighbour_distance
 from scene_experts.geometry.voxel import auto_voxel
-from scene_experts.scene import native_decode
+from scene_experts.scene import native_decode, triton_decode
 from scene_experts.scene.appearance import Codes, TestRule, fold
 from scene_experts.scene.experts import Experts, MixtureHead
 from scene_experts.scene.mix import FeatureBank, OwnFeature
@@ -111,6 +111,11 @@ class AnchorScene(nn.Module):
     def K(self) -> int:
         return self.config.K
 
+    @property
+    def file_values(self) -> int:
+        """float32 values that an anchor takes in the Scaffold-GS file: 79 for K = 10, F = 32."""
+        return 3 + 3 + 3 * self.K + self.config.F + 1 + 6 + 4  # position, normal, offsets, feature, opacity, scaling, rotation
+
     def meta(self) -> dict[str, Any]:
         views = {"views": list(self.codes.views)} if self.codes else {}
         return {"voxel": self.voxel, "extent": self.extent, **self.select.meta(), **views}
@@ -153,7 +158,7 @@ class AnchorScene(nn.Module):
         return self.with_global_routing(decoded, step) if training else decoded
 
     def decode(self, rows: Tensor, camera: Camera, step: int) -> Decoded:
-        """Gaussians of the given anchors [A], natively where that covers the scene, else in plain torch."""
+        """Gaussians of the given anchors [A], by the device's fused kernels where they cover the scene, else in plain torch."""
         weights = self.native_weights(step)
         if weights is None:
             return self.decode_composed(rows, camera, step)
@@ -161,24 +166,26 @@ class AnchorScene(nn.Module):
             weights["color"] = fold(weights["color"], self.codes(camera))
         p = self.table.params
         with_dist = {a: a in self.config.add_dist for a in ATTRIBUTES}
-        position = camera.position
-        gaussians, raw, routing = native_decode.decode(
-            rows, self.table.facts["xyz"], p["feature"], p["log_scaling"], p["offsets"], position, weights, with_dist, self.extent
-        )
-        return Decoded(gaussians, rows, raw, routing)
+        xyz, columns = self.table.facts["xyz"], (p["feature"], p["log_scaling"], p["offsets"])
+        if rows.device.type == "cpu":
+            made = native_decode.decode(rows, xyz, *columns, camera.position, weights, with_dist, self.extent)
+        else:
+            made = triton_decode.decode(rows, xyz, *columns, camera.position, weights, with_dist)
+        return Decoded(made[0], rows, made[1], made[2])
 
     def native_weights(self, step: int) -> dict[str, HeadWeights] | None:
-        """The heads' tensors for the native decode, or None where it does not apply (another device or dtype, unusual switches)."""
+        """The heads' tensors for the fused decode (compiled on the CPU, Triton on CUDA), or None where it does not apply."""
         feature = self.table.params["feature"]
-        fits = feature.device.type == "cpu" and feature.dtype == torch.float32 and native.load() is not None
-        fits = fits and not self.config.quat_align and self.mix is None
+        absent = no_kernels(feature.device)
+        fits = absent is None and feature.dtype == torch.float32 and not self.config.quat_align and self.mix is None
         if self.config.decode == "composed" or not fits:
             if self.config.decode == "native":
-                why = native.why_not() or "a device, dtype or switch it has no code for"
+                why = absent or "a device, dtype or switch it has no code for"
                 raise InputError(f"expected a scene that the native decode covers, found {why}; use --scene.decode auto")
             return None
         weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
-        without = next((a for a, w in weights.items() if w is None), None)
+        wide = lambda a, w: feature.is_cuda and not triton_decode.covers(a, w, self.config.F, self.K)  # noqa: E731
+        without = next((a for a, w in weights.items() if w is None or wide(a, w)), None)
         if without and self.config.decode == "native":
             raise InputError(
                 f"expected a {without} head that the native decode covers, found switches it has no code for; use --scene.decode auto"
@@ -269,6 +276,13 @@ class AnchorScene(nn.Module):
         """Every tensor of the decoder by name (`opacity.w1`, ...), for files."""
         parts: dict[str, Any] = {**self.heads, "mix": self.mix, "appearance": self.codes}
         return {f"{part}.{name}": p for part, module in parts.items() if module is not None for name, p in module.named_parameters()}
+
+
+def no_kernels(device: torch.device) -> str | None:
+    """None where `device` has fused kernels; else why not."""
+    if device.type == "cuda":
+        return triton_decode.available()
+    return native.why_not() if device.type == "cpu" else f"no kernels for {device.type}"
 
 
 def voxel_size(points: Tensor, rule: VoxelChoice) -> float:
