@@ -1,12 +1,13 @@
 // The fused decode of an anchor scene: gather -> direction -> routing -> expert networks -> Gaussians, forward and backward.
 //
-// A anchors are seen, each with K slots, a feature of F values and inputs z = (f, direction, 1, distance): the 1 carries the first layer's
-// bias. Three heads (opacity, covariance, colour) have E experts W2 relu(W1 z) + b2, each with its own tanh, identity or sigmoid, mixed
-// with weights w: none (one network), all gates (dense), or the softmax over the k largest logits (ties to the lowest index).
+// A anchors are seen, each with K slots, a feature of F values and inputs z = (f, direction, 1, distance, position): the 1 carries the
+// first layer's bias, the position is for routers that ask for it. Three heads (opacity, covariance, colour) have E experts
+// W2 relu(.. relu(W1 z)) + b2, each with its own tanh, identity or sigmoid, mixed with weights w: none (one network), all gates (dense), or
+// the softmax over the k largest logits (ties to the lowest index).
 //
 // Work is cut into CHUNK anchors; within a chunk the anchors of one expert are gathered, so that its weights stay in the first-level cache
-// (`products.h`). Gradients of weights are summed in at most BUFFERS partial buffers over fixed ranges of chunks, then in fixed order: the
-// same bits for every number of threads.
+// (`products.h`). Covariance and colour are computed for anchors of which something is drawn. Gradients of weights are summed in at most
+// BUFFERS partial buffers over fixed ranges of chunks, then in fixed order: the same bits for every number of threads.
 #pragma once
 #include <cstdint>
 #include <vector>
@@ -22,14 +23,17 @@ constexpr int COV = 7;       // 3 scale, 4 rotation
 
 // Plain C structures, mirrored by scene/native_decode.py: pointers first, then 64-bit integers.
 struct Head {
-  const float *router_w, *router_b, *w1, *b1, *w2, *b2;  // [E,F] or null, [E] or null, [E,H,D], [E,H], [E,out,H], [E,out]
-  float* gates;                                          // [A,E], with a router
-  int64_t* chosen;                                       // [A,k], with a router and k > 0
-  float* mix;                                            // [A,k], the weights of the chosen
-  float *d_router_w, *d_router_b, *d_w1, *d_b1, *d_w2, *d_b2;
-  const float* d_gates;         // [A,E] or null
-  int64_t E, k, H, out, distance;  // k = 0: dense; distance: 1 if it is an input
-  bool single() const { return E == 1 || k == 1; }  // one expert of weight 1 per anchor
+  const float *router_w, *router_b, *w1, *b1, *wm, *bm, *w2, *b2;  // [E,F or F+3] or null, [E] or null, [E,H,D], [E,H], [E,L,H,H],
+                                                                   // [E,L,H], [E,out,H], [E,out]
+  float* gates;                                                    // [A,E], with a router
+  int64_t* chosen;                                                 // [A,k], with a router and k > 0
+  float* mix;                                                      // [A,k], the weights of the chosen
+  float *d_router_w, *d_router_b, *d_w1, *d_b1, *d_wm, *d_bm, *d_w2, *d_b2;
+  const float* d_gates;                                  // [A,E] or null
+  int64_t E, k, H, L, out, distance, position;           // k = 0: dense; L: middle layers; distance, position: 1 if an input
+  bool single() const { return E == 1 || k == 1; }       // one expert of weight 1 per anchor
+  bool every() const { return !router_w || k == 0; }     // all experts see all anchors
+  int shares() const { return static_cast<int>(k ? k : E); }
 };
 
 struct Decode {
@@ -42,82 +46,104 @@ struct Decode {
   const float *d_means, *d_quats, *d_scales, *d_opacities, *d_colors, *d_raw;  // any may be null
   float *d_feature, *d_log_scaling, *d_offsets;                     // [N,...]
   int64_t A, N, K, F, threads, ascending;                           // ascending: rows are; then the gaps between them are zeroed here
+  double extent;                                                    // positions are divided by it
   Head heads[3];                                                    // opacity, covariance, colour
   int64_t chunks() const { return (A + CHUNK - 1) / CHUNK; }
 };
 
 // Sizes of padded blocks.
 struct Sizes {
-  int F, Fp, Z, R, Rp;  // feature; of one row z; logits of all heads together
+  int K, F, Fp, Z, R, Rp;  // slots; feature; of one row z; logits of all heads together
+  int router, routerp;     // inputs of the routers: F, or z up to the position
+  int shares, L, Hp_most;  // the most of any head
   int H[3], Hp[3], out[3], Op[3], inputs[3], first[3];  // first: of the head's logits
-  explicit Sizes(const Decode& d) : F(static_cast<int>(d.F)), Fp(round_up(F, 16)), Z(round_up(F + 5, 16)), R(0) {
-    for (int i = 0; i < 3; ++i) {
-      const Head& h = d.heads[i];
-      H[i] = static_cast<int>(h.H), Hp[i] = round_up(H[i], 16);
-      out[i] = static_cast<int>(h.out), Op[i] = round_up(out[i], 16);
-      inputs[i] = F + 4 + static_cast<int>(h.distance);
-      first[i] = R;
-      if (h.router_w) R += static_cast<int>(h.E);
-    }
-    Rp = round_up(R, 16);
-  }
+  explicit Sizes(const Decode& d);
 };
 
 // The weights in the layouts that the products read, padded with zeros.
 struct Packed {
   struct Expert {
-    std::vector<float> w1t, w2t, b2, w1, w2;  // [inputs][Hp], [H][Op], [Op]; for the backward pass [H][Fp], [out][Hp]
-  };
+    std::vector<float> w1t, wmt, bm, w2t, b2, w1, wm, w2;  // [inputs][Hp], [L][H][Hp], [L][Hp], [H][Op], [Op]; for the backward pass
+  };                                                       // [H][Fp], [L][H][Hp], [out][Hp]
   std::vector<Expert> experts[3];
-  std::vector<float> router_t, router_b, router;  // [F][Rp], [Rp]; backward [R][Fp]
+  std::vector<float> router_t, router_b, router;  // [router][Rp], [Rp]; backward [R][Fp]
   Packed(const Decode& d, const Sizes& s, bool backward);
 };
 
-// One chunk of anchors and its blocks in the worker's memory.
+// What a worker writes on: one block of memory that belongs to the thread, found once a chunk.
+struct Work {
+  float* z;          // [CHUNK][Z]
+  float* block;      // [BLOCK][Z]
+  float* hidden;     // [1 + L + 2][BLOCK][Hp]: activations of each layer, then two gradients
+  float* out;        // [2][BLOCK][Op]
+  float* mixed[3];   // [CHUNK][Op]: mixed outputs, or their gradients
+  float* logits;     // [CHUNK][Rp], then 4 times [Rp][CHUNK]
+  float* feature;    // [CHUNK][Fp]: gradient
+  float* weights;    // [CHUNK][shares]: the mixture's, gradient
+  float* size;       // [CHUNK][8]: exp(l) of offsets, 0, of scales, 0
+  float* spread;     // [CHUNK * K][3]
+  float* weight;     // lists: the mixture's weight, [CHUNK * shares]
+  int *anchor, *place;   // lists: index in the chunk; anchor * shares + the place among its shares
+  uint64_t* bits;    // one for each slot of the chunk: it is drawn
+  uint8_t* live;     // [CHUNK]: something of it is
+  explicit Work(const Sizes& s);  // valid until the thread's next one
+};
+
+// One chunk of anchors.
 struct Chunk {
   int64_t begin;  // first anchor
   int n;
-  float* z;       // [n][Z]
 };
 
-// What one expert computes at once.
+// What one expert computes at once: entries first .. first + n of the lists.
 struct Group {
-  int expert, n;
-  const int *anchor, *slot;  // [n]: index in the chunk; place among the anchor's k (dense: the expert)
+  int expert, first, n;
 };
 
-// The slots of a chunk that are drawn, in order.
-struct Drawn {
-  int count;
-  const int *anchor, *slot;  // [count], anchor within the chunk
-};
-
-// Short rows: a loop in place instead of a call of memmove.
+// A row that may end where its memory does.
 inline void copy_row(const float* from, int n, float* to) {
   int i = 0;
   for (; i + LANES <= n; i += LANES) store(to + i, load(from + i));
-  for (; i < n; ++i) to[i] = from[i];
+  if (i < n) store_part(to + i, load_part(from + i, n - i), n - i);
+}
+inline void zero_row(float* to, int n) {
+  int i = 0;
+  for (; i + LANES <= n; i += LANES) store(to + i, all(0.f));
+  if (i < n) store_part(to + i, all(0.f), n - i);
 }
 
-// A block of at least `floats` floats that belongs to the calling thread and to `use` until the next call with the same `use`.
-float* scratch(int use, int64_t floats);
-enum Use { USE_Z, USE_BLOCK, USE_LOGITS, USE_MIXED, USE_HIDDEN, USE_OUT, USE_GRADIENT, USE_FEATURE, USE_SCALING, USE_LISTS, USE_DRAWN, USES };
+// Up to 32 slots of an anchor from `slot` on that are drawn: bit j is slot + j.
+inline uint32_t slots(const Work& w, int K, int anchor, int slot) {
+  const int at = anchor * K + slot, n = K - slot < 32 ? K - slot : 32;
+  const uint64_t low = w.bits[at >> 6] >> (at & 63), high = (w.bits[(at >> 6) + 1] << 1) << (63 - (at & 63));
+  return static_cast<uint32_t>((low | high) & ((uint64_t(1) << n) - 1));
+}
+template <class F>
+inline void for_drawn(const Work& w, int K, int anchor, F&& f) {
+  for (int slot = 0; slot < K; slot += 32)
+    for (uint32_t bits = slots(w, K, anchor, slot); bits; bits &= bits - 1) f(slot + __builtin_ctz(bits));
+}
 
-void gather(const Decode& d, const Sizes& s, Chunk& chunk);
-Drawn drawn(const Decode& d, const Chunk& chunk);
-std::vector<Group> groups(const Head& head, const Chunk& chunk, int* lists);  // lists [2][n * max(1, k or E)]
-void block_inputs(const Chunk& chunk, const Sizes& s, const Group& g, int from, int n, float* to);
-void hidden(const Packed::Expert& e, const Sizes& s, int head, int n, const float* z, float* h);
+void gather(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w);
+void find_drawn(const Decode& d, const Chunk& chunk, Work& w);  // bits and live, from raw
+void scaling(const Decode& d, const Chunk& chunk, Work& w);
+// The chunk's anchors by expert; `live_only`: those that are.
+void groups(const Head& head, const Chunk& chunk, bool live_only, Work& w, std::vector<Group>& found);
+void block_inputs(const Work& w, const Sizes& s, const Group& g, int from, int n);
+// Hidden layers of w.block; the last of them.
+float* hidden(const Packed::Expert& e, const Sizes& s, int head, int middle, int n, Work& w);
 void outputs(const Packed::Expert& e, const Sizes& s, int head, int n, const float* h, float* y);
 void activate(int head, float* y, int n);
-void scaling(const Decode& d, const Chunk& chunk, float* to);  // exp(l), [n][6]
 inline int block_size(int n) {  // equal parts of at most BLOCK
   const int parts = (n + BLOCK - 1) / BLOCK;
   return parts ? (n + parts - 1) / parts : 1;
 }
-inline float weight(const Head& head, int64_t anchor, int slot) {
-  if (!head.router_w) return 1.f;
-  return head.k ? head.mix[anchor * head.k + slot] : head.gates[anchor * head.E + slot];
-}
+
+void route(const Decode& d, const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w);
+// Gradients of the mixture's weights (w.weights) and of the gates -> of the logits.
+void route_backward(const Decode& d, const Sizes& s, const Chunk& chunk, int head, Work& w);
+// The Gaussians of a chunk from its mixed outputs, and back.
+void emit(const Decode& d, const Sizes& s, const Chunk& chunk, int64_t first, Work& w);
+void emit_backward(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w);
 
 }  // namespace se

@@ -4,13 +4,31 @@
 
 #include "decode.h"
 #include "products.h"
+#include "quad.h"
 
 namespace se {
+
+Sizes::Sizes(const Decode& d) : K(static_cast<int>(d.K)), F(static_cast<int>(d.F)), Fp(round_up(F, 16)), R(0), shares(1), L(0), Hp_most(0) {
+  bool position = false;
+  for (int i = 0; i < 3; ++i) {
+    const Head& h = d.heads[i];
+    H[i] = static_cast<int>(h.H), Hp[i] = round_up(H[i], 16);
+    out[i] = static_cast<int>(h.out), Op[i] = round_up(out[i], 16);
+    inputs[i] = F + 4 + static_cast<int>(h.distance);
+    first[i] = R;
+    if (h.router_w) R += static_cast<int>(h.E), position |= h.position != 0;
+    shares = std::max(shares, h.shares()), L = std::max(L, static_cast<int>(h.L)), Hp_most = std::max(Hp_most, Hp[i]);
+  }
+  Rp = round_up(R, 16);
+  router = position ? F + 8 : F, routerp = round_up(router, 16);
+  Z = round_up(F + (position ? 8 : 5), 16);
+}
 
 Packed::Packed(const Decode& d, const Sizes& s, bool backward) {
   for (int i = 0; i < 3; ++i) {
     const Head& head = d.heads[i];
     const int D = s.F + 3 + static_cast<int>(head.distance), H = s.H[i], Hp = s.Hp[i], out = s.out[i], Op = s.Op[i];
+    const int L = static_cast<int>(head.L);
     experts[i].resize(head.E);
     for (int e = 0; e < head.E; ++e) {
       const float *w1 = head.w1 + int64_t(e) * H * D, *b1 = head.b1 + int64_t(e) * H;
@@ -23,101 +41,181 @@ Packed::Packed(const Decode& d, const Sizes& s, bool backward) {
         for (int o = 0; o < out; ++o) x.w2t[int64_t(j) * Op + o] = w2[int64_t(o) * H + j];
       }
       std::copy_n(b2, out, x.b2.begin());
+      x.wmt.assign(int64_t(L) * H * Hp, 0.f), x.bm.assign(int64_t(L) * Hp, 0.f);
+      if (backward) x.w1.assign(int64_t(H) * s.Fp, 0.f), x.wm.assign(int64_t(L) * H * Hp, 0.f), x.w2.assign(int64_t(out) * Hp, 0.f);
+      for (int l = 0; l < L; ++l) {
+        const float *wm = head.wm + (int64_t(e) * L + l) * H * H, *bm = head.bm + (int64_t(e) * L + l) * H;
+        std::copy_n(bm, H, &x.bm[int64_t(l) * Hp]);
+        for (int j = 0; j < H; ++j)
+          for (int c = 0; c < H; ++c) {
+            x.wmt[(int64_t(l) * H + c) * Hp + j] = wm[j * H + c];
+            if (backward) x.wm[(int64_t(l) * H + j) * Hp + c] = wm[j * H + c];
+          }
+      }
       if (!backward) continue;
-      x.w1.assign(int64_t(H) * s.Fp, 0.f), x.w2.assign(int64_t(out) * Hp, 0.f);
       for (int j = 0; j < H; ++j) std::copy_n(w1 + int64_t(j) * D, s.F, &x.w1[int64_t(j) * s.Fp]);
       for (int o = 0; o < out; ++o) std::copy_n(w2 + int64_t(o) * H, H, &x.w2[int64_t(o) * Hp]);
     }
   }
-  router_t.assign(int64_t(s.F) * s.Rp, 0.f), router_b.assign(s.Rp, 0.f), router.assign(int64_t(s.R) * s.Fp, 0.f);
+  router_t.assign(int64_t(s.router) * s.Rp, 0.f), router_b.assign(s.Rp, 0.f), router.assign(int64_t(s.R) * s.Fp, 0.f);
   for (int i = 0; i < 3; ++i) {
     const Head& head = d.heads[i];
     if (!head.router_w) continue;
+    const int inputs = s.F + (head.position ? 3 : 0);
     for (int e = 0; e < head.E; ++e) {
       const int r = s.first[i] + e;
-      for (int c = 0; c < s.F; ++c) router_t[int64_t(c) * s.Rp + r] = router[int64_t(r) * s.Fp + c] = head.router_w[int64_t(e) * s.F + c];
+      const float* w = head.router_w + int64_t(e) * inputs;
+      for (int c = 0; c < inputs; ++c) router_t[int64_t(c < s.F ? c : c + 5) * s.Rp + r] = w[c];
+      std::copy_n(w, s.F, &router[int64_t(r) * s.Fp]);
       router_b[r] = head.router_b ? head.router_b[e] : 0.f;
     }
   }
 }
 
-float* scratch(int use, int64_t floats) {
-  static thread_local std::vector<float> blocks[USES];
-  std::vector<float>& block = blocks[use];
-  if (static_cast<int64_t>(block.size()) < floats) block.resize(floats);
-  return block.data();
+namespace {
+
+std::vector<float>& memory() {
+  static thread_local std::vector<float> block;
+  return block;
 }
 
-void gather(const Decode& d, const Sizes& s, Chunk& chunk) {
-  chunk.z = scratch(USE_Z, int64_t(CHUNK + SLACK) * s.Z);
+}  // namespace
+
+Work::Work(const Sizes& s) {
+  const int64_t rows = CHUNK + SLACK, block_rows = BLOCK + SLACK;
+  const int Op = std::max({s.Op[0], s.Op[1], s.Op[2]});
+  int64_t total = 0;
+  const auto take = [&](int64_t floats) {
+    const int64_t at = total;
+    total += (floats + 15) / 16 * 16;  // whole cache lines
+    return at;
+  };
+  const int64_t parts[] = {
+      take(rows * s.Z), take(block_rows * s.Z), take((s.L + 3) * block_rows * s.Hp_most), take(2 * block_rows * Op),
+      take(rows * s.Op[0]), take(rows * s.Op[1]), take(rows * s.Op[2]), take(rows * s.Rp + 4 * int64_t(s.Rp) * CHUNK),
+      take(rows * s.Fp), take(int64_t(CHUNK) * s.shares + LANES), take(8 * CHUNK), take(3 * int64_t(CHUNK) * s.K + LANES),
+      take(int64_t(CHUNK) * s.shares), take(int64_t(CHUNK) * s.shares), take(int64_t(CHUNK) * s.shares),
+      take(2 * (int64_t(CHUNK) * s.K / 64 + 2)), take(CHUNK)};
+  std::vector<float>& own = memory();
+  if (static_cast<int64_t>(own.size()) < total + 16) own.resize(total + 16);
+  float* base = own.data() + (64 - reinterpret_cast<uintptr_t>(own.data()) % 64) % 64 / sizeof(float);
+  z = base + parts[0], block = base + parts[1], hidden = base + parts[2], out = base + parts[3];
+  for (int i = 0; i < 3; ++i) mixed[i] = base + parts[4 + i];
+  logits = base + parts[7], feature = base + parts[8], weights = base + parts[9], size = base + parts[10];
+  spread = base + parts[11], weight = base + parts[12];
+  anchor = reinterpret_cast<int*>(base + parts[13]), place = reinterpret_cast<int*>(base + parts[14]);
+  bits = reinterpret_cast<uint64_t*>(base + parts[15]), live = reinterpret_cast<uint8_t*>(base + parts[16]);
+}
+
+void gather(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w) {
+  const Quad camera = load3(d.camera);
+  const float extent = static_cast<float>(d.extent);
+  constexpr int AHEAD = 12;
   for (int a = 0; a < chunk.n; ++a) {
-    const int64_t row = d.rows[chunk.begin + a];
-    float* z = chunk.z + int64_t(a) * s.Z;
-    const float *f = d.feature + row * s.F, *x = d.xyz + row * 3;
-    copy_row(f, s.F, z);
-    const float v[3] = {x[0] - d.camera[0], x[1] - d.camera[1], x[2] - d.camera[2]};
-    const float distance = std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), inverse = 1.f / std::max(distance, 1e-12f);
-    for (int c = 0; c < 3; ++c) z[s.F + c] = v[c] * inverse;
-    z[s.F + 3] = 1.f;
+    const int64_t row = d.rows[chunk.begin + a], next = d.rows[chunk.begin + std::min(a + AHEAD, chunk.n - 1)];
+    for (int c = 0; c < s.F; c += 16) __builtin_prefetch(d.feature + next * s.F + c);
+    __builtin_prefetch(d.xyz + next * 3);
+    float* z = w.z + int64_t(a) * s.Z;
+    copy_row(d.feature + row * s.F, s.F, z);
+    const Quad x = load3(d.xyz + row * 3), v = x - camera;
+    const float distance = std::sqrt(dot(v, v));
+    Quad direction = v * four(1.f / std::max(distance, 1e-12f));
+    direction[3] = 1.f;
+    store4(z + s.F, direction);
     z[s.F + 4] = distance;
+    if (s.router > s.F) store3(z + s.F + 5, Quad{x[0] / extent, x[1] / extent, x[2] / extent, 0.f});
   }
 }
 
-Drawn drawn(const Decode& d, const Chunk& chunk) {
-  const int K = static_cast<int>(d.K), room = chunk.n * K + 1;
-  int* anchor = reinterpret_cast<int*>(scratch(USE_DRAWN, 2 * int64_t(room)));
-  int *slot = anchor + room, count = 0;
+void find_drawn(const Decode& d, const Chunk& chunk, Work& w) {
+  const int K = static_cast<int>(d.K), count = chunk.n * K;
   const float* raw = d.raw + chunk.begin * K;
-  for (int a = 0; a < chunk.n; ++a)
-    for (int k = 0; k < K; ++k) {  // no branch: which slots are drawn is as good as random
-      anchor[count] = a, slot[count] = k;
-      count += raw[a * K + k] > 0.f;
-    }
-  return {count, anchor, slot};
+  std::fill_n(w.bits, count / 64 + 2, 0);
+  int i = 0;
+  for (; i + LANES <= count; i += LANES) w.bits[i >> 6] |= static_cast<uint64_t>(positive(load(raw + i))) << (i & 63);
+  if (i < count) w.bits[i >> 6] |= static_cast<uint64_t>(positive(load_part(raw + i, count - i))) << (i & 63);
+  for (int a = 0; a < chunk.n; ++a) {
+    uint32_t any = 0;
+    for (int slot = 0; slot < K; slot += 32) any |= slots(w, K, a, slot);
+    w.live[a] = any != 0;
+  }
 }
 
-std::vector<Group> groups(const Head& head, const Chunk& chunk, int* lists) {
-  std::vector<Group> found;
+void scaling(const Decode& d, const Chunk& chunk, Work& w) {
+  for (int a = 0; a < chunk.n; ++a) {
+    const float* l = d.log_scaling + d.rows[chunk.begin + a] * 6;
+    store4(w.size + 8 * a, load3(l));
+    store4(w.size + 8 * a + 4, load3(l + 3));
+  }
+  const int n = round_up(8 * chunk.n, LANES);
+  for (int i = 0; i < n; i += LANES) store(w.size + i, exponential(load(w.size + i)));
+}
+
+void groups(const Head& head, const Chunk& chunk, bool live_only, Work& w, std::vector<Group>& found) {
+  found.clear();
   const int n = chunk.n, E = static_cast<int>(head.E), k = static_cast<int>(head.k);
-  if (!head.router_w || k == 0) {  // every expert sees every anchor
-    for (int a = 0; a < n; ++a) lists[a] = a;
-    for (int e = 0; e < E; ++e) {
-      int* slot = lists + n * (1 + e);
-      std::fill_n(slot, n, e);
-      found.push_back({e, n, lists, slot});
+  if (head.every()) {
+    int live = 0;
+    for (int a = 0; a < n; ++a) {
+      w.anchor[live] = a;
+      live += !live_only || w.live[a];
     }
-    return found;
+    for (int e = 0; e < E; ++e) {
+      int *anchor = w.anchor + e * live, *place = w.place + e * live;
+      float* weight = w.weight + e * live;
+      if (e) std::copy_n(w.anchor, live, anchor);
+      for (int i = 0; i < live; ++i) {
+        place[i] = anchor[i] * E + e;
+        weight[i] = head.router_w ? head.gates[(chunk.begin + anchor[i]) * E + e] : 1.f;
+      }
+      if (live) found.push_back({e, e * live, live});
+    }
+    return;
   }
   const int64_t* chosen = head.chosen + chunk.begin * k;
-  std::vector<int> place(E + 1, 0);
-  for (int i = 0; i < n * k; ++i) ++place[chosen[i] + 1];
-  for (int e = 0; e < E; ++e) {
-    if (place[e + 1]) found.push_back({e, place[e + 1], lists + place[e], lists + n * k + place[e]});
-    place[e + 1] += place[e];
+  const float* mix = head.mix + chunk.begin * k;
+  constexpr int FEW = 64;
+  int few[FEW] = {};
+  std::vector<int> many(E > FEW ? E : 0, 0);
+  int* next = E > FEW ? many.data() : few;
+  for (int a = 0; a < n; ++a)
+    if (!live_only || w.live[a])
+      for (int j = a * k; j < (a + 1) * k; ++j) ++next[chosen[j]];
+  for (int e = 0, total = 0; e < E; ++e) {
+    const int count = next[e];
+    if (count) found.push_back({e, total, count});
+    next[e] = total;
+    total += count;
   }
   for (int a = 0; a < n; ++a)
-    for (int slot = 0; slot < k; ++slot) {
-      const int to = place[chosen[a * k + slot]]++;
-      lists[to] = a, lists[n * k + to] = slot;
-    }
-  return found;
+    if (!live_only || w.live[a])
+      for (int j = a * k; j < (a + 1) * k; ++j) {
+        const int to = next[chosen[j]]++;
+        w.anchor[to] = a, w.place[to] = j, w.weight[to] = mix[j];
+      }
 }
 
-void block_inputs(const Chunk& chunk, const Sizes& s, const Group& g, int from, int n, float* to) {
+void block_inputs(const Work& w, const Sizes& s, const Group& g, int from, int n) {
+  const int* anchor = w.anchor + g.first + from;
   for (int i = 0; i < n; ++i) {
-    const float* z = chunk.z + int64_t(g.anchor[from + i]) * s.Z;
-    for (int c = 0; c < s.Z; c += LANES) store(to + int64_t(i) * s.Z + c, load(z + c));
+    const float* z = w.z + int64_t(anchor[i]) * s.Z;
+    float* to = w.block + int64_t(i) * s.Z;
+    for (int c = 0; c < s.Z; c += LANES) store(to + c, load(z + c));
   }
 }
 
-void hidden(const Packed::Expert& e, const Sizes& s, int head, int n, const float* z, float* h) {
-  const int Hp = s.Hp[head];
-  product(n, Hp, s.inputs[head], z, s.Z, e.w1t.data(), Hp, nullptr, h, Hp);
-  for (int i = 0; i < n * Hp; i += LANES) store(h + i, max(all(0.f), load(h + i)));  // in this order NaN stays NaN
+float* hidden(const Packed::Expert& e, const Sizes& s, int head, int middle, int n, Work& w) {
+  const int Hp = s.Hp[head], H = s.H[head];
+  const int64_t layer = int64_t(BLOCK + SLACK) * Hp;
+  float* h = w.hidden;
+  product(n, Hp, s.inputs[head], w.block, s.Z, e.w1t.data(), Hp, nullptr, StoreRelu{h, Hp});
+  for (int l = 0; l < middle; ++l, h += layer)
+    product(n, Hp, H, h, Hp, e.wmt.data() + int64_t(l) * H * Hp, Hp, e.bm.data() + int64_t(l) * Hp, StoreRelu{h + layer, Hp});
+  return h;
 }
 
 void outputs(const Packed::Expert& e, const Sizes& s, int head, int n, const float* h, float* y) {
-  product(n, s.Op[head], s.H[head], h, s.Hp[head], e.w2t.data(), s.Op[head], e.b2.data(), y, s.Op[head]);
+  product(n, s.Op[head], s.H[head], h, s.Hp[head], e.w2t.data(), s.Op[head], e.b2.data(), Store{y, s.Op[head]});
 }
 
 void activate(int head, float* y, int n) {
@@ -125,12 +223,6 @@ void activate(int head, float* y, int n) {
     for (int i = 0; i < n; i += LANES) store(y + i, tangent(load(y + i)));
   if (head == 2)
     for (int i = 0; i < n; i += LANES) store(y + i, sigmoid(load(y + i)));
-}
-
-void scaling(const Decode& d, const Chunk& chunk, float* to) {
-  for (int a = 0; a < chunk.n; ++a)
-    for (int j = 0; j < 6; ++j) to[6 * a + j] = d.log_scaling[d.rows[chunk.begin + a] * 6 + j];
-  for (int i = 0; i < 6 * chunk.n; i += LANES) store(to + i, exponential(load(to + i)));
 }
 
 }  // namespace se

@@ -28,6 +28,9 @@ inline V max(V a, V b) { return {_mm512_maskz_max_ps(0xffff, a.v, b.v)}; }
 inline V min(V a, V b) { return {_mm512_maskz_min_ps(0xffff, a.v, b.v)}; }
 inline V greater(V a, V b, V yes, V no) { return {_mm512_mask_blend_ps(_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ), no.v, yes.v)}; }
 inline V square_root(V a) { return {_mm512_sqrt_ps(a.v)}; }
+inline V load_part(const float* p, int n) { return {_mm512_maskz_loadu_ps(static_cast<__mmask16>((1u << n) - 1), p)}; }
+inline void store_part(float* p, V a, int n) { _mm512_mask_storeu_ps(p, static_cast<__mmask16>((1u << n) - 1), a.v); }
+inline uint32_t positive(V a) { return _mm512_cmp_ps_mask(a.v, _mm512_setzero_ps(), _CMP_GT_OQ); }
 inline V nearest(V a) { return {_mm512_maskz_roundscale_ps(0xffff, a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC)}; }
 inline V times_two_to(V a, V n) { return {_mm512_maskz_scalef_ps(0xffff, a.v, n.v)}; }  // n integral
 inline float sum(V a) {
@@ -54,6 +57,10 @@ inline V max(V a, V b) { return {_mm256_max_ps(a.v, b.v)}; }
 inline V min(V a, V b) { return {_mm256_min_ps(a.v, b.v)}; }
 inline V greater(V a, V b, V yes, V no) { return {_mm256_blendv_ps(no.v, yes.v, _mm256_cmp_ps(a.v, b.v, _CMP_GT_OQ))}; }
 inline V square_root(V a) { return {_mm256_sqrt_ps(a.v)}; }
+inline __m256i first_lanes(int n) { return _mm256_cmpgt_epi32(_mm256_set1_epi32(n), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7)); }
+inline V load_part(const float* p, int n) { return {_mm256_maskload_ps(p, first_lanes(n))}; }
+inline void store_part(float* p, V a, int n) { _mm256_maskstore_ps(p, first_lanes(n), a.v); }
+inline uint32_t positive(V a) { return static_cast<uint32_t>(_mm256_movemask_ps(_mm256_cmp_ps(a.v, _mm256_setzero_ps(), _CMP_GT_OQ))); }
 inline V nearest(V a) { return {_mm256_round_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC)}; }
 inline V times_two_to(V a, V n) {
   return {_mm256_mul_ps(a.v, _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_add_epi32(_mm256_cvtps_epi32(n.v), _mm256_set1_epi32(127)), 23)))};
@@ -86,6 +93,15 @@ inline V max(V a, V b) { return {a.v > b.v ? a.v : b.v}; }
 inline V min(V a, V b) { return {a.v < b.v ? a.v : b.v}; }
 inline V greater(V a, V b, V yes, V no) { return {a.v > b.v ? yes.v : no.v}; }
 inline V square_root(V a) { return {Float4{std::sqrt(a.v[0]), std::sqrt(a.v[1]), std::sqrt(a.v[2]), std::sqrt(a.v[3])}}; }
+inline V load_part(const float* p, int n) {
+  V a = all(0.f);
+  for (int i = 0; i < n; ++i) a.v[i] = p[i];
+  return a;
+}
+inline void store_part(float* p, V a, int n) {
+  for (int i = 0; i < n; ++i) p[i] = a.v[i];
+}
+inline uint32_t positive(V a) { return (a.v[0] > 0) | (a.v[1] > 0) << 1 | (a.v[2] > 0) << 2 | (a.v[3] > 0) << 3; }
 inline V nearest(V a) {
   const Float4 magic = {12582912.f, 12582912.f, 12582912.f, 12582912.f};  // 1.5 2^23: adding it leaves no bits below 1
   return {(a.v + magic) - magic};
@@ -114,10 +130,17 @@ inline V max(V a, V b) { return {a.v > b.v ? a.v : b.v}; }
 inline V min(V a, V b) { return {a.v < b.v ? a.v : b.v}; }
 inline V greater(V a, V b, V yes, V no) { return a.v > b.v ? yes : no; }
 inline V square_root(V a) { return {std::sqrt(a.v)}; }
+inline V load_part(const float* p, int n) { return {n ? *p : 0.f}; }
+inline void store_part(float* p, V a, int n) {
+  if (n) *p = a.v;
+}
+inline uint32_t positive(V a) { return a.v > 0; }
 inline V nearest(V a) { return {std::nearbyint(a.v)}; }
 inline V times_two_to(V a, V n) { return {std::ldexp(a.v, static_cast<int>(n.v))}; }
 inline float sum(V a) { return a.v; }
 #endif
+
+// load_part and store_part touch the first n < LANES values alone, the rest is zero; positive: one bit for each lane above zero.
 
 // e^x to 2 ulp, x clamped to [-87, 87]. max and min return their second operand where one is no number, so NaN stays NaN.
 inline V exponential(V x) {

@@ -1,5 +1,5 @@
 // The two small matrix products of the decode, on row-major blocks that stay in the first-level cache.
-//   product:     C[m][n] = (bias[n] or 0) + sum_k A[m][k] B[k][n]
+//   product:     C[m][n] = (bias[n] or 0) + sum_k A[m][k] B[k][n], stored or added by Out
 //   accumulate:  C[p][n] += sum_m A[m][p] B[m][n]
 // n runs along the registers and must be a multiple of 16; m is rounded up to TILE_STEP in product and p in accumulate, so A and C need
 // that many rows (columns of A in accumulate) of room, whose content does not matter.
@@ -15,9 +15,32 @@ constexpr int TILE = 6, TILE_STEP = 2;
 #endif
 constexpr int SLACK = TILE;
 
+// Where product puts C.
+struct Store {
+  float* c;
+  int stride;
+  void operator()(int row, int column, V sum) const { store(c + row * static_cast<int64_t>(stride) + column, sum); }
+};
+struct StoreRelu {
+  float* c;
+  int stride;
+  // max(0, x) in this order: NaN stays NaN
+  void operator()(int row, int column, V sum) const { store(c + row * static_cast<int64_t>(stride) + column, max(all(0.f), sum)); }
+};
+struct AddToRows {  // row i is added to row index[i]; no two alike but for rows that nobody reads
+  float* c;
+  int stride;
+  const int* index;
+  void operator()(int row, int column, V sum) const {
+    float* to = c + index[row] * static_cast<int64_t>(stride) + column;
+    store(to, load(to) + sum);
+  }
+};
+
 // Sums of TILE rows by `wide` registers; a compile-time stride (0: given at run time) lets one pointer address all rows of A.
-template <int rows, int wide, int fixed>
-inline void product_tile(const float* a, int a_stride, const float* b, int b_stride, int k, const float* bias, float* c, int c_stride) {
+template <int rows, int wide, int fixed, class Out>
+inline void product_tile(const float* a, int a_stride, const float* b, int b_stride, int k, const float* bias, const Out& out, int row,
+                         int column) {
   const int64_t stride = fixed ? fixed : a_stride;
   V sums[rows][wide];
   for (int j = 0; j < wide; ++j) {
@@ -39,35 +62,36 @@ inline void product_tile(const float* a, int a_stride, const float* b, int b_str
 #pragma GCC unroll 12
   for (int i = 0; i < rows; ++i)
 #pragma GCC unroll 2
-    for (int j = 0; j < wide; ++j) store(c + i * static_cast<int64_t>(c_stride) + j * LANES, sums[i][j]);
+    for (int j = 0; j < wide; ++j) out(row + i, column + j * LANES, sums[i][j]);
 }
 
-template <int wide, int fixed>
-inline void product_columns(int m, int k, const float* a, int as, const float* b, int bs, const float* bias, float* c, int cs) {
+template <int wide, int fixed, class Out>
+inline void product_columns(int m, int k, const float* a, int as, const float* b, int bs, const float* bias, const Out& out, int column) {
   int i = 0;
-  for (; i + TILE <= m; i += TILE) product_tile<TILE, wide, fixed>(a + i * as, as, b, bs, k, bias, c + i * cs, cs);
+  for (; i + TILE <= m; i += TILE) product_tile<TILE, wide, fixed>(a + i * as, as, b, bs, k, bias, out, i, column);
   if (m - i > 2 * TILE_STEP)
-    product_tile<TILE, wide, fixed>(a + i * as, as, b, bs, k, bias, c + i * cs, cs);
+    product_tile<TILE, wide, fixed>(a + i * as, as, b, bs, k, bias, out, i, column);
   else if (m - i > TILE_STEP)
-    product_tile<2 * TILE_STEP, wide, fixed>(a + i * as, as, b, bs, k, bias, c + i * cs, cs);
+    product_tile<2 * TILE_STEP, wide, fixed>(a + i * as, as, b, bs, k, bias, out, i, column);
   else if (m > i)
-    product_tile<TILE_STEP, wide, fixed>(a + i * as, as, b, bs, k, bias, c + i * cs, cs);
+    product_tile<TILE_STEP, wide, fixed>(a + i * as, as, b, bs, k, bias, out, i, column);
 }
 
-template <int fixed>
-void product_strided(int m, int n, int k, const float* a, int as, const float* b, int bs, const float* bias, float* c, int cs) {
+template <int fixed, class Out>
+void product_strided(int m, int n, int k, const float* a, int as, const float* b, int bs, const float* bias, const Out& out) {
   int j = 0;
-  for (; j + 2 * LANES <= n; j += 2 * LANES) product_columns<2, fixed>(m, k, a, as, b + j, bs, bias ? bias + j : nullptr, c + j, cs);
-  for (; j + LANES <= n; j += LANES) product_columns<1, fixed>(m, k, a, as, b + j, bs, bias ? bias + j : nullptr, c + j, cs);
+  for (; j + 2 * LANES <= n; j += 2 * LANES) product_columns<2, fixed>(m, k, a, as, b + j, bs, bias ? bias + j : nullptr, out, j);
+  for (; j + LANES <= n; j += LANES) product_columns<1, fixed>(m, k, a, as, b + j, bs, bias ? bias + j : nullptr, out, j);
 }
 
-inline void product(int m, int n, int k, const float* a, int as, const float* b, int bs, const float* bias, float* c, int cs) {
+template <class Out>
+inline void product(int m, int n, int k, const float* a, int as, const float* b, int bs, const float* bias, const Out& out) {
   switch (as) {
-    case 16: return product_strided<16>(m, n, k, a, as, b, bs, bias, c, cs);
-    case 32: return product_strided<32>(m, n, k, a, as, b, bs, bias, c, cs);
-    case 48: return product_strided<48>(m, n, k, a, as, b, bs, bias, c, cs);
-    case 80: return product_strided<80>(m, n, k, a, as, b, bs, bias, c, cs);
-    default: return product_strided<0>(m, n, k, a, as, b, bs, bias, c, cs);
+    case 16: return product_strided<16>(m, n, k, a, as, b, bs, bias, out);
+    case 32: return product_strided<32>(m, n, k, a, as, b, bs, bias, out);
+    case 48: return product_strided<48>(m, n, k, a, as, b, bs, bias, out);
+    case 80: return product_strided<80>(m, n, k, a, as, b, bs, bias, out);
+    default: return product_strided<0>(m, n, k, a, as, b, bs, bias, out);
   }
 }
 

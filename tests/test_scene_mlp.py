@@ -20,7 +20,7 @@ def test_equals_a_torch_sequential(attribute):
 
 def test_depth_adds_square_layers_that_kernels_do_not_cover():
     deep = Plain(depth=5).build("color", 35, 32, 30, 32)
-    assert len(deep.middle) == 3 and deep.weights(1) is None
+    assert len(deep.middle) == 3 and deep.weights(1).middle_w.shape[:2] == (1, 3)
     assert sum(p.numel() for p in deep.parameters()) == 2142 + 3 * (32 * 32 + 32)
     assert deep(torch.randn(4, 35), torch.randn(4, 32), 1)[0].shape == (4, 30)
     assert Plain().build("color", 35, 32, 30, 32).weights(1).k is None

@@ -16,7 +16,7 @@ ACTIVATIONS = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid
 LEVELS = [level for level in native.levels() if native.path(level)]
 
 
-def problem(A=70, N=100, K=4, F=8, H=16, E=3, k=2, distance=(), bias=True, seed=0, shuffled=False):
+def problem(A=70, N=100, K=4, F=8, H=16, E=3, k=2, distance=(), bias=True, seed=0, shuffled=False, depth=2, position=()):
     """Float64 inputs of a random scene; `k` is per attribute or one for all, 0 for a plain network."""
     g = torch.Generator().manual_seed(seed)
     randn = lambda *shape: torch.randn(*shape, generator=g, dtype=torch.float64).float().double()  # noqa: E731
@@ -27,16 +27,22 @@ def problem(A=70, N=100, K=4, F=8, H=16, E=3, k=2, distance=(), bias=True, seed=
         mine = k[i] if isinstance(k, tuple) else k
         experts, D, out = (1 if mine == 0 else E), F + 3 + (a in distance), K * CHANNELS[a]
         heads[a] = HeadWeights(
-            None if mine == 0 else randn(experts, F),
+            None if mine == 0 else randn(experts, F + 3 * (a in position)),
             None if mine == 0 or not bias else randn(experts),
             randn(experts, H, D) / 3,
             randn(experts, H) / 3,
             randn(experts, out, H) / 3,
             randn(experts, out) / 3,
             mine or None,
+            randn(experts, depth - 2, H, H) / 3 if depth > 2 else None,
+            randn(experts, depth - 2, H) / 3 if depth > 2 else None,
+            a in position,
         )
     rows = rows if shuffled else rows.sort().values
     return rows, columns, torch.tensor([0.3, -0.2, 2.5], dtype=torch.float64), heads, {a: a in distance for a in ATTRIBUTES}
+
+
+EXTENT = 3.0
 
 
 def oracle(rows, columns, camera, heads, with_dist):
@@ -50,11 +56,18 @@ def oracle(rows, columns, camera, heads, with_dist):
         y = {}
         for a, h in heads.items():
             z = torch.cat([f, v / distance] + ([distance[None]] if with_dist[a] else []))
-            expert = lambda e: ACTIVATIONS[a](h.w2[e] @ (h.w1[e] @ z + h.b1[e]).relu() + h.b2[e])  # noqa: B023, E731
+
+            def expert(e, a=a, h=h, z=z):
+                u = (h.w1[e] @ z + h.b1[e]).relu()
+                for w, b in [] if h.middle_w is None else zip(h.middle_w[e], h.middle_b[e]):
+                    u = (w @ u + b).relu()
+                return ACTIVATIONS[a](h.w2[e] @ u + h.b2[e])
+
             if h.router_w is None:
                 y[a] = expert(0)
                 continue
-            logits = h.router_w @ f + (0 if h.router_b is None else h.router_b)
+            seen = torch.cat([f, columns["xyz"][row] / EXTENT]) if h.position else f
+            logits = h.router_w @ seen + (0 if h.router_b is None else h.router_b)
             g = logits.softmax(0)
             picked = range(len(g)) if h.k is None else sorted(range(len(g)), key=lambda e: (-float(logits[e].detach()), e))[: h.k]
             y[a] = sum(g[e] / sum(g[j] for j in picked) * expert(e) for e in picked)
@@ -117,7 +130,7 @@ def single_precision(columns, heads):
 def run_native(rows, columns, camera, heads, with_dist, seed=5):
     columns, heads, named = leaves(*single_precision(columns, heads))
     gaussians, raw, routing = native_decode.decode(
-        rows, columns["xyz"], columns["feature"], columns["log_scaling"], columns["offsets"], camera.float(), heads, with_dist
+        rows, columns["xyz"], columns["feature"], columns["log_scaling"], columns["offsets"], camera.float(), heads, with_dist, EXTENT
     )
     objective(gaussians, raw, {a: r.gates for a, r in routing.items()}, seed).backward()
     return gaussians, raw, routing, {n: v.grad for n, v in named.items()}
@@ -145,6 +158,11 @@ CASES = {
     "one with distance": {"distance": ("cov",), "bias": False},
     "paper's sizes, several chunks": {"A": 600, "N": 640, "K": 10, "F": 32, "H": 32, "E": 5},
     "odd sizes": {"A": 37, "K": 3, "F": 7, "H": 19, "E": 4},
+    "many slots": {"K": 40, "A": 9},
+    "six layers": {"k": 0, "depth": 6},
+    "three layers, experts": {"depth": 3, "H": 19},
+    "routers that see positions": {"position": ATTRIBUTES},
+    "one router that does": {"position": ("cov",), "F": 12, "distance": ("color",)},
     "rows in any order": {"shuffled": True},
     "one anchor": {"A": 1, "N": 1, "seed": 1},
 }
@@ -211,7 +229,7 @@ def test_masked_slots_are_revived_through_the_opacity_head():
     rows, columns, camera, heads, with_dist = problem()
     columns, heads, named = leaves(*single_precision(columns, heads))
     _, raw, _ = native_decode.decode(
-        rows, columns["xyz"], columns["feature"], columns["log_scaling"], columns["offsets"], camera.float(), heads, with_dist
+        rows, columns["xyz"], columns["feature"], columns["log_scaling"], columns["offsets"], camera.float(), heads, with_dist, EXTENT
     )
     torch.relu(-raw).mean().backward()
     assert named["opacity.w2"].grad.any() and named["feature"].grad.any() and not named["color.w2"].grad.any()

@@ -166,12 +166,12 @@ class AnchorScene(nn.Module):
             weights["color"] = fold(weights["color"], self.codes(camera))
         p = self.table.params
         with_dist = {a: a in self.config.add_dist for a in ATTRIBUTES}
-        position = camera.position
-        fused = native_decode if rows.device.type == "cpu" else triton_decode
-        gaussians, raw, routing = fused.decode(
-            rows, self.table.facts["xyz"], p["feature"], p["log_scaling"], p["offsets"], position, weights, with_dist
-        )
-        return Decoded(gaussians, rows, raw, routing)
+        xyz, columns = self.table.facts["xyz"], (p["feature"], p["log_scaling"], p["offsets"])
+        if rows.device.type == "cpu":
+            made = native_decode.decode(rows, xyz, *columns, camera.position, weights, with_dist, self.extent)
+        else:
+            made = triton_decode.decode(rows, xyz, *columns, camera.position, weights, with_dist)
+        return Decoded(made[0], rows, made[1], made[2])
 
     def native_weights(self, step: int) -> dict[str, HeadWeights] | None:
         """The heads' tensors for the fused decode (compiled on the CPU, Triton on CUDA), or None where it does not apply."""

@@ -186,6 +186,6 @@ class MixtureHead(nn.Module):
 
     def weights(self, step: int) -> HeadWeights | None:
         r = self.config.router
-        if self.config.mix != "post_activation" or not r.renormalise or r.noise_std > 0 or r.detach_feature or r.input_pos:
+        if self.config.mix != "post_activation" or not r.renormalise or r.noise_std > 0 or r.detach_feature:
             return None
-        return HeadWeights(self.router_w, self.router_b, self.w1, self.b1, self.w2, self.b2, self.k(step))
+        return HeadWeights(self.router_w, self.router_b, self.w1, self.b1, self.w2, self.b2, self.k(step), position=r.input_pos)

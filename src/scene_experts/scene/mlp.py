@@ -24,13 +24,16 @@ class HeadWeights:
     k: experts chosen per anchor; None means dense (all of them, weighted by their gates).
     """
 
-    router_w: Tensor | None  # [E, F]
+    router_w: Tensor | None  # [E, F], or [E, F + 3] where the router sees the anchor's position
     router_b: Tensor | None  # [E]
     w1: Tensor  # [E, H, D]
     b1: Tensor  # [E, H]
     w2: Tensor  # [E, out, H]
     b2: Tensor  # [E, out]
     k: int | None
+    middle_w: Tensor | None = None  # [E, L, H, H]: L hidden layers between the first and the last
+    middle_b: Tensor | None = None  # [E, L, H]
+    position: bool = False  # the router sees the anchor's position, divided by the scene's extent
 
 
 class Head(Protocol):
@@ -39,7 +42,7 @@ class Head(Protocol):
     def __call__(self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None) -> tuple[Tensor, Routing | None]: ...
 
     def weights(self, step: int) -> HeadWeights | None:
-        """The tensors in use at `step`, or None where they do not say all (deeper networks, unusual switches)."""
+        """The tensors in use at `step`, or None where they do not say all (unusual switches)."""
         ...
 
     def routing(self, feature: Tensor, step: int, position: Tensor | None = None) -> Routing | None:
@@ -93,9 +96,11 @@ class MLP(nn.Module):
         return ACTIVATIONS[self.attribute](functional.linear(h, self.w2[0], self.b2[0])), None
 
     def weights(self, step: int) -> HeadWeights | None:
-        if self.middle:
-            return None
-        return HeadWeights(None, None, self.w1, self.b1, self.w2, self.b2, None)
+        if not self.middle:
+            return HeadWeights(None, None, self.w1, self.b1, self.w2, self.b2, None)
+        middle_w = torch.stack([layer.weight for layer in self.middle])[None]  # type: ignore[misc]
+        middle_b = torch.stack([layer.bias for layer in self.middle])[None]  # type: ignore[misc]
+        return HeadWeights(None, None, self.w1, self.b1, self.w2, self.b2, None, middle_w, middle_b)
 
     def routing(self, feature: Tensor, step: int, position: Tensor | None = None) -> Routing | None:
         return None

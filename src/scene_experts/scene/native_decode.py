@@ -2,7 +2,7 @@
 
 The same mathematics as `AnchorScene.decode_composed` (its oracle), forward and backward, with the anchors of each expert gathered so that
 Top-k costs k networks instead of E. Backward computes the hidden layers again instead of storing them. Gradients are the same bits for
-every number of threads. Symbols as in `types.py`; D inputs and H hidden units of a head.
+every number of threads. Symbols as in `types.py`; D inputs, H hidden units and L middle layers of a head.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from scene_experts.types import Gaussians, Routing
 
 ATTRIBUTES = ("opacity", "cov", "color")  # the library's order
 CHUNK = 256  # anchors per unit of work (csrc/decode.h)
-TENSORS = ("router_w", "router_b", "w1", "b1", "w2", "b2")
+TENSORS = ("router_w", "router_b", "w1", "b1", "middle_w", "middle_b", "w2", "b2")
+T = len(TENSORS)
 
 
 class _Head(ctypes.Structure):
@@ -28,7 +29,7 @@ class _Head(ctypes.Structure):
 
     _fields_ = [
         *[(name, ctypes.c_void_p) for name in (*TENSORS, "gates", "chosen", "mix", *(f"d_{t}" for t in TENSORS), "d_gates")],
-        *[(name, ctypes.c_int64) for name in ("E", "k", "H", "out", "distance")],
+        *[(name, ctypes.c_int64) for name in ("E", "k", "H", "L", "out", "distance", "position")],
     ]
 
 
@@ -41,6 +42,7 @@ class _Decode(ctypes.Structure):
         *[(name, ctypes.c_void_p) for name in ("d_means", "d_quats", "d_scales", "d_opacities", "d_colors", "d_raw")],
         *[(name, ctypes.c_void_p) for name in ("d_feature", "d_log_scaling", "d_offsets")],
         *[(name, ctypes.c_int64) for name in ("A", "N", "K", "F", "threads", "ascending")],
+        ("extent", ctypes.c_double),
         ("heads", _Head * 3),
     ]
 
@@ -54,6 +56,8 @@ class _Plan:
     camera: Tensor  # [3]
     k: tuple[int, int, int]  # 0: dense
     distance: tuple[int, int, int]
+    position: tuple[int, int, int]  # the router sees it
+    extent: float
     ascending: bool
 
 
@@ -66,13 +70,14 @@ def decode(
     camera_position: Tensor,
     heads: dict[str, HeadWeights],
     with_dist: dict[str, bool],
+    extent: float = 1.0,
 ) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
     """Gaussians of positive opacity in the order of (row, slot), raw opacities [A, K], and routing of the heads that have a router.
 
     rows [A] int64, each at most once; xyz [N, 3], feature [N, F], log_scaling [N, 6], offsets [N, K, 3], camera_position [3]; heads and
-    with_dist by attribute ("opacity", "cov", "color"), D = F + 3 (+ 1 with the distance). All float32 on the CPU. Differentiable in
-    feature, log_scaling, offsets and every tensor of the heads; not in xyz and the camera. Raises ValueError for shapes that do not fit,
-    IndexError for rows outside of the table.
+    with_dist by attribute ("opacity", "cov", "color"), D = F + 3 (+ 1 with the distance); a router that sees positions sees xyz / extent.
+    All float32 on the CPU. Differentiable in feature, log_scaling, offsets and every tensor of the heads; not in xyz and the camera. Raises
+    ValueError for shapes that do not fit, IndexError for rows outside of the table.
     """
     found = [heads[a] for a in ATTRIBUTES]
     distance = tuple(int(with_dist[a]) for a in ATTRIBUTES)
@@ -89,6 +94,8 @@ def decode(
         camera_position.detach().to(torch.float32).contiguous(),
         tuple(h.k or 0 if h.router_w is not None else 0 for h in found),  # type: ignore[arg-type]
         distance,  # type: ignore[arg-type]
+        tuple(int(h.position) for h in found),  # type: ignore[arg-type]
+        extent,
         ascending,
     )
     weights = [getattr(h, name) for h in found for name in TENSORS]
@@ -105,13 +112,18 @@ def _check(xyz: Tensor, feature: Tensor, log_scaling: Tensor, offsets: Tensor, h
         E, H, out = h.w1.shape[0], h.w1.shape[1], K * CHANNELS[a]
         wanted += [(f"{a}.w1", h.w1, (E, H, F + 3 + extra)), (f"{a}.b1", h.b1, (E, H))]
         wanted += [(f"{a}.w2", h.w2, (E, out, H)), (f"{a}.b2", h.b2, (E, out))]
+        if h.middle_w is not None and h.middle_b is not None:
+            L = h.middle_w.shape[1]
+            wanted += [(f"{a}.middle_w", h.middle_w, (E, L, H, H)), (f"{a}.middle_b", h.middle_b, (E, L, H))]
         if h.router_w is None:
             if E != 1:
                 raise ValueError(f"expected one expert for {a} without a router, found {E}")
             continue
         if h.k is not None and not 1 <= h.k <= E:
             raise ValueError(f"expected k between 1 and {E} for {a}, found {h.k}")
-        wanted += [(f"{a}.router_w", h.router_w, (E, F))] + ([] if h.router_b is None else [(f"{a}.router_b", h.router_b, (E,))])
+        wanted += [(f"{a}.router_w", h.router_w, (E, F + 3 * h.position))] + (
+            [] if h.router_b is None else [(f"{a}.router_b", h.router_b, (E,))]
+        )
     for name, tensor, shape in wanted:
         if tuple(tensor.shape) != shape or tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise ValueError(
@@ -129,7 +141,7 @@ class _DecodeFunction(torch.autograd.Function):
         raw, starts = torch.empty(A, K), torch.zeros(-(-A // CHUNK) + 1, dtype=torch.int64)
         gates, chosen, mix = [], [], []
         for i, k in enumerate(plan.k):
-            routed, E = weights[6 * i] is not None, call.heads[i].E
+            routed, E = weights[T * i] is not None, call.heads[i].E
             gates.append(torch.empty(A, E) if routed else None)
             chosen.append(torch.empty(A, k, dtype=torch.int64) if routed and k else None)
             mix.append(torch.empty(A, k) if routed and k else None)
@@ -154,12 +166,13 @@ class _DecodeFunction(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple:
         plan: _Plan = ctx.plan
         saved = ctx.saved_tensors
-        columns, weights, (raw, starts, means, quats, scales, opacities, colors, per_length) = saved[:3], saved[3:21], saved[21:29]
+        columns, weights, made, routing = saved[:3], saved[3 : 3 + 3 * T], saved[3 + 3 * T : 11 + 3 * T], saved[11 + 3 * T :]
+        raw, starts, means, quats, scales, opacities, colors, per_length = made
         call = _call(plan, columns, weights)
         _set(
             call, raw=raw, starts=starts, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, per_length=per_length
         )
-        _set_routing(call, saved[29:32], saved[32:35], saved[35:38])
+        _set_routing(call, routing[:3], routing[3:6], routing[6:])
         given = [None if g is None else g.contiguous() for g in upstream]
         _set(call, d_means=given[0], d_quats=given[1], d_scales=given[2], d_opacities=given[3], d_colors=given[4], d_raw=given[6])
         # Ascending rows: the library writes every row of the table, zeros where nothing was seen.
@@ -167,7 +180,7 @@ class _DecodeFunction(torch.autograd.Function):
         d_columns, d_weights = [fresh(t) for t in columns], [None if t is None else torch.empty_like(t) for t in weights]
         _set(call, d_feature=d_columns[0], d_log_scaling=d_columns[1], d_offsets=d_columns[2])
         for i, head in enumerate(call.heads):
-            _set(head, d_gates=given[7 + i], **{f"d_{name}": d_weights[6 * i + j] for j, name in enumerate(TENSORS)})
+            _set(head, d_gates=given[7 + i], **{f"d_{name}": d_weights[T * i + j] for j, name in enumerate(TENSORS)})
         library = native.load()
         assert library is not None
         library.se_decode_backward(ctypes.byref(call))
@@ -181,12 +194,14 @@ def _call(plan: _Plan, columns: Any, weights: Any) -> _Decode:
     call = _Decode(
         A=len(plan.rows), N=len(plan.xyz), K=offsets.shape[1], F=feature.shape[1], threads=native.threads(), ascending=plan.ascending
     )
+    call.extent = plan.extent
     _set(call, rows=plan.rows, xyz=plan.xyz, feature=feature, log_scaling=log_scaling, offsets=offsets, camera=plan.camera)
     for i, head in enumerate(call.heads):
-        own = dict(zip(TENSORS, weights[6 * i : 6 * i + 6]))
+        own = dict(zip(TENSORS, weights[T * i : T * i + T]))
         _set(head, **own)
         head.E, head.H, head.out = own["w1"].shape[0], own["w1"].shape[1], own["w2"].shape[1]
-        head.k, head.distance = plan.k[i], plan.distance[i]
+        head.L = 0 if own["middle_w"] is None else own["middle_w"].shape[1]
+        head.k, head.distance, head.position = plan.k[i], plan.distance[i], plan.position[i]
     return call
 
 

@@ -50,8 +50,13 @@ def available() -> str | None:
 
 
 def covers(attribute: str, h: HeadWeights, F: int, K: int) -> bool:
-    """Whether the kernels have room for a network of this size (a program holds it in registers) and for its number of experts."""
+    """Whether the kernels have room for a network of this size (a program holds it in registers) and for its number of experts.
+
+    Networks with middle layers and routers that see positions are not covered.
+    """
     E, H = h.w1.shape[:2]
+    if h.middle_w is not None or h.position:
+        return False
     return padded(F + 5) <= 64 and padded(H) <= 64 and padded(K * CHANNELS[attribute]) <= WIDEST and E <= MOST_EXPERTS
 
 

@@ -1,0 +1,104 @@
+// Gates, chosen experts and their weights, and the way back. See decode.h.
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "decode.h"
+#include "products.h"
+
+namespace se {
+namespace {
+
+// Softmax over `count` rows of CHUNK lanes each, in place.
+void softmax(float* rows, int count, int n) {
+  for (int a = 0; a < n; a += LANES) {
+    V largest = load(rows + a), total = all(0.f);
+    for (int e = 1; e < count; ++e) largest = max(largest, load(rows + e * CHUNK + a));
+    for (int e = 0; e < count; ++e) {
+      const V x = exponential(load(rows + e * CHUNK + a) - largest);
+      store(rows + e * CHUNK + a, x);
+      total = total + x;
+    }
+    const V inverse = all(1.f) / total;
+    for (int e = 0; e < count; ++e) store(rows + e * CHUNK + a, load(rows + e * CHUNK + a) * inverse);
+  }
+}
+
+// The k largest of E rows of logits: their values and their places (as floats), largest first, ties to the lowest place. Spoils `logits`.
+void choose(float* logits, int E, int k, int n, float* values, float* places) {
+  for (int a = 0; a < n; a += LANES)
+    for (int r = 0; r < k; ++r) {
+      V best = load(logits + a), place = all(0.f);
+      for (int e = 1; e < E; ++e) {
+        const V x = load(logits + e * CHUNK + a);
+        place = greater(x, best, all(float(e)), place);
+        best = greater(x, best, x, best);
+      }
+      store(values + r * CHUNK + a, best);
+      store(places + r * CHUNK + a, place);
+      const V gone = all(-std::numeric_limits<float>::infinity());
+      for (int e = 0; e < E; ++e) {
+        const V x = load(logits + e * CHUNK + a);
+        store(logits + e * CHUNK + a, greater(place, all(e - 0.5f), greater(all(e + 0.5f), place, gone, x), x));
+      }
+    }
+}
+
+}  // namespace
+
+void route(const Decode& d, const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {
+  if (!s.R) return;
+  float* across = w.logits + int64_t(CHUNK + SLACK) * s.Rp;  // [R][CHUNK]: anchors along the lanes
+  product(chunk.n, s.Rp, s.router, w.z, s.Z, packed.router_t.data(), s.Rp, packed.router_b.data(), Store{w.logits, s.Rp});
+  for (int r = 0; r < s.R; ++r)
+    for (int a = 0; a < chunk.n; ++a) across[r * CHUNK + a] = w.logits[a * s.Rp + r];
+  for (int i = 0; i < 3; ++i) {
+    const Head& head = d.heads[i];
+    if (!head.router_w) continue;
+    const int E = static_cast<int>(head.E), k = static_cast<int>(head.k), n = chunk.n;
+    float* mine = across + s.first[i] * CHUNK;
+    float *copy = across + s.Rp * CHUNK, *values = copy + s.Rp * CHUNK, *places = values + s.Rp * CHUNK;
+    std::copy_n(mine, E * CHUNK, copy);
+    softmax(mine, E, n);
+    float* gates = head.gates + chunk.begin * E;
+    for (int a = 0; a < n; ++a)
+      for (int e = 0; e < E; ++e) gates[a * E + e] = mine[e * CHUNK + a];
+    if (!k) continue;
+    choose(copy, E, k, n, values, places);
+    softmax(values, k, n);
+    int64_t* chosen = head.chosen + chunk.begin * k;
+    float* mix = head.mix + chunk.begin * k;
+    for (int a = 0; a < n; ++a)
+      for (int r = 0; r < k; ++r) {
+        chosen[a * k + r] = static_cast<int64_t>(places[r * CHUNK + a]);
+        mix[a * k + r] = values[r * CHUNK + a];
+      }
+  }
+}
+
+void route_backward(const Decode& d, const Sizes& s, const Chunk& chunk, int i, Work& w) {
+  const Head& head = d.heads[i];
+  const int E = static_cast<int>(head.E), k = static_cast<int>(head.k), shares = head.shares();
+  const bool dense = k == 0 && E > 1;
+  for (int a = 0; a < chunk.n; ++a) {
+    const int64_t anchor = chunk.begin + a;
+    float* to = w.logits + int64_t(a) * s.Rp + s.first[i];  // nothing else writes here
+    const float* own = w.weights + int64_t(a) * shares;
+    const float *gates = head.gates + anchor * E, *direct = head.d_gates ? head.d_gates + anchor * E : nullptr;
+    float mean = 0;
+    if (dense || direct) {
+      for (int e = 0; e < E; ++e) mean += gates[e] * (to[e] = (direct ? direct[e] : 0.f) + (dense ? own[e] : 0.f));
+      for (int e = 0; e < E; ++e) to[e] = gates[e] * (to[e] - mean);
+    } else {
+      for (int e = 0; e < E; ++e) to[e] = 0.f;
+    }
+    if (k <= 1) continue;
+    const float* mix = head.mix + anchor * k;
+    const int64_t* chosen = head.chosen + anchor * k;
+    mean = 0;
+    for (int r = 0; r < k; ++r) mean += mix[r] * own[r];
+    for (int r = 0; r < k; ++r) to[chosen[r]] += mix[r] * (own[r] - mean);
+  }
+}
+
+}  // namespace se
