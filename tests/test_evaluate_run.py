@@ -17,6 +17,7 @@ from scene_experts.errors import InputError
 from scene_experts.evaluate import metrics, pictures, run, weights
 from scene_experts.evaluate.run import About, evaluate
 from scene_experts.types import Camera, Decoded, Gaussians, Render, Routing
+from test_scene import started
 
 N, K, F, H, W = 6, 4, 8, 36, 48
 
@@ -56,6 +57,7 @@ class FakeScene:
     """Decodes 2 of 6 anchors; of their 8 Gaussians 3 have positive opacity."""
 
     K = K
+    file_values = 9
 
     def __init__(self) -> None:
         params = {"feature": torch.zeros(N, F), "offsets": torch.zeros(N, K, 3), "log_scaling": torch.zeros(N, 6)}
@@ -78,7 +80,7 @@ class FakeScene:
 
 class FakeTable:
     def __init__(self, params: dict[str, Tensor]) -> None:
-        self.params = params
+        self.params, self.facts = params, {}
 
     def __len__(self) -> int:
         return N
@@ -147,13 +149,12 @@ def test_scores_are_those_of_the_8_bit_files(tmp_path: Path) -> None:
     assert results["psnr"] == pytest.approx(20 * np.log10(255 / 26), abs=1e-4)  # 25.5 off, rounded up everywhere
 
 
-def test_sizes_are_those_of_the_published_layout() -> None:
-    scene = FakeScene()
-    assert run.sizes(scene)["ply_bytes"] == N * 4 * (6 + 3 * K + F + 1 + 6 + 4)  # type: ignore[arg-type]
-    scene.K = 10  # type: ignore[misc]
-    scene.table.params = {"feature": torch.zeros(N, 32), "offsets": torch.zeros(N, 10, 3)}
-    size = run.sizes(scene)  # type: ignore[arg-type]
-    assert size["ply_bytes"] == 316 * N and size["network_bytes"] == 200 and size["total_bytes"] == 316 * N + 200
+@pytest.mark.parametrize(("recipe", "row"), [("scaffold-gs", 316), ("3dgs", 248)])
+def test_sizes_are_those_of_the_published_layouts(recipe: str, row: int) -> None:
+    scene = started(recipe)
+    size, networks = run.sizes(scene), sum(4 * t.numel() for t in scene.network_tensors().values())
+    assert size["ply_bytes"] == row * len(scene.table) and size["network_bytes"] == networks
+    assert size["total_bytes"] == row * len(scene.table) + networks
     assert size["MB"] == size["total_bytes"] / 1e6 and size["MiB"] == size["total_bytes"] / 2**20
 
 

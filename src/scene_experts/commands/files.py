@@ -20,8 +20,8 @@ class ExportCommand:
 
     run: Annotated[Path, tyro.conf.Positional]
     """Run folder."""
-    format: Literal["anchors", "compact"] = "compact"
-    """anchors: the Scaffold-GS folder layout; compact: one small file of ours."""
+    format: Literal["anchors", "compact", "ply"] = "compact"
+    """anchors: the Scaffold-GS folder layout; compact: one small file of ours; ply: explicit Gaussians as 3DGS's file."""
     out: Path | None = None
     """File or folder to write; inside the run folder by default."""
     step: int | None = None
@@ -41,10 +41,10 @@ def export(args: list[str]) -> int:
 
 @dataclass(frozen=True)
 class ImportCommand:
-    """Make a run folder of a published Scaffold-GS result folder or of one of our compact files, to evaluate and convert it."""
+    """Make a run folder of a published Scaffold-GS or 3DGS result or of one of our compact files, to evaluate and convert it."""
 
     source: Annotated[Path, tyro.conf.Positional]
-    """Result folder (with point_cloud/iteration_N) or compact file."""
+    """Result folder (with point_cloud/iteration_N), PLY file of 3DGS, or compact file."""
     data: Annotated[Data, tyro.conf.arg(name="")]
     out: Annotated[Path, tyro.conf.arg(aliases=["-m"])]
     """Run folder to write."""

@@ -204,10 +204,8 @@ def _means(per_view: dict[str, dict[str, Any]], perceptual: Perceptual) -> dict[
 
 
 def sizes(scene: Scene) -> dict[str, Any]:
-    """Bytes of the scene on disk in the Scaffold-GS layout (float32 rows: 316 B an anchor for K = 10, F = 32) and of its networks."""
-    params, n = scene.table.params, len(scene.table)
-    values = 3 + 3 + 3 * scene.K + params["feature"].shape[1] + 1 + 6 + 4  # position, normal, offsets, feature, opacity, scaling, rotation
-    ply = 4 * values * n
+    """Bytes of the scene in its family's PLY file (float32 rows: 316 B an anchor for K = 10, F = 32; 248 B a Gaussian) and networks."""
+    ply = 4 * scene.file_values * len(scene.table)
     networks = sum(tensor.numel() * tensor.element_size() for tensor in scene.network_tensors().values())
     total = ply + networks
     return {"ply_bytes": ply, "network_bytes": networks, "total_bytes": total, "MB": total / 1e6, "MiB": total / 2**20}

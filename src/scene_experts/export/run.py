@@ -14,6 +14,7 @@ from scene_experts.config import Data, to_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
 from scene_experts.evaluate.metrics import psnr
+from scene_experts.export import explicit
 from scene_experts.export.cameras import write_cameras
 from scene_experts.export.compact import Compact, Sizes, read_compact, write_compact
 from scene_experts.export.extras import extra_networks, level_columns
@@ -31,17 +32,19 @@ from scene_experts.render import Rasterizer
 from scene_experts.run_folder import OpenRun
 from scene_experts.scene.anchors import ATTRIBUTES, AnchorScene
 from scene_experts.scene.experts import MixtureHead
+from scene_experts.scene.explicit import GaussianScene
 from scene_experts.scene.select import LevelSelector
 from scene_experts.state import scene_from
 
-COMPACT = "scene.compact"
+COMPACT, PLY = "scene.compact", "scene.ply"
 _LATTICE_TOLERANCE = 1e-3  # voxels
 
 
 def write_layout(run: OpenRun, capture: Capture, out: Path | None = None) -> Path:
     """Write point_cloud/iteration_<step>/, cameras.json and cfg_args below `out` (the run folder); returns the iteration's folder."""
     out = out or run.path
-    folder = _write_anchors(run, capture.world, out)
+    write = explicit.write_folder if isinstance(run.scene, GaussianScene) else _write_anchors
+    folder = write(run, capture.world, out)
     write_cameras(out / "cameras.json", capture)
     return folder
 
@@ -54,6 +57,11 @@ def export_run(run: Path, format: str, out: Path | None = None, step: int | None
     """
     opened = run_folder.open_run(run, "cpu", step)
     anchors = len(opened.scene.table)
+    if format == "ply":
+        path = out or run / PLY
+        path = path / PLY if path.is_dir() else path
+        explicit.write_file(explicit.scene_of(opened), world_of(opened), path)
+        return [f"wrote {path}", f"{anchors:,} Gaussians, {path.stat().st_size / 1e6:.2f} MB, in the capture's own frame"]
     if format == "anchors":
         out = out or run
         folder = _write_anchors(opened, world_of(opened), out)
@@ -182,7 +190,7 @@ def _settings(data: Data) -> dict[str, Any]:
 def anchors_of(run: OpenRun) -> AnchorScene:
     """The run's scene, which must be one of anchors. Raises InputError where it is none."""
     if not isinstance(run.scene, AnchorScene):
-        raise InputError(f"expected a scene of anchors, found a run of '{run.config.train.recipe}', which has none; use another --format")
+        raise InputError(f"expected a scene of anchors, found a run of '{run.config.train.recipe}', which has none; use --format ply")
     return run.scene
 
 
@@ -198,7 +206,8 @@ def world_of(run: OpenRun) -> World:
 
 
 def import_result(source: Path, data: Data, out: Path, iteration: int | None = None) -> Path:
-    """Make the run folder `out` of a result folder or compact file (`incoming.import_result`), with its layout; returns it."""
-    capture = import_files(source, data, out, iteration)
+    """Make the run folder `out` of a result folder, compact file (`incoming`) or PLY file of 3DGS, with its layout; returns it."""
+    file = explicit.find_file(source, iteration)
+    capture = import_files(source, data, out, iteration) if file is None else explicit.import_file(file, data, out, iteration)
     write_layout(run_folder.open_run(out), capture)
     return out

@@ -26,6 +26,11 @@ class Scene(Protocol):
         """Gaussians per row."""
         ...
 
+    @property
+    def file_values(self) -> int:
+        """float32 values that a row takes in the file of the scene's family."""
+        ...
+
     def __call__(self, camera: Camera, step: int, training: bool, cull: Cull) -> Decoded: ...
 
     def routing(self, step: int) -> dict[str, Routing]:

@@ -1,0 +1,128 @@
+"""Scenes of explicit Gaussians as 3DGS's files, both ways: point_cloud/iteration_<N>/point_cloud.ply, in the capture's own frame.
+
+From the trained world to the capture's frame lengths scale and positions move; axes are kept, so rotations and harmonics stay as they are.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scene_experts import checkpoint, run_folder
+from scene_experts.config import Data, RunConfig, Train, from_json, to_json
+from scene_experts.data.views import Capture, World
+from scene_experts.errors import InputError
+from scene_experts.export.cfg_args import cfg_args_text
+from scene_experts.export.ply import read_gaussian_ply, read_vertices, write_gaussian_ply
+from scene_experts.export.scaffold import SIDECAR, SIDECAR_FORMAT, iteration_folder, read_sidecar
+from scene_experts.io import write_bytes, write_json
+from scene_experts.recipes import gs_3d
+from scene_experts.run_folder import OpenRun
+from scene_experts.scene.explicit import COLUMNS, Explicit, GaussianScene
+
+KIND = "gaussians"  # in our description of a scene
+_STEPS = 30_000  # of a file that does not say how long it was trained
+
+
+def scene_of(run: OpenRun) -> GaussianScene:
+    """The run's scene, which must be one of explicit Gaussians. Raises InputError where it is none."""
+    if not isinstance(run.scene, GaussianScene):
+        raise InputError(f"expected a scene of explicit Gaussians, found a run of '{run.config.train.recipe}'; use another --format")
+    return run.scene
+
+
+def write_file(scene: GaussianScene, world: World, path: Path) -> None:
+    """Write the scene as a PLY file that readers of 3DGS open, in the capture's own frame. Raises RunError when the disk is full."""
+    p = {name: value.detach().cpu() for name, value in scene.table.params.items()}
+    means = world.to_input(p["means"].double()).float()
+    log_scales = (p["log_scales"].double() - math.log(world.scale)).float()
+    write_gaussian_ply(path, means, torch.cat([p["sh_dc"][:, None], p["sh_rest"]], dim=1), p["raw_opacity"], log_scales, p["quats"])
+
+
+def write_folder(run: OpenRun, world: World, out: Path) -> Path:
+    """Write out/point_cloud/iteration_<step>/ and out/cfg_args; returns the iteration's folder."""
+    scene, data = scene_of(run), {name: value for name, value in to_json(run.config.data).items() if name != "path"}
+    folder = out / "point_cloud" / f"iteration_{run.step}"
+    write_file(scene, world, folder / "point_cloud.ply")
+    about = {
+        "format": SIDECAR_FORMAT,
+        "kind": KIND,
+        "recipe": run.config.train.recipe,
+        "step": run.step,
+        "K": 1,
+        "F": 0,
+        "sh_degree": scene.config.sh_degree,
+        "voxel_size": {"trained": 0.0, "input": 0.0},
+        "world": {"scale": world.scale, "shift": list(world.shift)},
+        "extent": scene.extent,
+        "train": to_json(run.config.train),
+        "data": data,
+    }
+    write_json(folder / SIDECAR, about)
+    write_bytes(out / "cfg_args", cfg_args_text({"sh_degree": scene.config.sh_degree}).encode())
+    return folder
+
+
+def find_file(source: Path, iteration: int | None = None) -> Path | None:
+    """The PLY file of explicit Gaussians that `source` is, or that the result folder `source` holds; None where it holds another scene."""
+    source = Path(source)
+    if source.is_file() and source.suffix.lower() == ".ply":
+        path = source
+    elif (source / "point_cloud").is_dir() or (source / "point_cloud.ply").is_file():
+        path = iteration_folder(source, iteration) / "point_cloud.ply"
+    else:
+        return None
+    return path if "f_dc_0" in read_vertices(path) else None
+
+
+def read_columns(path: Path, world: World) -> dict[str, Tensor]:
+    """The columns of a table of explicit Gaussians, in the trained world, from a PLY file of 3DGS in the capture's own frame.
+
+    Raises InputError for files without such Gaussians and for values that are not finite.
+    """
+    found = read_gaussian_ply(path)
+    for name, value in found.items():
+        bad = int((~value.isfinite()).reshape(len(value), -1).any(1).sum())
+        if bad:
+            raise InputError(f"expected finite {name} in {path}, found {bad:,} Gaussians with others; export the result again")
+    sh = found["sh"]
+    columns = {
+        "means": world.from_input(found["means"].double()).float(),
+        "log_scales": (found["log_scales"].double() + math.log(world.scale)).float(),
+        "quats": found["quats"],
+        "raw_opacity": found["opacity_logit"],
+        "sh_dc": sh[:, 0].contiguous(),
+        "sh_rest": sh[:, 1:].contiguous(),
+    }
+    return {name: columns[name] for name in COLUMNS}
+
+
+def import_file(path: Path, data: Data, out: Path, iteration: int | None = None) -> Capture:
+    """Make the run folder `out` (configuration and checkpoint) of a PLY file of 3DGS, published or ours; returns its capture.
+
+    The file must be in the frame and unit of the capture. What it does not say is 3DGS's: the recipe, and 30,000 iterations unless its
+    folder's name says otherwise.
+    """
+    beside = path.parent / SIDECAR
+    about: dict[str, Any] = read_sidecar(beside) if beside.is_file() else {}
+    capture = run_folder.load_capture(data)
+    capture.images.close()
+    columns = read_columns(path, capture.world)
+    named = re.fullmatch(r"iteration_(\d+)", path.parent.name)
+    step = int(about.get("step") or iteration or (int(named[1]) if named else _STEPS))
+    degree = math.isqrt(columns["sh_rest"].shape[1] + 1) - 1
+    if about.get("kind") == KIND and "train" in about:
+        cfg = from_json(Train, about["train"], "train")
+    else:
+        cfg = replace(gs_3d, scene=Explicit(sh_degree=degree), iterations=max(step, 1))
+    config = RunConfig(cfg, data, f"import {path.name}", versions=run_folder.versions())
+    run_folder.prepare(out, config, resume=False)
+    meta = {"recipe": cfg.recipe, "step": step, "seconds": 0.0, "extent": capture.extent, "config": "imported"}
+    checkpoint.save(out / "checkpoints", step, {f"params.{name}": value for name, value in columns.items()}, meta)
+    return capture
