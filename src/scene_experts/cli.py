@@ -17,6 +17,7 @@ COMMANDS = {
     "eval": "render and score the held-out views of a run",
     "compare": "one table of several runs",
     "render": "a camera path through a run, as video or pictures",
+    "view": "a run in a browser, drawn here: experts, cameras, photographs beside",
     "report": "one page of runs: curves, views with a slider, experts, commands",
     "export": "write a trained scene as anchor PLY or compact file",
     "import": "make a run folder of a published Scaffold-GS result or of a compact file",

@@ -10,6 +10,7 @@ HANDLERS: dict[str, tuple[str, str]] = {
     "eval": ("evaluate", "evaluate"),
     "compare": ("evaluate", "compare"),
     "render": ("render", "render"),
+    "view": ("view", "view"),
     "report": ("report", "report"),
     "export": ("files", "export"),
     "import": ("files", "import_"),

@@ -25,6 +25,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.record import Recorder
 from scene_experts.render import Rasterizer
 from scene_experts.train import Run
+from scene_experts.view.server import Live, viser
 
 
 @dataclass(frozen=True)
@@ -51,12 +52,18 @@ class TrainCommand:
     """Iterations between pictures of a held-out view in RUN/previews; 0 for none."""
     max_memory: float = 0.0
     """GiB of resident memory at which growth stops; 0 for no cap."""
+    viewer: bool = False
+    """Show the training in a browser while it runs (pip install 'scene-experts[viewer]')."""
+    port: int = 8080
+    """Port of the viewer, on this machine alone."""
     tensorboard: bool = False
     """Write RUN/tensorboard too (pip install 'scene-experts[tensorboard]')."""
 
 
 def train(args: list[str]) -> int:
     command = parse_train(args)
+    if command.viewer:
+        viser()  # says what is missing before anything is read
     command = replace(command, data=run_folder.named(command.data))
     check_settings(command)
     console = Console(highlight=False)
@@ -119,6 +126,12 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
             raise KeyboardInterrupt  # a second signal does not wait
         run.stop.append(signal.Signals(number).name)
 
+    live = None
+    if command.viewer:
+        say = lambda url: console.print(f"viewer: {url}", soft_wrap=True)  # noqa: E731
+        label = f"{command.cfg.recipe} on {capture.name}"
+        live = Live(capture, rasterize, lambda: bool(run.stop), command.port, label, command.out / "paths", say)
+        run = replace(run, watch=live)
     previous = {s: signal.signal(s, stop) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
         with Recorder(command.out, command.tensorboard, capture) as record, Progress(console) as progress:
@@ -127,7 +140,11 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
                     run_folder.prepare(command.out, run.config, command.resume, command.overwrite)
                 record(event)
                 progress(event)
+                if live:
+                    live.event(event)
     finally:
+        if live:
+            live.close()
         for number, handler in previous.items():
             signal.signal(number, handler)
         capture.images.close()

@@ -26,11 +26,13 @@ LOW, MIDDLE, HIGH = (0.05, 0.03, 0.30), (0.75, 0.20, 0.45), (1.00, 0.90, 0.35)  
 
 @dataclass(frozen=True)
 class Look:
-    """What to show. `attribute`: of which routers; `only`: the experts whose anchors are drawn (None: all)."""
+    """What to show. `attribute`: of which routers; `only`: the experts whose anchors are drawn (None: all); `box`: the corners of a
+    crop, trained world."""
 
     mode: Mode = "picture"
     attribute: str = "color"
     only: tuple[int, ...] | None = None
+    box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
 
 
 @torch.no_grad()
@@ -43,6 +45,9 @@ def paint(scene: Scene, camera: Camera, step: int, rasterize: Rasterizer, backgr
         wanted = [e for e in look.only if 0 <= e < mine.shape[1]]
         mask = mine[:, wanted].any(1)
         gaussians = keep(gaussians, mask)
+    if look.box is not None:
+        low, high = (gaussians.means.new_tensor(corner) for corner in look.box)
+        gaussians = keep(gaussians, ((gaussians.means >= low) & (gaussians.means <= high)).all(1))
     if look.mode in ("experts", "entropy", "activation"):
         colours = row_colours(decoded, look)
         place = torch.searchsorted(decoded.rows, torch.div(gaussians.source, scene.K, rounding_mode="floor"))

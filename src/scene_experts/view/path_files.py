@@ -19,17 +19,25 @@ FORMAT = 1
 OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # nerfstudio: y up, looking along -z
 
 
-def write(path: Path, cameras: CameraPath, world: World, loop: bool = False) -> None:
+def write(path: Path, cameras: CameraPath, world: World, loop: bool = False, play_fps: float | None = None) -> None:
     """Write every camera as a keyframe, in the capture's own frame.
 
     {"format": 1, "fps", "loop", "width", "height", "keyframes": [{"time", "camera_to_world" 4x4 (OpenCV axes), "fov" degrees, vertical}]}
+    play_fps: frames a second to draw between keyframes that are further apart.
     """
     keys = [
         {"time": i / cameras.fps, "camera_to_world": to_world(camera, world).tolist(), "fov": fov(camera)}
         for i, camera in enumerate(cameras.cameras)
     ]
     first = cameras.cameras[0]
-    value = {"format": FORMAT, "fps": cameras.fps, "loop": loop, "width": first.width, "height": first.height, "keyframes": keys}
+    value = {
+        "format": FORMAT,
+        "fps": play_fps or cameras.fps,
+        "loop": loop,
+        "width": first.width,
+        "height": first.height,
+        "keyframes": keys,
+    }
     write_json(path, value)
 
 

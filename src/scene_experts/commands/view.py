@@ -1,0 +1,51 @@
+"""`scene-experts view`: a trained scene in a browser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from scene_experts import run_folder
+from scene_experts.cli import PROG
+from scene_experts.commands.shared import Device, Raster, backend
+from scene_experts.view.server import Viewer, viser
+
+
+@dataclass(frozen=True)
+class ViewCommand:
+    """Look at a run in a browser; the scene is drawn here, so the browser needs no GPU."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+    port: int = 8080
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 lets other machines in (there is no password)."""
+    data: Annotated[Path | None, tyro.conf.arg(aliases=["-s"])] = None
+    """Where the capture is now, if it moved."""
+    step: int | None = None
+    """Checkpoint to show; the newest by default."""
+    device: Device = "auto"
+    rasterizer: Raster = "auto"
+
+
+def view(args: list[str]) -> int:
+    command = tyro.cli(ViewCommand, prog=f"{PROG} view", args=args)
+    viser()  # says what is missing before anything is read
+    device, rasterize = backend(command.device, command.rasterizer, False, False)
+    opened = run_folder.open_run(command.run, device, command.step)
+    if getattr(rasterize, "antialias", opened.cfg.antialias) != opened.cfg.antialias:
+        rasterize = replace(rasterize, antialias=opened.cfg.antialias)  # type: ignore[type-var]
+    data = opened.config.data if command.data is None else replace(opened.config.data, path=command.data)
+    capture = run_folder.load_capture(data, opened.cfg.seed)
+    label = f"{opened.config.train.recipe} on {capture.name}"
+    viewer = Viewer(capture, lambda: (opened.scene, opened.step), rasterize, command.host, command.port, label, paths=command.run / "paths")
+    print(f"{label}: {viewer.url} (Ctrl-C ends it)", flush=True)
+    try:
+        viewer.serve()
+    finally:
+        viewer.close()
+        capture.images.close()
+    return 0
