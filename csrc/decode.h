@@ -28,6 +28,7 @@ struct Head {
   float* gates;                                                    // [A,E], with a router
   int64_t* chosen;                                                 // [A,k], with a router and k > 0
   float* mix;                                                      // [A,k], the weights of the chosen
+  float* base;                                                     // frozen: [N,shares,Hp] or null, the features' part of layer 1
   float *d_router_w, *d_router_b, *d_w1, *d_b1, *d_wm, *d_bm, *d_w2, *d_b2;
   const float* d_gates;                                  // [A,E] or null
   int64_t E, k, H, L, out, distance, position;           // k = 0: dense; L: middle layers; distance, position: 1 if an input
@@ -46,9 +47,11 @@ struct Decode {
   const float *d_means, *d_quats, *d_scales, *d_opacities, *d_colors, *d_raw;  // any may be null
   float *d_feature, *d_log_scaling, *d_offsets;                     // [N,...]
   int64_t A, N, K, F, threads, ascending;                           // ascending: rows are; then the gaps between them are zeroed here
+  int64_t frozen;                                                   // gates, chosen and mix are given, for all N rows of the table
   double extent;                                                    // positions are divided by it
   Head heads[3];                                                    // opacity, covariance, colour
   int64_t chunks() const { return (A + CHUNK - 1) / CHUNK; }
+  int64_t routed(int64_t anchor) const { return frozen ? rows[anchor] : anchor; }  // where an anchor's gates, chosen and mix are
 };
 
 // Sizes of padded blocks.
@@ -128,10 +131,14 @@ void gather(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w);
 void find_drawn(const Decode& d, const Chunk& chunk, Work& w);  // bits and live, from raw
 void scaling(const Decode& d, const Chunk& chunk, Work& w);
 // The chunk's anchors by expert; `live_only`: those that are.
-void groups(const Head& head, const Chunk& chunk, bool live_only, Work& w, std::vector<Group>& found);
+void groups(const Decode& d, const Head& head, const Chunk& chunk, bool live_only, Work& w, std::vector<Group>& found);
 void block_inputs(const Work& w, const Sizes& s, const Group& g, int from, int n);
 // Hidden layers of w.block; the last of them.
 float* hidden(const Packed::Expert& e, const Sizes& s, int head, int middle, int n, Work& w);
+// The same from the features' part of the first layer, to the last bit.
+float* hidden_from_base(const Decode& d, const Packed::Expert& e, const Sizes& s, const Chunk& chunk, int head, const int* anchor,
+                        const int* place, int n, Work& w);
+float* middle_layers(const Packed::Expert& e, const Sizes& s, int head, int middle, int n, Work& w);
 void outputs(const Packed::Expert& e, const Sizes& s, int head, int n, const float* h, float* y);
 void activate(int head, float* y, int n);
 inline int block_size(int n) {  // equal parts of at most BLOCK

@@ -68,7 +68,7 @@ class Backward {
  private:
   void head(const Chunk& chunk, int i) {
     const Head& head = d_.heads[i];
-    groups(head, chunk, i > 0 || !d_.d_raw, w_, found_);
+    groups(d_, head, chunk, i > 0 || !d_.d_raw, w_, found_);
     if (!head.single()) std::fill_n(w_.weights, int64_t(chunk.n) * head.shares(), 0.f);
     for (const Group& g : found_) {
       const int step = block_size(g.n);

@@ -112,4 +112,4 @@ void parallel_chunks(int64_t n, int64_t grain, int threads, void (*body)(void*, 
 
 }  // namespace se
 
-SE_EXPORT int se_abi_version() { return 3; }
+SE_EXPORT int se_abi_version() { return 4; }

@@ -16,7 +16,7 @@ from torch import Tensor
 
 import scene_experts
 
-ABI_VERSION = 3
+ABI_VERSION = 4
 LEVELS = ("avx512", "avx2", "portable")  # best first
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 

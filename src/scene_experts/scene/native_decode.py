@@ -28,7 +28,7 @@ class _Head(ctypes.Structure):
     """`Head` of csrc/decode.h."""
 
     _fields_ = [
-        *[(name, ctypes.c_void_p) for name in (*TENSORS, "gates", "chosen", "mix", *(f"d_{t}" for t in TENSORS), "d_gates")],
+        *[(name, ctypes.c_void_p) for name in (*TENSORS, "gates", "chosen", "mix", "base", *(f"d_{t}" for t in TENSORS), "d_gates")],
         *[(name, ctypes.c_int64) for name in ("E", "k", "H", "L", "out", "distance", "position")],
     ]
 
@@ -41,14 +41,14 @@ class _Decode(ctypes.Structure):
         *[(name, ctypes.c_void_p) for name in ("means", "quats", "scales", "opacities", "colors", "per_length", "source")],
         *[(name, ctypes.c_void_p) for name in ("d_means", "d_quats", "d_scales", "d_opacities", "d_colors", "d_raw")],
         *[(name, ctypes.c_void_p) for name in ("d_feature", "d_log_scaling", "d_offsets")],
-        *[(name, ctypes.c_int64) for name in ("A", "N", "K", "F", "threads", "ascending")],
+        *[(name, ctypes.c_int64) for name in ("A", "N", "K", "F", "threads", "ascending", "frozen")],
         ("extent", ctypes.c_double),
         ("heads", _Head * 3),
     ]
 
 
 @dataclass(frozen=True)
-class _Plan:
+class Plan:
     """What is not differentiated."""
 
     rows: Tensor  # [A] int64
@@ -88,21 +88,23 @@ def decode(
         low, high = (int(rows[0]), int(rows[-1])) if ascending else (int(rows.min()), int(rows.max()))
         if low < 0 or high >= len(xyz):
             raise IndexError(f"expected rows from 0 to {len(xyz) - 1}, found {low} to {high}")
-    plan = _Plan(
-        rows,
-        xyz.detach().contiguous(),
-        camera_position.detach().to(torch.float32).contiguous(),
-        tuple(h.k or 0 if h.router_w is not None else 0 for h in found),  # type: ignore[arg-type]
-        distance,  # type: ignore[arg-type]
-        tuple(int(h.position) for h in found),  # type: ignore[arg-type]
-        extent,
-        ascending,
-    )
+    plan = planned(rows, xyz, camera_position, heads, with_dist, extent, ascending)
     weights = [getattr(h, name) for h in found for name in TENSORS]
     out = _DecodeFunction.apply(plan, feature, log_scaling, offsets, *weights)
     means, quats, scales, opacities, colors, source, raw = out[:7]
     routing = {a: Routing(gates, chosen) for a, gates, chosen in zip(ATTRIBUTES, out[7:10], out[10:13]) if gates is not None}
     return Gaussians(means, quats, scales, opacities, colors, source), raw, routing
+
+
+def planned(
+    rows: Tensor, xyz: Tensor, camera: Tensor, heads: dict[str, HeadWeights], with_dist: dict[str, bool], extent: float, ascending: bool
+) -> Plan:
+    """Plain values for the library; arguments as those of `decode`."""
+    found = [heads[a] for a in ATTRIBUTES]
+    k = tuple(h.k or 0 if h.router_w is not None else 0 for h in found)
+    distance, position = tuple(int(with_dist[a]) for a in ATTRIBUTES), tuple(int(h.position) for h in found)
+    camera = camera.detach().to(torch.float32).contiguous()
+    return Plan(rows.contiguous(), xyz.detach().contiguous(), camera, k, distance, position, extent, ascending)  # type: ignore[arg-type]
 
 
 def _check(xyz: Tensor, feature: Tensor, log_scaling: Tensor, offsets: Tensor, heads: list[HeadWeights], distance: tuple[int, ...]) -> None:
@@ -131,56 +133,70 @@ def _check(xyz: Tensor, feature: Tensor, log_scaling: Tensor, offsets: Tensor, h
             )
 
 
+def route(call: _Decode) -> None:
+    """Fills in the gates, chosen experts and weights that `set_routing` points to, and nothing else."""
+    library = native.load()
+    assert library is not None
+    library.se_decode_route(ctypes.byref(call))
+
+
+def run(call: _Decode) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor]:
+    """Decodes what `prepared` and `set_routing` put together: the fields of Gaussians, raw opacities [A, K], and for the backward pass the
+    first Gaussian of each chunk and the inverse lengths of the quaternions before their normalisation [M]."""
+    library = native.load()
+    assert library is not None
+    raw, starts = torch.empty(call.A, call.K), torch.zeros(-(-call.A // CHUNK) + 1, dtype=torch.int64)
+    set_pointers(call, raw=raw, starts=starts)
+    library.se_decode_begin.restype = ctypes.c_int64
+    M = library.se_decode_begin(ctypes.byref(call))
+    means, quats, scales, colors = torch.empty(M, 3), torch.empty(M, 4), torch.empty(M, 3), torch.empty(M, 3)
+    opacities, per_length, source = torch.empty(M), torch.empty(M), torch.empty(M, dtype=torch.int64)
+    set_pointers(call, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, per_length=per_length, source=source)
+    library.se_decode_emit(ctypes.byref(call))
+    return (means, quats, scales, opacities, colors, source), raw, starts, per_length
+
+
 class _DecodeFunction(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, plan: _Plan, feature: Tensor, log_scaling: Tensor, offsets: Tensor, *weights: Tensor | None) -> tuple:
+    def forward(ctx: Any, plan: Plan, feature: Tensor, log_scaling: Tensor, offsets: Tensor, *weights: Tensor | None) -> tuple:
         columns = [t.detach().contiguous() for t in (feature, log_scaling, offsets)]
         weights = tuple(None if t is None else t.detach().contiguous() for t in weights)
-        A, K = len(plan.rows), offsets.shape[1]
-        call = _call(plan, columns, weights)
-        raw, starts = torch.empty(A, K), torch.zeros(-(-A // CHUNK) + 1, dtype=torch.int64)
+        A = len(plan.rows)
+        call = prepared(plan, columns, weights)
         gates, chosen, mix = [], [], []
         for i, k in enumerate(plan.k):
             routed, E = weights[T * i] is not None, call.heads[i].E
             gates.append(torch.empty(A, E) if routed else None)
             chosen.append(torch.empty(A, k, dtype=torch.int64) if routed and k else None)
             mix.append(torch.empty(A, k) if routed and k else None)
-        _set(call, raw=raw, starts=starts)
-        _set_routing(call, gates, chosen, mix)
-        library = native.load()
-        assert library is not None
-        library.se_decode_begin.restype = ctypes.c_int64
-        M = library.se_decode_begin(ctypes.byref(call))
-        means, quats, scales, colors = torch.empty(M, 3), torch.empty(M, 4), torch.empty(M, 3), torch.empty(M, 3)
-        opacities, per_length, source = torch.empty(M), torch.empty(M), torch.empty(M, dtype=torch.int64)
-        made = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-        _set(call, **made, per_length=per_length, source=source)
-        library.se_decode_emit(ctypes.byref(call))
+        set_routing(call, gates, chosen, mix)
+        (means, quats, scales, opacities, colors, source), raw, starts, per_length = run(call)
+        made = (means, quats, scales, opacities, colors)
         ctx.plan = plan
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(source, *(c for c in chosen if c is not None))
-        ctx.save_for_backward(*columns, *weights, raw, starts, *made.values(), per_length, *gates, *chosen, *mix)
+        ctx.save_for_backward(*columns, *weights, raw, starts, *made, per_length, *gates, *chosen, *mix)
         return means, quats, scales, opacities, colors, source, raw, *gates, *chosen
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple:
-        plan: _Plan = ctx.plan
+        plan: Plan = ctx.plan
         saved = ctx.saved_tensors
         columns, weights, made, routing = saved[:3], saved[3 : 3 + 3 * T], saved[3 + 3 * T : 11 + 3 * T], saved[11 + 3 * T :]
         raw, starts, means, quats, scales, opacities, colors, per_length = made
-        call = _call(plan, columns, weights)
-        _set(
+        call = prepared(plan, columns, weights)
+        set_pointers(
             call, raw=raw, starts=starts, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, per_length=per_length
         )
-        _set_routing(call, routing[:3], routing[3:6], routing[6:])
+        set_routing(call, routing[:3], routing[3:6], routing[6:])
         given = [None if g is None else g.contiguous() for g in upstream]
-        _set(call, d_means=given[0], d_quats=given[1], d_scales=given[2], d_opacities=given[3], d_colors=given[4], d_raw=given[6])
+        set_pointers(call, d_means=given[0], d_quats=given[1], d_scales=given[2], d_opacities=given[3], d_colors=given[4], d_raw=given[6])
         # Ascending rows: the library writes every row of the table, zeros where nothing was seen.
         fresh = torch.empty_like if plan.ascending else torch.zeros_like
         d_columns, d_weights = [fresh(t) for t in columns], [None if t is None else torch.empty_like(t) for t in weights]
-        _set(call, d_feature=d_columns[0], d_log_scaling=d_columns[1], d_offsets=d_columns[2])
+        set_pointers(call, d_feature=d_columns[0], d_log_scaling=d_columns[1], d_offsets=d_columns[2])
         for i, head in enumerate(call.heads):
-            _set(head, d_gates=given[7 + i], **{f"d_{name}": d_weights[T * i + j] for j, name in enumerate(TENSORS)})
+            set_pointers(head, d_gates=given[7 + i], **{f"d_{name}": d_weights[T * i + j] for j, name in enumerate(TENSORS)})
         library = native.load()
         assert library is not None
         library.se_decode_backward(ctypes.byref(call))
@@ -188,28 +204,28 @@ class _DecodeFunction(torch.autograd.Function):
         return None, *(g if want else None for g, want in zip([*d_columns, *d_weights], wanted))
 
 
-def _call(plan: _Plan, columns: Any, weights: Any) -> _Decode:
+def prepared(plan: Plan, columns: Any, weights: Any) -> _Decode:
     """The structure with all inputs in it. The tensors must outlive the call."""
     feature, log_scaling, offsets = columns
     call = _Decode(
         A=len(plan.rows), N=len(plan.xyz), K=offsets.shape[1], F=feature.shape[1], threads=native.threads(), ascending=plan.ascending
     )
     call.extent = plan.extent
-    _set(call, rows=plan.rows, xyz=plan.xyz, feature=feature, log_scaling=log_scaling, offsets=offsets, camera=plan.camera)
+    set_pointers(call, rows=plan.rows, xyz=plan.xyz, feature=feature, log_scaling=log_scaling, offsets=offsets, camera=plan.camera)
     for i, head in enumerate(call.heads):
         own = dict(zip(TENSORS, weights[T * i : T * i + T]))
-        _set(head, **own)
+        set_pointers(head, **own)
         head.E, head.H, head.out = own["w1"].shape[0], own["w1"].shape[1], own["w2"].shape[1]
         head.L = 0 if own["middle_w"] is None else own["middle_w"].shape[1]
         head.k, head.distance, head.position = plan.k[i], plan.distance[i], plan.position[i]
     return call
 
 
-def _set(structure: ctypes.Structure, **tensors: Tensor | None) -> None:
+def set_pointers(structure: ctypes.Structure, **tensors: Tensor | None) -> None:
     for name, tensor in tensors.items():
         setattr(structure, name, native.pointer(tensor))
 
 
-def _set_routing(call: _Decode, gates: Any, chosen: Any, mix: Any) -> None:
+def set_routing(call: _Decode, gates: Any, chosen: Any, mix: Any) -> None:
     for head, g, c, m in zip(call.heads, gates, chosen, mix):
-        _set(head, gates=g, chosen=c, mix=m)
+        set_pointers(head, gates=g, chosen=c, mix=m)
