@@ -48,12 +48,12 @@ def same(found, expected):
 @pytest.mark.parametrize("recipe", ANCHORED)
 def test_every_recipe_draws_the_same_bits(recipe):
     scene = trained(RECIPES[recipe][1].scene)
-    for most_bytes in (1 << 30, 0):
-        frozen = freeze(scene, DONE, most_bytes)
+    for fold in (True, False):
+        frozen = freeze(scene, DONE, fold)
         if scene.native_weights(DONE) is None:
             assert frozen is scene
             continue
-        assert isinstance(frozen, Frozen) and frozen.folded == (most_bytes > 0)
+        assert isinstance(frozen, Frozen) and frozen.folded == fold
         for view in (camera(1), camera(7, -0.4)):
             with torch.no_grad():
                 expected = scene(view, DONE, False, halves)
@@ -75,7 +75,7 @@ def test_every_recipe_draws_the_same_bits(recipe):
 )
 def test_other_heads_draw_the_same_bits(config):
     scene = trained(config)
-    frozen = freeze(scene, DONE)
+    frozen = freeze(scene, DONE, fold_features=True)
     assert isinstance(frozen, Frozen) and frozen.folded
     for view in (camera(1), camera(7, -0.4)):
         with torch.no_grad():
@@ -101,10 +101,10 @@ def test_while_dense_all_gates_are_kept_and_nothing_seen_draws_nothing():
 @needs_native
 def test_memory_is_what_it_says():
     scene = trained(RECIPES["moe-gs"][1].scene, n=100)
-    N, frozen = len(scene.table), freeze(scene, DONE)
+    N, frozen = len(scene.table), freeze(scene, DONE, fold_features=True)
     assert isinstance(frozen, Frozen)
     assert frozen.bytes == N * (3 * 2 * 32 * 4 + 3 * 2 * (8 + 4) + 12)  # first layers, routing, scales
-    lean = freeze(scene, DONE, most_bytes=0)
+    lean = freeze(scene, DONE)
     assert isinstance(lean, Frozen) and lean.bytes == N * (3 * 2 * (8 + 4) + 12)
 
 

@@ -23,6 +23,7 @@ from scene_experts.evaluate import pictures, timing
 from scene_experts.evaluate.experts import expert_shares
 from scene_experts.evaluate.metrics import VARIANTS, Perceptual, score
 from scene_experts.io import write_json
+from scene_experts.scene.frozen import Draws, freeze
 from scene_experts.types import Camera, Decoded, Render
 
 if TYPE_CHECKING:
@@ -77,10 +78,11 @@ def evaluate(
     folder = out / views
     pictures.clear(folder)
     per_view: dict[str, dict[str, Any]] = {}
+    draws = freeze(scene, step)
     for n, (index, camera) in enumerate(zip(chosen, cameras)):
         capture.images.prefetch(list(chosen[n + 1 : n + 3]))
         name = capture.views[index].name
-        facts = _draw(scene, capture, rasterize, index, camera, step, background, folder, names[name])
+        facts = _draw(draws, capture, rasterize, index, camera, step, background, folder, names[name])
         scored = score_files(folder, names[name], perceptual, device)
         captions = ("photograph", _caption(scored), f"error, 0 to {pictures.WORST:g}")
         _compose(folder, names[name], captions)
@@ -117,7 +119,7 @@ EMPTY = {
 
 @torch.no_grad()
 def _draw(
-    scene: Scene,
+    draws: Draws,
     capture: Capture,
     rasterize: Rasterizer,
     index: int,
@@ -129,7 +131,7 @@ def _draw(
 ) -> dict[str, Any]:
     """Draw one view and write it beside its photograph; what was counted on the way."""
     frame = capture.frame(index)
-    decoded = scene(camera, step, False, rasterize.visible)
+    decoded = draws(camera, step, False, rasterize.visible)
     render = rasterize(decoded.gaussians, camera, background)
     photo, drawn = frame.rgb.cpu().numpy(), pictures.to_8bit(render.image)
     if photo.shape != drawn.shape:

@@ -1,4 +1,7 @@
-"""How fast a trained scene draws: visibility filter + decode + rasterise, without reading or writing pictures."""
+"""How fast a trained scene draws: visibility filter + decode + rasterise, without reading or writing pictures.
+
+Two decodes are timed: that of the frozen scene (`scene/frozen.py`), which gives the frames a second, and the training's own.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from scene_experts.scene.frozen import freeze
 from scene_experts.types import Camera
 
 if TYPE_CHECKING:
@@ -28,6 +32,8 @@ class Speed:
     fps: float
     decode_ms: float  # visibility filter and decode
     raster_ms: float
+    ordinary_fps: float  # with the training's own decode
+    ordinary_decode_ms: float
     frames: int  # that counted
     device: str
     threads: int
@@ -35,24 +41,32 @@ class Speed:
 
 @torch.no_grad()
 def measure(scene: Scene, cameras: Sequence[Camera], step: int, rasterize: Rasterizer, background: Tensor, budget: float = 10.0) -> Speed:
-    """Draw up to 32 of `cameras` (on the scene's device), each once or more after the warm-up; stop early after `budget` seconds."""
+    """Freeze the scene and draw up to 32 of `cameras` (on the scene's device), each once or more after the warm-up.
+
+    Stops early after `budget` seconds.
+    """
     every = max(1, -(-len(cameras) // MOST_VIEWS))
     chosen = cameras[::every]
-    decode, raster = [], []
+    frozen = freeze(scene, step)
+    decode, raster, ordinary = [], [], []
     start, frame, enough = time.perf_counter(), 0, WARM_UP + max(len(chosen), 10)
     while frame < WARM_UP + 3 or (frame < enough and time.perf_counter() - start < budget):
         camera = chosen[frame % len(chosen)]
         began = _now(background)
-        decoded = scene(camera, step, False, rasterize.visible)
+        decoded = frozen(camera, step, False, rasterize.visible)
         between = _now(background)
         rasterize(decoded.gaussians, camera, background)
         ended = _now(background)
+        if frozen is not scene:
+            scene(camera, step, False, rasterize.visible)
         if frame >= WARM_UP:
             decode.append(between - began)
             raster.append(ended - between)
+            ordinary.append(decode[-1] if frozen is scene else _now(background) - ended)
         frame += 1
-    total = median(d + r for d, r in zip(decode, raster))
-    return Speed(1 / total, 1e3 * median(decode), 1e3 * median(raster), len(decode), str(background.device.type), torch.get_num_threads())
+    fps, ordinary_fps = (1 / median(d + r for d, r in zip(decodes, raster)) for decodes in (decode, ordinary))
+    parts = [1e3 * median(times) for times in (decode, raster, ordinary)]
+    return Speed(fps, parts[0], parts[1], ordinary_fps, parts[2], len(decode), str(background.device.type), torch.get_num_threads())
 
 
 def _now(like: Tensor) -> float:

@@ -1,14 +1,14 @@
 """A trained anchor scene made ready for drawing: what no camera changes is computed once.
 
-Routing depends on an anchor's feature alone, so each anchor's experts and their weights are kept; and of the first layer
-W1 (f, direction) + b1 the part W1[:, :F] f of each chosen expert. Per view there remain the direction, the activation and the layers after
-it. The Gaussians are those of the native decode, bit for bit. Symbols as in `types.py`; S experts an anchor (k, or E while dense, or 1).
+Routing depends on the anchor alone, so each anchor's experts and their weights are kept; if asked for, also the part W1[:, :F] f of the
+first layer W1 (f, direction) + b1 of each chosen expert. The Gaussians are those of the native decode, bit for bit. Symbols as in
+`types.py`; S experts an anchor (k, or E while dense, or 1).
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,7 +25,6 @@ from scene_experts.types import Camera, Decoded, Gaussians
 
 Draws = Callable[[Camera, int, bool, Cull], Decoded]
 """What a scene does when called: (camera, step, training, cull) -> Decoded."""
-MOST_BYTES = 1 << 30  # of first layers kept, unless told otherwise: beyond it they are computed for each view
 
 
 @dataclass(frozen=True)
@@ -42,22 +41,23 @@ class Kept:
         return sum(t.numel() * t.element_size() for t in (self.gates, self.chosen, self.mix, self.base) if t is not None)
 
 
-def freeze(scene: Scene, step: int, most_bytes: int = MOST_BYTES) -> Draws:
+def freeze(scene: Scene, step: int, fold_features: bool = False) -> Draws:
     """`scene` for drawing at `step`: frozen where the native decode covers it, else the scene itself. It may not be trained meanwhile.
 
-    most_bytes: of memory for first layers (384 bytes an anchor and expert at 32 hidden units); beyond it they are computed for each view.
+    fold_features: keep the first layers too, 384 bytes an anchor and expert at 32 hidden units. Reading them has cost more than computing
+    them again (docs/performance.md), hence not the default.
     """
     if not isinstance(scene, AnchorScene) or not len(scene.table) or scene.table.params["feature"].device.type != "cpu":
         return scene
     weights = scene.native_weights(step)
-    return scene if weights is None else Frozen(scene, weights, step, most_bytes)
+    return scene if weights is None else Frozen(scene, weights, step, fold_features)
 
 
 class Frozen:
     """Draws one scene at one step without gradients; routing is left out of what it returns (`AnchorScene.routing` has it)."""
 
     @torch.no_grad()
-    def __init__(self, scene: AnchorScene, weights: dict[str, HeadWeights], step: int, most_bytes: int = MOST_BYTES) -> None:
+    def __init__(self, scene: AnchorScene, weights: dict[str, HeadWeights], step: int, fold_features: bool = False) -> None:
         self.scene, self.step = scene, step
         p = scene.table.params
         self.columns = [p[name].detach().contiguous() for name in ("feature", "log_scaling", "offsets")]
@@ -65,7 +65,7 @@ class Frozen:
         self.scales = self.columns[1][:, :3].contiguous().exp()
         self.with_dist = {a: a in scene.config.add_dist for a in ATTRIBUTES}
         self.weights = {a: _detached(w) for a, w in weights.items()}
-        self.kept = self._keep(most_bytes)
+        self.kept = self._keep(fold_features)
 
     @property
     def bytes(self) -> int:
@@ -111,7 +111,7 @@ class Frozen:
         weights = [getattr(heads[a], name) for a in ATTRIBUTES for name in native_decode.TENSORS]
         return native_decode.prepared(plan, self.columns, weights), (plan, weights)
 
-    def _keep(self, most_bytes: int) -> tuple[Kept, ...]:
+    def _keep(self, fold_features: bool) -> tuple[Kept, ...]:
         heads, N, nowhere = self.weights, len(self.xyz), torch.zeros(3)
         if self.scene.codes is not None:  # which code does not matter: it touches neither routing nor the feature's part
             heads = {**heads, "color": _detached(fold(heads["color"], self.scene.codes.table[0]))}
@@ -122,10 +122,11 @@ class Frozen:
         mix = [torch.empty(N, head.k) if r and head.k else None for r, head in zip(routed, call.heads)]
         native_decode.set_routing(call, gates, chosen, mix)
         native_decode.route(call)
-        bases: list[Tensor | None] = [None] * 3
+        bases: Sequence[Tensor | None] = (None, None, None)
         shares = [int(head.k or head.E) for head in call.heads]
-        if 4 * N * sum(s * w for s, w in zip(shares, width)) <= most_bytes:
-            call.frozen, bases = 1, [torch.empty(N, s, w) for s, w in zip(shares, width)]
+        if fold_features:
+            call.frozen = 1
+            bases = [torch.empty(N, s, w) for s, w in zip(shares, width)]
             for head, base in zip(call.heads, bases):
                 native_decode.set_pointers(head, base=base)
             library = native.load()
