@@ -20,7 +20,7 @@ from scene_experts.bench.step import AT, work
 from scene_experts.evaluate import timing
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
-from scene_experts.run_folder import open_run
+from scene_experts.run_folder import load_capture, open_run
 from scene_experts.scene.frozen import freeze
 
 KINDS = (
@@ -68,8 +68,9 @@ def runs(folders: list[Path]) -> None:
     print("| run | own decode ms | frozen ms | raster ms | FPS, own decode | FPS, frozen |\n|---|---|---|---|---|---|")
     for folder in folders:
         run = open_run(folder)
-        cameras = [run.capture.views[i].camera for i in run.capture.test or run.capture.train]
-        background = torch.tensor(run.capture.background)
+        capture = load_capture(run.config.data, run.cfg.seed)
+        cameras = [capture.views[i].camera for i in capture.test or capture.train]
+        background = torch.tensor(capture.background)
         s = timing.measure(run.scene, cameras, run.step, choose("auto", "cpu"), background)
         values = f"{s.ordinary_decode_ms:.1f} | {s.decode_ms:.1f} | {s.raster_ms:.1f} | {s.ordinary_fps:.1f} | {s.fps:.1f}"
         print(f"| {folder.name} | {values} |")
