@@ -12,7 +12,7 @@ from rich.console import Console
 from scene_experts import doctor, native
 from scene_experts.doctor import Check
 
-NAMES = ["Python", "torch", "CUDA", "CPU library", "gsplat", "cores", "memory", "LPIPS weights", "viser", "pycolmap", "tensorboard"]
+NAMES = ["Python", "torch", "CUDA", "CPU library", "gsplat", "triton", "cores", "memory", "LPIPS weights", "viser", "pycolmap", "tensorboard"]
 
 
 def test_this_machine() -> None:
