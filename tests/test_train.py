@@ -15,11 +15,13 @@ from scene_experts.errors import InputError, RunError
 from scene_experts.events import Adjusted, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
+from scene_experts.scene.anchors import Anchors
 from scene_experts.scene.experts import Experts
 from scene_experts.scene.explicit import Explicit
 from scene_experts.state import Training
 from scene_experts.train import Run, iterate, rows_to_move, stepped, train, without_graph
 from synthetic import make_capture
+from test_scene import METHODS
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -58,7 +60,7 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
         assert torch.equal(a[name], b[name]), name
 
 
-@pytest.mark.parametrize("recipe", ["scaffold-gs", "moe-gs", "3dgs", "3dgs-mcmc", "octree-gs", "octree-moe-gs", "scaffold-gs-bank"])
+@pytest.mark.parametrize("recipe", METHODS)
 def test_resumed_equals_uninterrupted_bit_for_bit_while_rows_come_and_go(recipe, folder, tmp_path):
     cfg = config(recipe)
     edits = [e for e in events(cfg, folder, tmp_path / "whole", stop_at=120) if isinstance(e, Adjusted)]
@@ -110,7 +112,7 @@ def test_the_unit_of_a_capture_does_not_matter(scale, folder, tmp_path):
         assert x.keys() == y.keys() and all(y[k] == pytest.approx(x[k], rel=2e-3, abs=1e-6) for k in x)
 
 
-@pytest.mark.parametrize("recipe", ["scaffold-gs", "moe-gs", "3dgs", "3dgs-mcmc", "octree-gs", "octree-moe-gs", "scaffold-gs-bank"])
+@pytest.mark.parametrize("recipe", METHODS)
 def test_losses_follow_the_golden_curve(recipe, tmp_path):
     """The first 100 iterations at a fixed seed, Top-k from the 51st, in float64 by the reference parts, so that machines agree to 1e-3:
     in float32 Adam turns the rounding of another instruction set into 1 % within these iterations. Recorded by this test with
@@ -118,7 +120,7 @@ def test_losses_follow_the_golden_curve(recipe, tmp_path):
     cfg = RECIPES[recipe][1]
     if isinstance(cfg.scene, Explicit):  # through all degrees of the harmonics, four adjustments and a reset
         cfg = config(recipe, iterations=1000, max_anchors=480)
-    elif isinstance(cfg.scene.decoder, Experts):
+    elif isinstance(cfg.scene, Anchors) and isinstance(cfg.scene.decoder, Experts):
         cfg = replace(cfg, scene=replace(cfg.scene, decoder=replace(cfg.scene.decoder, warmup=50)))
     folder = make_capture(tmp_path, views=8, size=(48, 32), points=400).folder
     seen = events(cfg, folder, rasterizer="reference", stop_at=100, log_every=5, dtype=torch.float64)

@@ -71,7 +71,7 @@ def _split(xyz: Tensor, size: int) -> tuple[Tensor, Tensor]:
         coords = xyz[order]  # [G, S, 3]
         axis = (coords.amax(1) - coords.amin(1)).argmax(1)  # the longest side of each group
         key = coords.gather(2, axis.view(-1, 1, 1).expand(-1, coords.shape[1], 1)).squeeze(2)
-        by = key.argsort(dim=1)
+        by = key.argsort(dim=1, stable=True)  # points on a lattice share coordinates; which of them go where must not depend on the machine
         half = (2 * order.shape[0], order.shape[1] // 2)
         order, real = order.gather(1, by).view(half), real.gather(1, by).view(half)
     return order, real
