@@ -134,7 +134,7 @@ class Flat {
     for (int width = 1; width <= kMost; ++width)
       for (int i = 0; i < kMost; ++i) offset_[width][i] = static_cast<uint32_t>(i / width * tiles_x + i % width);
   }
-  bool full() const { return count_ > kRoom - kMost; }
+  bool full() const { return count_ > kRoom - 2 * kMost; }
   // Takes a rectangle of at most kMost tiles; returns false for others.
   bool add(const Item& item) {
     const Rect r = item.rect;
@@ -148,12 +148,16 @@ class Flat {
     return true;
   }
   void flush(uint32_t* at, uint32_t* list) {
-    for (int i = 0; i < count_; ++i) list[at[tile_[i]]++] = place_[i];
+    for (int i = 0; i < kMost; ++i) tile_[count_ + i] = tile_[0];
+    for (int i = 0; i < count_; ++i) {
+      __builtin_prefetch(&list[at[tile_[i + kMost]]], 1);  // every tile writes elsewhere
+      list[at[tile_[i]]++] = place_[i];
+    }
     count_ = 0;
   }
 
  private:
-  static constexpr int kMost = 16, kRoom = 512;
+  static constexpr int kMost = 16, kRoom = 512 + 16;
   int tiles_x_, count_ = 0;
   alignas(64) uint32_t offset_[kMost + 1][kMost] = {};
   alignas(64) uint32_t tile_[kRoom], place_[kRoom];

@@ -112,6 +112,14 @@ inline void store_halves(float* p, F16 a, F16 b) {
   _mm256_storeu_ps(p + 16, a.hi), _mm256_storeu_ps(p + 24, b.hi);
 }
 
+// Sixteen rows of three floats as three columns.
+inline void load3(const float* p, F16& a, F16& b, F16& c) {
+  alignas(64) float column[3][16];
+  for (int i = 0; i < 16; ++i)
+    for (int k = 0; k < 3; ++k) column[k][i] = p[3 * i + k];
+  a = load(column[0]), b = load(column[1]), c = load(column[2]);
+}
+
 // a = m * 2^e with m in [0.75, 1.5)
 inline void split_exponent(F16 a, F16& m, F16& e) {
   split_exponent_half(a.lo, m.lo, e.lo);

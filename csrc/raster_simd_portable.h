@@ -143,6 +143,14 @@ inline void store_halves(float* p, F16 a, F16 b) {
   std::memcpy(p + 16, &a.v[2], 32), std::memcpy(p + 24, &b.v[2], 32);
 }
 
+// Sixteen rows of three floats as three columns.
+inline void load3(const float* p, F16& a, F16& b, F16& c) {
+  alignas(64) float column[3][16];
+  for (int i = 0; i < 16; ++i)
+    for (int k = 0; k < 3; ++k) column[k][i] = p[3 * i + k];
+  a = load(column[0]), b = load(column[1]), c = load(column[2]);
+}
+
 // a = m * 2^e with m in [0.75, 1.5)
 inline void split_exponent(F16 a, F16& m, F16& e) {
   SE_EACH {
