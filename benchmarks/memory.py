@@ -1,6 +1,6 @@
 """Peak memory of a training above the level after import and image cache, beside what it cannot do without.
 
-Usage: python benchmarks/memory.py [--capture demo/buddha] [--recipe moe-gs] [--anchors 400000] [--iterations 60] [--threads 1]
+Usage: python benchmarks/memory.py [--capture demo/buddha] [--recipe moe-gs] [--anchors 400000] [--spread 0.02] [--iterations 60]
 The capture's points are multiplied by jitter to `anchors` rows, so that a short run has a large table. The run has adjustments
 (rows come and go) and writes checkpoints. Resident memory: its level after the images are decoded, and its highest since (VmHWM).
 Bytes needed: parameters + gradients + both moments, + the largest frame's buffers by `memory.frame_bytes` with its own number of tiles.
@@ -20,12 +20,12 @@ from torch import Tensor
 from scene_experts import memory
 from scene_experts.config import Data, RunConfig
 from scene_experts.data.capture import Capture, load
-from scene_experts.events import Adjusted, Saved
+from scene_experts.events import Adjusted
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.schedule import Every
 from scene_experts.state import Training
-from scene_experts.train import Run, train
+from scene_experts.train import Run, iterate, train
 from scene_experts.types import Camera, Gaussians, Points, Render
 
 
@@ -56,13 +56,13 @@ class Watched:
         return render
 
 
-def crowded(capture: Capture, anchors: int) -> Capture:
-    """The capture with its points drawn `anchors` times, each with jitter."""
+def crowded(capture: Capture, anchors: int, spread: float) -> Capture:
+    """The capture with its points drawn `anchors` times, each with jitter of `spread` extents."""
     assert capture.points is not None
     generator = torch.Generator().manual_seed(0)
     at = torch.randint(len(capture.points.xyz), (anchors,), generator=generator)
     xyz = capture.points.xyz[at]
-    xyz = xyz + 0.02 * capture.extent * torch.randn(xyz.shape, generator=generator, dtype=xyz.dtype)
+    xyz = xyz + spread * capture.extent * torch.randn(xyz.shape, generator=generator, dtype=xyz.dtype)
     return replace(capture, points=Points(xyz, capture.points.rgb[at]))
 
 
@@ -71,40 +71,38 @@ def main() -> None:
     parser.add_argument("--capture", type=Path, default=Path("demo/buddha"))
     parser.add_argument("--recipe", default="moe-gs")
     parser.add_argument("--anchors", type=int, default=400_000)
+    parser.add_argument("--spread", type=float, default=0.02, help="jitter in extents: above 1 most rows are in no view")
     parser.add_argument("--iterations", type=int, default=60)
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    capture = crowded(load(args.capture), args.anchors)
+    capture = crowded(load(args.capture), args.anchors, args.spread)
     for index in capture.train:
         capture.frame(index)
     rasterize = Watched(choose("auto", "cpu"))
     recipe = RECIPES[args.recipe][1]
     growth = replace(recipe.growth, start_stat=0, adjust=Every(1, 10**6, 25), success_threshold=0.02, grad_threshold=2e-6)
-    cfg = replace(recipe, scene=replace(recipe.scene, voxel_size=1e-4), growth=growth, iterations=30_000, max_anchors=args.anchors * 11 // 10)
+    cfg = replace(
+        recipe, scene=replace(recipe.scene, voxel_size=1e-3), growth=growth, iterations=30_000, max_anchors=args.anchors * 11 // 10
+    )
     warm_up(cfg, load(args.capture), rasterize)
     Path("/proc/self/clear_refs").write_text("5")  # the highest level starts anew
     level = status("VmRSS")
     print(f"{args.recipe} on {capture.name}, {args.threads} thread(s); level after import and images {level / 1e6:.0f} MB")
     with tempfile.TemporaryDirectory() as folder:
         run = Run(RunConfig(cfg, Data(args.capture), stop_at=args.iterations), out=Path(folder), save_every=args.iterations // 2)
-        needed = rows = 0
-        peak = level
+        rows, peak = 0, level
         for event in train(cfg, run, capture, rasterize):  # type: ignore[arg-type]
             if status("VmHWM") > peak:
                 peak = status("VmHWM")
                 print(f"  {(peak - level) / 1e6:8.1f} MB above it at {event}"[:150])
             rows = event.edit.anchors if isinstance(event, Adjusted) else rows
-            if isinstance(event, Saved):
-                needed = 0
     report(cfg, capture, rows, rasterize, status("VmHWM") - level)
     capture.images.close()
 
 
 def warm_up(cfg, capture: Capture, rasterize: Watched) -> None:
     """Two iterations on the capture as it is: libraries, threads and code are in memory afterwards."""
-    from scene_experts.train import iterate
-
     training = Training.start(replace(cfg, max_anchors=0), capture, "cpu")
     for _ in range(2):
         iterate(training, Run(RunConfig(cfg, Data(capture.root))), capture, rasterize)  # type: ignore[arg-type]

@@ -26,8 +26,9 @@ namespace se::raster {
 
 constexpr int kTile = 16;     // pixels
 constexpr int kChunk = 4096;  // Gaussians that one worker projects at a time; a multiple of 16
-constexpr int kBatch = 256;   // Gaussians of a tile worked on at a time: fewer make the blocks' lists short, more leave the cache
-constexpr int kAhead = 32;    // how many of a tile's Gaussians ahead memory is fetched; this many entries follow the last list
+constexpr int kBatch = 512;   // Gaussians of a tile worked on at a time: each batch's end costs every block some hundred cycles
+constexpr int kAhead = 128;   // how many of a tile's Gaussians ahead memory is fetched
+constexpr int kBeyond = kAhead + 16;  // entries after the last list, so that looking ahead needs no test
 constexpr float kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
 constexpr float kMinAlphaLog2 = -7.994353437f;  // log2(1 / 255)
 constexpr float kWhiten = 0.84932180f;          // sqrt(log2(e) / 2)
@@ -48,11 +49,19 @@ struct Rect {  // tiles, end exclusive
   uint16_t x0, y0, x1, y1;
 };
 
+// What sorting and binning move: 16 bytes, read and written as one.
+struct alignas(16) Item {
+  uint32_t key, place;  // depth bits; place of the record
+  Rect rect;
+};
+static_assert(sizeof(Item) == 16);
+
 // Sums over pixels for one Gaussian, W = d loss / d power at a pixel: W, W dx, W dy, W dx^2, W dx dy, W dy^2, then colour and depth.
+// The places below kSums but kDepth are 0: a tile keeps the Gaussian's own numbers there, in the same cache line.
 struct alignas(64) Sums {
   float x[16];
 };
-enum { kS, kSx, kSy, kSxx, kSxy, kSyy, kRed, kGreen, kBlue, kDepth };
+enum { kDepth = 4, kS = 7, kSx, kSy, kSxx, kSxy, kSyy, kRed, kGreen, kBlue, kSums = kS };
 
 // Uninitialised memory that only grows. Large pieces ask for huge pages: their random reads would miss the translation cache otherwise.
 template <class T>
@@ -111,12 +120,12 @@ struct State {
   bool antialias = false;
 
   Buffer<Record> records;         // [chunk-aligned m]; chunk c holds its visible ones from c * kChunk on
-  Buffer<Rect> rects;             // same places
+  Buffer<Item> items;             // same places
   Buffer<uint16_t> group_mask;    // [m / 16] which of sixteen neighbours are visible
   Buffer<uint32_t> group_first;   // [m / 16] place of the first of them
   Buffer<uint32_t> chunk_count;   // [chunks]
-  Buffer<uint32_t> keys, order;   // [visible] depth bits and places, in the end near to far
-  Buffer<uint32_t> keys2, order2;
+  Buffer<uint32_t> chunk_low, chunk_high;  // [chunks] range of the keys
+  Buffer<Item> half_sorted, sorted;        // [visible]; the second near to far in the end
   Buffer<uint32_t> histogram;
   Buffer<uint32_t> tile_begin;    // [tiles + 1] into `list`
   Buffer<uint32_t> tile_used;     // [tiles] how many of its list a tile looked at before all its pixels had stopped
@@ -154,7 +163,7 @@ struct Gradients {
   float *means, *quats, *scales, *opacities, *colors, *mean2d, *background;
 };
 
-// Projects all; fills records, rects, groups, keys and order per chunk, and radii [m].
+// Projects all; fills records, items and groups per chunk, and radii [m].
 void project(State& s, const Inputs& in, int32_t* radii, int threads);
 // Radii alone, of unrotated Gaussians.
 void project_visible(const CameraArgs& camera, const float* means, const float* scales, int64_t m, uint8_t* visible, int threads);

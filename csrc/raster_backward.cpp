@@ -18,65 +18,100 @@ struct Pixels {
 
 struct Work {
   Batch batch;
-  F16 alpha[kBatch + 16], w[kBatch + 16];  // of one block's list
+  // Of one block's list: w, and alpha, whose place W takes.
+  F16 w[kBatch + 16], alpha[kBatch + 16];
+  float depth[kBatch + 16];  // the batch's sums for depth
 };
 
-// Adds the sixteen Gaussians' sums over one block. `weights` (w) and W are rows of pixels.
+// Upstream gradients of one block by column: lane l of column c is the pixel in column c of l's row.
 template <bool Depth>
-void reduce(Work& work, int first, const F16* weights, F16 (&W)[16], const Pixels& px, int block, const Tile& tile) {
-  F16 out[16], w[16];
-  const int at = block * 16;
-  std::copy(weights, weights + 16, w);
-  transpose(w);
-  const auto weighted = [&](const float* g) {  // two sums side by side: half as long a chain
-    F16 even = w[0] * bcast(g[0]), odd = w[1] * bcast(g[1]);
-    for (int l = 2; l < 16; l += 2) even = fma(w[l], bcast(g[l]), even), odd = fma(w[l + 1], bcast(g[l + 1]), odd);
-    return even + odd;
-  };
-  out[kRed] = weighted(px.color[0] + at), out[kGreen] = weighted(px.color[1] + at), out[kBlue] = weighted(px.color[2] + at);
-  out[kDepth] = Depth ? weighted(px.depth + at) : bcast(0.0f);
-
-  // Moments about the block's centre in half pixels, -3 -1 1 3: by rows first, then over the rows.
-  transpose(W);
-  const F16 three = bcast(3.0f), nine = bcast(9.0f);
-  F16 row0[4], row1[4], row2[4];
-  for (int j = 0; j < 4; ++j) {
-    const F16 outer = W[4 * j] + W[4 * j + 3], inner = W[4 * j + 1] + W[4 * j + 2];
-    row0[j] = outer + inner;
-    row1[j] = fma(three, W[4 * j + 3] - W[4 * j], W[4 * j + 2] - W[4 * j + 1]);
-    row2[j] = fma(nine, outer, inner);
+struct Columns {
+  F16 color[3][4], depth[Depth ? 4 : 1];
+  Columns(const Pixels& px, int block) {
+    for (int c = 0; c < 3; ++c) split(load(px.color[c] + block * 16), color[c]);
+    if constexpr (Depth) split(load(px.depth + block * 16), depth);
   }
-  const F16 outer = row0[0] + row0[3], inner = row0[1] + row0[2], half = bcast(0.5f), quarter = bcast(0.25f);
-  const F16 m = outer + inner;
-  const F16 my = fma(three, row0[3] - row0[0], row0[2] - row0[1]) * half, myy = fma(nine, outer, inner) * quarter;
-  const F16 mx = ((row1[0] + row1[3]) + (row1[1] + row1[2])) * half, mxx = ((row2[0] + row2[3]) + (row2[1] + row2[2])) * quarter;
-  const F16 mxy = fma(three, row1[3] - row1[0], row1[2] - row1[1]) * quarter;
+  static void split(F16 pixels, F16 (&columns)[4]) {
+    columns[0] = column<0>(pixels), columns[1] = column<1>(pixels), columns[2] = column<2>(pixels), columns[3] = column<3>(pixels);
+  }
+};
 
-  // To moments about each Gaussian's centre.
+// Weighted sums over the block's pixels of sixteen Gaussians' w, one Gaussian per lane.
+template <bool Depth>
+void reduce_colors(const F16* w, const Columns<Depth>& by, F16* out, F16& depth) {
+  F16 part[3][4], part_depth[4];
+  for (int j = 0; j < 4; ++j) {  // four Gaussians at a time; lanes: row of the block, then Gaussian
+    F16 c[4] = {w[4 * j], w[4 * j + 1], w[4 * j + 2], w[4 * j + 3]};
+    transpose4(c);
+    const auto sum = [&](const F16 (&g)[4]) { return fma(c[0], g[0], fma(c[1], g[1], fma(c[2], g[2], c[3] * g[3]))); };
+    for (int k = 0; k < 3; ++k) part[k][j] = sum(by.color[k]);
+    if constexpr (Depth) part_depth[j] = sum(by.depth);
+  }
+  for (int k = 0; k < 3; ++k) out[k] = sum_quarters(part[k]);
+  if constexpr (Depth) depth = sum_quarters(part_depth);
+}
+
+// Sums of W over the pixels: m, and with x and y in half pixels from the block's centre (-3 -1 1 3) those of W x, W y, W x^2, W x y, W y^2.
+struct Moments {
+  F16 m, x, y, xx, xy, yy;
+  explicit Moments(const F16* W) {
+    const F16 three = bcast(3.0f), nine = bcast(9.0f);
+    F16 row0[4], row1[4], row2[4];  // sums along a row: of W, W x, W x^2
+    for (int j = 0; j < 4; ++j) {
+      F16 c[4] = {W[4 * j], W[4 * j + 1], W[4 * j + 2], W[4 * j + 3]};
+      transpose4(c);
+      const F16 outer = c[0] + c[3], inner = c[1] + c[2];
+      row0[j] = outer + inner, row1[j] = fma(three, c[3] - c[0], c[2] - c[1]), row2[j] = fma(nine, outer, inner);
+    }
+    transpose_quarters(row0), transpose_quarters(row1), transpose_quarters(row2);
+    const F16 outer = row0[0] + row0[3], inner = row0[1] + row0[2];
+    m = outer + inner;
+    y = fma(three, row0[3] - row0[0], row0[2] - row0[1]), yy = fma(nine, outer, inner);
+    x = (row1[0] + row1[3]) + (row1[1] + row1[2]), xx = (row2[0] + row2[3]) + (row2[1] + row2[2]);
+    xy = fma(three, row1[3] - row1[0], row1[2] - row1[1]);
+  }
+};
+
+// Adds the sums over one block of sixteen Gaussians of its list to their rows.
+template <bool Depth>
+void reduce(Work& work, int first, const Columns<Depth>& by, int block, const Tile& tile) {
+  const uint16_t* place = work.batch.list.place + first;
+  F16 color[3], depth;
+  reduce_colors<Depth>(work.w + first, by, color, depth);
+  if constexpr (Depth) {
+    alignas(64) float value[16];
+    store(value, depth);
+    for (int k = 0; k < 16; ++k) work.depth[place[k] / kPlace] += value[k];
+  }
+  const Moments b(work.alpha + first);
+
+  // To moments about each Gaussian's centre, in half pixels.
   Row* rows[16];
   const float* centre[16];
-  for (int k = 0; k < 16; ++k) rows[k] = &work.batch.row(work.batch.list.place[first + k]), centre[k] = &rows[k]->u;
+  for (int k = 0; k < 16; ++k) rows[k] = &work.batch.row(place[k]), centre[k] = &rows[k]->u;
   F16 u, v;
   load_pairs(centre, u, v);
-  const F16 dx = u - bcast(tile.centre_x + 4.0f * static_cast<float>(block % 4) - 6.0f);
-  const F16 dy = v - bcast(tile.centre_y + 4.0f * static_cast<float>(block / 4) - 6.0f);
-  const F16 sx = dx * m - mx, sy = dy * m - my;
-  out[kS] = m, out[kSx] = sx, out[kSy] = sy;
-  out[kSxx] = fma(dx, sx - mx, mxx);
-  out[kSxy] = fma(dx, sy, fnma(dy, mx, mxy));
-  out[kSyy] = fma(dy, sy - my, myy);
-  for (int k = 10; k < 16; ++k) out[k] = bcast(0.0f);
-  transpose(out);
-  for (int k = 0; k < 16; ++k) {
-    float* sums = rows[k]->sums;
-    store(sums, load(sums) + out[k]);
+  const F16 dx = u + u - bcast(2 * (tile.centre_x + 4.0f * static_cast<float>(block % 4) - 6.0f));
+  const F16 dy = v + v - bcast(2 * (tile.centre_y + 4.0f * static_cast<float>(block / 4) - 6.0f));
+  const F16 zero = bcast(0.0f), sx = dx * b.m - b.x, sy = dy * b.m - b.y;
+  F16 q1[4] = {zero, zero, zero, b.m};
+  F16 q2[4] = {sx, sy, fma(dx, sx - b.x, b.xx), fma(dx, sy, fnma(dy, b.x, b.xy))};
+  F16 q3[4] = {fma(dy, sy - b.y, b.yy), color[0], color[1], color[2]};
+  transpose4(q1), transpose4(q2), transpose4(q3);
+  for (int k = 0; k < 4; ++k) {
+    F16 line[4] = {zero, q1[k], q2[k], q3[k]};
+    transpose_quarters(line);
+    for (int j = 0; j < 4; ++j) {
+      float* sums = &rows[4 * j + k]->l1;
+      store(sums, load(sums) + line[j]);
+    }
   }
 }
 
 // alpha and w of the first `count` of the block's list, near to far.
 void weigh(Work& work, int count, int block, const float* checkpoint, const Exp2& exp2) {
   const Batch& batch = work.batch;
-  const F16 y = block_y(block / 4), stop = bcast(kMinTransmittance), one = bcast(1.0f);
+  const F16 y = block_y(block / 4), stop = bcast(kMinTransmittance);
   const int column = block % 4;
   F16 through = load(checkpoint + block * 16);
   for (int i = 0; i < count; i += 4) {
@@ -85,11 +120,11 @@ void weigh(Work& work, int count, int block, const float* checkpoint, const Exp2
     for (int k = 0; k < 4; ++k) row[k] = &batch.row(batch.list.place[i + k]);
     alphas(row, column, y, exp2, alpha);
     for (int k = 0; k < 4; ++k) {
-      const F16 next = through * (one - alpha[k]);
-      const M16 drawn = ge(next, stop);
-      work.w[i + k] = mul_keep(drawn, through, alpha[k]);
+      const F16 weight = through * alpha[k];
+      through = fnma(through, alpha[k], through);
+      const M16 drawn = ge(through, stop);
+      work.w[i + k] = keep(drawn, weight);
       work.alpha[i + k] = keep(drawn, alpha[k]);
-      through = next;
     }
   }
 }
@@ -100,22 +135,20 @@ void block_backward(Work& work, int count, int block, const float* checkpoint, P
   weigh(work, count, block, checkpoint, exp2);
   const F16 most = bcast(kMaxAlpha), zero = bcast(0.0f), one = bcast(1.0f);
   const int at = block * 16;
+  const Columns<Depth> by(px, block);
   F16 behind = load(px.behind + at);
   const F16 red = load(px.color[0] + at), green = load(px.color[1] + at), blue = load(px.color[2] + at), depth = load(px.depth + at);
   for (int i = count; i < (count + 15) / 16 * 16; ++i) work.w[i] = work.alpha[i] = zero;
-  for (int first = (count - 1) / 16 * 16; first >= 0; first -= 16) {
-    F16 W[16];
-    for (int i = 15; i >= 0; --i) {
-      const Row& row = batch.row(batch.list.place[first + i]);
-      F16 s = fma(red, bcast(row.r), fma(green, bcast(row.g), blue * bcast(row.b)));
-      if constexpr (Depth) s = fma(depth, bcast(row.z), s);
-      const F16 alpha = work.alpha[first + i];
-      W[i] = mul_keep(gt(most, alpha), work.w[first + i], s - behind);
-      behind = fma(one - alpha, behind, alpha * s);  // the one chain from Gaussian to Gaussian: a single step long
-    }
-    reduce<Depth>(work, first, work.w + first, W, px, block, tile);
+  for (int i = count - 1; i >= 0; --i) {
+    const Row& row = batch.row(batch.list.place[i]);
+    F16 s = fma(red, bcast(row.r), fma(green, bcast(row.g), blue * bcast(row.b)));
+    if constexpr (Depth) s = fma(depth, bcast(row.z), s);
+    const F16 alpha = work.alpha[i];
+    work.alpha[i] = mul_keep(gt(most, alpha), work.w[i], s - behind);
+    behind = fma(one - alpha, behind, alpha * s);  // the one chain from Gaussian to Gaussian: a single step long
   }
   store(px.behind + at, behind);
+  for (int first = 0; first < count; first += 16) reduce<Depth>(work, first, by, block, tile);
 }
 
 // Upstream gradients of a tile in block order, what is seen behind everything, and the background's gradient.
@@ -157,14 +190,14 @@ struct Sink {
   State& s;
   Sums* own;
   Sums& slot(uint32_t place, const Tile& tile) const {
-    const Rect r = s.rects.data()[place];
+    const Rect r = s.items.data()[place].rect;
     return s.sums.data()[s.slots.data()[place] + static_cast<uint32_t>((tile.y - r.y0) * (r.x1 - r.x0) + tile.x - r.x0)];
   }
-  void add(uint32_t place, const Tile& tile, const float* sums) const {
+  void add(uint32_t place, const Tile& tile, F16 sums) const {
     if (own)
-      store(own[place].x, load(own[place].x) + load(sums));
+      store(own[place].x, load(own[place].x) + sums);
     else
-      store(slot(place, tile).x, load(sums));
+      store(slot(place, tile).x, sums);
   }
 };
 
@@ -179,24 +212,36 @@ void tile_backward(State& s, int number, Work& work, const float* background, co
     const uint32_t at = begin + static_cast<uint32_t>(index) * kBatch;
     const int n = static_cast<int>(std::min<uint32_t>(kBatch, end - at));
     const uint32_t* from = s.list.data() + at;
-    batch.load_rows(s.records.data(), from, n, tile);
-    for (int k = 0; k < n; ++k) {
-      if (sink.own) __builtin_prefetch(&sink.own[from[k]], 1);
-      store(batch.rows[k].sums, bcast(0.0f));
-    }
     const int64_t number_of_batch = s.batch(number, index);
     const Touched& touched = *reinterpret_cast<const Touched*>(s.masks.data() + number_of_batch * kBatch);
     const float* checkpoint = index > 0 ? s.checkpoints.data() + number_of_batch * 256 : px.through;
     const uint16_t* drawn = s.drawn.data() + number_of_batch * 16;  // multiples of 4: the lists are filled up
-    uint16_t any[kGroups] = {};
-    for (int b = 0; b < 16; ++b) {
+    uint16_t any[kGroups];
+    uint32_t blocks = 0;
+    for (int b = 0; b < 16; ++b) blocks |= (drawn[b] > 0 ? 1u : 0u) << b;
+    any_block(touched, blocks, n, any);
+    for (int k = 0; k < n; ++k) __builtin_prefetch(&s.records.data()[from[k + kAhead]]);
+    batch.load_rows(s.records.data(), from, any, n, tile);
+    if constexpr (Depth) std::fill(work.depth, work.depth + kBatch, 0.0f);
+    if (sink.own)
+      for (int k = 0; k < n; ++k) __builtin_prefetch(&sink.own[from[k]], 1);
+    for (const int b : kBlockOrder) {
       if (!drawn[b]) continue;
-      for (int i = 0; i < kGroups; ++i) any[i] |= touched[b][i];
-      batch.list_block(touched[b], n);
+      batch.list_block(touched, b, n);
       block_backward<Depth>(work, drawn[b], b, checkpoint, px, tile, exp2);
     }
-    for (int k = 0; k < n; ++k)
-      if (!sink.own || any[k / 16] >> k % 16 & 1) sink.add(from[k], tile, batch.rows[k].sums);
+    for (int first = 0; first < n; first += 16) {
+      if (!sink.own) {  // every slot is written
+        for (int k = first; k < std::min(n, first + 16); ++k)
+          if (!(any[first / 16] >> (k - first) & 1)) std::memset(&sink.slot(from[k], tile), 0, sizeof(Sums));
+      }
+      for (uint32_t left = any[first / 16]; left; left &= left - 1) {
+        const int k = first + __builtin_ctz(left);
+        F16 sums = load_from<kSums>(&batch.rows[k].l1);
+        if constexpr (Depth) sums = sums + at_lane(kDepth, work.depth[k]);
+        sink.add(from[k], tile, sums);
+      }
+    }
   }
   if (!sink.own)
     for (uint32_t at = end; at < s.tile_begin.data()[number + 1]; ++at)
@@ -210,7 +255,7 @@ void number_slots(State& s) {
   for (int64_t c = 0; c < s.places() / kChunk; ++c)
     for (uint32_t i = 0; i < s.chunk_count.data()[c]; ++i) {
       const int64_t place = c * kChunk + i;
-      const Rect r = s.rects.data()[place];
+      const Rect r = s.items.data()[place].rect;
       slots[place] = at;
       at += static_cast<uint32_t>((r.x1 - r.x0) * (r.y1 - r.y0));
     }

@@ -19,99 +19,100 @@ struct Slice {
 
 Slice slice(int64_t n, int part, int parts) { return {n * part / parts, n * (part + 1) / parts}; }
 
-// Moves the chunks' keys and places together, in `keys2`, `order2`; returns how many, and the range of the keys.
-int64_t gather(State& s, uint32_t& low, uint32_t& high) {
-  const int64_t chunks = s.places() / kChunk;
-  int64_t n = 0;
-  for (int64_t c = 0; c < chunks; ++c) n += s.chunk_count.data()[c];
-  uint32_t* keys = s.keys2.get(static_cast<size_t>(n));
-  uint32_t* order = s.order2.get(static_cast<size_t>(n));
-  low = UINT32_MAX, high = 0;
-  int64_t at = 0;
-  for (int64_t c = 0; c < chunks; ++c) {
-    const uint32_t* from = s.keys.data() + c * kChunk;
-    const int64_t count = s.chunk_count.data()[c];
-    for (int64_t i = 0; i < count; ++i) {
-      keys[at + i] = from[i];
-      order[at + i] = static_cast<uint32_t>(c * kChunk + i);
-      low = std::min(low, from[i]);
-      high = std::max(high, from[i]);
-    }
-    at += count;
+// Runs f(part, begin, end) over pieces of consecutive items: the first pass reads the chunks of the projection, the second one array.
+template <class F>
+void each_piece(const State& s, bool chunks, int64_t n, int part, int parts, F&& f) {
+  if (!chunks) {
+    const Slice range = slice(n, part, parts);
+    f(range.begin, range.end);
+    return;
   }
-  return n;
+  const Slice range = slice(s.places() / kChunk, part, parts);
+  for (int64_t c = range.begin; c < range.end; ++c) f(c * kChunk, c * kChunk + s.chunk_count.data()[c]);
 }
 
 // One stable counting pass on kDigit bits of (key - low) >> shift.
-void pass(State& s, const uint32_t* keys, const uint32_t* order, uint32_t* keys_out, uint32_t* order_out, int64_t n, uint32_t low,
-          int shift, int parts, int threads) {
+void pass(State& s, const Item* from, Item* to, bool chunks, uint32_t low, int shift, int parts, int threads) {
   uint32_t* histogram = s.histogram.get(static_cast<size_t>(parts) * kRadix);
-  const auto digit = [&](uint32_t key) { return ((key - low) >> shift) & (kRadix - 1); };
+  const auto digit = [=](const Item& item) { return ((item.key - low) >> shift) & (kRadix - 1); };
   parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) {
     uint32_t* count = histogram + p * kRadix;
     std::fill(count, count + kRadix, 0u);
-    const Slice range = slice(n, static_cast<int>(p), parts);
-    for (int64_t i = range.begin; i < range.end; ++i) ++count[digit(keys[i])];
+    each_piece(s, chunks, s.visible, static_cast<int>(p), parts, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) ++count[digit(from[i])];
+    });
   });
   uint32_t sum = 0;
   for (uint32_t d = 0; d < kRadix; ++d)
     for (int p = 0; p < parts; ++p) sum += std::exchange(histogram[p * kRadix + d], sum);
   parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) {
     uint32_t* at = histogram + p * kRadix;
-    const Slice range = slice(n, static_cast<int>(p), parts);
-    for (int64_t i = range.begin; i < range.end; ++i) {
-      const uint32_t to = at[digit(keys[i])]++;
-      keys_out[to] = keys[i];
-      order_out[to] = order[i];
-    }
+    each_piece(s, chunks, s.visible, static_cast<int>(p), parts, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) to[at[digit(from[i])]++] = from[i];
+    });
   });
 }
 
 // Two passes sort the 22 leading bits of the range; what is left are short runs, put in order one by one.
-void finish_runs(uint32_t* keys, uint32_t* order, int64_t n, uint32_t low, int shift) {
-  std::vector<std::pair<uint32_t, uint32_t>> long_run;
-  for (int64_t i = 0; i < n;) {
+void finish_runs(Item* items, Slice range, uint32_t low, int shift) {
+  const auto less = [](const Item& a, const Item& b) { return a.key != b.key ? a.key < b.key : a.place < b.place; };
+  for (int64_t i = range.begin; i < range.end;) {
+    const uint32_t run = (items[i].key - low) >> shift;
     int64_t end = i + 1;
-    while (end < n && (keys[end] - low) >> shift == (keys[i] - low) >> shift) ++end;
-    if (end - i <= 32) {
-      for (int64_t j = i + 1; j < end; ++j) {
-        const uint32_t key = keys[j], place = order[j];
-        int64_t k = j;
-        for (; k > i && keys[k - 1] > key; --k) keys[k] = keys[k - 1], order[k] = order[k - 1];
-        keys[k] = key, order[k] = place;
-      }
+    while (end < range.end && (items[end].key - low) >> shift == run) ++end;
+    if (end - i > 32) {
+      std::sort(items + i, items + end, less);  // places are unique and were ascending, so this is stable
     } else {
-      long_run.clear();
-      for (int64_t j = i; j < end; ++j) long_run.emplace_back(keys[j], order[j]);
-      std::sort(long_run.begin(), long_run.end());  // places are unique and were ascending, so this is stable
-      for (int64_t j = i; j < end; ++j) keys[j] = long_run[j - i].first, order[j] = long_run[j - i].second;
+      for (int64_t j = i + 1; j < end; ++j) {
+        const Item item = items[j];
+        int64_t k = j;
+        for (; k > i && items[k - 1].key > item.key; --k) items[k] = items[k - 1];
+        items[k] = item;
+      }
     }
     i = end;
   }
 }
 
-// Leaves the places of all visible Gaussians in `order`, near to far, ties by index.
+// A slice moved forward at both ends to where a run begins, so that no run is cut.
+Slice whole_runs(const Item* items, int64_t n, Slice range, uint32_t low, int shift) {
+  const auto forward = [&](int64_t i) {
+    while (i > 0 && i < n && (items[i].key - low) >> shift == (items[i - 1].key - low) >> shift) ++i;
+    return i;
+  };
+  return {forward(range.begin), forward(range.end)};
+}
+
+// Leaves all visible Gaussians in `sorted`, near to far, ties by index.
 void sort_depths(State& s, int threads) {
-  uint32_t low, high;
-  const int64_t n = s.visible = gather(s, low, high);
+  const int64_t chunks = s.places() / kChunk;
+  uint32_t low = UINT32_MAX, high = 0;
+  int64_t n = 0;
+  for (int64_t c = 0; c < chunks; ++c) {
+    n += s.chunk_count.data()[c];
+    low = std::min(low, s.chunk_low.data()[c]), high = std::max(high, s.chunk_high.data()[c]);
+  }
+  s.visible = n;
+  Item *half = s.half_sorted.get(static_cast<size_t>(n)), *sorted = s.sorted.get(static_cast<size_t>(n));
   if (n == 0) return;
   const int width = 32 - __builtin_clz((high - low) | 1u);
   const int shift = std::max(0, width - 2 * kDigit);
   const int parts = n < kSmall ? 1 : threads;
-  pass(s, s.keys2.data(), s.order2.data(), s.keys.data(), s.order.data(), n, low, shift, parts, threads);
-  pass(s, s.keys.data(), s.order.data(), s.keys2.data(), s.order2.data(), n, low, shift + kDigit, parts, threads);
-  if (shift > 0) finish_runs(s.keys2.data(), s.order2.data(), n, low, shift);
+  pass(s, s.items.data(), half, true, low, shift, parts, threads);
+  pass(s, half, sorted, false, low, shift + kDigit, parts, threads);
+  if (shift == 0) return;
+  std::vector<Slice> ranges;
+  for (int p = 0; p < parts; ++p) ranges.push_back(whole_runs(sorted, n, slice(n, p, parts), low, shift));
+  parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) { finish_runs(sorted, ranges[p], low, shift); });
 }
 
 // How many of a slice's rectangles hold each tile: each adds 1 at its first corner and takes it away past its sides; the running sums over
 // rows and columns are the counts. (Four steps per rectangle, and no branch on its size.)
-void count_tiles(const State& s, const uint32_t* order, Slice range, uint32_t* count) {
+void count_tiles(const State& s, const Item* items, Slice range, uint32_t* count) {
   const int width = s.tiles_x + 1, height = s.tiles_y + 1;
   std::vector<uint32_t> corner(static_cast<size_t>(width) * height, 0u);  // modulo 2^32, so that differences may be negative
-  const Rect* rects = s.rects.data();
   for (int64_t i = range.begin; i < range.end; ++i) {
-    __builtin_prefetch(&rects[order[std::min<int64_t>(i + kAhead, range.end - 1)]]);
-    const Rect r = rects[order[i]];
+    const Rect r = items[i].rect;
     ++corner[r.y0 * width + r.x0];
     --corner[r.y0 * width + r.x1];
     --corner[r.y1 * width + r.x0];
@@ -126,15 +127,53 @@ void count_tiles(const State& s, const uint32_t* order, Slice range, uint32_t* c
   }
 }
 
-void fill_lists(const State& s, const uint32_t* order, Slice range, uint32_t* at, uint32_t* list) {
-  const Rect* rects = s.rects.data();
-  for (int64_t i = range.begin; i < range.end; ++i) {
-    __builtin_prefetch(&rects[order[std::min<int64_t>(i + kAhead, range.end - 1)]]);
-    const uint32_t place = order[i];
-    const Rect r = rects[place];
-    for (int y = r.y0; y < r.y1; ++y)
-      for (int x = r.x0; x < r.x1; ++x) list[at[y * s.tiles_x + x]++] = place;
+// Tiles of rectangles one after the other, some hundreds at a time: written without a branch on a rectangle's size, then read in one loop.
+class Flat {
+ public:
+  explicit Flat(int tiles_x) : tiles_x_(tiles_x) {
+    for (int width = 1; width <= kMost; ++width)
+      for (int i = 0; i < kMost; ++i) offset_[width][i] = static_cast<uint32_t>(i / width * tiles_x + i % width);
   }
+  bool full() const { return count_ > kRoom - 2 * kMost; }
+  // Takes a rectangle of at most kMost tiles; returns false for others.
+  bool add(const Item& item) {
+    const Rect r = item.rect;
+    const int width = r.x1 - r.x0, area = width * (r.y1 - r.y0);
+    if (area > kMost) return false;
+    const uint32_t first = static_cast<uint32_t>(r.y0 * tiles_x_ + r.x0);
+    const uint32_t* offset = offset_[width];
+    for (int i = 0; i < kMost; ++i) tile_[count_ + i] = first + offset[i];
+    for (int i = 0; i < kMost; ++i) place_[count_ + i] = item.place;
+    count_ += area;
+    return true;
+  }
+  void flush(uint32_t* at, uint32_t* list) {
+    for (int i = 0; i < kMost; ++i) tile_[count_ + i] = tile_[0];
+    for (int i = 0; i < count_; ++i) {
+      __builtin_prefetch(&list[at[tile_[i + kMost]]], 1);  // every tile writes elsewhere
+      list[at[tile_[i]]++] = place_[i];
+    }
+    count_ = 0;
+  }
+
+ private:
+  static constexpr int kMost = 16, kRoom = 512 + 16;
+  int tiles_x_, count_ = 0;
+  alignas(64) uint32_t offset_[kMost + 1][kMost] = {};
+  alignas(64) uint32_t tile_[kRoom], place_[kRoom];
+};
+
+void fill_lists(const State& s, const Item* items, Slice range, uint32_t* at, uint32_t* list) {
+  Flat flat(s.tiles_x);
+  for (int64_t i = range.begin; i < range.end; ++i) {
+    const bool large = !flat.add(items[i]);
+    if (large || flat.full()) flat.flush(at, list);
+    if (!large) continue;
+    const Rect r = items[i].rect;
+    for (int y = r.y0; y < r.y1; ++y)
+      for (int x = r.x0; x < r.x1; ++x) list[at[y * s.tiles_x + x]++] = items[i].place;
+  }
+  flat.flush(at, list);
 }
 
 }  // namespace
@@ -144,10 +183,10 @@ void bin(State& s, int threads) {
   const int64_t n = s.visible;
   const int tiles = s.tiles();
   const int parts = n < kSmall ? 1 : threads;
-  const uint32_t* order = s.order2.data();
+  const Item* items = s.sorted.data();
   uint32_t* counts = s.histogram.get(static_cast<size_t>(parts) * tiles);
   parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) {
-    count_tiles(s, order, slice(n, static_cast<int>(p), parts), counts + p * tiles);
+    count_tiles(s, items, slice(n, static_cast<int>(p), parts), counts + p * tiles);
   });
   uint32_t* begin = s.tile_begin.get(static_cast<size_t>(tiles) + 1);
   s.tile_used.get(static_cast<size_t>(tiles));
@@ -159,15 +198,15 @@ void bin(State& s, int threads) {
       counts[p * tiles + t] = static_cast<uint32_t>(sum);
       sum += count;
     }
-    if (sum > UINT32_MAX - 64) throw std::bad_alloc();
+    if (sum > UINT32_MAX - kBeyond) throw std::bad_alloc();
   }
   begin[tiles] = static_cast<uint32_t>(sum);
   s.pairs = static_cast<int64_t>(sum);
-  uint32_t* list = s.list.get(sum + kAhead);
+  uint32_t* list = s.list.get(sum + kBeyond);
   parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) {
-    fill_lists(s, order, slice(n, static_cast<int>(p), parts), counts + p * tiles, list);
+    fill_lists(s, items, slice(n, static_cast<int>(p), parts), counts + p * tiles, list);
   });
-  std::fill(list + sum, list + sum + kAhead, sum > 0 ? list[sum - 1] : 0u);
+  std::fill(list + sum, list + sum + kBeyond, sum > 0 ? list[sum - 1] : 0u);
 }
 
 }  // namespace se::raster

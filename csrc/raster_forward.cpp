@@ -15,10 +15,9 @@ struct Pixels {  // a tile's pixels in block order
 // `through` runs on past the stop (it only falls); `left` keeps the value before it.
 int blend_block(const Batch& batch, int block, Pixels& px, const Exp2& exp2, bool& alive) {
   const F16 y = block_y(block / 4), stop = bcast(kMinTransmittance);
-  const F16 one = bcast(1.0f);
   const int at = block * 16, column = block % 4;
-  F16 through = load(px.through + at), left = load(px.left + at), depth = load(px.depth + at);
-  F16 red = load(px.color[0] + at), green = load(px.color[1] + at), blue = load(px.color[2] + at);
+  F16 through = load(px.through + at), left = load(px.left + at);
+  F16 sum[4] = {load(px.color[0] + at), load(px.color[1] + at), load(px.color[2] + at), load(px.depth + at)};
   int i = 0;
   for (alive = true; i < batch.list.count && alive; i += 4) {
     const Row* row[4];
@@ -26,20 +25,16 @@ int blend_block(const Batch& batch, int block, Pixels& px, const Exp2& exp2, boo
     for (int k = 0; k < 4; ++k) row[k] = &batch.row(batch.list.place[i + k]);
     alphas(row, column, y, exp2, alpha);
     for (int k = 0; k < 4; ++k) {
-      const F16 next = through * (one - alpha[k]);
-      const M16 drawn = ge(next, stop);
-      const F16 weight = mul_keep(drawn, through, alpha[k]);
-      left = select(drawn, next, left);
-      through = next;
-      red = fma(weight, bcast(row[k]->r), red);
-      green = fma(weight, bcast(row[k]->g), green);
-      blue = fma(weight, bcast(row[k]->b), blue);
-      depth = fma(weight, bcast(row[k]->z), depth);
+      const F16 weight = through * alpha[k];
+      through = fnma(through, alpha[k], through);
+      const M16 drawn = ge(through, stop);
+      left = select(drawn, through, left);
+      add_where(drawn, weight, &row[k]->r, sum);
     }
     alive = any(ge(through, stop));
   }
-  store(px.through + at, through), store(px.left + at, left), store(px.depth + at, depth);
-  store(px.color[0] + at, red), store(px.color[1] + at, green), store(px.color[2] + at, blue);
+  store(px.through + at, through), store(px.left + at, left), store(px.depth + at, sum[3]);
+  for (int c = 0; c < 3; ++c) store(px.color[c] + at, sum[c]);
   return i;
 }
 
@@ -73,12 +68,14 @@ void blend_tile(State& s, int number, Batch& batch, const float* background, con
     if (at > begin) std::copy(px.through, px.through + 256, s.checkpoints.data() + number_of_batch * 256);
     Touched& touched = *reinterpret_cast<Touched*>(s.masks.data() + number_of_batch * kBatch);
     uint16_t* drawn = s.drawn.data() + number_of_batch * 16;
-    batch.load_rows(s.records.data(), from, n, tile);
     touch_blocks(s.records.data(), from, n, tile, touched);
-    for (int b = 0; b < 16; ++b) {
+    uint16_t any[kGroups];
+    any_block(touched, alive, n, any);
+    batch.load_rows(s.records.data(), from, any, n, tile);
+    for (const int b : kBlockOrder) {
       drawn[b] = 0;
       if (!(alive >> b & 1)) continue;
-      batch.list_block(touched[b], n);
+      batch.list_block(touched, b, n);
       if (batch.list.count == 0) continue;
       bool still;
       drawn[b] = static_cast<uint16_t>(blend_block(batch, b, px, exp2, still));

@@ -45,7 +45,7 @@ struct Lanes {  // the parts of sixteen records that are not their depth key
 
 void project_chunk(State& s, const Inputs& in, int32_t* radii, int64_t begin, int64_t end) {
   const CameraArgs& camera = s.camera;
-  uint32_t at = static_cast<uint32_t>(begin);
+  uint32_t at = static_cast<uint32_t>(begin), low = UINT32_MAX, high = 0;
   for (int64_t i = begin; i < end; i += 16) {
     const int count = static_cast<int>(std::min<int64_t>(16, end - i));
     F16 mean[3], quat[4], scale[3], color[3], opacity[1];
@@ -79,18 +79,22 @@ void project_chunk(State& s, const Inputs& in, int32_t* radii, int64_t begin, in
     load_columns(in.colors + 3 * i, count, color);
     const Lanes lanes(p, log_opacity, color);
     alignas(64) int32_t x0[16], y0[16], x1[16], y1[16];
+    alignas(64) uint32_t key_bits[16];  // positive floats order as their bits do
+    store(reinterpret_cast<float*>(key_bits), p.vz);
     store_int(x0, r.x0), store_int(y0, r.y0), store_int(x1, r.x1), store_int(y1, r.y1);
     for (uint32_t left = drawn; left; left &= left - 1) {
       const int k = __builtin_ctz(left);
       Record& record = s.records.data()[at];
       store(reinterpret_cast<float*>(&record), lanes.row[k]);
-      __builtin_memcpy(&s.keys.data()[at], &record.z, 4);  // positive floats order as their bits do
-      s.order.data()[at] = at;
-      s.rects.data()[at] = {static_cast<uint16_t>(x0[k]), static_cast<uint16_t>(y0[k]), static_cast<uint16_t>(x1[k]),
-                            static_cast<uint16_t>(y1[k])};
+      const Rect rect{static_cast<uint16_t>(x0[k]), static_cast<uint16_t>(y0[k]), static_cast<uint16_t>(x1[k]),
+                      static_cast<uint16_t>(y1[k])};
+      const uint32_t key = key_bits[k];
+      s.items.data()[at] = {key, at, rect};
+      low = std::min(low, key), high = std::max(high, key);
       ++at;
     }
   }
+  s.chunk_low.data()[begin / kChunk] = low, s.chunk_high.data()[begin / kChunk] = high;
   s.chunk_count.data()[begin / kChunk] = at - static_cast<uint32_t>(begin);
 }
 
@@ -98,7 +102,7 @@ void project_chunk(State& s, const Inputs& in, int32_t* radii, int64_t begin, in
 
 void project(State& s, const Inputs& in, int32_t* radii, int threads) {
   const size_t places = static_cast<size_t>(s.places());
-  s.records.get(places), s.rects.get(places), s.keys.get(places), s.order.get(places);
+  s.records.get(places), s.items.get(places), s.chunk_low.get(places / kChunk), s.chunk_high.get(places / kChunk);
   s.group_mask.get(places / 16), s.group_first.get(places / 16), s.chunk_count.get(places / kChunk);
   parallel_for(s.m, kChunk, threads, [&](int64_t begin, int64_t end, int) { project_chunk(s, in, radii, begin, end); });
 }

@@ -13,14 +13,23 @@ inline float edge(int tiles) { return static_cast<float>(tiles * kTile); }
 // Reads sixteen rows of `Width` floats as columns; rows from `count` on repeat the last one.
 template <int Width>
 inline void load_columns(const float* rows, int count, F16 (&column)[Width]) {
-  alignas(64) float temporary[Width][16];
   if (count == 16) {
-    for (int i = 0; i < 16; ++i)
-      for (int k = 0; k < Width; ++k) temporary[k][i] = rows[i * Width + k];
-  } else {
-    for (int i = 0; i < 16; ++i)
-      for (int k = 0; k < Width; ++k) temporary[k][i] = rows[(i < count ? i : count - 1) * Width + k];
+    if constexpr (Width == 1) {
+      column[0] = load(rows);
+    } else if constexpr (Width == 3) {
+      load3(rows, column[0], column[1], column[2]);
+    } else {
+      static_assert(Width == 4);
+      // Four rows to a register, a row to a quarter: quarters become registers of quarters' rows, then rows become columns.
+      for (int k = 0; k < 4; ++k) column[k] = load(rows + 16 * k);
+      transpose_quarters(column);  // register q: rows q, 4 + q, 8 + q, 12 + q
+      transpose4(column);          // register k: column k, quarter j: rows 4 j + 0..3
+    }
+    return;
   }
+  alignas(64) float temporary[Width][16];
+  for (int i = 0; i < 16; ++i)
+    for (int k = 0; k < Width; ++k) temporary[k][i] = rows[(i < count ? i : count - 1) * Width + k];
   for (int k = 0; k < Width; ++k) column[k] = load(temporary[k]);
 }
 

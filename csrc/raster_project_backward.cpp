@@ -16,7 +16,7 @@ F16 total(const State& s, uint32_t place, int rows) {
     for (int r = 0; r < rows; ++r) sum = sum + load(s.sums.data()[r * places + place].x);
     return sum;
   }
-  const Rect rect = s.rects.data()[place];
+  const Rect rect = s.items.data()[place].rect;
   const uint32_t count = static_cast<uint32_t>((rect.x1 - rect.x0) * (rect.y1 - rect.y0));
   const Sums* slot = s.sums.data() + s.slots.data()[place];
   for (uint32_t k = 0; k < count; ++k) sum = sum + load(slot[k].x);
@@ -101,6 +101,8 @@ void group_backward(const State& s, const Inputs& in, const Gradients& out, int 
   uint32_t place = s.group_first.data()[i / 16];
   for (int k = 0; k < 16; ++k) sum[k] = drawn >> k & 1 ? total(s, place++, rows) : bcast(0.0f);
   transpose(sum);
+  for (const int k : {kSx, kSy}) sum[k] = sum[k] * bcast(0.5f);  // they came in half pixels
+  for (const int k : {kSxx, kSxy, kSyy}) sum[k] = sum[k] * bcast(0.25f);
   F16 mean[3], quat[4], scale[3], opacity[1];
   load_columns(in.means + 3 * i, count, mean);
   load_columns(in.quats + 4 * i, count, quat);

@@ -15,6 +15,12 @@
 
 namespace se {
 
+inline F16 at_lane(int lane, float x) {
+  alignas(64) float all[16] = {};
+  all[lane] = x;
+  return load(all);
+}
+
 // log2(a) for normal a > 0 (absolute error about one rounding of the result).
 inline F16 log2(F16 a) {
   F16 m, e;

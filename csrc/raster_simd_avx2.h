@@ -3,6 +3,7 @@
 #include <immintrin.h>
 
 #include <cstdint>
+#include "raster_packing.h"
 
 namespace se {
 
@@ -47,6 +48,11 @@ inline F16 select(M16 m, F16 a, F16 b) { return {_mm256_blendv_ps(b.lo, a.lo, m.
 inline F16 keep(M16 m, F16 a) { return {_mm256_and_ps(m.lo, a.lo), _mm256_and_ps(m.hi, a.hi)}; }
 inline F16 mul_keep(M16 m, F16 a, F16 b) { return keep(m, a * b); }
 inline F16 min_keep(M16 m, F16 a, F16 b) { return keep(m, min(a, b)); }
+// sum[k] += weight * by[k] in the lanes of the mask.
+inline void add_where(M16 m, F16 weight, const float* by, F16 (&sum)[4]) {
+  const F16 kept = keep(m, weight);
+  for (int k = 0; k < 4; ++k) sum[k] = fma(kept, bcast(by[k]), sum[k]);
+}
 inline uint32_t bits(M16 m) { return static_cast<uint32_t>(_mm256_movemask_ps(m.lo) | _mm256_movemask_ps(m.hi) << 8); }
 inline bool any(M16 m) { return _mm256_movemask_ps(_mm256_or_ps(m.lo, m.hi)) != 0; }
 inline void store_int(int32_t* p, F16 a) {
@@ -86,6 +92,34 @@ inline void split_exponent_half(__m256 a, __m256& m, __m256& e) {
   e = _mm256_cvtepi32_ps(k);
   m = _mm256_castsi256_ps(_mm256_sub_epi32(b, _mm256_slli_epi32(k, 23)));
 }
+// The first N of sixteen floats, the others 0.
+template <int N>
+inline F16 load_first(const float* p) {
+  static_assert(N == 7);
+  return {_mm256_blend_ps(_mm256_loadu_ps(p), _mm256_setzero_ps(), 0x80), _mm256_setzero_ps()};
+}
+
+// Sixteen floats, the first N of them taken as 0.
+template <int N>
+inline F16 load_from(const float* p) {
+  static_assert(N == 7);
+  return {_mm256_blend_ps(_mm256_setzero_ps(), _mm256_loadu_ps(p), 0x80), _mm256_loadu_ps(p + 8)};
+}
+
+// First halves of a and b, then second halves.
+inline void store_halves(float* p, F16 a, F16 b) {
+  _mm256_storeu_ps(p, a.lo), _mm256_storeu_ps(p + 8, b.lo);
+  _mm256_storeu_ps(p + 16, a.hi), _mm256_storeu_ps(p + 24, b.hi);
+}
+
+// Sixteen rows of three floats as three columns.
+inline void load3(const float* p, F16& a, F16& b, F16& c) {
+  alignas(64) float column[3][16];
+  for (int i = 0; i < 16; ++i)
+    for (int k = 0; k < 3; ++k) column[k][i] = p[3 * i + k];
+  a = load(column[0]), b = load(column[1]), c = load(column[2]);
+}
+
 // a = m * 2^e with m in [0.75, 1.5)
 inline void split_exponent(F16 a, F16& m, F16& e) {
   split_exponent_half(a.lo, m.lo, e.lo);
@@ -107,6 +141,37 @@ inline void load_pairs(const float* const (&p)[16], F16& first, F16& second) {
   };
   half(0, first.lo, second.lo);
   half(8, first.hi, second.hi);
+}
+
+// Sixteen lanes are four quarters of four. Column<C>: lane C of each quarter in all its lanes.
+template <int C>
+inline F16 column(F16 a) {
+  return {_mm256_permute_ps(a.lo, C * 0x55), _mm256_permute_ps(a.hi, C * 0x55)};
+}
+// Each quarter of four values, as a 4 x 4 matrix.
+inline void transpose4(F16 (&r)[4]) {
+  const auto half = [](__m256& w, __m256& x, __m256& y, __m256& z) {
+    const __m256 a = _mm256_unpacklo_ps(w, x), b = _mm256_unpackhi_ps(w, x), c = _mm256_unpacklo_ps(y, z), d = _mm256_unpackhi_ps(y, z);
+    w = _mm256_shuffle_ps(a, c, 0x44), x = _mm256_shuffle_ps(a, c, 0xee), y = _mm256_shuffle_ps(b, d, 0x44), z = _mm256_shuffle_ps(b, d, 0xee);
+  };
+  half(r[0].lo, r[1].lo, r[2].lo, r[3].lo);
+  half(r[0].hi, r[1].hi, r[2].hi, r[3].hi);
+}
+// Quarter q of value j becomes quarter j of value q.
+inline void transpose_quarters(F16 (&r)[4]) {
+  const auto first = [](__m256 a, __m256 b) { return _mm256_permute2f128_ps(a, b, 0x20); };
+  const auto second = [](__m256 a, __m256 b) { return _mm256_permute2f128_ps(a, b, 0x31); };
+  const F16 a = r[0], b = r[1], c = r[2], d = r[3];
+  r[0] = {first(a.lo, b.lo), first(c.lo, d.lo)}, r[1] = {second(a.lo, b.lo), second(c.lo, d.lo)};
+  r[2] = {first(a.hi, b.hi), first(c.hi, d.hi)}, r[3] = {second(a.hi, b.hi), second(c.hi, d.hi)};
+}
+// Quarter j of the result is the sum of value j's quarters.
+inline F16 sum_quarters(const F16 (&r)[4]) {
+  const auto pair = [](F16 a, F16 b) {
+    const __m256 x = _mm256_add_ps(a.lo, a.hi), y = _mm256_add_ps(b.lo, b.hi);
+    return _mm256_add_ps(_mm256_permute2f128_ps(x, y, 0x20), _mm256_permute2f128_ps(x, y, 0x31));
+  };
+  return {pair(r[0], r[1]), pair(r[2], r[3])};
 }
 
 inline void transpose8(__m256 (&r)[8]) {

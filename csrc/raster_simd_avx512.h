@@ -38,6 +38,10 @@ inline F16 select(M16 m, F16 a, F16 b) { return {_mm512_mask_blend_ps(m.m, b.v, 
 inline F16 keep(M16 m, F16 a) { return {_mm512_maskz_mov_ps(m.m, a.v)}; }
 inline F16 mul_keep(M16 m, F16 a, F16 b) { return {_mm512_maskz_mul_ps(m.m, a.v, b.v)}; }
 inline F16 min_keep(M16 m, F16 a, F16 b) { return {_mm512_maskz_min_ps(m.m, a.v, b.v)}; }
+// sum[k] += weight * by[k] in the lanes of the mask.
+inline void add_where(M16 m, F16 weight, const float* by, F16 (&sum)[4]) {
+  for (int k = 0; k < 4; ++k) sum[k].v = _mm512_mask3_fmadd_ps(weight.v, _mm512_set1_ps(by[k]), sum[k].v, m.m);
+}
 inline uint32_t bits(M16 m) { return m.m; }
 inline bool any(M16 m) { return m.m != 0; }
 inline void store_int(int32_t* p, F16 a) { _mm512_storeu_si512(p, _mm512_cvttps_epi32(a.v)); }
@@ -79,6 +83,46 @@ inline F16 reciprocal(F16 a) {
   return {_mm512_fmadd_ps(r, _mm512_fnmadd_ps(a.v, r, _mm512_set1_ps(1.0f)), r)};
 }
 
+// The first N of sixteen floats, the others 0.
+template <int N>
+inline F16 load_first(const float* p) {
+  return {_mm512_maskz_loadu_ps((1u << N) - 1, p)};
+}
+
+// Sixteen floats, the first N of them taken as 0.
+template <int N>
+inline F16 load_from(const float* p) {
+  return {_mm512_maskz_loadu_ps(0xffffu & ~((1u << N) - 1), p)};
+}
+
+// First halves of a and b, then second halves.
+inline void store_halves(float* p, F16 a, F16 b) {
+  _mm512_storeu_ps(p, _mm512_shuffle_f32x4(a.v, b.v, 0x44));
+  _mm512_storeu_ps(p + 16, _mm512_shuffle_f32x4(a.v, b.v, 0xee));
+}
+
+// Writes (first + lane) * Step of the mask's lanes to `to`, packed to the front of sixteen values.
+template <int Step>
+struct Packing {
+  __m512i lane = _mm512_mullo_epi32(_mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15), _mm512_set1_epi32(Step));
+  void pack(uint16_t* to, uint32_t mask, int first) const {
+    const __m512i packed = _mm512_maskz_compress_epi32(static_cast<__mmask16>(mask), _mm512_add_epi32(lane, _mm512_set1_epi32(first * Step)));
+    _mm256_storeu_si256(reinterpret_cast<__m256i*>(to), _mm512_cvtepi32_epi16(packed));
+  }
+};
+
+// Sixteen rows of three floats as three columns.
+inline void load3(const float* p, F16& a, F16& b, F16& c) {
+  const __m512 x = _mm512_loadu_ps(p), y = _mm512_loadu_ps(p + 16), z = _mm512_loadu_ps(p + 32);
+  const auto column = [&](__m512i from_xy, __m512i from_z) { return _mm512_permutex2var_ps(_mm512_permutex2var_ps(x, from_xy, y), from_z, z); };
+  a.v = column(_mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 0, 0, 0, 0, 0),
+               _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29));
+  b.v = column(_mm512_setr_epi32(1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, 0, 0, 0, 0, 0),
+               _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30));
+  c.v = column(_mm512_setr_epi32(2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 0, 0, 0, 0, 0, 0),
+               _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31));
+}
+
 // a = m * 2^e with m in [0.75, 1.5)
 inline void split_exponent(F16 a, F16& m, F16& e) {
   m.v = _mm512_getmant_ps(a.v, _MM_MANT_NORM_p75_1p5, _MM_MANT_SIGN_src);
@@ -100,6 +144,34 @@ inline void load_pairs(const float* const (&p)[16], F16& first, F16& second) {
   const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
   first.v = _mm512_permutex2var_ps(a, even, b);
   second.v = _mm512_permutex2var_ps(a, _mm512_add_epi32(even, _mm512_set1_epi32(1)), b);
+}
+
+// A register is four quarters of four lanes. Column<C>: lane C of each quarter in all its lanes.
+template <int C>
+inline F16 column(F16 a) {
+  return {_mm512_permute_ps(a.v, C * 0x55)};
+}
+// Each quarter of four registers, as a 4 x 4 matrix.
+inline void transpose4(F16 (&r)[4]) {
+  const __m512 a = _mm512_unpacklo_ps(r[0].v, r[1].v), b = _mm512_unpackhi_ps(r[0].v, r[1].v);
+  const __m512 c = _mm512_unpacklo_ps(r[2].v, r[3].v), d = _mm512_unpackhi_ps(r[2].v, r[3].v);
+  r[0].v = _mm512_shuffle_ps(a, c, 0x44), r[1].v = _mm512_shuffle_ps(a, c, 0xee);
+  r[2].v = _mm512_shuffle_ps(b, d, 0x44), r[3].v = _mm512_shuffle_ps(b, d, 0xee);
+}
+// Quarter q of register j becomes quarter j of register q.
+inline void transpose_quarters(F16 (&r)[4]) {
+  const __m512 a = _mm512_shuffle_f32x4(r[0].v, r[1].v, 0x44), b = _mm512_shuffle_f32x4(r[0].v, r[1].v, 0xee);
+  const __m512 c = _mm512_shuffle_f32x4(r[2].v, r[3].v, 0x44), d = _mm512_shuffle_f32x4(r[2].v, r[3].v, 0xee);
+  r[0].v = _mm512_shuffle_f32x4(a, c, 0x88), r[1].v = _mm512_shuffle_f32x4(a, c, 0xdd);
+  r[2].v = _mm512_shuffle_f32x4(b, d, 0x88), r[3].v = _mm512_shuffle_f32x4(b, d, 0xdd);
+}
+// Quarter j of the result is the sum of register j's quarters.
+inline F16 sum_quarters(const F16 (&r)[4]) {
+  const auto halves = [](__m512 a, __m512 b) {  // first half: of a, second: of b
+    return _mm512_add_ps(_mm512_mask_blend_ps(0xff00, a, b), _mm512_shuffle_f32x4(a, b, 0x4e));
+  };
+  const __m512 a = halves(r[0].v, r[1].v), b = halves(r[2].v, r[3].v);
+  return {_mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x88), _mm512_shuffle_f32x4(a, b, 0xdd))};
 }
 
 inline void transpose(F16 (&r)[16]) {

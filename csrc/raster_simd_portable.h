@@ -2,6 +2,7 @@
 #pragma once
 #include <cmath>
 #include <cstdint>
+#include "raster_packing.h"
 #include <cstring>
 
 namespace se {
@@ -78,6 +79,11 @@ inline F16 floor(F16 a) {
   SE_EACH for (int k = 0; k < 4; ++k) r.v[i][k] = __builtin_floorf(a.v[i][k]);
   return r;
 }
+// sum[k] += weight * by[k] in the lanes of the mask.
+inline void add_where(M16 m, F16 weight, const float* by, F16 (&sum)[4]) {
+  const F16 kept = keep(m, weight);
+  for (int k = 0; k < 4; ++k) sum[k] = fma(kept, bcast(by[k]), sum[k]);
+}
 inline uint32_t bits(M16 m) {
   uint32_t r = 0;
   SE_EACH {
@@ -115,6 +121,36 @@ struct Exp2 {
 
 inline F16 reciprocal(F16 a) { return bcast(1.0f) / a; }
 
+// The first N of sixteen floats, the others 0.
+template <int N>
+inline F16 load_first(const float* p) {
+  float all[16] = {};
+  std::memcpy(all, p, N * sizeof(float));
+  return load(all);
+}
+
+// Sixteen floats, the first N of them taken as 0.
+template <int N>
+inline F16 load_from(const float* p) {
+  F16 r = load(p);
+  for (int k = 0; k < N; ++k) r.v[k / 4][k % 4] = 0;
+  return r;
+}
+
+// First halves of a and b, then second halves.
+inline void store_halves(float* p, F16 a, F16 b) {
+  std::memcpy(p, &a.v[0], 32), std::memcpy(p + 8, &b.v[0], 32);
+  std::memcpy(p + 16, &a.v[2], 32), std::memcpy(p + 24, &b.v[2], 32);
+}
+
+// Sixteen rows of three floats as three columns.
+inline void load3(const float* p, F16& a, F16& b, F16& c) {
+  alignas(64) float column[3][16];
+  for (int i = 0; i < 16; ++i)
+    for (int k = 0; k < 3; ++k) column[k][i] = p[3 * i + k];
+  a = load(column[0]), b = load(column[1]), c = load(column[2]);
+}
+
 // a = m * 2^e with m in [0.75, 1.5)
 inline void split_exponent(F16 a, F16& m, F16& e) {
   SE_EACH {
@@ -127,6 +163,28 @@ inline void split_exponent(F16 a, F16& m, F16& e) {
 inline void load_pairs(const float* const (&p)[16], F16& first, F16& second) {
   for (int k = 0; k < 16; ++k) first.v[k / 4][k % 4] = p[k][0], second.v[k / 4][k % 4] = p[k][1];
 }
+
+// Sixteen lanes are four quarters of four. Column<C>: lane C of each quarter in all its lanes.
+template <int C>
+inline F16 column(F16 a) {
+  SE_ALL(F16, (V4{a.v[i][C], a.v[i][C], a.v[i][C], a.v[i][C]}));
+}
+// Each quarter of four values, as a 4 x 4 matrix.
+inline void transpose4(F16 (&r)[4]) {
+  SE_EACH {
+    const V4 w = r[0].v[i], x = r[1].v[i], y = r[2].v[i], z = r[3].v[i];
+    for (int k = 0; k < 4; ++k) r[k].v[i] = V4{w[k], x[k], y[k], z[k]};
+  }
+}
+// Quarter q of value j becomes quarter j of value q.
+inline void transpose_quarters(F16 (&r)[4]) {
+  F16 t[4];
+  for (int j = 0; j < 4; ++j)
+    for (int q = 0; q < 4; ++q) t[q].v[j] = r[j].v[q];
+  for (int q = 0; q < 4; ++q) r[q] = t[q];
+}
+// Quarter j of the result is the sum of value j's quarters.
+inline F16 sum_quarters(const F16 (&a)[4]) { SE_ALL(F16, (a[i].v[0] + a[i].v[2]) + (a[i].v[1] + a[i].v[3])); }
 
 inline void transpose(F16 (&r)[16]) {
   float t[16][16], s[16][16];

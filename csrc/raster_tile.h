@@ -19,14 +19,16 @@ struct Tile {
 
 // One Gaussian of a batch, as the tile's blocks read it.
 struct alignas(64) Row {
-  float height[16], slope[16];                        // by column of the tile, see raster.h
-  float l1, r, g, b, z, u, v, log_opacity, spare[8];  // the first half of the record
-  float sums[16];                                     // backward: what blocks have added up so far
+  float shape[2][2][8];            // by half of the tile: eight columns' heights, then their slopes, see raster.h
+  float l1, r, g, b, z, u, v;      // as in the record
+  float sums[16 - kSums];          // backward: what blocks have added up so far
+  const float* height(int block_column) const { return shape[block_column / 2][0] + block_column % 2 * 4; }
+  static constexpr int kSlope = 8;  // from a height to its slope
 };
-static_assert(sizeof(Row) == 256);
+static_assert(sizeof(Row) == 192 && kSums == 7);
 
 constexpr int kGroups = kBatch / 16;
-using Touched = uint16_t[16][kGroups];  // for each block one bit per Gaussian of the batch
+using Touched = uint16_t[kGroups][16];  // for each group of sixteen Gaussians and each block one bit per Gaussian
 
 // The Gaussians of a batch that touch one block, near to far, filled up to a multiple of 16.
 struct List {
@@ -36,58 +38,36 @@ struct List {
 
 constexpr int kPlace = sizeof(Row) / 8;
 
-// For each mask of eight Gaussians the places of the set ones, packed to the front.
-struct Packing {
-  alignas(16) uint16_t place[256][8];
-};
-inline const Packing& packing() {
-  static const Packing table = [] {
-    Packing t{};
-    for (int mask = 0; mask < 256; ++mask)
-      for (int lane = 0, at = 0; lane < 8; ++lane)
-        if (mask >> lane & 1) t.place[mask][at++] = static_cast<uint16_t>(lane * kPlace);
-    return t;
-  }();
-  return table;
-}
-
 struct Batch {
-  Row rows[kBatch + 1];  // one beyond the end is a Gaussian that draws nothing, which fills up lists
+  Row rows[kBatch + 16];  // those beyond the end are Gaussians that draw nothing, which fill up lists
   List list;             // of the current block
-  const Packing& table = packing();
+  const Packing<kPlace> packing;
 
   Batch() {
-    Row& blank = rows[kBatch];
-    for (float& height : blank.height) height = -1000.0f;
-    for (float& slope : blank.slope) slope = 0.0f;
-    blank.l1 = blank.r = blank.g = blank.b = blank.z = blank.u = blank.v = 0.0f;
+    std::memset(static_cast<void*>(rows + kBatch), 0, 16 * sizeof(Row));
+    for (int k = 0; k < 16; ++k)
+      for (auto& half : rows[kBatch + k].shape) std::fill(half[0], half[0] + 8, -1000.0f);
   }
 
   const Row& row(uint16_t place) const { return *reinterpret_cast<const Row*>(reinterpret_cast<const char*>(rows) + place * size_t{8}); }
   Row& row(uint16_t place) { return *reinterpret_cast<Row*>(reinterpret_cast<char*>(rows) + place * size_t{8}); }
 
-  void load_rows(const Record* records, const uint32_t* from, int n, const Tile& tile);
-  void list_block(const uint16_t* touched, int n);
+  void load_rows(const Record* records, const uint32_t* from, const uint16_t (&any)[kGroups], int n, const Tile& tile);
+  void list_block(const Touched& touched, int block, int n);
 };
 
-inline void Batch::list_block(const uint16_t* touched, int n) {
-  typedef uint16_t U8 __attribute__((vector_size(16)));
+inline void Batch::list_block(const Touched& touched, int block, int n) {
   int count = 0;
-  const auto add = [&](uint32_t mask, int first) {
-    U8 places;
-    std::memcpy(&places, table.place[mask], 16);
-    places += static_cast<uint16_t>(first * kPlace);
-    std::memcpy(list.place + count, &places, 16);
-    count += __builtin_popcount(mask);
-  };
   for (int i = 0; i < n; i += 16) {
-    const uint32_t mask = touched[i / 16];
-    add(mask & 255, i);
-    add(mask >> 8, i + 8);
+    packing.pack(list.place + count, touched[i / 16][block], i);
+    count += __builtin_popcount(touched[i / 16][block]);
   }
-  for (int k = 0; k < 16; ++k) list.place[count + k] = kBatch * kPlace;
+  packing.pack(list.place + count, 0xffff, kBatch);  // different ones: their sums need not wait for each other
   list.count = count;
 }
+
+// The order in which a tile's blocks are worked on: one half of the tile first, as only that half of each row is needed for it.
+constexpr int kBlockOrder[16] = {0, 1, 4, 5, 8, 9, 12, 13, 2, 3, 6, 7, 10, 11, 14, 15};
 
 inline const float* lane_x() {
   alignas(64) static const float x[16] = {-7.5f, -6.5f, -5.5f, -4.5f, -3.5f, -2.5f, -1.5f, -0.5f,
@@ -102,16 +82,18 @@ inline F16 block_y(int block_row) {
   return load(y) + bcast(4.0f * static_cast<float>(block_row));
 }
 
-inline void Batch::load_rows(const Record* records, const uint32_t* from, int n, const Tile& tile) {
+// Fills the rows of the Gaussians that `any` names.
+inline void Batch::load_rows(const Record* records, const uint32_t* from, const uint16_t (&any)[kGroups], int n, const Tile& tile) {
   const F16 columns = load(lane_x()) + bcast(tile.centre_x), centre_y = bcast(tile.centre_y);
-  for (int k = 0; k < n; ++k) {
-    __builtin_prefetch(&records[from[k + kAhead]]);
-    const Record& r = records[from[k]];
-    Row& row = rows[k];
-    const F16 dx = bcast(r.u) - columns, f = bcast(r.l3) * dx, ly = bcast(r.l1) * (bcast(r.v) - centre_y);
-    store(row.height, fnma(f, f, bcast(r.log_opacity)));
-    store(row.slope, fma(bcast(r.l2), dx, ly));
-    std::memcpy(&row.l1, &r, 32);
+  for (int first = 0; first < n; first += 16) {
+    for (uint32_t left = any[first / 16]; left; left &= left - 1) {
+      const int k = first + __builtin_ctz(left);
+      const Record& r = records[from[k]];
+      Row& row = rows[k];
+      const F16 dx = bcast(r.u) - columns, f = bcast(r.l3) * dx, ly = bcast(r.l1) * (bcast(r.v) - centre_y);
+      store_halves(&row.shape[0][0][0], fnma(f, f, bcast(r.log_opacity)), fma(bcast(r.l2), dx, ly));
+      store(&row.l1, load_first<kSums>(&r.l1));
+    }
   }
 }
 
@@ -121,6 +103,7 @@ inline void touch_blocks(const Record* records, const uint32_t* from, int n, con
   const F16 zero = bcast(0.0f);
   for (int i = 0; i < n; i += 16) {
     F16 c[16];
+    for (int k = 0; k < 16; ++k) __builtin_prefetch(&records[from[i + k + kAhead]]);
     for (int k = 0; k < 16; ++k) c[k] = load(&records[from[i + k < n ? i + k : n - 1]].l1);
     transpose(c);
     const F16 l1 = c[0], l2 = c[8], l3 = c[9], U = c[5] - bcast(tile.centre_x), V = c[6] - bcast(tile.centre_y);
@@ -139,9 +122,20 @@ inline void touch_blocks(const Record* records, const uint32_t* from, int n, con
       for (int y = 0; y < 4; ++y) {
         const F16 e1 = fma(l1, min(max(best_y, lo_y[y]), hi_y[y]), near_e);
         const F16 there = min(max(best_x[y], lo_x), hi_x), e2 = fma(l2, there, far_e[y]), f2 = l3 * there;
-        touched[4 * y + x][i / 16] = static_cast<uint16_t>(bits(ge(limit, min(fma(e1, e1, near_f2), fma(e2, e2, f2 * f2)))) & valid);
+        touched[i / 16][4 * y + x] = static_cast<uint16_t>(bits(ge(limit, min(fma(e1, e1, near_f2), fma(e2, e2, f2 * f2)))) & valid);
       }
     }
+  }
+}
+
+// Which of a batch's Gaussians touch any of the blocks whose bits are set.
+inline void any_block(const Touched& touched, uint32_t blocks, int n, uint16_t (&any)[kGroups]) {
+  uint16_t use[16];
+  for (int b = 0; b < 16; ++b) use[b] = blocks >> b & 1 ? 0xffff : 0;
+  for (int i = 0; i < (n + 15) / 16; ++i) {
+    uint16_t found = 0;
+    for (int b = 0; b < 16; ++b) found |= touched[i][b] & use[b];
+    any[i] = found;
   }
 }
 
@@ -152,8 +146,8 @@ inline void alphas(const Row* const (&row)[4], int block_column, F16 y, const Ex
   for (int i = 0; i < 4; i += N) {
     F16 e[N], p[N];
     M16 drawn[N];
-    for (int k = 0; k < N; ++k) e[k] = fnma(bcast(row[i + k]->l1), y, bcast4(row[i + k]->slope + 4 * block_column));
-    for (int k = 0; k < N; ++k) p[k] = fnma(e[k], e[k], bcast4(row[i + k]->height + 4 * block_column));
+    for (int k = 0; k < N; ++k) e[k] = fnma(bcast(row[i + k]->l1), y, bcast4(row[i + k]->height(block_column) + Row::kSlope));
+    for (int k = 0; k < N; ++k) p[k] = fnma(e[k], e[k], bcast4(row[i + k]->height(block_column)));
     for (int k = 0; k < N; ++k) drawn[k] = ge(p[k], limit);
     exp2(p);
     for (int k = 0; k < N; ++k) alpha[i + k] = min_keep(drawn[k], p[k], most);

@@ -52,7 +52,21 @@ def test_help_is_what_was_reviewed(capsys):
     assert code == 0 and out == path.read_text()
 
 
-HELP = ["info", "train moe-gs", "train scaffold-gs", "eval", "compare", "export", "import", "bench", "catalog", "download", "doctor"]
+HELP = [
+    "info",
+    "train moe-gs",
+    "train scaffold-gs",
+    "train 3dgs",
+    "train 3dgs-mcmc",
+    "eval",
+    "compare",
+    "export",
+    "import",
+    "bench",
+    "catalog",
+    "download",
+    "doctor",
+]
 
 
 @pytest.mark.parametrize("command", HELP)

@@ -42,3 +42,10 @@ def test_numbers_no_training_can_have_name_their_flag(flag, value):
 def test_an_unknown_recipe_names_the_nearest():
     with pytest.raises(InputError, match="did you mean 'moe-gs'"):
         parse_train(["moegs", *PLACES])
+
+
+def test_flags_reach_the_parts_of_explicit_recipes():
+    made = parse_train(["3dgs", *PLACES, "--growth.grad-threshold", "0.001", "--rates.means.first", "0.01", "--scene.sh-degree", "1"])
+    assert (made.cfg.growth.grad_threshold, made.cfg.rates.means.first, made.cfg.scene.sh_degree) == (0.001, 0.01, 1)  # type: ignore[union-attr]
+    with pytest.raises(InputError, match="sh-degree"):
+        check_settings(parse_train(["3dgs-mcmc", *PLACES, "--scene.sh-degree", "4"]))

@@ -9,7 +9,7 @@ import scene_experts
 
 SOURCE = Path(scene_experts.__path__[0])
 LAYERS = [
-    {"errors", "io", "native", "types", "__init__"},
+    {"errors", "io", "native", "transfer", "types", "__init__"},
     {"geometry"},
     {"table", "schedule", "checkpoint", "optim"},
     {"data", "render", "scene", "losses"},

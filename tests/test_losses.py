@@ -1,6 +1,7 @@
 """The losses against their formulas: slow float64 loops, finite differences, the paper's limits, and the compiled form against torch."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -248,3 +249,15 @@ def test_the_compiled_volume_has_autograds_gradient_to_the_bit():
     assert torch.equal(scales.grad, plain.grad)
     exact = 0.01 * plain.detach().double().prod(1).mean()
     assert float(value.detach()) == pytest.approx(float(exact), rel=1e-6)
+
+
+def test_mean_opacity_and_size_are_over_every_gaussian():
+    decoded, render, target = scene()
+    w = Weights(scale=0.0, mean_opacity=0.01, mean_size=0.02)
+    assert set(terms(decoded, render, target, w)) == {"l1", "dssim"}  # anchors have no population
+    logits, log_scales = torch.tensor([0.0, -2.0, 3.0]), torch.randn(3, 3, generator=torch.Generator().manual_seed(0))
+    found = terms(replace(decoded, population=(logits, log_scales)), render, target, w)
+    assert float(found["mean_opacity"]) == pytest.approx(0.01 * sum(1 / (1 + math.exp(-x)) for x in (0, -2, 3)) / 3)
+    assert float(found["mean_size"]) == pytest.approx(0.02 * sum(math.exp(x) for x in log_scales.flatten().tolist()) / 9)
+    none = replace(decoded, population=(logits[:0], log_scales[:0]))
+    assert float(terms(none, render, target, w)["mean_opacity"]) == 0

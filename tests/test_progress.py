@@ -11,17 +11,39 @@ from scene_experts.strategy import Edit
 def test_a_log_file_gets_plain_lines():
     out = io.StringIO()
     with Progress(Console(file=out, width=200), every=0.0) as show:
-        show(Started(0, 200, 1234))
+        show(Started(0, 200, 1234, 0.02))
         show(Stepped(10, {"l1": 0.05, "dssim": 0.02}, 21.5, 1300, 800, 4000, 0.61, 1.0, {}))
         show(Adjusted(100, Edit(10, 0, 1310, capped=True)))
         show(Saved(200, Path("a/b")))
         show(Finished(200, 75.0))
         show(Stopped(100, "SIGINT"))
     text = out.getvalue()
-    parts = ("1,234 anchors", "10/200", "l1 0.0500", "PSNR 21.50", "anchors 1,300", "active 61 %", "it/s", "left", "cap on anchors", "1:15")
+    parts = (
+        "1,234 anchors on a lattice of 0.02",
+        "10/200",
+        "l1 0.0500",
+        "PSNR 21.50",
+        "anchors 1,300",
+        "active 61 %",
+        "it/s",
+        "left",
+        "cap on anchors",
+        "1:15",
+    )
     for part in parts:
         assert part in text, part
     assert "--resume" in text and "\x1b" not in text
+
+
+def test_explicit_gaussians_are_called_so():
+    out = io.StringIO()
+    with Progress(Console(file=out, width=200), every=0.0) as show:
+        show(Started(0, 200, 1234))
+        show(Stepped(10, {"l1": 0.05}, 21.5, 1300, 800, 800, 0.0, 1.0, {}))
+        show(Adjusted(100, Edit(10, 0, 1310, capped=True)))
+    text = out.getvalue()
+    assert "1,234 Gaussians, 200" in text and "Gaussians 1,300" in text and "cap on Gaussians" in text
+    assert "anchors" not in text and "active" not in text and "lattice" not in text
 
 
 def test_clock():

@@ -79,3 +79,8 @@ def test_growth_pays(captures, monkeypatch):
     with_growth = held_out(brighton, "moe-gs", monkeypatch=monkeypatch, views="train")
     without = held_out(brighton, "moe-gs", grow=False, monkeypatch=monkeypatch, views="train")
     assert with_growth > without + 0.05
+
+
+def test_levels_of_detail_cost_less_than_a_decibel(captures, monkeypatch):
+    seeds = json.loads(GOLDEN.read_text())["scaffold-gs on brighton"]
+    assert held_out(captures["brighton"], "octree-moe-gs", monkeypatch=monkeypatch) > statistics.mean(seeds) - 1.0

@@ -7,7 +7,7 @@ from PIL import Image
 from scene_experts.errors import RunError
 from scene_experts.events import Adjusted, Previewed, Started, Stepped
 from scene_experts.record import Recorder
-from scene_experts.strategy.grow import Edit
+from scene_experts.strategy import Edit
 
 
 def step(i: int) -> Stepped:

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from scene_experts.scene import graph
 from scene_experts.scene.graph import Graph, blended
 
 
@@ -80,3 +81,21 @@ def test_points_in_one_place_stay_finite():
     found, weight = Graph.of(xyz, 4).among(torch.arange(4))
     assert torch.isfinite(weight).all() and weight.sum(1).tolist() == pytest.approx([0.25] * 4)
     assert torch.isfinite(blended(features(4).float(), found, weight)).all()
+
+
+@pytest.mark.skipif(graph._library() is None, reason="needs the compiled library")
+@pytest.mark.parametrize(("n", "seen", "F"), [(3000, 1700, 32), (600, 600, 5), (50, 3, 32), (20, 0, 8), (1, 1, 1)])
+def test_the_compiled_form_is_the_plain_one(n, seen, F, monkeypatch):
+    found, weight = Graph.of(points(n, torch.float32), 10).among(torch.randperm(n)[:seen])
+    f = features(seen, F).float().mul(3).round().requires_grad_()  # whole numbers: many ties
+    up = torch.randn(seen, F)
+
+    def both() -> tuple[torch.Tensor, torch.Tensor]:
+        out = blended(f, found, weight)
+        return out.detach(), torch.autograd.grad(out, f, up)[0]
+
+    compiled = both()
+    assert all(torch.equal(a, b) for a, b in zip(compiled, both()))
+    monkeypatch.setattr(graph, "_library", lambda: None)
+    for a, b in zip(compiled, both()):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)

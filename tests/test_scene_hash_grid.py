@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from scene_experts.errors import InputError
+from scene_experts.scene import hash_grid
 from scene_experts.scene.hash_grid import PRIMES, Grid, HashGrid, encode
 
 SMALL = HashGrid(levels=5, features=3, log2_table=7, base=2, growth=1.6)
@@ -90,3 +91,23 @@ def test_no_places_and_sizes_that_cannot_be():
     with pytest.raises(InputError, match="grid"):
         HashGrid(levels=0).check()
     assert built().meta() == {"low": [-1.0, 0.0, 2.0], "edge": 4.0}
+
+
+@pytest.mark.skipif(hash_grid._library() is None, reason="needs the compiled library")
+@pytest.mark.parametrize("config", [HashGrid(), SMALL, HashGrid(levels=3, features=1, coordinates="world")])
+def test_the_compiled_form_is_the_plain_one(config, monkeypatch):
+    grid = built(config, torch.float32)
+    for n in (0, 1, 1500):
+        xyz = places(n).float()
+        up = torch.randn(n, config.width)
+
+        def both(xyz=xyz, up=up) -> tuple[torch.Tensor, torch.Tensor]:
+            out = grid(xyz)
+            return out.detach(), torch.autograd.grad(out, grid.table, up)[0]
+
+        compiled = both()
+        assert all(torch.equal(a, b) for a, b in zip(compiled, both()))
+        with monkeypatch.context() as without:
+            without.setattr(hash_grid, "_library", lambda: None)
+            for a, b in zip(compiled, both()):
+                torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)

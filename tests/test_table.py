@@ -83,3 +83,22 @@ def test_errors_name_what_differs():
         Table({"a": torch.ones(2, 1)}, {"f": torch.ones(3)})
     with pytest.raises(ValueError, match="alone"):
         table.attach(torch.optim.Adam(table.params.values(), lr=0.1))
+
+
+def test_overwrite_sets_rows_and_clears_only_their_moments():
+    table = make()
+    optimizer = adam(table)
+    step(table, optimizer)
+    name, value = next(iter(table.params.items()))
+    before, moments = value.detach().clone(), {n: optimizer.state[p]["exp_avg"].clone() for n, p in table.params.items()}
+    rows = torch.tensor([2, 0])
+    table.overwrite(rows, {name: torch.full_like(before[rows], 7.0)})
+    assert torch.equal(table.params[name].detach()[rows], torch.full_like(before[rows], 7.0))
+    assert torch.equal(table.params[name].detach()[[1, 3]], before[[1, 3]])
+    assert all(torch.equal(optimizer.state[p]["exp_avg"], moments[n]) for n, p in table.params.items())
+    table.overwrite(rows, {}, clear=True)
+    for n, p in table.params.items():
+        state = optimizer.state[p]
+        assert moments[n].any() and not state["exp_avg"][rows].any() and not state["exp_avg_sq"][rows].any(), n
+        assert torch.equal(state["exp_avg"][[1, 3]], moments[n][[1, 3]]) and float(state["step"]) > 0
+    assert table.device == torch.device("cpu")

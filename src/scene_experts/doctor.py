@@ -32,7 +32,7 @@ class Check:
 
 def diagnose() -> list[Check]:
     """Look at everything the package can use. Nothing is installed, downloaded or changed, and no check raises."""
-    checks = (python, pytorch, cuda, native_library, gsplat, machine, memory, lpips, viewer, sfm, tensorboard)
+    checks = (python, pytorch, cuda, native_library, gsplat, triton, machine, memory, lpips, viewer, sfm, tensorboard)
     return [_guarded(check) for check in checks]
 
 
@@ -118,6 +118,17 @@ def gsplat() -> Check:
         reason = f"{type(error).__name__}: {error}"
     found = version if reason is None else f"{version}: {reason}"
     return Check("gsplat", reason is None, found, "install it again for this torch and CUDA")
+
+
+def triton() -> Check:
+    version = _version("triton")
+    if not torch.cuda.is_available():
+        return Check("triton", False, f"{version or 'not installed'} (it only runs on CUDA)")
+    from scene_experts.scene import triton_decode
+
+    reason = triton_decode.available()
+    why, _, fix = (reason or "").partition(": ")
+    return Check("triton", reason is None, version or "unknown" if reason is None else f"{why}; anchors are decoded in plain torch", fix)
 
 
 def machine() -> Check:

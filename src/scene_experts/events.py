@@ -15,7 +15,7 @@ class Started:
     step: int  # 0, or where the run resumes
     total: int  # the last iteration of this run
     anchors: int
-    voxel: float = 0.0  # edge of the finest lattice cell, trained world units
+    voxel: float = 0.0  # edge of the finest lattice cell, trained world units; 0: explicit Gaussians on no lattice
 
 
 @dataclass(frozen=True)

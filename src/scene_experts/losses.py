@@ -249,7 +249,11 @@ def load_sparse(gates: Tensor, chosen: Tensor) -> Tensor:
     gates [A, E], chosen [A, k]. Perfect balance is k, collapse on one expert nearly E.
     """
     A, E = gates.shape
-    share = torch.bincount(chosen.reshape(-1), minlength=E).to(gates.dtype) / max(A, 1)
+    if chosen.device.type == "cpu":
+        counts = torch.bincount(chosen.reshape(-1), minlength=E)
+    else:  # where bincount makes the host wait
+        counts = (chosen[..., None] == torch.arange(E, device=chosen.device)).sum((0, 1))
+    share = counts.to(gates.dtype) / max(A, 1)
     return E * (share * _mean(gates)).sum()
 
 

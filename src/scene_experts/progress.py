@@ -23,7 +23,7 @@ class Progress:
         self.total, self.first, self.began, self.printed = 0, 0, time.perf_counter(), 0.0
         self.loss: dict[str, float] = {}
         self.psnr: float | None = None
-        self.preview = ""
+        self.preview, self.rows = "", "anchors"
 
     def __enter__(self) -> Progress:
         if self.live:
@@ -39,12 +39,15 @@ class Progress:
             case Started():
                 self.total, self.first, self.began = event.total, event.step, time.perf_counter()
                 verb = f"resumed at iteration {event.step:,}" if event.step else "started"
-                self.say(f"{verb}: {event.anchors:,} anchors on a lattice of {event.voxel:.3g}, {event.total:,} iterations")
+                self.rows = "anchors" if event.voxel else "Gaussians"
+                lattice = f" on a lattice of {event.voxel:.3g}" if event.voxel else ""
+                self.say(f"{verb}: {event.anchors:,} {self.rows}{lattice}, {event.total:,} iterations")
             case Stepped():
                 self.step(event)
             case Adjusted():
                 if event.edit.capped:
-                    self.say(f"iteration {event.step:,}: the cap on anchors or memory held growth back at {event.edit.anchors:,} anchors")
+                    what = f"the cap on {self.rows} or memory held growth back at {event.edit.anchors:,} {self.rows}"
+                    self.say(f"iteration {event.step:,}: {what}")
             case Saved():
                 self.say(f"saved {event.path}")
             case Stopped():
@@ -62,9 +65,10 @@ class Progress:
         speed = (event.step - self.first) / max(time.perf_counter() - self.began, 1e-9)
         left = (self.total - event.step) / max(speed, 1e-9)
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
+        active = f"active {100 * event.active:.0f} %  " if self.rows == "anchors" else ""
         line = (
-            f"{event.step:>6,}/{self.total:,}  {terms}  PSNR {self.psnr:.2f}  anchors {event.anchors:,}  "
-            f"active {100 * event.active:.0f} %  {speed:.1f} it/s  {clock(left)} left"
+            f"{event.step:>6,}/{self.total:,}  {terms}  PSNR {self.psnr:.2f}  {self.rows} {event.anchors:,}  {active}"
+            f"{speed:.1f} it/s  {clock(left)} left"
         )
         if self.live:
             self.live.update(Text(line, no_wrap=True, overflow="ellipsis"))

@@ -24,12 +24,13 @@ from scene_experts.strategy.mcmc import MCMC
 from scene_experts.strategy.split_clone import SplitClone
 
 ALL = ("opacity", "cov", "color")
+EXPERTS = Experts(num=5, top_k=2, warmup=1500)
 
 scaffold_gs = Train(recipe="scaffold-gs", scene=Anchors(decoder=Plain()), loss=Weights(scale=0.01))
 moe_gs = replace(
     scaffold_gs,
     recipe="moe-gs",
-    scene=Anchors(decoder=Experts(num=5, top_k=2, warmup=1500)),
+    scene=Anchors(decoder=EXPERTS),
     loss=Weights(scale=0.01, opacity=0.01, load=0.01),
 )
 octree_gs = replace(
@@ -68,7 +69,7 @@ RECIPES: dict[str, tuple[str, Train]] = {
     "octree-gs": ("Octree-GS: anchors on levels of detail, each view using those that its distance asks for", octree_gs),
     "octree-moe-gs": (
         "Octree-GS with five experts per attribute, Top-2 after a dense warm-up (published nowhere)",
-        replace(octree_gs, recipe="octree-moe-gs", scene=replace(octree_gs.scene, decoder=moe_gs.scene.decoder), loss=moe_gs.loss),
+        replace(octree_gs, recipe="octree-moe-gs", scene=replace(octree_gs.scene, decoder=EXPERTS), loss=moe_gs.loss),
     ),
     "sags": ("SAGS: points with a graph over them and a hash grid, denser where the surface is flat", sags),
     "scaffold-gs-bank": ("Scaffold-GS with its feature bank", _scaffold("scaffold-gs-bank", mix=FeatureBank())),

@@ -139,6 +139,7 @@ def to_device(scene: Scene, device: str, dtype: torch.dtype | None = None) -> Sc
 
 LATER = {
     "sparse_adam": False,
+    "schedule": 30_000,
     "loss.mean_opacity": 0.0,
     "loss.mean_size": 0.0,
     "rates.appearance": {"type": "Rate", "first": 0.05, "last": 0.0005},

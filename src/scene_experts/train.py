@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -22,6 +22,7 @@ from scene_experts.memory import anchor_cap
 from scene_experts.render import Rasterizer
 from scene_experts.state import Training, resume, save
 from scene_experts.strategy import Edit, Strategy
+from scene_experts.transfer import upload
 from scene_experts.types import Decoded, Render
 
 log = logging.getLogger(__name__)
@@ -41,6 +42,7 @@ class Run:
     log_every: int = 10  # iterations between Stepped events
     max_memory: float = 0.0  # GiB of memory (resident, or reserved on the GPU) at which growth stops; 0: no cap
     keep: int = 2  # checkpoints kept
+    watch: Callable[[Training], None] = lambda training: None  # called between iterations, outside their time; a viewer draws here
     stop: list[str] = field(default_factory=list)  # put a reason here (a signal handler does) to save and stop
 
 
@@ -85,6 +87,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
             yield Saved(step, save(training, folder, run.keep))
             saved = step
         del done  # before the next frame needs its memory
+        run.watch(training)
     if folder and saved != training.step:
         yield Saved(training.step, save(training, folder, run.keep))
     if run.stop and training.step < total:
@@ -102,13 +105,13 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     camera = capture.views[index].camera.to(run.device, run.dtype)
     frame = capture.frame(index)
     capture.images.prefetch(following)
-    target = frame.rgb.to(run.device, run.dtype).div_(255.0)
-    mask = None if frame.mask is None else frame.mask.to(run.device, run.dtype)
+    target = upload(frame.rgb, run.device, run.dtype).div_(255.0)
+    mask = None if frame.mask is None else upload(frame.mask, run.device, run.dtype)
     background = torch.rand(3, generator=training.views) if cfg.random_background else torch.tensor(capture.background)
     decoded = scene(camera, training.step, True, rasterize.visible)
     if cfg.loss.opacity_scope == "all" and hinge_is_on(cfg.loss, training.step):
         decoded = replace(decoded, scene_opacity=scene.scene_opacity(camera, training.step))
-    render = rasterize(decoded.gaussians, camera, background.to(run.device, run.dtype))
+    render = rasterize(decoded.gaussians, camera, upload(background, run.device, run.dtype))
     parts = terms(decoded, render, target, cfg.loss, training.step, mask)
     loss = torch.stack(list(parts.values())).sum()
     if loss.requires_grad:

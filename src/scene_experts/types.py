@@ -15,10 +15,13 @@ Frames and units
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+
+from scene_experts.transfer import upload
 
 
 @dataclass(frozen=True)
@@ -38,25 +41,35 @@ class Camera:
         R, t = self.world_to_cam[:3, :3], self.world_to_cam[:3, 3]
         return -(R.transpose(0, 1) @ t)
 
+    @functools.cached_property
+    def pinhole(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy, px. Read once, before the camera goes to a device: reading from there waits for all that the device has to do."""
+        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
+        return fx, fy, cx, cy
+
     @property
     def fx(self) -> float:
-        return float(self.K[0, 0])
+        return self.pinhole[0]
 
     @property
     def fy(self) -> float:
-        return float(self.K[1, 1])
+        return self.pinhole[1]
 
     @property
     def cx(self) -> float:
-        return float(self.K[0, 2])
+        return self.pinhole[2]
 
     @property
     def cy(self) -> float:
-        return float(self.K[1, 2])
+        return self.pinhole[3]
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
         """The same camera with its tensors on `device` and of `dtype`."""
-        return replace(self, world_to_cam=self.world_to_cam.to(device=device, dtype=dtype), K=self.K.to(device=device, dtype=dtype))
+        K = self.K.to(dtype=dtype)
+        known = self.pinhole if K.dtype == self.K.dtype else replace(self, K=K).pinhole
+        moved = replace(self, world_to_cam=upload(self.world_to_cam, device, dtype), K=upload(K, device))
+        moved.__dict__["pinhole"] = known
+        return moved
 
 
 @dataclass(frozen=True)

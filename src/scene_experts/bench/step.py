@@ -18,7 +18,7 @@ from scene_experts.losses import terms
 from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer, choose
 from scene_experts.render.cpu import CpuRasterizer
-from scene_experts.scene.anchors import AnchorScene
+from scene_experts.scene.anchors import Anchors, AnchorScene
 from scene_experts.state import Training
 from scene_experts.types import Camera, Points
 
@@ -84,6 +84,7 @@ def work(recipe: str, anchors: int, width: int, height: int, rasterize: Rasteriz
     side = (torch.rand(anchors, 2) - 0.5) * torch.tensor([1.0, height / width])
     xyz = torch.cat([side * depth[:, None].abs(), depth[:, None]], 1).double()
     K = torch.tensor([[width * 1.0, 0, width / 2], [0, width * 1.0, height / 2], [0, 0, 1.0]])
+    assert isinstance(cfg.scene, Anchors)
     config = replace(cfg.scene, voxel_size=1e-4)
     scene = AnchorScene.from_points(config, Points(xyz, torch.zeros(anchors, 3, dtype=torch.uint8)), 5.0)
     scene.table.params["feature"].data.normal_()

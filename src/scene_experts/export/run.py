@@ -14,7 +14,7 @@ from scene_experts.config import Data, to_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
 from scene_experts.evaluate.metrics import psnr
-from scene_experts.export import explicit
+from scene_experts.export import explicit, graph_points
 from scene_experts.export.cameras import write_cameras
 from scene_experts.export.compact import Compact, Sizes, read_compact, write_compact
 from scene_experts.export.extras import extra_networks, level_columns
@@ -33,6 +33,7 @@ from scene_experts.run_folder import OpenRun
 from scene_experts.scene.anchors import ATTRIBUTES, AnchorScene
 from scene_experts.scene.experts import MixtureHead
 from scene_experts.scene.explicit import GaussianScene
+from scene_experts.scene.graph_points import GraphScene
 from scene_experts.scene.select import LevelSelector
 from scene_experts.state import scene_from
 
@@ -43,8 +44,8 @@ _LATTICE_TOLERANCE = 1e-3  # voxels
 def write_layout(run: OpenRun, capture: Capture, out: Path | None = None) -> Path:
     """Write point_cloud/iteration_<step>/, cameras.json and cfg_args below `out` (the run folder); returns the iteration's folder."""
     out = out or run.path
-    write = explicit.write_folder if isinstance(run.scene, GaussianScene) else _write_anchors
-    folder = write(run, capture.world, out)
+    own = {GaussianScene: explicit.write_folder, GraphScene: graph_points.write_folder}
+    folder = own.get(type(run.scene), _write_anchors)(run, capture.world, out)
     write_cameras(out / "cameras.json", capture)
     return folder
 
@@ -56,6 +57,7 @@ def export_run(run: Path, format: str, out: Path | None = None, step: int | None
     rasterize: what to draw the held-out views with, to say what a compact file costs in PSNR; None leaves that out.
     """
     opened = run_folder.open_run(run, "cpu", step)
+    graph_points.refuse(opened)
     anchors = len(opened.scene.table)
     if format == "ply":
         path = out or run / PLY

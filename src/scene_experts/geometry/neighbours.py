@@ -1,7 +1,8 @@
 """Exact nearest neighbours without a tree library: initial sizes of anchors and Gaussians, and graphs over points.
 
 Points are split at medians into equal leaves. Each leaf then meets the other leaves in the order of the distance between boxes, and stops
-when no box is nearer than the worst neighbour any of its points has. Every step works on all leaves at once.
+when no box is nearer than the worst neighbour any of its points has; whole branches of the tree are passed over first. Every step works on
+many leaves at once.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from torch import Tensor
 
 _LEAF = 64  # points in a leaf, 64 to 128; smaller leaves mean fewer distances but more boxes (measured: 24 is twice as slow at 200k)
 _PAIRS = 1 << 22  # distances held at a time, bounds the memory
+_BRANCHES = 32  # of the tree that a leaf looks into, about
 
 
 class _Leaves(NamedTuple):
@@ -69,7 +71,7 @@ def _split(xyz: Tensor, size: int) -> tuple[Tensor, Tensor]:
         coords = xyz[order]  # [G, S, 3]
         axis = (coords.amax(1) - coords.amin(1)).argmax(1)  # the longest side of each group
         key = coords.gather(2, axis.view(-1, 1, 1).expand(-1, coords.shape[1], 1)).squeeze(2)
-        by = key.argsort(dim=1)
+        by = key.argsort(dim=1, stable=True)  # points on a lattice share coordinates; which of them go where must not depend on the machine
         half = (2 * order.shape[0], order.shape[1] // 2)
         order, real = order.gather(1, by).view(half), real.gather(1, by).view(half)
     return order, real
@@ -81,15 +83,21 @@ def _search(tree: _Leaves, k: int) -> tuple[Tensor, Tensor]:
     best = tree.xyz.new_full((count, size, k), math.inf)
     ids = torch.full((count, size, k), -1, dtype=torch.int64, device=best.device)
     low, high = tree.xyz.amin(2), tree.xyz.amax(2)  # [3, L]
-    chunk = max(1, _PAIRS // count)
+    group = 1 << max(0, count.bit_length() // 2 - 2)  # a quarter of sqrt(L) leaves in a row are a branch of the tree
+    branch_low, branch_high = low.view(3, -1, group).amin(2), high.view(3, -1, group).amax(2)
+    chunk = min(512, max(1, _PAIRS // (count // group + _BRANCHES * group)))
     for start in range(0, count, chunk):
         own = torch.arange(start, min(start + chunk, count), device=best.device)
         _meet(tree, own, own, best, ids)
         worst = best[own, :, -1].masked_fill(~tree.real[own], -math.inf).amax(1)
-        gap = _box_gap(low[:, own, None], high[:, own, None], low[:, None], high[:, None])  # [c, L]
-        gap[own - start, own] = math.inf  # met already
-        mine, other = torch.where(gap < worst[:, None])
-        by = gap[mine, other].argsort(stable=True)
+        far = _box_gap(low[:, own, None], high[:, own, None], branch_low[:, None], branch_high[:, None])  # [c, L / group]
+        mine, branch = torch.where(far < worst[:, None])
+        mine = mine.repeat_interleave(group)
+        other = (branch[:, None] * group + torch.arange(group, device=best.device)).view(-1)
+        gap = _box_gap(low[:, own[mine]], high[:, own[mine]], low[:, other], high[:, other])
+        near = ((gap < worst[mine]) & (own[mine] != other)).nonzero().squeeze(1)
+        mine, other, gap = mine[near], other[near], gap[near]
+        by = gap.argsort(stable=True)
         by = by[mine[by].argsort(stable=True)]  # each leaf's others from near to far
         mine, other = mine[by], other[by]
         met = torch.bincount(mine, minlength=len(own))

@@ -121,7 +121,7 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
     rotation, shift = camera.world_to_cam[:3, :3], camera.world_to_cam[:3, 3]
     view = means @ rotation.T + shift
     front = view[:, 2] > camera.near
-    x, y, z = torch.where(front[:, None], view, view.new_tensor([0.0, 0.0, 1.0])).unbind(1)  # no division by 0 behind the camera
+    x, y, z = (torch.where(front, view[:, i], instead) for i, instead in enumerate((0.0, 0.0, 1.0)))  # no division by 0 behind the camera
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     mean2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
 
@@ -160,10 +160,13 @@ def watch_mean2d(mean2d: Tensor, others: tuple[Tensor, ...], camera: Camera, tot
     if not mean2d.requires_grad and any(t.requires_grad for t in others):
         mean2d.requires_grad_()
     if mean2d.requires_grad:
-        half = mean2d.new_tensor([camera.width / 2, camera.height / 2])
 
-        def store(gradient: Tensor | None) -> None:  # None: autograd knows the gradient to be zero
-            buffer[ids] = half * 0 if gradient is None else gradient.detach() * half
+        def store(gradient: Tensor | None) -> None:
+            if gradient is None:  # autograd knows it to be zero
+                buffer[ids] = 0.0
+            else:  # column by column: a tensor made of the two numbers would have to wait for a GPU
+                x, y = gradient.detach().unbind(1)
+                buffer[ids] = torch.stack([x * (camera.width / 2), y * (camera.height / 2)], dim=1)
 
         mean2d.register_hook(store)
     return buffer
@@ -173,9 +176,9 @@ def _radii(mean2d: Tensor, xx: Tensor, yy: Tensor, det: Tensor, drawn: Tensor, c
     """The 3 sigma radius [M] int32, 0 for what is not drawn."""
     mid = (xx + yy) / 2
     radius = (3 * (mid + (mid**2 - det).clamp_min(0.1).sqrt()).sqrt()).ceil()
-    edge = mean2d.new_tensor([-(-camera.width // TILE) * TILE, -(-camera.height // TILE) * TILE])
-    meets = (mean2d + radius[:, None] > 0) & (mean2d - radius[:, None] < edge)
-    drawn = drawn & meets.all(1) & radius.isfinite()
+    for centre, side in zip(mean2d.unbind(1), (camera.width, camera.height)):
+        drawn = drawn & (centre + radius > 0) & (centre - radius < -(-side // TILE) * TILE)
+    drawn = drawn & radius.isfinite()
     return torch.where(drawn, radius.clamp_max(2.0**30), torch.zeros_like(radius)).to(torch.int32)
 
 

@@ -1,11 +1,13 @@
 """A multi-resolution hash grid (Mueller et al., Instant Neural Graphics Primitives, 2022): a place in, learned features out.
 
 Level l divides the unit cube in N_l = floor(base growth^l) cells an axis. Features sit at the cells' corners and are blended trilinearly.
-A level with more corners than the table has rows shares rows among them by a hash.
+A level with more corners than the table has rows shares rows among them by a hash. The compiled library does the same where there is one.
 """
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -13,6 +15,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from scene_experts import native
 from scene_experts.errors import expect_at_least
 
 PRIMES = (1, 2_654_435_761, 805_459_861)  # eq. 4 of the paper
@@ -106,26 +109,62 @@ class _Encode(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, unit: Tensor, config: HashGrid) -> Tensor:
+        unit = unit.contiguous()
         ctx.save_for_backward(unit)
         ctx.config, ctx.shape = config, table.shape
-        columns = table.t().contiguous()  # [features, rows]
-        out, first = unit.new_empty(len(unit), config.levels, config.features), 0
-        for level, (cells, rows) in enumerate(zip(config.resolutions(), config.rows())):
-            row, weight = corners(unit, cells, rows)
-            for feature in range(config.features):
-                values = columns[feature, first : first + rows].index_select(0, row.view(-1)).view_as(weight)
-                out[:, level, feature] = (values * weight).sum(1)
-            first += rows
+        out, library = unit.new_empty(len(unit), config.levels, config.features), _library()
+        if library is None or not _fits(table, unit):
+            _forward(table, unit, config, out)
+        else:
+            sizes = torch.tensor([config.resolutions(), config.rows()])
+            columns = [native.pointer(t) for t in (table, unit, sizes[0], sizes[1])]
+            library.se_grid_forward(*columns, len(unit), config.levels, config.features, native.pointer(out), native.threads())
         return out.view(len(unit), config.width)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, None, None]:
-        (unit,), config = ctx.saved_tensors, ctx.config
-        grad = grads[0].view(len(unit), config.levels, config.features)
-        out, first = grad.new_zeros(ctx.shape[1], ctx.shape[0]), 0
-        for level, (cells, rows) in enumerate(zip(config.resolutions(), config.rows())):
-            row, weight = corners(unit, cells, rows)
-            for feature in range(config.features):
-                out[feature, first : first + rows].scatter_add_(0, row.view(-1), (weight * grad[:, level, feature, None]).view(-1))
-            first += rows
-        return out.t().contiguous(), None, None
+        (unit,), config, library = ctx.saved_tensors, ctx.config, _library()
+        grad = grads[0].contiguous().view(len(unit), config.levels, config.features)
+        if library is None or not _fits(grad, unit):
+            return _backward(unit, grad, config), None, None
+        out, sizes = grad.new_zeros(ctx.shape), torch.tensor([config.resolutions(), config.rows()])
+        columns = [native.pointer(t) for t in (unit, grad, sizes[0], sizes[1])]
+        library.se_grid_backward(*columns, len(unit), config.levels, config.features, native.pointer(out), native.threads())
+        return out, None, None
+
+
+def _forward(table: Tensor, unit: Tensor, config: HashGrid, out: Tensor) -> None:
+    """Fills `out` [A, levels, features] in plain torch, for any device and dtype."""
+    columns, first = table.t().contiguous(), 0  # [features, rows]
+    for level, (cells, rows) in enumerate(zip(config.resolutions(), config.rows())):
+        row, weight = corners(unit, cells, rows)
+        for feature in range(config.features):
+            values = columns[feature, first : first + rows].index_select(0, row.view(-1)).view_as(weight)
+            out[:, level, feature] = (values * weight).sum(1)
+        first += rows
+
+
+def _backward(unit: Tensor, grad: Tensor, config: HashGrid) -> Tensor:
+    """The table's gradient in plain torch."""
+    out, first = grad.new_zeros(config.features, sum(config.rows())), 0
+    for level, (cells, rows) in enumerate(zip(config.resolutions(), config.rows())):
+        row, weight = corners(unit, cells, rows)
+        for feature in range(config.features):
+            out[feature, first : first + rows].scatter_add_(0, row.view(-1), (weight * grad[:, level, feature, None]).view(-1))
+        first += rows
+    return out.t().contiguous()
+
+
+def _fits(*tensors: Tensor) -> bool:
+    return all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in tensors)
+
+
+@functools.cache
+def _library() -> ctypes.CDLL | None:
+    library = native.load()
+    if library is None or not hasattr(library, "se_grid_forward"):  # built before this file was
+        return None
+    P, L = ctypes.c_void_p, ctypes.c_int64
+    library.se_grid_forward.argtypes = library.se_grid_backward.argtypes = [P, P, P, P, L, L, L, P, ctypes.c_int32]
+    library.se_grid_forward.restype = library.se_grid_backward.restype = None
+    return library

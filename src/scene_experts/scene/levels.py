@@ -52,8 +52,9 @@ class Levels:
     def asked(self, xyz: Tensor, level: Tensor, camera: Tensor) -> Tensor:
         """The real-valued level [n] that a camera at `camera` [3] asks for at anchors xyz [n, 3] of `level` [n]:
         log_fork(standard / r), r the distance to the anchor moved by half a cell (Octree-GS)."""
-        half = 0.5 * self.edge / (float(self.fork) ** level.to(xyz.dtype))
-        r = (xyz + half[:, None] - camera.to(xyz)).norm(dim=1).clamp_min(1e-12)
+        halves = xyz.new_tensor([0.5 * self.size(i) for i in range(self.count)])
+        v = xyz - camera.to(xyz) + halves.index_select(0, level)[:, None]
+        r = v.norm(dim=1).clamp_min(1e-12)
         return torch.log(self.standard / r) / math.log(self.fork)
 
     def share(self, xyz: Tensor, level: Tensor) -> Tensor:

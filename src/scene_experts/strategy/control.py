@@ -56,10 +56,10 @@ class AnchorControl:
             observe.stop(scene.table)
         if not self.enabled or not self.adjust.due(step) or "visits" not in scene.table.stats:
             return None
-        grown, capped = self.grow(scene, generator, step)
-        pruned = self.prune(scene)
         for column in scene.table.params.values():
             column.grad = None  # Scaffold-GS's anchors miss the step of an adjustment, whether it changed a row or not
+        grown, capped = self.grow(scene, generator, step)
+        pruned = self.prune(scene)
         return Edit(grown, pruned, len(scene.table), capped)
 
     def grow(self, scene: AnchorScene, generator: torch.Generator, step: int = 0) -> tuple[int, bool]:

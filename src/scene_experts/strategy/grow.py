@@ -47,6 +47,13 @@ class GrowAnchors(AnchorControl):
     @torch.no_grad()
     def grow(self, scene: AnchorScene, generator: torch.Generator, step: int = 0) -> tuple[int, bool]:
         """Found anchors where gradients are large. Returns how many, and whether the cap held some back."""
+        rows, born, capped = self.search(scene, generator)  # what that needs is gone before columns are copied
+        if rows:
+            scene.table.append({name: torch.cat([row[name] for row in rows]) for name in rows[0]})
+        return born, capped
+
+    def search(self, scene: AnchorScene, generator: torch.Generator) -> tuple[list[dict[str, Tensor]], int, bool]:
+        """The rows to append, level by level, how many they are, and whether the cap held some back; restarts the counts."""
         table, stats = scene.table, scene.table.stats
         eligible = (stats["count"].view(-1) > self.gate()).nonzero().squeeze(1)  # flat slots, row * K + k
         g = stats["grad"].view(-1).index_select(0, eligible) / stats["count"].view(-1).index_select(0, eligible).clamp_min(1)
@@ -75,14 +82,12 @@ class GrowAnchors(AnchorControl):
                 cells, born = torch.cat([cells, rows[-1]["cell"]]), born + len(new)
         for name in ("grad", "count"):
             stats[name].view(-1).index_fill_(0, eligible, 0.0)
-        if rows:
-            table.append({name: torch.cat([row[name] for row in rows]) for name in rows[0]})
-        return born, capped
+        return rows, born, capped
 
 
 def slot_points(table: Table, slots: Tensor, rows: Tensor) -> Tensor:
     """Where the Gaussians of flat `slots` [P] of anchors `rows` [P] are, [P, 3] float64."""
-    scaling = table.params["log_scaling"][:, :3].exp().index_select(0, rows)
+    scaling = table.params["log_scaling"][:, :3].contiguous().exp().index_select(0, rows)
     offsets = table.params["offsets"].view(-1, 3).index_select(0, slots)
     return table.facts["xyz"].index_select(0, rows).double() + (offsets * scaling).double()
 

@@ -72,11 +72,11 @@ def _by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> Non
 
 
 def _drawn_by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:
-    drawn = (render.radii > 0).nonzero().squeeze(1)
-    source = decoded.gaussians.source.index_select(0, drawn)
-    norms = render.mean2d_grad.index_select(0, drawn).norm(dim=1)
-    stats["grad"].view(-1).index_add_(0, source, norms)
-    stats["count"].view(-1).index_add_(0, source, torch.ones_like(norms))
+    drawn, source = render.radii > 0, decoded.gaussians.source
+    norms = render.mean2d_grad.norm(dim=1)
+    # Zeros for what was not drawn, instead of picking out the others: on a GPU the host would wait for their number.
+    stats["grad"].view(-1).index_add_(0, source, torch.where(drawn, norms, 0.0))
+    stats["count"].view(-1).index_add_(0, source, drawn.to(norms.dtype))
 
 
 @functools.cache

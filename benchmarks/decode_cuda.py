@@ -1,0 +1,162 @@
+"""The decode of an anchor scene on a GPU, forward and backward: Triton kernels against plain torch, in one process.
+
+    python benchmarks/decode_cuda.py [--anchors 100000]
+
+Every decoder gets the same anchors, camera and upstream gradients. Times are medians of interleaved runs between CUDA events, the Triton
+form's compilation left out. `of the copy` is the bandwidth that the least traffic (every input read once, every output written once, per
+direction) would need in that time, over that of a plain device copy measured in the same run.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from statistics import median
+
+import torch
+
+from scene_experts.scene import triton_decode
+from scene_experts.scene.anchors import Anchors, AnchorScene
+from scene_experts.scene.experts import Experts
+from scene_experts.scene.mlp import Plain
+from scene_experts.table import Table
+from scene_experts.types import Camera, Decoded
+
+SPARSE = 1_000_000  # an iteration after the dense phase
+WARM_UP = 3  # first rounds that do not count: they compile
+KINDS = {
+    "one network": Anchors(decoder=Plain()),
+    "Top-2 of 5": Anchors(decoder=Experts(num=5, top_k=2)),
+    "dense 5": Anchors(decoder=Experts(num=5, top_k=None)),
+}
+GAUSSIAN = 4 * (3 + 4 + 3 + 1 + 3) + 8  # bytes of one drawn Gaussian with its source
+
+
+def least_bytes(total: int, anchors: int, drawn: int, F: int, K: int, experts: int) -> tuple[int, int]:
+    """The least traffic of forward and of backward, bytes: N rows of which A are seen, M Gaussians drawn; weights are not counted.
+
+    Forward reads row, place, feature and log-scaling of each anchor and the offset of each Gaussian, and writes raw opacities, gates of
+    three attributes and the Gaussians. Backward reads those and their gradients, and writes the gradients of all N rows.
+    """
+    inputs = anchors * (8 + 12 + 4 * F + 24) + drawn * 12
+    gates = 0 if experts == 1 else 3 * 4 * experts
+    forward = inputs + anchors * (4 * K + gates) + drawn * GAUSSIAN
+    backward = inputs + 2 * (anchors * (4 * K + gates) + drawn * (GAUSSIAN - 8)) + total * 4 * (F + 6 + 3 * K)
+    return forward, backward
+
+
+@dataclass
+class Case:
+    """One decoder of one kind, with its times in ms."""
+
+    scene: AnchorScene
+    rows: torch.Tensor
+    camera: Camera
+    form: str
+    forward: list[float] = field(default_factory=list)
+    backward: list[float] = field(default_factory=list)
+    drawn: int = 0
+    upstream: list[torch.Tensor] = field(default_factory=list)
+
+    def run(self) -> None:
+        """One forward and one backward pass, timed."""
+        self.scene.zero_grad(set_to_none=True)
+        self.scene.config = replace(self.scene.config, decode=self.form)  # type: ignore[arg-type]
+        kept: list[list[torch.Tensor]] = []
+        self.forward.append(timed(lambda: kept.append(outputs(self.scene.decode(self.rows, self.camera, SPARSE)))))
+        values = kept[0]
+        self.drawn = len(values[0])
+        if not self.upstream:
+            torch.manual_seed(1)
+            self.upstream = [torch.randn_like(v) for v in values]
+        self.backward.append(timed(lambda: torch.autograd.backward(values, self.upstream)))
+
+
+def outputs(decoded: Decoded) -> list[torch.Tensor]:
+    g = decoded.gaussians
+    raw = [] if decoded.raw_opacity is None else [decoded.raw_opacity]
+    return [g.means, g.quats, g.scales, g.opacities, g.colors, *raw, *(r.gates for r in decoded.routing.values())]
+
+
+def timed(work: Callable[[], object]) -> float:
+    """Milliseconds on the device."""
+    begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+    torch.cuda.synchronize()
+    begin.record()
+    work()
+    end.record()
+    end.synchronize()
+    return begin.elapsed_time(end)
+
+
+def scene(config: Anchors, total: int, device: str) -> AnchorScene:
+    """Random anchors with trained-looking features."""
+    torch.manual_seed(0)
+    params = {
+        "feature": 0.5 * torch.randn(total, config.F),
+        "offsets": 0.3 * torch.randn(total, config.K, 3),
+        "log_scaling": 0.3 * torch.randn(total, 6) - 3,
+    }
+    made = AnchorScene(config, Table(params, {"xyz": torch.randn(total, 3), "cell": torch.zeros(total, 3, dtype=torch.int64)}), 0.01, 5.0)
+    return made.to(device)
+
+
+def copy_bandwidth(rounds: int) -> float:
+    """Bytes a second that a plain copy of 512 MiB reads and writes."""
+    source = torch.empty(2**27, device="cuda")
+    to = torch.empty_like(source)
+    times = [timed(lambda: to.copy_(source)) for _ in range(rounds + WARM_UP)]
+    return 2 * 4 * 2**27 / (1e-3 * median(times[WARM_UP:]))
+
+
+def arguments() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--anchors", type=int, default=100_000, help="anchors that the camera sees")
+    parser.add_argument("--seen", type=float, default=0.7, help="share of the table that it sees")
+    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--precision", choices=("ieee", "tf32x3", "tf32"), default="ieee", help="of the kernels' products")
+    return parser
+
+
+def main() -> None:
+    args = arguments().parse_args()
+    if not torch.cuda.is_available() or triton_decode.available() is not None:
+        raise SystemExit(triton_decode.available() or "expected a CUDA device, found none; run this where there is one")
+    triton_decode.PRECISION = args.precision
+    pose = torch.eye(4)
+    pose[2, 3] = 6.0
+    camera = Camera(pose, torch.eye(3), 800, 544).to("cuda")
+    total = int(args.anchors / args.seen)
+    rows = torch.randperm(total)[: args.anchors].sort().values.cuda()
+    cases: dict[tuple[str, str], Case] = {}
+    for kind, config in KINDS.items():
+        for form in ("composed", "native"):  # on CUDA "native" is Triton
+            cases[kind, form] = Case(scene(config, total, "cuda"), rows, camera, form)
+    for case in (c for _ in range(args.rounds + WARM_UP) for c in cases.values()):
+        case.run()
+    copy = copy_bandwidth(args.rounds)
+    name = torch.cuda.get_device_name()
+    print(f"{name}, {args.anchors} of {total} anchors, K = 10, F = 32, {args.precision}; a copy moves {copy / 1e9:.0f} GB/s")
+    print("\n".join(report(cases, total, args.anchors, copy)))
+
+
+def report(cases: dict[tuple[str, str], Case], total: int, anchors: int, copy: float) -> list[str]:
+    """A line for each case; copy: bytes a second."""
+    lines = []
+    for (kind, form), case in cases.items():
+        forward, backward = median(case.forward[WARM_UP:]), median(case.backward[WARM_UP:])
+        config, other = case.scene.config, cases[kind, "composed"]
+        experts = config.decoder.num if isinstance(config.decoder, Experts) else 1
+        least = least_bytes(total, anchors, case.drawn, config.F, config.K, experts)
+        shares = [100 * b / (1e-3 * t) / copy for b, t in zip(least, (forward, backward))]
+        ratio = (median(other.forward[WARM_UP:]) + median(other.backward[WARM_UP:])) / (forward + backward)
+        lines.append(
+            f"{'Triton' if form == 'native' else 'torch':7}{kind:12} forward {forward:7.3f} ms ({shares[0]:3.0f} % of the copy), "
+            f"backward {backward:7.3f} ms ({shares[1]:3.0f} %), {ratio:5.2f}x as fast as torch ({case.drawn} drawn)"
+        )
+    return lines
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,204 @@
+"""Training on a GPU: time, peak memory and frames a second of recipes, beside plain explicit Gaussians on gsplat of the same number.
+
+    python benchmarks/train_cuda.py --data CAPTURE --out DIR --seconds 500     # again and again until it prints the table
+
+Works in slices: each call goes on where the last one stopped and ends after `--seconds` (saving included), so that it fits a machine that
+is lent for minutes. The peer comes last and gets as many Gaussians as the last recipe's scene has with positive opacity (mean over the
+held-out views), or `--count`. Time is that of iterations alone, with photographs read ahead, without compiling, saving and scoring.
+Peak memory is what torch's allocator held at most.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import mean, median
+from typing import Any
+
+import torch
+
+import explicit_gsplat
+from scene_experts import train as training
+from scene_experts.config import Data, RunConfig, Train
+from scene_experts.data.capture import Capture, load
+from scene_experts.evaluate import timing
+from scene_experts.events import Finished, Stepped
+from scene_experts.io import write_atomic
+from scene_experts.recipes import RECIPES
+from scene_experts.render import Rasterizer, choose
+from scene_experts.state import Training, resume
+from scene_experts.train import Run
+from scene_experts.transfer import upload
+
+PEER = "gsplat, explicit"
+SPARE = 25.0  # seconds of a slice kept for saving
+SCORING = 30.0  # and what must be left to begin with the scores of a finished training
+
+
+def arguments() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="a capture")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the runs and of results.json; kept between slices")
+    parser.add_argument("--seconds", type=float, default=500.0, help="length of this slice")
+    parser.add_argument("--recipes", nargs="+", default=["scaffold-gs", "moe-gs"], choices=list(RECIPES), metavar="RECIPE")
+    parser.add_argument("--iterations", type=int, default=30_000)
+    parser.add_argument("--resolution", default="auto")
+    parser.add_argument("--count", type=int, default=0, help="Gaussians of the peer; 0: as many as the last recipe has")
+    parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
+    return parser
+
+
+def plan(recipes: Sequence[str], results: dict[str, Any]) -> list[str]:
+    """What is still to be done, in order: the recipes, then the peer, which needs their number of Gaussians."""
+    return [name for name in (*recipes, PEER) if not results.get(name, {}).get("done")]
+
+
+def main(argv: list[str] | None = None, draw: explicit_gsplat.Draw = explicit_gsplat.draw) -> int:
+    args = arguments().parse_args(argv)
+    deadline = time.monotonic() + args.seconds - min(SPARE, args.seconds / 4)
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise SystemExit("expected a CUDA device, found none; run this where there is one")
+    args.out.mkdir(parents=True, exist_ok=True)
+    results = read(args)
+    capture = load(args.data, resolution=args.resolution)
+    rasterize = choose("auto", args.device)
+    for name in plan(args.recipes, results):
+        if time.monotonic() > deadline:
+            break
+        result = results.setdefault(name, {"peak_bytes": 0})
+        if args.device == "cuda":
+            torch.cuda.empty_cache()
+            torch.cuda.reset_peak_memory_stats()
+        if name == PEER:
+            count = args.count or results[args.recipes[-1]]["gaussians"]
+            peer(capture, count, args, deadline, result, draw)
+        else:
+            recipe(name, capture, rasterize, args, deadline, result)
+        write(args, results)
+    capture.images.close()
+    print(table(results))
+    left = plan(args.recipes, results)
+    print(f"to do: {', '.join(left)}; run the same command again" if left else "all done")
+    return 0
+
+
+def read(args: argparse.Namespace) -> dict[str, Any]:
+    """The results so far. Those of other settings are refused."""
+    path, settings = args.out / "results.json", {name: str(getattr(args, name)) for name in ("data", "iterations", "resolution", "device")}
+    found = json.loads(path.read_text()) if path.is_file() else {"settings": settings}
+    if found["settings"] != settings:
+        raise SystemExit(f"expected the settings of {path} ({found['settings']}), found {settings}; give another --out")
+    return found
+
+
+def write(args: argparse.Namespace, results: dict[str, Any]) -> None:
+    write_atomic(args.out / "results.json", lambda path: path.write_text(json.dumps(results, indent=1)))
+
+
+def held(args: argparse.Namespace, result: dict[str, Any]) -> None:
+    """Count this slice's peak of memory in."""
+    if args.device == "cuda":
+        result["peak_bytes"] = max(result["peak_bytes"], torch.cuda.max_memory_allocated())
+
+
+def recipe(name: str, capture: Capture, rasterize: Rasterizer, args: argparse.Namespace, deadline: float, result: dict[str, Any]) -> None:
+    """Train on, and score the scene once it is finished."""
+    cfg: Train = replace(RECIPES[name][1], iterations=args.iterations)
+    config = RunConfig(cfg, Data(args.data, resolution=args.resolution))
+    if args.device == "cuda":  # gsplat's and Triton's kernels are compiled before the clock runs: a few steps, dense and sparse
+        short = replace(cfg, iterations=20)
+        for _ in training.train(short, Run(replace(config, train=short), device=args.device), capture, rasterize):
+            pass
+        torch.cuda.reset_peak_memory_stats()
+    run = Run(config, args.out / name, args.device, resume=True, save_every=10**9, log_every=100, keep=1)
+    finished = False
+    for event in training.train(cfg, run, capture, rasterize):
+        if isinstance(event, Stepped):
+            result |= {"step": event.step, "seconds": event.seconds, "anchors": event.anchors}
+            if time.monotonic() > deadline:
+                run.stop.append("end of the slice")
+        if isinstance(event, Finished):
+            finished, result["step"], result["seconds"] = True, event.step, event.seconds
+    held(args, result)
+    if finished and time.monotonic() < deadline + min(SPARE, args.seconds / 4) - min(SCORING, args.seconds / 8):
+        done = resume(cfg.scaled(), args.out / name / "checkpoints", args.device)
+        assert done is not None
+        result |= scored(done, capture, rasterize, args.device) | {"done": True}
+
+
+@torch.no_grad()
+def scored(done: Training, capture: Capture, rasterize: Rasterizer, device: str) -> dict[str, Any]:
+    """PSNR over held-out views, frames a second, and the number of Gaussians with positive opacity."""
+    scene, active, psnr = done.scene, [], []
+    scene.eval()
+    background = upload(torch.tensor(capture.background), device)
+    for index in capture.test or capture.train:
+        camera = capture.views[index].camera.to(device)
+        decoded = scene(camera, done.step, False, rasterize.visible)
+        if decoded.raw_opacity is not None:
+            active.append(float((decoded.raw_opacity > 0).float().mean()))
+        psnr.append(quality(rasterize(decoded.gaussians, camera, background).image, capture, index))
+    cameras = [capture.views[i].camera.to(device) for i in capture.test or capture.train]
+    speed = timing.measure(scene, cameras, done.step, rasterize, background)
+    count = round(len(scene.table) * scene.K * (mean(active) if active else 1.0))
+    return {"psnr": mean(psnr), "fps": speed.fps, "decode_ms": speed.decode_ms, "raster_ms": speed.raster_ms, "gaussians": count}
+
+
+def quality(image: torch.Tensor, capture: Capture, index: int) -> float:
+    """PSNR of a picture [H, W, 3] as an 8-bit file would have it."""
+    target = capture.frame(index).rgb.to(image.device, torch.float32)
+    mse = float(((image.clamp(0, 1) * 255 + 0.5).floor() - target).square().mean()) / 255**2
+    return -10 * math.log10(max(mse, 1e-10))
+
+
+def peer(
+    capture: Capture, count: int, args: argparse.Namespace, deadline: float, result: dict[str, Any], draw: explicit_gsplat.Draw
+) -> None:
+    """The same for explicit Gaussians."""
+    if args.device == "cuda":  # compiled before the clock runs
+        explicit_gsplat.Training(capture, 1000, 20, args.out / "unused", args.device, draw).iterate()
+        torch.cuda.reset_peak_memory_stats()
+    made = explicit_gsplat.Training(capture, count, args.iterations, args.out / "explicit", args.device, draw)
+    finished = made.run(deadline)
+    held(args, result)
+    result |= {"step": made.step, "seconds": made.seconds, "gaussians": count}
+    if not finished:
+        return
+    psnr, times = [], []
+    with torch.no_grad():
+        views = list(capture.test or capture.train)
+        for index in views:
+            psnr.append(quality(made.picture(capture.views[index].camera), capture, index))
+        for index in (views * math.ceil(37 / len(views)))[:37]:
+            if args.device == "cuda":
+                torch.cuda.synchronize()
+            began = time.perf_counter()
+            made.picture(capture.views[index].camera)
+            if args.device == "cuda":
+                torch.cuda.synchronize()
+            times.append(time.perf_counter() - began)
+    result |= {"psnr": mean(psnr), "fps": 1 / median(times[5:]), "done": True}
+
+
+def table(results: dict[str, Any]) -> str:
+    """One line for each training, ratios to the peer where it is done."""
+    base = results.get(PEER, {})
+    lines = [f"{'':20}{'steps':>8}{'time s':>10}{'ms/step':>9}{'of peer':>9}{'peak MiB':>10}{'FPS':>8}{'PSNR':>8}{'Gaussians':>11}"]
+    for name, r in results.items():
+        if name == "settings" or not r.get("step"):
+            continue
+        each = 1e3 * r["seconds"] / r["step"]
+        ratio = f"{each / (1e3 * base['seconds'] / base['step']):.2f}" if base.get("step") else ""
+        cells = (r["step"], f"{r['seconds']:.1f}", f"{each:.2f}", ratio, f"{r['peak_bytes'] / 2**20:.0f}")
+        late = [f"{r[key]:{form}}" if key in r else "" for key, form in (("fps", ".0f"), ("psnr", ".2f"), ("gaussians", ","))]
+        lines.append(f"{name:20}" + "".join(f"{cell:>{w}}" for cell, w in zip((*cells, *late), (8, 10, 9, 9, 10, 8, 8, 11))))
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

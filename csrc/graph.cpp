@@ -1,0 +1,176 @@
+// What a point learns from its neighbours in a graph (scene/graph.py has the definition), and a multi-resolution hash grid
+// (scene/hash_grid.py), forward and backward. Every output row, or every level of the grid, belongs to one worker, which adds in a fixed
+// order: the bits do not depend on the number of threads.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "export.h"
+#include "pool.h"
+
+namespace {
+constexpr int64_t kRows = 256, kPlaces = 512;  // what a worker takes at a time
+constexpr uint32_t kPrimeY = 2654435761u, kPrimeZ = 805459861u;
+
+struct Edges {
+  const int64_t* found;  // [A, k], -1: no neighbour
+  const float* weight;   // [A, k]
+  const int32_t* start;  // [A + 1]: where the list of those who know a point begins
+  const int32_t* known;  // edges u k + j that lead to it, ascending
+  int64_t k;
+};
+
+struct Level {
+  int64_t first, rows, cells;
+  bool dense;
+};
+
+// Rows and weights of the eight corners around a place; z changes fastest.
+inline void corners(const float* unit, const Level& level, int64_t row[8], float weight[8]) {
+  int64_t at[3];
+  float part[3];
+  for (int a = 0; a < 3; ++a) {
+    const float place = unit[a] * static_cast<float>(level.cells), low = std::floor(place);
+    at[a] = static_cast<int64_t>(low);
+    part[a] = place - low;
+  }
+  for (int i = 0; i < 8; ++i) {
+    const int dx = i >> 2, dy = (i >> 1) & 1, dz = i & 1;
+    const int64_t x = at[0] + dx, y = at[1] + dy, z = at[2] + dz, side = level.cells + 1;
+    if (level.dense) {
+      int64_t r = x + side * (y + side * z);
+      if (r < 0 || r >= level.rows) r = (r % level.rows + level.rows) % level.rows;
+      row[i] = r;
+    } else {
+      const uint32_t hash = static_cast<uint32_t>(x) ^ (static_cast<uint32_t>(y) * kPrimeY) ^ (static_cast<uint32_t>(z) * kPrimeZ);
+      row[i] = hash & static_cast<uint32_t>(level.rows - 1);
+    }
+    weight[i] = (dx ? part[0] : 1.f - part[0]) * (dy ? part[1] : 1.f - part[1]) * (dz ? part[2] : 1.f - part[2]);
+  }
+}
+
+inline Level level_of(const int64_t* cells, const int64_t* rows, int64_t l) {
+  int64_t first = 0;
+  for (int64_t i = 0; i < l; ++i) first += rows[i];
+  const int64_t side = cells[l] + 1;
+  return {first, rows[l], cells[l], side * side * side <= rows[l]};
+}
+}  // namespace
+
+// found [A, k] -> start [A + 1], known [start[A]] (room for A k): the graph the other way round.
+SE_EXPORT void se_graph_reverse(const int64_t* found, int64_t A, int64_t k, int32_t* start, int32_t* known) {
+  std::fill(start, start + A + 1, 0);
+  for (int64_t e = 0; e < A * k; ++e)
+    if (found[e] >= 0) ++start[found[e] + 1];
+  for (int64_t v = 0; v < A; ++v) start[v + 1] += start[v];
+  for (int64_t e = 0; e < A * k; ++e)
+    if (found[e] >= 0) known[start[found[e]]++] = static_cast<int32_t>(e);
+  for (int64_t v = A; v > 0; --v) start[v] = start[v - 1];  // each now stands at the next one's begin
+  start[0] = 0;
+}
+
+// feature [A, F] -> least [A, F], the element-wise minimum over those who know a point, and out = f_u + share sum_v w_uv (f_v - least_v).
+SE_EXPORT void se_graph_forward(const float* feature, const int64_t* found, const float* weight, const int32_t* start, const int32_t* known,
+                                int64_t A, int64_t k, int64_t F, float share, float* least, float* out, int32_t threads) {
+  const Edges e{found, weight, start, known, k};
+  se::parallel_for(A, kRows, threads, [&](int64_t begin, int64_t end, int) {
+    for (int64_t v = begin; v < end; ++v) {
+      float* to = least + v * F;
+      for (int64_t c = 0; c < F; ++c) to[c] = feature[v * F + c];  // a point knows itself
+      for (int32_t i = e.start[v]; i < e.start[v + 1]; ++i) {
+        const float* f = feature + e.known[i] / e.k * F;
+        for (int64_t c = 0; c < F; ++c) to[c] = std::min(to[c], f[c]);
+      }
+    }
+  });
+  se::parallel_for(A, kRows, threads, [&](int64_t begin, int64_t end, int) {
+    for (int64_t u = begin; u < end; ++u) {
+      float* to = out + u * F;
+      for (int64_t c = 0; c < F; ++c) to[c] = feature[u * F + c];
+      for (int64_t j = 0; j < e.k; ++j) {
+        const int64_t v = e.found[u * e.k + j];
+        const float w = share * e.weight[u * e.k + j];
+        if (v < 0 || w == 0.f) continue;
+        for (int64_t c = 0; c < F; ++c) to[c] += w * (feature[v * F + c] - least[v * F + c]);
+      }
+    }
+  });
+}
+
+// grad [A, F] of out -> gradient [A, F] of feature; h, shared [A, F]: room for the gradients of the differences and of each minimum's holders.
+SE_EXPORT void se_graph_backward(const float* feature, const float* least, const float* grad, const int64_t* found, const float* weight,
+                                 const int32_t* start, const int32_t* known, int64_t A, int64_t k, int64_t F, float share, float* h,
+                                 float* shared, float* out, int32_t threads) {
+  const Edges e{found, weight, start, known, k};
+  se::parallel_for(A, kRows, threads, [&](int64_t begin, int64_t end, int) {
+    for (int64_t v = begin; v < end; ++v) {
+      float *to = h + v * F, *holders = shared + v * F;
+      const float* low = least + v * F;
+      for (int64_t c = 0; c < F; ++c) to[c] = holders[c] = 0.f;
+      for (int32_t i = e.start[v]; i < e.start[v + 1]; ++i) {
+        const int64_t u = e.known[i] / e.k;
+        const float w = share * e.weight[e.known[i]];
+        const float *f = feature + u * F, *g = grad + u * F;
+        for (int64_t c = 0; c < F; ++c) {
+          to[c] += w * g[c];
+          holders[c] += f[c] == low[c] ? 1.f : 0.f;
+        }
+      }
+      for (int64_t c = 0; c < F; ++c) holders[c] = to[c] / std::max(holders[c], 1.f);
+    }
+  });
+  se::parallel_for(A, kRows, threads, [&](int64_t begin, int64_t end, int) {
+    for (int64_t u = begin; u < end; ++u) {
+      float* to = out + u * F;
+      const float* f = feature + u * F;
+      for (int64_t c = 0; c < F; ++c) to[c] = grad[u * F + c] + h[u * F + c];
+      for (int64_t j = 0; j < e.k; ++j) {
+        const int64_t v = e.found[u * e.k + j];
+        if (v < 0) continue;
+        const float *low = least + v * F, *g = shared + v * F;
+        for (int64_t c = 0; c < F; ++c) to[c] -= f[c] == low[c] ? g[c] : 0.f;
+      }
+    }
+  });
+}
+
+// table [rows of all levels, features], unit [A, 3], cells and rows [levels] -> out [A, levels, features].
+SE_EXPORT void se_grid_forward(const float* table, const float* unit, const int64_t* cells, const int64_t* rows, int64_t A, int64_t levels,
+                               int64_t features, float* out, int32_t threads) {
+  se::parallel_for(A, kPlaces, threads, [&](int64_t begin, int64_t end, int) {
+    int64_t row[8];
+    float weight[8];
+    for (int64_t l = 0; l < levels; ++l) {  // level by level, so that its part of the table stays near
+      const Level level = level_of(cells, rows, l);
+      for (int64_t a = begin; a < end; ++a) {
+        corners(unit + 3 * a, level, row, weight);
+        float* to = out + (a * levels + l) * features;
+        for (int64_t c = 0; c < features; ++c) to[c] = 0.f;
+        for (int i = 0; i < 8; ++i) {
+          const float* from = table + (level.first + row[i]) * features;
+          for (int64_t c = 0; c < features; ++c) to[c] += weight[i] * from[c];
+        }
+      }
+    }
+  });
+}
+
+// grad [A, levels, features] -> added to out [rows of all levels, features], which comes as zeros; a level is one worker's.
+SE_EXPORT void se_grid_backward(const float* unit, const float* grad, const int64_t* cells, const int64_t* rows, int64_t A, int64_t levels,
+                                int64_t features, float* out, int32_t threads) {
+  se::parallel_for(levels, 1, threads, [&](int64_t begin, int64_t end, int) {
+    int64_t row[8];
+    float weight[8];
+    for (int64_t l = begin; l < end; ++l) {
+      const Level level = level_of(cells, rows, l);
+      for (int64_t a = 0; a < A; ++a) {
+        corners(unit + 3 * a, level, row, weight);
+        const float* from = grad + (a * levels + l) * features;
+        for (int i = 0; i < 8; ++i) {
+          float* to = out + (level.first + row[i]) * features;
+          for (int64_t c = 0; c < features; ++c) to[c] += weight[i] * from[c];
+        }
+      }
+    }
+  });
+}

@@ -1,0 +1,34 @@
+// Lists from masks by a table, for instruction sets that cannot pack a register.
+#pragma once
+#include <cstdint>
+#include <cstring>
+
+namespace se {
+
+// Writes (first + lane) * Step of the mask's lanes to `to`, packed to the front of sixteen values.
+template <int Step>
+struct Packing {
+  alignas(16) uint16_t places[256][8] = {};  // for each mask of eight lanes
+
+  Packing() {
+    for (int mask = 0; mask < 256; ++mask)
+      for (int lane = 0, at = 0; lane < 8; ++lane)
+        if (mask >> lane & 1) places[mask][at++] = static_cast<uint16_t>(lane * Step);
+  }
+
+  void pack(uint16_t* to, uint32_t mask, int first) const {
+    eight(to, mask & 255, first);
+    eight(to + __builtin_popcount(mask & 255), mask >> 8, first + 8);
+  }
+
+ private:
+  typedef uint16_t U8 __attribute__((vector_size(16)));
+  void eight(uint16_t* to, uint32_t mask, int first) const {
+    U8 packed;
+    std::memcpy(&packed, places[mask], 16);
+    packed += static_cast<uint16_t>(first * Step);
+    std::memcpy(to, &packed, 16);
+  }
+};
+
+}  // namespace se
