@@ -1,5 +1,4 @@
-// Backward pass of the fused decode. Hidden layers are computed again instead of stored: that costs no more time than memory would.
-// See decode.h.
+// Backward pass of the fused decode. Hidden layers are computed again instead of stored. See decode.h.
 #include <algorithm>
 
 #include "decode.h"

@@ -44,8 +44,8 @@ class Kept:
 def freeze(scene: Scene, step: int, fold_features: bool = False) -> Draws:
     """`scene` for drawing at `step`: frozen where the native decode covers it, else the scene itself. It may not be trained meanwhile.
 
-    fold_features: keep the first layers too, 384 bytes an anchor and expert at 32 hidden units. Reading them has cost more than computing
-    them again (docs/performance.md), hence not the default.
+    fold_features: keep the first layers too, 384 bytes an anchor and expert at 32 hidden units. Reading them took longer than computing
+    them again where it was measured (docs/performance.md).
     """
     if not isinstance(scene, AnchorScene) or not len(scene.table) or scene.table.params["feature"].device.type != "cpu":
         return scene
