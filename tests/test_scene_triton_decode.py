@@ -8,13 +8,18 @@ import torch
 from interpret import DEVICE, kernels
 from scene_experts.scene import anchors, native_decode, triton_decode
 from scene_experts.scene.anchors import ATTRIBUTES, Anchors, AnchorScene
-from scene_experts.scene.experts import Experts
+from scene_experts.scene.experts import Experts, Router
 from scene_experts.scene.mlp import HeadWeights, Plain
 from scene_experts.table import Table
 from scene_experts.types import Camera, Gaussians
-from test_scene_native_decode import CASES, compare, leaves, objective, oracle, problem, single_precision
+from test_scene_native_decode import CASES, EXTENT, compare, leaves, objective, oracle, problem, single_precision
 
-SMALL = {"paper's sizes, several chunks": {"A": 70, "N": 80}, "odd sizes": {}, "one anchor": {}}  # the interpreter is slow
+SMALL = {
+    "paper's sizes, several chunks": {"A": 70, "N": 80},
+    "odd sizes": {},
+    "one anchor": {},
+    "many slots": {},
+}  # the interpreter is slow
 PARTS = ("means", "quats", "scales", "opacities", "colors")
 
 
@@ -34,7 +39,7 @@ def moved(columns, heads, device=DEVICE):
 
 def call(rows, columns, camera, heads, with_dist):
     c = [columns[n] for n in ("xyz", "feature", "log_scaling", "offsets")]
-    return triton_decode.decode(rows.to(DEVICE), *c, camera.float().to(DEVICE), heads, with_dist)
+    return triton_decode.decode(rows.to(DEVICE), *c, camera.float().to(DEVICE), heads, with_dist, EXTENT)
 
 
 def run(rows, columns, camera, heads, with_dist):
@@ -47,7 +52,7 @@ def run(rows, columns, camera, heads, with_dist):
 
 
 @pytest.mark.usefixtures("triton")
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [name for name, case in CASES.items() if "depth" not in case])
 def test_value_and_gradient_are_the_equations(case):
     rows, columns, camera, heads, with_dist = problem(**{**CASES[case], **SMALL.get(case, {"A": 40, "N": 50})})
     exact_columns, exact_heads, named = leaves(columns, heads)
@@ -173,6 +178,12 @@ def test_what_does_not_fit_is_refused_or_left_to_torch():
     with pytest.raises(ValueError, match="k between"):
         triton_decode.decode(rows, *c, camera.float(), heads | {"cov": replace(heads["cov"], k=4)}, with_dist)
     assert all(triton_decode.covers(a, heads[a], 8, 4) for a in ATTRIBUTES)
+    deep = replace(heads["cov"], middle_w=torch.zeros(3, 1, 16, 16), middle_b=torch.zeros(3, 1, 16))
+    assert not triton_decode.covers("cov", deep, 8, 4)
+    with pytest.raises(ValueError, match="two layers"):
+        triton_decode.decode(rows, *c, camera.float(), heads | {"cov": deep}, with_dist)
+    with pytest.raises(ValueError, match="router weights"):
+        triton_decode.decode(rows, *c, camera.float(), heads | {"cov": replace(heads["cov"], position=True)}, with_dist)
     wide = HeadWeights(None, None, torch.zeros(1, 200, 35), torch.zeros(1, 200), torch.zeros(1, 70, 200), torch.zeros(1, 70), None)
     assert not triton_decode.covers("cov", wide, 32, 10)
 
@@ -197,7 +208,12 @@ def scene(config: Anchors, n: int) -> AnchorScene:
 
 
 CAMERA = Camera(torch.tensor([[1.0, 0, 0, 0.1], [0, 1, 0, 0.2], [0, 0, 1, 6], [0, 0, 0, 1]]), torch.eye(3), 64, 48)
-SCENES = {"scaffold": Anchors(decoder=Plain()), "top-2": Anchors(decoder=Experts(warmup=0)), "dense": Anchors(decoder=Experts(top_k=None))}
+SCENES = {
+    "scaffold": Anchors(decoder=Plain()),
+    "top-2": Anchors(decoder=Experts(warmup=0)),
+    "dense": Anchors(decoder=Experts(top_k=None)),
+    "positions": Anchors(decoder=Experts(warmup=0, router=Router(input_pos=True))),
+}
 
 
 @pytest.mark.usefixtures("triton")

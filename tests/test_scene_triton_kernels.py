@@ -20,12 +20,13 @@ from triton.compiler import ASTSource
 from scene_experts.scene import triton_decode, triton_kernels
 from scene_experts.scene.mlp import HeadWeights
 
-INTEGERS = {"rows": "*i64", "order": "*i64", "keys": "*i32", "chosen": "*i64", "dst": "*i32", "source": "*i64", "A": "i32", "blocks": "i32"}
+TYPES = {"rows": "*i64", "order": "*i64", "keys": "*i32", "chosen": "*i64", "dst": "*i32", "source": "*i64", "A": "i32", "blocks": "i32"}
+TYPES["extent"] = "fp32"
 F, K, H, E = 8, 2, 16, 3
 
 def check(name, sizes, target):
     kernel = getattr(triton_kernels, name)
-    signature = {p.name: "constexpr" if p.is_constexpr else INTEGERS.get(p.name, "*fp32") for p in kernel.params}
+    signature = {p.name: "constexpr" if p.is_constexpr else TYPES.get(p.name, "*fp32") for p in kernel.params}
     constants = {p.name: sizes[p.name] for p in kernel.params if p.is_constexpr}
     triton.compile(ASTSource(kernel, signature, constants), target=GPUTarget("cuda", target, 32))
 
@@ -39,10 +40,10 @@ target = int(sys.argv[1])
 common = {"B": 16, "EP": 16, "FP": 16, "KP": 2, "K": K}
 check("place", common, target)
 check("place_backward", common, target)
-check("route", {**common, "F": F, "E": E, "TOP": 2, "BIAS": True, "PRECISION": "ieee"}, target)
+check("route", {**common, "F": F, "E": E, "TOP": 2, "BIAS": True, "POSITION": True, "PRECISION": "ieee"}, target)
 for a, k, experts in (("opacity", 2, E), ("color", None, E), ("cov", 0, 1)):
     for kernel in ("head_forward", "head_backward", "weight_backward"):
-        check(kernel, {**common, **head(a, k, experts)}, target)
+        check(kernel, {**common, "POSITION": k == 2, **head(a, k, experts)}, target)
 print("compiled")
 """
 

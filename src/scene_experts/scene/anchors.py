@@ -167,10 +167,8 @@ class AnchorScene(nn.Module):
         p = self.table.params
         with_dist = {a: a in self.config.add_dist for a in ATTRIBUTES}
         xyz, columns = self.table.facts["xyz"], (p["feature"], p["log_scaling"], p["offsets"])
-        if rows.device.type == "cpu":
-            made = native_decode.decode(rows, xyz, *columns, camera.position, weights, with_dist, self.extent)
-        else:
-            made = triton_decode.decode(rows, xyz, *columns, camera.position, weights, with_dist)
+        fused = native_decode if rows.device.type == "cpu" else triton_decode
+        made = fused.decode(rows, xyz, *columns, camera.position, weights, with_dist, self.extent)
         return Decoded(made[0], rows, made[1], made[2])
 
     def native_weights(self, step: int) -> dict[str, HeadWeights] | None:

@@ -50,14 +50,10 @@ def available() -> str | None:
 
 
 def covers(attribute: str, h: HeadWeights, F: int, K: int) -> bool:
-    """Whether the kernels have room for a network of this size (a program holds it in registers) and for its number of experts.
-
-    Networks with middle layers and routers that see positions are not covered.
-    """
+    """Whether the kernels have code and room for a network (two layers, held in registers) and for its number of experts."""
     E, H = h.w1.shape[:2]
-    if h.middle_w is not None or h.position:
-        return False
-    return padded(F + 5) <= 64 and padded(H) <= 64 and padded(K * CHANNELS[attribute]) <= WIDEST and E <= MOST_EXPERTS
+    fits = padded(F + 5) <= 64 and padded(H) <= 64 and padded(K * CHANNELS[attribute]) <= WIDEST
+    return h.middle_w is None and fits and E <= MOST_EXPERTS
 
 
 def padded(n: int, least: int = 16) -> int:
@@ -74,6 +70,7 @@ class _Head:
     k: int  # 0: dense, or no router
     routed: bool
     distance: bool
+    position: bool  # the router sees it
     sizes: dict[str, Any]  # the compile-time constants of its three kernels
 
 
@@ -85,6 +82,7 @@ class _Plan:
     xyz: Tensor  # [N, 3]
     camera: Tensor  # [3]
     heads: tuple[_Head, _Head, _Head]
+    extent: float
 
     def order(self, keys: Tensor) -> Tensor:
         """The anchors sorted by their sets of experts, [A] int64."""
@@ -100,17 +98,18 @@ def decode(
     camera_position: Tensor,
     heads: dict[str, HeadWeights],
     with_dist: dict[str, bool],
+    extent: float = 1.0,
 ) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
     """Gaussians of positive opacity in the order of (row, slot), raw opacities [A, K], and routing of the heads that have a router.
 
     rows [A] int64, each at most once and inside of the table (not checked: that would wait for the device); xyz [N, 3], feature [N, F],
     log_scaling [N, 6], offsets [N, K, 3], camera_position [3]; heads and with_dist by attribute ("opacity", "cov", "color"), D = F + 3
-    (+ 1 with the distance). All float32 on one device. Differentiable in feature, log_scaling, offsets and every tensor of the heads; not
-    in xyz and the camera. Raises ValueError for shapes that do not fit.
+    (+ 1 with the distance); a router that sees positions sees xyz / extent. All float32 on one device. Differentiable in feature,
+    log_scaling, offsets and every tensor of the heads; not in xyz and the camera. Raises ValueError for shapes that do not fit.
     """
     F, K = feature.shape[1], offsets.shape[1]
     made = tuple(_head(a, heads[a], with_dist[a], F, K) for a in ATTRIBUTES)
-    plan = _Plan(rows.contiguous(), xyz.detach().contiguous(), camera_position.detach().to(xyz).contiguous(), made)  # type: ignore[arg-type]
+    plan = _Plan(rows.contiguous(), xyz.detach().contiguous(), camera_position.detach().to(xyz).contiguous(), made, extent)  # type: ignore[arg-type]
     weights = [getattr(heads[a], name) for a in ATTRIBUTES for name in TENSORS]
     means, quats, scales, opacities, colors, source, raw, *routing = _Decode.apply(plan, feature, log_scaling, offsets, *weights)
     found = {a: Routing(routing[i], routing[3 + i]) for i, a in enumerate(ATTRIBUTES) if routing[i] is not None}
@@ -123,15 +122,19 @@ def _head(attribute: str, h: HeadWeights, distance: bool, F: int, K: int) -> _He
     if F + 3 + distance != D or tuple(h.w2.shape) != (E, K * C, H):
         expected = f"{attribute} weights [E, H, {F + 3 + distance}] and [E, {K * C}, H]"
         raise ValueError(f"expected {expected}, found {tuple(h.w1.shape)} and {tuple(h.w2.shape)}")
+    if h.middle_w is not None:
+        raise ValueError(f"expected networks of two layers, found {2 + h.middle_w.shape[1]} for {attribute}")
     routed = h.router_w is not None
     if not routed and E != 1:
         raise ValueError(f"expected one expert for {attribute} without a router, found {E}")
+    if h.router_w is not None and h.router_w.shape[1] != F + 3 * h.position:
+        raise ValueError(f"expected {attribute} router weights [{E}, {F + 3 * h.position}], found {tuple(h.router_w.shape)}")
     if routed and h.k is not None and not 1 <= h.k <= E:
         raise ValueError(f"expected k between 1 and {E} for {attribute}, found {h.k}")
     sizes: dict[str, Any] = {"E": E, "F": F, "H": H, "K": K, "C": C, "DISTANCE": int(distance), "ROUTED": routed}
     sizes |= {"SPARSE": routed and h.k is not None, "ACT": ACTIVATION[attribute], "COMPACT": attribute != "opacity"}
     sizes |= {"XP": padded(D + 1), "HP": padded(H), "COLS": padded(K * C), "PRECISION": PRECISION}
-    return _Head(attribute, E, (h.k or 0) if routed else 0, routed, distance, sizes)
+    return _Head(attribute, E, (h.k or 0) if routed else 0, routed, distance, h.position, sizes)
 
 
 def _kernels() -> ModuleType:
@@ -204,11 +207,11 @@ def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Ten
         keys = torch.empty(A, dtype=torch.int32, device=device)
     if A:
         bias = weights[1]
-        sizes = {"F": feature.shape[1], "E": head.E, "TOP": head.k, "BIAS": bias is not None, "B": BLOCK, "PRECISION": PRECISION}
-        sizes |= {"FP": padded(feature.shape[1]), "EP": padded(head.E)}
+        sizes = {"F": feature.shape[1], "E": head.E, "TOP": head.k, "BIAS": bias is not None, "POSITION": head.position}
+        sizes |= {"FP": padded(feature.shape[1]), "EP": padded(head.E), "B": BLOCK, "PRECISION": PRECISION}
         unused = plan.rows  # stands for arrays that a kernel's constants say it does not touch
-        arguments = [plan.rows, feature, weights[0], bias, gates, mix, chosen, keys]
-        _kernels().route[(-(-A // BLOCK),)](*(unused if t is None else t for t in arguments), A, **sizes)
+        arguments = [plan.rows, plan.xyz, feature, weights[0], bias, gates, mix, chosen, keys]
+        _kernels().route[(-(-A // BLOCK),)](*(unused if t is None else t for t in arguments), A, plan.extent, **sizes)
     return gates, mix, chosen, keys, None if keys is None else plan.order(keys)
 
 
@@ -234,7 +237,9 @@ def _backward(
     shared = [plan.rows, order, keys, mix]
     arguments = [*shared, gates, plan.xyz, feature, plan.camera, own[0], *own[2:], dst, d_out, d_gates, d_logits, d_feature]
     grid = (-(-A // BLOCK),)
-    _kernels().head_backward[grid](*(plan.rows if t is None else t for t in arguments), A, **head.sizes, B=BLOCK, EP=padded(head.E))
+    _kernels().head_backward[grid](
+        *(plan.rows if t is None else t for t in arguments), A, **head.sizes, B=BLOCK, EP=padded(head.E), POSITION=head.position
+    )
     blocks = -(-A // BLOCK_WEIGHTS)
     parts = [t.new_empty(_parts(t.device, head.E, blocks), *t.shape) for t in own[2:]]
     arguments = [*shared, plan.xyz, feature, plan.camera, *own[2:], dst, d_out, *parts]
@@ -243,6 +248,9 @@ def _backward(
     )
     found: list[Tensor | None] = [None, None]
     if d_logits is not None:
-        found[0] = d_logits.T @ feature.index_select(0, plan.rows)
+        seen = feature.index_select(0, plan.rows)
+        if head.position:
+            seen = torch.cat([seen, plan.xyz.index_select(0, plan.rows) / plan.extent], dim=1)
+        found[0] = d_logits.T @ seen
         found[1] = None if own[1] is None else d_logits.sum(0)
     return [*found, *(part.sum(0) for part in parts)]

@@ -121,19 +121,27 @@ def outputs(dst, anchor, inside, K: tl.constexpr, C: tl.constexpr, COLS: tl.cons
 
 @triton.jit
 def route(
-    rows, feature, router_w, router_b, gates, mix, chosen, keys, A,
-    F: tl.constexpr, E: tl.constexpr, TOP: tl.constexpr, BIAS: tl.constexpr,
+    rows, xyz, feature, router_w, router_b, gates, mix, chosen, keys, A, extent,
+    F: tl.constexpr, E: tl.constexpr, TOP: tl.constexpr, BIAS: tl.constexpr, POSITION: tl.constexpr,
     B: tl.constexpr, FP: tl.constexpr, EP: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Gates [A, E] (eq. 3); with TOP > 0 also the chosen [A, TOP] (ties to the lowest), their weights `mix` [A, E] (eq. 5) and keys."""
+    """Gates [A, E] (eq. 3); with TOP > 0 also the chosen [A, TOP] (ties to the lowest), their weights `mix` [A, E] (eq. 5) and keys.
+
+    POSITION: the router also sees xyz / extent.
+    """
     anchor = tl.program_id(0) * B + tl.arange(0, B)
     inside = anchor < A
     row = tl.load(rows + anchor, mask=inside, other=0)
     anchor = anchor.to(tl.int64)
     column, expert = tl.arange(0, FP), tl.arange(0, EP)[None, :]
     f = tl.load(feature + row[:, None] * F + column[None, :], mask=inside[:, None] & (column[None, :] < F), other=0.0)
-    w = tl.load(router_w + expert * F + column[:, None], mask=(expert < E) & (column[:, None] < F), other=0.0)
+    R: tl.constexpr = F + 3 * POSITION
+    w = tl.load(router_w + expert * R + column[:, None], mask=(expert < E) & (column[:, None] < F), other=0.0)
     logits = tl.dot(f, w, input_precision=PRECISION)
+    if POSITION:
+        for c in tl.static_range(3):
+            x = tl.load(xyz + row * 3 + c, mask=inside, other=0.0) / extent
+            logits += x[:, None] * tl.load(router_w + expert * R + F + c, mask=expert < E, other=0.0)
     if BIAS:
         logits += tl.load(router_b + expert, mask=expert < E, other=0.0)
     logits = tl.where(expert < E, logits, -float("inf"))
@@ -181,7 +189,8 @@ def head_backward(
     rows, order, keys, mix, gates, xyz, feature, camera, router_w, w1, b1, w2, b2, dst, d_out, d_gates, d_logits, d_feature, A,
     E: tl.constexpr, F: tl.constexpr, H: tl.constexpr, K: tl.constexpr, C: tl.constexpr,
     DISTANCE: tl.constexpr, ROUTED: tl.constexpr, SPARSE: tl.constexpr, ACT: tl.constexpr, COMPACT: tl.constexpr,
-    B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, EP: tl.constexpr, PRECISION: tl.constexpr,
+    B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, EP: tl.constexpr, POSITION: tl.constexpr,
+    PRECISION: tl.constexpr,
 ):  # fmt: skip
     """What one attribute adds to the features' gradient (through networks and router), and the logits' gradient [A, E]."""
     anchor, row, key, inside = block_of(order, keys, rows, tl.program_id(0), A, B, SPARSE)
@@ -211,7 +220,7 @@ def head_backward(
         d_logit = m * (d_mix - tl.sum(m * d_mix, axis=1)[:, None]) + g * (d_g - tl.sum(g * d_g, axis=1)[:, None])  # two softmaxes
         tl.store(d_logits + anchor[:, None] * E + expert, d_logit, mask=real)
         expert_down = tl.arange(0, EP)[:, None]
-        r = tl.load(router_w + expert_down * F + column, mask=(expert_down < E) & (column < F), other=0.0)
+        r = tl.load(router_w + expert_down * (F + 3 * POSITION) + column, mask=(expert_down < E) & (column < F), other=0.0)
         dx += tl.dot(d_logit, r, input_precision=PRECISION)
     to = d_feature + row[:, None] * F + column
     kept = inside[:, None] & (column < F)
