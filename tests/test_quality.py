@@ -58,8 +58,10 @@ def held_out(capture, recipe: str, seed: int = 0, grow: bool = True, monkeypatch
     return statistics.mean(scores)
 
 
-@pytest.mark.parametrize("name", ["brighton", "coloured"])
-@pytest.mark.parametrize("recipe", ["scaffold-gs", "moe-gs"])
+BOTH = [(recipe, name) for recipe in ("scaffold-gs", "moe-gs") for name in ("brighton", "coloured")]
+
+
+@pytest.mark.parametrize(("recipe", "name"), [*BOTH, ("3dgs", "coloured")])
 def test_held_out_psnr_stays_within_three_sigma_of_the_recorded_seeds(name, recipe, captures, monkeypatch):
     key = f"{recipe} on {name}"
     if os.environ.get("SCENE_EXPERTS_RECORD"):

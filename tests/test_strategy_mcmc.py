@@ -6,8 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from scene_experts import native
 from scene_experts.errors import InputError
 from scene_experts.geometry.rotation import covariance
+from scene_experts.strategy import mcmc
 from scene_experts.strategy.mcmc import MCMC, MOST, draw, shared
 from test_strategy_split_clone import make, moments
 
@@ -122,6 +124,24 @@ def test_noise_has_the_shape_of_the_gaussian_and_spares_the_opaque():
         p["raw_opacity"].fill_(-5.0)
     replace(rule, noise=0.0).finish(scene, 1, {"means": 1e-3}, generator)
     assert torch.equal(p["means"], before)
+
+
+@pytest.mark.parametrize("level", [level for level in native.levels() if native.load(level)])
+@pytest.mark.parametrize("n", [1, 300])
+def test_native_noise_is_that_of_torch(level, n, monkeypatch):
+    library = mcmc._library(level)
+    if library is None:
+        pytest.skip("built before this was written")
+    monkeypatch.setattr(mcmc, "_library", lambda: library)
+    scene = make(n)
+    with torch.no_grad():
+        scene.table.params["means"].zero_()
+    columns = [scene.table.params[name].detach().clone().double() for name in ("means", "quats", "log_scales", "raw_opacity")]
+    eta = torch.randn(n, 3, generator=torch.Generator().manual_seed(5)).double()
+    mcmc.disturb(*columns, eta, 500.0, 0.005)
+    MCMC().finish(scene, 1, {"means": 1e-3}, torch.Generator().manual_seed(5))
+    torch.testing.assert_close(scene.table.params["means"].detach().double(), columns[0], rtol=2e-5, atol=1e-7)
+    assert columns[0].any()
 
 
 def test_impossible_numbers_are_refused():

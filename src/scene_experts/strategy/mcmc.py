@@ -5,6 +5,7 @@ The two regularisers that belong to it are loss weights: `Weights.mean_opacity` 
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import math
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from scene_experts import native
 from scene_experts.errors import expect_at_least
 from scene_experts.geometry.rotation import normalise_quats, quat_to_matrix
 from scene_experts.scene.explicit import GaussianScene
@@ -111,11 +113,22 @@ class MCMC:
         if not self.enabled or size == 0:
             return
         p = scene.table.params
-        noise = torch.randn(p["means"].shape, generator=generator).to(p["means"])
-        gate = torch.sigmoid(-_SHARP * (p["raw_opacity"].sigmoid() - self.min_opacity))
-        turn = quat_to_matrix(normalise_quats(p["quats"].detach()))
-        along = (turn.transpose(1, 2) @ noise[..., None]).squeeze(-1) * (2 * p["log_scales"]).exp()
-        p["means"] += (turn @ along[..., None]).squeeze(-1) * (gate * size)[:, None]
+        columns = [p[name].detach() for name in ("means", "quats", "log_scales", "raw_opacity")]
+        eta = torch.randn(p["means"].shape, generator=generator).to(p["means"])
+        library = _library()
+        if library is not None and all(c.device.type == "cpu" and c.dtype == torch.float32 and c.is_contiguous() for c in columns):
+            where = [native.pointer(t) for t in (*columns, eta)]
+            library.se_noise(*where, len(eta), size, _SHARP, self.min_opacity, native.threads())
+        else:
+            disturb(*columns, eta, size, self.min_opacity)
+
+
+def disturb(means: Tensor, quats: Tensor, log_scales: Tensor, raw_opacity: Tensor, eta: Tensor, size: float, faint: float) -> None:
+    """means += Sigma eta size sigmoid(-100 (opacity - faint)) in place, in plain torch, for any device and dtype."""
+    gate = torch.sigmoid(-_SHARP * (raw_opacity.sigmoid() - faint))
+    turn = quat_to_matrix(normalise_quats(quats))
+    along = (turn.transpose(1, 2) @ eta[..., None]).squeeze(-1) * (2 * log_scales).exp()
+    means += (turn @ along[..., None]).squeeze(-1) * (gate * size)[:, None]
 
 
 def draw(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -143,3 +156,14 @@ def _signed_binomials() -> Tensor:
     """binom(n, j) (-1)^(j-1) / sqrt(j) for n = 0 .. MOST (rows) and j = 1 .. MOST (columns), float64."""
     rows = [[math.comb(n, j) * (-1) ** (j - 1) / math.sqrt(j) for j in range(1, MOST + 1)] for n in range(MOST + 1)]
     return torch.tensor(rows, dtype=torch.float64)
+
+
+@functools.cache
+def _library(level: str | None = None) -> ctypes.CDLL | None:
+    library = native.load(level)
+    if library is None or not hasattr(library, "se_noise"):  # built before this file was
+        return None
+    P, F = ctypes.c_void_p, ctypes.c_float
+    library.se_noise.argtypes = [P, P, P, P, P, ctypes.c_int64, F, F, F, ctypes.c_int32]
+    library.se_noise.restype = None
+    return library
