@@ -1,112 +1,71 @@
-"""A whole training step (decode, raster, loss, backward, density statistics, optimiser) beside the rasteriser's own forward + backward.
+"""A whole training step (target, decode, raster, loss, backward, density statistics, Adam) beside the scalar peer's forward + backward.
 
-Usage: python benchmarks/step.py [--recipes moe-gs scaffold-gs] [--anchors 20000] [--size 800 544] [--threads 2]
-The scene is random anchors in front of one camera. Prints minima over interleaved rounds, the time of each part, and the ratios that
-docs/performance.md quotes.
+Usage: python benchmarks/step.py [--recipes moe-gs scaffold-gs] [--anchors 40000] [--size 800 544] [--threads 2] [--rounds 15]
+Random anchors, half of them in front of one camera. Wall time, minima over interleaved rounds: the time of each part, and the ratios that
+docs/performance.md quotes. The peer is one thread of plain C++ on the same Gaussians (bench/peer.py).
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import replace
 
 import torch
 
-from scene_experts.losses import terms
-from scene_experts.recipes import RECIPES
-from scene_experts.render import choose
-from scene_experts.scene.anchors import AnchorScene
-from scene_experts.state import Training
-from scene_experts.strategy import observe
-from scene_experts.types import Camera, Points
+from scene_experts import native
+from scene_experts.bench import peer, raster
+from scene_experts.bench.step import PARTS, Work, work
+from scene_experts.types import Gaussians
 
 
-def make(recipe: str, anchors: int, width: int, height: int) -> tuple[Training, Camera]:
-    """Random anchors filling the picture of one camera; networks as initialised, features random so that experts differ."""
-    torch.manual_seed(0)
-    cfg = RECIPES[recipe][1]
-    depth = 3 + 5 * torch.rand(anchors)
-    side = (torch.rand(anchors, 2) - 0.5) * torch.tensor([1.0, height / width])
-    xyz = torch.cat([side * depth[:, None], depth[:, None]], 1).double()
-    K = torch.tensor([[width * 1.0, 0, width / 2], [0, width * 1.0, height / 2], [0, 0, 1.0]])
-    config = replace(cfg.scene, voxel_size=1e-4)
-    scene = AnchorScene.from_points(config, Points(xyz, torch.zeros(anchors, 3, dtype=torch.uint8)), 5.0)
-    scene.table.params["feature"].data.normal_()
-    scene.table.params["offsets"].data.normal_(0, 0.5)
-    observe.start(scene.table, scene.K)
-    return Training(replace(cfg, scene=config), scene), Camera(torch.eye(4), K, width, height, 0.2)
-
-
-def step(training: Training, camera: Camera, rasterize, target, times: dict[str, float]) -> int:
-    """One step at iteration 2,000 (sparse); adds the seconds of its parts to `times`. Returns the Gaussians drawn."""
-    clock = [time.perf_counter()]
-
-    def lap(name: str) -> None:
-        clock.append(time.perf_counter())
-        times[name] = times.get(name, 0.0) + clock[-1] - clock[-2]
-
-    training.step = 2000
-    training.set_rates()
-    decoded = training.scene(camera, 2000, True, rasterize.visible)
-    lap("cull + decode")
-    render = rasterize(decoded.gaussians, camera, torch.zeros(3))
-    lap("raster")
-    loss = torch.stack(list(terms(decoded, render, target, training.cfg.loss, 2000).values())).sum()
-    lap("loss")
-    loss.backward()
-    lap("backward")
-    observe.observe(training.scene.table, decoded, render)
-    lap("statistics")
-    training.optimizer.step()
-    training.optimizer.zero_grad(set_to_none=True)
-    lap("adam")
-    return len(decoded.gaussians)
-
-
-def raster_alone(training: Training, camera: Camera, rasterize) -> float:
-    """Seconds of the rasteriser's forward + backward on the Gaussians of this scene."""
-    with torch.no_grad():
-        g = training.scene(camera, 2000, False, rasterize.visible).gaussians
-    leaf = lambda t: t.clone().requires_grad_()  # noqa: E731
-    g = replace(g, means=leaf(g.means), quats=leaf(g.quats), scales=leaf(g.scales), opacities=leaf(g.opacities), colors=leaf(g.colors))
-    upstream = torch.rand(camera.height, camera.width, 3)
+def target_of(pixels: torch.Tensor, step: Work) -> float:
+    """Seconds of the target's way from the image cache: bytes [H, W, 3] to floats."""
     began = time.perf_counter()
-    rasterize(g, camera, torch.zeros(3)).image.backward(upstream)
+    step.target.copy_(pixels.to("cpu", torch.float32).div_(255.0))
     return time.perf_counter() - began
+
+
+@torch.no_grad()
+def drawn(step: Work) -> Gaussians:
+    """The Gaussians that one step draws."""
+    g = step.training.scene(step.camera, 2000, False, step.rasterize.visible).gaussians
+    return Gaussians(*(t.detach() for t in (g.means, g.quats, g.scales, g.opacities, g.colors)), g.source)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--recipes", nargs="+", default=["moe-gs", "scaffold-gs"])
-    parser.add_argument("--anchors", type=int, default=20_000)
+    parser.add_argument("--anchors", type=int, default=40_000)
     parser.add_argument("--size", type=int, nargs=2, default=[800, 544])
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--rounds", type=int, default=12)
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--peer", type=int, default=2, help="rounds in which the peer runs too (seconds each)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    rasterize = choose("auto", "cpu")
     width, height = args.size
-    target = torch.rand(height, width, 3)
-    made = {name: make(name, args.anchors, width, height) for name in args.recipes}
-    best: dict[str, dict[str, float]] = {name: {} for name in made}
-    alone, whole, drawn = dict.fromkeys(made, float("inf")), dict.fromkeys(made, float("inf")), {}
-    for _ in range(args.rounds):
-        for name, (training, camera) in made.items():
-            state = {k: v.detach().clone() for k, v in training.scene.state_dict().items()}
-            alone[name] = min(alone[name], raster_alone(training, camera, rasterize))
-            times: dict[str, float] = {}
-            drawn[name] = step(training, camera, rasterize, target, times)
-            whole[name] = min(whole[name], sum(times.values()))
-            best[name] = {k: min(v, best[name].get(k, v)) for k, v in times.items()}
-            training.scene.load_state_dict(state)
-    for name in made:
-        size = f"{width}x{height}, {args.threads} threads, raster {rasterize.name}"
-        print(f"{name}: {args.anchors:,} anchors, {drawn[name]:,} Gaussians drawn, {size}")
+    made = {name: work(name, args.anchors, width, height) for name in args.recipes}
+    pixels = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8)
+    upstream, slow = torch.rand(height, width, 3), peer.load(getattr(native.load(), "level", None))
+    parts = ("target", *PARTS)
+    best = {name: dict.fromkeys(parts, float("inf")) for name in made}
+    whole, alone, scalar = (dict.fromkeys(made, float("inf")) for _ in range(3))
+    for turn in range(args.rounds):
+        for name, step in made.items():
+            times = (target_of(pixels, step), *step(time.perf_counter))
+            best[name] = {part: min(best[name][part], t) for part, t in zip(parts, times, strict=True)}
+            whole[name] = min(whole[name], sum(times))
+            picture = raster.Picture(drawn(step), step.camera, upstream)
+            alone[name] = min(alone[name], sum(raster.draw(step.rasterize, picture, time.perf_counter)))
+            if slow is not None and turn < args.peer:
+                scalar[name] = min(scalar[name], sum(slow.draw(picture.gaussians, step.camera, upstream, time.perf_counter)[:2]))
+    for name, step in made.items():
+        print(f"{name}: {args.anchors // 2:,} visible of {args.anchors:,} anchors, {step.drawn():,} Gaussians, {width}x{height}, ", end="")
+        print(f"{args.threads} thread(s), raster {step.rasterize.name}")
         for part, seconds in best[name].items():
-            print(f"  {part:<14} {1e3 * seconds:7.1f} ms")
+            print(f"  {part:<14} {1e3 * seconds:7.2f} ms")
         against = f"{whole[name] / alone[name]:.2f} x raster alone ({1e3 * alone[name]:.1f} ms)"
-        print(f"  {'whole step':<14} {1e3 * whole[name]:7.1f} ms = {against}")
+        print(f"  {'whole step':<14} {1e3 * whole[name]:7.2f} ms = {against}, {whole[name] / scalar[name]:.4f} x {peer.NAME}", end="")
+        print(f" ({1e3 * scalar[name]:.0f} ms)")
     if {"moe-gs", "scaffold-gs"} <= set(made):
         print(f"moe-gs step / scaffold-gs step: {whole['moe-gs'] / whole['scaffold-gs']:.2f}")
 
