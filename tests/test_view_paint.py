@@ -5,6 +5,7 @@ import torch
 
 from scene_experts.errors import InputError
 from scene_experts.render import choose
+from scene_experts.scene.frozen import freeze
 from scene_experts.view.paint import MODES, PALETTE, Look, paint, ramp, row_colours
 from test_scene import CAMERA, started
 
@@ -22,6 +23,13 @@ def test_the_plain_picture_is_the_render():
     with torch.no_grad():
         image = DRAW(scene(CAMERA, 2000, False, DRAW.visible).gaussians, CAMERA, BLACK).image
     assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK), image.clamp(0, 1))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_frozen_scene_gives_the_same_picture(mode):
+    scene = started("moe-gs")
+    draws = freeze(scene, 2000)
+    assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK, Look(mode), draws), paint(scene, CAMERA, 2000, DRAW, BLACK, Look(mode)))
 
 
 @pytest.mark.parametrize("mode", MODES)

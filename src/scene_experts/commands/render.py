@@ -21,6 +21,7 @@ from scene_experts.errors import InputError, expect_at_least
 from scene_experts.evaluate.expert_pictures import strip
 from scene_experts.evaluate.pictures import to_8bit
 from scene_experts.progress import Bar
+from scene_experts.scene.frozen import freeze
 from scene_experts.types import Camera
 from scene_experts.view import path_files, paths, video
 from scene_experts.view.paint import Look, Mode, paint
@@ -101,14 +102,16 @@ def drawn(
 ) -> Iterator[np.ndarray]:
     """The frames, each as 8-bit RGB: every run in every mode, side by side."""
     only = tuple(number - 1 for number in command.only) or None
+    frozen = [freeze(run.scene, run.step) for run in opened]
     for i, camera in enumerate(cameras):
         camera = camera.to(background.device)
         tiles = []
-        for run in opened:
+        for run, draws in zip(opened, frozen):
             draw = rasterize
             if getattr(rasterize, "antialias", run.cfg.antialias) != run.cfg.antialias:
                 draw = replace(rasterize, antialias=run.cfg.antialias)
-            tiles += [paint(run.scene, camera, run.step, draw, background, Look(mode, command.attribute, only)) for mode in command.show]
+            looks = [Look(mode, command.attribute, only) for mode in command.show]
+            tiles += [paint(run.scene, camera, run.step, draw, background, look, draws) for look in looks]
         yield to_8bit(strip(tiles) if len(tiles) > 1 else tiles[0])
         tell("rendering", i + 1, len(cameras))
 

@@ -11,6 +11,7 @@ import tyro
 from scene_experts import run_folder
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import Device, Raster, backend
+from scene_experts.scene.frozen import freeze
 from scene_experts.view.server import Viewer, viser
 
 
@@ -41,7 +42,16 @@ def view(args: list[str]) -> int:
     data = opened.config.data if command.data is None else replace(opened.config.data, path=command.data)
     capture = run_folder.load_capture(data, opened.cfg.seed)
     label = f"{opened.config.train.recipe} on {capture.name}"
-    viewer = Viewer(capture, lambda: (opened.scene, opened.step), rasterize, command.host, command.port, label, paths=command.run / "paths")
+    viewer = Viewer(
+        capture,
+        lambda: (opened.scene, opened.step),
+        rasterize,
+        command.host,
+        command.port,
+        label,
+        paths=command.run / "paths",
+        draws=freeze(opened.scene, opened.step),
+    )
     print(f"{label}: {viewer.url} (Ctrl-C ends it)", flush=True)
     try:
         viewer.serve()

@@ -12,6 +12,7 @@ from scene_experts.errors import InputError
 from scene_experts.evaluate.expert_pictures import chosen_by, keep
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Scene
+from scene_experts.scene.frozen import Draws
 from scene_experts.types import Camera, Decoded, Gaussians, Render
 
 Mode = Literal["picture", "depth", "alpha", "experts", "entropy", "activation"]
@@ -36,9 +37,21 @@ class Look:
 
 
 @torch.no_grad()
-def paint(scene: Scene, camera: Camera, step: int, rasterize: Rasterizer, background: Tensor, look: Look = Look()) -> Tensor:
-    """A picture [H, W, 3] in [0, 1]. Raises InputError where the look needs experts and the scene has none."""
-    decoded = scene(camera, step, False, rasterize.visible)
+def paint(
+    scene: Scene,
+    camera: Camera,
+    step: int,
+    rasterize: Rasterizer,
+    background: Tensor,
+    look: Look = Look(),
+    draws: Draws | None = None,
+) -> Tensor:
+    """A picture [H, W, 3] in [0, 1]. Raises InputError where the look needs experts and the scene has none.
+
+    draws: the same scene frozen (`scene.frozen.freeze`), which is faster; it does not say who decodes what, so expert views leave it aside.
+    """
+    routed = look.only is not None or look.mode in ("experts", "entropy")
+    decoded = (scene if draws is None or routed else draws)(camera, step, False, rasterize.visible)
     gaussians = decoded.gaussians
     if look.only is not None:
         mine = chosen_by(needed(decoded, look.attribute), look.attribute, scene.K)

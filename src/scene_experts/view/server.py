@@ -24,6 +24,7 @@ from scene_experts.events import Event
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Scene
+from scene_experts.scene.frozen import Draws
 from scene_experts.types import Camera
 from scene_experts.view.paint import paint
 from scene_experts.view.panel import Panel
@@ -74,6 +75,7 @@ class Viewer:
     label: str = "scene-experts"
     height: int = 1080  # px of a full picture, at most
     paths: Path | None = None  # where camera paths are saved
+    draws: Draws | None = None  # the scene frozen, where it does not train
     clients: dict[int, Client] = field(default_factory=dict)
     changed: threading.Event = field(default_factory=threading.Event)
 
@@ -190,7 +192,7 @@ class Viewer:
         """What the client is to see: the scene as the panel asks, the photograph over the left of it where it stands at a view."""
         look, background = self.panel.look(), torch.tensor(self.panel.background(), device=self.device)
         scene = self.panel.levelled(scene)
-        picture = paint(scene, camera.to(self.device), step, self.rasterize, background, look).cpu()
+        picture = paint(scene, camera.to(self.device), step, self.rasterize, background, look, self.draws).cpu()
         part = self.panel.photograph()
         if part > 0 and client.at_view is not None:
             photo = self.photograph(client.at_view, camera)
