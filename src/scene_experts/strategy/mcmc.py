@@ -120,7 +120,8 @@ class MCMC:
             where = [native.pointer(t) for t in (*columns, eta)]
             library.se_noise(*where, len(eta), size, _SHARP, self.min_opacity, native.threads())
         else:
-            disturb(*columns, eta, size, self.min_opacity)
+            means, quats, log_scales, raw_opacity = columns
+            disturb(means, quats, log_scales, raw_opacity, eta, size, self.min_opacity)
 
 
 def disturb(means: Tensor, quats: Tensor, log_scales: Tensor, raw_opacity: Tensor, eta: Tensor, size: float, faint: float) -> None:
