@@ -10,7 +10,7 @@ import scene_experts
 SOURCE = Path(scene_experts.__path__[0])
 LAYERS = [
     {"errors", "io", "native", "transfer", "types", "__init__"},
-    {"geometry"},
+    {"geometry", "native_terms"},
     {"table", "schedule", "checkpoint", "optim"},
     {"data", "render", "scene", "losses"},
     {"strategy"},

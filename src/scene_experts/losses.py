@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from scene_experts import native
+from scene_experts import native, native_terms
 from scene_experts.types import Decoded, Render, Routing
 
 TAPS, SIGMA, C1, C2 = 11, 1.5, 0.01**2, 0.03**2
@@ -199,47 +199,16 @@ def hinge_opacities(decoded: Decoded, render: Render, w: Weights) -> Tensor:
 
 def volume(scales: Tensor) -> Tensor:
     """Mean of sx sy sz over Gaussians [M, 3], []: Scaffold-GS's volume regulariser."""
-    if scales.device.type == "cpu" and scales.dtype == torch.float32 and _volume_library() is not None:
-        return _Volume.apply(scales) / max(len(scales), 1)
+    if native_terms.covers(scales):
+        return native_terms.volume_sum(scales) / max(len(scales), 1)
     x, y, z = scales.unbind(1)
     return (x * y * z).sum() / max(len(scales), 1)
 
 
-class _Volume(torch.autograd.Function):
-    """Sum of sx sy sz, []."""
-
-    @staticmethod
-    def forward(ctx: Any, scales: Tensor) -> Tensor:
-        scales, library = scales.detach().contiguous(), _volume_library()
-        assert library is not None
-        ctx.save_for_backward(scales)
-        partial = torch.empty(library.se_volume_chunks(len(scales)), dtype=torch.float64)
-        library.se_volume(native.pointer(scales), len(scales), native.pointer(partial), native.threads())
-        return partial.sum().float()
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
-        (scales,), library = ctx.saved_tensors, _volume_library()
-        assert library is not None
-        gradient = torch.empty_like(scales)
-        library.se_volume_backward(native.pointer(scales), len(scales), float(upstream[0]), native.pointer(gradient), native.threads())
-        return gradient
-
-
-@cache
-def _volume_library() -> ctypes.CDLL | None:
-    library = native.load()
-    if library is None or not hasattr(library, "se_volume"):  # built before this was
-        return None
-    P, L = ctypes.c_void_p, ctypes.c_int64
-    library.se_volume_chunks.argtypes, library.se_volume_chunks.restype = [L], L
-    library.se_volume.argtypes, library.se_volume.restype = [P, L, P, ctypes.c_int32], None
-    library.se_volume_backward.argtypes, library.se_volume_backward.restype = [P, L, ctypes.c_float, P, ctypes.c_int32], None
-    return library
-
-
 def opacity_hinge(raw_opacity: Tensor, tau: float = 0.0) -> Tensor:
     """Mean of max(0, tau - sigma) over all K Gaussians of the decoded anchors, drawn or not (eq. 8); raw_opacity [A, K]."""
+    if native_terms.covers(raw_opacity):
+        return native_terms.hinge_sum(raw_opacity, tau) / max(raw_opacity.numel(), 1)
     return functional.relu(tau - raw_opacity).sum() / max(raw_opacity.numel(), 1)
 
 
