@@ -28,7 +28,15 @@ def test_every_ablation_of_the_paper_has_a_recipe():
     assert RECIPES["scaffold-gs-opacity"][1].loss.opacity == 0.01
 
 
+NAMED = {"reproduce/experiments.py", "reproduce/claims.py", "reproduce/figures.py", "bench/step.py"}
+
+
 @pytest.mark.parametrize("path", [p for p in SOURCE.rglob("*.py") if p.name != "recipes.py"], ids=lambda p: str(p.relative_to(SOURCE)))
 def test_no_recipe_name_steers_code_elsewhere(path):
-    found = [n.value for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Constant) and n.value in RECIPES]
+    tree = ast.parse(path.read_text())
+    if str(path.relative_to(SOURCE)) in NAMED:  # what to run is data there; nothing may depend on it
+        tree = [node for node in ast.walk(tree) if isinstance(node, ast.Compare)]
+        found = [n.value for compare in tree for n in ast.walk(compare) if isinstance(n, ast.Constant) and n.value in RECIPES]
+    else:
+        found = [n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and n.value in RECIPES]
     assert not found

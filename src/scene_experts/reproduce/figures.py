@@ -47,14 +47,14 @@ def of_recipe(records: Sequence[Record], recipe: str, scene: str | None = None) 
 
 
 def relative_psnr(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str], path: Path) -> list[Path]:
-    """Figure 1(b): PSNR relative to 3DGS in percent, scenes in order of Scaffold-GS's anchors."""
+    """Figure 1(b): PSNR relative to the first row (3DGS) in percent, scenes in order of Scaffold-GS's anchors."""
     anchors = {s: m.value for s in scenes if (m := mean(of_recipe(records, "scaffold-gs", s), "anchors"))}
-    base = {s: m.value for s in scenes if (m := mean(of_recipe(records, "3dgs", s), "psnr"))}
+    (_, first), *others = experiment.rows.items()
+    base = {s: m.value for s in scenes if (m := mean(of_recipe(records, first, s), "psnr"))}
     shown = sorted((s for s in scenes if s in anchors and s in base), key=lambda s: anchors[s])
     if not shown:
         return []
     figure, axes = canvas(width=max(6.4, 0.9 * len(shown)))
-    others = [(name, recipe) for name, recipe in experiment.rows.items() if recipe != "3dgs"]
     for i, (name, recipe) in enumerate(others):
         found = [(j, m.value) for j, s in enumerate(shown) if (m := mean(of_recipe(records, recipe, s), "psnr"))]
         xs = [j + (i - (len(others) - 1) / 2) * 0.38 for j, _ in found]

@@ -59,7 +59,7 @@ class Keyframes:
 
     def path(self) -> CameraPath:
         """The keyframes alone, one every so many seconds: `render` and `play` join them."""
-        return CameraPath(tuple(replace(key, id=i) for i, key in enumerate(self.keys)), 1 / float(self.seconds.value))
+        return CameraPath(tuple(self.keys), 1 / float(self.seconds.value))
 
     def save(self, client: Any) -> None:
         """Write the path beside the run, and send it to the browser."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +105,7 @@ def from_keyframes(value: dict[str, Any], world: World, model: Camera, size: tup
     for i, pose in enumerate(found):
         t = float(times[0]) + i / rate
         angle = math.radians(float(linear(times, degrees, t)))
-        out.append(camera_of(model, pose, angle, width, height, i))
+        out.append(camera_of(model, pose, angle, width, height))
     return CameraPath(tuple(out), rate)
 
 
@@ -113,22 +114,22 @@ def from_nerfstudio(value: dict[str, Any], world: World, model: Camera, size: tu
         raise ValueError(f"camera_type: {value['camera_type']} is not drawn here, only perspective")
     width, height = size or (int(value["render_width"]), int(value["render_height"]))
     out = []
-    for i, entry in enumerate(value["camera_path"]):
+    for entry in value["camera_path"]:
         pose = proper(torch.tensor(entry["camera_to_world"], dtype=torch.float64).reshape(4, 4) @ OPENGL)
         rotation, place = pose[:3, :3], world.from_input(pose[:3, 3])
         to_cam = torch.eye(4, dtype=torch.float64)
         to_cam[:3, :3], to_cam[:3, 3] = rotation.T, -(rotation.T @ place)
-        out.append(camera_of(model, to_cam, math.radians(float(entry["fov"])), width, height, i))
+        out.append(camera_of(model, to_cam, math.radians(float(entry["fov"])), width, height))
     if not out:
         raise ValueError("camera_path: it is empty")
     return CameraPath(tuple(out), float(fps or value.get("fps", 24)))
 
 
-def camera_of(model: Camera, to_cam: Tensor, angle: float, width: int, height: int, number: int) -> Camera:
+def camera_of(model: Camera, to_cam: Tensor, angle: float, width: int, height: int) -> Camera:
     if not 0 < angle < math.pi:
         raise ValueError(f"fov: {math.degrees(angle):.3g} degrees is no field of view")
     camera = with_fov(model, angle, width, height)
-    return Camera(to_cam.float(), camera.K, width, height, camera.near, number)
+    return replace(camera, world_to_cam=to_cam.float())
 
 
 def proper(pose: Tensor) -> Tensor:

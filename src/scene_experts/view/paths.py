@@ -15,6 +15,7 @@ from scene_experts.geometry.rotation import matrix_to_quat, normalise_quats, qua
 from scene_experts.types import Camera
 
 NAMES = ("auto", "orbit", "spiral", "views")
+FREE = -1  # the id of a camera that is none of the capture's views: what belongs to a view (appearance codes) must not be taken
 FACING = 0.7  # cameras whose directions have a mean longer than this look the same way: an orbit would go behind the scene
 MOST_POSES = 40  # captured poses that a path goes through
 
@@ -87,7 +88,7 @@ def make(name: str, capture: Capture, frames: int, size: tuple[int, int] | None 
         raise InputError(f"expected a path among {', '.join(NAMES)} or a file, found '{name}'; correct --path")
     poses = {"orbit": orbit, "spiral": spiral, "views": through}[name](seen, frames)
     model = lens(seen.cameras, size)
-    return CameraPath(tuple(replace(model, world_to_cam=pose.float(), id=i) for i, pose in enumerate(poses)), fps)
+    return CameraPath(tuple(replace(model, world_to_cam=pose.float()) for pose in poses), fps)
 
 
 def orbit(seen: Around, frames: int) -> list[Tensor]:
@@ -200,7 +201,7 @@ def with_fov(camera: Camera, fov: float, width: int, height: int) -> Camera:
     """The camera with a vertical field of view (radians) and a size."""
     f = height / (2 * math.tan(fov / 2))
     K = torch.tensor([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
-    return replace(camera, K=K, width=width, height=height)
+    return replace(camera, K=K, width=width, height=height, id=FREE)
 
 
 def normalised(vector: Tensor) -> Tensor:
