@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <condition_variable>
 #include <mutex>
 #include <thread>
@@ -29,21 +30,49 @@ struct Job {
   }
 };
 
+inline void pause() {
+#if defined(__x86_64__) || defined(__i386__)
+  __builtin_ia32_pause();
+#elif defined(__aarch64__)
+  asm volatile("yield");
+#endif
+}
+
+// Waits for what another thread is about to do: some microseconds awake, since a sleep and a wake cost more than most gaps between two jobs;
+// not longer, since on a busy machine the other thread may not be running. Returns whether it happened.
+template <class Condition>
+bool soon(Condition&& condition) {
+  const auto end = std::chrono::steady_clock::now() + std::chrono::microseconds(25);
+  do {
+    for (int i = 0; i < 16; ++i) {
+      if (condition()) return true;
+      pause();
+    }
+  } while (std::chrono::steady_clock::now() < end);
+  return false;
+}
+
 class Pool {
  public:
   void run(Job& job, int threads) {
+    bool wake;
     {
       std::lock_guard lock(mutex_);
       while (static_cast<int>(workers_.size()) < threads - 1) workers_.emplace_back([this] { loop(); });
       job_ = &job;
       joined_ = 0;
       job.slots = threads - 1;
-      ++generation_;
+      generation_.fetch_add(1, std::memory_order_release);
+      wake = asleep_ > 0;
     }
-    wake_.notify_all();
+    if (wake) wake_.notify_all();
     job.work(0);
+    {
+      std::lock_guard lock(mutex_);
+      job_ = nullptr;  // nobody joins from here on
+    }
+    soon([&] { return active_.load(std::memory_order_acquire) == 0; });
     std::unique_lock lock(mutex_);
-    job_ = nullptr;  // nobody joins from here on
     idle_.wait(lock, [&] { return active_ == 0; });
   }
 
@@ -61,7 +90,15 @@ class Pool {
     uint64_t seen = 0;
     std::unique_lock lock(mutex_);
     for (;;) {
-      wake_.wait(lock, [&] { return stop_ || (job_ && generation_ != seen); });
+      const auto called = [&] { return stop_ || (job_ && generation_ != seen); };
+      if (!called()) {
+        lock.unlock();
+        soon([&] { return generation_.load(std::memory_order_acquire) != seen; });
+        lock.lock();
+        ++asleep_;
+        wake_.wait(lock, called);
+        --asleep_;
+      }
       if (stop_) return;
       seen = generation_;
       Job* job = job_;
@@ -79,8 +116,9 @@ class Pool {
   std::condition_variable wake_, idle_;
   std::vector<std::thread> workers_;
   Job* job_ = nullptr;
-  uint64_t generation_ = 0;
-  int joined_ = 0, active_ = 0;
+  std::atomic<uint64_t> generation_ = 0;  // changed under the mutex, as all here; read without it while waiting awake
+  std::atomic<int> active_ = 0;
+  int joined_ = 0, asleep_ = 0;
   bool stop_ = false;
 };
 

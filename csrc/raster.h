@@ -125,7 +125,6 @@ struct State {
   Buffer<uint32_t> group_first;   // [m / 16] place of the first of them
   Buffer<uint32_t> chunk_count;   // [chunks]
   Buffer<uint32_t> chunk_low, chunk_high;  // [chunks] range of the keys
-  Buffer<Item> half_sorted, sorted;        // [visible]; the second near to far in the end
   Buffer<uint32_t> histogram;
   Buffer<uint32_t> tile_begin;    // [tiles + 1] into `list`
   Buffer<uint32_t> tile_used;     // [tiles] how many of its list a tile looked at before all its pixels had stopped
@@ -134,7 +133,7 @@ struct State {
   Buffer<uint16_t> drawn;         // [batches, 16 blocks] how many of those were blended before all the block's pixels had stopped
   Buffer<float> transmittance;    // [tiles * 256] what is left at the end, in block order
   Buffer<float> checkpoints;      // [batches * 256] what is left before each batch but a tile's first, see batch()
-  Buffer<Sums> sums;              // backward: one row per place and worker, or (deterministic) per pair
+  Buffer<Sums> sums;              // backward: one row per place and worker, or (deterministic) per pair; forward sorts its items here
   Buffer<uint32_t> slots;         // deterministic backward: first row of each place
   Buffer<double> background;      // backward: [tiles * 3]
 

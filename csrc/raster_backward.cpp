@@ -280,7 +280,7 @@ void prepare_sums(State& s, int rows, int threads) {
 void blend_backward(State& s, const float* background, const Upstream& up, float* g_background, int rows, int threads) {
   prepare_sums(s, rows, threads);
   double* total = s.background.get(static_cast<size_t>(s.tiles()) * 3);
-  parallel_for(s.tiles(), 2, threads, [&](int64_t begin, int64_t end, int worker) {
+  parallel_for(s.tiles(), tiles_at_a_time(s, threads), threads, [&](int64_t begin, int64_t end, int worker) {
     Work& work = scratch<Work>();
     const Exp2 exp2;
     const Sink sink{s, rows ? s.sums.data() + worker * s.places() : nullptr};

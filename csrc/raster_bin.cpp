@@ -83,8 +83,8 @@ Slice whole_runs(const Item* items, int64_t n, Slice range, uint32_t low, int sh
   return {forward(range.begin), forward(range.end)};
 }
 
-// Leaves all visible Gaussians in `sorted`, near to far, ties by index.
-void sort_depths(State& s, int threads) {
+// All visible Gaussians, near to far, ties by index, in memory that backward will overwrite.
+const Item* sort_depths(State& s, int threads) {
   const int64_t chunks = s.places() / kChunk;
   uint32_t low = UINT32_MAX, high = 0;
   int64_t n = 0;
@@ -93,17 +93,19 @@ void sort_depths(State& s, int threads) {
     low = std::min(low, s.chunk_low.data()[c]), high = std::max(high, s.chunk_high.data()[c]);
   }
   s.visible = n;
-  Item *half = s.half_sorted.get(static_cast<size_t>(n)), *sorted = s.sorted.get(static_cast<size_t>(n));
-  if (n == 0) return;
+  static_assert(sizeof(Sums) == 4 * sizeof(Item));
+  Item *half = reinterpret_cast<Item*>(s.sums.get(static_cast<size_t>(n + 1) / 2)), *sorted = half + n;
+  if (n == 0) return sorted;
   const int width = 32 - __builtin_clz((high - low) | 1u);
   const int shift = std::max(0, width - 2 * kDigit);
   const int parts = n < kSmall ? 1 : threads;
   pass(s, s.items.data(), half, true, low, shift, parts, threads);
   pass(s, half, sorted, false, low, shift + kDigit, parts, threads);
-  if (shift == 0) return;
+  if (shift == 0) return sorted;
   std::vector<Slice> ranges;
   for (int p = 0; p < parts; ++p) ranges.push_back(whole_runs(sorted, n, slice(n, p, parts), low, shift));
   parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) { finish_runs(sorted, ranges[p], low, shift); });
+  return sorted;
 }
 
 // How many of a slice's rectangles hold each tile: each adds 1 at its first corner and takes it away past its sides; the running sums over
@@ -179,11 +181,10 @@ void fill_lists(const State& s, const Item* items, Slice range, uint32_t* at, ui
 }  // namespace
 
 void bin(State& s, int threads) {
-  sort_depths(s, threads);
+  const Item* items = sort_depths(s, threads);
   const int64_t n = s.visible;
   const int tiles = s.tiles();
   const int parts = n < kSmall ? 1 : threads;
-  const Item* items = s.sorted.data();
   uint32_t* counts = s.histogram.get(static_cast<size_t>(parts) * tiles);
   parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) {
     count_tiles(s, items, slice(n, static_cast<int>(p), parts), counts + p * tiles);

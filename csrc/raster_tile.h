@@ -235,6 +235,9 @@ inline void store_tile(float* picture, const CameraArgs& c, const Tile& tile, co
       });
 }
 
+// Tiles that a worker takes at a time: neighbours share Gaussians and fetch each other's ahead, but the last ones must not keep others waiting.
+inline int64_t tiles_at_a_time(const State& s, int threads) { return std::clamp<int64_t>(s.tiles() / (64 * int64_t{threads}), 1, 8); }
+
 // One T per thread, made at its first use. (A plain thread_local object in a shared library is found anew at each access, in inner loops.)
 template <class T>
 T& scratch() {

@@ -32,19 +32,19 @@ class Largest:
 def gaussian_bytes(pairs: float = _TILES) -> float:
     """Bytes that one drawn Gaussian takes during a step on the CPU; `pairs`: picture tiles that it touches.
 
-    68 as decoded (14 floats, its length, its slot), 76 of gradients, radius and 2D gradient; in the rasteriser 64 of its record, 8 of its
-    rectangle, 16 of keys, 64 of sums per thread, and 10 a pair (its place in a list, the masks and checkpoints of its batch).
+    68 as decoded (14 floats, its length, its slot), 76 of gradients, radius and 2D gradient; in the rasteriser 64 of its record, 16 of its
+    rectangle and key, 64 of sums per thread, and 8 a pair (its place in a list, the masks and checkpoints of its batch).
     """
     sums = 64 * min(native.threads(), 4)
-    return 68 + 76 + _SPARE * (64 + 8 + 16 + sums + 10 * pairs)
+    return 68 + 76 + _SPARE * (64 + 16 + sums + 8 * pairs)
 
 
 def frame_bytes(gaussians: int, pixels: int, pairs: float = _TILES) -> int:
     """Bytes of all the buffers of one frame, forward and backward, on the CPU.
 
-    A pixel takes 20 of picture, alpha and depth, 24 of target and gradient, and in the rasteriser 4 of transmittance and 6 of its tile's.
+    A pixel takes 20 of picture, alpha and depth, 24 of target and gradient, and in the rasteriser 4 of transmittance and 8 of its tile's.
     """
-    return int(gaussians * gaussian_bytes(pairs) + pixels * (44 + _SPARE * 10))
+    return int(gaussians * gaussian_bytes(pairs) + pixels * (44 + _SPARE * 12))
 
 
 def row_bytes(scene: Scene) -> int:

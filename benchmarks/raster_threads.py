@@ -1,0 +1,117 @@
+"""How the rasteriser gains from a second thread: on idle cores, and where other processes hold every core.
+
+    python benchmarks/raster_threads.py [--cloud garden.npz] [--case 100000,800,544] [--threads 2] [--rounds 60]
+
+Idle: wall time of a loop of multiply-adds that waits for nothing, and of the rasteriser forward + backward, on 1 thread and on several, taken
+in turns, minima; both go through the same pool. The ratio of the two scalings is what the rasteriser itself loses. Busy: as many endless
+loops as there are cores run beside it; mean wall time of a frame on 1 thread and on several, taken in turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import multiprocessing
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from raster_scene import read, scene, synthetic
+from scene_experts import native
+from scene_experts.render.cpu import CpuRasterizer
+from scene_experts.types import Camera, Gaussians
+
+CHUNKS = 512  # of multiply-adds: about as long as a frame
+
+
+def arithmetic(threads: int) -> Callable[[], None]:
+    """A loop that has nothing to wait for."""
+    library = native.load()
+    if library is None:
+        raise SystemExit(native.why_not())
+    library.se_arithmetic.restype, library.se_arithmetic.argtypes = ctypes.c_double, [ctypes.c_int64, ctypes.c_int32]
+    return lambda: library.se_arithmetic(CHUNKS, threads)
+
+
+def raster(g: Gaussians, camera: Camera, threads: int) -> Callable[[], None]:
+    """One picture and its gradients."""
+    draw = CpuRasterizer(threads=threads)
+    weights = torch.rand((camera.height, camera.width, 3), generator=torch.Generator().manual_seed(0))
+    leaves = [t.clone().requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.colors)]
+
+    def run() -> None:
+        draw(Gaussians(*leaves, g.source), camera, torch.zeros(3)).image.backward(weights)
+        for leaf in leaves:
+            leaf.grad = None
+
+    return run
+
+
+def times(runs: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[float]]:
+    """Wall seconds of each, taken in turns."""
+    taken: dict[str, list[float]] = {name: [] for name in runs}
+    for turn in range(rounds + 2):
+        for name, run in runs.items():
+            start = time.perf_counter()
+            run()
+            if turn >= 2:
+                taken[name].append(time.perf_counter() - start)
+    return taken
+
+
+def spin() -> None:
+    """Holds a core."""
+    while True:
+        pass
+
+
+def busy(runs: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[float]]:
+    """As `times`, with an endless loop for every core beside it."""
+    others = [multiprocessing.get_context("spawn").Process(target=spin, daemon=True) for _ in range(os.cpu_count() or 1)]
+    for other in others:
+        other.start()
+    try:
+        time.sleep(1.0)
+        return times(runs, rounds)
+    finally:
+        for other in others:
+            other.kill()
+            other.join()
+
+
+def report(g: Gaussians, camera: Camera, threads: int, rounds: int) -> None:
+    """Measures and prints both."""
+    several = f"{threads} threads"
+    runs = {
+        "loop 1": arithmetic(1),
+        f"loop {several}": arithmetic(threads),
+        "raster 1": raster(g, camera, 1),
+        f"raster {several}": raster(g, camera, threads),
+    }
+    least = {name: min(taken) for name, taken in times(runs, rounds).items()}
+    loop, drawn = least["loop 1"] / least[f"loop {several}"], least["raster 1"] / least[f"raster {several}"]
+    print(f"idle, {several}: multiply-adds {loop:.3f}x, rasteriser {drawn:.3f}x one thread: {drawn / loop:.3f} of it")
+    both = {name: run for name, run in runs.items() if name.startswith("raster")}
+    mean = {name: sum(taken) / len(taken) for name, taken in busy(both, rounds).items()}
+    one, more = mean["raster 1"], mean[f"raster {several}"]
+    print(f"busy, every core taken: one thread {1e3 * one:.1f} ms, {several} {1e3 * more:.1f} ms: {more / one:.2f} of its time")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cloud", type=Path, help="npz of a point cloud (default: one made in code)")
+    parser.add_argument("--case", default="100000,800,544", help="Gaussians,width,height")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=60)
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    count, width, height = (int(n) for n in args.case.split(","))
+    g, camera = scene(read(args.cloud) if args.cloud else synthetic(), count, width, height)
+    report(g, camera, args.threads, args.rounds)
+
+
+if __name__ == "__main__":
+    main()
