@@ -96,10 +96,10 @@ def work(recipe: str, anchors: int, width: int, height: int, rasterize: Rasteriz
 def figures(anchors: int, width: int, height: int, machine: Machine, seconds: float) -> list[Result]:
     """The parts of a step of the mixture, the whole of it beside one of the baseline, and Adam beside the memory it must move."""
     subjects: dict[str, Subject] = {recipe: work(recipe, anchors, width, height) for recipe in (MIXTURE, BASELINE)}
-    with torch_threads(machine.threads):
-        best = least(subjects, seconds, clock_for(machine.threads))
+    with torch_threads(1):
+        best = least(subjects, seconds, clock_for(1))
     mixture: Work = subjects[MIXTURE]  # type: ignore[assignment]
-    group = f"{GROUP} of {MIXTURE}, {machine.threads} thread(s)"
+    group = f"{GROUP} of {MIXTURE}, one thread"
     note = f"{round(anchors / 2):,} visible of {anchors:,} anchors, {mixture.drawn():,} Gaussians, {width}x{height}"
     out: list[Result] = [Figure(group, part, 1e3 * s, "ms") for part, s in zip(PARTS, best[MIXTURE], strict=True)]
     total, base = sum(best[MIXTURE]), sum(best[BASELINE])
@@ -107,9 +107,7 @@ def figures(anchors: int, width: int, height: int, machine: Machine, seconds: fl
     if machine.copied:
         moved = 28 * sum(p.numel() for g in mixture.training.optimizer.param_groups for p in g["params"])
         share = 100 * moved / machine.copied / best[MIXTURE][PARTS.index("adam")]
-        out.append(
-            Figure(group, "adam, share of one thread's memory bound", share, "%", note=f"{moved / 1e6:.0f} MB at the rate of a copy")
-        )
+        out.append(Figure(group, "adam, share of the memory bound", share, "%", note=f"{moved / 1e6:.0f} MB at a copy's rate; caches help"))
     return out
 
 

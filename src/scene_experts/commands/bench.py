@@ -19,7 +19,7 @@ class BenchCommand:
     seconds: float = 60.0
     """How long to measure, about. Below 30 the measured scenes are smaller."""
     threads: int | None = None
-    """Threads for the whole step and for the gain of threads; torch's own setting by default."""
+    """Threads whose gain over one is measured; torch's own setting by default."""
     json: Path | None = None
     """File to write the figures to, too."""
 
