@@ -25,27 +25,59 @@ struct Level {
   bool dense;
 };
 
-// Rows and weights of the eight corners around a place; z changes fastest.
-inline void corners(const float* unit, const Level& level, int64_t row[8], float weight[8]) {
+// Table rows and weights of the eight corners around a place; z changes fastest.
+inline void corners(const float* unit, const Level& level, int32_t row[8], float weight[8]) {
   int64_t at[3];
-  float part[3];
+  float share[3][2];
   for (int a = 0; a < 3; ++a) {
     const float place = unit[a] * static_cast<float>(level.cells), low = std::floor(place);
     at[a] = static_cast<int64_t>(low);
-    part[a] = place - low;
+    share[a][1] = place - low;
+    share[a][0] = 1.f - share[a][1];
   }
-  for (int i = 0; i < 8; ++i) {
-    const int dx = i >> 2, dy = (i >> 1) & 1, dz = i & 1;
-    const int64_t x = at[0] + dx, y = at[1] + dy, z = at[2] + dz, side = level.cells + 1;
-    if (level.dense) {
-      int64_t r = x + side * (y + side * z);
+  if (level.dense) {
+    const int64_t side = level.cells + 1;
+    for (int i = 0; i < 8; ++i) {
+      int64_t r = at[0] + (i >> 2) + side * (at[1] + ((i >> 1) & 1) + side * (at[2] + (i & 1)));
       if (r < 0 || r >= level.rows) r = (r % level.rows + level.rows) % level.rows;
-      row[i] = r;
-    } else {
-      const uint32_t hash = static_cast<uint32_t>(x) ^ (static_cast<uint32_t>(y) * kPrimeY) ^ (static_cast<uint32_t>(z) * kPrimeZ);
-      row[i] = hash & static_cast<uint32_t>(level.rows - 1);
+      row[i] = static_cast<int32_t>(r);
     }
-    weight[i] = (dx ? part[0] : 1.f - part[0]) * (dy ? part[1] : 1.f - part[1]) * (dz ? part[2] : 1.f - part[2]);
+  } else {
+    const uint32_t x = static_cast<uint32_t>(at[0]), y = static_cast<uint32_t>(at[1]) * kPrimeY, z = static_cast<uint32_t>(at[2]) * kPrimeZ;
+    const uint32_t xs[2] = {x, x + 1}, ys[2] = {y, y + kPrimeY}, zs[2] = {z, z + kPrimeZ}, mask = static_cast<uint32_t>(level.rows - 1);
+    for (int i = 0; i < 8; ++i) row[i] = static_cast<int32_t>((xs[i >> 2] ^ ys[(i >> 1) & 1] ^ zs[i & 1]) & mask);
+  }
+  for (int i = 0; i < 8; ++i) weight[i] = share[0][i >> 2] * share[1][(i >> 1) & 1] * share[2][i & 1];
+}
+
+// One level for places [begin, end): C features a row, or `features` of them where C is 0.
+template <int C>
+void blend_level(const Level& level, const float* table, const float* unit, int64_t begin, int64_t end, int64_t stride, int64_t features,
+                 float* out) {
+  const int64_t n = C ? C : features;
+  for (int64_t a = begin; a < end; ++a) {
+    int32_t row[8];
+    float weight[8];
+    corners(unit + 3 * a, level, row, weight);
+    float* to = out + a * stride;
+    for (int64_t c = 0; c < n; ++c) {
+      float sum = 0.f;
+      for (int i = 0; i < 8; ++i) sum += weight[i] * table[row[i] * n + c];
+      to[c] = sum;
+    }
+  }
+}
+
+template <int C>
+void spread_level(const Level& level, const float* unit, const float* grad, int64_t A, int64_t stride, int64_t features, float* out) {
+  const int64_t n = C ? C : features;
+  for (int64_t a = 0; a < A; ++a) {
+    int32_t row[8];
+    float weight[8];
+    corners(unit + 3 * a, level, row, weight);
+    const float* from = grad + a * stride;
+    for (int i = 0; i < 8; ++i)
+      for (int64_t c = 0; c < n; ++c) out[row[i] * n + c] += weight[i] * from[c];
   }
 }
 
@@ -138,19 +170,10 @@ SE_EXPORT void se_graph_backward(const float* feature, const float* least, const
 SE_EXPORT void se_grid_forward(const float* table, const float* unit, const int64_t* cells, const int64_t* rows, int64_t A, int64_t levels,
                                int64_t features, float* out, int32_t threads) {
   se::parallel_for(A, kPlaces, threads, [&](int64_t begin, int64_t end, int) {
-    int64_t row[8];
-    float weight[8];
     for (int64_t l = 0; l < levels; ++l) {  // level by level, so that its part of the table stays near
       const Level level = level_of(cells, rows, l);
-      for (int64_t a = begin; a < end; ++a) {
-        corners(unit + 3 * a, level, row, weight);
-        float* to = out + (a * levels + l) * features;
-        for (int64_t c = 0; c < features; ++c) to[c] = 0.f;
-        for (int i = 0; i < 8; ++i) {
-          const float* from = table + (level.first + row[i]) * features;
-          for (int64_t c = 0; c < features; ++c) to[c] += weight[i] * from[c];
-        }
-      }
+      const auto run = features == 2 ? blend_level<2> : blend_level<0>;
+      run(level, table + level.first * features, unit, begin, end, levels * features, features, out + l * features);
     }
   });
 }
@@ -159,18 +182,10 @@ SE_EXPORT void se_grid_forward(const float* table, const float* unit, const int6
 SE_EXPORT void se_grid_backward(const float* unit, const float* grad, const int64_t* cells, const int64_t* rows, int64_t A, int64_t levels,
                                 int64_t features, float* out, int32_t threads) {
   se::parallel_for(levels, 1, threads, [&](int64_t begin, int64_t end, int) {
-    int64_t row[8];
-    float weight[8];
     for (int64_t l = begin; l < end; ++l) {
       const Level level = level_of(cells, rows, l);
-      for (int64_t a = 0; a < A; ++a) {
-        corners(unit + 3 * a, level, row, weight);
-        const float* from = grad + (a * levels + l) * features;
-        for (int i = 0; i < 8; ++i) {
-          float* to = out + (level.first + row[i]) * features;
-          for (int64_t c = 0; c < features; ++c) to[c] += weight[i] * from[c];
-        }
-      }
+      const auto run = features == 2 ? spread_level<2> : spread_level<0>;
+      run(level, unit, grad + l * features, A, levels * features, features, out + level.first * features);
     }
   });
 }
