@@ -220,3 +220,14 @@ def test_killed_at_random_points_of_saving_nothing_is_lost(tmp_path):
             step = meta["step"] + 1
         server.stdin.close()
     assert step > 1 and midway > 0, "no kill came in the middle of a save: the test has shown nothing"
+
+
+def test_the_newest_whole_one_is_read_once(tmp_path, monkeypatch):
+    good = checkpoint.save(tmp_path, 3, {"x": torch.arange(3)}, {"step": 3})
+    (tmp_path / "ckpt_000009.safetensors").write_bytes(good.read_bytes()[:-4])
+    reads = []
+    real = checkpoint.read_tensors
+    monkeypatch.setattr(checkpoint, "read_tensors", lambda path, *a: reads.append(path) or real(path, *a))
+    found = checkpoint.newest(tmp_path)
+    assert found is not None and torch.equal(found[0]["x"], torch.arange(3)) and found[1] == {"step": 3}
+    assert reads == [tmp_path / "ckpt_000009.safetensors", good] and checkpoint.newest(tmp_path / "none") is None

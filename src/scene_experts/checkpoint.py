@@ -53,13 +53,27 @@ def save(folder: Path, step: int, tensors: dict[str, Tensor], meta: dict[str, An
 
 def latest(folder: Path) -> Path | None:
     """The newest checkpoint in `folder` that is whole, or None; files cut short or damaged are skipped with a warning."""
+    found = _whole(folder)
+    return found[0] if found else None
+
+
+def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+    """Tensors and meta of the newest whole checkpoint, read once; None where there is none. Raises InputError for another format version."""
+    found = _whole(folder)
+    if found is None:
+        return None
+    path, tensors, meta = found
+    with safe_open(path, framework="pt", device="cpu") as file:
+        _expect_format(_head((file.metadata() or {}).get(KEY), KIND, path), KIND, FORMAT, path)
+    return tensors, meta
+
+
+def _whole(folder: Path) -> tuple[Path, dict[str, Tensor], dict[str, Any]] | None:
     for _, path in _numbered(Path(folder)):
         try:
-            read_tensors(path, KIND)
+            return path, *read_tensors(path, KIND)
         except InputError as error:
             log.warning("skipped a checkpoint: %s", error)
-        else:
-            return path
     return None
 
 
@@ -112,11 +126,8 @@ def read_tensors(path: Path, kind: str, version: int | None = None) -> tuple[dic
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
             head = _head((file.metadata() or {}).get(KEY), kind, path)
-            if version is not None and head["format"] != version:
-                raise InputError(
-                    f"expected {what} of format {version} at {path}, found format {head['format']}; "
-                    f"use the version of scene-experts that wrote it, or write it again"
-                )
+            if version is not None:
+                _expect_format(head, kind, version, path)
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 - not a mapping
     except (SafetensorError, OSError) as error:
         raise InputError(
@@ -125,6 +136,14 @@ def read_tensors(path: Path, kind: str, version: int | None = None) -> tuple[dic
     if digest(tensors) != head["sha256"]:
         raise InputError(f"expected {what} at {path}, found one whose contents are damaged (checksum); use an older one or copy it again")
     return tensors, head["meta"]
+
+
+def _expect_format(head: dict[str, Any], kind: str, version: int, path: Path) -> None:
+    if head["format"] != version:
+        raise InputError(
+            f"expected a {kind} file of format {version} at {path}, found format {head['format']}; "
+            f"use the version of scene-experts that wrote it, or write it again"
+        )
 
 
 def _head(text: str | None, kind: str, path: Path) -> dict[str, Any]:

@@ -15,8 +15,10 @@ import platform
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor
 
 import scene_experts
 from scene_experts import checkpoint
@@ -160,17 +162,28 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     """The newest whole checkpoint of a run (or the one at `step`). Raises InputError when there is none."""
     config = read_config(run)
     folder = run / "checkpoints"
-    path = checkpoint.latest(folder) if step is None else folder / f"ckpt_{step:06d}.safetensors"
-    if path is None and any(folder.glob("ckpt_*.safetensors")):
-        raise InputError(f"expected a whole checkpoint in {folder}, found only damaged ones; copy one back or train again")
-    if path is None:
-        raise InputError(f"expected a checkpoint in {folder}, found none; train first, or use --resume")
-    if not path.is_file():
-        kept = ", ".join(str(int(p.stem[5:])) for p in sorted(folder.glob("ckpt_*.safetensors")) if p.stem[5:].isdigit()) or "none"
-        raise InputError(f"expected a checkpoint at step {step} in {folder}, found {kept}; give one of those, or leave --step out")
-    tensors, meta = checkpoint.load(path)
+    tensors, meta = newest(folder) if step is None else at_step(folder, step)
     checkpoint.expect(meta, recipe=config.train.recipe)
     cfg = config.train.scaled()
     scene = to_device(scene_from(cfg, tensors, meta), device)
     scene.eval()
     return OpenRun(run, config, cfg, scene, int(meta["step"]), float(meta["seconds"]), meta.get("capture", ""))
+
+
+def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and meta of the newest whole checkpoint."""
+    found = checkpoint.newest(folder)
+    if found is None and any(folder.glob("ckpt_*.safetensors")):
+        raise InputError(f"expected a whole checkpoint in {folder}, found only damaged ones; copy one back or train again")
+    if found is None:
+        raise InputError(f"expected a checkpoint in {folder}, found none; train first, or use --resume")
+    return found
+
+
+def at_step(folder: Path, step: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and meta of the checkpoint at a step."""
+    path = folder / f"ckpt_{step:06d}.safetensors"
+    if not path.is_file():
+        kept = ", ".join(str(int(p.stem[5:])) for p in sorted(folder.glob("ckpt_*.safetensors")) if p.stem[5:].isdigit()) or "none"
+        raise InputError(f"expected a checkpoint at step {step} in {folder}, found {kept}; give one of those, or leave --step out")
+    return checkpoint.load(path)

@@ -173,11 +173,11 @@ def save(training: Training, folder: Path, keep: int) -> Path:
 
 def resume(cfg: Train, folder: Path, device: str) -> Training | None:
     """The newest whole checkpoint of a run, or None where there is none yet. Raises InputError where all that there are are damaged."""
-    path = checkpoint.latest(folder)
-    if path is None and any(folder.glob("ckpt_*.safetensors")):
+    found = checkpoint.newest(folder)
+    if found is None and any(folder.glob("ckpt_*.safetensors")):
         raise InputError(f"expected a whole checkpoint in {folder}, found only damaged ones; copy one back, or begin anew with --overwrite")
-    if path is None:
+    if found is None:
         return None
-    tensors, meta = checkpoint.load(path)
+    tensors, meta = found
     checkpoint.expect(meta, recipe=cfg.recipe)
     return Training.restore(cfg, tensors, meta, device)
