@@ -58,7 +58,10 @@ def latest(folder: Path) -> Path | None:
 
 
 def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-    """Tensors and meta of the newest whole checkpoint, read once; None where there is none. Raises InputError for another format version."""
+    """Tensors and meta of the newest whole checkpoint, read once; None where there is none.
+
+    Raises InputError for another format version.
+    """
     found = _whole(folder)
     if found is None:
         return None
