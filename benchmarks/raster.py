@@ -1,11 +1,11 @@
 """Times the CPU rasteriser, forward + backward, against a scalar C++ peer and the pure-torch reference, on one scene.
 
-    python benchmarks/raster.py [--cloud garden.npz] [--cases 100000,800,544 ...] [--levels avx512 avx2] [--reference] [--threads 1]
+    python benchmarks/raster.py [--cloud garden.npz] [--cases 100000,800,544 ...] [--levels avx512 avx2] [--reference] [--threads 1] [--scaling]
 
 Times of one thread are processor time, the least of interleaved runs, so that a busy machine blurs them little; with more threads they are
 wall time. "cycles/pair" is core cycles (time x clock, the clock measured by a loop of dependent additions) per composited (pixel,
 Gaussian) pair, forward + backward; the peer counts the pairs. The peer is benchmarks/peer/raster_peer.cpp, compiled here with
--O3 -march=native.
+-O3 -march=native. `--scaling` measures threads instead: see raster_threads.py.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+import raster_threads
 from raster_scene import read, scene, synthetic
 from scene_experts import native
 from scene_experts.render import cpu
@@ -164,12 +165,18 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeat", type=int, default=15)
     parser.add_argument("--reference", action="store_true", help="also time the pure-torch reference (a minute or more)")
+    parser.add_argument("--scaling", action="store_true", help="only: what a second thread brings, idle and busy (raster_threads.py)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
+    cases = [tuple(int(n) for n in case.split(",")) for case in args.cases]
+    if args.scaling:
+        for count, width, height in cases:
+            g, camera = scene(read(args.cloud) if args.cloud else synthetic(), count, width, height)
+            raster_threads.report(g, camera, max(2, args.threads), 4 * args.repeat)
+        return
     with tempfile.TemporaryDirectory() as folder:
         library = compile_peer(Path(folder))
-        for case in args.cases:
-            count, width, height = (int(n) for n in case.split(","))
+        for count, width, height in cases:
             run((count, width, height), args, library)
 
 

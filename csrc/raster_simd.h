@@ -5,6 +5,18 @@
 //   Exp2 (relative error below 4e-7; anything where p < -126), reciprocal (to rounding), split_exponent, transpose (16 x 16),
 //   load_pairs(p, a, b): p[0][0] p[1][0] ... and p[0][1] p[1][1] ...
 #pragma once
+#include <cstdint>
+
+// Four of the eight lanes of two vectors.
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_shufflevector)
+#define SE_SHUFFLE __builtin_shufflevector
+#endif
+#endif
+#ifndef SE_SHUFFLE  // GCC before 12
+#define SE_SHUFFLE(a, b, ...) __builtin_shuffle(a, b, (int32_t __attribute__((vector_size(16)))){__VA_ARGS__})
+#endif
+
 #if defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512BW__)
 #include "raster_simd_avx512.h"
 #elif defined(__AVX2__) && defined(__FMA__)

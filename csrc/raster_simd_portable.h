@@ -1,9 +1,12 @@
-// Sixteen floats in four 16-byte vectors of the compiler (SSE2, NEON, or scalars); see raster_simd.h for what each function promises.
+// Sixteen floats in four 16-byte vectors of the compiler (SSE2, NEON); see raster_simd.h for what each function promises.
 #pragma once
 #include <cmath>
 #include <cstdint>
 #include "raster_packing.h"
 #include <cstring>
+#if defined(__aarch64__)
+#include <arm_neon.h>
+#endif
 
 namespace se {
 
@@ -43,17 +46,25 @@ inline F16 operator+(F16 a, F16 b) { SE_ALL(F16, a.v[i] + b.v[i]); }
 inline F16 operator-(F16 a, F16 b) { SE_ALL(F16, a.v[i] - b.v[i]); }
 inline F16 operator*(F16 a, F16 b) { SE_ALL(F16, a.v[i] * b.v[i]); }
 inline F16 operator/(F16 a, F16 b) { SE_ALL(F16, a.v[i] / b.v[i]); }
-#if defined(__aarch64__) || defined(__FMA__)
-inline V4 fma4(V4 a, V4 b, V4 c) {
-  V4 r;
-  for (int k = 0; k < 4; ++k) r[k] = __builtin_fmaf(a[k], b[k], c[k]);
-  return r;
-}
+#if defined(__aarch64__)
+inline V4 fma4(V4 a, V4 b, V4 c) { return (V4)vfmaq_f32((float32x4_t)c, (float32x4_t)a, (float32x4_t)b); }
+inline V4 fnma4(V4 a, V4 b, V4 c) { return (V4)vfmsq_f32((float32x4_t)c, (float32x4_t)a, (float32x4_t)b); }
+inline V4 sqrt4(V4 a) { return (V4)vsqrtq_f32((float32x4_t)a); }
+inline V4 ceil4(V4 a) { return (V4)vrndpq_f32((float32x4_t)a); }
+inline V4 floor4(V4 a) { return (V4)vrndmq_f32((float32x4_t)a); }
+inline bool any4(I4 a) { return vmaxvq_u32((uint32x4_t)a) != 0; }
+inline uint32_t sum4(I4 a) { return vaddvq_u32((uint32x4_t)a); }
 #else
 inline V4 fma4(V4 a, V4 b, V4 c) { return a * b + c; }
+inline V4 fnma4(V4 a, V4 b, V4 c) { return c - a * b; }
+inline V4 sqrt4(V4 a) { return V4{__builtin_sqrtf(a[0]), __builtin_sqrtf(a[1]), __builtin_sqrtf(a[2]), __builtin_sqrtf(a[3])}; }
+inline V4 ceil4(V4 a) { return V4{__builtin_ceilf(a[0]), __builtin_ceilf(a[1]), __builtin_ceilf(a[2]), __builtin_ceilf(a[3])}; }
+inline V4 floor4(V4 a) { return V4{__builtin_floorf(a[0]), __builtin_floorf(a[1]), __builtin_floorf(a[2]), __builtin_floorf(a[3])}; }
+inline bool any4(I4 a) { return (a[0] | a[1] | a[2] | a[3]) != 0; }
+inline uint32_t sum4(I4 a) { return static_cast<uint32_t>(a[0] + a[1] + a[2] + a[3]); }
 #endif
 inline F16 fma(F16 a, F16 b, F16 c) { SE_ALL(F16, fma4(a.v[i], b.v[i], c.v[i])); }
-inline F16 fnma(F16 a, F16 b, F16 c) { SE_ALL(F16, fma4(-a.v[i], b.v[i], c.v[i])); }
+inline F16 fnma(F16 a, F16 b, F16 c) { SE_ALL(F16, fnma4(a.v[i], b.v[i], c.v[i])); }
 inline F16 min(F16 a, F16 b) { SE_ALL(F16, a.v[i] < b.v[i] ? a.v[i] : b.v[i]); }
 inline F16 max(F16 a, F16 b) { SE_ALL(F16, a.v[i] > b.v[i] ? a.v[i] : b.v[i]); }
 inline M16 ge(F16 a, F16 b) { SE_ALL(M16, a.v[i] >= b.v[i]); }
@@ -64,39 +75,21 @@ inline F16 select(M16 m, F16 a, F16 b) { SE_ALL(F16, (V4)((m.v[i] & (I4)a.v[i]) 
 inline F16 keep(M16 m, F16 a) { SE_ALL(F16, (V4)(m.v[i] & (I4)a.v[i])); }
 inline F16 mul_keep(M16 m, F16 a, F16 b) { return keep(m, a * b); }
 inline F16 min_keep(M16 m, F16 a, F16 b) { return keep(m, min(a, b)); }
-inline F16 sqrt(F16 a) {
-  F16 r;
-  SE_EACH for (int k = 0; k < 4; ++k) r.v[i][k] = __builtin_sqrtf(a.v[i][k]);
-  return r;
-}
-inline F16 ceil(F16 a) {
-  F16 r;
-  SE_EACH for (int k = 0; k < 4; ++k) r.v[i][k] = __builtin_ceilf(a.v[i][k]);
-  return r;
-}
-inline F16 floor(F16 a) {
-  F16 r;
-  SE_EACH for (int k = 0; k < 4; ++k) r.v[i][k] = __builtin_floorf(a.v[i][k]);
-  return r;
-}
+inline F16 sqrt(F16 a) { SE_ALL(F16, sqrt4(a.v[i])); }
+inline F16 ceil(F16 a) { SE_ALL(F16, ceil4(a.v[i])); }
+inline F16 floor(F16 a) { SE_ALL(F16, floor4(a.v[i])); }
 // sum[k] += weight * by[k] in the lanes of the mask.
 inline void add_where(M16 m, F16 weight, const float* by, F16 (&sum)[4]) {
   const F16 kept = keep(m, weight);
   for (int k = 0; k < 4; ++k) sum[k] = fma(kept, bcast(by[k]), sum[k]);
 }
 inline uint32_t bits(M16 m) {
-  uint32_t r = 0;
-  SE_EACH {
-    const I4 weight = {1 << 0, 1 << 1, 1 << 2, 1 << 3};
-    const I4 b = m.v[i] & weight;
-    r |= static_cast<uint32_t>(b[0] | b[1] | b[2] | b[3]) << (4 * i);
-  }
-  return r;
+  const I4 weight = {1 << 0, 1 << 1, 1 << 2, 1 << 3};
+  I4 all = m.v[0] & weight;
+  for (int i = 1; i < 4; ++i) all |= m.v[i] & (weight << 4 * i);
+  return sum4(all);
 }
-inline bool any(M16 m) {
-  const I4 o = (m.v[0] | m.v[1]) | (m.v[2] | m.v[3]);
-  return (o[0] | o[1] | o[2] | o[3]) != 0;
-}
+inline bool any(M16 m) { return any4((m.v[0] | m.v[1]) | (m.v[2] | m.v[3])); }
 inline void store_int(int32_t* p, F16 a) {
   for (int k = 0; k < 16; ++k) p[k] = static_cast<int32_t>(a.v[k / 4][k % 4]);
 }
@@ -169,13 +162,12 @@ template <int C>
 inline F16 column(F16 a) {
   SE_ALL(F16, (V4{a.v[i][C], a.v[i][C], a.v[i][C], a.v[i][C]}));
 }
-// Each quarter of four values, as a 4 x 4 matrix.
-inline void transpose4(F16 (&r)[4]) {
-  SE_EACH {
-    const V4 w = r[0].v[i], x = r[1].v[i], y = r[2].v[i], z = r[3].v[i];
-    for (int k = 0; k < 4; ++k) r[k].v[i] = V4{w[k], x[k], y[k], z[k]};
-  }
+inline void transpose4(V4& w, V4& x, V4& y, V4& z) {
+  const V4 a = SE_SHUFFLE(w, x, 0, 4, 1, 5), b = SE_SHUFFLE(w, x, 2, 6, 3, 7), c = SE_SHUFFLE(y, z, 0, 4, 1, 5), d = SE_SHUFFLE(y, z, 2, 6, 3, 7);
+  w = SE_SHUFFLE(a, c, 0, 1, 4, 5), x = SE_SHUFFLE(a, c, 2, 3, 6, 7), y = SE_SHUFFLE(b, d, 0, 1, 4, 5), z = SE_SHUFFLE(b, d, 2, 3, 6, 7);
 }
+// Each quarter of four values, as a 4 x 4 matrix.
+inline void transpose4(F16 (&r)[4]) { SE_EACH transpose4(r[0].v[i], r[1].v[i], r[2].v[i], r[3].v[i]); }
 // Quarter q of value j becomes quarter j of value q.
 inline void transpose_quarters(F16 (&r)[4]) {
   F16 t[4];
@@ -187,11 +179,14 @@ inline void transpose_quarters(F16 (&r)[4]) {
 inline F16 sum_quarters(const F16 (&a)[4]) { SE_ALL(F16, (a[i].v[0] + a[i].v[2]) + (a[i].v[1] + a[i].v[3])); }
 
 inline void transpose(F16 (&r)[16]) {
-  float t[16][16], s[16][16];
-  for (int i = 0; i < 16; ++i) store(t[i], r[i]);
-  for (int i = 0; i < 16; ++i)
-    for (int j = 0; j < 16; ++j) s[j][i] = t[i][j];
-  for (int i = 0; i < 16; ++i) r[i] = load(s[i]);
+  F16 t[16];
+  for (int a = 0; a < 4; ++a)
+    for (int b = 0; b < 4; ++b) {
+      V4 w = r[4 * a].v[b], x = r[4 * a + 1].v[b], y = r[4 * a + 2].v[b], z = r[4 * a + 3].v[b];
+      transpose4(w, x, y, z);
+      t[4 * b].v[a] = w, t[4 * b + 1].v[a] = x, t[4 * b + 2].v[a] = y, t[4 * b + 3].v[a] = z;
+    }
+  for (int i = 0; i < 16; ++i) r[i] = t[i];
 }
 #undef SE_EACH
 #undef SE_ALL

@@ -155,27 +155,17 @@ inline void alphas(const Row* const (&row)[4], int block_column, F16 y, const Ex
 }
 
 // Four pixels of three interleaved channels, apart and together again.
-#if defined(__has_builtin)
-#if __has_builtin(__builtin_shufflevector)
-#define SE_SHUFFLE __builtin_shufflevector
-#endif
-#endif
 typedef float Four __attribute__((vector_size(16)));
 
 inline void split_rgb(const float* p, float* r, float* g, float* b) {
-#if defined(SE_SHUFFLE)
   Four x, y, z;  // r0 g0 b0 r1, g1 b1 r2 g2, b2 r3 g3 b3
   std::memcpy(&x, p, 16), std::memcpy(&y, p + 4, 16), std::memcpy(&z, p + 8, 16);
   const Four low = SE_SHUFFLE(x, y, 1, 2, 4, 5), high = SE_SHUFFLE(y, z, 2, 3, 5, 6);  // g0 b0 g1 b1, r2 g2 r3 g3
   const Four red = SE_SHUFFLE(x, high, 0, 3, 4, 6), green = SE_SHUFFLE(low, high, 0, 2, 5, 7), blue = SE_SHUFFLE(low, z, 1, 3, 4, 7);
   std::memcpy(r, &red, 16), std::memcpy(g, &green, 16), std::memcpy(b, &blue, 16);
-#else
-  for (int i = 0; i < 4; ++i) r[i] = p[3 * i], g[i] = p[3 * i + 1], b[i] = p[3 * i + 2];
-#endif
 }
 
 inline void join_rgb(float* p, const float* r, const float* g, const float* b) {
-#if defined(SE_SHUFFLE)
   Four red, green, blue;
   std::memcpy(&red, r, 16), std::memcpy(&green, g, 16), std::memcpy(&blue, b, 16);
   const Four rg = SE_SHUFFLE(red, green, 0, 4, 1, 5), gb = SE_SHUFFLE(green, blue, 1, 5, 2, 6), br = SE_SHUFFLE(blue, red, 0, 5, 2, 7);
@@ -185,9 +175,6 @@ inline void join_rgb(float* p, const float* r, const float* g, const float* b) {
   const Four end = SE_SHUFFLE(middle, blue, 2, 3, 7, 7);       // r3 g3 b3 b3
   const Four z = SE_SHUFFLE(br, end, 2, 4, 5, 6);              // b2 r3 g3 b3
   std::memcpy(p, &x, 16), std::memcpy(p + 4, &y, 16), std::memcpy(p + 8, &z, 16);
-#else
-  for (int i = 0; i < 4; ++i) p[3 * i] = r[i], p[3 * i + 1] = g[i], p[3 * i + 2] = b[i];
-#endif
 }
 
 // Calls whole(offset in the picture, place in block order) for four neighbours at a time where the tile lies inside the picture,
