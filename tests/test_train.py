@@ -18,6 +18,7 @@ from scene_experts.render import choose
 from scene_experts.scene.anchors import Anchors
 from scene_experts.scene.experts import Experts
 from scene_experts.scene.explicit import Explicit
+from scene_experts.scene.graph_points import GraphPoints
 from scene_experts.state import Training
 from scene_experts.train import Run, iterate, rows_to_move, stepped, train, without_graph
 from synthetic import make_capture
@@ -122,8 +123,10 @@ def test_losses_follow_the_golden_curve(recipe, tmp_path):
         cfg = config(recipe, iterations=1000, max_anchors=480)
     elif isinstance(cfg.scene, Anchors) and isinstance(cfg.scene.decoder, Experts):
         cfg = replace(cfg, scene=replace(cfg.scene, decoder=replace(cfg.scene.decoder, warmup=50)))
+    # Adam's first steps leave SAGS's features in near-ties; which of them its maxima take is soon a matter of the last bit.
+    until = 25 if isinstance(cfg.scene, GraphPoints) else 100
     folder = make_capture(tmp_path, views=8, size=(48, 32), points=400).folder
-    seen = events(cfg, folder, rasterizer="reference", stop_at=100, log_every=5, dtype=torch.float64)
+    seen = events(cfg, folder, rasterizer="reference", stop_at=until, log_every=5, dtype=torch.float64)
     curve = [sum(e.terms.values()) for e in seen if isinstance(e, Stepped)]
     path = GOLDEN / f"{recipe}.json"
     if os.environ.get("SCENE_EXPERTS_RECORD"):

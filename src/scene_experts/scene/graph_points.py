@@ -8,7 +8,7 @@ networks without biases turn that into the Gaussian.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -25,7 +25,7 @@ from scene_experts.scene import Cull
 from scene_experts.scene.anchors import EPS, VoxelChoice, voxel_size
 from scene_experts.scene.graph import Graph, blended
 from scene_experts.scene.hash_grid import HashGrid
-from scene_experts.scene.mlp import ACTIVATIONS, CHANNELS
+from scene_experts.scene.mlp import CHANNELS
 from scene_experts.scene.select import visible_rows
 from scene_experts.schedule import Rate
 from scene_experts.table import Table
@@ -97,17 +97,24 @@ class GraphPoints:
 
 
 class Unbiased(nn.Module):
-    """Linear layers without biases, Glorot-uniform at first; a ReLU between them unless `linear`."""
+    """Linear layers without biases, Glorot-uniform at first."""
 
-    def __init__(self, sizes: Sequence[int], linear: bool = False) -> None:
+    def __init__(self, sizes: Sequence[int]) -> None:
         super().__init__()
-        self.linear = linear
         self.layers = nn.ParameterList(nn.init.xavier_uniform_(torch.empty(b, a)) for a, b in pairwise(sizes))
 
-    def forward(self, x: Tensor) -> Tensor:
-        for i, layer in enumerate(self.layers):
-            x = functional.linear(x if i == 0 or self.linear else functional.relu(x), layer)
-        return x
+    def product(self) -> Tensor:
+        """The one linear map that the layers are when nothing stands between them, [out, in]."""
+        out = self.layers[0]
+        for layer in list(self.layers)[1:]:
+            out = layer @ out
+        return out
+
+    def after_first(self, h: Tensor) -> Tensor:
+        """The outputs from what the first layer gave, with a ReLU before every other one."""
+        for layer in list(self.layers)[1:]:
+            h = functional.linear(functional.relu(h), layer)
+        return h
 
 
 class GraphScene(nn.Module):
@@ -128,8 +135,9 @@ class GraphScene(nn.Module):
         width = 2 * config.F + config.grid.width
         self.alpha, self.beta = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
         inner = [width + 4, config.hidden, config.hidden]  # with direction and distance
-        self.heads = nn.ModuleDict({name: Unbiased([*inner, size]) for name, size in CHANNELS.items()})
-        self.offsets = Unbiased([width, config.offset_hidden, 3], linear=True)
+        heads = {name: Unbiased([*inner, size]) for name, size in CHANNELS.items()}
+        self.heads: Mapping[str, Unbiased] = nn.ModuleDict(heads)  # type: ignore[assignment]
+        self.offsets = Unbiased([width, config.offset_hidden, 3])
         self._graph: tuple[Tensor, Graph] | None = None  # of the places it was made of
 
     def meta(self) -> dict[str, Any]:
@@ -147,8 +155,8 @@ class GraphScene(nn.Module):
         Without biases or features it sees little but distances, and where all is hidden no gradient would ever show it.
         """
         rows = torch.arange(0, len(self.table), max(1, len(self.table) // PROBES))
-        encoded = self.encode(rows)
-        raw = [self.heads["opacity"](torch.cat([encoded, self.view(rows, camera)], dim=1)).tanh().mean() for camera in cameras]
+        own, strongest = self.encode(rows)
+        raw = [self.opacity(torch.cat([own, self.view(rows, camera)], dim=1), strongest).mean() for camera in cameras]
         if raw and float(torch.stack(raw).mean()) < 0:
             next(reversed(list(self.heads["opacity"].parameters()))).neg_()
 
@@ -166,32 +174,55 @@ class GraphScene(nn.Module):
         rows = visible_rows(None, table.facts["xyz"], table.params["log_scaling"].detach()[:, :3].exp(), camera, cull)
         return self.decode(rows, camera)
 
-    def encode(self, rows: Tensor, told: Tensor | None = None) -> Tensor:
-        """What the networks see of points [A], from the graph among them: [A, 2 F + grid]; with `told` [P], of rows[told] alone."""
+    def encode(self, rows: Tensor, told: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """What the networks see of points [A], from the graph among them: each one's own [A, grid + F], and what all share [F].
+
+        With `told` [P], of rows[told] alone.
+        """
         feature = self.table.params["feature"].index_select(0, rows)
         near = blended(feature, *self.graph().among(rows), self.config.blend)
         strongest = feature.amax(0) if len(rows) else feature.new_zeros(self.config.F)
         if told is not None:
             near, rows = near.index_select(0, told), rows.index_select(0, told)
-        place = self.grid(self.table.facts["xyz"].index_select(0, rows))
-        return torch.cat([place, near, strongest.expand(len(rows), -1)], dim=1) * self.alpha + self.beta
+        return torch.cat([self.grid(self.table.facts["xyz"].index_select(0, rows)), near], dim=1), strongest
+
+    def folded(self, weight: Tensor, strongest: Tensor) -> tuple[Tensor, Tensor]:
+        """A first layer [H, 2 F + grid (+ 4)] for `encode`'s rows (and a view's 4): [H, grid + F (+ 4)] and the bias [H] of the rest.
+
+        weight ([own, strongest] alpha + beta) in other brackets: nothing of size A is scaled, and what all share is multiplied once.
+        """
+        width, own = len(self.alpha), len(self.alpha) - self.config.F
+        encoded = weight[:, :width] * self.alpha
+        bias = encoded[:, own:] @ strongest + weight[:, :width] @ self.beta
+        return torch.cat([encoded[:, :own], weight[:, width:]], dim=1), bias
+
+    def opacity(self, x: Tensor, strongest: Tensor) -> Tensor:
+        """Raw opacities [A, 1] of rows and view x [A, grid + F + 4]."""
+        head = self.heads["opacity"]
+        return head.after_first(functional.linear(x, *self.folded(head.layers[0], strongest))).tanh()
+
+    def offset(self, own: Tensor, strongest: Tensor) -> Tensor:
+        """Offsets [A, 3], in units of the scaling, of rows own [A, grid + F]."""
+        return functional.linear(own, *self.folded(self.offsets.product(), strongest))
 
     def decode(self, rows: Tensor, camera: Camera) -> Decoded:
         """Gaussians of the given points [A]: opacity first, the rest for those whose opacity is positive."""
-        encoded = self.encode(rows)
-        x = torch.cat([encoded, self.view(rows, camera)], dim=1)
-        raw = torch.tanh(self.heads["opacity"](x))  # [A, 1]
+        own, strongest = self.encode(rows)
+        x = torch.cat([own, self.view(rows, camera)], dim=1)
+        raw = self.opacity(x, strongest)
         keep = (raw > 0).view(-1).nonzero().squeeze(1)
         x, source = x.index_select(0, keep), rows.index_select(0, keep)
-        cov, color = self.heads["cov"](x), ACTIVATIONS["color"](self.heads["color"](x))
+        cov, color = (self.heads[name] for name in ("cov", "color"))
+        first = functional.linear(x, *self.folded(torch.cat([cov.layers[0], color.layers[0]]), strongest))  # both in one product
+        shape, rgb = (head.after_first(h) for head, h in zip((cov, color), first.chunk(2, dim=1)))
         scaling = self.table.params["log_scaling"].index_select(0, source).exp()
-        offset = self.offsets(encoded.index_select(0, keep)) * scaling[:, :3]
+        offset = self.offset(x[:, : own.shape[1]], strongest) * scaling[:, :3]
         gaussians = Gaussians(
             means=self.table.facts["xyz"].index_select(0, source) + offset,
-            quats=functional.normalize(cov[:, 3:], dim=1, eps=EPS),
-            scales=scaling[:, 3:] * cov[:, :3].sigmoid(),
+            quats=functional.normalize(shape[:, 3:], dim=1, eps=EPS),
+            scales=scaling[:, 3:] * shape[:, :3].sigmoid(),
             opacities=raw.view(-1).index_select(0, keep),
-            colors=color,
+            colors=rgb.sigmoid(),
             source=source,
         )
         return Decoded(gaussians, rows, raw, {})
@@ -206,13 +237,14 @@ class GraphScene(nn.Module):
     def slot_points(self, rows: Tensor) -> Tensor:
         """Where the Gaussians of `rows` [P] are, [P, 3] float64: from the whole graph, as no camera is asked."""
         everyone = torch.arange(len(self.table), device=rows.device)
-        offset = self.offsets(self.encode(everyone, rows)) * self.table.params["log_scaling"].index_select(0, rows)[:, :3].exp()
+        offset = self.offset(*self.encode(everyone, rows)) * self.table.params["log_scaling"].index_select(0, rows)[:, :3].exp()
         return self.table.facts["xyz"].index_select(0, rows).double() + offset.double()
 
     def scene_opacity(self, camera: Camera, step: int) -> Tensor:
         """Raw opacities [N, 1] of every point from `camera`, whether it sees them or not."""
         everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
-        return torch.tanh(self.heads["opacity"](torch.cat([self.encode(everyone), self.view(everyone, camera)], dim=1)))
+        own, strongest = self.encode(everyone)
+        return self.opacity(torch.cat([own, self.view(everyone, camera)], dim=1), strongest)
 
     def routing(self, step: int) -> dict[str, Routing]:
         """There are no experts."""
