@@ -2,9 +2,9 @@
 
     python benchmarks/raster_threads.py [--cloud garden.npz] [--case 100000,800,544] [--threads 2] [--rounds 60]
 
-Idle: wall time of a loop of multiply-adds that waits for nothing, and of the rasteriser forward + backward, on 1 thread and on several, taken
-in turns, minima; both go through the same pool. The ratio of the two scalings is what the rasteriser itself loses. Busy: as many endless
-loops as there are cores run beside it; mean wall time of a frame on 1 thread and on several, taken in turns.
+Idle: wall time of a loop of multiply-adds that waits for nothing, and of the rasteriser forward + backward, on 1 thread and on several,
+taken in turns, minima; both go through the same pool. The ratio of the two scalings is what the rasteriser itself loses. Busy: as many
+endless loops as there are cores run beside it; mean wall time of a frame on 1 thread and on several, taken in turns.
 """
 
 from __future__ import annotations
@@ -63,9 +63,10 @@ def times(runs: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[fl
 
 
 def spin() -> None:
-    """Holds a core."""
-    while True:
-        pass
+    """Holds a core, as long as the process that started it lives."""
+    parent = os.getppid()
+    while os.getppid() == parent:
+        sum(range(100_000))
 
 
 def busy(runs: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[float]]:

@@ -1,0 +1,74 @@
+"""Whether a change left the CPU rasteriser's results alone, to the last bit.
+
+    python benchmarks/raster_same.py record before.json     # at the commit before
+    python benchmarks/raster_same.py compare before.json    # with the change built; exit 1 where anything differs
+
+Hashes of the picture, alpha, depth, radii and all gradients in the deterministic mode, on this machine, for every instruction set it runs.
+Bits may differ between processors and compilers, so the file is of use on the machine that made it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+from pathlib import Path
+
+import torch
+
+from raster_scene import scene, synthetic
+from scene_experts import native
+from scene_experts.render.cpu import CpuRasterizer
+from scene_experts.types import Gaussians
+
+CASES = ((20_000, 400, 301), (100_000, 800, 544))
+NAMES = ("image", "alpha", "depth", "radii", "mean2d", "means", "quats", "scales", "opacities", "colors")
+
+
+def hashes(case: tuple[int, int, int], level: str, antialias: bool, threads: int) -> dict[str, str]:
+    """One hash for each result."""
+    g, camera = scene(synthetic(), *case)
+    leaves = [t.clone().requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.colors)]
+    draw = CpuRasterizer(level=level, antialias=antialias, deterministic=True, threads=threads)
+    render = draw(Gaussians(*leaves, g.source), camera, torch.tensor([0.2, 0.5, 0.9]))
+    rng = torch.Generator().manual_seed(0)
+    parts = (render.image, render.alpha, render.depth)
+    torch.stack([(torch.rand(part.shape, generator=rng) * part).sum() for part in parts]).sum().backward()
+    results = (*parts, render.radii, render.mean2d_grad, *(leaf.grad for leaf in leaves))
+    return {name: hashlib.sha256(t.detach().numpy().tobytes()).hexdigest()[:16] for name, t in zip(NAMES, results, strict=True)}  # type: ignore[union-attr]
+
+
+def everything() -> dict[str, dict[str, str]]:
+    """Hashes of all cases."""
+    levels = [name for name in native.levels() if native.path(name)]
+    return {
+        f"{case[0]} {level} antialias={antialias}": hashes(case, level, antialias, threads=1 + antialias)
+        for case in CASES
+        for level in levels
+        for antialias in (False, True)
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("record", "compare"))
+    parser.add_argument("file", type=Path)
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    found = everything()
+    if args.what == "record":
+        args.file.write_text(json.dumps(found, indent=1))
+        return
+    recorded = json.loads(args.file.read_text())
+    differ = [
+        f"{case}: {', '.join(n for n in NAMES if recorded[case][n] != found[case][n])}"
+        for case in found
+        if recorded.get(case) != found[case]
+    ]
+    print("\n".join(differ) if differ else f"the same bits in {len(found)} cases")
+    sys.exit(bool(differ))
+
+
+if __name__ == "__main__":
+    main()
