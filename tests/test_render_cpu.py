@@ -101,7 +101,7 @@ def test_needles() -> None:
         assert relative(exact[name], ours[name]) < 10 * max(relative(exact[name], single[name]), 1e-6), name
 
 
-@pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 33), (3, 40), (100, 5)])
+@pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 33), (3, 40), (100, 5), (2100, 3)])
 def test_any_picture_size(size: tuple[int, int]) -> None:
     agree(*make(width=size[0], height=size[1], size=0.1))
 
@@ -111,8 +111,9 @@ def test_each_output_alone(parts: str) -> None:
     agree(*make(), parts=parts)
 
 
-def test_many_gaussians_on_one_pixel() -> None:
-    inputs, camera = make(m=700)
+@pytest.mark.parametrize("m", [700, 1100])  # two and three batches
+def test_many_gaussians_on_one_pixel(m: int) -> None:
+    inputs, camera = make(m=m)
     inputs[0][:] = torch.tensor([0.0, 0.0, 1.0]) + 0.01 * inputs[0]
     inputs[3][:] = 0.02
     agree(inputs, camera)
@@ -203,6 +204,16 @@ def test_backward_twice_and_without_any() -> None:
     first = torch.autograd.grad(render.image.sum(), leaf, retain_graph=True)[0]
     second = torch.autograd.grad(render.image.sum(), leaf)[0]
     assert torch.equal(first, second) and render.mean2d_grad.any()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_forward_alone_draws_the_same_bits(threads: int) -> None:
+    inputs, camera = make(m=40000, width=300, height=200)
+    kept, _ = draw(CpuRasterizer(threads=threads), inputs, camera, torch.float32)
+    for _ in range(2):
+        with torch.no_grad():
+            alone = CpuRasterizer(threads=threads)(Gaussians(*inputs, torch.arange(40000)), camera, BACKGROUND)
+        assert all(torch.equal(getattr(kept, part), getattr(alone, part)) for part in ("image", "alpha", "depth", "radii"))
 
 
 def test_wrong_shapes_are_refused() -> None:
