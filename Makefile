@@ -1,4 +1,5 @@
 # make demo   train Scaffold-GS and MoE-GS on the shipped capture, score both, print one table (minutes on two CPU cores)
+# make view   the demo's MoE-GS scene in a browser
 # make test   the test suite
 # Both build a virtual environment in .venv first; an importable torch of PYTHON is used as it is, otherwise the pinned CPU one is installed.
 PYTHON ?= python3
@@ -14,7 +15,7 @@ DEMO_FLAGS ?= --iterations $(DEMO_ITERATIONS) --loss.dssim 0.8
 # as the package sets it when it is imported before torch, which the benchmark scripts do not
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo test lint bench env lpips clean
+.PHONY: demo view test lint bench env lpips clean
 
 env: $(STAMP)
 
@@ -35,6 +36,11 @@ demo: $(STAMP) lpips
 	$(SE) eval $(DEMO_OUT)/moe-gs
 	$(SE) compare $(DEMO_OUT)/scaffold-gs $(DEMO_OUT)/moe-gs
 	@echo "pictures (photograph | render | error): $(DEMO_OUT)/moe-gs/test/side_by_side"
+	@echo "everything on one page: $(DEMO_OUT)/moe-gs/report.html"
+	@echo "walk around in a browser: make view, then http://localhost:8080"
+
+view: $(STAMP)
+	$(SE) view $(DEMO_OUT)/moe-gs
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
