@@ -97,7 +97,7 @@ def test_every_command_has_help(command, capsys):
 def test_unknown_command_recipe_and_flag(capsys):
     code, _, err = run(capsys, "trian")
     assert code == 2 and "found 'trian'" in err
-    assert "expected a recipe (scaffold-gs, moe-gs" in fails(capsys, "train", "moegs")
+    assert "expected a recipe, found 'moegs'; did you mean 'moe-gs'" in fails(capsys, "train", "moegs")
     code, _, err = run(capsys, "train", "scaffold-gs", "--data", "x", "--out", "y", "--scene.decoder.top-k", "1")
     assert code == 2 and "--scene.decoder.top-k" in err
     assert run(capsys)[0] == 2

@@ -46,6 +46,18 @@ def test_a_video_lands_in_the_run_folder(run, capsys):
     assert (run / "renders" / "spiral.mp4").stat().st_size > 500
 
 
+def test_flags_that_no_video_can_have(run, tmp_path, capsys):
+    for wrong, word in (
+        (["--quality", "20"], "--quality"),
+        (["--fps", "0"], "--fps"),
+        (["--only", "9"], "experts 1 to 5"),
+        (["--out", str(tmp_path / "a.gif")], "ending in .mp4"),
+        (["--path", "bogus"], "test or a file"),
+    ):
+        assert cli.main(["render", str(run), *wrong]) == 2
+        assert word in capsys.readouterr().err
+
+
 def test_sizes():
     assert size_of("640x360") == (640, 360) and size_of(None) is None
     for wrong in ("640", "640x", "0x10", "1x99999", "-5x5"):

@@ -41,7 +41,10 @@ def test_a_failure_is_told_at_the_end(tmp_path, capsys):
     assert "FAILED" in found.out and "1 that failed" in found.err and "Traceback" not in found.err
 
 
-def test_names_that_are_none(tmp_path):
+def test_names_that_are_none(tmp_path, capsys):
+    (tmp_path / "box").mkdir()
+    assert cli.main(["reproduce", "table3", "--captures", str(tmp_path / "box"), "--recipes", "scafold-gs", "--dry-run"]) == 2
+    assert "did you mean 'scaffold-gs'" in capsys.readouterr().err
     with pytest.raises(InputError, match="did you mean 'table1'"):
         experiments_of(ReproduceCommand(("tabel1",)))
     with pytest.raises(InputError, match="found nothing"):

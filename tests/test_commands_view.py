@@ -14,6 +14,11 @@ def test_without_viser_the_error_says_what_to_install(monkeypatch):
         command.view(["run"])
 
 
+def test_a_port_that_is_none_is_refused(tmp_path):
+    with pytest.raises(InputError, match="--port"):
+        command.view([str(tmp_path), "--port", "99999"])
+
+
 def test_a_folder_that_is_no_run_is_refused(tmp_path):
     pytest.importorskip("viser")
     with pytest.raises(InputError, match="expected a run folder"):

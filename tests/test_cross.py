@@ -1,6 +1,7 @@
 """The build for 64-bit ARM (NEON), cross-compiled and run under an emulator, against this machine's own portable build.
 
-Compiling takes a minute, so this runs only where SCENE_EXPERTS_CROSS is set and the tools are there (Debian: g++-aarch64-linux-gnu, qemu-user).
+Compiling takes a minute, so this runs only where SCENE_EXPERTS_CROSS is set and the tools are there (Debian: g++-aarch64-linux-gnu,
+qemu-user).
 """
 
 from __future__ import annotations

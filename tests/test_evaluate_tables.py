@@ -136,7 +136,7 @@ def test_a_table_tells_a_shorter_training_from_one_cut_off() -> None:
     short, cut = results("moe-gs", 27.0, step=7000, iterations=7000), results("moe-gs", 26.0, step=7000, iterations=30_000)
     made = tables.table(["short", "cut"], [short, cut])
     place = made.titles.index("steps")
-    assert made.titles[place + 1] == "of" and [row[place : place + 2] for row in made.rows] == [("7000", "7000"), ("7000", "30,000")]
+    assert made.titles[place + 1] == "of" and [row[place : place + 2] for row in made.rows] == [("7,000", "7,000"), ("7,000", "30,000")]
 
 
 @pytest.mark.parametrize("width", [10, 40, 80, 200])

@@ -172,6 +172,15 @@ def test_a_training_is_shown_within_its_share_and_held_while_paused(viewer, capt
         live.close()
 
 
+def test_a_taken_port_is_told(viewer, capture):
+    taken = viewer.server.get_port()
+    other = Viewer(capture, viewer.current, DRAW, port=taken)
+    try:
+        assert other.moved and other.server.get_port() != taken and not viewer.moved
+    finally:
+        other.close()
+
+
 def test_clients_are_due_when_something_changed():
     client = Client(Handle())
     assert client.wanted and not client.full and not client.moving(time.monotonic())

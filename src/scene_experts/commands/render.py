@@ -25,6 +25,7 @@ from scene_experts.scene.frozen import freeze
 from scene_experts.types import Camera
 from scene_experts.view import path_files, paths, video
 from scene_experts.view.paint import Look, Mode, paint
+from scene_experts.view.panel import number_of_experts
 from scene_experts.view.paths import CameraPath
 
 
@@ -67,10 +68,14 @@ class RenderCommand:
 
 def render(args: list[str]) -> int:
     command = tyro.cli(RenderCommand, prog=f"{PROG} render", args=args)
-    expect_at_least([("--seconds", command.seconds, 0.01), ("--fps", command.fps or 1, 0.1), ("--quality", command.quality, 1)])
-    expect_at_least([("--only", number, 1) for number in command.only])
+    check(command)
     device, rasterize = backend(command.device, command.rasterizer, False, False)
     opened = [run_folder.open_run(run, device, command.step if run == command.run else None) for run in (command.run, *command.beside)]
+    for run in opened:
+        count = number_of_experts(run.scene)
+        if command.only and max(command.only) > count:
+            has = f"experts 1 to {count}" if count else "no experts"
+            raise InputError(f"expected --only among the experts of {run.path}, which has {has}, found {max(command.only)}; correct it")
     data = opened[0].config.data if command.data is None else replace(opened[0].config.data, path=command.data)
     capture = run_folder.load_capture(data, opened[0].cfg.seed)
     try:
@@ -95,6 +100,18 @@ def render(args: list[str]) -> int:
         capture.images.close()
     print(f"wrote {out} ({count} frames, {count / route.fps:.1f} s)")
     return 0
+
+
+def check(command: RenderCommand) -> None:
+    """Raises InputError for flags that no video can have."""
+    fps = 1.0 if command.fps is None else command.fps
+    expect_at_least([("--seconds", command.seconds, 0.01), ("--fps", fps, 0.1), ("--quality", command.quality, 1)])
+    expect_at_least([("--only", number, 1) for number in command.only])
+    if command.quality > 10:
+        raise InputError(f"expected --quality of at most 10, found {command.quality}; give a smaller number")
+    out = command.out
+    if out is not None and out.suffix and not video.is_video(out) and not out.is_dir():
+        raise InputError(f"expected --out as a folder or a file ending in {', '.join(video.VIDEO)}, found {out}; choose one of those")
 
 
 def drawn(

@@ -63,11 +63,17 @@ def reproduce(args: list[str]) -> int:
     scenes = scenes_of(command)
     scale = Scale.of(command.scale, command.iterations, command.resolution)
     wanted = specs(chosen, scenes, command.seeds or (0,), scale)
+    known = {recipe for experiment in chosen for recipe in experiment.rows.values()}
+    for recipe in command.recipes:
+        if recipe not in known:
+            raise InputError(f"expected --recipes among {', '.join(sorted(known))}, found '{recipe}'{nearest(recipe, known)}; correct it")
     if command.recipes:
         wanted = [spec for spec in wanted if spec.recipe in command.recipes]
     records, runs = command.out / "records", command.runs or command.out / "runs"
     console = Console(highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
+    if not wanted:
+        say("nothing to run: these scenes are in none of these experiments")
     for run in command.adopt:
         say(f"adopted {report.adopt(run, records)}")
     if command.dry_run:

@@ -25,7 +25,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.record import Recorder
 from scene_experts.render import Rasterizer
 from scene_experts.train import Run
-from scene_experts.view.server import Live, viser
+from scene_experts.view.server import Live, check_port, viser
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,7 @@ class TrainCommand:
 def train(args: list[str]) -> int:
     command = parse_train(args)
     if command.viewer:
+        check_port(command.port)
         viser()  # says what is missing before anything is read
     command = replace(command, data=run_folder.named(command.data))
     check_settings(command)
@@ -91,7 +92,9 @@ def train(args: list[str]) -> int:
 def parse_train(args: list[str]) -> TrainCommand:
     """The recipe and its flags. Every recipe is a subcommand whose defaults are its numbers."""
     if args and not args[0].startswith("-") and args[0] not in RECIPES:
-        raise InputError(f"expected a recipe ({', '.join(RECIPES)}), found '{args[0]}'{nearest(args[0], RECIPES)}; see {PROG} train --help")
+        raise InputError(
+            f"expected a recipe, found '{args[0]}'{nearest(args[0], RECIPES)}; there are {', '.join(RECIPES)}; see {PROG} train --help"
+        )
     chosen = {args[0]: RECIPES[args[0]]} if args and args[0] in RECIPES else RECIPES
     defaults = {
         name: (text, TrainCommand(data=Data(path=tyro.MISSING), out=tyro.MISSING, cfg=cfg))  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +13,7 @@ from scene_experts import run_folder
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import Device, Raster, backend
 from scene_experts.scene.frozen import freeze
-from scene_experts.view.server import Viewer, viser
+from scene_experts.view.server import Viewer, check_port, viser
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class ViewCommand:
 
 def view(args: list[str]) -> int:
     command = tyro.cli(ViewCommand, prog=f"{PROG} view", args=args)
+    check_port(command.port)
     viser()  # says what is missing before anything is read
     device, rasterize = backend(command.device, command.rasterizer, False, False)
     opened = run_folder.open_run(command.run, device, command.step)
@@ -52,6 +54,8 @@ def view(args: list[str]) -> int:
         paths=command.run / "paths",
         draws=freeze(opened.scene, opened.step),
     )
+    if viewer.moved:
+        print(f"warning: port {command.port} is taken, this scene is on another", file=sys.stderr)
     print(f"{label}: {viewer.url} (Ctrl-C ends it)", flush=True)
     try:
         viewer.serve()

@@ -38,7 +38,7 @@ def summarise(capture: Capture) -> dict:
         "near": capture.views[0].camera.near,
         "world": {"scale": capture.world.scale, "shift": list(capture.world.shift)},
         "background": list(capture.background),
-        "cache_bytes": capture.images.cache_bytes,
+        "image_cache_limit_bytes": capture.images.cache_bytes,
         "decoded_bytes": sum(s.size[0] * s.size[1] * 3 for s in sources),
         "warnings": list(capture.warnings),
     }

@@ -48,7 +48,7 @@ class Column:
         return None if found is None else float(found) * self.factor
 
     def text(self, value: float | None) -> str:
-        return "-" if value is None else f"{value:,.{self.digits}f}" if abs(value) >= 10_000 else f"{value:.{self.digits}f}"
+        return "-" if value is None else f"{value:,.{self.digits}f}"
 
 
 COLUMNS = (

@@ -59,8 +59,12 @@ def opposite(verdict: Verdict) -> Verdict:
 def describe(d: Difference, unit: str = "dB") -> str:
     return (
         f"{d.mean:+.2f} {unit} (95 % interval {d.low:+.2f} to {d.high:+.2f}; "
-        f"{d.captures} captures, {d.views} views, {d.seeds} seed{'s' if d.seeds > 1 else ''})"
+        f"{many(d.captures, 'capture')}, {many(d.views, 'view')}, {many(d.seeds, 'seed')})"
     )
+
+
+def many(count: int, thing: str) -> str:
+    return f"{count} {thing}{'' if count == 1 else 's'}"
 
 
 def common(a: list[Record], b: list[Record]) -> tuple[list[Record], list[Record]]:
@@ -105,8 +109,10 @@ def balance(loaded: list[Record], free: list[Record]) -> Finding:
     if not with_load or not without:
         return Finding(claim, None, "no runs")
     a, b = float(np.mean(with_load)), float(np.mean(without))
-    measured = f"the busiest expert has {a:.2f} times its fair share with it, {b:.2f} without"
-    return Finding(claim, "confirmed" if a < b else "contradicted", measured)
+    measured = f"the busiest expert has {a:.2f} times its fair share with it, {b:.2f} without ({many(len(with_load), 'pair')} of runs)"
+    every = all(x < y for x, y in zip(with_load, without))
+    verdict: Verdict = "confirmed" if every and len(with_load) > 1 else "contradicted" if a > b else "undecided"
+    return Finding(claim, verdict, measured)
 
 
 def experts(by: dict[str, list[Record]]) -> Finding:

@@ -85,7 +85,7 @@ def make(name: str, capture: Capture, frames: int, size: tuple[int, int] | None 
     if name == "auto":
         name = "spiral" if float(seen.forward.mean(0).norm()) > FACING else "orbit"
     if name not in NAMES:
-        raise InputError(f"expected a path among {', '.join(NAMES)} or a file, found '{name}'; correct --path")
+        raise InputError(f"expected a path among {', '.join(NAMES)}, test or a file, found '{name}'; correct --path")
     poses = {"orbit": orbit, "spiral": spiral, "views": through}[name](seen, frames)
     model = lens(seen.cameras, size)
     return CameraPath(tuple(replace(model, world_to_cam=pose.float()) for pose in poses), fps)

@@ -47,6 +47,12 @@ def viser() -> Any:
     return module
 
 
+def check_port(port: int) -> None:
+    """Raises InputError for a number that is no port; 0 lets the system choose."""
+    if not 0 <= port <= 65535:
+        raise InputError(f"expected --port between 0 and 65535, found {port}; choose another")
+
+
 @dataclass
 class Client:
     """One browser: where it looks from, and what it was last sent."""
@@ -94,6 +100,11 @@ class Viewer:
         self.panel = Panel(self.server, self.capture, self.current, self.touch, self.go, self.paths)
         self.server.on_client_connect(self.connect)
         self.server.on_client_disconnect(self.disconnect)
+
+    @property
+    def moved(self) -> bool:
+        """Whether the port that was asked for was taken, so that another is in use."""
+        return self.port != 0 and self.server.get_port() != self.port
 
     @property
     def url(self) -> str:
@@ -268,7 +279,7 @@ class Live:
             current = lambda: (training.scene, training.step)  # noqa: E731
             self.viewer = Viewer(self.capture, current, self.rasterize, port=self.port, label=self.label, paths=self.paths)
             self.viewer.panel.train()
-            self.ready(self.viewer.url)
+            self.ready(self.viewer.url + (f" (port {self.port} is taken)" if self.viewer.moved else ""))
             self.last = now
         self.owed, self.last = max(0.0, self.owed - (now - self.last)), now
         if self.owed == 0.0 and self.viewer.due(now):
