@@ -1,6 +1,7 @@
 """Times the CPU rasteriser, forward + backward, against a scalar C++ peer and the pure-torch reference, on one scene.
 
-    python benchmarks/raster.py [--cloud garden.npz] [--cases 100000,800,544 ...] [--levels avx512 avx2] [--reference] [--threads 1] [--scaling]
+    python benchmarks/raster.py [--cloud garden.npz] [--cases 100000,800,544 ...] [--levels avx512 avx2]
+    [--reference] [--threads 1] [--scaling]
 
 Times of one thread are processor time, the least of interleaved runs, so that a busy machine blurs them little; with more threads they are
 wall time. "cycles/pair" is core cycles (time x clock, the clock measured by a loop of dependent additions) per composited (pixel,
