@@ -32,7 +32,7 @@ class Camera:
     K: Tensor  # [3, 3] float32, px: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
     width: int
     height: int
-    near: float = 0.2  # world units; nothing closer than this along z is drawn (METHODS P-R1)
+    near: float = 0.2  # world units; nothing closer than this along z is drawn
     id: int = 0  # index of the view in its capture
 
     @property
@@ -105,7 +105,7 @@ class Render:
     image: Tensor  # [H, W, 3], the background blended in, not clamped
     alpha: Tensor  # [H, W] = 1 - final transmittance
     depth: Tensor  # [H, W] expected depth: sum_i T_i alpha_i z_i (not divided by alpha)
-    radii: Tensor  # [M] int32 px, ceil(3 sigma) (METHODS 1.10 step 5); 0 where nothing was drawn
+    radii: Tensor  # [M] int32 px, ceil(3 sigma), as the published rasteriser has it; 0 where nothing was drawn
     mean2d_grad: Tensor  # [M, 2] NDC units
 
 
