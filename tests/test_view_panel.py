@@ -6,7 +6,7 @@ import torch
 
 from scene_experts.events import Finished, Stepped
 from test_scene import started
-from test_view_server import Handle, capture, viewer  # noqa: F401
+from test_view_server import capture, viewer  # noqa: F401
 
 pytest.importorskip("viser")
 from scene_experts.view.panel import number_of_experts, positions
@@ -50,4 +50,3 @@ def test_curves_follow_a_training(viewer):  # noqa: F811
 
 def test_the_background_is_the_captures(viewer, capture):  # noqa: F811
     assert torch.allclose(torch.tensor(viewer.panel.background()), torch.tensor(capture.background), atol=0.01)
-    assert isinstance(Handle().camera.fov, float)
