@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from scene_experts import checkpoint, run_folder
@@ -21,10 +20,11 @@ from scene_experts.errors import InputError
 from scene_experts.export.cfg_args import cfg_args_text
 from scene_experts.export.ply import read_gaussian_ply, read_vertices, write_gaussian_ply
 from scene_experts.export.scaffold import SIDECAR, SIDECAR_FORMAT, iteration_folder, read_sidecar
+from scene_experts.export.splats import Splats, from_scene, to_columns
 from scene_experts.io import write_bytes, write_json
 from scene_experts.recipes import gs_3d
 from scene_experts.run_folder import OpenRun
-from scene_experts.scene.explicit import COLUMNS, Explicit, GaussianScene
+from scene_experts.scene.explicit import Explicit, GaussianScene
 
 KIND = "gaussians"  # in our description of a scene
 _STEPS = 30_000  # of a file that does not say how long it was trained
@@ -39,10 +39,8 @@ def scene_of(run: OpenRun) -> GaussianScene:
 
 def write_file(scene: GaussianScene, world: World, path: Path) -> None:
     """Write the scene as a PLY file that readers of 3DGS open, in the capture's own frame. Raises RunError when the disk is full."""
-    p = {name: value.detach().cpu() for name, value in scene.table.params.items()}
-    means = world.to_input(p["means"].double()).float()
-    log_scales = (p["log_scales"].double() - math.log(world.scale)).float()
-    write_gaussian_ply(path, means, torch.cat([p["sh_dc"][:, None], p["sh_rest"]], dim=1), p["raw_opacity"], log_scales, p["quats"])
+    s = from_scene(scene, world)
+    write_gaussian_ply(path, s.means, s.sh, s.opacity_logit, s.log_scales, s.quats)
 
 
 def write_folder(run: OpenRun, world: World, out: Path) -> Path:
@@ -91,16 +89,7 @@ def read_columns(path: Path, world: World) -> dict[str, Tensor]:
         bad = int((~value.isfinite()).reshape(len(value), -1).any(1).sum())
         if bad:
             raise InputError(f"expected finite {name} in {path}, found {bad:,} Gaussians with others; export the result again")
-    sh = found["sh"]
-    columns = {
-        "means": world.from_input(found["means"].double()).float(),
-        "log_scales": (found["log_scales"].double() + math.log(world.scale)).float(),
-        "quats": found["quats"],
-        "raw_opacity": found["opacity_logit"],
-        "sh_dc": sh[:, 0].contiguous(),
-        "sh_rest": sh[:, 1:].contiguous(),
-    }
-    return {name: columns[name] for name in COLUMNS}
+    return to_columns(Splats(**found), world)
 
 
 def import_file(path: Path, data: Data, out: Path, iteration: int | None = None) -> Capture:
