@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -99,13 +99,16 @@ def _read_ascii(path: Path, start: int, count: int, row: np.dtype[np.void]) -> N
     return table
 
 
-def write_vertices(path: Path, columns: Mapping[str, NDArray[np.generic]]) -> None:
-    """Write columns [N] as the element `vertex` in binary_little_endian, atomically. Raises RunError when the disk is full."""
+def write_vertices(path: Path, columns: Mapping[str, NDArray[np.generic]], comments: Sequence[str] = ()) -> None:
+    """Write columns [N] as the element `vertex` in binary_little_endian, atomically. Raises RunError when the disk is full.
+
+    comments: lines of ASCII for the header, which readers skip.
+    """
     codes = {name: value.dtype.newbyteorder("<").str[1:] for name, value in columns.items()}
     table = np.empty(len(next(iter(columns.values()))), np.dtype([(name, "<" + code) for name, code in codes.items()]))
     for name, value in columns.items():
         table[name] = value
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments), f"element vertex {len(table)}"]
     lines += [f"property {_NAMES[code]} {name}" for name, code in codes.items()] + ["end_header", ""]
 
     def write(temporary: Path) -> None:
@@ -172,9 +175,16 @@ def read_anchor_ply(path: Path) -> dict[str, Tensor]:
 
 
 def write_gaussian_ply(
-    path: Path, means: Tensor, sh: Tensor, opacity_logit: Tensor, log_scales: Tensor, quats: Tensor, normals: bool = True
+    path: Path,
+    means: Tensor,
+    sh: Tensor,
+    opacity_logit: Tensor,
+    log_scales: Tensor,
+    quats: Tensor,
+    normals: bool = True,
+    comments: Sequence[str] = (),
 ) -> None:
-    """Write Gaussians in 3DGS's layout (248 bytes for degree 3), which standard viewers read.
+    """Write Gaussians in 3DGS's layout (248 bytes for degree 3), which standard viewers read; comments are lines for the header.
 
     means [N, 3], sh [N, (degree + 1)^2, 3] (coefficient, channel), opacity_logit [N], log_scales [N, 3], quats [N, 4] (w, x, y, z).
     """
@@ -186,7 +196,7 @@ def write_gaussian_ply(
     columns |= _numbered("f_rest_", sh[:, 1:].transpose(1, 2).flatten(1))
     columns["opacity"] = _floats(opacity_logit[:, None])[0]
     columns |= _numbered("scale_", log_scales) | _numbered("rot_", quats)
-    write_vertices(path, columns)
+    write_vertices(path, columns, comments)
 
 
 def read_gaussian_ply(path: Path) -> dict[str, Tensor]:
