@@ -16,7 +16,7 @@ from scene_experts.view.paint import paint
 from synthetic import make_capture
 
 pytest.importorskip("viser")
-from scene_experts.view.server import Client, Live, Viewer
+from scene_experts.view.server import Client, Viewer
 
 DRAW = choose("auto", "cpu")
 
@@ -148,28 +148,6 @@ def test_a_budget_leaves_clients_for_the_next_turn(viewer):
     assert sum(len(h.pictures) for h in handles) <= 1
     viewer.draw()
     assert all(h.pictures for h in handles)
-
-
-def test_a_training_is_shown_within_its_share_and_held_while_paused(viewer, capture):
-    scene, _ = viewer.current()
-    training = SimpleNamespace(scene=scene, step=5)
-    stop: list[str] = []
-    live = Live(capture, DRAW, lambda: bool(stop), port=0, ready=lambda url: None)
-    live(training)
-    assert live.viewer is not None
-    try:
-        handle = joined(live.viewer)
-        for _ in range(200):
-            live.viewer.touch()
-            live(training)
-        assert 1 <= len(handle.pictures) < 200  # most iterations are left alone
-        live.viewer.panel.pause.value = True  # type: ignore[union-attr]
-        stop.append("enough")
-        began = time.monotonic()
-        live(training)
-        assert time.monotonic() - began < 2
-    finally:
-        live.close()
 
 
 def test_a_taken_port_is_told(viewer, capture):

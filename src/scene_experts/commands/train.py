@@ -25,7 +25,8 @@ from scene_experts.recipes import RECIPES
 from scene_experts.record import Recorder
 from scene_experts.render import Rasterizer
 from scene_experts.train import Run
-from scene_experts.view.server import Live, check_port, viser
+from scene_experts.view.live import Live
+from scene_experts.view.server import check_port, viser
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +21,6 @@ import torch
 from scene_experts.data.capture import Capture
 from scene_experts.errors import InputError, RunError
 from scene_experts.evaluate.pictures import to_8bit
-from scene_experts.events import Event
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Scene
@@ -35,7 +35,6 @@ log = logging.getLogger(__name__)
 REST = 0.15  # seconds without a movement after which the full picture is drawn
 GOAL = 1 / 25  # seconds that a picture may take while its client moves
 SMALLEST = 0.2  # of the full size
-SHARE = 0.12  # of a training's time that drawing may take
 
 
 def viser() -> Any:
@@ -88,6 +87,7 @@ class Viewer:
     def __post_init__(self) -> None:
         module = viser()
         logging.getLogger("websockets").setLevel(logging.CRITICAL)  # a browser that goes away is no fault of ours
+        warnings.filterwarnings("ignore", message=r"Queued an? \w+ on a closed connection")
         try:
             self.server = module.ViserServer(host=self.host, port=self.port, label=self.label, verbose=False)
         except OSError as error:
@@ -192,6 +192,8 @@ class Viewer:
             camera = with_fov(camera, fov_of(camera), max(16, round(camera.width * share)), max(16, round(camera.height * share)))
         scene, step = self.current()
         picture = to_8bit(self.picture(client, scene, step, camera))
+        if client.handle.client_id not in self.clients:  # it went away meanwhile
+            return
         client.handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=75 if moving else 95)
         client.full = not moving
         taken = (time.monotonic() - began) / (camera.width * camera.height)
@@ -256,46 +258,3 @@ class Viewer:
 def fov_of(camera: Camera) -> float:
     """Vertical field of view, radians."""
     return 2 * float(np.arctan(camera.height / (2 * camera.fy)))
-
-
-@dataclass
-class Live:
-    """Shows a training as it goes: called between iterations, it draws within its share of the time and holds a training that is paused."""
-
-    capture: Capture
-    rasterize: Rasterizer
-    stopped: Callable[[], bool]  # whether the training has been told to stop
-    port: int = 8080
-    label: str = "training"
-    paths: Path | None = None
-    ready: Callable[[str], None] = print  # told the address
-    viewer: Viewer | None = None
-    owed: float = 0.0  # seconds of training that must pass before drawing has only had its share
-    last: float = 0.0
-
-    def __call__(self, training: Any) -> None:
-        now = time.monotonic()
-        if self.viewer is None:
-            current = lambda: (training.scene, training.step)  # noqa: E731
-            self.viewer = Viewer(self.capture, current, self.rasterize, port=self.port, label=self.label, paths=self.paths)
-            self.viewer.panel.train()
-            self.ready(self.viewer.url + (f" (port {self.port} is taken)" if self.viewer.moved else ""))
-            self.last = now
-        self.owed, self.last = max(0.0, self.owed - (now - self.last)), now
-        if self.owed == 0.0 and self.viewer.due(now):
-            self.owed = self.viewer.draw(budget=0.01) * (1 / SHARE - 1)
-            self.last = time.monotonic()
-        while self.viewer.panel.paused() and not self.stopped():
-            self.viewer.changed.wait(0.05)
-            self.viewer.changed.clear()
-            self.viewer.draw()
-            self.last, self.owed = time.monotonic(), 0.0
-
-    def event(self, event: Event) -> None:
-        """Follow the training's events."""
-        if self.viewer is not None:
-            self.viewer.panel.event(event)
-
-    def close(self) -> None:
-        if self.viewer is not None:
-            self.viewer.close()

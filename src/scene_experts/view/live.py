@@ -1,0 +1,59 @@
+"""A training shown in a browser while it goes on: the viewer draws between two iterations, in the training's own thread."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scene_experts.data.capture import Capture
+from scene_experts.events import Event
+from scene_experts.render import Rasterizer
+from scene_experts.view.server import Viewer
+
+SHARE = 0.12  # of a training's time that drawing may take
+
+
+@dataclass
+class Live:
+    """Shows a training as it goes: called between iterations, it draws within its share of the time and holds a training that is paused."""
+
+    capture: Capture
+    rasterize: Rasterizer
+    stopped: Callable[[], bool]  # whether the training has been told to stop
+    port: int = 8080
+    label: str = "training"
+    paths: Path | None = None
+    ready: Callable[[str], None] = print  # told the address
+    viewer: Viewer | None = None
+    owed: float = 0.0  # seconds of training that must pass before drawing has only had its share
+    last: float = 0.0
+
+    def __call__(self, training: Any) -> None:
+        now = time.monotonic()
+        if self.viewer is None:
+            current = lambda: (training.scene, training.step)  # noqa: E731
+            self.viewer = Viewer(self.capture, current, self.rasterize, port=self.port, label=self.label, paths=self.paths)
+            self.viewer.panel.train()
+            self.ready(self.viewer.url + (f" (port {self.port} is taken)" if self.viewer.moved else ""))
+            self.last = now
+        self.owed, self.last = max(0.0, self.owed - (now - self.last)), now
+        if self.owed == 0.0 and self.viewer.due(now):
+            self.owed = self.viewer.draw(budget=0.01) * (1 / SHARE - 1)
+            self.last = time.monotonic()
+        while self.viewer.panel.paused() and not self.stopped():
+            self.viewer.changed.wait(0.05)
+            self.viewer.changed.clear()
+            self.viewer.draw()
+            self.last, self.owed = time.monotonic(), 0.0
+
+    def event(self, event: Event) -> None:
+        """Follow the training's events."""
+        if self.viewer is not None:
+            self.viewer.panel.event(event)
+
+    def close(self) -> None:
+        if self.viewer is not None:
+            self.viewer.close()
