@@ -1,213 +1,155 @@
-// One radix sort of the visible depths, then a stable scatter into the tiles' lists.
+// Tile lists in two steps, each in the nearest caches and the jobs of one independent of each other: part by part of the Gaussians, a stable
+// scatter into areas of 4 x 4 tiles; then area by area a sort by depth, and the lists of the area's tiles.
 #include <algorithm>
 #include <utility>
-#include <vector>
 
 #include "pool.h"
-#include "raster.h"
+#include "raster_area.h"
 
 namespace se::raster {
 namespace {
 
-constexpr int kDigit = 11;  // bits per pass
-constexpr uint32_t kRadix = 1u << kDigit;
-constexpr int64_t kSmall = 1 << 15;  // elements below which a second thread costs more than it brings
+// Chunks that are scattered together: the more areas, the more, so that an area's share of a part is no single Gaussian.
+int64_t span(const State& s) { return std::min<int64_t>(1 + s.areas() / 128, kMostSpan); }
 
-struct Slice {
-  int64_t begin, end;
-};
-
-Slice slice(int64_t n, int part, int parts) { return {n * part / parts, n * (part + 1) / parts}; }
-
-// Runs f(part, begin, end) over pieces of consecutive items: the first pass reads the chunks of the projection, the second one array.
-template <class F>
-void each_piece(const State& s, bool chunks, int64_t n, int part, int parts, F&& f) {
-  if (!chunks) {
-    const Slice range = slice(n, part, parts);
-    f(range.begin, range.end);
-    return;
-  }
-  const Slice range = slice(s.places() / kChunk, part, parts);
-  for (int64_t c = range.begin; c < range.end; ++c) f(c * kChunk, c * kChunk + s.chunk_count.data()[c]);
-}
-
-// One stable counting pass on kDigit bits of (key - low) >> shift.
-void pass(State& s, const Item* from, Item* to, bool chunks, uint32_t low, int shift, int parts, int threads) {
-  uint32_t* histogram = s.histogram.get(static_cast<size_t>(parts) * kRadix);
-  const auto digit = [=](const Item& item) { return ((item.key - low) >> shift) & (kRadix - 1); };
-  parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) {
-    uint32_t* count = histogram + p * kRadix;
-    std::fill(count, count + kRadix, 0u);
-    each_piece(s, chunks, s.visible, static_cast<int>(p), parts, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) ++count[digit(from[i])];
-    });
-  });
-  uint32_t sum = 0;
-  for (uint32_t d = 0; d < kRadix; ++d)
-    for (int p = 0; p < parts; ++p) sum += std::exchange(histogram[p * kRadix + d], sum);
-  parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) {
-    uint32_t* at = histogram + p * kRadix;
-    each_piece(s, chunks, s.visible, static_cast<int>(p), parts, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) to[at[digit(from[i])]++] = from[i];
-    });
-  });
-}
-
-// Two passes sort the 22 leading bits of the range; what is left are short runs, put in order one by one.
-void finish_runs(Item* items, Slice range, uint32_t low, int shift) {
-  const auto less = [](const Item& a, const Item& b) { return a.key != b.key ? a.key < b.key : a.place < b.place; };
-  for (int64_t i = range.begin; i < range.end;) {
-    const uint32_t run = (items[i].key - low) >> shift;
-    int64_t end = i + 1;
-    while (end < range.end && (items[end].key - low) >> shift == run) ++end;
-    if (end - i > 32) {
-      std::sort(items + i, items + end, less);  // places are unique and were ascending, so this is stable
-    } else {
-      for (int64_t j = i + 1; j < end; ++j) {
-        const Item item = items[j];
-        int64_t k = j;
-        for (; k > i && items[k - 1].key > item.key; --k) items[k] = items[k - 1];
-        items[k] = item;
-      }
-    }
-    i = end;
-  }
-}
-
-// A slice moved forward at both ends to where a run begins, so that no run is cut.
-Slice whole_runs(const Item* items, int64_t n, Slice range, uint32_t low, int shift) {
-  const auto forward = [&](int64_t i) {
-    while (i > 0 && i < n && (items[i].key - low) >> shift == (items[i - 1].key - low) >> shift) ++i;
-    return i;
-  };
-  return {forward(range.begin), forward(range.end)};
-}
-
-// All visible Gaussians, near to far, ties by index, in memory that backward will overwrite.
-const Item* sort_depths(State& s, int threads) {
+// Counts what is visible; returns each part's first entry, and the number of all.
+uint64_t number_entries(State& s, int64_t parts) {
   const int64_t chunks = s.places() / kChunk;
-  uint32_t low = UINT32_MAX, high = 0;
-  int64_t n = 0;
+  uint32_t* begin = s.part_begin.get(static_cast<size_t>(parts) + 1);
+  uint64_t sum = 0;
+  s.visible = 0;
   for (int64_t c = 0; c < chunks; ++c) {
-    n += s.chunk_count.data()[c];
-    low = std::min(low, s.chunk_low.data()[c]), high = std::max(high, s.chunk_high.data()[c]);
+    if (c % span(s) == 0) begin[c / span(s)] = static_cast<uint32_t>(sum);
+    s.visible += s.chunk_count.data()[c], sum += s.chunk_entries.data()[c];
+    if (sum > UINT32_MAX) throw std::bad_alloc();
   }
-  s.visible = n;
-  static_assert(sizeof(Sums) == 4 * sizeof(Item));
-  Item *half = reinterpret_cast<Item*>(s.sums.get(static_cast<size_t>(n + 1) / 2)), *sorted = half + n;
-  if (n == 0) return sorted;
-  const int width = 32 - __builtin_clz((high - low) | 1u);
-  const int shift = std::max(0, width - 2 * kDigit);
-  const int parts = n < kSmall ? 1 : threads;
-  pass(s, s.items.data(), half, true, low, shift, parts, threads);
-  pass(s, half, sorted, false, low, shift + kDigit, parts, threads);
-  if (shift == 0) return sorted;
-  std::vector<Slice> ranges;
-  for (int p = 0; p < parts; ++p) ranges.push_back(whole_runs(sorted, n, slice(n, p, parts), low, shift));
-  parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) { finish_runs(sorted, ranges[p], low, shift); });
-  return sorted;
+  begin[parts] = static_cast<uint32_t>(sum);
+  return sum;
 }
 
-// How many of a slice's rectangles hold each tile: each adds 1 at its first corner and takes it away past its sides; the running sums over
-// rows and columns are the counts. (Four steps per rectangle, and no branch on its size.)
-void count_tiles(const State& s, const Item* items, Slice range, uint32_t* count) {
-  const int width = s.tiles_x + 1, height = s.tiles_y + 1;
-  std::vector<uint32_t> corner(static_cast<size_t>(width) * height, 0u);  // modulo 2^32, so that differences may be negative
-  for (int64_t i = range.begin; i < range.end; ++i) {
-    const Rect r = items[i].rect;
-    ++corner[r.y0 * width + r.x0];
-    --corner[r.y0 * width + r.x1];
-    --corner[r.y1 * width + r.x0];
-    ++corner[r.y1 * width + r.x1];
-  }
-  for (int y = 0; y < s.tiles_y; ++y) {
-    uint32_t along = 0;
-    for (int x = 0; x < s.tiles_x; ++x) {
-      along += corner[y * width + x];
-      count[y * s.tiles_x + x] = along + (y > 0 ? count[(y - 1) * s.tiles_x + x] : 0u);
-    }
-  }
+// Bit y of four goes to bit 4 y.
+inline uint32_t apart(uint32_t rows) {
+  static constexpr uint16_t bits[16] = {0x0000, 0x0001, 0x0010, 0x0011, 0x0100, 0x0101, 0x0110, 0x0111,
+                                        0x1000, 0x1001, 0x1010, 0x1011, 0x1100, 0x1101, 0x1110, 0x1111};
+  return bits[rows];
 }
 
-// Tiles of rectangles one after the other, some hundreds at a time: written without a branch on a rectangle's size, then read in one loop.
-class Flat {
- public:
-  explicit Flat(int tiles_x) : tiles_x_(tiles_x) {
-    for (int width = 1; width <= kMost; ++width)
-      for (int i = 0; i < kMost; ++i) offset_[width][i] = static_cast<uint32_t>(i / width * tiles_x + i % width);
+// An entry on its way: the item's number in its part, the area, and the tiles; in one number, so that it is written at once.
+inline uint64_t pack(uint64_t area, uint64_t number, uint64_t tiles) { return area << 32 | number << 16 | tiles; }
+
+// Writes an item's entries, one for each area that it meets, and returns their end. Those of up to 2 x 2 areas are written without a branch
+// on how many there are.
+uint64_t* expand(const Rect r, uint64_t number, uint32_t areas_x, uint64_t* to) {
+  const uint32_t x = r.x0 / kArea, y = r.y0 / kArea, from_x = r.x0 % kArea, from_y = r.y0 % kArea;
+  const uint32_t end_x = r.x1 - x * kArea, end_y = r.y1 - y * kArea;
+  if (std::max(end_x, end_y) > 2 * kArea) {
+    for (uint32_t j = 0; j * kArea < end_y; ++j)
+      for (uint32_t i = 0; i * kArea < end_x; ++i) {
+        const uint32_t columns = (1u << std::min<uint32_t>(end_x - i * kArea, kArea)) - (i == 0 ? 1u << from_x : 1u);
+        const uint32_t rows = (1u << std::min<uint32_t>(end_y - j * kArea, kArea)) - (j == 0 ? 1u << from_y : 1u);
+        *to++ = pack((y + j) * areas_x + x + i, number, columns * apart(rows));
+      }
+    return to;
   }
-  bool full() const { return count_ > kRoom - 2 * kMost; }
-  // Takes a rectangle of at most kMost tiles; returns false for others.
-  bool add(const Item& item) {
-    const Rect r = item.rect;
-    const int width = r.x1 - r.x0, area = width * (r.y1 - r.y0);
-    if (area > kMost) return false;
-    const uint32_t first = static_cast<uint32_t>(r.y0 * tiles_x_ + r.x0);
-    const uint32_t* offset = offset_[width];
-    for (int i = 0; i < kMost; ++i) tile_[count_ + i] = first + offset[i];
-    for (int i = 0; i < kMost; ++i) place_[count_ + i] = item.place;
-    count_ += area;
-    return true;
-  }
-  void flush(uint32_t* at, uint32_t* list) {
-    for (int i = 0; i < kMost; ++i) tile_[count_ + i] = tile_[0];
-    for (int i = 0; i < count_; ++i) {
-      __builtin_prefetch(&list[at[tile_[i + kMost]]], 1);  // every tile writes elsewhere
-      list[at[tile_[i]]++] = place_[i];
+  const uint32_t columns = (1u << end_x) - (1u << from_x), rows = (1u << end_y) - (1u << from_y);  // of two areas, four bits each
+  const uint32_t left = columns & 15, right = columns >> 4, top = apart(rows & 15), bottom = apart(rows >> 4);
+  const uint64_t first = pack(y * areas_x + x, number, 0), beside = pack(1, 0, 0), below = pack(areas_x, 0, 0);
+  *to = first | left * top, ++to;
+  *to = (first + beside) | right * top, to += right > 0;
+  *to = (first + below) | left * bottom, to += bottom > 0;
+  *to = (first + below + beside) | right * bottom, to += (right > 0) & (bottom > 0);
+  return to;
+}
+
+// One part: its chunks' entries, area after area, from `entries` on; `begin` [areas + 1] tells where each area's are.
+void scatter(const State& s, int64_t part, Entry* entries, uint32_t* begin) {
+  const int areas = s.areas();
+  const uint32_t first = s.part_begin.data()[part], n = s.part_begin.data()[part + 1] - first;
+  const int64_t first_chunk = part * span(s), last_chunk = std::min(s.places() / kChunk, first_chunk + span(s));
+  const Item* items = s.items.data() + first_chunk * kChunk;
+  uint64_t *flat = scratch<Buffer<uint64_t>>().get(n + 4), *end = flat;
+  for (int64_t c = first_chunk; c < last_chunk; ++c) {
+    const uint32_t from = static_cast<uint32_t>((c - first_chunk) * kChunk), to = from + s.chunk_count.data()[c];
+    for (uint32_t i = from; i < to; ++i) {
+      __builtin_prefetch(entries + first + (end - flat), 1);
+      end = expand(items[i].rect, i, static_cast<uint32_t>(s.areas_x()), end);
     }
-    count_ = 0;
   }
-
- private:
-  static constexpr int kMost = 16, kRoom = 512 + 16;
-  int tiles_x_, count_ = 0;
-  alignas(64) uint32_t offset_[kMost + 1][kMost] = {};
-  alignas(64) uint32_t tile_[kRoom], place_[kRoom];
-};
-
-void fill_lists(const State& s, const Item* items, Slice range, uint32_t* at, uint32_t* list) {
-  Flat flat(s.tiles_x);
-  for (int64_t i = range.begin; i < range.end; ++i) {
-    const bool large = !flat.add(items[i]);
-    if (large || flat.full()) flat.flush(at, list);
-    if (!large) continue;
-    const Rect r = items[i].rect;
-    for (int y = r.y0; y < r.y1; ++y)
-      for (int x = r.x0; x < r.x1; ++x) list[at[y * s.tiles_x + x]++] = items[i].place;
+  std::fill(begin, begin + areas + 1, 0u);
+  for (const uint64_t* e = flat; e < end; ++e) ++begin[*e >> 32];
+  uint32_t sum = first;
+  for (int a = 0; a < areas; ++a) sum += std::exchange(begin[a], sum);
+  begin[areas] = sum;
+  for (const uint64_t* e = flat; e < end; ++e) {
+    const uint64_t key = items[*e >> 16 & 0xffff].key;
+    entries[begin[*e >> 32]++] = key << 32 | (*e & 0xffffffff);
   }
-  flat.flush(at, list);
+  for (int a = areas - 1; a > 0; --a) begin[a] = begin[a - 1];  // each stands at its end now, where the next begins
+  begin[0] = first;
+}
+
+// Calls f(tile, its bit) for the area's tiles in the picture.
+template <class F>
+void each_tile(const State& s, int64_t area, F&& f) {
+  const int x = static_cast<int>(area) % s.areas_x() * kArea, y = static_cast<int>(area) / s.areas_x() * kArea;
+  for (int j = 0; j < std::min(kArea, s.tiles_y - y); ++j)
+    for (int i = 0; i < std::min(kArea, s.tiles_x - x); ++i) f((y + j) * s.tiles_x + x + i, j * kArea + i);
+}
+
+// Where the lists begin; returns how many places they hold.
+uint64_t number_lists(State& s) {
+  uint32_t* begin = s.tile_begin.data();  // so far each list's length
+  uint64_t sum = 0;
+  for (int t = 0; t < s.tiles(); ++t) {
+    sum += std::exchange(begin[t], static_cast<uint32_t>(sum));
+    if (sum > UINT32_MAX - kBeyond) throw std::bad_alloc();
+  }
+  begin[s.tiles()] = static_cast<uint32_t>(sum);
+  return sum;
 }
 
 }  // namespace
 
 void bin(State& s, int threads) {
-  const Item* items = sort_depths(s, threads);
-  const int64_t n = s.visible;
-  const int tiles = s.tiles();
-  const int parts = n < kSmall ? 1 : threads;
-  uint32_t* counts = s.histogram.get(static_cast<size_t>(parts) * tiles);
-  parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) {
-    count_tiles(s, items, slice(n, static_cast<int>(p), parts), counts + p * tiles);
+  const int areas = s.areas();
+  const int64_t parts = (s.places() / kChunk + span(s) - 1) / span(s);
+  const size_t total = number_entries(s, parts);
+  // Until backward needs them, the rows of sums hold the entries and, per area near to far, their places and tiles.
+  const size_t room = total + kBeyond;
+  Entry* entries = reinterpret_cast<Entry*>(s.sums.get(room * (sizeof(Entry) + sizeof(uint32_t) + sizeof(uint16_t)) / sizeof(Sums) + 1));
+  uint32_t* places = reinterpret_cast<uint32_t*>(entries + room);
+  uint16_t* tiles_of = reinterpret_cast<uint16_t*>(places + room);
+  uint32_t* begin = s.area_begin.get(static_cast<size_t>(parts) * (areas + 1));
+  parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) { scatter(s, p, entries, begin + p * (areas + 1)); });
+
+  uint32_t* area_at = s.area_at.get(static_cast<size_t>(areas) + 1);
+  std::fill(area_at, area_at + areas + 1, 0u);
+  for (int64_t p = 0; p < parts; ++p)
+    for (int a = 0; a < areas; ++a) area_at[a + 1] += begin[p * (areas + 1) + a + 1] - begin[p * (areas + 1) + a];
+  for (int a = 0; a < areas; ++a) area_at[a + 1] += area_at[a];
+
+  s.tile_used.get(static_cast<size_t>(s.tiles()));
+  uint32_t* length = s.tile_begin.get(static_cast<size_t>(s.tiles()) + 1);
+  parallel_for(areas, 1, threads, [&](int64_t a, int64_t, int) {
+    AreaSort& sort = scratch<AreaSort>();
+    uint32_t count[kArea * kArea];
+    sort.read(entries, begin + a, parts, areas + 1, span(s) * kChunk, area_at[a + 1] - area_at[a], count);
+    sort(places + area_at[a], tiles_of + area_at[a]);
+    each_tile(s, a, [&](int tile, int bit) { length[tile] = count[bit]; });
   });
-  uint32_t* begin = s.tile_begin.get(static_cast<size_t>(tiles) + 1);
-  s.tile_used.get(static_cast<size_t>(tiles));
-  uint64_t sum = 0;
-  for (int t = 0; t < tiles; ++t) {
-    begin[t] = static_cast<uint32_t>(sum);
-    for (int p = 0; p < parts; ++p) {
-      const uint32_t count = counts[p * tiles + t];
-      counts[p * tiles + t] = static_cast<uint32_t>(sum);
-      sum += count;
-    }
-    if (sum > UINT32_MAX - kBeyond) throw std::bad_alloc();
-  }
-  begin[tiles] = static_cast<uint32_t>(sum);
-  s.pairs = static_cast<int64_t>(sum);
-  uint32_t* list = s.list.get(sum + kBeyond);
-  parallel_for(parts, 1, threads, [&](int64_t p, int64_t, int) {
-    fill_lists(s, items, slice(n, static_cast<int>(p), parts), counts + p * tiles, list);
+
+  s.pairs = static_cast<int64_t>(number_lists(s));
+  uint32_t* list = s.list.get(static_cast<size_t>(s.pairs) + kBeyond);
+  parallel_for(areas, 1, threads, [&](int64_t a, int64_t, int) {
+    const uint32_t n = area_at[a + 1] - area_at[a];
+    uint32_t* picked = scratch<Buffer<uint32_t>>().get(n + 16);
+    const Picking pick;
+    each_tile(s, a, [&](int tile, int bit) {
+      const uint32_t* end = pick(picked, places + area_at[a], tiles_of + area_at[a], n, bit);
+      std::copy(static_cast<const uint32_t*>(picked), end, list + s.tile_begin.data()[tile]);
+    });
   });
-  std::fill(list + sum, list + sum + kBeyond, sum > 0 ? list[sum - 1] : 0u);
+  std::fill(list + s.pairs, list + s.pairs + kBeyond, s.pairs > 0 ? list[s.pairs - 1] : 0u);
 }
 
 }  // namespace se::raster

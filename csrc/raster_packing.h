@@ -31,4 +31,12 @@ struct Packing {
   }
 };
 
+// Copies the places whose tiles have the bit to `to`, which needs room for n + 16, and returns their end; may read 16 beyond n.
+struct Picking {
+  uint32_t* operator()(uint32_t* to, const uint32_t* place, const uint16_t* tiles, uint32_t n, int bit) const {
+    for (uint32_t i = 0; i < n; ++i) *to = place[i], to += tiles[i] >> bit & 1;
+    return to;
+  }
+};
+
 }  // namespace se

@@ -2,6 +2,8 @@
 #include "raster_project.h"
 
 #include <algorithm>
+#include <new>
+#include <numeric>
 
 #include "pool.h"
 
@@ -11,6 +13,12 @@ namespace {
 struct Reach {  // tiles that hold a pixel centre within the ellipse of alpha >= 1/255
   F16 x0, y0, x1, y1;
   M16 drawn;
+
+  // How many areas these meet (lanes beyond the last Gaussian count too). A chunk's sum in one lane is exact: at most 2^24 for kMostAreas.
+  F16 areas() const {
+    const F16 inv = bcast(1.0f / kArea);
+    return keep(drawn, (ceil(x1 * inv) - floor(x0 * inv)) * (ceil(y1 * inv) - floor(y0 * inv)));
+  }
 };
 
 Reach reach(const Projection& p, F16 log_opacity, F16 radius, int tiles_x, int tiles_y) {
@@ -43,9 +51,17 @@ struct Lanes {  // the parts of sixteen records that are not their depth key
   }
 };
 
+// The sum of sixteen whole numbers.
+uint32_t whole_sum(F16 a) {
+  alignas(64) int32_t lane[16];
+  store_int(lane, a);
+  return static_cast<uint32_t>(std::accumulate(lane, lane + 16, int64_t{0}));
+}
+
 void project_chunk(State& s, const Inputs& in, int32_t* radii, int64_t begin, int64_t end) {
   const CameraArgs& camera = s.camera;
-  uint32_t at = static_cast<uint32_t>(begin), low = UINT32_MAX, high = 0;
+  uint32_t at = static_cast<uint32_t>(begin);
+  F16 entries = bcast(0.0f);
   for (int64_t i = begin; i < end; i += 16) {
     const int count = static_cast<int>(std::min<int64_t>(16, end - i));
     F16 mean[3], quat[4], scale[3], color[3], opacity[1];
@@ -76,6 +92,7 @@ void project_chunk(State& s, const Inputs& in, int32_t* radii, int64_t begin, in
     const uint32_t drawn = bits(r.drawn) & valid;
     s.group_mask.data()[i / 16] = static_cast<uint16_t>(drawn);
     if (!drawn) continue;
+    entries = entries + r.areas();
     load_columns(in.colors + 3 * i, count, color);
     const Lanes lanes(p, log_opacity, color);
     alignas(64) int32_t x0[16], y0[16], x1[16], y1[16];
@@ -88,21 +105,20 @@ void project_chunk(State& s, const Inputs& in, int32_t* radii, int64_t begin, in
       store(reinterpret_cast<float*>(&record), lanes.row[k]);
       const Rect rect{static_cast<uint16_t>(x0[k]), static_cast<uint16_t>(y0[k]), static_cast<uint16_t>(x1[k]),
                       static_cast<uint16_t>(y1[k])};
-      const uint32_t key = key_bits[k];
-      s.items.data()[at] = {key, at, rect};
-      low = std::min(low, key), high = std::max(high, key);
+      s.items.data()[at] = {key_bits[k], at, rect};
       ++at;
     }
   }
-  s.chunk_low.data()[begin / kChunk] = low, s.chunk_high.data()[begin / kChunk] = high;
+  s.chunk_entries.data()[begin / kChunk] = whole_sum(entries);
   s.chunk_count.data()[begin / kChunk] = at - static_cast<uint32_t>(begin);
 }
 
 }  // namespace
 
 void project(State& s, const Inputs& in, int32_t* radii, int threads) {
+  if (s.areas() > kMostAreas) throw std::bad_alloc();
   const size_t places = static_cast<size_t>(s.places());
-  s.records.get(places), s.items.get(places), s.chunk_low.get(places / kChunk), s.chunk_high.get(places / kChunk);
+  s.records.get(places), s.items.get(places), s.chunk_entries.get(places / kChunk);
   s.group_mask.get(places / 16), s.group_first.get(places / 16), s.chunk_count.get(places / kChunk);
   parallel_for(s.m, kChunk, threads, [&](int64_t begin, int64_t end, int) { project_chunk(s, in, radii, begin, end); });
 }

@@ -111,6 +111,23 @@ struct Packing {
   }
 };
 
+// Copies the places whose tiles have the bit to `to`, which needs room for n + 16, and returns their end; may read 16 beyond n.
+struct Picking {
+  uint32_t* operator()(uint32_t* to, const uint32_t* place, const uint16_t* tiles, uint32_t n, int bit) const {
+    const __m256i wanted = _mm256_set1_epi16(static_cast<int16_t>(1 << bit));
+    const auto sixteen = [&](uint32_t i, uint32_t valid) {
+      const __m256i of = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(tiles + i));
+      const uint32_t mask = _mm256_mask_test_epi16_mask(static_cast<__mmask16>(valid), of, wanted);
+      _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(static_cast<__mmask16>(mask), _mm512_loadu_si512(place + i)));
+      to += __builtin_popcount(mask);
+    };
+    uint32_t i = 0;
+    for (; i + 16 <= n; i += 16) sixteen(i, 0xffff);
+    if (i < n) sixteen(i, (1u << (n - i)) - 1);
+    return to;
+  }
+};
+
 // Sixteen rows of three floats as three columns.
 inline void load3(const float* p, F16& a, F16& b, F16& c) {
   const __m512 x = _mm512_loadu_ps(p), y = _mm512_loadu_ps(p + 16), z = _mm512_loadu_ps(p + 32);
