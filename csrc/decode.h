@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "lanes.h"
+#include "pool.h"
 
 namespace se {
 
@@ -63,11 +64,28 @@ struct Sizes {
   explicit Sizes(const Decode& d);
 };
 
+// Calls f(head, expert) for all, on all threads.
+template <class F>
+void each_expert(const Decode& d, F&& f) {
+  const int64_t first = d.heads[0].E, second = first + d.heads[1].E;
+  parallel_for(second + d.heads[2].E, 1, static_cast<int>(d.threads), [&](int64_t e, int64_t, int) {
+    if (e < first)
+      f(0, static_cast<int>(e));
+    else if (e < second)
+      f(1, static_cast<int>(e - first));
+    else
+      f(2, static_cast<int>(e - second));
+  });
+}
+
 // The weights in the layouts that the products read, padded with zeros.
 struct Packed {
   struct Expert {
     std::vector<float> w1t, wmt, bm, w2t, b2, w1, wm, w2;  // [inputs][Hp], [L][H][Hp], [L][Hp], [H][Op], [Op]; for the backward pass
-  };                                                       // [H][Fp], [L][H][Hp], [out][Hp]
+                                                           // [H][Fp], [L][H][Hp], [out][Hp]
+    Expert() = default;
+    Expert(const Decode& d, const Sizes& s, int head, int number, bool backward);
+  };
   std::vector<Expert> experts[3];
   std::vector<float> router_t, router_b, router;  // [router][Rp], [Rp]; backward [R][Fp]
   Packed(const Decode& d, const Sizes& s, bool backward);

@@ -1,5 +1,6 @@
 // Backward pass of the fused decode. Hidden layers are computed again instead of stored. See decode.h.
 #include <algorithm>
+#include <memory>
 
 #include "decode.h"
 #include "export.h"
@@ -215,6 +216,19 @@ void write_routers(const Decode& d, const Sizes& s, const Layout& layout, const 
   }
 }
 
+// Memory for that many floats, kept from call to call: made anew it would cost its page faults each time.
+float* partial_sums(int64_t floats) {
+  static thread_local std::unique_ptr<float[]> memory;
+  static thread_local int64_t size = 0;
+  if (floats > size) {
+    memory.reset();
+    size = 0;
+    memory.reset(new float[floats]);
+    size = floats;
+  }
+  return memory.get();
+}
+
 }  // namespace
 
 // Gradients of the table's rows and of all weights.
@@ -225,17 +239,19 @@ SE_EXPORT void se_decode_backward(const Decode* decode) {
   const Layout layout(d, s);
   const int64_t grain = std::max<int64_t>(1, (d.chunks() + BUFFERS - 1) / BUFFERS) * CHUNK;
   const int64_t buffers = std::max<int64_t>(1, (d.A + grain - 1) / grain);
-  std::vector<float> sums(buffers * layout.total, 0.f);
+  float* sums = partial_sums(buffers * layout.total);
+  if (!d.A) std::fill_n(sums, layout.total, 0.f);
   const int threads = static_cast<int>(d.threads);
   parallel_for(d.A, grain, threads, [&](int64_t begin, int64_t end, int) {
-    Backward pass(d, s, packed, layout, sums.data() + begin / grain * layout.total);
+    float* own = sums + begin / grain * layout.total;
+    std::fill_n(own, layout.total, 0.f);
+    Backward pass(d, s, packed, layout, own);
     for (int64_t at = begin; at < end; at += CHUNK) pass.run(at, std::min<int64_t>(end, at + CHUNK));
   });
   parallel_for(layout.total, 4096, threads, [&](int64_t begin, int64_t end, int) {
     for (int64_t b = 1; b < buffers; ++b)
       for (int64_t i = begin; i < end; ++i) sums[i] += sums[b * layout.total + i];
   });
-  for (int i = 0; i < 3; ++i)
-    for (int e = 0; e < d.heads[i].E; ++e) write_expert(d, s, layout.experts[i][e], sums.data(), i, e);
-  write_routers(d, s, layout, sums.data());
+  each_expert(d, [&](int i, int e) { write_expert(d, s, layout.experts[i][e], sums, i, e); });
+  write_routers(d, s, layout, sums);
 }

@@ -24,39 +24,38 @@ Sizes::Sizes(const Decode& d) : K(static_cast<int>(d.K)), F(static_cast<int>(d.F
   Z = round_up(F + (position ? 8 : 5), 16);
 }
 
-Packed::Packed(const Decode& d, const Sizes& s, bool backward) {
-  for (int i = 0; i < 3; ++i) {
-    const Head& head = d.heads[i];
-    const int D = s.F + 3 + static_cast<int>(head.distance), H = s.H[i], Hp = s.Hp[i], out = s.out[i], Op = s.Op[i];
-    const int L = static_cast<int>(head.L);
-    experts[i].resize(head.E);
-    for (int e = 0; e < head.E; ++e) {
-      const float *w1 = head.w1 + int64_t(e) * H * D, *b1 = head.b1 + int64_t(e) * H;
-      const float *w2 = head.w2 + int64_t(e) * out * H, *b2 = head.b2 + int64_t(e) * out;
-      Expert& x = experts[i][e];
-      x.w1t.assign(int64_t(s.inputs[i]) * Hp, 0.f), x.w2t.assign(int64_t(H) * Op, 0.f), x.b2.assign(Op, 0.f);
-      for (int j = 0; j < H; ++j) {
-        for (int c = 0; c < D; ++c) x.w1t[int64_t(c < s.F + 3 ? c : c + 1) * Hp + j] = w1[int64_t(j) * D + c];
-        x.w1t[int64_t(s.F + 3) * Hp + j] = b1[j];
-        for (int o = 0; o < out; ++o) x.w2t[int64_t(j) * Op + o] = w2[int64_t(o) * H + j];
-      }
-      std::copy_n(b2, out, x.b2.begin());
-      x.wmt.assign(int64_t(L) * H * Hp, 0.f), x.bm.assign(int64_t(L) * Hp, 0.f);
-      if (backward) x.w1.assign(int64_t(H) * s.Fp, 0.f), x.wm.assign(int64_t(L) * H * Hp, 0.f), x.w2.assign(int64_t(out) * Hp, 0.f);
-      for (int l = 0; l < L; ++l) {
-        const float *wm = head.wm + (int64_t(e) * L + l) * H * H, *bm = head.bm + (int64_t(e) * L + l) * H;
-        std::copy_n(bm, H, &x.bm[int64_t(l) * Hp]);
-        for (int j = 0; j < H; ++j)
-          for (int c = 0; c < H; ++c) {
-            x.wmt[(int64_t(l) * H + c) * Hp + j] = wm[j * H + c];
-            if (backward) x.wm[(int64_t(l) * H + j) * Hp + c] = wm[j * H + c];
-          }
-      }
-      if (!backward) continue;
-      for (int j = 0; j < H; ++j) std::copy_n(w1 + int64_t(j) * D, s.F, &x.w1[int64_t(j) * s.Fp]);
-      for (int o = 0; o < out; ++o) std::copy_n(w2 + int64_t(o) * H, H, &x.w2[int64_t(o) * Hp]);
-    }
+Packed::Expert::Expert(const Decode& d, const Sizes& s, int i, int e, bool backward) {
+  const Head& head = d.heads[i];
+  const int D = s.F + 3 + static_cast<int>(head.distance), H = s.H[i], Hp = s.Hp[i], out = s.out[i], Op = s.Op[i];
+  const int L = static_cast<int>(head.L);
+  const float *from_w1 = head.w1 + int64_t(e) * H * D, *from_b1 = head.b1 + int64_t(e) * H;
+  const float *from_w2 = head.w2 + int64_t(e) * out * H, *from_b2 = head.b2 + int64_t(e) * out;
+  w1t.assign(int64_t(s.inputs[i]) * Hp, 0.f), w2t.assign(int64_t(H) * Op, 0.f), b2.assign(Op, 0.f);
+  for (int j = 0; j < H; ++j) {
+    for (int c = 0; c < D; ++c) w1t[int64_t(c < s.F + 3 ? c : c + 1) * Hp + j] = from_w1[int64_t(j) * D + c];
+    w1t[int64_t(s.F + 3) * Hp + j] = from_b1[j];
+    for (int o = 0; o < out; ++o) w2t[int64_t(j) * Op + o] = from_w2[int64_t(o) * H + j];
   }
+  std::copy_n(from_b2, out, b2.begin());
+  wmt.assign(int64_t(L) * H * Hp, 0.f), bm.assign(int64_t(L) * Hp, 0.f);
+  if (backward) w1.assign(int64_t(H) * s.Fp, 0.f), wm.assign(int64_t(L) * H * Hp, 0.f), w2.assign(int64_t(out) * Hp, 0.f);
+  for (int l = 0; l < L; ++l) {
+    const float *from_wm = head.wm + (int64_t(e) * L + l) * H * H, *from_bm = head.bm + (int64_t(e) * L + l) * H;
+    std::copy_n(from_bm, H, &bm[int64_t(l) * Hp]);
+    for (int j = 0; j < H; ++j)
+      for (int c = 0; c < H; ++c) {
+        wmt[(int64_t(l) * H + c) * Hp + j] = from_wm[j * H + c];
+        if (backward) wm[(int64_t(l) * H + j) * Hp + c] = from_wm[j * H + c];
+      }
+  }
+  if (!backward) return;
+  for (int j = 0; j < H; ++j) std::copy_n(from_w1 + int64_t(j) * D, s.F, &w1[int64_t(j) * s.Fp]);
+  for (int o = 0; o < out; ++o) std::copy_n(from_w2 + int64_t(o) * H, H, &w2[int64_t(o) * Hp]);
+}
+
+Packed::Packed(const Decode& d, const Sizes& s, bool backward) {
+  for (int i = 0; i < 3; ++i) experts[i].resize(d.heads[i].E);
+  each_expert(d, [&](int i, int e) { experts[i][e] = Expert(d, s, i, e, backward); });
   router_t.assign(int64_t(s.router) * s.Rp, 0.f), router_b.assign(s.Rp, 0.f), router.assign(int64_t(s.R) * s.Fp, 0.f);
   for (int i = 0; i < 3; ++i) {
     const Head& head = d.heads[i];
