@@ -38,18 +38,21 @@ inline void pause() {
 #endif
 }
 
-// Waits for what another thread is about to do: some microseconds awake, since a sleep and a wake cost more than most gaps between two jobs;
-// not longer, since on a busy machine the other thread may not be running. Returns whether it happened.
+// Waits for what another thread is about to do, without sleep: waking up takes some microseconds, and on an idle core, most of all one of a
+// virtual machine, hundreds. First with the core held, which must be short, since the other thread may need it; then giving it to whoever
+// asks, which costs others little, as long as the gaps between jobs of one frame. Returns whether it happened.
 template <class Condition>
 bool soon(Condition&& condition) {
-  const auto end = std::chrono::steady_clock::now() + std::chrono::microseconds(25);
-  do {
+  const auto begin = std::chrono::steady_clock::now();
+  for (;;) {
     for (int i = 0; i < 16; ++i) {
       if (condition()) return true;
       pause();
     }
-  } while (std::chrono::steady_clock::now() < end);
-  return false;
+    const auto waited = std::chrono::steady_clock::now() - begin;
+    if (waited > std::chrono::microseconds(1000)) return false;
+    if (waited > std::chrono::microseconds(25)) std::this_thread::yield();
+  }
 }
 
 class Pool {

@@ -115,8 +115,8 @@ class _Draw(torch.autograd.Function):
         image, alpha, depth = torch.empty((*size, 3)), torch.empty(size), torch.empty(size)
         radii = torch.empty(len(means), dtype=torch.int32)
         library = _library(how.level)
-        out = [native.pointer(t).value for t in (image, alpha, depth, radii)]
-        args = _Forward(_camera(camera), how.antialias, how._threads(), len(means), *[native.pointer(t).value for t in plain], *out)
+        where = [t.data_ptr() for t in (*plain, image, alpha, depth, radii)]
+        args = _Forward(_camera(camera), how.antialias, how._threads(), len(means), *where)
         state = c_void_p()
         keep = any(ctx.needs_input_grad)
         if library.se_raster_forward(ctypes.byref(args), ctypes.byref(state) if keep else None):
@@ -136,8 +136,8 @@ class _Draw(torch.autograd.Function):
         up = [None if g is None else _plain(g) for g in grad_outputs[:3]]  # of image, alpha, depth; None: zero
         outputs = [torch.empty_like(t) for t in plain[:5]] + [ctx.mean2d_grad, torch.empty(3)]
         how: CpuRasterizer = ctx.how
-        tensors = [*plain, *up, *outputs]
-        args = _Backward(how.deterministic, how._threads(), *[native.pointer(t).value for t in tensors])
+        where = [None if t is None else t.data_ptr() for t in (*plain, *up, *outputs)]
+        args = _Backward(how.deterministic, how._threads(), *where)
         if ctx.state.library.se_raster_backward(c_void_p(ctx.state.address), ctypes.byref(args)):
             raise RunError("the backward pass of the picture ran out of memory: train with fewer Gaussians or smaller pictures")
         return *outputs[:5], outputs[6], None, None, None
@@ -159,7 +159,7 @@ def _library(level: str | None) -> ctypes.CDLL:
 
 
 def _camera(camera: Camera) -> _Camera:
-    rows = [value for row in camera.world_to_cam[:3].tolist() for value in row]
+    rows = [value for row in camera.world_to_cam.tolist()[:3] for value in row]
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     return _Camera((c_float * 12)(*rows), fx, fy, cx, cy, camera.near, camera.width, camera.height)
 
@@ -168,10 +168,12 @@ def _check(inputs: tuple[Tensor, ...]) -> None:
     count = len(inputs[0])
     for tensor, name, width in zip(inputs, ("means", "quats", "scales", "opacities", "colors"), (3, 4, 3, None, 3), strict=True):
         expected = (count,) if width is None else (count, width)
-        found = tuple(tensor.shape)
-        if found != expected or tensor.device.type != "cpu":
-            raise InputError(f"the CPU rasteriser needs {name} of shape {expected} on the CPU, not {found} on {tensor.device}")
+        if tensor.shape != expected or not tensor.is_cpu:
+            found = f"{tuple(tensor.shape)} on {tensor.device}"
+            raise InputError(f"the CPU rasteriser needs {name} of shape {expected} on the CPU, not {found}")
 
 
 def _plain(tensor: Tensor) -> Tensor:
+    if tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous():
+        return tensor  # nearly always; every call of torch costs microseconds in which other threads wait
     return tensor.detach().to(device="cpu", dtype=torch.float32).contiguous()
