@@ -33,8 +33,25 @@ inline void load_columns(const float* rows, int count, F16 (&column)[Width]) {
   for (int k = 0; k < Width; ++k) column[k] = load(temporary[k]);
 }
 
+// The way back.
 template <int Width>
 inline void store_columns(float* rows, int count, const F16 (&column)[Width]) {
+  if (count == 16) {
+    if constexpr (Width == 1) {
+      store(rows, column[0]);
+    } else if constexpr (Width == 2) {
+      store2(rows, column[0], column[1]);
+    } else if constexpr (Width == 3) {
+      store3(rows, column[0], column[1], column[2]);
+    } else {
+      static_assert(Width == 4);
+      F16 row[4] = {column[0], column[1], column[2], column[3]};
+      transpose4(row);
+      transpose_quarters(row);
+      for (int k = 0; k < 4; ++k) store(rows + 16 * k, row[k]);
+    }
+    return;
+  }
   alignas(64) float temporary[Width][16];
   for (int k = 0; k < Width; ++k) store(temporary[k], column[k]);
   for (int i = 0; i < count; ++i)
