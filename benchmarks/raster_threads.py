@@ -24,7 +24,7 @@ from scene_experts import native
 from scene_experts.render.cpu import CpuRasterizer
 from scene_experts.types import Camera, Gaussians
 
-CHUNKS = 512  # of multiply-adds: about as long as a frame
+CHUNKS = 4096  # of multiply-adds: about as long as a frame
 
 
 def arithmetic(threads: int) -> Callable[[], None]:

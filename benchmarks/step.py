@@ -67,7 +67,9 @@ def main() -> None:
         print(f"  {'whole step':<14} {1e3 * whole[name]:7.2f} ms = {against}, {whole[name] / scalar[name]:.4f} x {peer.NAME}", end="")
         print(f" ({1e3 * scalar[name]:.0f} ms)")
     if {"moe-gs", "scaffold-gs"} <= set(made):
-        print(f"moe-gs step / scaffold-gs step: {whole['moe-gs'] / whole['scaffold-gs']:.2f}")
+        same = whole["moe-gs"] - alone["moe-gs"] + alone["scaffold-gs"]
+        print(f"moe-gs step / scaffold-gs step: {whole['moe-gs'] / whole['scaffold-gs']:.2f}", end="")
+        print(f"; with scaffold-gs's Gaussians in the rasteriser: {same / whole['scaffold-gs']:.2f}")
 
 
 if __name__ == "__main__":

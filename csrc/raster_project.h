@@ -37,19 +37,12 @@ inline void load_columns(const float* rows, int count, F16 (&column)[Width]) {
 template <int Width>
 inline void store_columns(float* rows, int count, const F16 (&column)[Width]) {
   if (count == 16) {
-    if constexpr (Width == 1) {
-      store(rows, column[0]);
-    } else if constexpr (Width == 2) {
-      store2(rows, column[0], column[1]);
-    } else if constexpr (Width == 3) {
-      store3(rows, column[0], column[1], column[2]);
-    } else {
-      static_assert(Width == 4);
-      F16 row[4] = {column[0], column[1], column[2], column[3]};
-      transpose4(row);
-      transpose_quarters(row);
-      for (int k = 0; k < 4; ++k) store(rows + 16 * k, row[k]);
-    }
+    F16 line[Width];
+    for (int k = 0; k < Width; ++k) line[k] = column[k];
+    if constexpr (Width == 2) interleave2(line);
+    if constexpr (Width == 3) interleave3(line);
+    if constexpr (Width == 4) transpose4(line), transpose_quarters(line);
+    for (int k = 0; k < Width; ++k) store(rows + 16 * k, line[k]);
     return;
   }
   alignas(64) float temporary[Width][16];

@@ -140,20 +140,21 @@ inline void load3(const float* p, F16& a, F16& b, F16& c) {
                _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31));
 }
 
-// Two and three columns as sixteen rows.
-inline void store2(float* p, F16 a, F16 b) {
+// Two and three columns of sixteen rows, one row after the other.
+inline void interleave2(F16 (&r)[2]) {
   const __m512i low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
-  _mm512_storeu_ps(p, _mm512_permutex2var_ps(a.v, low, b.v));
-  _mm512_storeu_ps(p + 16, _mm512_permutex2var_ps(a.v, _mm512_add_epi32(low, _mm512_set1_epi32(8)), b.v));
+  const __m512 a = r[0].v, b = r[1].v;
+  r[0].v = _mm512_permutex2var_ps(a, low, b), r[1].v = _mm512_permutex2var_ps(a, _mm512_add_epi32(low, _mm512_set1_epi32(8)), b);
 }
-inline void store3(float* p, F16 a, F16 b, F16 c) {
-  const auto line = [&](__m512i from_ab, __m512i from_c) { return _mm512_permutex2var_ps(_mm512_permutex2var_ps(a.v, from_ab, b.v), from_c, c.v); };
-  _mm512_storeu_ps(p, line(_mm512_setr_epi32(0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5),
-                           _mm512_setr_epi32(0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15)));
-  _mm512_storeu_ps(p + 16, line(_mm512_setr_epi32(21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26),
-                                _mm512_setr_epi32(0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15)));
-  _mm512_storeu_ps(p + 32, line(_mm512_setr_epi32(0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0),
-                                _mm512_setr_epi32(26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31)));
+inline void interleave3(F16 (&r)[3]) {
+  const __m512 a = r[0].v, b = r[1].v, c = r[2].v;
+  const auto line = [&](__m512i from_ab, __m512i from_c) { return _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, from_ab, b), from_c, c); };
+  r[0].v = line(_mm512_setr_epi32(0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5),
+                _mm512_setr_epi32(0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15));
+  r[1].v = line(_mm512_setr_epi32(21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26),
+                _mm512_setr_epi32(0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15));
+  r[2].v = line(_mm512_setr_epi32(0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0),
+                _mm512_setr_epi32(26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31));
 }
 
 // a = m * 2^e with m in [0.75, 1.5)

@@ -144,19 +144,17 @@ inline void load3(const float* p, F16& a, F16& b, F16& c) {
   a = load(column[0]), b = load(column[1]), c = load(column[2]);
 }
 
-// Two and three columns as sixteen rows.
-inline void store2(float* p, F16 a, F16 b) {
-  alignas(64) float column[2][16];
-  store(column[0], a), store(column[1], b);
+// Columns of sixteen rows, one row after the other.
+template <int N>
+inline void interleave(F16 (&r)[N]) {
+  alignas(64) float column[N][16], row[16 * N];
+  for (int k = 0; k < N; ++k) store(column[k], r[k]);
   for (int i = 0; i < 16; ++i)
-    for (int k = 0; k < 2; ++k) p[2 * i + k] = column[k][i];
+    for (int k = 0; k < N; ++k) row[N * i + k] = column[k][i];
+  for (int k = 0; k < N; ++k) r[k] = load(row + 16 * k);
 }
-inline void store3(float* p, F16 a, F16 b, F16 c) {
-  alignas(64) float column[3][16];
-  store(column[0], a), store(column[1], b), store(column[2], c);
-  for (int i = 0; i < 16; ++i)
-    for (int k = 0; k < 3; ++k) p[3 * i + k] = column[k][i];
-}
+inline void interleave2(F16 (&r)[2]) { interleave(r); }
+inline void interleave3(F16 (&r)[3]) { interleave(r); }
 
 // a = m * 2^e with m in [0.75, 1.5)
 inline void split_exponent(F16 a, F16& m, F16& e) {

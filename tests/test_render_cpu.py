@@ -136,6 +136,29 @@ def test_depths_close_together_and_one_far_away() -> None:
 
 
 @pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("steps", [1e6, 30.0], ids=["single depths", "equal depths"])
+def test_order_across_chunks(level: str, steps: float) -> None:
+    """Sorted by depth beforehand, ties in their order, the same Gaussians give the same bits."""
+    inputs, camera = make(m=20_000, width=250, height=190, size=0.02)
+    camera.world_to_cam[:] = torch.eye(4)
+    inputs[0][:, 2] = torch.round(inputs[0][:, 2] * steps) / steps
+    inputs[2][::1000] *= 100  # some meet many areas
+    order = torch.sort(inputs[0][:, 2], stable=True).indices
+    drawn = [
+        CpuRasterizer(level=level, threads=2)(Gaussians(*tensors, torch.arange(len(order))), camera, BACKGROUND)
+        for tensors in (inputs, [t[order] for t in inputs])
+    ]
+    assert torch.equal(drawn[0].image, drawn[1].image) and torch.equal(drawn[0].depth, drawn[1].depth)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_from_a_pixel_to_all_the_picture(level: str) -> None:
+    inputs, camera = make(m=150, width=330, height=210, size=0.01)
+    inputs[2][:] *= 10 ** (2.5 * torch.rand(150, 1, generator=torch.Generator().manual_seed(2)))
+    agree(inputs, camera, 1e-4, level=level)
+
+
+@pytest.mark.parametrize("level", LEVELS)
 def test_deterministic_whatever_the_threads(level: str) -> None:
     inputs, camera = make(m=20000, width=150, height=130)
     first = None
