@@ -280,15 +280,15 @@ void prepare_sums(State& s, int rows, int threads) {
 void blend_backward(State& s, const float* background, const Upstream& up, float* g_background, int rows, int threads) {
   prepare_sums(s, rows, threads);
   double* total = s.background.get(static_cast<size_t>(s.tiles()) * 3);
-  parallel_for(s.tiles(), tiles_at_a_time(s, threads), threads, [&](int64_t begin, int64_t end, int worker) {
+  share_tiles(s, threads, [&](int begin, int end, int worker) {
     Work& work = scratch<Work>();
     const Exp2 exp2;
     const Sink sink{s, rows ? s.sums.data() + worker * s.places() : nullptr};
-    for (int64_t t = begin; t < end; ++t) {
+    for (int t = begin; t < end; ++t) {
       if (up.depth)
-        tile_backward<true>(s, static_cast<int>(t), work, background, up, sink, exp2);
+        tile_backward<true>(s, t, work, background, up, sink, exp2);
       else
-        tile_backward<false>(s, static_cast<int>(t), work, background, up, sink, exp2);
+        tile_backward<false>(s, t, work, background, up, sink, exp2);
     }
   });
   for (int c = 0; c < 3; ++c) {

@@ -93,10 +93,10 @@ void blend(State& s, const float* background, const Outputs& out, int threads) {
   s.transmittance.get(static_cast<size_t>(s.tiles()) * 256);
   s.checkpoints.get(s.batches() * 256);
   s.masks.get(s.batches() * kBatch), s.drawn.get(s.batches() * 16);
-  parallel_for(s.tiles(), tiles_at_a_time(s, threads), threads, [&](int64_t begin, int64_t end, int) {
+  share_tiles(s, threads, [&](int begin, int end, int) {
     Batch& batch = scratch<Batch>();
     const Exp2 exp2;
-    for (int64_t t = begin; t < end; ++t) blend_tile(s, static_cast<int>(t), batch, background, out, exp2);
+    for (int t = begin; t < end; ++t) blend_tile(s, t, batch, background, out, exp2);
   });
 }
 

@@ -4,8 +4,10 @@
 // relative to the tile's centre. Both directions of the blending run `alpha` on the same numbers, so they agree to the last bit.
 #pragma once
 #include <algorithm>
+#include <atomic>
 #include <cstring>
 
+#include "pool.h"
 #include "raster.h"
 #include "raster_simd.h"
 
@@ -222,8 +224,27 @@ inline void store_tile(float* picture, const CameraArgs& c, const Tile& tile, co
       });
 }
 
-// Tiles that a worker takes at a time: neighbours share Gaussians and fetch each other's ahead, but the last ones must not keep others waiting.
-inline int64_t tiles_at_a_time(const State& s, int threads) { return std::clamp<int64_t>(s.tiles() / (64 * int64_t{threads}), 1, 8); }
+// Runs f(begin, end, worker) over all tiles. Each worker has its own part of the picture, since neighbours share Gaussians, and then helps with
+// the parts of others. Some tiles at a time, as they fetch each other's Gaussians ahead; few, as the last ones keep all waiting.
+template <class F>
+void share_tiles(const State& s, int threads, F&& f) {
+  struct alignas(64) Part {
+    std::atomic<int> next;
+    int end;
+  };
+  const int parts = std::clamp(threads, 1, std::max(1, s.tiles())), step = std::clamp(s.tiles() / (64 * parts), 1, 8);
+  std::vector<Part> part(static_cast<size_t>(parts));
+  for (int p = 0; p < parts; ++p) {
+    part[p].next = static_cast<int>(int64_t{s.tiles()} * p / parts);
+    part[p].end = static_cast<int>(int64_t{s.tiles()} * (p + 1) / parts);
+  }
+  parallel_for(parts, 1, threads, [&](int64_t own, int64_t, int worker) {
+    for (int k = 0; k < parts; ++k) {
+      Part& from = part[(own + k) % parts];
+      for (int begin; (begin = from.next.fetch_add(step, std::memory_order_relaxed)) < from.end;) f(begin, std::min(begin + step, from.end), worker);
+    }
+  });
+}
 
 // One T per thread, made at its first use. (A plain thread_local object in a shared library is found anew at each access, in inner loops.)
 template <class T>
