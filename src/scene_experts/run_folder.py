@@ -21,7 +21,10 @@ import torch
 from torch import Tensor
 
 import scene_experts
-from scene_experts import checkpoint
+from scene_experts import (
+    checkpoint,
+    recipes,  # noqa: F401  (variants of parts that only a recipe names must be known before a configuration is read)
+)
 from scene_experts.config import Data, RunConfig, Train, from_json, to_json
 from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
