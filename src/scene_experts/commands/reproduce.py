@@ -35,6 +35,8 @@ class ReproduceCommand:
     """Folder for tables, figures and records of runs."""
     runs: Path | None = None
     """Folder for run folders; OUT/runs by default."""
+    records: Path | None = None
+    """Folder for records of finished runs, which count as done; OUT/records by default. Experiments of several sizes may share one."""
     scale: float = 1.0
     """1 is the paper's size; less shortens the schedule and the longest side (of 1,600 px) together."""
     iterations: int | None = None
@@ -69,7 +71,7 @@ def reproduce(args: list[str]) -> int:
             raise InputError(f"expected --recipes among {', '.join(sorted(known))}, found '{recipe}'{nearest(recipe, known)}; correct it")
     if command.recipes:
         wanted = [spec for spec in wanted if spec.recipe in command.recipes]
-    records, runs = command.out / "records", command.runs or command.out / "runs"
+    records, runs = command.records or command.out / "records", command.runs or command.out / "runs"
     console = Console(highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
     if not wanted:
@@ -77,9 +79,11 @@ def reproduce(args: list[str]) -> int:
     for run in command.adopt:
         say(f"adopted {report.adopt(run, records)}")
     if command.dry_run:
-        done = store.load(records)
-        for spec in wanted:
-            say(f"{'done   ' if store.find(done, spec) else 'to run '} {spec.label}")
+        there = store.load(records)
+        done = [store.find(there, spec) is not None for spec in wanted]
+        for spec, is_done in zip(wanted, done):
+            say(f"{'done   ' if is_done else 'to run '} {spec.label}")
+        say(f"{len(wanted)} runs, {sum(done)} of them done")
         return 0
     figure5 = set(EXPERIMENTS["fig5"].rows.values()) if any(e.name == "fig5" for e in chosen) else set()
 
@@ -98,7 +102,7 @@ def reproduce(args: list[str]) -> int:
     for spec in wanted:  # pictures of runs that were done before this figure was asked for
         if not (command.out / f"fig5_{spec.scene.name}.png").is_file() and (spec.folder(runs) / "results.json").is_file():
             draw(spec, spec.folder(runs))
-    for path in report.write(command.out, chosen, scenes, [r for r in store.load(records) if r.key in keys]):
+    for path in report.write(command.out, chosen, scenes, [r for r in store.load(records) if r.key in keys], said(command, scenes)):
         say(f"wrote {path}")
     if runner.stop.is_set():
         say("stopped; give the same command again to go on")
@@ -107,6 +111,18 @@ def reproduce(args: list[str]) -> int:
         lines = "; ".join(f"{f.spec.label}: {f.why} ({f.log})" for f in failures)
         raise RunError(f"expected {len(wanted)} runs to end well, found {len(failures)} that failed, the rest is done: {lines}")
     return 0
+
+
+def said(command: ReproduceCommand, scenes: list[Scene]) -> str:
+    """The command that makes these tables and figures, without the places that are this machine's own."""
+    words = [PROG, "reproduce", *command.experiments]
+    if command.captures:
+        words += ["--captures", *(f"CAPTURES/{scene.name}" for scene in scenes)]
+    for name in ("scenes", "scale", "iterations", "resolution", "seeds", "recipes"):
+        value = getattr(command, name)
+        if value != getattr(ReproduceCommand(()), name):
+            words += [f"--{name}", *(map(str, value) if isinstance(value, tuple) else [str(value)])]
+    return " ".join(words)
 
 
 def experiments_of(command: ReproduceCommand) -> list[Experiment]:
