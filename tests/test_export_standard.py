@@ -27,7 +27,7 @@ def test_every_format_is_known_by_its_content(tmp_path, format):
 
 
 def test_what_is_refused(tmp_path):
-    with pytest.raises(InputError, match="expected a format of ply.*, found 'plx'; did you mean 'ply'"):
+    with pytest.raises(InputError, match=r"expected a format of ply.*, found 'plx'; did you mean 'ply'"):
         write_standard(tmp_path / "a", splats(), "plx", {})
     s = splats()
     s.sh[2, 1, 0] = float("nan")

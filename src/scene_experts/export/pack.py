@@ -78,12 +78,12 @@ def to_bytes(values: Floats) -> Bytes:
 
 def byte_logits(values: NDArray[Any]) -> NDArray[np.float32]:
     """Logits [N] of opacities stored as bytes."""
-    return logits(np.asarray(values, np.float64) / 255)
+    return logits(np.asarray(values, np.float64) / 255, _EDGE)
 
 
-def logits(opacity: Floats) -> NDArray[np.float32]:
-    """Logits [N] of opacities in [0, 1], finite at both ends."""
-    a = np.clip(opacity, _EDGE, 1 - _EDGE)
+def logits(opacity: Floats, edge: float = 1e-7) -> NDArray[np.float32]:
+    """Logits [N] of opacities in [0, 1], taken at least `edge` inside, so that they are finite."""
+    a = np.clip(opacity, edge, 1 - edge)
     return np.log(a / (1 - a)).astype(np.float32)
 
 

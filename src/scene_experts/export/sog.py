@@ -1,8 +1,8 @@
 """PlayCanvas's SOG, version 2: a zip of lossless WebP pictures with a byte or two per value, and a palette for the harmonics.
 
 Positions are 16 bits of sign(x) ln(1 + |x|) between each axis's ends; log scales and colours indices into 256 levels; rotations the
-smallest three in a byte each; harmonics above the constant one of at most 65,536 rows, whose values are indices into 256 levels as well. Gaussians
-are sorted along the Morton curve and fill the pictures row by row.
+smallest three in a byte each; harmonics above the constant one of at most 65,536 rows, whose values are indices into 256 levels as well.
+Gaussians are sorted along the Morton curve and fill the pictures row by row.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def _webp(values: NDArray[Any], width: int, height: int) -> bytes:
     pixels[:, 3] = 255
     pixels[: len(values), : values.shape[1]] = values
     stream = io.BytesIO()
-    Image.fromarray(pixels.reshape(height, width, 4), "RGBA").save(stream, "WEBP", lossless=True, exact=True, quality=100, method=4)
+    Image.fromarray(pixels.reshape(height, width, 4), "RGBA").save(stream, "WEBP", lossless=True, exact=True, quality=75, method=4)
     return stream.getvalue()
 
 

@@ -84,7 +84,7 @@ def decode_spz(data: bytes, path: Path) -> Splats:
         raise damaged(path, WHAT, "positions that are no numbers")
     quats = _unpack_quats(streams["rotations"], n) if version >= 3 else _unpack_xyz(streams["rotations"], n)
     dc = (streams["colors"].reshape(n, 1, 3) / 255.0 - 0.5) / _COLOR
-    rest = (streams["sh"].reshape(n, -1, 3).astype(np.float64) - 128) / 128
+    rest = (streams["sh"].reshape(n, (degree + 1) ** 2 - 1, 3).astype(np.float64) - 128) / 128
     used = min(degree, 3)
     sh = np.concatenate([dc, rest[:, : (used + 1) ** 2 - 1]], 1)
     scales = streams["scales"].reshape(n, 3) / 16.0 - 10
