@@ -30,8 +30,8 @@ def refuse(run: OpenRun) -> None:
     """Raises InputError for a scene of graph points: no file of anchors holds what its networks need."""
     if isinstance(run.scene, GraphScene):
         raise InputError(
-            f"expected a scene of anchors for this format, found a run of '{run.config.train.recipe}'; use a standard format (--format ply); "
-            "its own files are in point_cloud/ of the run folder, where training wrote them"
+            f"expected a scene of anchors for this format, found a run of '{run.config.train.recipe}'; "
+            "use a standard format such as ply; its own files are in point_cloud/ of the run folder, where training wrote them"
         )
 
 
