@@ -43,7 +43,7 @@ def evaluate_run(
         raise InputError(f"expected the capture that {run} was trained on, found other views in {capture.root}; give the right --data")
     about = About(
         recipe=opened.config.train.recipe,
-        iterations=opened.cfg.iterations,
+        iterations=opened.cfg.iterations if opened.step else 0,  # an imported file that says nothing of its training
         seed=opened.cfg.seed,
         train_seconds=opened.seconds,
         versions=opened.config.versions,
