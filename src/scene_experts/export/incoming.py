@@ -59,7 +59,7 @@ def import_result(source: Path, data: Data, out: Path, iteration: int | None = N
     capture = run_folder.load_capture(data)
     capture.images.close()
     if read.scene is not None:
-        _check_world(world_in(read.scene), capture.world)
+        check_world(world_in(read.scene), capture.world)
         capture = replace(capture, world=world_in(read.scene))
     voxel = float(read.scene["voxel_size"]["trained"]) if read.scene else read.voxel
     plain = _plain_values(read, capture)
@@ -164,7 +164,7 @@ def _config(read: _Read) -> Train:
     return replace(scaffold_gs, scene=scene, iterations=length)
 
 
-def _check_world(trained: World, found: World) -> None:
+def check_world(trained: World, found: World) -> None:
     """Raises InputError unless the capture is read into the world the scene was trained in (to rounding)."""
     pairs = [(trained.scale, found.scale), *zip(trained.shift, found.shift)]
     reach = max(1.0, *(abs(s) for s in trained.shift))

@@ -11,7 +11,7 @@ from scene_experts import run_folder
 from scene_experts.config import Data, to_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
-from scene_experts.export import explicit, graph_points
+from scene_experts.export import explicit, graph_points, graph_points_in
 from scene_experts.export.bake_measure import as_trained, scores
 from scene_experts.export.cameras import write_cameras
 from scene_experts.export.compact import Compact, Sizes, read_compact, write_compact
@@ -195,6 +195,10 @@ def world_of(run: OpenRun) -> World:
 
 def import_result(source: Path, data: Data, out: Path, iteration: int | None = None) -> Path:
     """Make the run folder `out` of a result folder, compact file (`incoming`) or PLY file of 3DGS, with its layout; returns it."""
+    if graph := graph_points_in.find_folder(source, iteration):
+        capture = graph_points_in.import_folder(graph, data, out)
+        write_layout(run_folder.open_run(out), capture)
+        return out
     file = explicit.find_file(source, iteration)
     capture = import_files(source, data, out, iteration) if file is None else explicit.import_file(file, data, out, iteration)
     write_layout(run_folder.open_run(out), capture)
