@@ -78,8 +78,8 @@ def _compressed(s: Splats) -> dict[str, Tensor | float]:
 
 def _spz(s: Splats) -> dict[str, Tensor | float]:
     bits = max(0, min(20, 22 - math.floor(math.log2(max(float(s.means.abs().max()) if len(s) else 1, 1e-9)))))
-    half = torch.tensor([4.6] * 3 + [8.6] * 12, dtype=torch.float64)[: s.sh.shape[1] - 1, None] / 128
-    rest = half + (s.sh[:, 1:].double().abs() - 1 + half).clamp_min(0)
+    half = 0.51 / 128
+    rest = half + (s.sh[:, 1:].double().abs() - 1 + 1 / 128).clamp_min(0)
     dc = s.sh[:, :1].double()
     return {
         "means": 0.51 / 2**bits + 1e-7 * s.means.abs().double(),

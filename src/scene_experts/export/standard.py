@@ -16,6 +16,7 @@ from scene_experts.errors import InputError, nearest
 from scene_experts.export.comments import note_comments
 from scene_experts.export.compressed_ply import read_compressed_ply, write_compressed_ply
 from scene_experts.export.gltf import read_glb, write_glb
+from scene_experts.export.html_page import MARK, read_html, write_html
 from scene_experts.export.ply import HEADER_LIMIT, read_gaussian_ply, write_gaussian_ply
 from scene_experts.export.sog import read_sog, write_sog
 from scene_experts.export.splat_file import ROW, read_splat, write_splat
@@ -53,6 +54,7 @@ FORMATS: dict[str, Format] = {
     "spz": Format(".spz", "Niantic's, small; phones and glTF tools read it", write_spz, read_spz),
     "sog": Format(".sog", "PlayCanvas's, the smallest", write_sog, read_sog),
     "glb": Format(".glb", "glTF with KHR_gaussian_splatting, exact", write_glb, read_glb),
+    "html": Format(".html", "a page that shows the scene, opened from disk in any browser", write_html, read_html),
 }
 
 _MARKS: dict[str, tuple[bytes, ...]] = {"spz": (b"\x1f\x8b", b"NGSP"), "sog": (b"PK\x03\x04",), "glb": (b"glTF",)}
@@ -97,6 +99,8 @@ def format_of(path: Path) -> str:
     for name, marks in _MARKS.items():
         if head.startswith(marks):
             return name
+    if MARK in head:
+        return "html"
     if path.suffix.lower() == ".splat" or _like_splat(head, path.stat().st_size):
         return "splat"
     raise InputError(f"expected a file of {', '.join(FORMATS)} at {path}, found something else; give another file")
