@@ -129,7 +129,9 @@ def experiments_of(command: ReproduceCommand) -> list[Experiment]:
     """Raises InputError for a name that is no experiment."""
     if not command.experiments:
         raise InputError(f"expected what to reproduce ({', '.join(EXPERIMENTS)}, or all), found nothing; name one or more")
-    names = list(EXPERIMENTS) if "all" in command.experiments else list(command.experiments)
+    names = list(dict.fromkeys(command.experiments))
+    if "all" in names:  # on one's own captures table 2 is table 1 again
+        names = [name for name in EXPERIMENTS if name != "table2" or not command.captures]
     for name in names:
         if name not in EXPERIMENTS:
             hint = nearest(name, EXPERIMENTS)

@@ -16,6 +16,7 @@ from scene_experts.render import choose
 from scene_experts.reproduce import claims, figures, store, tables
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN, Scene, Spec
+from scene_experts.reproduce.statistics import SEED_NOISE
 from scene_experts.reproduce.store import Record
 
 
@@ -35,7 +36,8 @@ def write(
         page += [f"## {experiment.title}", "", ", ".join(f"[{p.name}]({p.name})" for p in made) or "No run is done yet.", ""]
         page += [f"![{p.stem}]({p.name})\n" for p in made if p.suffix == ".png"]
     page += ["## The paper's claims", "", claims.to_markdown(claims.check(records))]
-    page += ["Differences are paired over views and seeds; the interval is a bootstrap over both within these captures.", ""]
+    page += ["Differences are paired over views and seeds; the interval is a bootstrap over both within these captures."]
+    page += [f"With one seed it is at least {SEED_NOISE} dB / sqrt(captures) to each side: what another seed changes.", ""]
     path = out / "README.md"
     write_bytes(path, "\n".join(page).encode())
     return [*written, path]
@@ -86,7 +88,8 @@ def expert_strip(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
     finally:
         capture.images.close()
     path = out / f"fig5_{spec.scene.name}.png"
-    pictures.write(path, pictures.to_8bit(expert_pictures.strip([whole, *each])))
+    captions = [f"all {attribute} experts", *(f"expert {i + 1}" for i in range(len(each)))]
+    pictures.write(path, pictures.row([pictures.to_8bit(p) for p in (whole, *each)], captions))
     return path
 
 
