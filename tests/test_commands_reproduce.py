@@ -2,6 +2,7 @@
 
 import pytest
 
+from records import record
 from scene_experts import cli
 from scene_experts.commands.reproduce import ReproduceCommand, experiments_of, scenes_of
 from scene_experts.errors import InputError
@@ -37,6 +38,15 @@ def test_runs_tables_and_figures_and_nothing_twice(tmp_path, capsys):
     assert "2 runs, 2 of them done" in capsys.readouterr().out
     page = (tmp_path / "other" / "README.md").read_text()
     assert "scene-experts reproduce fig3 --captures CAPTURES/box --iterations 40 --recipes" in page and str(tmp_path) not in page
+
+
+def test_tables_of_what_is_done_without_running_the_rest(tmp_path, capsys):
+    (tmp_path / "fox").mkdir()
+    args = ["--captures", str(tmp_path / "fox"), "--out", str(tmp_path / "out"), "--iterations", "3000", "--tables-only"]
+    store.write(tmp_path / "out" / "records", record("moe-gs", "fox"))
+    assert cli.main(["reproduce", "table4", *args]) == 0
+    assert "wrote" in capsys.readouterr().out and "31.50" in (tmp_path / "out" / "table4.md").read_text()
+    assert not (tmp_path / "out" / "runs").exists()
 
 
 def recipes_of(capsys, *args: str) -> tuple[int, set[str], set[str]]:

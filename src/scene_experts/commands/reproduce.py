@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -56,6 +56,8 @@ class ReproduceCommand:
     """Run folders made elsewhere, to count as done where they are exactly what is asked for."""
     dry_run: bool = False
     """Say what would run, and run nothing."""
+    tables_only: bool = False
+    """Write the tables and figures of what is done, and run nothing."""
 
 
 def reproduce(args: list[str]) -> int:
@@ -64,13 +66,8 @@ def reproduce(args: list[str]) -> int:
     chosen = experiments_of(command)
     scenes = scenes_of(command)
     scale = Scale.of(command.scale, command.iterations, command.resolution)
+    chosen = rows_of(chosen, command.recipes) if command.recipes else chosen
     wanted = specs(chosen, scenes, command.seeds or (0,), scale)
-    known = {recipe for experiment in chosen for recipe in experiment.rows.values()}
-    for recipe in command.recipes:
-        if recipe not in known:
-            raise InputError(f"expected --recipes among {', '.join(sorted(known))}, found '{recipe}'{nearest(recipe, known)}; correct it")
-    if command.recipes:
-        wanted = [spec for spec in wanted if spec.recipe in command.recipes]
     records, runs = command.records or command.out / "records", command.runs or command.out / "runs"
     console = Console(highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
@@ -94,7 +91,7 @@ def reproduce(args: list[str]) -> int:
     runner = Runner(runs, records, command.workers, command.devices, command.discard, say, draw)
     previous = {s: signal.signal(s, lambda *_: runner.end()) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
-        failures = runner.make(wanted)
+        failures = [] if command.tables_only else runner.make(wanted)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
@@ -123,6 +120,16 @@ def said(command: ReproduceCommand, scenes: list[Scene]) -> str:
         if value != getattr(ReproduceCommand(()), name):
             words += [f"--{name}", *(map(str, value) if isinstance(value, tuple) else [str(value)])]
     return " ".join(words)
+
+
+def rows_of(experiments: list[Experiment], recipes: tuple[str, ...]) -> list[Experiment]:
+    """The experiments with the rows of `recipes` alone. Raises InputError for a recipe that none of them has."""
+    known = {recipe for experiment in experiments for recipe in experiment.rows.values()}
+    for recipe in recipes:
+        if recipe not in known:
+            raise InputError(f"expected --recipes among {', '.join(sorted(known))}, found '{recipe}'{nearest(recipe, known)}; correct it")
+    few = [replace(e, rows={name: recipe for name, recipe in e.rows.items() if recipe in recipes}) for e in experiments]
+    return [e for e in few if e.rows]
 
 
 def experiments_of(command: ReproduceCommand) -> list[Experiment]:
