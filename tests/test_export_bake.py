@@ -29,24 +29,22 @@ def capture(tmp_path_factory):
     found.images.close()
 
 
-def sums_of(weight, opacity) -> Sums:
-    weight, n = torch.tensor(weight), len(weight)
-    ones = torch.ones(n)
-    return Sums(weight, weight / torch.tensor(opacity), ones, ones, weight[:, None] * ones[:, None].repeat(1, 3),
-                weight[:, None] * torch.full((n, 3), -2.0), weight[:, None] * torch.tensor([[0.0, 0, 3, 0]]), ())  # fmt: skip
-
-
 def test_what_is_kept_contributes_most():
-    sums = sums_of([5.0, 0.0, 1.0, 90.0, 3.0, 1.0], [0.5, 0.5, 0.5, 0.5, 0.5, 0.5 * LEAST_ALPHA])
-    assert kept(sums, Bake()).tolist() == [0, 2, 3, 4]  # nothing that shows nowhere, nothing too faint to be drawn
-    assert kept(sums, Bake(max_gaussians=2)).tolist() == [0, 3]
-    assert kept(sums, Bake(prune=0.05)).tolist() == [0, 3]
-    assert kept(sums, Bake(prune=0.5)).tolist() == [3]
-    columns = closed_form(sums, torch.tensor([0, 3]))
+    weight, opacity = torch.tensor([5.0, 0.0, 1.0, 90.0, 3.0, 1.0]), torch.tensor([0.5, 0.5, 0.5, 0.5, 0.5, 0.5 * LEAST_ALPHA])
+    assert kept(weight, opacity, Bake()).tolist() == [0, 2, 3, 4]  # nothing that shows nowhere, nothing too faint to be drawn
+    assert kept(weight, opacity, Bake(max_gaussians=2)).tolist() == [0, 3]
+    assert kept(weight, opacity, Bake(prune=0.05)).tolist() == [0, 3]
+    assert kept(weight, opacity, Bake(prune=0.5)).tolist() == [3]
+
+
+def test_means_are_sums_over_contributions():
+    weight = torch.tensor([[5.0], [90.0]])
+    sums = Sums(weight[:, 0], weight[:, 0] / 0.5, weight * torch.ones(3), weight * -2.0, weight * torch.tensor([0.0, 0, 3, 0]), ())
+    columns = closed_form(sums, torch.tensor([1, 0]))
     torch.testing.assert_close(columns["means"], torch.ones(2, 3))
-    torch.testing.assert_close(columns["log_scales"], torch.full((2, 3), -2.0))
+    torch.testing.assert_close(columns["log_scales"], torch.full((2, 1), -2.0))
     torch.testing.assert_close(columns["quats"], torch.tensor([[0.0, 0, 1, 0]]).repeat(2, 1))
-    torch.testing.assert_close(columns["raw_opacity"].sigmoid(), torch.full((2,), 0.5))
+    torch.testing.assert_close(sums.opacity(), torch.full((2,), 0.5))
 
 
 def test_explicit_gaussians_keep_everything_but_cut_harmonics(capture):

@@ -1,6 +1,7 @@
 """Contributions, means over views and least squares of a bake, against what they are by definition."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,10 +9,10 @@ from torch.nn import functional
 
 from scene_experts.export import bake_sums
 from scene_experts.export.bake import explicit
-from scene_experts.export.bake_sums import add_up, contributions, fit_harmonics, solved
+from scene_experts.export.bake_sums import add_up, contributions, fit_harmonics, hidden, solved
 from scene_experts.geometry.sh import basis
 from scene_experts.render import choose
-from scene_experts.types import Camera, Gaussians
+from scene_experts.types import Camera, Decoded, Gaussians
 from scene_experts.view.paths import look_at
 
 STEP = 3
@@ -63,7 +64,7 @@ def test_contributions_are_blending_weights():
 
 def test_means_over_views_of_what_does_not_change_are_what_it_is():
     draw, made = choose("auto", "cpu"), columns(60)
-    sums = add_up(explicit(made, 5.0), STEP, 60, 1, cameras(6), draw, silent)
+    sums = add_up(explicit(made, 5.0), STEP, 60, cameras(6), draw, silent)
     seen = sums.weight > 1
     assert seen.sum() > 40 and sums.quats.shape == (60, 4)
     weight = sums.weight[seen, None]
@@ -75,20 +76,25 @@ def test_means_over_views_of_what_does_not_change_are_what_it_is():
     torch.testing.assert_close(sums.opacity()[seen], made["raw_opacity"][seen].sigmoid(), rtol=1e-4, atol=1e-5)
 
 
-def test_a_slot_that_is_off_in_half_of_its_views_has_half_its_opacity():
-    draw, made = choose("auto", "cpu"), columns(1) | {"means": torch.zeros(1, 3)}
-    scene, count = explicit(made, 5.0), iter(range(100))
+def test_what_is_left_out_counts_by_its_area():
+    draw, made = choose("auto", "cpu"), columns(2) | {"means": torch.zeros(2, 3)}
+    scene, (near, far) = explicit(made, 5.0), (cameras(1)[0], cameras(1)[0])
+    pose = far.world_to_cam.clone()
+    pose[2, 3] *= 2
+    far = replace(far, world_to_cam=pose)
 
-    def blinking(camera, step, training, cull):
-        decoded = scene(camera, step, training, cull)
-        g, on = decoded.gaussians, next(count) % 2 == 0
-        if on:
-            return decoded
-        none = Gaussians(*(getattr(g, name)[:0] for name in ("means", "quats", "scales", "opacities", "colors", "source")))
-        return type(decoded)(none, decoded.rows, None, {})
+    def shy(camera, step, training, cull):
+        """Leaves the first Gaussian out when seen from far away."""
+        g = scene(camera, step, training, cull).gaussians
+        rows = torch.arange(int(camera is far), len(g))
+        names = ("means", "quats", "scales", "opacities", "colors", "source")
+        return Decoded(Gaussians(*(getattr(g, name)[rows] for name in names)), rows, None, {})
 
-    sums = add_up(blinking, STEP, 1, 1, cameras(4), draw, silent)
-    assert float(sums.opacity()) == pytest.approx(0.5 * float(made["raw_opacity"].sigmoid()), rel=1e-4)
+    sizes = made["log_scales"].amax(1).exp()
+    ratio = float((far.position.norm() / near.position.norm()) ** -2)
+    for looks, expected in (([near, far], [ratio, 0.0]), ([near, near, far], [ratio / 2, 0.0])):
+        found = hidden(shy, STEP, torch.arange(2), 2, made["means"], sizes, looks, draw, silent)
+        torch.testing.assert_close(found, torch.tensor(expected), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -110,7 +116,7 @@ def test_harmonics_of_a_scene_that_has_some_come_back(monkeypatch):
     monkeypatch.setattr(bake_sums, "_ROOM", 20 * 16 * 40)  # twenty Gaussians at a time
     monkeypatch.setattr(bake_sums, "_SOLVE", 7)
     draw, made, looks = choose("auto", "cpu"), columns(60, 1), cameras(40)
-    sums = add_up(explicit(made, 5.0), STEP, 60, 1, looks, draw, silent)
+    sums = add_up(explicit(made, 5.0), STEP, 60, looks, draw, silent)
     rows = (sums.weight > 20).nonzero().squeeze(1)
     found = fit_harmonics(explicit(made, 5.0), STEP, rows, sums, made["means"][rows], 1, looks, draw, silent)
     torch.testing.assert_close(found, torch.cat([made["sh_dc"][:, None], made["sh_rest"]], 1)[rows], rtol=1e-2, atol=1e-3)

@@ -1,8 +1,8 @@
 """The bake: a scene whose Gaussians depend on the camera as standard Gaussians, which do not but for their harmonics.
 
 Every decoded Gaussian that contributes to a training view becomes one standard Gaussian. Its opacity, size, rotation and colour are means
-over the views, weighted by what it contributed (`bake_sums`); then all parameters are moved together until the pictures agree
-(`bake_refine`). Views held out are never looked at.
+over the views, weighted by what it contributed (`bake_sums`), its opacity less where the scene often leaves it out; then all parameters
+are moved together until the pictures agree (`bake_refine`). Views held out are never looked at.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch.nn import functional
 from scene_experts.data.views import Capture
 from scene_experts.errors import InputError, expect_at_least
 from scene_experts.export.bake_refine import Refine, refine
-from scene_experts.export.bake_sums import Sums, Tell, add_up, fit_harmonics
+from scene_experts.export.bake_sums import Sums, Tell, add_up, fit_harmonics, hidden
 from scene_experts.export.bake_views import Views
 from scene_experts.geometry.sh import MAX_DEGREE
 from scene_experts.render import Rasterizer
@@ -25,6 +25,9 @@ from scene_experts.scene.explicit import Explicit, GaussianScene
 from scene_experts.scene.frozen import freeze
 from scene_experts.table import Table
 
+FREE_LOOKS = 150  # free views, beside the others, from which is seen what the scene leaves out
+MOSTLY = 3.0  # Gaussians left out more than so many times as much as they are drawn are dropped, and the others take their place
+MOST_ALPHA = 0.995  # so that logits stay finite
 LEAST_ALPHA = 1.0 / 255.0  # rasterisers leave out what is fainter: such a Gaussian is drawn nowhere
 
 
@@ -65,20 +68,26 @@ def bake(scene: Scene, step: int, capture: Capture, rasterize: Rasterizer, how: 
     how.check()
     generator = torch.Generator().manual_seed(how.seed)
     views, draws = Views.of(capture), freeze(scene, step)
-    cameras = views.for_sums(generator)
-    slots = len(scene.table) * scene.K
-    sums = add_up(draws, step, slots, scene.K, cameras, rasterize, tell)
-    rows = kept(sums, how)
-    if not len(rows):
+    cameras, slots = views.for_sums(generator), len(scene.table) * scene.K
+    sums = add_up(draws, step, slots, cameras, rasterize, tell)
+    rows = (sums.weight > 0).nonzero().squeeze(1)
+    found, columns, opacity = len(rows), closed_form(sums, rows), sums.opacity().index_select(0, rows)
+    if not isinstance(scene, GaussianScene):
+        looks = [*cameras, *(views.free(generator) for _ in range(FREE_LOOKS))]
+        sizes = columns["log_scales"].amax(1).exp()
+        left_out = hidden(draws, step, rows, slots, columns["means"], sizes, looks, rasterize, tell)
+        opacity = torch.where(left_out > MOSTLY, 0.0, opacity / (1 + left_out))
+    chosen = kept(sums.weight.index_select(0, rows), opacity, how)
+    if not len(chosen):
         raise InputError("expected a scene that shows in its training views, found none of its Gaussians in any; train it longer")
-    columns = closed_form(sums, rows)
+    columns["raw_opacity"] = torch.logit(opacity.clamp(LEAST_ALPHA, MOST_ALPHA))
+    rows, columns = rows[chosen], {name: value.index_select(0, chosen) for name, value in columns.items()}
     degree = how.sh_degree
     if isinstance(scene, GaussianScene):  # nothing but colours depends on the camera
         degree = min(degree, scene.config.sh_degree)
         columns = {name: scene.table.params[name].detach().index_select(0, rows) for name in columns}
     sh = fit_harmonics(draws, step, rows, sums, columns["means"], degree, cameras, rasterize, tell)
     columns |= {"sh_dc": sh[:, 0].contiguous(), "sh_rest": sh[:, 1:].contiguous()}
-    found = int((sums.weight > 0).sum())
     del sums, sh
     first = explicit(columns, scene.extent)
     if not how.refine.iterations:
@@ -88,28 +97,25 @@ def bake(scene: Scene, step: int, capture: Capture, rasterize: Rasterizer, how: 
     return Baked(drawable(second), first, found)
 
 
-def kept(sums: Sums, how: Bake) -> Tensor:
-    """The slots [n] int64, ascending, that become Gaussians: those that contribute, less what the settings leave out."""
-    order = sums.weight.argsort(descending=True)
-    weight = sums.weight.index_select(0, order).double()
-    opaque = (sums.opacity() >= LEAST_ALPHA).index_select(0, order)
-    share = weight.cumsum(0) / weight.sum().clamp_min(1e-12)
-    chosen = (weight > 0) & opaque
+def kept(weight: Tensor, opacity: Tensor, how: Bake) -> Tensor:
+    """Which Gaussians [k] int64, ascending, of contributions `weight` [n] are kept: those that can be drawn, less what `how` leaves out."""
+    order = weight.argsort(descending=True)
+    sorted_ = weight.index_select(0, order).double()
+    before = (sorted_.cumsum(0) - sorted_) / sorted_.sum().clamp_min(1e-12)
+    chosen = (sorted_ > 0) & (opacity.index_select(0, order) >= LEAST_ALPHA)
     if how.prune > 0:
-        chosen &= share - weight / weight.sum().clamp_min(1e-12) < 1 - how.prune
+        chosen &= before < 1 - how.prune
     out = order[chosen]
     return (out[: how.max_gaussians] if how.max_gaussians else out).sort().values
 
 
 def closed_form(sums: Sums, rows: Tensor) -> dict[str, Tensor]:
-    """The columns of explicit Gaussians without their harmonics: means over the views of the slots `rows` [n]."""
+    """Means over the views, weighted by contribution, of the slots `rows` [n]: columns of explicit Gaussians but opacity and harmonics."""
     weight = sums.weight.index_select(0, rows)[:, None]
-    opacity = sums.opacity().index_select(0, rows).clamp(LEAST_ALPHA, 0.995)
     return {
         "means": sums.means.index_select(0, rows) / weight,
         "log_scales": sums.log_scales.index_select(0, rows) / weight,
         "quats": functional.normalize(sums.quats.index_select(0, rows), dim=1),
-        "raw_opacity": torch.logit(opacity),
     }
 
 

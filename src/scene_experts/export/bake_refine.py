@@ -24,7 +24,7 @@ class Refine:
     """How baked Gaussians are refined. Learning rates run log-linearly from first to last; that of means is multiplied by the extent."""
 
     iterations: int = 500
-    between: float = 0.5  # share of iterations that look from between the training views
+    free: float = 0.6  # share of iterations that look from free views
     dssim: float = 0.2  # weight of 1 - SSIM in the loss, L1 has the rest
     means: Rate = Rate(0.00004, 0.0000016)
     log_scales: Rate = Rate(0.005, 0.0005)
@@ -47,17 +47,17 @@ def refine(
 ) -> None:
     """Move the columns of `scene` until it draws what `draws` does at `step`, over `background` [3].
 
-    It looks from the training views, each once an epoch in random order, and from views between them.
+    It looks from the training views, each once an epoch in random order, and from free views around them.
     """
     generator = torch.Generator().manual_seed(seed)
     groups = scene.rate_groups().items()
     optimizer = Adam([{"params": params, "name": name, "lr": 0.0} for name, params in groups])
-    between = (torch.rand(how.iterations, generator=generator) < how.between).tolist()
+    free = (torch.rand(how.iterations, generator=generator) < how.free).tolist()
     queue: list[int] = []
-    for i, is_between in enumerate(between):
-        if not is_between and not queue:
+    for i, is_free in enumerate(free):
+        if not is_free and not queue:
             queue = torch.randperm(len(views), generator=generator).tolist()
-        camera = views.between(generator) if is_between else views.cameras[queue.pop()]
+        camera = views.free(generator) if is_free else views.cameras[queue.pop()]
         with torch.no_grad():
             target = rasterize(draws(camera, step, False, rasterize.visible).gaussians, camera, background).image.clamp_(0, 1)
         for group in optimizer.param_groups:

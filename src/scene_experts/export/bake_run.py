@@ -155,7 +155,7 @@ def one_file(
     lines = [f"wrote {path}", count + ("" if is_direct(run, options.bake) else f"; baked in {clock(seconds)}")]
     measured: dict[str, Any] = {}
     if options.measure and capture is not None and capture.test:
-        measured, line = measure(run, made, path, world, capture, rasterize, tell)
+        measured, line = measure(run, made, path, world, capture, rasterize, options.bake.refine.iterations > 0, tell)
         lines.append(line)
     elif options.measure:
         absent = "the capture is gone" if capture is None else "no view is held out"
@@ -178,22 +178,22 @@ def gaussians(run: OpenRun, capture: Capture | None, world: World, rasterize: Ra
 
 
 def measure(
-    run: OpenRun, made: Made, path: Path, world: World, capture: Capture, rasterize: Rasterizer, tell: Tell
+    run: OpenRun, made: Made, path: Path, world: World, capture: Capture, rasterize: Rasterizer, refined: bool, tell: Tell
 ) -> tuple[dict[str, Any], str]:
     """PSNR of the held-out views from the run, the closed form, the bake and the file as it is read again; and the line that says it."""
     scenes: dict[str, Any] = {"run": (freeze(run.scene, run.step), run.step)}
     if made.closed_form is not None:
-        scenes["closed_form"] = (made.closed_form, DRAWN_AT)
+        scenes |= {"closed_form": (made.closed_form, DRAWN_AT)} if refined else {}
         scenes["bake"] = (scene_of(made.splats, world, run.scene.extent), DRAWN_AT)
     scenes["file"] = (scene_of(read_standard(path), world, run.scene.extent), DRAWN_AT)
     found = scores(scenes, capture, capture.test, rasterize, tell)
     before, after = found["run"].photographs, found["file"].photographs
-    words = {"closed_form": "means over the views", "bake": "refined"}
+    words = {"closed_form": "means over the views", "bake": "refined" if refined else "means over the views"}
     middle = "".join(f"{words[name]} {found[name].photographs:.3f}, " for name in words if name in found)
     line = f"PSNR of {len(capture.test)} held-out views: run {before:.3f} dB, {middle}this file {after:.3f} dB ({after - before:+.3f})"
     if made.closed_form is not None:
         line += f"; its pictures against the run's {found['file'].first:.2f} dB"
-    plain: dict[str, Any] = {name: {"photographs": round(s.photographs, 4), "run": round(s.first, 4)} for name, s in found.items()}
+    plain: dict[str, Any] = {name: {"photographs": round(s.photographs, 6), "run": round(s.first, 6)} for name, s in found.items()}
     return plain | {"views": len(capture.test)}, line
 
 

@@ -1,7 +1,7 @@
 """What a bake adds up over views: how much each decoded Gaussian contributes to pictures, and what it looked like where it did.
 
 The contribution of a Gaussian to a picture is the sum over pixels of its blending weight T alpha: the derivative of the picture's sum by
-its colour. S slots (rows x K), M Gaussians of one view, C = (degree + 1)^2 harmonics.
+its colour. S slots (rows times Gaussians a row), M Gaussians of one view, C = (degree + 1)^2 harmonics.
 """
 
 from __future__ import annotations
@@ -31,17 +31,14 @@ class Sums:
 
     weight: Tensor  # [S] contribution
     potential: Tensor  # [S] contribution / opacity: what it would contribute if it were opaque, as long as it is small
-    drawn: Tensor  # [S] views with positive opacity
-    visits: Tensor  # [S] views that decoded the slot
     means: Tensor  # [S, 3] times contribution, as are the next two
     log_scales: Tensor  # [S, 3]
     quats: Tensor  # [S, 4], signs aligned
     of_views: tuple[Tensor, ...]  # the contributions [M] of each view's Gaussians, in the order in which they were drawn
 
     def opacity(self) -> Tensor:
-        """Mean opacity [S] by potential contribution, in [0, 1]; 0 in the views that decoded a slot without drawing it."""
-        on = self.drawn / self.visits.clamp_min(1)
-        return (self.weight / self.potential.clamp_min(1e-12) * on).clamp(0, 1)
+        """Mean opacity [S] by potential contribution, in [0, 1], over the views that drew the slot."""
+        return (self.weight / self.potential.clamp_min(1e-12)).clamp(0, 1)
 
 
 def contributions(gaussians: Gaussians, camera: Camera, rasterize: Rasterizer) -> Tensor:
@@ -54,22 +51,48 @@ def contributions(gaussians: Gaussians, camera: Camera, rasterize: Rasterizer) -
 
 
 @torch.no_grad()
-def add_up(draws: Draws, step: int, slots: int, K: int, cameras: Sequence[Camera], rasterize: Rasterizer, tell: Tell) -> Sums:
-    """Sums over the pictures of `cameras`. slots: rows of the scene's table times `K`."""
-    total = torch.zeros(slots, 13)  # weight, potential, drawn, means, log-scales, quaternions
-    visits, of_views = torch.zeros(slots // K), []
+def add_up(draws: Draws, step: int, slots: int, cameras: Sequence[Camera], rasterize: Rasterizer, tell: Tell) -> Sums:
+    """Sums over the pictures of `cameras`. slots: rows of the scene's table times Gaussians a row."""
+    total, of_views = torch.zeros(slots, 12), []  # weight, potential, means, log-scales, quaternions
     for i, camera in enumerate(cameras):
-        decoded = draws(camera, step, False, rasterize.visible)
-        g = decoded.gaussians
+        g = draws(camera, step, False, rasterize.visible).gaussians
         of_views.append(contributions(g, camera, rasterize))
         w, before = of_views[-1][:, None], total.index_select(0, g.source)
-        sign = torch.where((before[:, 9:] * g.quats).sum(1, keepdim=True) < 0, -1.0, 1.0)
-        parts = [w, w / g.opacities[:, None].clamp_min(1e-6), torch.ones_like(w), w * g.means, w * g.scales.clamp_min(1e-12).log()]
+        sign = torch.where((before[:, 8:] * g.quats).sum(1, keepdim=True) < 0, -1.0, 1.0)
+        parts = [w, w / g.opacities[:, None].clamp_min(1e-6), w * g.means, w * g.scales.clamp_min(1e-12).log()]
         total.index_copy_(0, g.source, before.add_(torch.cat([*parts, w * sign * g.quats], dim=1)))  # a slot is drawn at most once
-        visits[decoded.rows] += 1
         tell("looking at what contributes", i + 1, len(cameras))
-    of_slots = visits.repeat_interleave(K)
-    return Sums(total[:, 0], total[:, 1], total[:, 2], of_slots, total[:, 3:6], total[:, 6:9], total[:, 9:], tuple(of_views))
+    return Sums(total[:, 0], total[:, 1], total[:, 2:5], total[:, 5:8], total[:, 8:], tuple(of_views))
+
+
+@torch.no_grad()
+def hidden(
+    draws: Draws,
+    step: int,
+    slots: Tensor,
+    total: int,
+    means: Tensor,
+    sizes: Tensor,
+    cameras: Sequence[Camera],
+    rasterize: Rasterizer,
+    tell: Tell,
+) -> Tensor:
+    """How much the Gaussians at `slots` [n] (of `total`) are left out where they would be seen, over how much they are drawn, [n].
+
+    A Gaussian is left out where its opacity is negative or its anchor is not in the picture. What it would contribute goes with its area
+    in the picture, so each view counts by the inverse square of its distance. means [n, 3]; sizes [n]: largest standard deviations.
+    """
+    ball = sizes[:, None].expand(-1, 3).contiguous()
+    drawn, on, off = torch.zeros(total, dtype=torch.bool), torch.zeros(len(slots)), torch.zeros(len(slots))
+    for i, camera in enumerate(cameras):
+        drawn.zero_()
+        drawn[draws(camera, step, False, rasterize.visible).gaussians.source] = True
+        is_drawn = drawn.index_select(0, slots)
+        area = 1 / (means - camera.position).square().sum(1).clamp_min(camera.near**2)
+        on += area * is_drawn
+        off += area * (rasterize.visible(means, ball, camera) & ~is_drawn)
+        tell("looking at what is left out", i + 1, len(cameras))
+    return off / on.clamp_min(1e-12)
 
 
 @torch.no_grad()

@@ -1,4 +1,8 @@
-"""The cameras that a bake looks from: the training views, and views between neighbouring ones. Held-out views are never among them."""
+"""The cameras that a bake looks from: the training views, and free views between and around neighbouring ones.
+
+Held-out views are never among them. Free views matter: a Gaussian that training views show and that the scene leaves out from nearby (its
+anchor is behind the camera, its opacity is negative) would hang as fog before a camera there, and training views alone do not tell.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +17,11 @@ from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 from scene_experts.types import Camera
 from scene_experts.view.paths import FREE, pose, slerp
 
-NEIGHBOURS = 4  # training views that a view may be joined with
-LEAST_VIEWS = 60  # sums over views are taken over at least so many, views between the training views among them
-MOST_VIEWS = 240  # and over at most so many, evenly chosen
+NEIGHBOURS = 8  # training views that a view may be joined with
+BEYOND = 0.1  # a free view lies in the triangle of three neighbours, made larger by so much
+LEAST_VIEWS = 60  # sums over views are taken over at least so many
+MOST_TRAINING = 120  # training views among them at most, evenly chosen
+FREE_SHARE = 0.25  # free views among them for each training view, at least
 
 
 @dataclass(frozen=True)
@@ -41,21 +47,30 @@ class Views:
     def __len__(self) -> int:
         return len(self.cameras)
 
-    def between(self, generator: torch.Generator) -> Camera:
-        """A random view on the straight way from a training view to one of its neighbours, with the lens of the first."""
-        first = int(torch.randint(len(self.cameras), (1,), generator=generator))
-        if not self.near.shape[1]:
-            return self.cameras[first]
-        second = int(self.near[first, int(torch.randint(self.near.shape[1], (1,), generator=generator))])
-        u = float(torch.rand(1, generator=generator))
-        place = torch.lerp(self.positions[first], self.positions[second], u)
-        rotation = quat_to_matrix(slerp(self.quats[first], self.quats[second], u))
-        return replace(self.cameras[first], world_to_cam=pose(place, rotation).to(self.cameras[first].world_to_cam.dtype))
+    def free(self, generator: torch.Generator) -> Camera:
+        """A random view in the triangle of a training view and two of its neighbours, turned with them, with the lens of the first."""
+        i, (j, k) = self._three(generator)
+        share = -torch.rand(3, generator=generator, dtype=torch.float64).clamp_min(1e-12).log()
+        share = share / share.sum() * (1 + 3 * BEYOND) - BEYOND  # uniform in the triangle, of which BEYOND pushes the corners outwards
+        place = share @ self.positions[[i, j, k]]
+        turned = slerp(self.quats[i], self.quats[j], _part(share[1], share[0]))
+        turned = slerp(turned, self.quats[k], _part(share[2], share[0] + share[1]))
+        first = self.cameras[i]
+        return replace(first, world_to_cam=pose(place, quat_to_matrix(turned)).to(first.world_to_cam.dtype))
 
-    def for_sums(self, generator: torch.Generator, least: int = LEAST_VIEWS, most: int = MOST_VIEWS) -> list[Camera]:
-        """The cameras over which sums are taken: all training views or `most` of them, filled up to `least` with views between them."""
-        chosen = torch.linspace(0, len(self) - 1, min(len(self), most)).round().long().tolist()
-        return [self.cameras[i] for i in chosen] + [self.between(generator) for _ in range(least - len(chosen))]
+    def _three(self, generator: torch.Generator) -> tuple[int, list[int]]:
+        """A training view and two of its neighbours; the view itself where it has too few."""
+        first = int(torch.randint(len(self.cameras), (1,), generator=generator))
+        near = self.near[first]
+        others = near[torch.randperm(len(near), generator=generator)[:2]].tolist()
+        return first, (others + [first, first])[:2]
+
+    def for_sums(self, generator: torch.Generator) -> list[Camera]:
+        """The cameras over which sums are taken: training views, all or evenly chosen, and free ones."""
+        n = min(len(self), MOST_TRAINING)
+        chosen = torch.linspace(0, len(self) - 1, n).round().long().tolist()
+        free = max(LEAST_VIEWS - n, round(FREE_SHARE * n))
+        return [self.cameras[i] for i in chosen] + [self.free(generator) for _ in range(free)]
 
 
 def neighbours(positions: Tensor, forward: Tensor, extent: float, count: int = NEIGHBOURS) -> Tensor:
@@ -67,3 +82,9 @@ def neighbours(positions: Tensor, forward: Tensor, extent: float, count: int = N
     away = torch.cdist(positions, positions) / max(extent, 1e-12) + turn
     away.fill_diagonal_(float("inf"))
     return away.argsort(dim=1)[:, : min(count, len(positions) - 1)]
+
+
+def _part(one: Tensor, other: Tensor) -> float:
+    """How much of two shares the first is, held in [0, 1]."""
+    one, other = one.clamp_min(0), other.clamp_min(0)
+    return float(one / (one + other).clamp_min(1e-12))
