@@ -70,6 +70,7 @@ def test_what_is_printed_is_what_the_file_gives(run, tmp_path):
     assert {"run", "closed_form", "bake", "file", "views"} == set(about["psnr"]) and "refining" in said
 
 
+@pytest.mark.parametrize("run", ["moe-gs", "3dgs"], indirect=True)
 def test_frames_and_folders(run, tmp_path):
     draw, still = choose("auto", "cpu"), Bake(sh_degree=3, refine=Refine(iterations=0))
     export_standard(run, "ply", tmp_path, None, draw, Options(still, measure=False))
