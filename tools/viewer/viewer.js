@@ -145,7 +145,9 @@ class Page {
 
   frame() {
     const now = performance.now();
-    const flying = this.fly(Math.min((now - this.last) / 1000, 0.1));
+    const seconds = (now - this.last) / 1000;
+    const flying = this.fly(Math.min(seconds, 0.1));
+    this.controls.dampingFactor = 1 - Math.exp(-8 * seconds); // by time, so that slow machines come to rest as soon
     this.last = now;
     if (!this.held) this.controls.update();
     this.renderer.render(this.scene, this.camera);

@@ -51,7 +51,7 @@ def write_spz(path: Path, splats: Splats, note: dict[str, Any]) -> None:
 def spz_bytes(splats: Splats, first_step: int = 1, rest_step: int = 1) -> bytes:
     """The bytes of an SPZ file, version 3.
 
-    first_step, rest_step: harmonics of degree 1 and above it are kept in multiples of so many 1/128. The format's first writer has 8 and 16,
+    first_step, rest_step: harmonics of degree 1 and above are kept in multiples of so many 1/128. The format's first writer has 8 and 16,
     which saves a third of the bytes and costs a trained scene up to 20 dB against its own picture; 1 keeps all that a byte holds.
     Positions get as many bits of fraction as their reach leaves, 12 in a room of 2 km.
     """
