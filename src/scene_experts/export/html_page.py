@@ -28,6 +28,7 @@ from scene_experts.io import write_bytes
 ASSETS = files("scene_experts.export") / "assets"
 MARK = b'<meta name="generator" content="scene-experts">'
 _SCENE = b'<script type="text/plain" id="scene">'
+PAGE_NOTES = ("camera", "cameras", "background", "antialias", "title")
 _FOV = 50.0  # degrees, where no camera is known
 Pose = dict[str, Any]
 

@@ -16,7 +16,7 @@ from scene_experts.errors import InputError, nearest
 from scene_experts.export.comments import note_comments
 from scene_experts.export.compressed_ply import read_compressed_ply, write_compressed_ply
 from scene_experts.export.gltf import read_glb, write_glb
-from scene_experts.export.html_page import MARK, read_html, write_html
+from scene_experts.export.html_page import MARK, PAGE_NOTES, read_html, write_html
 from scene_experts.export.ply import HEADER_LIMIT, read_gaussian_ply, write_gaussian_ply
 from scene_experts.export.sog import read_sog, write_sog
 from scene_experts.export.splat_file import ROW, read_splat, write_splat
@@ -63,7 +63,8 @@ _MARKS: dict[str, tuple[bytes, ...]] = {"spz": (b"\x1f\x8b", b"NGSP"), "sog": (b
 def write_standard(path: Path, splats: Splats, format: str, note: Note) -> None:
     """Write `splats` to `path` in a format of `FORMATS`, atomically.
 
-    note: how the file was made (plain JSON values), kept where the format has room for it.
+    note: how the file was made (plain JSON values), kept where the format has room for it. What a page shows beside the scene (camera,
+    cameras, background, antialias, title: see `html_page`) is for html alone.
     Raises InputError for an unknown format and for values that are not finite; RunError when the disk is full.
     """
     if format not in FORMATS:
@@ -73,7 +74,8 @@ def write_standard(path: Path, splats: Splats, format: str, note: Note) -> None:
         bad = int((~value.isfinite()).reshape(len(splats), -1).any(1).sum()) if len(splats) else 0
         if bad:
             raise InputError(f"expected finite {name}, found {bad:,} Gaussians with others; make them again")
-    FORMATS[format].write(Path(path), splats, note)
+    kept = note if format == "html" else {name: value for name, value in note.items() if name not in PAGE_NOTES}
+    FORMATS[format].write(Path(path), splats, kept)
 
 
 def read_standard(path: Path) -> Splats:
