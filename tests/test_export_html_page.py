@@ -5,15 +5,18 @@ import json
 import math
 import re
 import shutil
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from scene_experts.data.views import View, World
 from scene_experts.errors import InputError
 from scene_experts.export import html_page
-from scene_experts.export.html_page import page_settings, read_html, write_html
+from scene_experts.export.html_page import capture_notes, page_settings, read_html, write_html
 from scene_experts.export.splats import Splats
 from scene_experts.geometry.rotation import quat_to_matrix
 from scene_experts.geometry.sh import sh_to_rgb
@@ -127,6 +130,20 @@ def test_settings_of_the_page():
     for bad in ({"position": [0, 0]}, entry | {"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, entry | {"fov": 180}, {"a": 1}):
         with pytest.raises(InputError, match="expected cameras with position"):
             page_settings(s, {"camera": bad})
+
+
+def test_a_capture_s_views_in_the_frame_of_the_file():
+    world = World(scale=2.0, shift=(1.0, 0.0, -3.0))
+    K = torch.tensor([[100.0, 0, 60], [0, 100.0, 40], [0, 0, 1]])
+    poses = [torch.eye(4), torch.eye(4)]
+    poses[1][:3, 3] = torch.tensor([0.0, 0.0, 7.0])  # the camera's centre at z = -7 of the trained world
+    views = tuple(View(f"{i}.jpg", Camera(pose, K, 120, 80, id=i), Path("x")) for i, pose in enumerate(poses))
+    capture = SimpleNamespace(views=views, test=(1,), background=(1.0, 1.0, 1.0))
+    note = capture_notes(capture, world, antialias=True)  # type: ignore[arg-type]
+    assert note["camera"] == note["cameras"][1] and len(note["cameras"]) == 2 and note["background"] == [1.0, 1.0, 1.0]
+    np.testing.assert_allclose(note["camera"]["position"], [-1.0, 0.0, -3.5 + 3.0], atol=1e-6)
+    found = page_settings(blobs(), note)
+    assert found["antialias"] and found["fov"] == pytest.approx(math.degrees(2 * math.atan(0.4)))
 
 
 def test_damaged_pages(tmp_path):

@@ -18,6 +18,7 @@ from scene_experts.export.bake import Bake, bake, explicit
 from scene_experts.export.bake_measure import as_trained, scores
 from scene_experts.export.bake_refine import DRAWN_AT
 from scene_experts.export.bake_sums import Tell
+from scene_experts.export.html_page import capture_notes
 from scene_experts.export.run import world_of
 from scene_experts.export.splats import Splats, from_scene, to_columns
 from scene_experts.export.standard import FORMATS, read_standard, write_standard
@@ -148,7 +149,8 @@ def one_file(
     made = gaussians(run, capture, world, rasterize, options.bake, tell)
     seconds = time.perf_counter() - began
     about = description(run, made, options, level)
-    write_standard(path, made.splats, format, about)
+    page = capture_notes(capture, world, run.cfg.antialias) if capture is not None else {}
+    write_standard(path, made.splats, format, about | page)
     size = path.stat().st_size
     frame = "the capture's own frame" if options.frame == "capture" else "the trained world"
     count = f"{len(made.splats):,} Gaussians, {size / 1e6:.2f} MB, harmonics of degree {made.splats.degree}, in {frame}"

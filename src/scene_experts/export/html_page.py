@@ -19,7 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
+from scene_experts.export.cameras import camera_entries
 from scene_experts.export.pack import Floats, damaged
 from scene_experts.export.splats import Splats
 from scene_experts.export.spz import decode_spz, spz_bytes
@@ -60,6 +62,20 @@ def read_html(path: Path) -> Splats:
     except ValueError:
         raise damaged(path, "html", "a scene that is no base64") from None
     return decode_spz(scene, path)
+
+
+def capture_notes(capture: Capture, world: World, antialias: bool = False) -> dict[str, Any]:
+    """The page's part of a note: starts at the first held-out view (or the first), steps through all, over the capture's background.
+
+    world: the frame that the Gaussians are written in. antialias: whether the scene was trained with it.
+    """
+    entries = camera_entries(capture.views, world)
+    return {
+        "camera": entries[capture.test[0] if capture.test else 0] if entries else None,
+        "cameras": entries,
+        "background": list(capture.background),
+        "antialias": antialias,
+    }
 
 
 def page_settings(splats: Splats, note: Mapping[str, Any]) -> dict[str, Any]:
