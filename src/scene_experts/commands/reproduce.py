@@ -15,7 +15,7 @@ from scene_experts.data.obtain import captures_dir
 from scene_experts.errors import InputError, RunError, expect_at_least, nearest
 from scene_experts.reproduce import report, store
 from scene_experts.reproduce.experiments import EXPERIMENTS, Experiment
-from scene_experts.reproduce.plan import Scale, Scene, Spec, own_scenes, paper_scenes, specs
+from scene_experts.reproduce.plan import Scale, Scene, Spec, distinct, own_scenes, paper_scenes, specs
 from scene_experts.reproduce.run import Runner
 
 
@@ -67,7 +67,8 @@ def reproduce(args: list[str]) -> int:
     scenes = scenes_of(command)
     scale = Scale.of(command.scale, command.iterations, command.resolution)
     chosen = rows_of(chosen, command.recipes) if command.recipes else chosen
-    wanted = specs(chosen, scenes, command.seeds or (0,), scale)
+    shown = specs(chosen, scenes, command.seeds or (0,), scale)
+    wanted = distinct(shown)
     records, runs = command.records or command.out / "records", command.runs or command.out / "runs"
     console = Console(highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
@@ -95,11 +96,10 @@ def reproduce(args: list[str]) -> int:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-    keys = {spec.key for spec in specs(chosen, scenes, command.seeds or (0,), scale)}  # others are of another size or protocol
     for spec in wanted:  # pictures of runs that were done before this figure was asked for
         if not (command.out / f"fig5_{spec.scene.name}.png").is_file() and (spec.folder(runs) / "results.json").is_file():
             draw(spec, spec.folder(runs))
-    for path in report.write(command.out, chosen, scenes, [r for r in store.load(records) if r.key in keys], said(command, scenes)):
+    for path in report.write(command.out, chosen, scenes, store.of_specs(store.load(records), shown), said(command, scenes)):
         say(f"wrote {path}")
     if runner.stop.is_set():
         say("stopped; give the same command again to go on")
