@@ -93,6 +93,7 @@ def test_each_format_is_measured_from_its_own_file(run, tmp_path):
         export_standard(run, format, path, None, choose("auto", "cpu"), Options(Bake(sh_degree=1, refine=Refine(iterations=0))))
         about = json.loads(path.with_name(path.name + ".json").read_text())
         assert measured(run, path) == pytest.approx(about["psnr"]["file"]["photographs"], abs=2e-5), format
+        assert about["sh_degree"] == (0 if format == "splat" else 1)
 
 
 @pytest.mark.parametrize("run", ["moe-gs"], indirect=True)

@@ -32,6 +32,7 @@ from scene_experts.scene.frozen import freeze
 from scene_experts.scene.select import LevelSelector
 
 SIDECAR_FORMAT = 1
+WITHOUT_HARMONICS = ("splat",)  # formats that hold one colour a Gaussian: what is baked for them is fitted without harmonics
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,8 @@ def export_standard(
     if format not in FORMATS:
         raise InputError(f"expected a format among {', '.join(FORMATS)}, found '{format}'; choose one of those")
     opened = moved(run_folder.open_run(run, "cpu", step), data)
+    if format in WITHOUT_HARMONICS and not isinstance(opened.scene, GaussianScene):
+        options = replace(options, bake=replace(options.bake, sh_degree=0))
     name = "scene" + FORMATS[format].suffix
     path = run / name if out is None else out / name if out.is_dir() else out
     rasterize = as_trained(rasterize, opened.cfg.antialias)
