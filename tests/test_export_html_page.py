@@ -60,6 +60,7 @@ def psnr(a, b):
     return 10 * math.log10(255**2 / ((a.astype(float) - b.astype(float)) ** 2).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 def test_the_page_in_a_browser(tmp_path):
     """The start pose, a pose set from outside, one from the link, a drag and a key: from disk, without a request to anywhere."""

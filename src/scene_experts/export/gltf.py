@@ -172,4 +172,5 @@ def _accessor(path: Path, scene: dict[str, Any], data: bytes, index: int) -> Flo
     rows = np.ndarray((count, width), item, data, start, (stride, item.itemsize))
     if accessor.get("normalized"):
         return np.maximum(rows / float(np.iinfo(item).max), -1.0)
-    return rows.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # what is no number is refused by the caller
+        return rows.astype(np.float64)
