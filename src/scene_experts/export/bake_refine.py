@@ -26,12 +26,12 @@ class Refine:
     iterations: int = 500
     free: float = 0.6  # share of iterations that look from free views
     dssim: float = 0.2  # weight of 1 - SSIM in the loss, L1 has the rest
-    means: Rate = Rate(0.00008, 0.0000032)
-    log_scales: Rate = Rate(0.01, 0.001)
-    quats: Rate = Rate(0.004, 0.0004)
-    raw_opacity: Rate = Rate(0.06, 0.006)
-    sh_dc: Rate = Rate(0.01, 0.001)
-    sh_rest: Rate = Rate(0.002, 0.0002)
+    means: Rate = Rate(0.00012, 0.000005)
+    log_scales: Rate = Rate(0.015, 0.0015)
+    quats: Rate = Rate(0.006, 0.0006)
+    raw_opacity: Rate = Rate(0.09, 0.009)
+    sh_dc: Rate = Rate(0.015, 0.0015)
+    sh_rest: Rate = Rate(0.003, 0.0003)
 
 
 def refine(
