@@ -17,6 +17,8 @@ from scene_experts.export.bake import Bake
 from scene_experts.export.bake_measure import picture
 from scene_experts.export.bake_refine import DRAWN_AT, Refine
 from scene_experts.export.bake_run import Options, export_standard, scene_of
+from scene_experts.export.run import write_layout
+from scene_experts.export.splats import from_scene
 from scene_experts.export.standard import FORMATS, read_standard
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
@@ -118,6 +120,17 @@ def test_a_capture_that_moved_is_found_by_its_flag(run, tmp_path):
     (tmp_path / "moved").symlink_to(data)
     lines = export_standard(run, "ply", tmp_path / "x.ply", None, choose("auto", "cpu"), Options(SHORT), data=tmp_path / "moved")
     assert "held-out views" in lines[2]
+
+
+@pytest.mark.parametrize("run", ["3dgs"], indirect=True)
+def test_plain_gaussians_need_no_capture(run, tmp_path):
+    opened = run_folder.open_run(run)
+    capture = run_folder.load_capture(opened.config.data)
+    capture.images.close()
+    write_layout(opened, capture)
+    lines = export_standard(run, "ply", tmp_path / "x.ply", None, choose("auto", "cpu"), data=tmp_path / "gone")
+    assert lines[2] == "the capture is gone: what the file costs in PSNR was not measured"
+    torch.testing.assert_close(read_standard(tmp_path / "x.ply").means, from_scene(opened.scene, capture.world).means)
 
 
 def test_levels_of_detail_become_one_file_each(tmp_path):
