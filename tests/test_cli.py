@@ -58,6 +58,7 @@ HELP = [
     "train scaffold-gs",
     "train 3dgs",
     "train 3dgs-mcmc",
+    "train moe-gs-balance",
     "eval",
     "compare",
     "export",

@@ -2,6 +2,7 @@
 
 import pytest
 
+from records import record
 from scene_experts import cli
 from scene_experts.commands.reproduce import ReproduceCommand, experiments_of, scenes_of
 from scene_experts.errors import InputError
@@ -31,7 +32,41 @@ def test_runs_tables_and_figures_and_nothing_twice(tmp_path, capsys):
     assert cli.main(["reproduce", "fig3", "fig5", *args]) == 0
     assert "2 runs, 2 of them done" in capsys.readouterr().out and (tmp_path / "out" / "fig5_box.png").is_file()
     assert cli.main(["reproduce", "fig3", *args, "--dry-run"]) == 0
-    assert capsys.readouterr().out.count("done") == 2
+    assert capsys.readouterr().out.count("done ") == 2
+    elsewhere = ["--out", str(tmp_path / "other"), "--records", str(tmp_path / "out" / "records")]
+    assert cli.main(["reproduce", "fig3", *args, *elsewhere]) == 0
+    assert "2 runs, 2 of them done" in capsys.readouterr().out
+    page = (tmp_path / "other" / "README.md").read_text()
+    assert "scene-experts reproduce fig3 --captures CAPTURES/box --iterations 40 --recipes" in page and str(tmp_path) not in page
+
+
+def test_tables_of_what_is_done_without_running_the_rest(tmp_path, capsys):
+    (tmp_path / "fox").mkdir()
+    args = ["--captures", str(tmp_path / "fox"), "--out", str(tmp_path / "out"), "--iterations", "3000", "--tables-only"]
+    store.write(tmp_path / "out" / "records", record("moe-gs", "fox"))
+    assert cli.main(["reproduce", "table4", *args]) == 0
+    assert "wrote" in capsys.readouterr().out and "31.50" in (tmp_path / "out" / "table4.md").read_text()
+    assert not (tmp_path / "out" / "runs").exists()
+
+
+def recipes_of(capsys, *args: str) -> tuple[int, set[str], set[str]]:
+    """How many runs a plan has, and their recipes and seeds."""
+    assert cli.main(["reproduce", *args, "--dry-run"]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith(("done ", "to run "))]
+    return len(lines), {line[-5] for line in lines}, {line[-1] for line in lines}
+
+
+def test_the_plans_of_the_results_page_are_one_command_each(tmp_path, capsys):
+    for name in ("bonsai", "fox", "buddha"):
+        (tmp_path / name).mkdir()
+    captures = ["--captures", *(str(tmp_path / name) for name in ("bonsai", "fox", "buddha"))]
+    suite = ["table1", "table3", "table4", "fig1b", "fig3", "fig5", "fig6", "fig7"]
+    count, recipes, _ = recipes_of(capsys, *suite, *captures, "--iterations", "3000", "--resolution", "longest:400")
+    assert {"3dgs", "scaffold-gs", "sags", "octree-gs", "moe-gs", "moe-gs-no-cl", "moe-gs-e2-dense", "scaffold-gs-depth6"} <= recipes
+    assert count == 3 * len(recipes) == 3 * 25  # moe-gs-e5-top2 is moe-gs, scaffold-gs-depth2 is scaffold-gs
+    few = ["--recipes", "scaffold-gs", "moe-gs", "moe-gs-dist", "--iterations", "7000", "--seeds", "0", "1", "2"]
+    count, recipes, seeds = recipes_of(capsys, "table1", "appendix", *captures, *few)
+    assert recipes == {"scaffold-gs", "moe-gs", "moe-gs-dist"} and seeds == {"0", "1", "2"} and count == 27
 
 
 def test_a_failure_is_told_at_the_end(tmp_path, capsys):

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from scene_experts.commands.train import check_settings, parse_train
+from scene_experts.commands.train import check_settings, parse_train, train
 from scene_experts.errors import InputError
 from scene_experts.recipes import RECIPES
+from synthetic import make_capture
 
 PLACES = ["--data", "c", "--out", "r"]
 
@@ -49,3 +50,24 @@ def test_flags_reach_the_parts_of_explicit_recipes():
     assert (made.cfg.growth.grad_threshold, made.cfg.rates.means.first, made.cfg.scene.sh_degree) == (0.001, 0.01, 1)  # type: ignore[union-attr]
     with pytest.raises(InputError, match="sh-degree"):
         check_settings(parse_train(["3dgs-mcmc", *PLACES, "--scene.sh-degree", "4"]))
+
+
+def test_the_help_without_a_recipe_names_the_flags_that_all_take(capsys):
+    with pytest.raises(SystemExit):
+        parse_train(["--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    for flag in ("--data", "--out", "--iterations", "--resolution", "--resume", "--device", "--seed"):
+        assert f"{flag}," in said
+    assert "scene-experts train RECIPE --help" in said and "--schedule" not in said
+
+
+def test_a_finished_run_keeps_its_files_when_resumed(tmp_path, capsys):
+    capture = make_capture(tmp_path / "capture", views=9, size=(48, 32)).folder
+    args = ["scaffold-gs", "--data", str(capture), "--out", str(tmp_path / "run"), "--iterations", "3", "--preview-every", "0"]
+    assert train(args) == 0
+    layout = tmp_path / "run" / "point_cloud" / "iteration_3"
+    (layout / "point_cloud.ply").write_bytes(b"mine")
+    assert train([*args, "--resume"]) == 0
+    assert "nothing was left to train" in capsys.readouterr().out and (layout / "point_cloud.ply").read_bytes() == b"mine"
+    (layout / "point_cloud.ply").unlink()
+    assert train([*args, "--resume"]) == 0 and (layout / "point_cloud.ply").is_file()  # a run that was killed before it wrote them

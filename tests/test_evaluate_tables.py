@@ -130,6 +130,9 @@ def test_print_results(tmp_path: Path) -> None:
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "27.50" in text and "experts, color: share 60% 40%, gate entropy 0.97" in text
     assert "10.0 ms decode + 40.0 ms raster on cpu" in text and str(tmp_path / "results.json") in text
+    tables.print_results(results("moe-gs", 27.5, appearance="half"), console, tmp_path)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "right halves of 9 test views" in text and str(tmp_path / "results_half.json") in text and "test_half" in text
 
 
 def test_a_table_tells_a_shorter_training_from_one_cut_off() -> None:

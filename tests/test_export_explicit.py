@@ -11,6 +11,7 @@ from scene_experts.config import Data, RunConfig
 from scene_experts.data.capture import load
 from scene_experts.errors import InputError
 from scene_experts.export import explicit
+from scene_experts.export.bake_run import Options, export_standard
 from scene_experts.export.ply import read_vertices, write_vertices
 from scene_experts.export.run import export_run, import_result
 from scene_experts.recipes import RECIPES
@@ -32,6 +33,10 @@ def made(tmp_path_factory):
     return root / "run", folder
 
 
+def to_ply(run, path):
+    return export_standard(run, "ply", path, None, choose("auto", "cpu"), Options(measure=False))
+
+
 def drawn(run, index=0):
     opened = run_folder.open_run(run)
     capture = run_folder.load_capture(opened.config.data)
@@ -43,7 +48,7 @@ def drawn(run, index=0):
 
 def test_the_file_has_the_layout_of_3dgs_in_the_frame_of_the_capture(made, tmp_path):
     run, folder = made
-    lines = export_run(run, "ply", tmp_path / "out.ply")
+    lines = to_ply(run, tmp_path / "out.ply")
     columns = read_vertices(tmp_path / "out.ply")
     names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45)), "opacity"]
     assert list(columns) == [*names, *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
@@ -63,12 +68,12 @@ def test_the_file_has_the_layout_of_3dgs_in_the_frame_of_the_capture(made, tmp_p
 
 def test_a_file_comes_back_as_a_run_that_draws_the_same_picture(made, tmp_path):
     run, folder = made
-    export_run(run, "ply", tmp_path / "scene.ply")
+    to_ply(run, tmp_path / "scene.ply")
     out = import_result(tmp_path / "scene.ply", Data(folder), tmp_path / "again")
     opened = run_folder.open_run(out)
-    assert opened.step == 30_000 and opened.config.train.recipe == "3dgs" and opened.scene.degree(opened.step) == 3
+    assert opened.step == 0 and opened.config.train.recipe == "3dgs" and opened.scene.degree(opened.step) == 3
     assert (drawn(out) - drawn(run)).abs().mean() < 1e-4
-    assert (out / "cameras.json").is_file() and (out / "point_cloud" / "iteration_30000" / "point_cloud.ply").is_file()
+    assert (out / "cameras.json").is_file() and (out / "point_cloud" / "iteration_0" / "point_cloud.ply").is_file()
 
 
 def test_our_own_folder_keeps_recipe_and_step(made, tmp_path):
@@ -84,7 +89,7 @@ def test_our_own_folder_keeps_recipe_and_step(made, tmp_path):
 @pytest.mark.parametrize("degree", range(3))
 def test_files_of_lower_degree_are_read(made, tmp_path, degree):
     run, folder = made
-    export_run(run, "ply", tmp_path / "full.ply")
+    to_ply(run, tmp_path / "full.ply")
     columns, count = read_vertices(tmp_path / "full.ply"), (degree + 1) ** 2 - 1
     rest = [f"f_rest_{15 * channel + i}" for channel in range(3) for i in range(count)]
     kept = {n: c for n, c in columns.items() if not n.startswith("f_rest_")} | {f"f_rest_{i}": columns[n] for i, n in enumerate(rest)}
@@ -99,7 +104,7 @@ def test_formats_that_do_not_fit_are_refused_in_one_sentence(made, tmp_path):
     for format in ("anchors", "compact"):
         with pytest.raises(InputError, match="expected a scene of anchors, found a run of '3dgs'"):
             export_run(run, format, tmp_path / "x")
-    export_run(run, "ply", tmp_path / "bad.ply")
+    to_ply(run, tmp_path / "bad.ply")
     columns = {name: column.copy() for name, column in read_vertices(tmp_path / "bad.ply").items()}
     columns["opacity"][2] = np.nan
     write_vertices(tmp_path / "bad.ply", columns)

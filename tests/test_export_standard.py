@@ -1,9 +1,15 @@
 """The table of formats: what is written comes back by content, and what is none of them is refused in one sentence."""
 
+import struct
+
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from scene_experts.errors import InputError
+from scene_experts.export.comments import read_note
+from scene_experts.export.splats import Splats
 from scene_experts.export.standard import FORMATS, format_of, read_standard, write_standard
 from test_export_splats import splats
 
@@ -27,7 +33,7 @@ def test_every_format_is_known_by_its_content(tmp_path, format):
 
 
 def test_what_is_refused(tmp_path):
-    with pytest.raises(InputError, match="expected a format of ply.*, found 'plx'; did you mean 'ply'"):
+    with pytest.raises(InputError, match=r"expected a format of ply.*, found 'plx'; did you mean 'ply'"):
         write_standard(tmp_path / "a", splats(), "plx", {})
     s = splats()
     s.sh[2, 1, 0] = float("nan")
@@ -38,3 +44,45 @@ def test_what_is_refused(tmp_path):
     (tmp_path / "a").write_bytes(b"plain words")
     with pytest.raises(InputError, match="found something else"):
         read_standard(tmp_path / "a")
+
+
+def test_what_only_a_page_shows_is_not_in_other_files(tmp_path):
+    write_standard(tmp_path / "a.ply", splats(), "ply", NOTE | {"cameras": [1, 2], "background": [0, 0, 0]})
+    assert read_note(tmp_path / "a.ply") == NOTE
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    out = {}
+    for format in FORMATS:
+        path = tmp_path_factory.mktemp("good") / "a"
+        write_standard(path, splats(40, 1), format, NOTE)
+        out[format] = path.read_bytes()
+    return out
+
+
+@given(st.sampled_from(sorted(FORMATS)), st.integers(0, 2**32), st.integers(1, 4), st.sampled_from(["flip", "cut", "zero", "repeat"]))
+@settings(max_examples=120, deadline=None)
+def test_damage_of_any_kind_is_a_sentence_or_a_scene(good, tmp_path_factory, format, seed, times, kind):
+    """Bytes changed anywhere: an InputError, or Gaussians of sound shapes; no other error, no endless work."""
+    data = bytearray(good[format])
+    end = data.find(b'id="code"') if format == "html" else len(data)  # its renderer is no part of the scene
+    for i in range(times):
+        at = (seed >> i) * 2654435761 % min(end, len(data))
+        if kind == "flip":
+            data[at] ^= 1 << (seed + i) % 8
+        elif kind == "cut":
+            del data[max(at, 1) :]
+            break
+        elif kind == "zero":
+            data[at : at + 4] = bytes(len(data[at : at + 4]))
+        else:
+            data[at:at] = struct.pack("<I", seed % 2**32)
+    path = tmp_path_factory.mktemp("bad") / "a"
+    path.write_bytes(bytes(data))
+    try:
+        found = read_standard(path)
+    except InputError as error:
+        assert str(error).startswith("expected ")
+    else:
+        assert isinstance(found, Splats)

@@ -49,7 +49,7 @@ def test_depth_that_helps_contradicts():
 
 
 def test_number_of_experts_and_top_2_near_dense():
-    runs = [record(f"moe-gs-e{n}-{r}", psnr=29 + 0.1 * n) for n in (2, 5) for r in ("top1", "top2", "dense")]
+    runs = [record(f"moe-gs-e{n}-{r}", psnr=29 + 0.1 * n, seed=k) for n in (2, 5) for r in ("top1", "top2", "dense") for k in (0, 1)]
     assert get(runs, "rises with the number").verdict == "confirmed"
     assert get(runs, "close to dense").verdict == "confirmed"
     assert get([record("moe-gs-posrouter", psnr=31), record("moe-gs")], "position").verdict == "contradicted"

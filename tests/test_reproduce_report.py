@@ -14,10 +14,11 @@ def test_files_and_page(tmp_path):
     scenes = [Scene(name, OWN, tmp_path / name) for name in ("fox", "fern")]
     runs = [record(recipe, scene.name, psnr=30.0 + i) for scene in scenes for i, recipe in enumerate(("scaffold-gs", "moe-gs"))]
     stray = record("moe-gs", "elsewhere", psnr=99.0)
-    report.write(tmp_path, [EXPERIMENTS["table4"], EXPERIMENTS["fig7"]], scenes, [*runs, stray])
+    report.write(tmp_path, [EXPERIMENTS["table4"], EXPERIMENTS["fig7"]], scenes, [*runs, stray], "scene-experts reproduce table4 fig7")
     assert {"table4.md", "table4.csv", "table4.tex", "README.md"} <= {p.name for p in tmp_path.iterdir()}
     assert not (tmp_path / "fig7.png").exists()
     page = (tmp_path / "README.md").read_text()
+    assert "scene-experts reproduce table4 fig7" in page and "No run is done yet." in page
     assert "(table4.md)" in page and "MoE-GS has more PSNR than Scaffold-GS | confirmed | +1.00 dB" in page
     assert "99" not in (tmp_path / "table4.md").read_text()
     assert "fern" in (tmp_path / "table4.md").read_text()

@@ -1,5 +1,6 @@
 """The runner: skips, resumes, fails one by one, stops."""
 
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -73,3 +74,16 @@ def test_run_folders_go_when_asked_after_what_else_is_taken(runner):
 def test_nothing_begins_after_a_stop(runner):
     runner.end()
     assert runner.make([spec()]) == [] and runner.calls == []
+
+
+def test_a_terminal_s_ctrl_c_reaches_a_run_once(tmp_path, monkeypatch):
+    """A terminal signals the whole foreground group, and our own signal on top would end a training without saving it."""
+    seen = {}
+
+    class Popen(subprocess.Popen):
+        def __init__(self, args, **options):
+            seen.update(options)
+            super().__init__(["true"], **options)
+
+    monkeypatch.setattr(subprocess, "Popen", Popen)
+    assert Runner(tmp_path, tmp_path).command(["train"], 0, tmp_path / "log") == 0 and seen["process_group"] == 0

@@ -41,12 +41,20 @@ def test_gains_here_and_losses_there_are_undecided():
 
 
 def test_the_interval_is_that_of_the_mean_of_the_views():
-    a, b = record("moe-gs", views=400), record("scaffold-gs", views=400)
-    for i, view in enumerate(a.per_view):
-        a.per_view[view]["psnr"] += 1.0 if i % 2 else -1.0
-    d = difference([a], [b])
+    a, b = ([record(recipe, views=400, seed=k) for k in (0, 1)] for recipe in ("moe-gs", "scaffold-gs"))
+    for each in a:
+        for i, view in enumerate(each.per_view):
+            each.per_view[view]["psnr"] += 1.0 if i % 2 else -1.0
+    d = difference(a, b)
     assert d is not None and d.high - d.low == pytest.approx(2 * 1.96 / math.sqrt(400), rel=0.1)
 
 
 def test_only_what_both_have_is_paired():
     assert difference([record(seed=0)], [record("scaffold-gs", seed=1)]) is None
+
+
+def test_one_seed_leaves_room_for_what_another_would_change():
+    a, b = ([record(recipe, scene=s, psnr=p) for s in "wxyz"] for recipe, p in (("moe-gs", 30.2), ("scaffold-gs", 30.0)))
+    one, four = difference(a[:1], b[:1]), difference(a, b)
+    assert one is not None and one.low == pytest.approx(0.2 - 0.3) and one.verdict(1) == "undecided"
+    assert four is not None and four.low == pytest.approx(0.2 - 0.3 / 2) and four.verdict(1) == "confirmed"

@@ -8,8 +8,8 @@ import pytest
 
 from records import record
 from scene_experts.errors import InputError
-from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec
-from scene_experts.reproduce.store import POINTS, curves, find, load, of_run, read, write
+from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec, distinct
+from scene_experts.reproduce.store import POINTS, curves, find, load, of_run, of_specs, read, write
 
 
 def test_a_record_comes_back_as_it_was_without_the_place_of_the_capture(tmp_path):
@@ -58,3 +58,14 @@ def test_columns():
     made = record(mb=12.0, active=0.5)
     assert [made.value(c) for c in ("size_mb", "active_percent", "psnr", "unknown")] == [12.0, 50.0, 31.5, None]
     assert replace(made, results={**made.results, "activation_ratio": None}).value("active_percent") is None
+
+
+def test_a_run_counts_for_every_recipe_of_the_same_numbers(tmp_path):
+    """Five experts with Top-2 in Figure 6 are the main recipe, two layers in Figure 7 are Scaffold-GS."""
+    scene = Scene("fox", OWN, tmp_path)
+    pair = [Spec(scene, recipe, 0, Scale(3000)) for recipe in ("moe-gs", "moe-gs-e5-top2")]
+    assert distinct([*pair, Spec(scene, "moe-gs-e4-top2", 0, Scale(3000))]) == [pair[0], Spec(scene, "moe-gs-e4-top2", 0, Scale(3000))]
+    write(tmp_path, record("moe-gs", "fox"))
+    found = of_specs(load(tmp_path), pair)
+    assert [r.recipe for r in found] == ["moe-gs", "moe-gs-e5-top2"] and [r.key for r in found] == [s.key for s in pair]
+    assert find(load(tmp_path), Spec(scene, "moe-gs-e5-top1", 0, Scale(3000))) is None

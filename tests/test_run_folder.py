@@ -149,3 +149,11 @@ def test_near_of_the_users_choice(tmp_path):
         assert {round(v.camera.near, 6) for v in capture.views} == {expected}
     with pytest.raises(InputError, match="--near"):
         run_folder.load_capture(Data(folder, near=0.0))
+
+
+def test_an_import_over_another_run_is_not_told_to_resume(tmp_path):
+    (tmp_path / "checkpoints").mkdir(parents=True)
+    (tmp_path / "checkpoints" / "ckpt_000001.safetensors").write_bytes(b"")
+    with pytest.raises(InputError, match="choose another --out") as error:
+        run_folder.check(tmp_path, replace(CONFIG, command="import scene.ply"), resume=False)
+    assert "--resume" not in str(error.value)

@@ -11,7 +11,7 @@ from scene_experts.scene import Scene
 from scene_experts.table import Table
 from scene_experts.types import Camera, Points
 
-METHODS = ("scaffold-gs", "moe-gs", "3dgs", "3dgs-mcmc", "octree-gs", "octree-moe-gs", "scaffold-gs-bank", "sags")
+METHODS = ("scaffold-gs", "moe-gs", "3dgs", "3dgs-mcmc", "octree-gs", "octree-moe-gs", "scaffold-gs-bank", "sags", "moe-gs-balance")
 CAMERA = Camera(torch.eye(4), torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), 48, 32, 0.2)
 
 

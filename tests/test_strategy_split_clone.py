@@ -149,8 +149,14 @@ def test_the_cap_lets_the_largest_gradients_through():
 
 
 def test_windows_scale_and_thresholds_stay():
-    rule = SplitClone().scaled(0.1)
-    assert rule == replace(SplitClone(), adjust=Every(50, 1500, 100), reset=Every(0, 1500, 300))
+    rule = SplitClone().scaled(0.5)
+    assert rule == replace(SplitClone(), adjust=Every(250, 7500, 100), reset=Every(0, 7500, 1500))
+    short = SplitClone().scaled(0.1)  # opacities need hundreds of iterations to come back, however short the training
+    assert short.reset == Every(0, 1500, 1000) and not any(SplitClone().scaled(0.05).reset.due(step) for step in range(1500))
+    assert SplitClone(reset_least=1).scaled(0.1).reset == Every(0, 1500, 300)
+    assert SplitClone(reset=Every(0, 15_000, 400)).scaled(1.0).reset.interval == 400  # what was asked for stays
+    with pytest.raises(InputError, match="reset-least"):
+        replace(rule, reset_least=0).check()
     with pytest.raises(InputError, match="reset-opacity"):
         replace(rule, reset_opacity=1.0).check()
     with pytest.raises(InputError, match=r"reset\.interval"):

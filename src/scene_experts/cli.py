@@ -19,7 +19,7 @@ COMMANDS = {
     "render": "a camera path through a run, as video or pictures",
     "view": "a run in a browser, drawn here: experts, cameras, photographs beside",
     "report": "one page of runs: curves, views with a slider, experts, commands",
-    "export": "write a trained scene as anchor PLY or compact file",
+    "export": "write a trained scene to files that viewers and later runs open",
     "import": "make a run folder of a published Scaffold-GS result or of a compact file",
     "reproduce": "the paper's tables and figures, from runs made or reused",
     "bench": "how fast this machine is, in a minute: each part beside a named peer",

@@ -173,12 +173,18 @@ def _from_union(args: tuple[Any, ...], value: Any, where: str) -> Any:
         return None
     options = [a for a in args if a is not type(None)]
     if isinstance(value, dict) and "type" in value:
-        for option in options:
+        for option in [kind for a in options for kind in (a, *_variants(a))]:
             if getattr(option, "__name__", None) == value["type"]:
                 return from_json(option, value, where)
     if len(options) == 1:
         return from_json(options[0], value, where)
     raise InputError(f"expected one of {[getattr(o, '__name__', str(o)) for o in options]} at {where}, found {value!r}; correct the file")
+
+
+def _variants(kind: Any) -> list[type]:
+    """The parts made of a part by subclassing; a field that accepts it accepts them."""
+    below = kind.__subclasses__() if isinstance(kind, type) else []
+    return [variant for each in below for variant in (each, *_variants(each))]
 
 
 def _from_object(kind: Any, value: Any, where: str) -> Any:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from scene_experts.config import Train
 from scene_experts.losses import Weights
 from scene_experts.scene.anchors import Anchors
+from scene_experts.scene.balance import BalancedExperts
 from scene_experts.scene.experts import Experts, Router
 from scene_experts.scene.explicit import Explicit, ExplicitRates
 from scene_experts.scene.graph_points import GraphPoints, GraphRates
@@ -52,8 +53,8 @@ gs_mcmc = replace(
 sags = Train(recipe="sags", scene=GraphPoints(), loss=Weights(scale=0.0), growth=GrowPoints(), rates=GraphRates())
 
 
-def _moe(name: str, *, loss: Weights = moe_gs.loss, add_dist: tuple[str, ...] = (), **experts: object) -> Train:
-    decoder = replace(moe_gs.scene.decoder, **experts)  # type: ignore[type-var]
+def _moe(name: str, *, loss: Weights = moe_gs.loss, add_dist: tuple[str, ...] = (), decoder: Experts = EXPERTS, **experts: object) -> Train:
+    decoder = replace(decoder, **experts)  # type: ignore[arg-type]
     return replace(moe_gs, recipe=name, scene=replace(moe_gs.scene, decoder=decoder, add_dist=add_dist), loss=loss)
 
 
@@ -82,6 +83,10 @@ RECIPES: dict[str, tuple[str, Train]] = {
     "moe-gs-no-opacity": ("without the opacity hinge (Table 4)", _moe("moe-gs-no-opacity", loss=replace(moe_gs.loss, opacity=0.0))),
     "moe-gs-dist": ("the decoders also see the distance, as the paper's text has it", _moe("moe-gs-dist", add_dist=ALL)),
     "moe-gs-posrouter": ("the routers also see the anchor's position (appendix)", _moe("moe-gs-posrouter", router=Router(input_pos=True))),
+    "moe-gs-balance": (
+        "experts kept in use by biases instead of L_load (Wang et al. 2024; not in the paper)",
+        _moe("moe-gs-balance", loss=replace(moe_gs.loss, load=0.0), decoder=BalancedExperts()),
+    ),
     "moe-gs-e3-no-load": (
         "three experts without L_load (Figure 3a)",
         _moe("moe-gs-e3-no-load", num=3, loss=replace(moe_gs.loss, load=0.0)),

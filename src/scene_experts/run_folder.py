@@ -21,7 +21,10 @@ import torch
 from torch import Tensor
 
 import scene_experts
-from scene_experts import checkpoint
+from scene_experts import (
+    checkpoint,
+    recipes,  # noqa: F401  (variants of parts that only a recipe names must be known before a configuration is read)
+)
 from scene_experts.config import Data, RunConfig, Train, from_json, to_json
 from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
@@ -76,10 +79,9 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
     if resume:
         _check_same(out, read_config(out), config)
     elif not overwrite and any((out / "checkpoints").glob("ckpt_*.safetensors")):
-        raise InputError(
-            f"expected a new or empty run folder, found checkpoints in {out}; "
-            f"add --resume to go on, --overwrite to begin anew, or choose another --out"
-        )
+        imported = config.command.startswith("import ")
+        advice = "choose another --out" if imported else "add --resume to go on, --overwrite to begin anew, or choose another --out"
+        raise InputError(f"expected a new or empty run folder, found checkpoints in {out}; {advice}")
 
 
 def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
@@ -110,7 +112,7 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False)
     """Make `out` ready for a run that `check` admits: an overwritten run's checkpoints and results go, config.json is written."""
     check(out, config, resume, overwrite)
     if overwrite:
-        results = [out / f"{name}{suffix}.json" for name in ("results", "per_view") for suffix in ("", "_train")]
+        results = [out / f"{name}{suffix}.json" for name in ("results", "per_view") for suffix in ("", "_train", "_half")]
         for old in [*(out / "checkpoints").glob("ckpt_*.safetensors"), *results, out / "scene.compact", out / "config.json"]:
             old.unlink(missing_ok=True)
         for sidecar in (out / "point_cloud").glob("iteration_*/scene.json"):  # a later iteration's would be taken for the new run's

@@ -22,6 +22,9 @@ class EvalCommand:
     data: Annotated[Path | None, tyro.conf.arg(aliases=["-s"])] = None
     """Where the capture is now, if it moved."""
     views: Literal["test", "train"] = "test"
+    appearance: Literal["rule", "half"] = "rule"
+    """Appearance codes of held-out views: as the recipe's rule has it, or found on the left half of each photograph, whose right half is
+    then scored (NeRF in the Wild's protocol; written beside the other results)."""
     step: int | None = None
     """Checkpoint to score; the newest by default."""
     lpips: bool = True
@@ -47,13 +50,14 @@ def evaluate(args: list[str]) -> int:
         rasterize,
         data=command.data,
         views=command.views,
+        appearance=command.appearance,
         step=command.step,
         lpips=command.lpips,
         lpips_weights=command.lpips_weights,
         download=command.download_lpips,
     )
     print_results(results, Console(highlight=False), command.run)
-    if command.views == "test":
+    if command.views == "test" and command.appearance == "rule":
         print(f"wrote {page.write([command.run])}")
     return 0
 

@@ -2,41 +2,77 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from rich.console import Console
 
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import backend
 from scene_experts.config import Data
+from scene_experts.progress import Bar
+from scene_experts.render import Rasterizer
 from scene_experts.run_folder import named
 
 
 @dataclass(frozen=True)
 class ExportCommand:
-    """Write a trained scene to a file other tools or later runs can read."""
+    """Write a trained scene to a file other tools or later runs can read.
+
+    Standard files (ply and what follows it) hold Gaussians that no network changes: scenes of anchors are baked for them, in minutes.
+    """
 
     run: Annotated[Path, tyro.conf.Positional]
     """Run folder."""
-    format: Literal["anchors", "compact", "ply"] = "compact"
-    """anchors: the Scaffold-GS folder layout; compact: one small file of ours; ply: explicit Gaussians as 3DGS's file."""
+    format: Literal["anchors", "compact", "ply", "compressed-ply", "splat", "spz", "sog", "glb", "html"] = "compact"
+    """anchors: the Scaffold-GS folder layout; compact: one small file of ours; the others are standard files that viewers open."""
     out: Path | None = None
     """File or folder to write; inside the run folder by default."""
     step: int | None = None
     measure: bool = True
-    """Render the held-out views before and after, and say what a compact file costs in PSNR."""
+    """Render the held-out views before and after, and say what the file costs in PSNR."""
+    data: Annotated[Path | None, tyro.conf.arg(aliases=["-s"])] = None
+    """Where the capture is now, if it moved. Standard files need it."""
+    sh_degree: int = 3
+    """Standard files: degree of the harmonics, 0 (smallest) to 3 (best)."""
+    max_gaussians: int = 0
+    """Standard files: keep so many that contribute most; 0 keeps all."""
+    prune: float = 0.0
+    """Standard files: leave out those that contribute least, up to this share of everything that all contribute (0.02: small loss)."""
+    refine: int = 500
+    """Standard files: iterations that move all parameters towards the run's pictures; 0 takes means over the views as they are."""
+    frame: Literal["capture", "trained"] = "capture"
+    """Standard files: the capture's own frame, or the one that it was trained in."""
+    levels: bool = False
+    """Standard files: one for each level of detail, each without the finer ones."""
 
 
 def export(args: list[str]) -> int:
     from scene_experts.export.run import export_run
 
     command = tyro.cli(ExportCommand, prog=f"{PROG} export", args=args)
-    rasterize = backend("cpu", "auto", False, False)[1] if command.measure else None
-    for line in export_run(command.run, command.format, command.out, command.step, rasterize):
+    rasterize = backend("cpu", "auto", False, False)[1]
+    if command.format in ("anchors", "compact"):
+        lines = export_run(command.run, command.format, command.out, command.step, rasterize if command.measure else None)
+    else:
+        lines = _standard(command, args, rasterize)
+    for line in lines:
         print(line)
     return 0
+
+
+def _standard(command: ExportCommand, args: list[str], rasterize: Rasterizer) -> list[str]:
+    from scene_experts.export.bake import Bake
+    from scene_experts.export.bake_refine import Refine
+    from scene_experts.export.bake_run import Options, export_standard
+
+    how = Bake(command.sh_degree, command.max_gaussians, command.prune, Refine(command.refine))
+    options = Options(how, command.frame, command.levels, command.measure, shlex.join([PROG, "export", *args]))
+    with Bar(Console(stderr=True)) as tell:
+        return export_standard(command.run, command.format, command.out, command.step, rasterize, options, command.data, tell)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +15,7 @@ from scene_experts.data.obtain import captures_dir
 from scene_experts.errors import InputError, RunError, expect_at_least, nearest
 from scene_experts.reproduce import report, store
 from scene_experts.reproduce.experiments import EXPERIMENTS, Experiment
-from scene_experts.reproduce.plan import Scale, Scene, Spec, own_scenes, paper_scenes, specs
+from scene_experts.reproduce.plan import Scale, Scene, Spec, distinct, own_scenes, paper_scenes, specs
 from scene_experts.reproduce.run import Runner
 
 
@@ -35,6 +35,8 @@ class ReproduceCommand:
     """Folder for tables, figures and records of runs."""
     runs: Path | None = None
     """Folder for run folders; OUT/runs by default."""
+    records: Path | None = None
+    """Folder for records of finished runs, which count as done; OUT/records by default. Experiments of several sizes may share one."""
     scale: float = 1.0
     """1 is the paper's size; less shortens the schedule and the longest side (of 1,600 px) together."""
     iterations: int | None = None
@@ -54,6 +56,8 @@ class ReproduceCommand:
     """Run folders made elsewhere, to count as done where they are exactly what is asked for."""
     dry_run: bool = False
     """Say what would run, and run nothing."""
+    tables_only: bool = False
+    """Write the tables and figures of what is done, and run nothing."""
 
 
 def reproduce(args: list[str]) -> int:
@@ -62,14 +66,10 @@ def reproduce(args: list[str]) -> int:
     chosen = experiments_of(command)
     scenes = scenes_of(command)
     scale = Scale.of(command.scale, command.iterations, command.resolution)
-    wanted = specs(chosen, scenes, command.seeds or (0,), scale)
-    known = {recipe for experiment in chosen for recipe in experiment.rows.values()}
-    for recipe in command.recipes:
-        if recipe not in known:
-            raise InputError(f"expected --recipes among {', '.join(sorted(known))}, found '{recipe}'{nearest(recipe, known)}; correct it")
-    if command.recipes:
-        wanted = [spec for spec in wanted if spec.recipe in command.recipes]
-    records, runs = command.out / "records", command.runs or command.out / "runs"
+    chosen = rows_of(chosen, command.recipes) if command.recipes else chosen
+    shown = specs(chosen, scenes, command.seeds or (0,), scale)
+    wanted = distinct(shown)
+    records, runs = command.records or command.out / "records", command.runs or command.out / "runs"
     console = Console(highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
     if not wanted:
@@ -77,9 +77,11 @@ def reproduce(args: list[str]) -> int:
     for run in command.adopt:
         say(f"adopted {report.adopt(run, records)}")
     if command.dry_run:
-        done = store.load(records)
-        for spec in wanted:
-            say(f"{'done   ' if store.find(done, spec) else 'to run '} {spec.label}")
+        there = store.load(records)
+        done = [store.find(there, spec) is not None for spec in wanted]
+        for spec, is_done in zip(wanted, done):
+            say(f"{'done   ' if is_done else 'to run '} {spec.label}")
+        say(f"{len(wanted)} runs, {sum(done)} of them done")
         return 0
     figure5 = set(EXPERIMENTS["fig5"].rows.values()) if any(e.name == "fig5" for e in chosen) else set()
 
@@ -90,15 +92,14 @@ def reproduce(args: list[str]) -> int:
     runner = Runner(runs, records, command.workers, command.devices, command.discard, say, draw)
     previous = {s: signal.signal(s, lambda *_: runner.end()) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
-        failures = runner.make(wanted)
+        failures = [] if command.tables_only else runner.make(wanted)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-    keys = {spec.key for spec in specs(chosen, scenes, command.seeds or (0,), scale)}  # others are of another size or protocol
     for spec in wanted:  # pictures of runs that were done before this figure was asked for
         if not (command.out / f"fig5_{spec.scene.name}.png").is_file() and (spec.folder(runs) / "results.json").is_file():
             draw(spec, spec.folder(runs))
-    for path in report.write(command.out, chosen, scenes, [r for r in store.load(records) if r.key in keys]):
+    for path in report.write(command.out, chosen, scenes, store.of_specs(store.load(records), shown), said(command, scenes)):
         say(f"wrote {path}")
     if runner.stop.is_set():
         say("stopped; give the same command again to go on")
@@ -109,11 +110,35 @@ def reproduce(args: list[str]) -> int:
     return 0
 
 
+def said(command: ReproduceCommand, scenes: list[Scene]) -> str:
+    """The command that makes these tables and figures, without the places that are this machine's own."""
+    words = [PROG, "reproduce", *command.experiments]
+    if command.captures:
+        words += ["--captures", *(f"CAPTURES/{scene.name}" for scene in scenes)]
+    for name in ("scenes", "scale", "iterations", "resolution", "seeds", "recipes"):
+        value = getattr(command, name)
+        if value != getattr(ReproduceCommand(()), name):
+            words += [f"--{name}", *(map(str, value) if isinstance(value, tuple) else [str(value)])]
+    return " ".join(words)
+
+
+def rows_of(experiments: list[Experiment], recipes: tuple[str, ...]) -> list[Experiment]:
+    """The experiments with the rows of `recipes` alone. Raises InputError for a recipe that none of them has."""
+    known = {recipe for experiment in experiments for recipe in experiment.rows.values()}
+    for recipe in recipes:
+        if recipe not in known:
+            raise InputError(f"expected --recipes among {', '.join(sorted(known))}, found '{recipe}'{nearest(recipe, known)}; correct it")
+    few = [replace(e, rows={name: recipe for name, recipe in e.rows.items() if recipe in recipes}) for e in experiments]
+    return [e for e in few if e.rows]
+
+
 def experiments_of(command: ReproduceCommand) -> list[Experiment]:
     """Raises InputError for a name that is no experiment."""
     if not command.experiments:
         raise InputError(f"expected what to reproduce ({', '.join(EXPERIMENTS)}, or all), found nothing; name one or more")
-    names = list(EXPERIMENTS) if "all" in command.experiments else list(command.experiments)
+    names = list(dict.fromkeys(command.experiments))
+    if "all" in names:  # on one's own captures table 2 is table 1 again
+        names = [name for name in EXPERIMENTS if name != "table2" or not command.captures]
     for name in names:
         if name not in EXPERIMENTS:
             hint = nearest(name, EXPERIMENTS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -111,7 +111,18 @@ def parse_train(args: list[str]) -> TrainCommand:
             description=text,
             config=(tyro.conf.AvoidSubcommands,),
         )
-    return tyro.extras.overridable_config_cli(defaults, args=args, prog=f"{PROG} train")
+    return tyro.extras.overridable_config_cli(defaults, args=args, prog=f"{PROG} train", description=flags_of_all())
+
+
+def flags_of_all() -> str:
+    """For the help without a recipe: the flags that every recipe takes."""
+    parts = {"path", "cfg", "scene", "loss", "growth", "rates", "recipe", "schedule"}  # set by the recipe, or by flags of their own
+    names = {f.name for part in (Data, Train, TrainCommand) for f in fields(part)} - parts
+    own = sorted(f"--{name.replace('_', '-')}" for name in names)
+    return (
+        f"Train a scene: {PROG} train RECIPE --data CAPTURE --out RUN. Every recipe takes {', '.join(own)}, and the numbers of its "
+        f"parts (--scene..., --loss..., --growth..., --rates...): {PROG} train RECIPE --help says them all."
+    )
 
 
 def check_settings(command: TrainCommand) -> None:
@@ -130,7 +141,7 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
             raise KeyboardInterrupt  # a second signal does not wait
         run.stop.append(signal.Signals(number).name)
 
-    live = None
+    live, finished = None, 0  # the iteration at which there was nothing left to train
     if command.viewer:
         say = lambda url: console.print(f"viewer: {url}", soft_wrap=True)  # noqa: E731
         label = f"{command.cfg.recipe} on {capture.name}"
@@ -141,6 +152,7 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
         with Recorder(command.out, command.tensorboard, capture) as record, Progress(console) as progress:
             for event in training.train(command.cfg, run, capture, rasterize):
                 if isinstance(event, Started):  # what can fail before the first iteration has not: now the folder may change
+                    finished = event.step if event.step == event.total else 0
                     run_folder.prepare(command.out, run.config, command.resume, command.overwrite)
                 record(event)
                 progress(event)
@@ -152,7 +164,9 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
         for number, handler in previous.items():
             signal.signal(number, handler)
         capture.images.close()
-    if not run.stop:
+    if finished and (command.out / f"point_cloud/iteration_{finished}/point_cloud.ply").is_file():
+        console.print("nothing was left to train: the run's files stay as they are", soft_wrap=True)
+    elif not run.stop:
         from scene_experts.export.run import write_layout
         from scene_experts.run_folder import open_run
 

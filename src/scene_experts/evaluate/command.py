@@ -24,6 +24,7 @@ def evaluate_run(
     *,
     data: Path | None = None,
     views: Literal["test", "train"] = "test",
+    appearance: Literal["rule", "half"] = "rule",
     step: int | None = None,
     lpips: bool = True,
     lpips_weights: Path | None = None,
@@ -42,7 +43,7 @@ def evaluate_run(
         raise InputError(f"expected the capture that {run} was trained on, found other views in {capture.root}; give the right --data")
     about = About(
         recipe=opened.config.train.recipe,
-        iterations=opened.cfg.iterations,
+        iterations=opened.cfg.iterations if opened.step else 0,  # an imported file that says nothing of its training
         seed=opened.cfg.seed,
         train_seconds=opened.seconds,
         versions=opened.config.versions,
@@ -56,6 +57,7 @@ def evaluate_run(
                 run,
                 step=opened.step,
                 views=views,
+                appearance=appearance,
                 lpips=lpips,
                 lpips_weights=lpips_weights,
                 download=download,

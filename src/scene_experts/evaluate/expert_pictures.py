@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -44,11 +43,3 @@ def alone(
     mine = chosen_by(decoded, attribute, scene.K)
     draw = lambda gaussians: rasterize(gaussians, camera, background).image.clamp(0, 1)  # noqa: E731
     return draw(decoded.gaussians), [draw(keep(decoded.gaussians, mine[:, e])) for e in range(mine.shape[1])]
-
-
-def strip(pictures: Sequence[Tensor], gap: int = 4) -> Tensor:
-    """Pictures of one height beside each other, [H, W', 3], a white gap between them."""
-    height = pictures[0].shape[0]
-    white = torch.ones(height, gap, 3)
-    parts = [part for picture in pictures for part in (white, picture.cpu())]
-    return torch.cat(parts[1:], dim=1)

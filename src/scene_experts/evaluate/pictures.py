@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -75,16 +75,27 @@ def error_map(render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = N
 
 def side_by_side(photo: np.ndarray, render: np.ndarray, errors: np.ndarray, captions: tuple[str, str, str]) -> np.ndarray:
     """Photograph, render and errors in a row with thin gaps, each under its caption."""
-    h, w = photo.shape[:2]
-    sheet = Image.new("RGB", (3 * w + 2 * GAP, BAR + h), PAPER)
+    width = photo.shape[1]
+    sheet = _row((photo, render, errors), captions)
+    _scale(ImageDraw.Draw(sheet), sheet.width, width)
+    return np.asarray(sheet)
+
+
+def row(parts: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
+    """Pictures of one size beside each other, each under its caption."""
+    return np.asarray(_row(parts, captions))
+
+
+def _row(parts: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
+    h, w = parts[0].shape[:2]
+    sheet = Image.new("RGB", (len(parts) * (w + GAP) - GAP, BAR + h), PAPER)
     draw = ImageDraw.Draw(sheet)
-    for i, (pixels, caption) in enumerate(zip((photo, render, errors), captions)):
+    for i, (pixels, caption) in enumerate(zip(parts, captions)):
         left = i * (w + GAP)
         sheet.paste(Image.fromarray(pixels), (left, BAR))
         text, font = _fit(draw, caption, w - 8)
         draw.text((left + 4, BAR // 2), text, fill=INK, font=font, anchor="lm")
-    _scale(draw, 3 * w + 2 * GAP, w)
-    return np.asarray(sheet)
+    return sheet
 
 
 def _fit(draw: ImageDraw.ImageDraw, text: str, room: int) -> tuple[str, ImageFont.ImageFont | ImageFont.FreeTypeFont]:

@@ -1,7 +1,7 @@
 """Evaluates a trained scene: renders held-out views to disk, scores the 8-bit files, and states everything the scores depend on.
 
 OUT/test/{renders,gt,errors,side_by_side}/<view name>.png (masks/ too where the capture has any), OUT/results.json, OUT/per_view.json. With
-views="train" the same in OUT/train, OUT/results_train.json and OUT/per_view_train.json.
+views="train" the same in OUT/train, OUT/results_train.json and OUT/per_view_train.json; with appearance="half" in OUT/test_half and so on.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 
 import scene_experts
 from scene_experts.errors import InputError
-from scene_experts.evaluate import pictures, timing
+from scene_experts.evaluate import halves, pictures, timing
 from scene_experts.evaluate.experts import expert_shares
 from scene_experts.evaluate.metrics import VARIANTS, Perceptual, score
 from scene_experts.io import write_json
@@ -54,6 +54,7 @@ def evaluate(
     *,
     step: int,
     views: Literal["test", "train"] = "test",
+    appearance: Literal["rule", "half"] = "rule",
     lpips: bool = True,
     lpips_weights: Path | None = None,
     download: bool = False,
@@ -62,7 +63,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Render, score and time the views of a split; returns what results.json then holds.
 
-    The scene is drawn on the device its parameters are on. Raises InputError where the split holds no view, RunError on a full disk.
+    appearance: a held-out view's code is what the scene's rule says, or is found on its left half, and only its right half is scored. The
+    scene is drawn on the device its parameters are on. Raises InputError where the split holds no view, RunError on a full disk.
     """
     chosen = capture.test if views == "test" else capture.train
     if not chosen:
@@ -75,14 +77,20 @@ def evaluate(
     perceptual = Perceptual.find(lpips_weights, device, fetch=download, progress=fetching) if lpips else Perceptual.off()
     names = pictures.file_names(capture.views[i].name for i in chosen)
     cameras = [capture.views[i].camera.to(device) for i in chosen]
-    folder = out / views
+    half = appearance == "half"
+    if half and views == "train":
+        raise InputError("expected held-out views for --appearance half, found --views train, which have codes; leave one of them out")
+    if half:
+        halves.fit(scene, capture, rasterize, chosen, step, background, lambda done, total: tell("finding appearance codes", done, total))
+    suffix = "_half" if half else "" if views == "test" else f"_{views}"
+    folder = out / (f"{views}_half" if half else views)
     pictures.clear(folder)
     per_view: dict[str, dict[str, Any]] = {}
     draws = freeze(scene, step)
     for n, (index, camera) in enumerate(zip(chosen, cameras)):
         capture.images.prefetch(list(chosen[n + 1 : n + 3]))
         name = capture.views[index].name
-        facts = _draw(draws, capture, rasterize, index, camera, step, background, folder, names[name])
+        facts = _draw(draws, capture, rasterize, index, camera, step, background, folder, names[name], half)
         scored = score_files(folder, names[name], perceptual, device)
         captions = ("photograph", _caption(scored), f"error, 0 to {pictures.WORST:g}")
         _compose(folder, names[name], captions)
@@ -98,6 +106,7 @@ def evaluate(
         "fps": asdict(speed),
         "capture": capture.name,
         "views": views,
+        **({"appearance": appearance} if half else {}),
         "view_count": len(chosen),
         "split": capture.split,
         "resolution": capture.resolution,
@@ -105,7 +114,6 @@ def evaluate(
         **_about(about or About(), step, rasterize, perceptual),
         "evaluation_seconds": time.perf_counter() - began,
     }
-    suffix = "" if views == "test" else f"_{views}"
     write_json(out / f"per_view{suffix}.json", per_view)
     write_json(out / f"results{suffix}.json", results)
     return results
@@ -128,8 +136,9 @@ def _draw(
     background: Tensor,
     folder: Path,
     file: str,
+    half: bool = False,
 ) -> dict[str, Any]:
-    """Draw one view and write it beside its photograph; what was counted on the way."""
+    """Draw one view and write it beside its photograph; what was counted on the way. half: only the right half counts."""
     frame = capture.frame(index)
     decoded = draws(camera, step, False, rasterize.visible)
     render = rasterize(decoded.gaussians, camera, background)
@@ -141,8 +150,9 @@ def _draw(
         )
     pictures.write(folder / "renders" / file, drawn)
     pictures.write(folder / "gt" / file, photo)
-    if frame.mask is not None:
-        pictures.write(folder / "masks" / file, (frame.mask.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy())
+    mask = halves.right_mask(frame.mask, *photo.shape[:2]) if half else frame.mask
+    if mask is not None:
+        pictures.write(folder / "masks" / file, (mask.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy())
     return view_facts(decoded, render)
 
 

@@ -206,7 +206,8 @@ def print_results(results: dict[str, Any], console: Console, run: Path) -> None:
     def say(line: str) -> None:
         console.print(line, markup=False, soft_wrap=True)
 
-    suffix = "" if results["views"] == "test" else f"_{results['views']}"
+    half = "_half" if results.get("appearance") == "half" else ""
+    suffix = half or ("" if results["views"] == "test" else f"_{results['views']}")
     made = table([str(results.get("recipe") or run.name)], [results])
     say(_title(results))
     console.print(to_rich(made, console.width), crop=False)
@@ -217,12 +218,13 @@ def print_results(results: dict[str, Any], console: Console, run: Path) -> None:
         say(f"experts, {attribute}: {named} {' '.join(f'{v:.0%}' for v in values)}, gate entropy {shares['entropy']:.2f}")
     fps = results["fps"]
     say(f"drawing: {fps['decode_ms']:.1f} ms decode + {fps['raster_ms']:.1f} ms raster on {fps['device']}")
-    say(f"wrote {run / f'results{suffix}.json'} and pictures in {run / results['views'] / 'side_by_side'}")
+    say(f"wrote {run / f'results{suffix}.json'} and pictures in {run / (results['views'] + half) / 'side_by_side'}")
 
 
 def _title(results: dict[str, Any]) -> str:
     """What the scores of a table are of."""
-    return f"{results['capture']}: {results['view_count']} {results['views']} views ({results['split']}), {results['resolution']}"
+    part = "right halves of " if results.get("appearance") == "half" else ""
+    return f"{results['capture']}: {part}{results['view_count']} {results['views']} views ({results['split']}), {results['resolution']}"
 
 
 @cache

@@ -18,6 +18,7 @@ from scene_experts.config import Data, RunConfig, Train, from_json, to_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
 from scene_experts.export.cfg_args import cfg_args_text
+from scene_experts.export.incoming import UNKNOWN
 from scene_experts.export.ply import read_gaussian_ply, read_vertices, write_gaussian_ply
 from scene_experts.export.scaffold import SIDECAR, SIDECAR_FORMAT, iteration_folder, read_sidecar
 from scene_experts.export.splats import Splats, from_scene, to_columns
@@ -27,7 +28,6 @@ from scene_experts.run_folder import OpenRun
 from scene_experts.scene.explicit import Explicit, GaussianScene
 
 KIND = "gaussians"  # in our description of a scene
-_STEPS = 30_000  # of a file that does not say how long it was trained
 
 
 def scene_of(run: OpenRun) -> GaussianScene:
@@ -95,8 +95,8 @@ def read_columns(path: Path, world: World) -> dict[str, Tensor]:
 def import_file(path: Path, data: Data, out: Path, iteration: int | None = None) -> Capture:
     """Make the run folder `out` (configuration and checkpoint) of a PLY file of 3DGS, published or ours; returns its capture.
 
-    The file must be in the frame and unit of the capture. What it does not say is 3DGS's: the recipe, and 30,000 iterations unless its
-    folder's name says otherwise.
+    The file must be in the frame and unit of the capture. A recipe that it does not say is 3DGS; an iteration that neither it nor its
+    folder's name says is 0.
     """
     beside = path.parent / SIDECAR
     about: dict[str, Any] = read_sidecar(beside) if beside.is_file() else {}
@@ -104,12 +104,12 @@ def import_file(path: Path, data: Data, out: Path, iteration: int | None = None)
     capture.images.close()
     columns = read_columns(path, capture.world)
     named = re.fullmatch(r"iteration_(\d+)", path.parent.name)
-    step = int(about.get("step") or iteration or (int(named[1]) if named else _STEPS))
+    step = int(about.get("step") or iteration or (int(named[1]) if named else UNKNOWN))
     degree = math.isqrt(columns["sh_rest"].shape[1] + 1) - 1
     if about.get("kind") == KIND and "train" in about:
         cfg = from_json(Train, about["train"], "train")
     else:
-        cfg = replace(gs_3d, scene=Explicit(sh_degree=degree), iterations=max(step, 1))
+        cfg = replace(gs_3d, scene=Explicit(sh_degree=degree), iterations=step or gs_3d.iterations)
     config = RunConfig(cfg, data, f"import {path.name}", versions=run_folder.versions())
     run_folder.prepare(out, config, resume=False)
     meta = {"recipe": cfg.recipe, "step": step, "seconds": 0.0, "extent": capture.extent, "config": "imported"}

@@ -27,11 +27,11 @@ NETWORKS = "networks.safetensors"
 
 
 def refuse(run: OpenRun) -> None:
-    """Raises InputError for a scene of graph points: no format but its own holds what its networks need."""
+    """Raises InputError for a scene of graph points: no file of anchors holds what its networks need."""
     if isinstance(run.scene, GraphScene):
         raise InputError(
-            f"expected a scene of anchors or of explicit Gaussians to export, found a run of '{run.config.train.recipe}'; "
-            "its own files are in point_cloud/ of the run folder, where training wrote them"
+            f"expected a scene of anchors for this format, found a run of '{run.config.train.recipe}'; "
+            "use a standard format such as ply; its own files are in point_cloud/ of the run folder, where training wrote them"
         )
 
 

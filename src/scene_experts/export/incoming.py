@@ -31,6 +31,8 @@ from scene_experts.scene.levels import Levels
 from scene_experts.scene.mix import FeatureBank
 from scene_experts.scene.mlp import Plain
 
+UNKNOWN = 0  # the step of files that do not say how long they were trained
+
 
 @dataclass(frozen=True)
 class _Read:
@@ -41,7 +43,7 @@ class _Read:
     voxel: float  # input unit
     networks: dict[str, Network]
     add_dist: tuple[str, ...]
-    step: int
+    step: int  # 0 where nothing says it
     scene: dict[str, Any] | None  # our description
 
 
@@ -57,7 +59,7 @@ def import_result(source: Path, data: Data, out: Path, iteration: int | None = N
     capture = run_folder.load_capture(data)
     capture.images.close()
     if read.scene is not None:
-        _check_world(world_in(read.scene), capture.world)
+        check_world(world_in(read.scene), capture.world)
         capture = replace(capture, world=world_in(read.scene))
     voxel = float(read.scene["voxel_size"]["trained"]) if read.scene else read.voxel
     plain = _plain_values(read, capture)
@@ -136,20 +138,20 @@ def _read(source: Path, iteration: int | None) -> _Read:
         )
     voxel, origin = float(facts["voxel_size"] or 0.0), (0.0, 0.0, 0.0)
     if facts["kind"] == "octree":  # its lattices are told by its own columns
-        return _Read(anchors, None, voxel, networks, facts["add_dist"], int(facts["iteration"] or 40_000), scene)
+        return _Read(anchors, None, voxel, networks, facts["add_dist"], facts["iteration"] or UNKNOWN, scene)
     if scene is not None:
         voxel, origin = lattice_to_input(float(scene["voxel_size"]["trained"]), world_in(scene))
     elif voxel <= 0:  # it was automatic and is written nowhere
         voxel = recover_voxel(anchors["xyz"]) or 0.0
     cells = cells_of(anchors["xyz"], voxel, origin) if voxel > 0 else None
-    return _Read(anchors, cells, voxel, networks, facts["add_dist"], int(facts["iteration"] or 30_000), scene)
+    return _Read(anchors, cells, voxel, networks, facts["add_dist"], facts["iteration"] or UNKNOWN, scene)
 
 
 def _config(read: _Read) -> Train:
     """The recipe: the one our description holds, else Scaffold-GS with the numbers that the files show."""
     if read.scene is not None and "train" in read.scene:
         return from_json(Train, read.scene["train"], "train")
-    network = read.networks["opacity"]
+    network, length = read.networks["opacity"], read.step or (octree_gs if "level" in read.anchors else scaffold_gs).iterations
     depth = 2 + sum(name.startswith("middle.") and name.endswith(".weight") for name in network)
     K, F = read.anchors["offsets"].shape[1], read.anchors["feature"].shape[1]
     scene = Anchors(K=K, F=F, hidden=network["w1"].shape[1], add_dist=read.add_dist, voxel_size=max(read.voxel, 0.0), decoder=Plain(depth))
@@ -158,11 +160,11 @@ def _config(read: _Read) -> Train:
     if "appearance" in read.networks:
         scene = replace(scene, appearance=read.networks["appearance"]["table"].shape[1])
     if "level" in read.anchors:
-        return replace(octree_gs, scene=replace(scene, select=octree_gs.scene.select), iterations=read.step)  # type: ignore[union-attr]
-    return replace(scaffold_gs, scene=scene, iterations=read.step)
+        return replace(octree_gs, scene=replace(scene, select=octree_gs.scene.select), iterations=length)  # type: ignore[union-attr]
+    return replace(scaffold_gs, scene=scene, iterations=length)
 
 
-def _check_world(trained: World, found: World) -> None:
+def check_world(trained: World, found: World) -> None:
     """Raises InputError unless the capture is read into the world the scene was trained in (to rounding)."""
     pairs = [(trained.scale, found.scale), *zip(trained.shift, found.shift)]
     reach = max(1.0, *(abs(s) for s in trained.shift))

@@ -27,7 +27,7 @@ _TYPES = {
 }  # fmt: skip
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
-_HEADER_LIMIT = 1 << 20
+HEADER_LIMIT = 1 << 20
 ANCHOR_OPACITY = math.log(0.1 / 0.9)  # logit(0.1): Scaffold-GS stores it and never uses it
 
 
@@ -43,7 +43,7 @@ def read_vertices(path: Path) -> Columns:
     if not path.is_file():
         raise InputError(f"expected a PLY file at {path}, found none; check the path")
     with path.open("rb") as stream:
-        head = stream.read(_HEADER_LIMIT)
+        head = stream.read(HEADER_LIMIT)
     match = re.search(rb"\nend_header[ \t]*\r?\n", head)
     if not head.startswith(b"ply") or match is None:
         raise InputError(f"expected a PLY file at {path}, found something else; replace it")

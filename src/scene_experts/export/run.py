@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from scene_experts import run_folder
 from scene_experts.config import Data, to_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
-from scene_experts.evaluate.metrics import psnr
-from scene_experts.export import explicit, graph_points
+from scene_experts.export import explicit, graph_points, graph_points_in
+from scene_experts.export.bake_measure import as_trained, scores
 from scene_experts.export.cameras import write_cameras
 from scene_experts.export.compact import Compact, Sizes, read_compact, write_compact
 from scene_experts.export.extras import extra_networks, level_columns
@@ -33,11 +31,12 @@ from scene_experts.run_folder import OpenRun
 from scene_experts.scene.anchors import ATTRIBUTES, AnchorScene
 from scene_experts.scene.experts import MixtureHead
 from scene_experts.scene.explicit import GaussianScene
+from scene_experts.scene.frozen import freeze
 from scene_experts.scene.graph_points import GraphScene
 from scene_experts.scene.select import LevelSelector
 from scene_experts.state import scene_from
 
-COMPACT, PLY = "scene.compact", "scene.ply"
+COMPACT = "scene.compact"
 _LATTICE_TOLERANCE = 1e-3  # voxels
 
 
@@ -53,17 +52,13 @@ def write_layout(run: OpenRun, capture: Capture, out: Path | None = None) -> Pat
 def export_run(run: Path, format: str, out: Path | None = None, step: int | None = None, rasterize: Rasterizer | None = None) -> list[str]:
     """Write the newest checkpoint of a run (or the one at `step`) as "anchors" (the Scaffold-GS layout) or "compact"; says what it wrote.
 
+    Standard files of Gaussians are `bake_run`'s.
     out: folder for anchors, file or folder for compact; inside the run folder by default.
     rasterize: what to draw the held-out views with, to say what a compact file costs in PSNR; None leaves that out.
     """
     opened = run_folder.open_run(run, "cpu", step)
     graph_points.refuse(opened)
     anchors = len(opened.scene.table)
-    if format == "ply":
-        path = out or run / PLY
-        path = path / PLY if path.is_dir() else path
-        explicit.write_file(explicit.scene_of(opened), world_of(opened), path)
-        return [f"wrote {path}", f"{anchors:,} Gaussians, {path.stat().st_size / 1e6:.2f} MB, in the capture's own frame"]
     if format == "anchors":
         out = out or run
         folder = _write_anchors(opened, world_of(opened), out)
@@ -93,19 +88,10 @@ def _cost_line(run: OpenRun, path: Path, rasterize: Rasterizer) -> str:
 
 def psnr_cost(run: OpenRun, capture: Capture, path: Path, rasterize: Rasterizer) -> tuple[float, float]:
     """Mean PSNR (dB, 8-bit pictures) of the held-out views drawn from the run and from its compact file."""
-    if getattr(rasterize, "antialias", run.cfg.antialias) != run.cfg.antialias:
-        rasterize = replace(rasterize, antialias=run.cfg.antialias)  # type: ignore[type-var]
-    scenes = (run.scene, scene_of_compact(run, read_compact(path), capture.world))
-    totals = [0.0, 0.0]
-    with torch.no_grad():
-        for index in capture.test:
-            camera, frame = capture.views[index].camera, capture.frame(index)
-            for i, scene in enumerate(scenes):
-                decoded = scene(camera, run.step, False, rasterize.visible)
-                image = rasterize(decoded.gaussians, camera, torch.tensor(capture.background)).image
-                picture = (image.clamp(0, 1) * 255).round() / 255
-                totals[i] += psnr(picture, frame.rgb.float() / 255, frame.mask)
-    return totals[0] / len(capture.test), totals[1] / len(capture.test)
+    again = scene_of_compact(run, read_compact(path), capture.world)
+    scenes = {"run": (freeze(run.scene, run.step), run.step), "file": (freeze(again, run.step), run.step)}
+    found = scores(scenes, capture, capture.test, as_trained(rasterize, run.cfg.antialias))
+    return found["run"].photographs, found["file"].photographs
 
 
 def scene_of_compact(run: OpenRun, file: Compact, world: World) -> AnchorScene:
@@ -209,6 +195,10 @@ def world_of(run: OpenRun) -> World:
 
 def import_result(source: Path, data: Data, out: Path, iteration: int | None = None) -> Path:
     """Make the run folder `out` of a result folder, compact file (`incoming`) or PLY file of 3DGS, with its layout; returns it."""
+    if graph := graph_points_in.find_folder(source, iteration):
+        capture = graph_points_in.import_folder(graph, data, out)
+        write_layout(run_folder.open_run(out), capture)
+        return out
     file = explicit.find_file(source, iteration)
     capture = import_files(source, data, out, iteration) if file is None else explicit.import_file(file, data, out, iteration)
     write_layout(run_folder.open_run(out), capture)

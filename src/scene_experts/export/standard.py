@@ -10,10 +10,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from scene_experts.errors import InputError, nearest
 from scene_experts.export.comments import note_comments
-from scene_experts.export.ply import read_gaussian_ply, write_gaussian_ply
+from scene_experts.export.compressed_ply import read_compressed_ply, write_compressed_ply
+from scene_experts.export.gltf import read_glb, write_glb
+from scene_experts.export.html_page import MARK, PAGE_NOTES, read_html, write_html
+from scene_experts.export.ply import HEADER_LIMIT, read_gaussian_ply, write_gaussian_ply
+from scene_experts.export.sog import read_sog, write_sog
+from scene_experts.export.splat_file import ROW, read_splat, write_splat
 from scene_experts.export.splats import Splats
+from scene_experts.export.spz import read_spz, write_spz
 
 Note = dict[str, Any]
 
@@ -41,13 +49,22 @@ def read_ply(path: Path) -> Splats:
 
 FORMATS: dict[str, Format] = {
     "ply": Format(".ply", "3DGS's file, exact; every viewer of Gaussians reads it", write_ply, read_ply),
+    "compressed-ply": Format(".compressed.ply", "SuperSplat's PLY, 16 - 61 bytes a Gaussian", write_compressed_ply, read_compressed_ply),
+    "splat": Format(".splat", "32 bytes a Gaussian, no harmonics; the oldest web viewers read it", write_splat, read_splat),
+    "spz": Format(".spz", "Niantic's, small; phones and glTF tools read it", write_spz, read_spz),
+    "sog": Format(".sog", "PlayCanvas's, the smallest", write_sog, read_sog),
+    "glb": Format(".glb", "glTF with KHR_gaussian_splatting, exact", write_glb, read_glb),
+    "html": Format(".html", "a page that shows the scene, opened from disk in any browser", write_html, read_html),
 }
+
+_MARKS: dict[str, tuple[bytes, ...]] = {"spz": (b"\x1f\x8b", b"NGSP"), "sog": (b"PK\x03\x04",), "glb": (b"glTF",)}
 
 
 def write_standard(path: Path, splats: Splats, format: str, note: Note) -> None:
     """Write `splats` to `path` in a format of `FORMATS`, atomically.
 
-    note: how the file was made (plain JSON values), kept where the format has room for it.
+    note: how the file was made (plain JSON values), kept where the format has room for it. What a page shows beside the scene (camera,
+    cameras, background, antialias, title: see `html_page`) is for html alone.
     Raises InputError for an unknown format and for values that are not finite; RunError when the disk is full.
     """
     if format not in FORMATS:
@@ -57,11 +74,12 @@ def write_standard(path: Path, splats: Splats, format: str, note: Note) -> None:
         bad = int((~value.isfinite()).reshape(len(splats), -1).any(1).sum()) if len(splats) else 0
         if bad:
             raise InputError(f"expected finite {name}, found {bad:,} Gaussians with others; make them again")
-    FORMATS[format].write(Path(path), splats, note)
+    kept = note if format == "html" else {name: value for name, value in note.items() if name not in PAGE_NOTES}
+    FORMATS[format].write(Path(path), splats, kept)
 
 
 def read_standard(path: Path) -> Splats:
-    """The Gaussians of a file in any format of `FORMATS`, known by its first bytes.
+    """The Gaussians of a file in any format of `FORMATS`, known by its first bytes; .splat, which has no mark, by its name or size.
 
     Raises InputError: absent, of no format known here, or damaged.
     """
@@ -72,9 +90,34 @@ def read_standard(path: Path) -> Splats:
 
 
 def format_of(path: Path) -> str:
-    """The name in `FORMATS` of a file's format, by its first bytes. Raises InputError for others."""
+    """The name in `FORMATS` of a file's format, by its first bytes. Raises InputError for others.
+
+    A .splat file has no mark: what starts like no other and is so called, or is whole rows of numbers that make sense, is one.
+    """
     with path.open("rb") as stream:
         head = stream.read(4096)
     if head.startswith(b"ply"):
-        return "ply"
+        return "compressed-ply" if b"\nelement chunk " in _ply_header(path) else "ply"
+    for name, marks in _MARKS.items():
+        if head.startswith(marks):
+            return name
+    if MARK in head:
+        return "html"
+    if path.suffix.lower() == ".splat" or _like_splat(head, path.stat().st_size):
+        return "splat"
     raise InputError(f"expected a file of {', '.join(FORMATS)} at {path}, found something else; give another file")
+
+
+def _ply_header(path: Path) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(HEADER_LIMIT).split(b"\nend_header", 1)[0]
+
+
+def _like_splat(head: bytes, size: int) -> bool:
+    """Whether the first rows hold positions and lengths such as a .splat file's."""
+    if size == 0 or size % ROW.itemsize:
+        return False
+    rows = np.frombuffer(head[: len(head) // ROW.itemsize * ROW.itemsize], ROW)
+    lengths = rows["scales"]
+    sane = np.isfinite(rows["means"]) & (np.abs(rows["means"]) < 1e6) & (lengths > 1e-12) & (lengths < 1e6)
+    return bool(sane.all())

@@ -25,6 +25,11 @@ def check(records: Sequence[Record]) -> list[Finding]:
     get: Callable[[str], list[Record]] = lambda name: by.get(name, [])  # noqa: E731
     out = [
         better("MoE-GS has more PSNR than Scaffold-GS", get("moe-gs"), get("scaffold-gs")),
+        better(
+            "with the distance as an input (the text's formula) MoE-GS has more PSNR than Scaffold-GS",
+            get("moe-gs-dist"),
+            get("scaffold-gs"),
+        ),
         size("MoE-GS is at most as large as Scaffold-GS", get("moe-gs"), get("scaffold-gs")),
         better("MoE-GS has more PSNR than 3DGS", get("moe-gs"), get("3dgs")),
         better("MoE-GS has more PSNR than Octree-GS", get("moe-gs"), get("octree-gs")),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,8 @@ from scene_experts.reproduce.statistics import mean
 from scene_experts.reproduce.store import Record
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # told apart by colour-blind readers
+
+ROUTING_NAMES = {"top1": "Top-1", "top2": "Top-2", "dense": "dense"}
 
 
 def canvas(columns: int = 1, width: float = 6.4, height: float = 3.8) -> tuple[Any, Any]:
@@ -46,6 +48,13 @@ def of_recipe(records: Sequence[Record], recipe: str, scene: str | None = None) 
     return [r for r in records if r.recipe == recipe and (scene is None or r.scene == scene)]
 
 
+def shared(records: Sequence[Record], recipes: Iterable[str]) -> list[Record]:
+    """The records of recipes that have any, on the scenes that all of these have: lines over different scenes would compare scenes."""
+    by = {recipe: rows for recipe in recipes if (rows := of_recipe(records, recipe))}
+    scenes = set.intersection(*({r.scene for r in rows} for rows in by.values())) if by else set()
+    return [r for rows in by.values() for r in rows if r.scene in scenes]
+
+
 def relative_psnr(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str], path: Path) -> list[Path]:
     """Figure 1(b): PSNR relative to the first row (3DGS) in percent, scenes in order of Scaffold-GS's anchors."""
     anchors = {s: m.value for s in scenes if (m := mean(of_recipe(records, "scaffold-gs", s), "anchors"))}
@@ -62,7 +71,7 @@ def relative_psnr(experiment: Experiment, records: Sequence[Record], scenes: Seq
     axes[0, 0].axhline(0, color="black", linewidth=0.8)
     axes[0, 0].set_xticks(range(len(shown)), [f"{s}\n{anchors[s] / 1000:.0f}k" for s in shown])
     axes[0, 0].set(ylabel="PSNR relative to 3DGS, %", xlabel="scene, by anchors of Scaffold-GS")
-    axes[0, 0].legend()
+    figure.legend(loc="outside upper center", ncols=len(others))
     return save(figure, path)
 
 
@@ -77,17 +86,18 @@ def shares(experiment: Experiment, records: Sequence[Record], scene: str, path: 
         points = [(c["step"], c["routing"][attribute]) for c in record.curves if attribute in c.get("routing", {})]
         for e in range(len(points[0][1]) if points else 0):
             axis.plot([s for s, _ in points], [100 * v[e] for _, v in points], color=COLOURS[e], label=f"expert {e + 1}")
-        warmup = getattr(record.config.train.scaled().scene, "decoder", None)
-        axis.axvline(getattr(warmup, "warmup", 0), color="grey", linestyle=":", linewidth=1)
+        decoder = getattr(record.config.train.scaled().scene, "decoder", None)
+        axis.axvline(getattr(decoder, "warmup", 0), color="grey", linestyle=":", linewidth=1, label="end of the dense warm-up")
         axis.set(title=f"{name} ({scene})", xlabel="iteration", ylabel=f"share of {attribute} assignments, %", ylim=(0, 100))
-        axis.legend()
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
     return save(figure, path)
 
 
 def cost(experiment: Experiment, records: Sequence[Record], path: Path) -> list[Path]:
     """Figure 6: PSNR against training time; a line per routing, a point per number of experts."""
     figure, axes = canvas()
-    drawn = False
+    drawn, records = False, shared(records, experiment.rows.values())
     for i, routing in enumerate(ROUTINGS):
         points = []
         for num in (2, 3, 4, 5):
@@ -97,21 +107,20 @@ def cost(experiment: Experiment, records: Sequence[Record], path: Path) -> list[
                 points.append((seconds.value / 60, psnr.value, num))
         if points:
             drawn = True
-            axes[0, 0].plot([p[0] for p in points], [p[1] for p in points], "o-", color=COLOURS[i], label=routing)
+            axes[0, 0].plot([p[0] for p in points], [p[1] for p in points], "o-", color=COLOURS[i], label=ROUTING_NAMES[routing])
             for x, y, num in points:
                 axes[0, 0].annotate(str(num), (x, y), textcoords="offset points", xytext=(5, 4), fontsize=8)
-    axes[0, 0].set(xlabel="training, minutes (mean over scenes)", ylabel="PSNR, dB", title="numbers: experts")
-    if not drawn:
-        return []
-    axes[0, 0].legend()
-    return save(figure, path)
+    axes[0, 0].set(xlabel=f"training, minutes (mean over {names(records)})", ylabel="PSNR, dB; numbers: experts")
+    if drawn:
+        figure.legend(loc="outside upper center", ncols=len(ROUTINGS))
+    return save(figure, path) if drawn else discard(figure)
 
 
 def layers(experiment: Experiment, records: Sequence[Record], path: Path) -> list[Path]:
     """Figure 7: scores of Scaffold-GS against the number of linear layers."""
     columns = [("psnr", "PSNR, dB"), ("ssim", "SSIM"), ("lpips_3dgs", "LPIPS")]
     figure, axes = canvas(len(columns), width=4.2)
-    drawn = False
+    drawn, records = False, shared(records, experiment.rows.values())
     for axis, (column, title) in zip(axes[0], columns):
         found = [(int(name.split()[0]), mean(of_recipe(records, recipe), column)) for name, recipe in experiment.rows.items()]
         points = [(n, m) for n, m in found if m is not None]
@@ -120,4 +129,18 @@ def layers(experiment: Experiment, records: Sequence[Record], path: Path) -> lis
             spreads = [m.spread or 0.0 for _, m in points]
             axis.errorbar([n for n, _ in points], [m.value for _, m in points], spreads, fmt="o-", color=COLOURS[0], capsize=3)
         axis.set(xlabel="linear layers", ylabel=title, xticks=[n for n, _ in found])
-    return save(figure, path) if drawn else []
+    figure.suptitle(f"mean over {names(records)}", fontsize="medium")
+    return save(figure, path) if drawn else discard(figure)
+
+
+def names(records: Sequence[Record]) -> str:
+    """The scenes of records, for a label."""
+    return ", ".join(sorted({r.scene for r in records}))
+
+
+def discard(figure: Any) -> list[Path]:
+    """Close a figure on which nothing was drawn."""
+    from matplotlib import pyplot
+
+    pyplot.close(figure)
+    return []

@@ -75,6 +75,11 @@ class Spec:
         return identity(self.scene.name, self.train, self.data)
 
     @property
+    def numbers(self) -> str:
+        """The same hash without the recipe's name: some rows of different experiments are one and the same training."""
+        return identity(self.scene.name, replace(self.train, recipe=""), self.data)
+
+    @property
     def label(self) -> str:
         return f"{self.recipe} on {self.scene.name}, seed {self.seed}"
 
@@ -134,3 +139,11 @@ def specs(experiments: Iterable[Experiment], scenes: Sequence[Scene], seeds: Seq
                 for recipe in experiment.rows.values():
                     wanted[Spec(scene, recipe, seed, scale)] = None
     return list(wanted)
+
+
+def distinct(wanted: Iterable[Spec]) -> list[Spec]:
+    """The first of all runs that have the same numbers, in order."""
+    first: dict[str, Spec] = {}
+    for spec in wanted:
+        first.setdefault(spec.numbers, spec)
+    return list(first.values())

@@ -16,24 +16,28 @@ from scene_experts.render import choose
 from scene_experts.reproduce import claims, figures, store, tables
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN, Scene, Spec
+from scene_experts.reproduce.statistics import SEED_NOISE
 from scene_experts.reproduce.store import Record
 
 
-def write(out: Path, experiments: Sequence[Experiment], scenes: Sequence[Scene], records: Sequence[Record]) -> list[Path]:
-    """Write every experiment's files below `out`; returns them. Records of other scenes are not counted."""
+def write(
+    out: Path, experiments: Sequence[Experiment], scenes: Sequence[Scene], records: Sequence[Record], command: str = ""
+) -> list[Path]:
+    """Write every experiment's files below `out`; returns them. Records of other scenes are not counted. `command` made them."""
     wanted = {scene.name for scene in scenes}
     records = [r for r in records if r.scene in wanted]
     written: list[Path] = []
-    page = ["# Reproduced", ""]
+    page = ["# Reproduced", "", *(["```sh", command, "```", ""] if command else [])]
     for experiment in experiments:
         made = [*write_tables(out, experiment, scenes, records), *write_figures(out, experiment, scenes, records)]
         if experiment.name == "fig5":
             made += sorted(out.glob("fig5_*.png"))
         written += made
-        page += [f"## {experiment.title}", "", ", ".join(f"[{p.name}]({p.name})" for p in made), ""]
+        page += [f"## {experiment.title}", "", ", ".join(f"[{p.name}]({p.name})" for p in made) or "No run is done yet.", ""]
         page += [f"![{p.stem}]({p.name})\n" for p in made if p.suffix == ".png"]
     page += ["## The paper's claims", "", claims.to_markdown(claims.check(records))]
-    page += ["Differences are paired over views and seeds; the interval is a bootstrap over both within these captures.", ""]
+    page += ["Differences are paired over views and seeds; the interval is a bootstrap over both within these captures."]
+    page += [f"With one seed it is at least {SEED_NOISE} dB / sqrt(captures) to each side: what another seed changes.", ""]
     path = out / "README.md"
     write_bytes(path, "\n".join(page).encode())
     return [*written, path]
@@ -84,7 +88,8 @@ def expert_strip(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
     finally:
         capture.images.close()
     path = out / f"fig5_{spec.scene.name}.png"
-    pictures.write(path, pictures.to_8bit(expert_pictures.strip([whole, *each])))
+    captions = [f"all {attribute} experts", *(f"expert {i + 1}" for i in range(len(each)))]
+    pictures.write(path, pictures.row([pictures.to_8bit(p) for p in (whole, *each)], captions))
     return path
 
 

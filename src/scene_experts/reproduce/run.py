@@ -109,8 +109,14 @@ class Runner:
         with log.open("a") as stream:
             stream.write(f"$ scene-experts {' '.join(args)}\n")
             stream.flush()
+            # In a process group of its own: a terminal's Ctrl-C would reach it beside our own signal, and a second signal does not save.
             process = subprocess.Popen(
-                [sys.executable, "-m", "scene_experts", *args], stdout=stream, stderr=subprocess.STDOUT, env=environment, text=True
+                [sys.executable, "-m", "scene_experts", *args],
+                stdout=stream,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                text=True,
+                process_group=0,
             )
             with self._lock:
                 self._running.add(process)

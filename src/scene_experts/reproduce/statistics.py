@@ -12,6 +12,7 @@ import numpy as np
 from scene_experts.reproduce.store import Record
 
 DRAWS = 4000
+SEED_NOISE = 0.3  # dB that another seed may change the difference of two runs on one capture by (docs/results.md: standard deviations)
 Verdict = Literal["confirmed", "contradicted", "undecided"]
 
 
@@ -62,6 +63,7 @@ def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -
     """Differences of a per-view metric between two recipes, on the captures, seeds and views that both have.
 
     The interval is a bootstrap within captures: views and seeds are drawn anew, captures stay, so it speaks of these captures alone.
+    One seed cannot tell what another would change: the interval is then at least SEED_NOISE / sqrt(captures) to each side.
     None where nothing pairs.
     """
     theirs = {(r.scene, r.seed): r for r in b}
@@ -86,5 +88,8 @@ def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -
         v = random.integers(0, grid.shape[1], (DRAWS, grid.shape[1]))
         drawn += grid[s[:, :, None], v[:, None, :]].mean((1, 2)) / len(blocks)
     low, high = np.quantile(drawn, [0.025, 0.975])
+    centre = float(np.mean(centres))
+    least = SEED_NOISE * sum(len(seeds) == 1 for seeds in blocks.values()) ** 0.5 / len(blocks)
+    low, high = min(float(low), centre - least), max(float(high), centre + least)
     views = sum(len(next(iter(seeds.values()))) for seeds in blocks.values())
-    return Difference(float(np.mean(centres)), float(low), float(high), len(blocks), max(map(len, blocks.values())), views)
+    return Difference(centre, low, high, len(blocks), max(map(len, blocks.values())), views)

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +33,14 @@ class Record:
     per_view: dict[str, dict[str, Any]]
     curves: list[dict[str, Any]]  # step, seconds, anchors, active, routing of some iterations
 
-    @property
+    @cached_property
     def key(self) -> str:
         return identity(self.scene, self.config.train, self.config.data)
+
+    @cached_property
+    def numbers(self) -> str:
+        """As `Spec.numbers`."""
+        return identity(self.scene, replace(self.config.train, recipe=""), self.config.data)
 
     @property
     def recipe(self) -> str:
@@ -131,7 +138,13 @@ def digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
-def find(records: list[Record], spec: Spec) -> Record | None:
-    """The record of exactly this run, if it is done."""
-    key = spec.key
-    return next((r for r in records if r.key == key), None)
+def find(records: Sequence[Record], spec: Spec) -> Record | None:
+    """The record of exactly this run if it is done, or of one with the same numbers under another recipe's name."""
+    key, numbers = spec.key, spec.numbers
+    found = next((r for r in records if r.key == key), None) or next((r for r in records if r.numbers == numbers), None)
+    return found and replace(found, config=replace(found.config, train=spec.train))
+
+
+def of_specs(records: Sequence[Record], specs: Sequence[Spec]) -> list[Record]:
+    """The records of these runs, as far as they are done."""
+    return [record for spec in specs if (record := find(records, spec))]

@@ -41,9 +41,11 @@ def by_dataset(experiment: Experiment, records: Sequence[Record], dataset: str, 
     titles = ["", *(COLUMNS[c].title for c in experiment.columns)]
     titles += [f"{COLUMNS[c].title} (paper)" for c in experiment.columns] if theirs else []
     rows, values = [], []
+    every = {r.scene for some in found.values() for r in some}
     for name in experiment.rows:
         means = [mean(found[name], c) for c in experiment.columns]
-        values.append([m.value if m else None for m in means])
+        fair = {r.scene for r in found[name]} == every  # a mean over fewer scenes is no rival
+        values.append([m.value if m and fair else None for m in means])
         cells = [text(m, c) for m, c in zip(means, experiment.columns)]
         if theirs:
             numbers = theirs.get(name)
@@ -102,11 +104,13 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
     sizes = sorted({r.config.data.resolution for r in records})
     seeds = sorted({r.seed for r in records})
     out = [f"{', '.join(f'{n:,}' for n in lengths)} iterations; resolution {', '.join(sizes)}; seeds {', '.join(map(str, seeds))}"]
-    every = {r.scene for r in records}
+    every, none = {r.scene for r in records}, [name for name, rows in found.items() if not rows]
     for name, rows in found.items():
         lacking = sorted(every - {r.scene for r in rows})
-        if lacking:
-            out.append(f"{name}: {'no run' if len(lacking) == len(every) else 'no run on ' + ', '.join(lacking)}")
+        if rows and lacking:
+            out.append(f"{name}: no run on {', '.join(lacking)}")
+    if none:
+        out.append(f"no run: {'; '.join(none)}")
     return tuple(out)
 
 

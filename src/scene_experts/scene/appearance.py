@@ -23,7 +23,8 @@ class Codes(nn.Module):
     """One code per training view, standard normal at the start (Scaffold-GS).
 
     views: the training cameras' ids. rule: the code of any other camera: the mean of all codes, or (what Scaffold-GS does) that of the
-    training view with the test view's number among the test views.
+    training view with the test view's number among the test views. `fitted` holds codes of other cameras, by id, that an evaluation
+    found; they are no part of the scene.
     """
 
     def __init__(self, dim: int, views: Sequence[int], rule: TestRule = "mean") -> None:
@@ -31,9 +32,12 @@ class Codes(nn.Module):
         self.views, self.rule = tuple(views), rule
         self.row = {view: i for i, view in enumerate(self.views)}
         self.table = nn.Parameter(torch.randn(len(self.views), dim))
+        self.fitted: dict[int, Tensor] = {}
 
     def forward(self, camera: Camera) -> Tensor:
         """The code [dim] of a camera."""
+        if camera.id in self.fitted:
+            return self.fitted[camera.id]
         row = self.row.get(camera.id)
         if row is None and self.rule == "index":
             row = (camera.id - sum(view < camera.id for view in self.views)) % len(self.views)  # its number among the other views

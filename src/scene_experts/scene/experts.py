@@ -75,7 +75,11 @@ class Experts:
             return MLP(attribute, inputs, hidden, outputs)
         if self.top_k == 1 and self.router.renormalise and attribute == self.attributes[0]:
             log.warning("with top_k 1 and renormalised weights the picture does not train the routers; only L_load does")
-        return MixtureHead(self, attribute, inputs, hidden, outputs, feature)
+        return self.head()(self, attribute, inputs, hidden, outputs, feature)
+
+    def head(self) -> type[MixtureHead]:
+        """What decodes an attribute that has experts; variants of the routing give their own."""
+        return MixtureHead
 
 
 def top_k(logits: Tensor, k: int) -> Tensor:
@@ -133,9 +137,13 @@ class MixtureHead(nn.Module):
         k = self.k(step)
         if k is None:
             return Routing(gates, None), gates
-        chosen = top_k(logits, k)
+        chosen = self.choose(logits, k)
         picked = logits.gather(1, chosen).softmax(dim=1) if self.config.router.renormalise else gates.gather(1, chosen)  # eq. 5
         return Routing(gates, chosen), picked
+
+    def choose(self, logits: Tensor, k: int) -> Tensor:
+        """Indices [A, k] of the experts that decode each anchor, from logits [A, E]."""
+        return top_k(logits, k)
 
     def routing(self, feature: Tensor, step: int, position: Tensor | None = None) -> Routing:
         return self.route(feature, step, position)[0]

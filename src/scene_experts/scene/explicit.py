@@ -100,8 +100,9 @@ class GaussianScene(nn.Module):
         return FILE_VALUES + 3 * (self.config.sh_degree + 1) ** 2
 
     def degree(self, step: int) -> int:
-        """The degree of the harmonics in use at `step`."""
-        return min(self.config.sh_degree, step // self.config.sh_ramp)
+        """The degree of the harmonics in use at `step`: all of them at 0, where a training has none yet and a file that does not say
+        how long it was trained has what it has."""
+        return min(self.config.sh_degree, step // self.config.sh_ramp) if step else self.config.sh_degree
 
     def forward(self, camera: Camera, step: int, training: bool, cull: Cull) -> Decoded:
         """The Gaussians that may touch the picture of `camera`; `cull` is the rasteriser's visibility test.

@@ -37,6 +37,8 @@ class SplitClone:
     """Share of the scene's extent beyond which Gaussians are removed, after the first reset."""
     reset: Every = Every(0, 15_000, 3000)
     """When opacities are pressed down to `reset_opacity`."""
+    reset_least: int = 1000
+    """Resets are at least so many iterations apart, however short the training: it takes them hundreds to come back."""
     reset_opacity: float = 0.01
     reset_at_start: bool = False
     """Reset at `adjust.start` too, as 3DGS does for captures on white."""
@@ -45,13 +47,15 @@ class SplitClone:
     enabled: bool = True
 
     def scaled(self, factor: float) -> SplitClone:
-        """The same in a training `factor` times as long: windows and the interval of resets scale; the rest stays."""
-        reset = replace(self.reset.scaled(factor), interval=max(1, round(self.reset.interval * factor)))
+        """The same in a training `factor` times as long: windows and, down to `reset_least`, the interval of resets scale."""
+        least = min(self.reset_least, self.reset.interval)
+        reset = replace(self.reset.scaled(factor), interval=max(1, least, round(self.reset.interval * factor)))
         return replace(self, adjust=self.adjust.scaled(factor), reset=reset)
 
     def check(self) -> None:
         """Raises InputError for numbers that no training can have."""
         intervals = [("--growth.adjust.interval", self.adjust.interval, 1), ("--growth.reset.interval", self.reset.interval, 1)]
+        intervals += [("--growth.reset-least", self.reset_least, 1)]
         expect_at_least([*intervals, ("--growth.max-anchors", self.max_anchors, 0)])
         if not 0 < self.reset_opacity < 1:
             raise InputError(f"expected --growth.reset-opacity between 0 and 1, found {self.reset_opacity}; correct it")

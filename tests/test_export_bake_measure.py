@@ -1,0 +1,37 @@
+"""What a file costs: the same pictures score the same, others what they are."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from scene_experts.data.capture import load
+from scene_experts.evaluate.metrics import psnr
+from scene_experts.export.bake import explicit
+from scene_experts.export.bake_measure import as_trained, picture, scores
+from scene_experts.recipes import RECIPES
+from scene_experts.render import choose
+from synthetic import make_capture
+
+
+def test_scores_are_means_over_views_of_8_bit_pictures(tmp_path):
+    capture = load(make_capture(tmp_path, views=9, size=(48, 32), points=200).folder)
+    scene = RECIPES["3dgs"][1].scene.start(capture.points, capture.extent)
+    columns = {name: value.detach() for name, value in scene.table.params.items()}
+    darker = explicit(columns | {"sh_dc": columns["sh_dc"] - 0.3}, capture.extent)
+    draw, said = choose("auto", "cpu"), []
+    found = scores({"a": (scene, 0), "b": (darker, 3)}, capture, capture.test, draw, lambda *what: said.append(what))
+    assert found["a"].first == 100 and found["b"].first < 60 and said[-1] == ("measuring", 2, 2)
+    by_hand = []
+    for index in capture.test:
+        with torch.no_grad():
+            image = picture(darker, 3, capture.views[index].camera, torch.tensor(capture.background), draw)
+        assert torch.equal((image * 255).round() / 255, image)
+        by_hand.append(psnr(image, capture.frame(index).rgb.float() / 255))
+    assert found["b"].photographs == pytest.approx(sum(by_hand) / len(by_hand), abs=1e-6)
+    capture.images.close()
+
+
+def test_the_rasteriser_is_the_runs():
+    draw = choose("auto", "cpu")
+    assert as_trained(draw, False) is draw and as_trained(draw, True) == replace(draw, antialias=True)  # type: ignore[type-var]

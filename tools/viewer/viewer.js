@@ -1,0 +1,188 @@
+// The page of `export --format html`: one scene, drawn by Spark (https://sparkjs.dev) on three.js, from data inside the page alone.
+// Poses are those of the capture: position and camera-to-world rotation (rows of 3x3; x right, y down, z forward).
+// The scene is drawn in SPZ's frame (x right, y up, z back), half a turn about x from the capture's.
+import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import { Color, Matrix4, PerspectiveCamera, Scene, SRGBColorSpace, Vector3, WebGLRenderer } from "three";
+import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+
+const FLIP = [1, -1, -1];
+const settings = JSON.parse(document.getElementById("settings").textContent);
+const QUIET = 400; // milliseconds of drawing after the last news
+const UNIT = 10 / settings.distance; // the renderer sorts anew when the camera moves by 0.001: scenes are drawn in lengths that suit it
+const note = document.getElementById("note");
+const say = (text) => { note.textContent = text; note.hidden = !text; };
+
+function bytesOf(id) {
+  const text = document.getElementById(id).textContent;
+  return Uint8Array.fromBase64 ? Uint8Array.fromBase64(text) : Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+}
+
+const rotationMatrix = (r) => new Matrix4().set(
+  r[0][0], -r[0][1], -r[0][2], 0, -r[1][0], r[1][1], r[1][2], 0, -r[2][0], r[2][1], r[2][2], 0, 0, 0, 0, 1);
+
+class Page {
+  constructor() {
+    this.renderer = new WebGLRenderer({ antialias: false, powerPreference: "high-performance" });
+    document.body.prepend(this.renderer.domElement);
+    this.scene = new Scene();
+    this.scene.background = new Color().setRGB(...settings.background, SRGBColorSpace);
+    this.camera = new PerspectiveCamera(settings.fov, 1, settings.near * UNIT, settings.far * UNIT);
+    this.camera.up.set(...settings.up.map((v, i) => v * FLIP[i]));
+    // as our rasteriser draws: by depth, to 1/255, 0.3 pixels of blur, and wide Gaussians whose centres lie far outside too
+    this.spark = new SparkRenderer({
+      renderer: this.renderer, sortRadial: false, enableLod: false, maxStdDev: 3.33, minAlpha: 1 / 255, maxPixelRadius: 2048, clipXY: 4,
+      preBlurAmount: settings.antialias ? 0 : 0.3, blurAmount: settings.antialias ? 0.3 : 0, onDirty: () => this.wake(),
+    });
+    this.scene.add(this.spark);
+    this.keys = new Set();
+    this.news = this.last = performance.now();
+    this.held = true; // an exact pose, until somebody takes the camera
+    this.frames = 0;
+    this.listen();
+    this.resize();
+    this.setPose(settings.pose);
+    this.readHash();
+  }
+
+  listen() {
+    const canvas = this.renderer.domElement;
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.enableDamping = true;
+    this.controls.zoomToCursor = true;
+    this.controls.addEventListener("start", () => { this.held = false; this.wake(); });
+    this.controls.addEventListener("change", () => this.wake());
+    canvas.addEventListener("wheel", () => { this.held = false; this.wake(); }, { passive: true });
+    addEventListener("resize", () => this.resize());
+    addEventListener("hashchange", () => this.readHash());
+    addEventListener("keydown", (event) => this.press(event));
+    addEventListener("keyup", (event) => this.keys.delete(event.code));
+    addEventListener("blur", () => this.keys.clear());
+    const buttons = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: () => this.whole() };
+    for (const [name, act] of Object.entries(buttons)) document.getElementById(name).addEventListener("click", act);
+    if (settings.poses.length < 2) document.getElementById("previous").hidden = document.getElementById("next").hidden = true;
+  }
+
+  press(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const act = { KeyR: () => this.home(), KeyF: () => this.whole(), BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
+      KeyL: () => this.writeHash() }[event.code];
+    if (act) act();
+    else if (/^(Key[WASDQE]|Arrow)/.test(event.code)) this.keys.add(event.code);
+    this.wake();
+  }
+
+  home() { this.index = 0; this.setPose(settings.pose); }
+
+  step(by) {
+    const n = settings.poses.length;
+    this.index = ((this.index ?? 0) + by + n) % n;
+    this.setPose(settings.poses[this.index]);
+  }
+
+  whole() { document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.(); }
+
+  // A pose of the capture: {position, rotation, fov}; fov is the vertical field of view in degrees and may be left out.
+  setPose(pose) {
+    this.camera.position.set(...pose.position.map((v, i) => v * FLIP[i] * UNIT));
+    this.camera.quaternion.setFromRotationMatrix(rotationMatrix(pose.rotation));
+    this.camera.fov = pose.fov ?? settings.fov;
+    this.camera.updateProjectionMatrix();
+    const ahead = new Vector3(0, 0, -1).applyQuaternion(this.camera.quaternion);
+    this.controls.target.copy(this.camera.position).addScaledVector(ahead, settings.distance * UNIT);
+    this.held = true;
+    this.wake();
+  }
+
+  pose() {
+    const e = new Matrix4().makeRotationFromQuaternion(this.camera.quaternion).elements;
+    const rotation = [0, 1, 2].map((i) => [0, 1, 2].map((j) => e[4 * j + i] * FLIP[i] * FLIP[j]));
+    return { position: this.camera.position.toArray().map((v, i) => (v * FLIP[i]) / UNIT), rotation, fov: this.camera.fov };
+  }
+
+  readHash() {
+    const parts = new URLSearchParams(location.hash.slice(1));
+    const numbers = (name, count) => {
+      const found = (parts.get(name) ?? "").split(",").map(Number);
+      return found.length === count && found.every(Number.isFinite) ? found : null;
+    };
+    const [position, r, fov] = [numbers("position", 3), numbers("rotation", 9), numbers("fov", 1)];
+    if (position && r) this.setPose({ position, rotation: [r.slice(0, 3), r.slice(3, 6), r.slice(6)], fov: fov?.[0] });
+  }
+
+  writeHash() {
+    const { position, rotation, fov } = this.pose();
+    const text = (list) => list.map((v) => +v.toPrecision(7)).join(",");
+    history.replaceState(null, "", `#position=${text(position)}&rotation=${text(rotation.flat())}&fov=${+fov.toFixed(3)}`);
+  }
+
+  resize() {
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.renderer.setSize(innerWidth, innerHeight);
+    this.camera.aspect = innerWidth / innerHeight;
+    this.camera.updateProjectionMatrix();
+    this.wake();
+  }
+
+  fly(seconds) {
+    const on = (...names) => (names.some((name) => this.keys.has(name)) ? 1 : 0);
+    const move = new Vector3(on("KeyD", "ArrowRight") - on("KeyA", "ArrowLeft"), on("KeyE") - on("KeyQ"),
+      on("KeyS", "ArrowDown") - on("KeyW", "ArrowUp"));
+    if (!move.lengthSq()) return false;
+    this.held = false;
+    move.applyQuaternion(this.camera.quaternion).multiplyScalar(settings.speed * UNIT * seconds);
+    this.camera.position.add(move);
+    this.controls.target.add(move);
+    return true;
+  }
+
+  wake() {
+    this.news = performance.now();
+    if (this.running) return;
+    this.running = true;
+    this.last = this.news;
+    requestAnimationFrame(() => this.frame());
+  }
+
+  frame() {
+    const now = performance.now();
+    const seconds = (now - this.last) / 1000;
+    const flying = this.fly(Math.min(seconds, 0.1));
+    this.controls.dampingFactor = 1 - Math.exp(-8 * seconds); // by time, so that slow machines come to rest as soon
+    this.last = now;
+    if (!this.held) this.controls.update();
+    this.renderer.render(this.scene, this.camera);
+    this.frames += 1;
+    this.running = flying || now - this.news < QUIET || this.spark.sorting || this.spark.sortDirty;
+    if (this.running) requestAnimationFrame(() => this.frame());
+  }
+
+  // Resolves once the picture of the present pose is final.
+  async settled() {
+    await this.loaded;
+    do await new Promise((done) => setTimeout(done, 50)); while (this.running);
+    return true;
+  }
+
+  async load() {
+    const fileBytes = bytesOf("scene");
+    const mesh = new SplatMesh({ fileBytes, fileName: "scene.spz", extSplats: true });
+    mesh.scale.setScalar(UNIT);
+    this.scene.add(mesh);
+    await mesh.initialized;
+    this.mesh = mesh;
+    say("");
+    this.wake();
+  }
+}
+
+try {
+  const page = new Page();
+  page.loaded = page.load().catch((error) => { say(`The scene could not be shown: ${error.message}`); throw error; });
+  window.sceneExperts = {
+    setPose: (pose) => page.setPose(pose), pose: () => page.pose(), settled: () => page.settled(), count: settings.count,
+    frames: () => page.frames, page,
+  };
+} catch (error) {
+  say(`This page needs WebGL 2: ${error.message}`);
+  throw error;
+}
