@@ -1,6 +1,6 @@
 """A whole training step (target, decode, raster, loss, backward, density statistics, Adam) beside the scalar peer's forward + backward.
 
-Usage: python benchmarks/step.py [--recipes moe-gs scaffold-gs] [--anchors 40000] [--size 800 544] [--threads 2] [--rounds 15]
+Usage: python benchmarks/step.py [--recipes moe-gs scaffold-gs] [--anchors 40000] [--size 800 544] [--threads 2] [--rounds 15] [--same]
 Random anchors, half of them in front of one camera. Wall time, minima over interleaved rounds: the time of each part, and the ratios that
 docs/performance.md quotes. The peer is one thread of plain C++ on the same Gaussians (bench/peer.py).
 """
@@ -14,7 +14,7 @@ import torch
 
 from scene_experts import native
 from scene_experts.bench import peer, raster
-from scene_experts.bench.step import PARTS, Work, work
+from scene_experts.bench.step import BASELINE, MIXTURE, PARTS, Work, alike, work
 from scene_experts.types import Gaussians
 
 
@@ -38,12 +38,16 @@ def main() -> None:
     parser.add_argument("--anchors", type=int, default=40_000)
     parser.add_argument("--size", type=int, nargs=2, default=[800, 544])
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--same", action="store_true", help="moe-gs draws what scaffold-gs draws: its network as every expert")
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--peer", type=int, default=2, help="rounds in which the peer runs too (seconds each)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     width, height = args.size
     made = {name: work(name, args.anchors, width, height) for name in args.recipes}
+    both = {MIXTURE, BASELINE} <= set(made)
+    if args.same and both:
+        alike(made[MIXTURE], made[BASELINE])
     pixels = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8)
     upstream, slow = torch.rand(height, width, 3), peer.load(getattr(native.load(), "level", None))
     parts = ("target", *PARTS)
@@ -66,10 +70,8 @@ def main() -> None:
         against = f"{whole[name] / alone[name]:.2f} x raster alone ({1e3 * alone[name]:.1f} ms)"
         print(f"  {'whole step':<14} {1e3 * whole[name]:7.2f} ms = {against}, {whole[name] / scalar[name]:.4f} x {peer.NAME}", end="")
         print(f" ({1e3 * scalar[name]:.0f} ms)")
-    if {"moe-gs", "scaffold-gs"} <= set(made):
-        same = whole["moe-gs"] - alone["moe-gs"] + alone["scaffold-gs"]
-        print(f"moe-gs step / scaffold-gs step: {whole['moe-gs'] / whole['scaffold-gs']:.2f}", end="")
-        print(f"; with scaffold-gs's Gaussians in the rasteriser: {same / whole['scaffold-gs']:.2f}")
+    if both:
+        print(f"{MIXTURE} step / {BASELINE} step{', same Gaussians' * args.same}: {whole[MIXTURE] / whole[BASELINE]:.2f}")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,17 @@ def test_half_of_the_anchors_are_seen_and_a_step_leaves_the_networks_as_they_wer
     assert work.drawn() > 100
 
 
+def test_a_mixture_alike_draws_the_same_gaussians():
+    mixture, base = (step.work(recipe, 300, 64, 48) for recipe in (step.MIXTURE, step.BASELINE))
+    step.alike(mixture, base)
+    for made in (mixture, base):
+        made(clock_for(2))  # and a step changes nothing of it
+    a, b = (w.training.scene(w.camera, step.AT, False, w.rasterize.visible) for w in (mixture, base))
+    assert torch.allclose(a.raw_opacity, b.raw_opacity, atol=1e-5) and abs(mixture.drawn() - base.drawn()) <= 2
+    sure = (b.raw_opacity.abs() > 1e-4).all() and len(a.gaussians) == len(b.gaussians)
+    assert not sure or torch.allclose(a.gaussians.colors, b.gaussians.colors, atol=1e-4)
+
+
 def test_figures_of_a_step():
     here = replace(machine.describe(1), copied=1e9)
     found = {f.name: f for f in step.figures(100, 48, 32, here, 0.0)}

@@ -40,7 +40,7 @@ class Work:
     def __call__(self, clock: Clock) -> tuple[float, ...]:
         """One step; returns the seconds of PARTS. The scene is put back, so every step is the same."""
         training, scene = self.training, self.training.scene
-        before = {k: v.detach().clone() for k, v in scene.network_tensors().items()}
+        before = {k: v.detach().clone() for k, v in self._values().items()}
         times = [clock()]
         training.step = AT
         training.set_rates()
@@ -60,11 +60,15 @@ class Work:
         self._put_back(before)
         return tuple(b - a for a, b in pairwise(times))
 
+    def _values(self) -> dict[str, Tensor]:
+        """What an optimiser moves: columns of the anchors and networks."""
+        scene = self.training.scene
+        return {f"column {k}": v for k, v in scene.table.params.items()} | scene.network_tensors()
+
     @torch.no_grad()
-    def _put_back(self, networks: dict[str, Tensor]) -> None:
-        """The columns move by a learning rate a step, which changes nothing measured; the networks decide how much is drawn."""
-        for name, value in self.training.scene.network_tensors().items():
-            value.copy_(networks[name])
+    def _put_back(self, before: dict[str, Tensor]) -> None:
+        for name, value in self._values().items():
+            value.copy_(before[name])
 
     @torch.no_grad()
     def drawn(self) -> int:
@@ -93,17 +97,29 @@ def work(recipe: str, anchors: int, width: int, height: int, rasterize: Rasteriz
     return Work(Training(replace(cfg, scene=config), scene), camera, rasterize or choose("auto", "cpu"), torch.rand(height, width, 3))
 
 
+@torch.no_grad()
+def alike(mixture: Work, base: Work) -> None:
+    """Give a mixture the anchors of a baseline and its networks as every expert: both then draw the same Gaussians, but for rounding."""
+    for name, value in mixture.training.scene.table.params.items():
+        value.copy_(base.training.scene.table.params[name])
+    networks = base.training.scene.network_tensors()
+    for name, value in mixture.training.scene.network_tensors().items():
+        if name in networks:  # [E, ...] from [1, ...]; routers are the mixture's own
+            value.copy_(networks[name].expand_as(value))
+
+
 def figures(anchors: int, width: int, height: int, machine: Machine, seconds: float) -> list[Result]:
     """The parts of a step of the mixture, the whole of it beside one of the baseline, and Adam beside the memory it must move."""
-    subjects: dict[str, Subject] = {recipe: work(recipe, anchors, width, height) for recipe in (MIXTURE, BASELINE)}
+    mixture, base = (work(recipe, anchors, width, height) for recipe in (MIXTURE, BASELINE))
+    alike(mixture, base)
+    subjects: dict[str, Subject] = {MIXTURE: mixture, BASELINE: base}
     with torch_threads(1):
         best = least(subjects, seconds, clock_for(1))
-    mixture: Work = subjects[MIXTURE]  # type: ignore[assignment]
     group = f"{GROUP} of {MIXTURE}, one thread"
     note = f"{round(anchors / 2):,} visible of {anchors:,} anchors, {mixture.drawn():,} Gaussians, {width}x{height}"
     out: list[Result] = [Figure(group, part, 1e3 * s, "ms") for part, s in zip(PARTS, best[MIXTURE], strict=True)]
-    total, base = sum(best[MIXTURE]), sum(best[BASELINE])
-    out.append(Figure(group, "whole step", 1e3 * total, "ms", f"one of {BASELINE}, same anchors", base / total, note))
+    total, plain = sum(best[MIXTURE]), sum(best[BASELINE])
+    out.append(Figure(group, "whole step", 1e3 * total, "ms", f"one of {BASELINE}, same anchors and Gaussians", plain / total, note))
     if machine.copied:
         moved = 28 * sum(p.numel() for g in mixture.training.optimizer.param_groups for p in g["params"])
         share = 100 * moved / machine.copied / best[MIXTURE][PARTS.index("adam")]
