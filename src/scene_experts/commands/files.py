@@ -42,7 +42,7 @@ class ExportCommand:
     """Standard files: keep so many that contribute most; 0 keeps all."""
     prune: float = 0.0
     """Standard files: leave out those that contribute least, up to this share of everything that all contribute (0.02: small loss)."""
-    refine: int = 500
+    refine: int = 1000
     """Standard files: iterations that move all parameters towards the run's pictures; 0 takes means over the views as they are."""
     frame: Literal["capture", "trained"] = "capture"
     """Standard files: the capture's own frame, or the one that it was trained in."""

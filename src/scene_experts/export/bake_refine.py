@@ -23,7 +23,7 @@ DRAWN_AT = 3  # the step at which baked scenes are drawn: all degrees are in use
 class Refine:
     """How baked Gaussians are refined. Learning rates run log-linearly from first to last; that of means is multiplied by the extent."""
 
-    iterations: int = 500
+    iterations: int = 1000
     free: float = 0.6  # share of iterations that look from free views
     dssim: float = 0.2  # weight of 1 - SSIM in the loss, L1 has the rest
     means: Rate = Rate(0.00012, 0.000005)
