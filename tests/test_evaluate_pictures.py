@@ -73,3 +73,9 @@ def test_clear_leaves_other_files(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("keep")
     pictures.clear(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_strip_has_a_white_gap():
+    left, right = torch.zeros(5, 7, 3), torch.full((5, 6, 3), 0.5)
+    made = pictures.strip([left, right], gap=2)
+    assert made.shape == (5, 15, 3) and (made[:, 7:9] == 1).all() and (made[:, 9:] == 0.5).all()

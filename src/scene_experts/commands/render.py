@@ -18,8 +18,7 @@ from scene_experts.cli import PROG
 from scene_experts.commands.shared import Device, Raster, backend
 from scene_experts.data.capture import Capture
 from scene_experts.errors import InputError, expect_at_least
-from scene_experts.evaluate.expert_pictures import strip
-from scene_experts.evaluate.pictures import to_8bit
+from scene_experts.evaluate.pictures import strip, to_8bit
 from scene_experts.progress import Bar
 from scene_experts.scene.frozen import freeze
 from scene_experts.types import Camera

@@ -120,3 +120,10 @@ def _scale(draw: ImageDraw.ImageDraw, right: int, width: int) -> None:
     for x, colour in enumerate(colours):
         draw.line([(right - length + x, 5), (right - length + x, BAR - 6)], fill=tuple(int(c) for c in colour))
     draw.rectangle([right - length - 1, 4, right - 1, BAR - 5], outline=INK)
+
+
+def strip(pictures: Sequence[Tensor], gap: int = 4) -> Tensor:
+    """Pictures [H, W, 3] of one height beside each other, [H, W', 3], a white gap between them."""
+    white = torch.ones(pictures[0].shape[0], gap, 3)
+    parts = [part for picture in pictures for part in (white, picture.cpu())]
+    return torch.cat(parts[1:], dim=1)
