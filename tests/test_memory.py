@@ -1,7 +1,12 @@
 """The memory cap on growth, and the estimate of a frame's buffers."""
 
+import os
+import platform
+import subprocess
+import sys
 from types import SimpleNamespace
 
+import pytest
 import torch
 
 from scene_experts import memory
@@ -48,3 +53,20 @@ def test_memory_is_counted_where_the_scene_is(monkeypatch):
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 12345)
     assert used_bytes(torch.device("cuda")) == 12345
     assert used_bytes(torch.device("cpu")) > 1 << 20
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's own setting")
+def test_freed_arrays_are_used_again():
+    script = (
+        "import resource, torch; from scene_experts.memory import reuse_freed; took = reuse_freed()\n"
+        "count = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "for _ in range(4): torch.ones(10_000_000)\n"
+        "before = count()\n"
+        "for _ in range(20): torch.ones(10_000_000)\n"
+        "print(took, count() - before)"
+    )
+    plain = {k: v for k, v in os.environ.items() if not k.startswith("MALLOC_") and k != "GLIBC_TUNABLES"}
+    for extra, expected in (({}, "True"), ({"MALLOC_ARENA_MAX": "2"}, "False")):
+        found = subprocess.run([sys.executable, "-c", script], env=plain | extra, capture_output=True, text=True, check=True).stdout.split()
+        assert found[0] == expected
+        assert (int(found[1]) < 9000) == (expected == "True")  # an array is 9,766 pages

@@ -13,6 +13,7 @@ from rich.console import Console
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import backend
 from scene_experts.config import Data
+from scene_experts.memory import reuse_freed
 from scene_experts.progress import Bar
 from scene_experts.render import Rasterizer
 from scene_experts.run_folder import named
@@ -55,6 +56,7 @@ def export(args: list[str]) -> int:
 
     command = tyro.cli(ExportCommand, prog=f"{PROG} export", args=args)
     rasterize = backend("cpu", "auto", False, False)[1]
+    reuse_freed()
     if command.format in ("anchors", "compact"):
         lines = export_run(command.run, command.format, command.out, command.step, rasterize if command.measure else None)
     else:

@@ -20,6 +20,7 @@ from scene_experts.config import Data, RunConfig, Train, check
 from scene_experts.data.capture import Capture
 from scene_experts.errors import InputError, expect_at_least, nearest
 from scene_experts.events import Started
+from scene_experts.memory import reuse_freed
 from scene_experts.progress import Progress
 from scene_experts.recipes import RECIPES
 from scene_experts.record import Recorder
@@ -68,6 +69,7 @@ def train(args: list[str]) -> int:
         viser()  # says what is missing before anything is read
     command = replace(command, data=run_folder.named(command.data))
     check_settings(command)
+    reuse_freed()
     console = Console(highlight=False)
     device, rasterize = backend(command.device, command.rasterizer, command.cfg.antialias, command.deterministic)
     line = shlex.join([PROG, "train", *args])
