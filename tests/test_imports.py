@@ -7,7 +7,7 @@ import pytest
 
 import scene_experts
 
-SOURCE = Path(scene_experts.__path__[0])
+SOURCE = Path(scene_experts.__file__).parent
 LAYERS = [
     {"errors", "io", "native", "transfer", "types", "__init__"},
     {"geometry", "native_terms"},

@@ -8,7 +8,7 @@ import scene_experts
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.experts import Experts
 
-SOURCE = Path(scene_experts.__path__[0])
+SOURCE = Path(scene_experts.__file__).parent
 
 
 def test_moe_gs_is_scaffold_gs_with_experts_and_their_losses():

@@ -16,7 +16,7 @@ from scene_experts.scene.balance import BalancedExperts, BalancedHead
 from scene_experts.scene.experts import Experts, MixtureHead
 from test_scene import started
 
-SOURCE = Path(scene_experts.__path__[0])
+SOURCE = Path(scene_experts.__file__).parent
 STEP = 2000  # after the dense warm-up
 
 
