@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sys
@@ -25,7 +26,7 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
         os.close(handle)
     except OSError as error:
-        raise RunError(f"cannot write {path}: {error.strerror or error}; free some space or choose another folder with --out") from error
+        raise _unwritable(path, error) from error
     temporary = Path(name)
     try:
         write(temporary)
@@ -34,9 +35,24 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
         temporary.chmod(new_file_mode(0o666))
         os.replace(temporary, path)
     except OSError as error:
-        raise RunError(f"cannot write {path}: {error.strerror or error}; free some space or choose another folder with --out") from error
+        raise _unwritable(path, error) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _unwritable(path: Path, error: OSError) -> RunError:
+    full = error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
+    return RunError(f"cannot write {path}: {error.strerror or error}; {'free some space or ' * full}choose another folder with --out")
+
+
+def check_writable(path: Path) -> None:
+    """Make the folder of `path` and see that a file can be made there, before long work is done for it. Raises RunError where it cannot."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise _unwritable(path, error) from error
 
 
 def new_file_mode(most: int) -> int:

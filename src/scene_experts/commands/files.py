@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,6 +13,7 @@ from rich.console import Console
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import backend
 from scene_experts.config import Data
+from scene_experts.errors import InputError
 from scene_experts.memory import reuse_freed
 from scene_experts.progress import Bar
 from scene_experts.render import Rasterizer
@@ -36,7 +37,7 @@ class ExportCommand:
     measure: bool = True
     """Render the held-out views before and after, and say what the file costs in PSNR."""
     data: Annotated[Path | None, tyro.conf.arg(aliases=["-s"])] = None
-    """Where the capture is now, if it moved. Standard files need it."""
+    """Where the capture is now, if it moved. Standard files need it; for a compact file, what it costs in PSNR does."""
     sh_degree: int = 3
     """Standard files: degree of the harmonics, 0 (smallest) to 3 (best)."""
     max_gaussians: int = 0
@@ -58,12 +59,22 @@ def export(args: list[str]) -> int:
     rasterize = backend("cpu", "auto", False, False)[1]
     reuse_freed()
     if command.format in ("anchors", "compact"):
-        lines = export_run(command.run, command.format, command.out, command.step, rasterize if command.measure else None)
+        check_unused(command)
+        lines = export_run(command.run, command.format, command.out, command.step, rasterize if command.measure else None, command.data)
     else:
         lines = _standard(command, args, rasterize)
     for line in lines:
         print(line)
     return 0
+
+
+def check_unused(command: ExportCommand) -> None:
+    """Raises InputError for settings of standard files where none is written."""
+    standard = ("sh_degree", "max_gaussians", "prune", "refine", "frame", "levels")
+    given = [f.name for f in fields(command) if f.name in standard and getattr(command, f.name) != f.default]
+    if given:
+        flag = "--" + given[0].replace("_", "-")
+        raise InputError(f"expected {flag} with a standard file (ply, spz, html ...), found --format {command.format}; leave it out")
 
 
 def _standard(command: ExportCommand, args: list[str], rasterize: Rasterizer) -> list[str]:
@@ -79,10 +90,10 @@ def _standard(command: ExportCommand, args: list[str], rasterize: Rasterizer) ->
 
 @dataclass(frozen=True)
 class ImportCommand:
-    """Make a run folder of a published Scaffold-GS or 3DGS result or of one of our compact files, to evaluate and convert it."""
+    """Make a run folder of a published Scaffold-GS, Octree-GS or 3DGS result or of a file that `export` writes, to evaluate and convert it."""
 
     source: Annotated[Path, tyro.conf.Positional]
-    """Result folder (with point_cloud/iteration_N), PLY file of 3DGS, or compact file."""
+    """Result folder (with point_cloud/iteration_N), compact file, or standard Gaussians: ply, compressed-ply, splat, spz, sog, glb, html."""
     data: Annotated[Data, tyro.conf.arg(name="")]
     out: Annotated[Path, tyro.conf.arg(aliases=["-m"])]
     """Run folder to write."""

@@ -169,10 +169,12 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
     if finished and (command.out / f"point_cloud/iteration_{finished}/point_cloud.ply").is_file():
         console.print("nothing was left to train: the run's files stay as they are", soft_wrap=True)
     elif not run.stop:
-        from scene_experts.export.run import write_layout
+        from scene_experts.export.run import warnings_of_layout, write_layout
         from scene_experts.run_folder import open_run
 
-        folder = write_layout(open_run(command.out), capture)
-        console.print(f"wrote {folder}", soft_wrap=True)
+        done = open_run(command.out)
+        console.print(f"wrote {write_layout(done, capture)}", soft_wrap=True)
+        for warning in warnings_of_layout(done):
+            print(warning, file=sys.stderr)
         console.print(f"next: {PROG} eval {command.out}", soft_wrap=True)
     return 128 + signal.Signals[run.stop[0]] if run.stop else 0  # saved, but not whole: `train && eval` must not go on

@@ -19,10 +19,10 @@ from scene_experts.export.bake_measure import as_trained, scores
 from scene_experts.export.bake_refine import DRAWN_AT
 from scene_experts.export.bake_sums import Tell
 from scene_experts.export.html_page import capture_notes
-from scene_experts.export.run import world_of
+from scene_experts.export.run import moved, world_of
 from scene_experts.export.splats import Splats, from_scene, to_columns
 from scene_experts.export.standard import FORMATS, read_standard, write_standard
-from scene_experts.io import write_json
+from scene_experts.io import check_writable, write_json
 from scene_experts.progress import clock
 from scene_experts.render import Rasterizer
 from scene_experts.run_folder import OpenRun
@@ -88,6 +88,8 @@ def export_standard(
         options = replace(options, bake=replace(options.bake, sh_degree=0))
     name = "scene" + FORMATS[format].suffix
     path = run / name if out is None else out / name if out.is_dir() else out
+    check_suffix(path, format)
+    check_writable(path)
     rasterize = as_trained(rasterize, opened.cfg.antialias)
     lines: list[str] = []
     with opened_capture(opened, needed=not is_direct(opened, options.bake)) as capture:
@@ -95,6 +97,15 @@ def export_standard(
             with capped(opened, level):
                 lines += one_file(opened, format, file, capture, rasterize, options, level, tell)
     return lines
+
+
+def check_suffix(path: Path, format: str) -> None:
+    """Raises InputError for a name that says another format: programs go by it."""
+    named = max((f for f in FORMATS if path.name.lower().endswith(FORMATS[f].suffix)), key=lambda f: len(FORMATS[f].suffix), default=format)
+    if named != format and (named, format) != ("ply", "compressed-ply"):
+        raise InputError(
+            f"expected a name that ends in {FORMATS[format].suffix} for --format {format}, found {path.name}; correct --out or --format"
+        )
 
 
 @contextmanager
@@ -224,10 +235,3 @@ def description(run: OpenRun, made: Made, options: Options, level: int | None) -
         **({} if level is None else {"level": level}),
         **({} if direct else {"bake": to_json(options.bake), "contributing": made.contributing}),
     }
-
-
-def moved(run: OpenRun, data: Path | None) -> OpenRun:
-    """The run with its capture at `data`, where that is given."""
-    if data is None:
-        return run
-    return replace(run, config=replace(run.config, data=replace(run.config.data, path=data)))

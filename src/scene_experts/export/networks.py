@@ -45,14 +45,19 @@ def write_torchscript(folder: Path, networks: dict[str, Network]) -> None:
         if attribute == "appearance":
             _save_trace(folder / EXTRA_FILES[attribute], _Codes(network["table"]), torch.zeros(1, dtype=torch.long))
             continue
-        layers: list[nn.Module] = []
-        for weight, bias in _linear_layers(network):
-            linear = nn.Linear(weight.shape[1], weight.shape[0])
-            linear.load_state_dict({"weight": weight, "bias": bias})
-            layers += [nn.ReLU(), linear]
-        last = nn.Softmax(dim=1) if attribute == "feature_bank" else _LAYERS[ACTIVATIONS[attribute]]
-        module = nn.Sequential(*layers[1:], *([last] if last else []))
+        module = sequential(attribute, network)
         _save_trace(folder / (FILES | EXTRA_FILES)[attribute], module, torch.rand(1, network["w1"].shape[2]))
+
+
+def sequential(attribute: str, network: Network) -> nn.Sequential:
+    """A single network as Scaffold-GS's readers know it: Linear, ReLU, ..., Linear and the attribute's activation."""
+    layers: list[nn.Module] = []
+    for weight, bias in _linear_layers(network):
+        linear = nn.Linear(weight.shape[1], weight.shape[0])
+        linear.load_state_dict({"weight": weight, "bias": bias})
+        layers += [nn.ReLU(), linear]
+    last = nn.Softmax(dim=1) if attribute == "feature_bank" else _LAYERS[ACTIVATIONS[attribute]]
+    return nn.Sequential(*layers[1:], *([last] if last else []))
 
 
 class _Codes(nn.Module):

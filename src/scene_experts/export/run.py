@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from scene_experts import run_folder
@@ -24,6 +26,7 @@ from scene_experts.export.frame import (
 )
 from scene_experts.export.incoming import compact_anchors, run_tensors, world_in
 from scene_experts.export.incoming import import_result as import_files
+from scene_experts.export.networks import is_plain, sequential
 from scene_experts.export.scaffold import SIDECAR, describe, read_sidecar, write_scaffold_folder
 from scene_experts.io import write_bytes
 from scene_experts.render import Rasterizer
@@ -49,14 +52,17 @@ def write_layout(run: OpenRun, capture: Capture, out: Path | None = None) -> Pat
     return folder
 
 
-def export_run(run: Path, format: str, out: Path | None = None, step: int | None = None, rasterize: Rasterizer | None = None) -> list[str]:
+def export_run(
+    run: Path, format: str, out: Path | None = None, step: int | None = None, rasterize: Rasterizer | None = None, data: Path | None = None
+) -> list[str]:
     """Write the newest checkpoint of a run (or the one at `step`) as "anchors" (the Scaffold-GS layout) or "compact"; says what it wrote.
 
     Standard files of Gaussians are `bake_run`'s.
     out: folder for anchors, file or folder for compact; inside the run folder by default.
     rasterize: what to draw the held-out views with, to say what a compact file costs in PSNR; None leaves that out.
+    data: where the capture is now, if it moved.
     """
-    opened = run_folder.open_run(run, "cpu", step)
+    opened = moved(run_folder.open_run(run, "cpu", step), data)
     graph_points.refuse(opened)
     anchors = len(opened.scene.table)
     if format == "anchors":
@@ -65,7 +71,8 @@ def export_run(run: Path, format: str, out: Path | None = None, step: int | None
         if out != run and (run / "cameras.json").is_file():
             write_bytes(out / "cameras.json", (run / "cameras.json").read_bytes())
         size = sum(p.stat().st_size for p in folder.iterdir())
-        return [f"wrote {folder}", f"{anchors:,} anchors, {size / 1e6:.2f} MB with networks, in the capture's own frame"]
+        said = f"{anchors:,} anchors, {size / 1e6:.2f} MB with networks, in the capture's own frame"
+        return [f"wrote {folder}", said, *warnings_of_layout(opened)]
     path = out or run / COMPACT
     path = path / COMPACT if path.is_dir() else path
     sizes = write_compact_run(opened, world_of(opened), path)
@@ -75,7 +82,26 @@ def export_run(run: Path, format: str, out: Path | None = None, step: int | None
     return lines
 
 
+@torch.no_grad()
+def warnings_of_layout(run: OpenRun) -> list[str]:
+    """What readers of the Scaffold-GS layout would get wrong of a run: single networks of another form than the layout can say."""
+    if not isinstance(run.scene, AnchorScene) or not is_plain(networks := _networks(run.scene)):
+        return []
+    others = []
+    for attribute, network in networks.items():
+        x = torch.randn(64, network["w1"].shape[2], generator=torch.Generator().manual_seed(0))
+        own, _ = run.scene.heads[attribute](x, x[:, : run.scene.config.F], run.step)
+        if not torch.allclose(own, sequential(attribute, network)(x), atol=1e-4, rtol=1e-4):
+            others.append(attribute)
+    if not others:
+        return []
+    what = f"the {', '.join(others)} networks of '{run.config.train.recipe}' are not Linear, ReLU, ..., Linear"
+    return [f"warning: {what}, which is all that the Scaffold-GS layout can say: other readers of it will draw another scene"]
+
+
 def _cost_line(run: OpenRun, path: Path, rasterize: Rasterizer) -> str:
+    if not run.config.data.path.exists():
+        return f"its capture is not at {run.config.data.path}: the cost in PSNR was not measured (--data says where it is)"
     capture = run_folder.load_capture(run.config.data, run.config.train.seed)
     try:
         if not capture.test:
@@ -180,6 +206,13 @@ def anchors_of(run: OpenRun) -> AnchorScene:
     if not isinstance(run.scene, AnchorScene):
         raise InputError(f"expected a scene of anchors, found a run of '{run.config.train.recipe}', which has none; use --format ply")
     return run.scene
+
+
+def moved(run: OpenRun, data: Path | None) -> OpenRun:
+    """The run with its capture at `data`, where that is given."""
+    if data is None:
+        return run
+    return replace(run, config=replace(run.config, data=replace(run.config.data, path=data)))
 
 
 def world_of(run: OpenRun) -> World:
