@@ -140,8 +140,8 @@ def test_levels_of_detail_become_one_file_each(tmp_path):
     options = Options(replace(SHORT, refine=Refine(iterations=0)), levels=True)
     lines = export_standard(run, "ply", tmp_path / "out.ply", None, choose("auto", "cpu"), options)
     files = sorted(tmp_path.glob("out_level*.ply"))
-    count = scene.select.lattices.count
+    count = len(scene.table.facts["level"].unique())
     assert len(files) == count > 1 and len(lines) == 3 * count
     sizes = [len(read_standard(file)) for file in files]
-    assert sizes == sorted(sizes) and sizes[0] < sizes[-1]
+    assert sizes == sorted(set(sizes))  # a level without anchors gets no file
     assert json.loads((tmp_path / "out_level1.ply.json").read_text())["level"] == 1

@@ -136,7 +136,8 @@ def files(run: OpenRun, path: Path, levels: bool) -> list[tuple[int | None, Path
     if not isinstance(select, LevelSelector):
         raise InputError(f"expected a run with levels of detail for --levels, found one of '{run.config.train.recipe}'; leave --levels out")
     stem, suffixes = path.name.partition(".")[::2]
-    return [(level, path.with_name(f"{stem}_level{level}.{suffixes}")) for level in range(select.lattices.count)]
+    held = run.scene.table.facts["level"].unique().tolist()  # levels that growth never reached would repeat the one before
+    return [(level, path.with_name(f"{stem}_level{level}.{suffixes}")) for level in range(select.lattices.count) if level in held]
 
 
 @contextmanager
