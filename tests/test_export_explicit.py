@@ -14,6 +14,7 @@ from scene_experts.export import explicit
 from scene_experts.export.bake_run import Options, export_standard
 from scene_experts.export.ply import read_vertices, write_vertices
 from scene_experts.export.run import export_run, import_result
+from scene_experts.export.standard import FORMATS, read_standard, write_standard
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from synthetic import make_capture
@@ -97,6 +98,52 @@ def test_files_of_lower_degree_are_read(made, tmp_path, degree):
     scene = run_folder.open_run(import_result(tmp_path / "low.ply", Data(folder), tmp_path / "again")).scene
     full = run_folder.open_run(run).scene.table.params["sh_rest"]
     assert scene.config.sh_degree == degree and torch.equal(scene.table.params["sh_rest"], full[:, :count])
+
+
+@pytest.mark.parametrize("format", list(FORMATS))
+def test_every_standard_file_comes_back_as_a_run(made, tmp_path, format):
+    run, folder = made
+    options = Options(measure=False)
+    file = tmp_path / f"scene{FORMATS[format].suffix}"
+    export_standard(run, format, file, None, choose("auto", "cpu"), options)
+    out = import_result(file, Data(folder), tmp_path / "again")
+    opened, there, world = run_folder.open_run(out), read_standard(file), run_folder.load_capture(Data(folder)).world
+    assert opened.config.train.recipe == "3dgs" and opened.scene.config.sh_degree == there.degree == (0 if format == "splat" else 3)
+    torch.testing.assert_close(
+        world.to_input(opened.scene.table.params["means"].detach().double()).float(), there.means, atol=1e-4, rtol=1e-5
+    )
+    assert (drawn(out) - drawn(run)).abs().mean() < 0.02
+    whole = file.read_bytes()
+    end = whole.find(b'id="scene"') + 500 if format == "html" else len(whole) * 2 // 3 // 32 * 32 + 5
+    file.write_bytes(whole[:end])
+    with pytest.raises(InputError, match=r"^expected [^;]*; [^;]*$"):
+        import_result(file, Data(folder), tmp_path / "damaged")
+    assert not (tmp_path / "damaged").exists()
+
+
+def test_beside_a_description_of_more_harmonics_the_file_says_the_degree(made, tmp_path):
+    run, folder = made
+    layout = explicit.write_folder(run_folder.open_run(run), run_folder.load_capture(Data(folder)).world, tmp_path / "result")
+    write_standard(layout / "scene.splat", read_standard(layout / "point_cloud.ply"), "splat", {})
+    opened = run_folder.open_run(import_result(layout / "scene.splat", Data(folder), tmp_path / "again"))
+    assert opened.step == 90 and opened.scene.config.sh_degree == 0
+
+
+def test_files_that_hold_no_gaussians_are_named(made, tmp_path):
+    folder = made[1]
+    (tmp_path / "text").write_text("x")
+    (tmp_path / "none.splat").write_bytes(b"")
+    (tmp_path / "cut.compact").write_bytes(b"x")
+    write_vertices(tmp_path / "anchors.ply", {name: np.zeros(2, np.float32) for name in (*"xyz", "f_offset_0")})
+    said = {
+        "text": "a compact file or one of ply, .*html at .*, found something else",
+        "none.splat": "expected Gaussians in .*, found none",
+        "cut.compact": "expected a compact scene file",
+        "anchors.ply": "found anchors, which need their networks",
+    }
+    for name, words in said.items():
+        with pytest.raises(InputError, match=words):
+            import_result(tmp_path / name, Data(folder), tmp_path / "again")
 
 
 def test_formats_that_do_not_fit_are_refused_in_one_sentence(made, tmp_path):

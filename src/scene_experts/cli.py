@@ -20,7 +20,7 @@ COMMANDS = {
     "view": "a run in a browser, drawn here: experts, cameras, photographs beside",
     "report": "one page of runs: curves, views with a slider, experts, commands",
     "export": "write a trained scene to files that viewers and later runs open",
-    "import": "make a run folder of a published Scaffold-GS result or of a compact file",
+    "import": "make a run folder of a published result or of a file that export writes",
     "reproduce": "the paper's tables and figures, from runs made or reused",
     "bench": "how fast this machine is, in a minute: each part beside a named peer",
     "catalog": "the paper's 17 scenes: sources, sizes, licences, what is on this machine",

@@ -90,10 +90,10 @@ def _standard(command: ExportCommand, args: list[str], rasterize: Rasterizer) ->
 
 @dataclass(frozen=True)
 class ImportCommand:
-    """Make a run folder of a published Scaffold-GS, Octree-GS or 3DGS result or of a file that `export` writes, to evaluate and convert it."""
+    """Make a run folder of a published Scaffold-GS, Octree-GS or 3DGS result or of a file that `export` writes, to score and convert it."""
 
     source: Annotated[Path, tyro.conf.Positional]
-    """Result folder (with point_cloud/iteration_N), compact file, or standard Gaussians: ply, compressed-ply, splat, spz, sog, glb, html."""
+    """Result folder (with point_cloud/iteration_N), compact file, or Gaussians as ply, compressed-ply, splat, spz, sog, glb or html."""
     data: Annotated[Data, tyro.conf.arg(name="")]
     out: Annotated[Path, tyro.conf.arg(aliases=["-m"])]
     """Run folder to write."""

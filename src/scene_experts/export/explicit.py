@@ -1,5 +1,7 @@
 """Scenes of explicit Gaussians as 3DGS's files, both ways: point_cloud/iteration_<N>/point_cloud.ply, in the capture's own frame.
 
+The way in takes a file in any format of `standard.FORMATS`.
+
 From the trained world to the capture's frame lengths scale and positions move; axes are kept, so rotations and harmonics stay as they are.
 """
 
@@ -19,9 +21,10 @@ from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
 from scene_experts.export.cfg_args import cfg_args_text
 from scene_experts.export.incoming import UNKNOWN
-from scene_experts.export.ply import read_gaussian_ply, read_vertices, write_gaussian_ply
+from scene_experts.export.ply import read_vertices, write_gaussian_ply
 from scene_experts.export.scaffold import SIDECAR, SIDECAR_FORMAT, iteration_folder, read_sidecar
-from scene_experts.export.splats import Splats, from_scene, to_columns
+from scene_experts.export.splats import from_scene, to_columns
+from scene_experts.export.standard import FORMATS, format_of, read_standard
 from scene_experts.io import write_bytes, write_json
 from scene_experts.recipes import gs_3d
 from scene_experts.run_folder import OpenRun
@@ -68,32 +71,60 @@ def write_folder(run: OpenRun, world: World, out: Path) -> Path:
 
 
 def find_file(source: Path, iteration: int | None = None) -> Path | None:
-    """The PLY file of explicit Gaussians that `source` is, or that the result folder `source` holds; None where it holds another scene."""
+    """The file of explicit Gaussians that `source` is, in any of `standard.FORMATS`, or the PLY file that the result folder `source` holds.
+
+    None where `source` is a compact file or a folder with another scene. Raises InputError for other files and for anchors without the
+    networks that belong to them.
+    """
     source = Path(source)
-    if source.is_file() and source.suffix.lower() == ".ply":
-        path = source
-    elif (source / "point_cloud").is_dir() or (source / "point_cloud.ply").is_file():
+    if source.is_file():
+        return None if _is_compact(source) else _gaussians(source)
+    if (source / "point_cloud").is_dir() or (source / "point_cloud.ply").is_file():
         path = iteration_folder(source, iteration) / "point_cloud.ply"
     else:
         return None
     return path if "f_dc_0" in read_vertices(path) else None
 
 
+def _is_compact(path: Path) -> bool:
+    """Whether a file is meant as a compact one: by its name, or as safetensors begin (the length of a JSON header, then the header)."""
+    with path.open("rb") as stream:
+        head = stream.read(9)
+    return path.suffix == ".compact" or (head[8:] == b"{" and 2 <= int.from_bytes(head[:8], "little") < path.stat().st_size)
+
+
+def _gaussians(path: Path) -> Path:
+    """`path`, when it begins like a file of Gaussians. Raises InputError else."""
+    try:
+        format = format_of(path)
+    except InputError:
+        raise InputError(
+            f"expected a compact file or one of {', '.join(FORMATS)} at {path}, found something else; give another file"
+        ) from None
+    if format == "ply" and "f_offset_0" in read_vertices(path):
+        raise InputError(
+            f"expected Gaussians in {path}, found anchors, which need their networks; give the folder with point_cloud/iteration_N"
+        )
+    return path
+
+
 def read_columns(path: Path, world: World) -> dict[str, Tensor]:
-    """The columns of a table of explicit Gaussians, in the trained world, from a PLY file of 3DGS in the capture's own frame.
+    """The columns of a table of explicit Gaussians, in the trained world, from a file of `standard.FORMATS` in the capture's own frame.
 
     Raises InputError for files without such Gaussians and for values that are not finite.
     """
-    found = read_gaussian_ply(path)
-    for name, value in found.items():
+    found = read_standard(path)
+    if not len(found):
+        raise InputError(f"expected Gaussians in {path}, found none; export the result again")
+    for name, value in vars(found).items():
         bad = int((~value.isfinite()).reshape(len(value), -1).any(1).sum())
         if bad:
             raise InputError(f"expected finite {name} in {path}, found {bad:,} Gaussians with others; export the result again")
-    return to_columns(Splats(**found), world)
+    return to_columns(found, world)
 
 
 def import_file(path: Path, data: Data, out: Path, iteration: int | None = None) -> Capture:
-    """Make the run folder `out` (configuration and checkpoint) of a PLY file of 3DGS, published or ours; returns its capture.
+    """Make the run folder `out` (configuration and checkpoint) of a file of standard Gaussians, published or ours; returns its capture.
 
     The file must be in the frame and unit of the capture. A recipe that it does not say is 3DGS; an iteration that neither it nor its
     folder's name says is 0.
@@ -108,6 +139,8 @@ def import_file(path: Path, data: Data, out: Path, iteration: int | None = None)
     degree = math.isqrt(columns["sh_rest"].shape[1] + 1) - 1
     if about.get("kind") == KIND and "train" in about:
         cfg = from_json(Train, about["train"], "train")
+        if isinstance(cfg.scene, Explicit) and cfg.scene.sh_degree != degree:  # a format that keeps fewer harmonics
+            cfg = replace(cfg, scene=replace(cfg.scene, sh_degree=degree))
     else:
         cfg = replace(gs_3d, scene=Explicit(sh_degree=degree), iterations=step or gs_3d.iterations)
     config = RunConfig(cfg, data, f"import {path.name}", versions=run_folder.versions())
