@@ -35,7 +35,10 @@ def test_iterations_scale_windows_and_nothing_else():
         ({"unheard_of": 1}, "unheard_of"),
         ({"scene": 3}, "config.scene"),
         ({"growth": {"type": "GrowAnchors", "scale_clamp": "never"}}, "config.growth.scale_clamp"),
-        ({"scene": {"type": "Anchors", "decoder": {"type": "Transformer"}}}, "config.scene.decoder"),
+        (
+            {"scene": {"type": "Anchors", "decoder": {"type": "Transformer"}}},
+            r"'Plain', 'Experts', .*'BalancedExperts'.* at config.scene.decoder, found 'Transformer'",
+        ),
     ],
 )
 def test_errors_name_the_place(edit, message):

@@ -50,4 +50,4 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (about.recipe, about.iterations, about.seed, about.train_seconds, about.versions) == ("moe-gs", 300, 4, 9.0, {"torch": "x"})
     opened.capture = "b"
     with pytest.raises(InputError, match="other views in new"):
-        command.evaluate_run(tmp_path, "cpu", Raster(), lpips=False)  # type: ignore[arg-type]
+        command.evaluate_run(tmp_path, "cpu", Raster(), data=Path("new"), lpips=False)  # type: ignore[arg-type]

@@ -64,6 +64,28 @@ def test_a_damaged_checkpoint_is_passed_over_and_said_of(run, caplog):
     (run / "checkpoints" / "ckpt_000010.safetensors").write_bytes(b"")
     with pytest.raises(InputError, match="found only damaged ones"):
         run_folder.open_run(run)
+    (run / "checkpoints" / "ckpt_000010.safetensors").unlink()
+    newest.unlink()
+    with pytest.raises(InputError, match="found none; train it first"):
+        run_folder.open_run(run)
+
+
+def test_a_capture_that_is_not_here_is_asked_for_by_its_flag(run, tmp_path, monkeypatch):
+    folder = make_capture(tmp_path / "home" / "capture", views=3).folder
+    monkeypatch.chdir(tmp_path)
+    for path, said in (
+        (folder / "absent", "absent, found none"),
+        (Path("capture"), "at capture below the current folder"),
+    ):
+        opened = run_folder.open_run(run)
+        opened = replace(opened, config=replace(opened.config, data=Data(path)))
+        with pytest.raises(InputError, match=f"{said}.*; say where it is with --data$"):
+            run_folder.capture_of(opened)
+        assert run_folder.capture_of(opened, folder).root == folder
+    with pytest.raises(InputError, match="expected the folder of a capture"):
+        run_folder.capture_of(opened, tmp_path / "nowhere")
+    monkeypatch.chdir(tmp_path / "home")
+    assert run_folder.capture_of(opened).root == Path("capture")
 
 
 def test_a_checkpoint_of_another_recipe_in_the_folder(run):

@@ -160,9 +160,9 @@ def test_top_1_warns(caplog):
 
 
 def test_nonsense_is_refused():
-    with pytest.raises(InputError, match="top_k between 1"):
+    with pytest.raises(InputError, match=r"--scene\.decoder.top-k between 1"):
         Experts(num=2, top_k=3).build("color", D, H, OUT, F)
-    with pytest.raises(InputError, match="at least 1 expert"):
+    with pytest.raises(InputError, match=r"--scene\.decoder.num of at least 1"):
         Experts(num=0).build("color", D, H, OUT, F)
 
 

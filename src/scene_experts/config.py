@@ -172,13 +172,17 @@ def _from_union(args: tuple[Any, ...], value: Any, where: str) -> Any:
     if value is None and type(None) in args:
         return None
     options = [a for a in args if a is not type(None)]
+    all_options = [kind for a in options for kind in (a, *_variants(a))]
     if isinstance(value, dict) and "type" in value:
-        for option in [kind for a in options for kind in (a, *_variants(a))]:
+        for option in all_options:
             if getattr(option, "__name__", None) == value["type"]:
                 return from_json(option, value, where)
     if len(options) == 1:
         return from_json(options[0], value, where)
-    raise InputError(f"expected one of {[getattr(o, '__name__', str(o)) for o in options]} at {where}, found {value!r}; correct the file")
+    found = value["type"] if isinstance(value, dict) and "type" in value else value
+    raise InputError(
+        f"expected one of {[getattr(o, '__name__', str(o)) for o in all_options]} at {where}, found {found!r}; correct the file"
+    )
 
 
 def _variants(kind: Any) -> list[type]:

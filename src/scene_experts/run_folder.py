@@ -160,6 +160,18 @@ def load_capture(data: Data, seed: int = 0) -> Capture:
     return replace(capture, views=tuple(replace(v, camera=replace(v.camera, near=data.near)) for v in capture.views))
 
 
+def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
+    """The capture that a run was trained on; data: where it is now, if it moved. Raises InputError, naming --data, where it is gone.
+
+    A run keeps the path as its training was given it, and a relative one is read from the current folder.
+    """
+    where = named(run.config.data if data is None else replace(run.config.data, path=data))
+    if data is None and not where.path.exists():
+        origin = "" if where.path.is_absolute() else " below the current folder"
+        raise InputError(f"expected the run's capture at {where.path}{origin}, found none; say where it is with --data")
+    return load_capture(where, run.cfg.seed)
+
+
 def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun:
     """The newest whole checkpoint of a run (or the one at `step`). Raises InputError when there is none."""
     config = read_config(run)
@@ -178,7 +190,9 @@ def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if found is None and any(folder.glob("ckpt_*.safetensors")):
         raise InputError(f"expected a whole checkpoint in {folder}, found only damaged ones; copy one back or train again")
     if found is None:
-        raise InputError(f"expected a checkpoint in {folder}, found none; train first, or use --resume")
+        raise InputError(
+            f"expected a checkpoint in {folder}, found none; train it first (`train --resume` goes on with a run that was stopped)"
+        )
     return found
 
 

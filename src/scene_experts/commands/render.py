@@ -75,8 +75,7 @@ def render(args: list[str]) -> int:
         if command.only and max(command.only) > count:
             has = f"experts 1 to {count}" if count else "no experts"
             raise InputError(f"expected --only among the experts of {run.path}, which has {has}, found {max(command.only)}; correct it")
-    data = opened[0].config.data if command.data is None else replace(opened[0].config.data, path=command.data)
-    capture = run_folder.load_capture(data, opened[0].cfg.seed)
+    capture = run_folder.capture_of(opened[0], command.data)
     try:
         for other in opened[1:]:
             if other.capture and other.capture != opened[0].capture:

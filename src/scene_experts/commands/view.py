@@ -41,8 +41,7 @@ def view(args: list[str]) -> int:
     opened = run_folder.open_run(command.run, device, command.step)
     if getattr(rasterize, "antialias", opened.cfg.antialias) != opened.cfg.antialias:
         rasterize = replace(rasterize, antialias=opened.cfg.antialias)  # type: ignore[type-var]
-    data = opened.config.data if command.data is None else replace(opened.config.data, path=command.data)
-    capture = run_folder.load_capture(data, opened.cfg.seed)
+    capture = run_folder.capture_of(opened, command.data)
     label = f"{opened.config.train.recipe} on {capture.name}"
     viewer = Viewer(
         capture,

@@ -37,8 +37,7 @@ def evaluate_run(
     opened = run_folder.open_run(run, device, step)
     if getattr(rasterize, "antialias", opened.cfg.antialias) != opened.cfg.antialias:
         rasterize = replace(rasterize, antialias=opened.cfg.antialias)  # type: ignore[type-var]
-    where = opened.config.data if data is None else replace(opened.config.data, path=data)
-    capture = run_folder.load_capture(run_folder.named(where), opened.cfg.seed)
+    capture = run_folder.capture_of(opened, data)
     if opened.capture and opened.capture != capture.fingerprint():
         raise InputError(f"expected the capture that {run} was trained on, found other views in {capture.root}; give the right --data")
     about = About(

@@ -221,7 +221,7 @@ def world_of(run: OpenRun) -> World:
         found = read_sidecar(path)
         if found.get("data") == _settings(run.config.data):
             return world_in(found)
-    capture = run_folder.load_capture(run.config.data, run.config.train.seed)
+    capture = run_folder.capture_of(run)
     capture.images.close()
     return capture.world
 

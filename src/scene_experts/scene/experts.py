@@ -68,9 +68,12 @@ class Experts:
 
     def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> MixtureHead | MLP:
         if self.num < 1:
-            raise InputError(f"expected at least 1 expert, found {self.num}; give a larger number")
+            raise InputError(f"expected --scene.decoder.num of at least 1, found {self.num}; give a larger number")
         if self.top_k is not None and not 1 <= self.top_k <= self.num:
-            raise InputError(f"expected top_k between 1 and the number of experts ({self.num}), found {self.top_k}; change one of them")
+            raise InputError(
+                f"expected --scene.decoder.top-k between 1 and the number of experts ({self.num}), found {self.top_k}; "
+                "change it or --scene.decoder.num"
+            )
         if self.num == 1 or attribute not in self.attributes:
             return MLP(attribute, inputs, hidden, outputs)
         if self.top_k == 1 and self.router.renormalise and attribute == self.attributes[0]:
