@@ -26,6 +26,7 @@ from splat_quanta import check, scene
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+WITHOUT = "--disable-3d-apis"  # no WebGL
 WIDTH, HEIGHT, FOV = 320, 240, 50.0
 BACKGROUND = (0.2, 0.3, 0.5)
 
@@ -139,7 +140,7 @@ def test_a_capture_s_views_in_the_frame_of_the_file():
     poses = [torch.eye(4), torch.eye(4)]
     poses[1][:3, 3] = torch.tensor([0.0, 0.0, 7.0])  # the camera's centre at z = -7 of the trained world
     views = tuple(View(f"{i}.jpg", Camera(pose, K, 120, 80, id=i), Path("x")) for i, pose in enumerate(poses))
-    capture = SimpleNamespace(views=views, test=(1,), background=(1.0, 1.0, 1.0))
+    capture = SimpleNamespace(views=views, test=(1,), train=(0,), points=None, extent=1.0, background=(1.0, 1.0, 1.0))
     note = capture_notes(capture, world, antialias=True)  # type: ignore[arg-type]
     assert note["camera"] == note["cameras"][1] and len(note["cameras"]) == 2 and note["background"] == [1.0, 1.0, 1.0]
     np.testing.assert_allclose(note["camera"]["position"], [-1.0, 0.0, -3.5 + 3.0], atol=1e-6)
@@ -166,3 +167,31 @@ def test_what_is_vendored_has_its_licences():
         all(name in text for name in ("@sparkjsdev/spark 2.2.0", "three 0.187.0", "fflate 0.8.2"))
         and text.count("Permission is hereby") == 3
     )
+
+
+def test_the_hint_is_in_the_words_of_the_pointer():
+    text = (html_page.ASSETS / "page.html").read_text()
+    touch, mouse = (re.search(rf'<span class="{kind}">([^<]+)</span>', text) for kind in ("touch", "mouse"))
+    assert touch and mouse and "finger" in touch[1] and "wheel" not in touch[1] and "right drag" in mouse[1]
+    coarse = text.partition("(pointer: coarse)")[2].partition("</style>")[0]
+    assert "#bar .mouse { display: none; }" in coarse and "#bar .touch { display: inline-block; }" in coarse
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_hints_on_touch_screens_and_none_without_webgl(tmp_path):
+    playwright = pytest.importorskip("playwright.sync_api")
+    write_html(tmp_path / "a.html", blobs(20), {"camera": pose()})
+    with playwright.sync_playwright() as p:
+        for flags, touch, shown in (
+            (FLAGS, False, ".mouse"),
+            (FLAGS, True, ".touch"),
+            (["--no-sandbox", "--disable-gpu", WITHOUT], True, ""),
+        ):
+            browser = p.chromium.launch(executable_path=CHROMIUM, args=flags)
+            page = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT}, has_touch=touch, is_mobile=touch).new_page()
+            page.goto((tmp_path / "a.html").as_uri())
+            page.wait_for_function("window.sceneExperts || /WebGL/.test(document.getElementById('note').textContent)", timeout=60_000)
+            assert [kind for kind in (".mouse", ".touch") if page.locator(f"#bar {kind}").is_visible()] == ([shown] if shown else [])
+            assert page.locator("#home").is_visible() == bool(shown)
+            browser.close()

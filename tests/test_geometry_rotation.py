@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from scene_experts.geometry.rotation import covariance, matrix_to_quat, normalise_quats, quat_to_matrix
+from scene_experts.geometry.rotation import common_up, covariance, matrix_to_quat, normalise_quats, quat_to_matrix
 
 
 def quats(n: int) -> torch.Tensor:
@@ -51,3 +51,32 @@ def test_zero_quaternion_stays_finite() -> None:
     cov.sum().backward()
     torch.testing.assert_close(cov[0].detach(), torch.eye(3))
     assert q.grad is not None and q.grad.isfinite().all()
+
+
+def ring(roll: list[float], pitch: float = 0.5) -> torch.Tensor:
+    """Cameras on a circle that look inwards and down by `pitch`, turned about their axis by `roll`; up is +z. [V, 3, 3]"""
+    out = []
+    for i, turn in enumerate(torch.tensor(roll, dtype=torch.float64)):
+        a = torch.tensor(2 * torch.pi * i / len(roll), dtype=torch.float64)
+        p = torch.tensor(pitch, dtype=torch.float64)
+        forward = torch.stack([-a.cos() * p.cos(), -a.sin() * p.cos(), -p.sin()])
+        right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0, 1], dtype=torch.float64)), dim=0)
+        down = torch.linalg.cross(forward, right)
+        out.append(torch.stack([turn.cos() * right + turn.sin() * down, turn.cos() * down - turn.sin() * right, forward], dim=1))
+    return torch.stack(out)
+
+
+def test_the_common_up_is_that_of_the_upright_photographs_whatever_lies_on_its_side() -> None:
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    quarter = torch.pi / 2
+    torch.testing.assert_close(common_up(ring([0.0] * 9)), up)
+    for roll in ([0.0] * 4 + [quarter] * 5, [0.0, quarter, quarter, 0.0, 0.0, quarter, quarter, quarter, 0.0, 0.0, quarter]):
+        rotations = ring(roll)
+        mean = torch.nn.functional.normalize(-rotations[:, :, 1].mean(0), dim=0)
+        assert float(common_up(rotations) @ up) > 0.995 > float(mean @ up)
+
+
+def test_the_common_up_of_cameras_that_look_one_way_is_their_mean() -> None:
+    one = ring([0.0])
+    torch.testing.assert_close(common_up(one), -one[0, :, 1])
+    torch.testing.assert_close(common_up(one.expand(5, 3, 3)), -one[0, :, 1])

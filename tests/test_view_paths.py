@@ -2,6 +2,8 @@
 
 import itertools
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,9 +12,11 @@ from scene_experts.data.capture import load
 from scene_experts.errors import InputError
 from scene_experts.geometry.rotation import quat_to_matrix
 from scene_experts.view import paths
-from scene_experts.view.paths import Around, catmull_rom, interpolate, look_at, make, orbit, pose, slerp, spiral, with_fov
+from scene_experts.view.paths import Around, best_view, catmull_rom, interpolate, look_at, make, orbit, pose, slerp, spiral, with_fov
 from synthetic import make_capture
 from test_scene import CAMERA
+
+DEMO = Path(__file__).parents[1] / "demo"
 
 
 @pytest.fixture(scope="module")
@@ -120,3 +124,39 @@ def test_a_field_of_view():
     camera = with_fov(CAMERA, math.radians(90), 200, 100)
     assert camera.fy == pytest.approx(50) and (camera.cx, camera.cy) == (100, 50)
     assert pose(torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)).equal(torch.eye(4, dtype=torch.float64))
+
+
+def standing(capture, places, rolls):
+    """The capture with views at `places` that look at the middle of a ring, turned about their axes; up is +z."""
+    up, views = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), []
+    for i, (place, roll) in enumerate(zip(places, rolls)):
+        made = look_at(torch.tensor(place, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), up)
+        c, s = math.cos(roll), math.sin(roll)
+        made[:3] = torch.tensor([[c, s, 0], [-s, c, 0], [0, 0, 1]], dtype=torch.float64) @ made[:3]
+        views.append(replace(capture.views[0], name=f"{i}", camera=replace(CAMERA, world_to_cam=made.float(), id=i)))
+    return replace(capture, views=tuple(views), train=tuple(range(3, len(views))), test=(0, 1, 2))
+
+
+def test_the_best_view_is_upright_not_near_and_level(capture):
+    around = [(4 * math.cos(a), 4 * math.sin(a), 1.0) for a in (0.1, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)]
+    rolls = [0.0] * 4 + [math.pi / 2] * 3  # portraits among them
+    scene = lambda places, turned: standing(capture, [*places, *around], [*turned, *rolls])  # noqa: E731
+    far, near, above, level = (5.0, 0, 1.0), (0.0, 1.5, 0.3), (0.5, 0, 6.0), (0, 6.0, 1.0)
+    assert best_view(scene((far, near, level), (math.pi / 2, 0.0, 0.0))) == 2  # on its side; a close-up
+    assert best_view(scene((above, level, near), (0.0, 0.0, 0.0))) == 1  # from straight above
+    assert best_view(scene((far, near, near), (math.pi / 2, math.pi, 0.1))) == 2  # upright before far
+    assert best_view(scene((near, (0, 2.0, 0.3), near), (0.0, 0.0, 0.0))) == 1  # all near: the farthest
+    none_held_out = replace(scene((far, level, near), (1.0, 0.0, 0.0)), test=(), train=tuple(range(10)))
+    assert best_view(none_held_out) == 1
+    assert best_view(replace(none_held_out, views=none_held_out.views[:1], train=(0,))) == 0
+    assert best_view(capture) in capture.test
+
+
+@pytest.mark.skipif(not DEMO.is_dir(), reason="the demo captures are not shipped with the package")
+def test_the_shipped_captures_open_upright_with_the_whole_scene_in_view():
+    found = {}
+    for name in ("buddha", "brighton"):
+        made = load(DEMO / name)
+        found[name] = made.views[best_view(made)].name
+        made.images.close()
+    assert found == {"buddha": "017.jpg", "brighton": "DJI_0034.jpg"}

@@ -13,6 +13,7 @@ from scene_experts.evaluate.pictures import to_8bit
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.view.paint import paint
+from scene_experts.view.paths import best_view
 from synthetic import make_capture
 
 pytest.importorskip("viser")
@@ -65,12 +66,13 @@ def joined(viewer, number=0) -> Handle:
     return handle
 
 
-def test_a_client_starts_at_a_held_out_view_and_gets_our_own_render(viewer, capture):
+def test_a_client_starts_at_the_best_held_out_view_and_gets_our_own_render(viewer, capture):
     handle = joined(viewer)
     viewer.draw()
     (picture, how), camera = handle.pictures[-1], viewer.camera(viewer.clients[0])
     assert how["format"] == "jpeg" and picture.shape == (60, 90, 3)
-    first = capture.views[capture.test[0]].camera
+    first = capture.views[best_view(capture)].camera
+    assert viewer.panel.chosen.value == viewer.panel.names[best_view(capture)]
     assert torch.allclose(camera.world_to_cam, first.world_to_cam, atol=1e-5)
     scene, step = viewer.current()
     assert np.array_equal(picture, to_8bit(paint(scene, camera, step, DRAW, torch.tensor(capture.background))))
@@ -105,7 +107,7 @@ def test_controls_change_the_picture(viewer):
 
 def test_the_photograph_is_wiped_over_the_render_at_its_view(viewer, capture):
     handle = joined(viewer)
-    view = capture.test[0]
+    view = best_view(capture)
     camera = capture.views[view].camera
     handle.camera.aspect, handle.camera.image_height = camera.width / camera.height, camera.height
     viewer.panel.wipe.value = 1.0

@@ -18,6 +18,7 @@ from string import Template
 from typing import Any
 
 import numpy as np
+import torch
 
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
@@ -25,7 +26,9 @@ from scene_experts.export.cameras import camera_entries
 from scene_experts.export.pack import Floats, damaged
 from scene_experts.export.splats import Splats
 from scene_experts.export.spz import decode_spz, spz_bytes
+from scene_experts.geometry.rotation import common_up
 from scene_experts.io import write_bytes
+from scene_experts.view.paths import best_view
 
 ASSETS = files("scene_experts.export") / "assets"
 MARK = b'<meta name="generator" content="scene-experts">'
@@ -65,13 +68,13 @@ def read_html(path: Path) -> Splats:
 
 
 def capture_notes(capture: Capture, world: World, antialias: bool = False) -> dict[str, Any]:
-    """The page's part of a note: starts at the first held-out view (or the first), steps through all, over the capture's background.
+    """The page's part of a note: starts at the view that shows it best, steps through all, over the capture's background.
 
     world: the frame that the Gaussians are written in. antialias: whether the scene was trained with it.
     """
     entries = camera_entries(capture.views, world)
     return {
-        "camera": entries[capture.test[0] if capture.test else 0] if entries else None,
+        "camera": entries[best_view(capture)] if entries else None,
         "cameras": entries,
         "background": list(capture.background),
         "antialias": antialias,
@@ -84,9 +87,7 @@ def page_settings(splats: Splats, note: Mapping[str, Any]) -> dict[str, Any]:
     poses = [_pose(entry) for entry in note.get("cameras") or []]
     first = _pose(note["camera"]) if note.get("camera") else poses[0] if poses else _from_outside(means)
     poses = poses or [first]
-    down = np.mean([np.array(pose["rotation"])[:, 1] for pose in poses], 0)
-    length = float(np.linalg.norm(down))
-    up = -down / length if length > 1e-3 else -np.array(first["rotation"])[:, 1]
+    up = common_up(torch.tensor([pose["rotation"] for pose in poses], dtype=torch.float64))
     distance = _distance(means, first)
     return {
         "count": len(splats),

@@ -56,3 +56,22 @@ def covariance(quats: Tensor, scales: Tensor) -> Tensor:
     """Covariances R S S^T R^T, [..., 3, 3] in squared world units, of unit quaternions [..., 4] and standard deviations [..., 3]."""
     half = quat_to_matrix(quats) * scales[..., None, :]
     return half @ half.transpose(-1, -2)
+
+
+def common_up(rotations: Tensor) -> Tensor:
+    """The way up [3] (unit) that cameras share, from their camera-to-world rotations [V, 3, 3] (x right, y down).
+
+    The mean of the cameras' ups leans where some photographs lie on their side (portraits stored unturned) or look down from one side
+    more often. So from there: the direction to which every camera's more level axis, right or up, is most at a right angle.
+    """
+    right, ups = rotations[:, :, 0].double(), -rotations[:, :, 1].double()
+    mean = ups.mean(0)
+    mean = mean / mean.norm().clamp_min(1e-12)
+    up = mean
+    off = torch.eye(3, dtype=torch.float64, device=up.device) - mean[:, None] * mean
+    for _ in range(5):  # until each camera's level axis is known
+        level = torch.where(((right @ up).abs() < (ups @ up).abs())[:, None], right, ups)
+        # with cameras that all look one way only one axis is ruled out: the last term keeps to the mean
+        up = torch.linalg.eigh(level.T @ level / len(level) + 0.02 * off)[1][:, 0]
+        up = up if float(up @ mean) >= 0 else -up
+    return up

@@ -19,6 +19,7 @@ from scene_experts.scene.select import LevelSelector
 from scene_experts.types import Camera
 from scene_experts.view.keyframes import Keyframes
 from scene_experts.view.paint import MODES, Look
+from scene_experts.view.paths import best_view
 
 MOST_FRUSTA = 300
 MOST_POINTS = 200_000
@@ -86,7 +87,7 @@ class Panel:
         gui, views = self.server.gui, self.capture.views
         names = tuple(f"{'test  ' if i in set(self.capture.test) else 'train '} {view.name}" for i, view in enumerate(views))
         with gui.add_folder("Views"):
-            chosen = gui.add_dropdown("view", options=names, initial_value=names[(self.capture.test or self.capture.train)[0]])
+            chosen = gui.add_dropdown("view", options=names, initial_value=names[best_view(self.capture)])
             chosen.on_update(lambda _: self.go(names.index(chosen.value)))
             self.wipe = self.on(gui.add_slider("photograph", min=0.0, max=1.0, step=0.01, initial_value=0.0))
             frusta = gui.add_checkbox("cameras", initial_value=False)

@@ -11,13 +11,14 @@ from torch import Tensor
 
 from scene_experts.data.views import Capture
 from scene_experts.errors import InputError
-from scene_experts.geometry.rotation import matrix_to_quat, normalise_quats, quat_to_matrix
+from scene_experts.geometry.rotation import common_up, matrix_to_quat, normalise_quats, quat_to_matrix
 from scene_experts.types import Camera
 
 NAMES = ("auto", "orbit", "spiral", "views")
 FREE = -1  # the id of a camera that is none of the capture's views: what belongs to a view (appearance codes) must not be taken
 FACING = 0.7  # cameras whose directions have a mean longer than this look the same way: an orbit would go behind the scene
 MOST_POSES = 40  # captured poses that a path goes through
+LEVEL = math.cos(math.radians(15))  # of the roll of a picture that stands upright
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def around(capture: Capture) -> Around:
     poses = torch.stack([c.world_to_cam.double() for c in cameras])
     rotations = poses[:, :3, :3].transpose(1, 2)
     positions = -(rotations @ poses[:, :3, 3:]).squeeze(2)
-    up = normalised(-rotations[:, :, 1].mean(0))
+    up = common_up(rotations)
     forward = rotations[:, :, 2]
     # the point whose squared distances to all axes are least: sum (I - d d^T) (p - c) = 0; nearly parallel axes leave the depth open
     across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
@@ -63,6 +64,26 @@ def around(capture: Capture) -> Around:
     else:
         centre = positions.mean(0) + normalised(forward.mean(0)) * depth(capture, positions.mean(0), normalised(forward.mean(0)))
     return Around(centre, up, positions, rotations, cameras)
+
+
+def best_view(capture: Capture) -> int:
+    """The view that shows a capture best at first sight, of the held-out ones (of those for training where none is held out).
+
+    Upright (or else the one nearest to it: photographs on their side, views straight down), not nearer to what the cameras look at than
+    half of the training cameras (or else the farthest), and of those the one that looks most level and most at the centre.
+    """
+    seen = around(capture)
+    middle = float((seen.positions - seen.centre).norm(dim=1).median())
+    chosen = capture.test or capture.train
+    rotations = torch.stack([capture.views[i].camera.world_to_cam[:3, :3].double().T for i in chosen])
+    to_centre = seen.centre - torch.stack([capture.views[i].camera.position.double() for i in chosen])
+    distance = to_centre.norm(dim=1)
+    ups, across = -rotations[:, :, 1] @ seen.up, rotations[:, :, 0] @ seen.up
+    level = ups / (ups.square() + across.square()).sqrt().clamp_min(0.3)  # cosine of the roll; straight down there is hardly one
+    fits = level >= min(LEVEL, float(level.max()))
+    fits &= distance >= min(0.999 * middle, float(distance[fits].max()))
+    score = (rotations[:, :, 2] * to_centre).sum(1) / distance.clamp_min(1e-12) * ups
+    return chosen[int(score.masked_fill(~fits, -math.inf).argmax())]
 
 
 def depth(capture: Capture, position: Tensor, direction: Tensor) -> float:

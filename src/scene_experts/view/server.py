@@ -28,7 +28,7 @@ from scene_experts.scene.frozen import Draws
 from scene_experts.types import Camera
 from scene_experts.view.paint import paint
 from scene_experts.view.panel import Panel
-from scene_experts.view.paths import around, pose, with_fov
+from scene_experts.view.paths import around, best_view, pose, with_fov
 
 log = logging.getLogger(__name__)
 
@@ -97,6 +97,7 @@ class Viewer:
         seen = around(self.capture)
         self.server.scene.set_up_direction(tuple(seen.up.tolist()))
         self.centre, self.reach = seen.centre, float((seen.positions - seen.centre).norm(dim=1).median())
+        self.first = best_view(self.capture)  # where clients begin
         self.panel = Panel(self.server, self.capture, self.current, self.touch, self.go, self.paths)
         self.server.on_client_connect(self.connect)
         self.server.on_client_disconnect(self.disconnect)
@@ -116,8 +117,7 @@ class Viewer:
         client = Client(handle)
         with self.lock:
             self.clients[handle.client_id] = client
-        first = (self.capture.test or self.capture.train)[0]
-        self.go(first, [client])
+        self.go(self.first, [client])
 
         @handle.camera.on_update
         def _(_: Any) -> None:
