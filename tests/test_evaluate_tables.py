@@ -152,3 +152,12 @@ def test_no_cell_is_cut_in_a_narrow_terminal(runs: list[Path], width: int) -> No
     straight = any(line.startswith("run ") and "PSNR" in line for line in lines)
     assert straight == (width == 200)
     assert width < 40 or max(map(len, lines)) <= max(width, len(made.notes[0]))  # prose is wrapped by the terminal
+
+
+def test_a_file_that_knows_nothing_of_its_training_has_no_figures_of_it() -> None:
+    trained = results("moe-gs", 27.0, step=4000, iterations=7000)
+    imported = results("scaffold-gs", 26.0, step=0, iterations=0, train_seconds=0.0)
+    found = tables.table(["a", "b"], [trained, imported])
+    place = [found.titles.index(title) for title in ("steps", "of", "train s")]
+    assert [found.rows[0][j] for j in place] == ["4,000", "7,000", "100"] and [found.rows[1][j] for j in place] == ["-"] * 3
+    assert not {"steps", "of", "train s"} & set(tables.table(["b"], [imported]).titles)

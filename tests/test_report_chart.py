@@ -68,3 +68,9 @@ def test_ticks_are_round():
 
 def test_bars_are_as_wide_as_the_shares():
     assert re.findall(r"width:([\d.]+)%", bars("cov", [0.5, 0.3, 0.2])) == ["50.00", "30.00", "20.00"]
+
+
+@pytest.mark.parametrize("last", [4000, 7000, 30_000, 12_500, 2_500_000])
+def test_no_label_is_cut_at_the_edge(last):
+    drawn = re.findall(r'<text x="([\d.]+)" y="\d+" text-anchor="middle">([^<]+)</text>', lines("a", [Line("a", [(0, 1.0), (last, 2.0)])]))
+    assert len(drawn) > 2 and all(float(x) + 3.6 * len(text) <= WIDTH for x, text in drawn)  # 11 px letters are at most 7 px wide

@@ -68,3 +68,11 @@ def test_a_run_without_pictures_or_results(tmp_path):
         write([tmp_path / "a"])
     with pytest.raises(InputError, match="at least one"):
         write([])
+
+
+def test_an_imported_run_claims_no_training(tmp_path):
+    folder = run(tmp_path)
+    results = json.loads((folder / "results.json").read_text())
+    write_json(folder / "results.json", {**results, "step": 0, "iterations": 0, "train_seconds": 0.0})
+    text = write([folder]).read_text()
+    assert "0 iterations" not in text and "train s" not in text and "steps" not in text

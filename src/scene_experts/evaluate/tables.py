@@ -40,12 +40,13 @@ class Column:
     digits: int = 0
     factor: float = 1.0
     best: int = 0
+    counted: bool = False  # 0 says that nobody counted: a file of another program knows nothing of its training
 
     def value(self, results: dict[str, Any]) -> float | None:
         found: Any = results
         for key in self.path:
             found = found.get(key) if isinstance(found, dict) else None
-        return None if found is None else float(found) * self.factor
+        return None if found is None or (self.counted and not found) else float(found) * self.factor
 
     def text(self, value: float | None) -> str:
         return "-" if value is None else f"{value:,.{self.digits}f}"
@@ -62,9 +63,11 @@ COLUMNS = (
     Column("active %", ("activation_ratio",), 1, 100.0),
     Column("sharpness", ("sharpness", "ratio"), 2),
     Column("FPS", ("fps", "fps"), 1, best=1),
-    Column("steps", ("step",)),
-    Column("of", ("iterations",)),  # the schedule's length: fewer steps are a training cut off early, which is not a shorter one
-    Column("train s", ("train_seconds",)),
+    Column("steps", ("step",), counted=True),
+    Column(
+        "of", ("iterations",), counted=True
+    ),  # the schedule's length: fewer steps are a training cut off early, which is not a shorter one
+    Column("train s", ("train_seconds",), counted=True),
 )
 
 

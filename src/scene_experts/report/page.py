@@ -85,7 +85,8 @@ def page(sources: Sequence[Source]) -> str:
     first = sources[0]
     title = f"{', '.join(s.name for s in sources)} on {first.results.get('capture', '?')}"
     r = first.results
-    facts = f"{r.get('view_count')} {r.get('views')} views ({r.get('split')}), {r.get('resolution')}, {r.get('step'):,} iterations"
+    steps = f", {r['step']:,} iterations" if r.get("step") else ""
+    facts = f"{r.get('view_count')} {r.get('views')} views ({r.get('split')}), {r.get('resolution')}{steps}"
     views, pictures = held_out(sources)
     parts = [
         f"<h1>{escape(title)}</h1><p class='soft'>{escape(facts)}</p>",
