@@ -64,9 +64,7 @@ COLUMNS = (
     Column("sharpness", ("sharpness", "ratio"), 2),
     Column("FPS", ("fps", "fps"), 1, best=1),
     Column("steps", ("step",), counted=True),
-    Column(
-        "of", ("iterations",), counted=True
-    ),  # the schedule's length: fewer steps are a training cut off early, which is not a shorter one
+    Column("of", ("iterations",), counted=True),  # the schedule's length: with fewer steps a training was cut off, not short
     Column("train s", ("train_seconds",), counted=True),
 )
 
