@@ -1,5 +1,6 @@
 """Explicit Gaussians through 3DGS's file and back: the same picture, in the capture's own frame."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -127,6 +128,17 @@ def test_beside_a_description_of_more_harmonics_the_file_says_the_degree(made, t
     write_standard(layout / "scene.splat", read_standard(layout / "point_cloud.ply"), "splat", {})
     opened = run_folder.open_run(import_result(layout / "scene.splat", Data(folder), tmp_path / "again"))
     assert opened.step == 90 and opened.scene.config.sh_degree == 0
+
+
+def test_the_description_beside_a_file_is_heard(made, tmp_path):
+    run, folder = made
+    to_ply(run, tmp_path / "scene.ply")
+    about = json.loads((tmp_path / "scene.ply.json").read_text())
+    (tmp_path / "scene.ply.json").write_text(json.dumps(about | {"antialias": True}))
+    assert run_folder.read_config(import_result(tmp_path / "scene.ply", Data(folder), tmp_path / "again")).train.antialias
+    export_standard(run, "ply", tmp_path / "scene.ply", None, choose("auto", "cpu"), Options(frame="trained", measure=False))
+    with pytest.raises(InputError, match="in the trained one; export it again with --frame capture"):
+        import_result(tmp_path / "scene.ply", Data(folder), tmp_path / "other")
 
 
 def test_files_that_hold_no_gaussians_are_named(made, tmp_path):

@@ -25,7 +25,7 @@ from scene_experts.export.ply import read_vertices, write_gaussian_ply
 from scene_experts.export.scaffold import SIDECAR, SIDECAR_FORMAT, iteration_folder, read_sidecar
 from scene_experts.export.splats import from_scene, to_columns
 from scene_experts.export.standard import FORMATS, format_of, read_standard
-from scene_experts.io import write_bytes, write_json
+from scene_experts.io import read_json, write_bytes, write_json
 from scene_experts.recipes import gs_3d
 from scene_experts.run_folder import OpenRun
 from scene_experts.scene.explicit import Explicit, GaussianScene
@@ -123,12 +123,29 @@ def read_columns(path: Path, world: World) -> dict[str, Tensor]:
     return to_columns(found, world)
 
 
+def _antialias(path: Path) -> bool:
+    """Whether the description that `export` writes beside a standard file says that its scene was trained with antialiasing.
+
+    Raises InputError where it says that the file is not in the capture's own frame.
+    """
+    beside = path.with_name(path.name + ".json")
+    found = read_json(beside, "description of a file") if beside.is_file() else None
+    if not isinstance(found, dict):
+        return False
+    if found.get("frame") == "trained":
+        raise InputError(
+            f"expected a file in the capture's own frame, found {path} in the trained one; export it again with --frame capture"
+        )
+    return found.get("antialias") is True
+
+
 def import_file(path: Path, data: Data, out: Path, iteration: int | None = None) -> Capture:
     """Make the run folder `out` (configuration and checkpoint) of a file of standard Gaussians, published or ours; returns its capture.
 
     The file must be in the frame and unit of the capture. A recipe that it does not say is 3DGS; an iteration that neither it nor its
-    folder's name says is 0.
+    folder's name says is 0. Raises InputError where the description beside it (FILE.json) says another frame.
     """
+    antialias = _antialias(path)
     beside = path.parent / SIDECAR
     about: dict[str, Any] = read_sidecar(beside) if beside.is_file() else {}
     capture = run_folder.load_capture(data)
@@ -142,7 +159,7 @@ def import_file(path: Path, data: Data, out: Path, iteration: int | None = None)
         if isinstance(cfg.scene, Explicit) and cfg.scene.sh_degree != degree:  # a format that keeps fewer harmonics
             cfg = replace(cfg, scene=replace(cfg.scene, sh_degree=degree))
     else:
-        cfg = replace(gs_3d, scene=Explicit(sh_degree=degree), iterations=step or gs_3d.iterations)
+        cfg = replace(gs_3d, scene=Explicit(sh_degree=degree), iterations=step or gs_3d.iterations, antialias=antialias)
     config = RunConfig(cfg, data, f"import {path.name}", versions=run_folder.versions())
     run_folder.prepare(out, config, resume=False)
     meta = {"recipe": cfg.recipe, "step": step, "seconds": 0.0, "extent": capture.extent, "config": "imported"}
