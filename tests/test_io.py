@@ -34,7 +34,7 @@ def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path):
     assert path.read_text() == "new" and names(tmp_path) == ["x"]
 
 
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), OSError("only a text")])
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), OSError(13, "Permission denied"), OSError("only a text")])
 def test_a_failed_write_is_a_run_error_and_leaves_the_old_file(tmp_path, error):
     path = tmp_path / "x"
     path.write_text("old")
@@ -43,7 +43,7 @@ def test_a_failed_write_is_a_run_error_and_leaves_the_old_file(tmp_path, error):
         temporary.write_text("half")
         raise error
 
-    advice = "free some space or choose" if error.errno == 28 else "choose another folder"
+    advice = "choose another folder" if error.errno == 13 else "free some space or choose"
     with pytest.raises(RunError, match=f"cannot write .*{error.strerror or error}; {advice}"):
         write_atomic(path, write)
     assert path.read_text() == "old" and names(tmp_path) == ["x"]

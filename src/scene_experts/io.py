@@ -41,8 +41,10 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def _unwritable(path: Path, error: OSError) -> RunError:
-    full = error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
-    return RunError(f"cannot write {path}: {error.strerror or error}; {'free some space or ' * full}choose another folder with --out")
+    place = error.errno in (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM, errno.EROFS)  # not the room in it
+    return RunError(
+        f"cannot write {path}: {error.strerror or error}; {'' if place else 'free some space or '}choose another folder with --out"
+    )
 
 
 def check_writable(path: Path) -> None:
