@@ -40,11 +40,20 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
         temporary.unlink(missing_ok=True)
 
 
+_PLACE = (
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EEXIST,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+)  # the place's fault, not its room's
+
+
 def _unwritable(path: Path, error: OSError) -> RunError:
-    place = error.errno in (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM, errno.EROFS)  # not the room in it
-    return RunError(
-        f"cannot write {path}: {error.strerror or error}; {'' if place else 'free some space or '}choose another folder with --out"
-    )
+    advice = "choose" if error.errno in _PLACE else "free some space or choose"
+    return RunError(f"cannot write {path}: {error.strerror or error}; {advice} another folder with --out")
 
 
 def check_writable(path: Path) -> None:
