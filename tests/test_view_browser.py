@@ -13,23 +13,13 @@ from PIL import Image
 
 from scene_experts.evaluate.pictures import to_8bit
 from scene_experts.view.paint import paint
-from test_view_server import DRAW, capture, viewer  # noqa: F401
+from test_view_server import DRAW, capture, serving, viewer  # noqa: F401
 
 playwright = pytest.importorskip("playwright.sync_api")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 PART = np.s_[200:500, 330:610]  # between the notification and the panel
-
-
-@pytest.fixture
-def serving(viewer):  # noqa: F811
-    stop = threading.Event()
-    thread = threading.Thread(target=viewer.serve, args=(stop.is_set,), daemon=True)
-    thread.start()
-    yield viewer
-    stop.set()
-    thread.join(10)
 
 
 @pytest.fixture
@@ -65,7 +55,7 @@ def test_the_page_shows_our_own_render_and_follows_the_controls(serving, browser
     assert np.abs(settled(page, serving)[PART].astype(int) - shot[PART]).mean() > 3
 
 
-def test_clients_come_and_go_and_nonsense_harms_nobody(serving, browser):
+def test_clients_come_and_go_and_nonsense_harms_nobody(serving, browser):  # noqa: F811
     websockets = pytest.importorskip("websockets.sync.client")
     before = threading.active_count()
     for _ in range(10):

@@ -1,5 +1,6 @@
 """The viewer without a browser: clients come, move, ask, go away, and send nonsense; in a browser it is driven in test_view_browser.py."""
 
+import threading
 import time
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -57,6 +58,16 @@ def viewer(capture):
     made = Viewer(capture, lambda: (scene, 2000), DRAW, port=0)
     yield made
     made.close()
+
+
+@pytest.fixture
+def serving(viewer):
+    stop = threading.Event()
+    thread = threading.Thread(target=viewer.serve, args=(stop.is_set,), daemon=True)
+    thread.start()
+    yield viewer
+    stop.set()
+    thread.join(10)
 
 
 def joined(viewer, number=0) -> Handle:

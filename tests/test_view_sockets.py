@@ -13,17 +13,7 @@ import viser
 from viser._messages import ViewerCameraMessage
 from websockets.sync.client import connect
 
-from test_view_server import capture, viewer  # noqa: F401
-
-
-@pytest.fixture
-def serving(viewer):  # noqa: F811
-    stop = threading.Event()
-    thread = threading.Thread(target=viewer.serve, args=(stop.is_set,), daemon=True)
-    thread.start()
-    yield viewer
-    stop.set()
-    thread.join(10)
+from test_view_server import capture, serving, viewer  # noqa: F401
 
 
 @contextmanager
@@ -54,7 +44,7 @@ def settled(viewer, seconds=20.0):  # noqa: F811
         time.sleep(0.02)
 
 
-def test_fifty_reconnects_leak_nothing(serving):
+def test_fifty_reconnects_leak_nothing(serving):  # noqa: F811
     with socket(serving) as made:
         assert picture(made)
     settled(serving)
@@ -74,7 +64,7 @@ def test_fifty_reconnects_leak_nothing(serving):
     assert serving.server.get_clients() == {}
 
 
-def test_malformed_messages_end_their_own_client_alone(serving):
+def test_malformed_messages_end_their_own_client_alone(serving):  # noqa: F811
     camera = {"type": "ViewerCameraMessage"}
     nonsense = [
         b"",
