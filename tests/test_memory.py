@@ -69,4 +69,5 @@ def test_freed_arrays_are_used_again():
     for extra, expected in (({}, "True"), ({"MALLOC_ARENA_MAX": "2"}, "False")):
         found = subprocess.run([sys.executable, "-c", script], env=plain | extra, capture_output=True, text=True, check=True).stdout.split()
         assert found[0] == expected
-        assert (int(found[1]) < 9000) == (expected == "True")  # an array is 9,766 pages
+        share = int(found[1]) / (20 * 9766)  # of the arrays' pages that were new: now and then the heap is cut short between two of them
+        assert share < 0.5 if expected == "True" else share > 0.9
