@@ -66,9 +66,7 @@ def evaluate(
     appearance: a held-out view's code is what the scene's rule says, or is found on its left half, and only its right half is scored. The
     scene is drawn on the device its parameters are on. Raises InputError where the split holds no view, RunError on a full disk.
     """
-    chosen = capture.test if views == "test" else capture.train
-    if not chosen:
-        raise InputError(f"expected at least one {views} view in {capture.name}, found none (split {capture.split}); {EMPTY[views]}")
+    chosen = _chosen(capture, views, appearance)
     began = time.perf_counter()
     tell = progress or (lambda *_: None)
     device = next(iter(scene.table.params.values())).device
@@ -78,8 +76,6 @@ def evaluate(
     names = pictures.file_names(capture.views[i].name for i in chosen)
     cameras = [capture.views[i].camera.to(device) for i in chosen]
     half = appearance == "half"
-    if half and views == "train":
-        raise InputError("expected held-out views for --appearance half, found --views train, which have codes; leave one of them out")
     if half:
         halves.fit(scene, capture, rasterize, chosen, step, background, lambda done, total: tell("finding appearance codes", done, total))
     suffix = "_half" if half else "" if views == "test" else f"_{views}"
@@ -117,6 +113,16 @@ def evaluate(
     write_json(out / f"per_view{suffix}.json", per_view)
     write_json(out / f"results{suffix}.json", results)
     return results
+
+
+def _chosen(capture: Capture, views: str, appearance: str) -> tuple[int, ...]:
+    """The views to score. Raises InputError where there is none, or where the training's views have codes already."""
+    chosen = capture.test if views == "test" else capture.train
+    if not chosen:
+        raise InputError(f"expected at least one {views} view in {capture.name}, found none (split {capture.split}); {EMPTY[views]}")
+    if appearance == "half" and views == "train":
+        raise InputError("expected held-out views for --appearance half, found --views train, which have codes; leave one of them out")
+    return chosen
 
 
 EMPTY = {
