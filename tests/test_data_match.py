@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from scene_experts.data.match import absent_error, find_mask, match_images
+from scene_experts.data.match import absent_error, find_mask, match_images, plain_name
 
 
 def touch(root: Path, *names: str) -> None:
@@ -27,6 +27,27 @@ def test_another_extension_when_there_is_one_choice(tmp_path: Path) -> None:
     match = match_images(tmp_path, ["a.JPG", "b.JPG"])
     assert match.found == {"a.JPG": tmp_path / "a.png"} and match.absent == ("b.JPG",)
     assert "1 images found under another extension (first: a.JPG -> a.png)" in match.warnings
+
+
+def test_one_photograph_is_not_two_views(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg")
+    match = match_images(tmp_path, ["a.jpg", "a.png"])
+    assert match.found == {"a.jpg": tmp_path / "a.jpg"} and match.absent == ("a.png",)
+
+
+@pytest.mark.parametrize(
+    ("name", "plain"),
+    [
+        ("left/a.1.jpg", "left/a.1.jpg"),
+        ("./images/a.png", "images/a.png"),
+        ("../../images/a.png", "images/a.png"),
+        ("/home/me/a.png", "home/me/a.png"),
+        ("images/../../a.png", "images/a.png"),
+        ("C:\\photos\\a.png", "photos/a.png"),
+    ],
+)
+def test_a_name_leads_out_of_no_folder(name: str, plain: str) -> None:
+    assert plain_name(name) == plain
 
 
 def test_flattened_folders_when_base_names_are_unique(tmp_path: Path) -> None:

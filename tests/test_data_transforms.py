@@ -63,6 +63,30 @@ def test_frames_without_a_file_are_dropped_and_counted(tmp_path: Path) -> None:
         load(tmp_path)
 
 
+@pytest.mark.parametrize("outside", ["../photos", "{}/photos"])
+def test_photographs_elsewhere_keep_their_results_inside(tmp_path: Path, outside: str) -> None:
+    """Results are written under the names of views: a name with a root or ".." would overwrite the photograph itself."""
+    make_nerfstudio(tmp_path / "c", views=3, size=(24, 16), points=50)
+    (tmp_path / "c/images").rename(tmp_path / "photos")
+    edit(
+        tmp_path / "c/transforms.json",
+        lambda m: [f.update(file_path=f["file_path"].replace("images", outside.format(tmp_path))) for f in m["frames"]],
+    )
+    capture = load(tmp_path / "c")
+    for view in capture.views:
+        assert view.path.samefile(tmp_path / "photos" / view.path.name) and view.name.endswith(f"photos/{view.path.name}")
+        assert (tmp_path / "run" / view.name).resolve().is_relative_to(tmp_path / "run")
+
+
+def test_photographs_whose_results_would_share_a_name(tmp_path: Path) -> None:
+    make_nerfstudio(tmp_path / "c", views=3, size=(24, 16), points=50)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images/view_000.png").write_bytes((tmp_path / "c/images/view_000.png").read_bytes())
+    edit(tmp_path / "c/transforms.json", lambda m: m["frames"][1].update(file_path="../images/view_000.png"))
+    with pytest.raises(InputError, match=r"two called images/view_000\.png"):
+        load(tmp_path / "c")
+
+
 def test_shared_intrinsics_and_an_angle_of_view(tmp_path: Path) -> None:
     make_nerfstudio(tmp_path, views=3, size=(48, 32), points=50, mixed_sizes=False)
     path = tmp_path / "transforms.json"

@@ -14,7 +14,7 @@ from scene_experts.data import colmap, prepare, transforms
 from scene_experts.data.found import Colour, Found, Posed
 from scene_experts.data.images import Source, check_policy, probe
 from scene_experts.data.lens import Lens, pinhole_of, without_principal_point
-from scene_experts.data.match import EXTENSIONS, absent_error, find_mask, match_images
+from scene_experts.data.match import EXTENSIONS, absent_error, find_mask, match_images, plain_name
 from scene_experts.data.store import ImageStore
 from scene_experts.data.views import Capture, Frame, View, World
 from scene_experts.errors import InputError
@@ -134,7 +134,11 @@ def _read_colmap(root: Path, images: str, missing: str) -> Found:
 def _assemble(root: Path, found: Found, centred: bool, background: Colour, cache_bytes: int | None) -> Capture:
     """The capture in its own world at the files' resolution, in float64, before any choice but the kind."""
     views, sources = [], []
-    for i, view in enumerate(sorted(found.posed, key=lambda v: v.name)):
+    posed = sorted((replace(view, name=plain_name(view.name)) for view in found.posed), key=lambda v: v.name)
+    twice = next((b for a, b in pairwise(posed) if a.name == b.name), None)
+    if twice is not None:
+        raise InputError(f"expected images in {root} that differ in their names, found two called {twice.name}; rename one of them")
+    for i, view in enumerate(posed):
         lens, turn = _fitted(view)
         if centred:
             lens = without_principal_point(lens)
@@ -143,8 +147,7 @@ def _assemble(root: Path, found: Found, centred: bool, background: Colour, cache
         camera = Camera(torch.from_numpy(view.world_to_cam), K, flat.width, flat.height, id=i)
         views.append(View(view.name, camera, view.path))
         sources.append(Source(view.path, lens, (flat.width, flat.height), view.mask, turn, found.over))
-    order = sorted(found.posed, key=lambda v: v.name)
-    train, test = (tuple(i for i, v in enumerate(order) if v.test == held) for held in (False, True))
+    train, test = (tuple(i for i, v in enumerate(posed) if v.test == held) for held in (False, True))
     store = ImageStore(sources, cache_bytes)
     name = root.resolve().name
     return Capture(

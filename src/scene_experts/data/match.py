@@ -21,30 +21,40 @@ class Match:
     warnings: tuple[str, ...]
 
 
+def plain_name(name: str) -> str:
+    """`name` as a path that stays below whatever folder it is put in: "/" between its parts, no root, drive, "." or "..".
+
+    Results are written under the names of views, and a capture may name "../photos/a.png" or a place on its maker's disk.
+    """
+    parts = name.replace("\\", "/").split("/")
+    return "/".join(part for part in parts if part not in ("", ".", "..") and not part.endswith(":"))
+
+
 def match_images(folder: Path, names: Sequence[str]) -> Match:
     """For each of `names` (relative, "/" between folders) its file in `folder`.
 
-    The exact path first; else the only file with the same stem and another extension; else the only file of that base name in `folder`,
-    when no other name shares it. Everything but an exact match is reported in `warnings`.
+    The exact path first; else the only file with the same stem and another extension; else the only file of that base name in `folder`;
+    these two when no other name shares the stem or base name. Everything but an exact match is reported in `warnings`.
     """
     files = [path for path in folder.rglob("*") if path.suffix.lower() in EXTENSIONS] if folder.is_dir() else []
     by_stem, by_base = defaultdict(list), defaultdict(list)
     for path in sorted(files):
         by_stem[path.relative_to(folder).with_suffix("").as_posix()].append(path)
         by_base[path.stem].append(path)
-    bases = defaultdict(int)
+    stems, bases = defaultdict(int), defaultdict(int)
     for name in names:
+        stems[PurePosixPath(name).with_suffix("").as_posix()] += 1
         bases[PurePosixPath(name).stem] += 1
     found, absent, other, moved = {}, [], [], []
     for name in names:
-        stem = PurePosixPath(name)
-        same_stem, same_base = by_stem[stem.with_suffix("").as_posix()], by_base[stem.stem]
+        stem, base = PurePosixPath(name).with_suffix("").as_posix(), PurePosixPath(name).stem
+        same_stem, same_base = by_stem[stem], by_base[base]
         if (folder / name).is_file():
             found[name] = folder / name
-        elif len(same_stem) == 1:
+        elif len(same_stem) == 1 and stems[stem] == 1:
             found[name] = same_stem[0]
             other.append(f"{name} -> {same_stem[0].name}")
-        elif not same_stem and len(same_base) == 1 and bases[stem.stem] == 1:
+        elif not same_stem and len(same_base) == 1 and bases[base] == 1:
             found[name] = same_base[0]
             moved.append(f"{name} -> {same_base[0].relative_to(folder).as_posix()}")
         else:
