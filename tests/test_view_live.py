@@ -4,6 +4,10 @@ import time
 from types import SimpleNamespace
 
 import pytest
+import torch
+
+from scene_experts.recipes import RECIPES
+from scene_experts.types import Camera
 
 pytest.importorskip("viser")
 from scene_experts.view.live import Live
@@ -28,5 +32,24 @@ def test_a_training_is_shown_within_its_share_and_held_while_paused(viewer, capt
         began = time.monotonic()
         live(training)
         assert time.monotonic() - began < 2
+    finally:
+        live.close()
+
+
+def test_a_coarser_level_in_the_browser_leaves_the_training_all_its_levels(capture):  # noqa: F811
+    torch.manual_seed(0)
+    scene = RECIPES["octree-gs"][1].scene.start(capture.points, capture.extent, [v.camera for v in capture.views])
+    live = Live(capture, DRAW, lambda: False, port=0, ready=lambda url: None)
+    live(SimpleNamespace(scene=scene, step=20_000))
+    assert live.viewer is not None
+    try:
+        handle = joined(live.viewer)
+        live.viewer.draw()
+        live.viewer.panel.level.value = 0  # type: ignore[union-attr]
+        live.viewer.draw()
+        whole, coarse = (picture for picture, _ in handle.pictures[-2:])
+        assert (whole != coarse).any()  # it is drawn coarser there
+        camera: Camera = capture.views[0].camera
+        assert scene.table.facts["level"][scene(camera, 20_000, True, DRAW.visible).rows].unique().numel() > 1
     finally:
         live.close()

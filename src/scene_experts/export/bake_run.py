@@ -29,7 +29,7 @@ from scene_experts.run_folder import OpenRun
 from scene_experts.scene.anchors import AnchorScene
 from scene_experts.scene.explicit import GaussianScene
 from scene_experts.scene.frozen import freeze
-from scene_experts.scene.select import LevelSelector
+from scene_experts.scene.select import LevelSelector, capped
 
 SIDECAR_FORMAT = 1
 WITHOUT_HARMONICS = ("splat",)  # formats that hold one colour a Gaussian: what is baked for them is fitted without harmonics
@@ -94,7 +94,7 @@ def export_standard(
     lines: list[str] = []
     with opened_capture(opened, needed=not is_direct(opened, options.bake)) as capture:
         for level, file in files(opened, path, options.levels):
-            with capped(opened, level):
+            with capped(opened.scene, level):
                 lines += one_file(opened, format, file, capture, rasterize, options, level, tell)
     return lines
 
@@ -138,21 +138,6 @@ def files(run: OpenRun, path: Path, levels: bool) -> list[tuple[int | None, Path
     stem, suffixes = path.name.partition(".")[::2]
     held = run.scene.table.facts["level"].unique().tolist()  # levels that growth never reached would repeat the one before
     return [(level, path.with_name(f"{stem}_level{level}.{suffixes}")) for level in range(select.lattices.count) if level in held]
-
-
-@contextmanager
-def capped(run: OpenRun, level: int | None) -> Iterator[None]:
-    """The run's scene drawing no finer level than `level` meanwhile."""
-    scene = run.scene
-    if level is None or not isinstance(scene, AnchorScene) or not isinstance(scene.select, LevelSelector):
-        yield
-        return
-    whole = scene.select
-    scene.select = whole.capped(level)
-    try:
-        yield
-    finally:
-        scene.select = whole
 
 
 def one_file(

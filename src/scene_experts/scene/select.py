@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any, Protocol
@@ -201,6 +202,20 @@ class LevelSelector:
 
     def meta(self) -> dict[str, Any]:
         return {"levels": self.lattices.meta()}
+
+
+@contextmanager
+def capped(scene: Any, level: int | None) -> Iterator[None]:
+    """`scene` (any) drawing no finer level than `level` meanwhile; as it is where `level` is None and where it has no levels."""
+    whole = getattr(scene, "select", None)
+    if level is None or not isinstance(whole, LevelSelector):
+        yield
+        return
+    scene.select = whole.capped(level)
+    try:
+        yield
+    finally:
+        scene.select = whole
 
 
 def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera: Camera, cull) -> Tensor:

@@ -133,13 +133,9 @@ class Panel:
     def photograph(self) -> float:
         return float(self.wipe.value)
 
-    def levelled(self, scene: Scene) -> Scene:
-        """The scene with the finest level that the slider allows."""
-        if self.level is None or not isinstance(scene, AnchorScene) or not isinstance(scene.select, LevelSelector):
-            return scene
-        top = scene.select.lattices.count - 1
-        scene.select = scene.select.capped(None if int(self.level.value) >= top else int(self.level.value))
-        return scene
+    def finest(self) -> int | None:
+        """The finest level to draw; None for all of them."""
+        return None if self.level is None or self.level.value >= self.level.max else int(self.level.value)
 
     # --- what is shown beside the picture
 

@@ -25,6 +25,7 @@ from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Scene
 from scene_experts.scene.frozen import Draws
+from scene_experts.scene.select import capped
 from scene_experts.types import Camera
 from scene_experts.view.paint import paint
 from scene_experts.view.panel import Panel
@@ -204,8 +205,8 @@ class Viewer:
     def picture(self, client: Client, scene: Scene, step: int, camera: Camera) -> torch.Tensor:
         """What the client is to see: the scene as the panel asks, the photograph over the left of it where it stands at a view."""
         look, background = self.panel.look(), torch.tensor(self.panel.background(), device=self.device)
-        scene = self.panel.levelled(scene)
-        picture = paint(scene, camera.to(self.device), step, self.rasterize, background, look, self.draws).cpu()
+        with capped(scene, self.panel.finest()):  # meanwhile alone: a training's own scene must go on with all its levels
+            picture = paint(scene, camera.to(self.device), step, self.rasterize, background, look, self.draws).cpu()
         part = self.panel.photograph()
         if part > 0 and client.at_view is not None:
             photo = self.photograph(client.at_view, camera)
