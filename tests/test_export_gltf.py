@@ -114,6 +114,9 @@ def test_damaged_files(tmp_path):
         (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), "do not fit"),
         (lambda d: d.update(meshes=[], extensionsUsed=[]), "no primitive with"),
         (lambda d: d.update(meshes=5), "do not fit"),
+        (lambda d: d.update(meshes=[], extensionsUsed=None), "do not fit"),
+        (lambda d: d["accessors"][2].update(type="VEC3"), "other widths"),
+        (lambda d: d["accessors"][0].update(type="VEC2"), "other widths"),
     ):
         changed = json.loads(json.dumps(doc))
         change(changed)

@@ -149,6 +149,7 @@ def test_bounds_of_tensors(tmp_path):
         {"stride": (2,)},
         {"stride": (-1, 1)},
         {"size": (1 << 40, 1 << 40), "stride": (0, 0)},
+        {"size": (0, 10**30), "stride": (1, 1)},
         {"key": "1"},
         {"key": "../0"},
         {"storage": "QInt8Storage"},
@@ -180,6 +181,27 @@ def test_damaged_and_foreign_files(tmp_path):
         read_tensors(path)
 
 
+def test_any_damaged_byte_is_an_input_error(tmp_path):
+    path = tmp_path / "n.pt"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as out:  # torch stores; others may deflate
+        out.writestr("archive/data.pkl", tensor_pickle())
+        out.writestr("archive/data/0", torch.arange(16.0).numpy().tobytes())
+    data = path.read_bytes()
+    refused = 0
+    for i in range(len(data)):
+        path.write_bytes(data[:i] + bytes([data[i] ^ 0xFF]) + data[i + 1 :])
+        try:
+            read_tensors(path)
+        except InputError:
+            refused += 1
+    assert refused > len(data) // 2  # the rest is times and flags that say nothing
+
+
+def test_a_storage_that_is_text(tmp_path):
+    with pytest.raises(InputError, match="a tensor is stored as"):
+        read_tensors(archive(tmp_path / "t.pt", tensor_pickle().replace(b"ctorch\nFloatStorage\n", b"X\x12\0\0\0torch.FloatStorage")))
+
+
 @pytest.mark.parametrize(
     "code", [b"", b".", b"\x80\x02", b"}K\x01s.", b"]}s.", b"}]K\x01s.", b"h\x05.", b"t.", b"K\x01b.", b"(K\x01d.", b"cbad.", b"\xff."]
 )
@@ -193,3 +215,11 @@ def test_a_value_that_contains_itself(tmp_path):
     loop.append(loop)
     with pytest.raises(InputError, match="nested too deeply"):
         read_tensors(archive(tmp_path / "a.pt", pickle.dumps(loop, protocol=2)))
+
+
+def test_a_hundred_bytes_that_name_a_list_a_billion_times(tmp_path):
+    deep: list = [1]
+    for _ in range(30):
+        deep = [deep, deep]
+    with pytest.raises(InputError, match="more than 1,000,000 values"):
+        read_tensors(archive(tmp_path / "a.pt", pickle.dumps(deep, protocol=2)))

@@ -79,10 +79,11 @@ def read_glb(path: Path) -> Splats:
     try:
         primitives = [p for mesh in scene.get("meshes", []) for p in mesh["primitives"] if NAME in p.get("extensions", {})]
         found = [_read_primitive(path, scene, data, p["attributes"]) for p in primitives]
+        none_meant = NAME in scene.get("extensionsUsed", [])
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         raise damaged(path, WHAT, f"Gaussians that do not fit together ({error})") from None
     if not found:
-        if NAME in scene.get("extensionsUsed", []):
+        if none_meant:
             return _splats(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3)))
         raise damaged(path, WHAT, f"no primitive with {NAME}")
     coefficients = min(part[4].shape[1] for part in found)
@@ -154,8 +155,9 @@ def _read_primitive(path: Path, scene: dict[str, Any], data: bytes, attributes: 
         get(f"{NAME}:OPACITY")[:, 0],
         np.stack([get(n) for n in names], 1),
     )
-    if len({len(part) for part in out}) != 1 or not all(np.isfinite(part).all() for part in out):
-        raise ValueError("columns of several lengths, or values that are no numbers")
+    shapes = (out[0].shape[1:], out[1].shape[1:], out[2].shape[1:], out[4].shape[2:])
+    if len({len(part) for part in out}) != 1 or shapes != ((3,), (3,), (4,), (3,)) or not all(np.isfinite(part).all() for part in out):
+        raise ValueError("columns of several lengths or other widths, or values that are no numbers")
     return out
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.errors import InputError
-from scene_experts.export.pickle_data import NotData, Outside, Record, decode
+from scene_experts.export.pickle_data import Global, NotData, Outside, Record, decode
 
 _STORAGES = {
     "FloatStorage": torch.float32, "DoubleStorage": torch.float64, "HalfStorage": torch.float16, "BFloat16Storage": torch.bfloat16,
@@ -27,6 +28,8 @@ _STORAGES = {
 }  # fmt: skip
 _RECORD_LIMIT = 1 << 30  # bytes of one record
 _DEPTH_LIMIT = 50
+_VALUE_LIMIT = 1_000_000  # values looked at; a pickle of 100 bytes can name the same list 2^30 times
+_LARGEST = 1 << 62  # of a size, a stride, an offset
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
@@ -44,7 +47,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
             reader.collect(decode(reader.record("data.pkl")), "", found, 0)
     except NotData as error:
         raise InputError(f"expected nothing but tensors in {path}, found otherwise: {error}; do not use this file, get it again") from None
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, OSError, EOFError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, NotImplementedError, OSError, EOFError, RuntimeError) as error:
         raise InputError(
             f"expected a TorchScript or torch.save archive at {path}, found another or damaged file ({error}); get it again"
         ) from None
@@ -55,7 +58,7 @@ class _Reader:
     """The records of one archive; `collect` turns the pickle's tree into tensors."""
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
-        self.archive = archive
+        self.archive, self.values = archive, 0
         pickles = [name for name in archive.namelist() if re.fullmatch(r"[^/]+/data\.pkl", name)]
         if len(pickles) != 1:
             raise NotData("no data.pkl in it")
@@ -74,8 +77,9 @@ class _Reader:
 
     def collect(self, value: Any, place: str, found: dict[str, Tensor], depth: int) -> None:
         """Put every tensor below `value` into `found`, named by the path to it."""
-        if depth > _DEPTH_LIMIT:
-            raise NotData("it is nested too deeply")
+        self.values += 1
+        if depth > _DEPTH_LIMIT or self.values > _VALUE_LIMIT:
+            raise NotData("it is nested too deeply" if depth > _DEPTH_LIMIT else f"it holds more than {_VALUE_LIMIT:,} values")
         if isinstance(value, Record):
             inner = self.content(value)
             if isinstance(inner, Tensor):
@@ -108,11 +112,12 @@ class _Reader:
         key = storage.key if isinstance(storage, Outside) else None
         if not (isinstance(key, tuple) and len(key) == 5 and key[0] == "storage" and isinstance(key[2], str)):
             raise NotData("a tensor has no storage")
-        dtype = _STORAGES.get(key[1].name) if str(key[1]).startswith("torch.") else None
+        known = isinstance(key[1], Global) and key[1].module.split(".")[0] == "torch"
+        dtype = _STORAGES.get(key[1].name) if known else None
         if dtype is None:
             raise NotData(f"a tensor is stored as {key[1]}")
         shape = (offset, *size, *stride) if isinstance(size, tuple) and isinstance(stride, tuple) and len(size) == len(stride) else (None,)
-        if not all(isinstance(n, int) and n >= 0 for n in shape):
+        if not all(isinstance(n, int) and 0 <= n < _LARGEST for n in shape):
             raise NotData("a tensor has no proper size")
         data = self.record(f"data/{key[2]}")
         last = offset + sum((n - 1) * step for n, step in zip(size, stride)) if math.prod(size) else -1
