@@ -148,6 +148,22 @@ def test_the_world_without_an_earlier_export_comes_from_the_capture(folder, tmp_
     assert world_of(opened) == wanted
 
 
+def test_another_capture_gives_no_world_and_a_catalogs_name_is_understood(folder, tmp_path, monkeypatch):
+    opened = trained("scaffold-gs", folder, tmp_path / "run")
+    for path in (tmp_path / "run" / "point_cloud").rglob("scene.json"):
+        path.unlink()  # as in a run that was interrupted
+    other = make_capture(tmp_path / "other", views=9).folder
+    for form in ("anchors", "compact"):
+        with pytest.raises(InputError, match="found other views"):
+            export_run(opened.path, form, tmp_path / form, data=other)
+    assert not (tmp_path / "anchors").exists() and not (tmp_path / "compact").exists()
+    (tmp_path / "captures" / "tandt").mkdir(parents=True)
+    (tmp_path / "captures" / "tandt" / "truck").symlink_to(folder)
+    monkeypatch.setenv("SCENE_EXPERTS_CAPTURES", str(tmp_path / "captures"))
+    lines = export_run(opened.path, "compact", tmp_path / "file", rasterize=choose("auto", "cpu"), data=Path("catalog:truck"))
+    assert "PSNR of 2 held-out views" in lines[2]
+
+
 def test_anchors_off_the_lattice_cannot_be_packed(run, tmp_path):
     packable(run)
     opened = run_folder.open_run(run.path)

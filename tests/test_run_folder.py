@@ -85,7 +85,11 @@ def test_a_capture_that_is_not_here_is_asked_for_by_its_flag(run, tmp_path, monk
     with pytest.raises(InputError, match="expected the folder of a capture"):
         run_folder.capture_of(opened, tmp_path / "nowhere")
     monkeypatch.chdir(tmp_path / "home")
-    assert run_folder.capture_of(opened).root == Path("capture")
+    found = run_folder.capture_of(opened)
+    assert found.root == Path("capture")
+    assert run_folder.capture_of(replace(opened, capture=found.fingerprint())).root == Path("capture")
+    with pytest.raises(InputError, match="trained on, found other views in capture; give the right --data"):
+        run_folder.capture_of(replace(opened, capture="of other views"))
 
 
 def test_a_checkpoint_of_another_recipe_in_the_folder(run):

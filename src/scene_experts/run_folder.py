@@ -161,15 +161,20 @@ def load_capture(data: Data, seed: int = 0) -> Capture:
 
 
 def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
-    """The capture that a run was trained on; data: where it is now, if it moved. Raises InputError, naming --data, where it is gone.
+    """The capture that a run was trained on; data: where it is now, if it moved.
 
+    Raises InputError, naming --data, where it is gone, and where there are other views (its world would be another).
     A run keeps the path as its training was given it, and a relative one is read from the current folder.
     """
     where = named(run.config.data if data is None else replace(run.config.data, path=data))
     if data is None and not where.path.exists():
         origin = "" if where.path.is_absolute() else " below the current folder"
         raise InputError(f"expected the run's capture at {where.path}{origin}, found none; say where it is with --data")
-    return load_capture(where, run.cfg.seed)
+    capture = load_capture(where, run.cfg.seed)
+    if run.capture not in ("", capture.fingerprint()):
+        capture.images.close()
+        raise InputError(f"expected the capture that {run.path} was trained on, found other views in {capture.root}; give the right --data")
+    return capture
 
 
 def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun:

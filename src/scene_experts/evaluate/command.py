@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich.console import Console
 
 from scene_experts import run_folder
-from scene_experts.errors import InputError
 from scene_experts.evaluate.run import About, evaluate
 from scene_experts.progress import Bar
 
@@ -38,8 +37,6 @@ def evaluate_run(
     if getattr(rasterize, "antialias", opened.cfg.antialias) != opened.cfg.antialias:
         rasterize = replace(rasterize, antialias=opened.cfg.antialias)  # type: ignore[type-var]
     capture = run_folder.capture_of(opened, data)
-    if opened.capture and opened.capture != capture.fingerprint():
-        raise InputError(f"expected the capture that {run} was trained on, found other views in {capture.root}; give the right --data")
     about = About(
         recipe=opened.config.train.recipe,
         iterations=opened.cfg.iterations if opened.step else 0,  # an imported file that says nothing of its training

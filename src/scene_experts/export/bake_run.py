@@ -119,10 +119,8 @@ def opened_capture(run: OpenRun, needed: bool) -> Iterator[Capture | None]:
         raise InputError(
             f"expected the run's capture at {data.path}, whose cameras this file is made with, found none; give it with --data"
         )
-    capture = run_folder.load_capture(data, run.config.train.seed)
+    capture = run_folder.capture_of(run)
     try:
-        if run.capture not in ("", capture.fingerprint()):
-            raise InputError(f"expected the capture that this run was trained on, found other views in {data.path}; give the right --data")
         yield capture
     finally:
         capture.images.close()

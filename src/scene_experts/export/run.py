@@ -102,7 +102,7 @@ def warnings_of_layout(run: OpenRun) -> list[str]:
 def _cost_line(run: OpenRun, path: Path, rasterize: Rasterizer) -> str:
     if not run.config.data.path.exists():
         return f"its capture is not at {run.config.data.path}: the cost in PSNR was not measured (--data says where it is)"
-    capture = run_folder.load_capture(run.config.data, run.config.train.seed)
+    capture = run_folder.capture_of(run)
     try:
         if not capture.test:
             return "no view is held out: the cost in PSNR was not measured"
@@ -209,10 +209,10 @@ def anchors_of(run: OpenRun) -> AnchorScene:
 
 
 def moved(run: OpenRun, data: Path | None) -> OpenRun:
-    """The run with its capture at `data`, where that is given."""
+    """The run with its capture at `data` (a folder or catalog:SCENE), where that is given."""
     if data is None:
         return run
-    return replace(run, config=replace(run.config, data=replace(run.config.data, path=data)))
+    return replace(run, config=replace(run.config, data=replace(run.config.data, path=run_folder.named(Data(data)).path)))
 
 
 def world_of(run: OpenRun) -> World:
