@@ -56,6 +56,12 @@ def test_between_keyframes_the_camera_moves_and_size_and_speed_can_be_others(tmp
     assert len(path_files.read(tmp_path / "p.json", World(), CAMERA)) == 3
 
 
+def test_the_way_back_of_a_loop_turns_the_field_of_view_back(tmp_path):
+    path_files.write(tmp_path / "p.json", path(3), World(), loop=True, play_fps=20.0)  # 50, 51, 52 degrees at 0, 0.1, 0.2 s
+    back = path_files.read(tmp_path / "p.json", World(), CAMERA)
+    assert [path_files.fov(camera) for camera in back.cameras] == pytest.approx([50, 50.5, 51, 51.5, 52, 51], abs=1e-3)
+
+
 @pytest.mark.parametrize(
     ("change", "word"),
     [
@@ -65,6 +71,10 @@ def test_between_keyframes_the_camera_moves_and_size_and_speed_can_be_others(tmp
         (lambda v: v["keyframes"][0].update(camera_to_world=[[1]]), "4 x 4"),
         (lambda v: v["keyframes"][0]["camera_to_world"][0].__setitem__(0, 7.0), "no rotation"),
         (lambda v: v["keyframes"][0].pop("time"), "time"),
+        (lambda v: v.update(fps=0), "fps: 0 is no number"),
+        (lambda v: v.update(fps=float("nan")), "fps: nan is no number"),
+        (lambda v: v.update(width=0), "0 x 48 px is no size"),
+        (lambda v: v.update(height=10**9), "px is no size"),
         (lambda v: v.pop("format"), "found something else"),
     ],
 )
@@ -86,4 +96,8 @@ def test_nerfstudios_other_cameras_are_refused(tmp_path):
     (tmp_path / "p.json").write_text(json.dumps({**value, "camera_path": []}))
     with pytest.raises(InputError, match="it is empty"):
         path_files.read(tmp_path / "p.json", World(), CAMERA)
+    for wrong, word in (({"fps": 0}, "fps: 0 is no number"), ({"render_width": -5}, "px is no size")):
+        (tmp_path / "p.json").write_text(json.dumps({**value, **wrong}))
+        with pytest.raises(InputError, match=word):
+            path_files.read(tmp_path / "p.json", World(), CAMERA)
     assert path_files.is_path_file("x.json") and not path_files.is_path_file("orbit")

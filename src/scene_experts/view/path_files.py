@@ -17,6 +17,7 @@ from scene_experts.types import Camera
 from scene_experts.view.paths import CameraPath, interpolate, with_fov
 
 FORMAT = 1
+LARGEST, FASTEST = 16384, 1000  # px of a side; frames a second
 OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # nerfstudio: y up, looking along -z
 
 
@@ -88,8 +89,8 @@ def from_keyframes(value: dict[str, Any], world: World, model: Camera, size: tup
     keys = value["keyframes"]
     if not keys:
         raise ValueError("keyframes: there are none")
-    width, height = size or (int(value["width"]), int(value["height"]))
-    rate, loop = float(fps or value["fps"]), bool(value.get("loop", False))
+    width, height = size or size_in(value["width"], value["height"])
+    rate, loop = rate_in(fps or value["fps"]), bool(value.get("loop", False))
     times = torch.tensor([float(k["time"]) for k in keys], dtype=torch.float64)
     if len(keys) > 1 and not bool((times.diff() > 0).all()):
         raise ValueError("time: it must rise from one keyframe to the next")
@@ -101,6 +102,8 @@ def from_keyframes(value: dict[str, Any], world: World, model: Camera, size: tup
     positions = world.from_input(poses[:, :3, 3])
     found = interpolate(positions, poses[:, :3, :3], frames, times, loop)
     degrees = torch.tensor([float(k["fov"]) for k in keys], dtype=torch.float64)
+    if loop:  # the way back to the first
+        times, degrees = torch.cat([times, times[:1] + span]), torch.cat([degrees, degrees[:1]])
     out = []
     for i, pose in enumerate(found):
         t = float(times[0]) + i / rate
@@ -112,7 +115,7 @@ def from_keyframes(value: dict[str, Any], world: World, model: Camera, size: tup
 def from_nerfstudio(value: dict[str, Any], world: World, model: Camera, size: tuple[int, int] | None, fps: float | None) -> CameraPath:
     if value.get("camera_type", "perspective") != "perspective":
         raise ValueError(f"camera_type: {value['camera_type']} is not drawn here, only perspective")
-    width, height = size or (int(value["render_width"]), int(value["render_height"]))
+    width, height = size or size_in(value["render_width"], value["render_height"])
     out = []
     for entry in value["camera_path"]:
         pose = proper(torch.tensor(entry["camera_to_world"], dtype=torch.float64).reshape(4, 4) @ OPENGL)
@@ -122,7 +125,23 @@ def from_nerfstudio(value: dict[str, Any], world: World, model: Camera, size: tu
         out.append(camera_of(model, to_cam, math.radians(float(entry["fov"])), width, height))
     if not out:
         raise ValueError("camera_path: it is empty")
-    return CameraPath(tuple(out), float(fps or value.get("fps", 24)))
+    return CameraPath(tuple(out), rate_in(fps or value.get("fps", 24)))
+
+
+def size_in(width: Any, height: Any) -> tuple[int, int]:
+    """A picture's size in px as a file has it. Raises ValueError for one that cannot be drawn."""
+    width, height = int(width), int(height)
+    if not (1 <= width <= LARGEST and 1 <= height <= LARGEST):
+        raise ValueError(f"width and height: {width} x {height} px is no size between 1 and {LARGEST}")
+    return width, height
+
+
+def rate_in(value: Any) -> float:
+    """Frames a second as a file has them. Raises ValueError for none."""
+    rate = float(value)
+    if not 0 < rate <= FASTEST:
+        raise ValueError(f"fps: {rate:g} is no number above 0 and up to {FASTEST}")
+    return rate
 
 
 def camera_of(model: Camera, to_cam: Tensor, angle: float, width: int, height: int) -> Camera:

@@ -134,7 +134,7 @@ def spiral(seen: Around, frames: int, turns: int = 2, reach: float = 0.5) -> lis
     forward = normalised(seen.centre - middle)
     right = normalised(torch.linalg.cross(forward, seen.up))
     up = torch.linalg.cross(right, forward)
-    offset = (seen.positions - middle).abs() if len(seen.positions) == 1 else seen.positions - middle
+    offset = seen.positions - middle
     spread = [float(torch.quantile((offset @ axis).abs(), 0.9)) for axis in (right, up, forward)]
     out = []
     for i in range(frames):
