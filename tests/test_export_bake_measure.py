@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from PIL import Image
 
 from scene_experts.data.capture import load
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.export.bake import explicit
-from scene_experts.export.bake_measure import as_trained, picture, scores
+from scene_experts.export.bake_measure import as_trained, counted, picture, scores
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from synthetic import make_capture
@@ -35,3 +36,19 @@ def test_scores_are_means_over_views_of_8_bit_pictures(tmp_path):
 def test_the_rasteriser_is_the_runs():
     draw = choose("auto", "cpu")
     assert as_trained(draw, False) is draw and as_trained(draw, True) == replace(draw, antialias=True)  # type: ignore[type-var]
+
+
+def test_views_whose_mask_counts_nothing_are_not_scored(tmp_path):
+    folder = make_capture(tmp_path, views=17, size=(24, 16), points=60).folder
+    capture = load(folder)
+    first, second = (capture.views[i] for i in capture.test[:2])
+    capture.images.close()
+    for view, value in ((first, 0), (second, 255)):
+        name = folder / "masks" / f"{view.name}.png"
+        name.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (view.camera.width, view.camera.height), value).save(name)
+    capture = load(folder)
+    assert capture.frame(capture.test[0]).mask is not None and counted(capture) == list(capture.test[1:])
+    scene = RECIPES["3dgs"][1].scene.start(capture.points, capture.extent)
+    assert scores({"a": (scene, 0)}, capture, counted(capture), choose("auto", "cpu"))["a"].first == 100
+    capture.images.close()

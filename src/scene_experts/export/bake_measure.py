@@ -15,6 +15,8 @@ from scene_experts.render import Rasterizer
 from scene_experts.scene.frozen import Draws
 from scene_experts.types import Camera
 
+NOTHING_HELD_OUT = "no view that counts is held out"
+
 
 @dataclass(frozen=True)
 class Score:
@@ -31,11 +33,16 @@ def as_trained(rasterize: Rasterizer, antialias: bool) -> Rasterizer:
     return rasterize
 
 
+def counted(capture: Capture) -> list[int]:
+    """The held-out views that can be scored: those whose mask leaves something."""
+    return [i for i in capture.test if (mask := capture.frame(i).mask) is None or bool(mask.any())]
+
+
 @torch.no_grad()
 def scores(
     scenes: Mapping[str, tuple[Draws, int]], capture: Capture, views: Sequence[int], rasterize: Rasterizer, tell: Tell | None = None
 ) -> dict[str, Score]:
-    """The score of each scene, drawn at its step, over `views` (at least one) of the capture."""
+    """The score of each scene, drawn at its step, over `views` (at least one, of `counted`) of the capture."""
     background = torch.tensor(capture.background)
     totals = {name: [0.0, 0.0] for name in scenes}
     for i, index in enumerate(views):

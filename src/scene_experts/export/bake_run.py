@@ -15,7 +15,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.data.views import World
 from scene_experts.errors import InputError
 from scene_experts.export.bake import Bake, bake, explicit
-from scene_experts.export.bake_measure import as_trained, scores
+from scene_experts.export.bake_measure import NOTHING_HELD_OUT, as_trained, counted, scores
 from scene_experts.export.bake_refine import DRAWN_AT
 from scene_experts.export.bake_sums import Tell
 from scene_experts.export.html_page import capture_notes
@@ -154,11 +154,12 @@ def one_file(
     count = f"{len(made.splats):,} Gaussians, {size / 1e6:.2f} MB, harmonics of degree {made.splats.degree}, in {frame}"
     lines = [f"wrote {path}", count + ("" if is_direct(run, options.bake) else f"; baked in {clock(seconds)}")]
     measured: dict[str, Any] = {}
-    if options.measure and capture is not None and capture.test:
-        measured, line = measure(run, made, path, world, capture, rasterize, options.bake.refine.iterations > 0, tell)
+    views = counted(capture) if options.measure and capture is not None else []
+    if views and capture is not None:
+        measured, line = measure(run, made, path, world, capture, views, rasterize, options.bake.refine.iterations > 0, tell)
         lines.append(line)
     elif options.measure:
-        absent = "the capture is gone" if capture is None else "no view is held out"
+        absent = "the capture is gone" if capture is None else NOTHING_HELD_OUT
         lines.append(f"{absent}: what the file costs in PSNR was not measured")
     write_json(
         path.with_name(path.name + ".json"),
@@ -178,23 +179,31 @@ def gaussians(run: OpenRun, capture: Capture | None, world: World, rasterize: Ra
 
 
 def measure(
-    run: OpenRun, made: Made, path: Path, world: World, capture: Capture, rasterize: Rasterizer, refined: bool, tell: Tell
+    run: OpenRun,
+    made: Made,
+    path: Path,
+    world: World,
+    capture: Capture,
+    views: list[int],
+    rasterize: Rasterizer,
+    refined: bool,
+    tell: Tell,
 ) -> tuple[dict[str, Any], str]:
-    """PSNR of the held-out views from the run, the closed form, the bake and the file as it is read again; and the line that says it."""
+    """PSNR of the held-out `views` from the run, the closed form, the bake and the file as it is read again; and the line that says it."""
     scenes: dict[str, Any] = {"run": (freeze(run.scene, run.step), run.step)}
     if made.closed_form is not None:
         scenes |= {"closed_form": (made.closed_form, DRAWN_AT)} if refined else {}
         scenes["bake"] = (scene_of(made.splats, world, run.scene.extent), DRAWN_AT)
     scenes["file"] = (scene_of(read_standard(path), world, run.scene.extent), DRAWN_AT)
-    found = scores(scenes, capture, capture.test, rasterize, tell)
+    found = scores(scenes, capture, views, rasterize, tell)
     before, after = found["run"].photographs, found["file"].photographs
     words = {"closed_form": "means over the views", "bake": "refined" if refined else "means over the views"}
     middle = "".join(f"{words[name]} {found[name].photographs:.3f}, " for name in words if name in found)
-    line = f"PSNR of {len(capture.test)} held-out views: run {before:.3f} dB, {middle}this file {after:.3f} dB ({after - before:+.3f})"
+    line = f"PSNR of {len(views)} held-out views: run {before:.3f} dB, {middle}this file {after:.3f} dB ({after - before:+.3f})"
     if made.closed_form is not None:
         line += f"; its pictures against the run's {found['file'].first:.2f} dB"
     plain: dict[str, Any] = {name: {"photographs": round(s.photographs, 6), "run": round(s.first, 6)} for name, s in found.items()}
-    return plain | {"views": len(capture.test)}, line
+    return plain | {"views": len(views)}, line
 
 
 def scene_of(splats: Splats, world: World, extent: float) -> GaussianScene:

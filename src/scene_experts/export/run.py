@@ -14,7 +14,7 @@ from scene_experts.config import Data, to_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
 from scene_experts.export import explicit, graph_points, graph_points_in
-from scene_experts.export.bake_measure import as_trained, scores
+from scene_experts.export.bake_measure import NOTHING_HELD_OUT, as_trained, counted, scores
 from scene_experts.export.cameras import write_cameras
 from scene_experts.export.compact import Compact, Sizes, read_compact, write_compact
 from scene_experts.export.extras import extra_networks, level_columns
@@ -104,19 +104,20 @@ def _cost_line(run: OpenRun, path: Path, rasterize: Rasterizer) -> str:
         return f"its capture is not at {run.config.data.path}: the cost in PSNR was not measured (--data says where it is)"
     capture = run_folder.capture_of(run)
     try:
-        if not capture.test:
-            return "no view is held out: the cost in PSNR was not measured"
+        views = len(counted(capture))
+        if not views:
+            return f"{NOTHING_HELD_OUT}: the cost in PSNR was not measured"
         before, after = psnr_cost(run, capture, path, rasterize)
     finally:
         capture.images.close()
-    return f"PSNR of {len(capture.test)} held-out views {before:.3f} dB, from this file {after:.3f} dB ({after - before:+.3f})"
+    return f"PSNR of {views} held-out views {before:.3f} dB, from this file {after:.3f} dB ({after - before:+.3f})"
 
 
 def psnr_cost(run: OpenRun, capture: Capture, path: Path, rasterize: Rasterizer) -> tuple[float, float]:
     """Mean PSNR (dB, 8-bit pictures) of the held-out views drawn from the run and from its compact file."""
     again = scene_of_compact(run, read_compact(path), capture.world)
     scenes = {"run": (freeze(run.scene, run.step), run.step), "file": (freeze(again, run.step), run.step)}
-    found = scores(scenes, capture, capture.test, as_trained(rasterize, run.cfg.antialias))
+    found = scores(scenes, capture, counted(capture), as_trained(rasterize, run.cfg.antialias))
     return found["run"].photographs, found["file"].photographs
 
 
