@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from scene_experts.errors import InputError
 from scene_experts.geometry.voxel import coarsen
 from scene_experts.scene.anchors import Anchors, AnchorScene
 from scene_experts.schedule import Every
@@ -97,10 +98,22 @@ def make_like(scene: AnchorScene) -> AnchorScene:
 
 
 def test_parity_quirk_skips_finer_levels_when_the_coarsest_added_nothing():
-    coarse_full = make()
-    coarse_full.table.params["log_scaling"].data.fill_(-20.0)  # every point stays in its anchor's own coarse and fine cell
-    rule = GrowAnchors(elimination=False, parity_level_skip=True)
-    assert rule.grow(coarse_full, torch.Generator())[0] == 0
+    for skip, cells in ((True, []), (False, [4, 8, 2, 6])):
+        scene = make()
+        scene.table.keep(torch.arange(len(scene.table)) == 0)
+        scene.table.facts = {"cell": torch.zeros(1, 3, dtype=torch.int64), "xyz": torch.zeros(1, 3)}
+        scene.table.stats["count"].fill_(50)
+        scene.table.stats["grad"].fill_(50 * 1e-2)
+        steps = torch.tensor([[2.0, 0, 0], [6, 0, 0], [0, 0, 0], [0, 0, 0]])  # fine cells from its own, in its coarse cell all of them
+        scene.table.params["offsets"].data[0] = steps * VOXEL / 0.4
+        assert GrowAnchors(elimination=False, parity_level_skip=skip).grow(scene, torch.Generator())[0] == len(cells)
+        assert scene.table.facts["cell"][:, 0].tolist() == [0, *cells]
+
+
+def test_impossible_numbers_are_refused():
+    for wrong, flag in (({"hierarchy_factor": 1}, "hierarchy-factor"), ({"init_factor": 0}, "init-factor"), ({"levels": 0}, "levels")):
+        with pytest.raises(InputError, match=rf"--growth\.{flag}"):
+            GrowAnchors(**wrong).check()
 
 
 def test_cap_holds_and_prefers_large_gradients():

@@ -33,7 +33,8 @@ class GrowAnchors(AnchorControl):
     def check(self) -> None:
         """Raises InputError for numbers that no training can have."""
         super().check()
-        expect_at_least([("--growth.hierarchy-factor", self.hierarchy_factor, 2)])
+        expect_at_least([("--growth.hierarchy-factor", self.hierarchy_factor, 2), ("--growth.init-factor", self.init_factor, 1)])
+        expect_at_least([("--growth.levels", self.levels, 1)])
 
     def cell_factors(self) -> list[int]:
         """Cell edges of the levels in fine voxels, coarse to fine (16, 4, 1); levels whose factor would be 0 do not exist."""
