@@ -152,9 +152,22 @@ def test_newborn_anchors_have_the_facts_and_checkpoints_the_levels():
 
 def test_impossible_numbers_are_refused():
     Octree().check()
-    for wrong in ({"fork": 1}, {"count": -1}, {"dist_ratio": 0.5}, {"visible_threshold": 1.0}, {"coarse_factor": 0.0}, {"extend": 0.9}):
-        with pytest.raises(InputError, match=r"--scene\.select"):
-            Octree(**wrong).check()
+    impossible = {
+        "fork": 1,
+        "count": -1,
+        "dist_ratio": 0.5,
+        "visible_threshold": 1.0,
+        "coarseness": 0.0,
+        "coarse_factor": 0.0,
+        "extend": 0.9,
+    }
+    for name, value in impossible.items():
+        with pytest.raises(InputError, match=rf"--scene\.select\.{name.replace('_', '-')} .*found {value}"):
+            Octree(**{name: value}).check()
+    assert start(base_layer=19)[2].lattices.count == 1
+    for layer in (20, 1000):
+        with pytest.raises(InputError, match=rf"found 2\^{layer}; lower --scene\.select\.base-layer"):
+            start(base_layer=layer)
     points = Points(torch.rand(9, 3, dtype=torch.float64), torch.zeros(9, 3, dtype=torch.uint8))
     with pytest.raises(InputError, match="training cameras"):
         RECIPES["octree-gs"][1].scene.start(points, 5.0)

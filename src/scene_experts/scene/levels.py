@@ -17,6 +17,7 @@ from scene_experts.types import Camera
 
 log = logging.getLogger(__name__)
 LevelRule = Literal["round", "floor", "ceil", "blend"]
+MOST_CELLS = AXIS_LIMIT - 1  # of an axis of the cube, at any level
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ def cube(points: Tensor, extend: float, parity: bool = False) -> tuple[float, fl
 def within_reach(count: int, edge: float, cube_edge: float, fork: int) -> int:
     """At most so many levels that the finest one's cell numbers still fit."""
     most = count
-    while most > 1 and cube_edge / (edge / fork ** (most - 1)) >= AXIS_LIMIT - 1:
+    while most > 1 and cube_edge / (edge / fork ** (most - 1)) >= MOST_CELLS:
         most -= 1
     if most < count:
         log.warning("%d levels of detail instead of %d: finer cells than that cannot be told apart", most, count)

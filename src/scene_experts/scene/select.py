@@ -114,7 +114,8 @@ class Octree:
         return facts, levels.size(levels.count - 1), LevelSelector(self, levels)
 
     def levels(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> Levels:
-        """The lattices for points [P, 3] and training cameras. Raises InputError where there is no camera."""
+        """The lattices for points [P, 3] and training cameras. Raises InputError where there is no
+        camera, and for more cells than can be told apart."""
         if not cameras:
             raise InputError("expected training cameras to choose levels of detail from, found none; choose another --split")
         far, near = lattices.distances(points, cameras, self.dist_ratio)
@@ -123,6 +124,12 @@ class Octree:
         layer = self.base_layer
         if layer < 0:
             layer = round(math.log(cube / (self.coarseness * voxel), self.fork)) - count // 2 + 1
+        finest = math.floor(math.log(lattices.MOST_CELLS, self.fork))
+        if layer > finest:
+            raise InputError(
+                f"expected at most {self.fork}^{finest} cells an axis at level 0, found {self.fork}^{layer}; "
+                "lower --scene.select.base-layer, or where it adapts itself, remove points far from all others"
+            )
         edge = cube / float(self.fork) ** layer
         count = lattices.within_reach(count, edge, cube, self.fork)
         first = min(count // 2 if self.first < 0 else self.first, count - 1)
@@ -148,11 +155,15 @@ class Octree:
             [("--scene.select.fork", self.fork, 2), ("--scene.select.count", self.count, 0), ("--scene.select.first", self.first, -1)]
         )
         expect_at_least([("--scene.select.coarse-until", self.coarse_until, 0), ("--scene.select.extend", self.extend, 1)])
-        if not (0.5 < self.dist_ratio <= 1 and self.visible_threshold < 1 and self.coarseness > 0 and self.coarse_factor > 0):
-            raise InputError(
-                "expected --scene.select.dist-ratio above 0.5 and at most 1, visible-threshold below 1, coarseness and coarse-factor "
-                "above 0, found others; correct the flag"
-            )
+        bounds = [
+            ("dist-ratio", self.dist_ratio, 0.5 < self.dist_ratio <= 1, "above 0.5 and at most 1"),
+            ("visible-threshold", self.visible_threshold, self.visible_threshold < 1, "below 1"),
+            ("coarseness", self.coarseness, self.coarseness > 0, "above 0"),
+            ("coarse-factor", self.coarse_factor, self.coarse_factor > 0, "above 0"),
+        ]
+        for name, value, possible, wanted in bounds:
+            if not possible:
+                raise InputError(f"expected --scene.select.{name} {wanted}, found {value}; correct it or leave it out")
 
 
 @dataclass(frozen=True)
