@@ -88,9 +88,10 @@ def test_gradient_of_the_table_by_finite_differences():
 
 def test_no_places_and_sizes_that_cannot_be():
     assert built()(places(0)).shape == (0, 15)
-    with pytest.raises(InputError, match="grid"):
-        HashGrid(levels=0).check()
-    assert built().meta() == {"low": [-1.0, 0.0, 2.0], "edge": 4.0}
+    HashGrid().check()
+    for wrong, flag in (({"levels": 0}, "levels"), ({"log2_table": 0}, "log2-table"), ({"log2_table": 60}, "log2-table")):
+        with pytest.raises(InputError, match=rf"--scene\.grid\.{flag} of at"):
+            HashGrid(**wrong).check()
 
 
 @pytest.mark.skipif(hash_grid._library() is None, reason="needs the compiled library")

@@ -16,10 +16,11 @@ import torch
 from torch import Tensor, nn
 
 from scene_experts import native
-from scene_experts.errors import expect_at_least
+from scene_experts.errors import InputError, expect_at_least
 
 PRIMES = (1, 2_654_435_761, 805_459_861)  # eq. 4 of the paper
 INITIAL = 1e-4  # features start uniform in +-INITIAL
+LARGEST = 24  # 2^24 rows a level, the most that the paper tries
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,10 @@ class HashGrid:
 
     def check(self) -> None:
         """Raises InputError for sizes that no grid can have."""
-        expect_at_least(
-            [(f"--scene.grid.{name}", getattr(self, name), 1) for name in ("levels", "features", "log2_table", "base", "growth")]
-        )
+        names = ("levels", "features", "log2_table", "base", "growth")
+        expect_at_least([(f"--scene.grid.{name.replace('_', '-')}", getattr(self, name), 1) for name in names])
+        if self.log2_table > LARGEST:
+            raise InputError(f"expected --scene.grid.log2-table of at most {LARGEST}, found {self.log2_table}; give a smaller number")
 
     def resolutions(self) -> list[int]:
         """Cells an axis of every level."""
@@ -68,9 +70,6 @@ class Grid(nn.Module):
         super().__init__()
         self.config, self.low, self.edge = config, low, edge
         self.table = nn.Parameter(torch.empty(sum(config.rows()), config.features).uniform_(-INITIAL, INITIAL))
-
-    def meta(self) -> dict[str, Any]:
-        return {"low": list(self.low), "edge": self.edge}
 
     def unit(self, xyz: Tensor) -> Tensor:
         """World places [A, 3] in the grid's own coordinates: in [0, 1] within the cube, clamped to it outside."""
