@@ -11,6 +11,7 @@ from scene_experts.errors import InputError
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors import ATTRIBUTES, Anchors, AnchorScene, Rates, voxel_size
 from scene_experts.scene.experts import Experts, Router
+from scene_experts.scene.mix import FeatureBank
 from scene_experts.types import Camera, Points
 
 EVERYTHING = lambda means, scales, camera: torch.ones(len(means), dtype=torch.bool)  # noqa: E731
@@ -149,8 +150,17 @@ def test_rates_by_group():
 def test_switches_the_native_decode_does_not_cover_fall_back_or_are_refused():
     odd = Anchors(decoder=Experts(router=Router(detach_feature=True)))
     assert scene(odd, n=4).native_weights(1) is None
-    with pytest.raises(InputError, match=r"--scene\.decode auto"):
-        scene(replace(odd, quat_align=True, decode="native"), n=4).native_weights(1)
+    if native.load() is None:
+        pytest.skip("no compiled library")
+    for uncovered, named in (
+        (Anchors(quat_align=True), "quat-align"),
+        (Anchors(mix=FeatureBank()), "a feature bank"),
+        (odd, "opacity head"),
+    ):
+        with pytest.raises(InputError, match=rf"{named}.*--scene\.decode auto"):
+            scene(replace(uncovered, decode="native"), n=4).native_weights(1)
+    with pytest.raises(InputError, match=r"torch\.float64"):
+        scene(Anchors(decode="native"), n=4).double().native_weights(1)
 
 
 def test_new_rows_have_the_columns_of_the_table():

@@ -18,7 +18,7 @@ def test_equals_a_torch_sequential(attribute):
     assert routing is None and mlp.routing(x[:, :32], 1) is None
 
 
-def test_depth_adds_square_layers_that_kernels_do_not_cover():
+def test_depth_adds_square_layers():
     deep = Plain(depth=5).build("color", 35, 32, 30, 32)
     assert len(deep.middle) == 3 and deep.weights(1).middle_w.shape[:2] == (1, 3)
     assert sum(p.numel() for p in deep.parameters()) == 2142 + 3 * (32 * 32 + 32)

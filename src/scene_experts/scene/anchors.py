@@ -174,11 +174,11 @@ class AnchorScene(nn.Module):
     def native_weights(self, step: int) -> dict[str, HeadWeights] | None:
         """The heads' tensors for the fused decode (compiled on the CPU, Triton on CUDA), or None where it does not apply."""
         feature = self.table.params["feature"]
-        absent = no_kernels(feature.device)
-        fits = absent is None and feature.dtype == torch.float32 and not self.config.quat_align and self.mix is None
-        if self.config.decode == "composed" or not fits:
+        why = no_kernels(feature.device)
+        why = why or ("--scene.quat-align" if self.config.quat_align else "a feature bank" if self.mix is not None else None)
+        why = why or (f"tensors of {feature.dtype}" if feature.dtype != torch.float32 else None)
+        if self.config.decode == "composed" or why:
             if self.config.decode == "native":
-                why = absent or "a device, dtype or switch it has no code for"
                 raise InputError(f"expected a scene that the native decode covers, found {why}; use --scene.decode auto")
             return None
         weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
