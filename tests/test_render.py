@@ -21,6 +21,13 @@ def test_auto_without_a_library_warns_once_and_takes_the_reference(monkeypatch):
     render._warn.cache_clear()
 
 
+def test_auto_on_a_device_without_a_fast_one_takes_the_reference():
+    render._warn.cache_clear()
+    with pytest.warns(UserWarning, match="slow reference rasteriser"):
+        assert choose("auto", "meta").name == "reference"
+    render._warn.cache_clear()
+
+
 @pytest.mark.parametrize(
     ("name", "device", "said"),
     [

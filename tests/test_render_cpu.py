@@ -10,7 +10,7 @@ from torch import Tensor
 
 from scene_experts import native
 from scene_experts.errors import InputError
-from scene_experts.render import Rasterizer, choose
+from scene_experts.render import Rasterizer
 from scene_experts.render.cpu import CpuRasterizer
 from scene_experts.render.reference import ReferenceRasterizer
 from scene_experts.types import Camera, Gaussians, Render
@@ -243,17 +243,3 @@ def test_wrong_shapes_are_refused() -> None:
     inputs, camera = make(m=10)
     with pytest.raises(InputError, match="quats of shape"):
         CpuRasterizer()(Gaussians(inputs[0], inputs[1][:5], *inputs[2:], torch.arange(10)), camera, BACKGROUND)
-
-
-def test_choose() -> None:
-    assert choose("auto", "cpu").name == "cpu" and choose("reference", "cpu").name == "reference"
-    with pytest.raises(InputError, match="choose one of"):
-        choose("opengl", "cpu")
-    with pytest.raises(InputError, match="CUDA"):
-        choose("gsplat", "cpu")
-
-
-def test_auto_falls_back_with_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(native, "load", lambda level=None: None)
-    with pytest.warns(UserWarning, match="slow reference rasteriser"):
-        assert choose("auto", "cpu").name == "reference"

@@ -75,6 +75,8 @@ def _best(device: torch.device) -> str:
         if reason is None:
             return "gsplat"
         _warn(reason)
+    elif device.type != "cpu":
+        _warn(f"no other one draws tensors on {device}")
     elif native.load() is not None:
         return "cpu"
     else:
