@@ -224,6 +224,14 @@ def test_losses_that_are_no_numbers_end_the_run_and_keep_its_checkpoint(folder, 
     with pytest.raises(RunError, match="expected finite losses, found l1 = nan at iteration 9"):
         list(events(config(), folder, tmp_path, stop_at=60, log_every=1, resume=True))
     same(before, final(tmp_path))
+    with pytest.raises(RunError, match="at iteration 11"):  # not a moment to tell of it, but one to save
+        list(events(config(), folder, tmp_path, stop_at=60, log_every=20, save_every=11, resume=True))
+    same(before, final(tmp_path))
+    with pytest.raises(RunError, match="at iteration 10"):  # stopped
+        stop: list[str] = []
+        for event in events(config(), folder, tmp_path, stop_at=60, log_every=20, preview_every=10, stop=stop, resume=True):
+            stop += ["SIGTERM"] if isinstance(event, Previewed) else []
+    same(before, final(tmp_path))
 
 
 def test_more_anchors_than_the_cap_to_start_with_is_said(folder):

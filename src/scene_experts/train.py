@@ -69,26 +69,27 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     training.capture = capture.fingerprint()
     total = min(cfg.iterations, run.config.stop_at or cfg.iterations)
     yield Started(training.step, total, len(training.scene.table), training.scene.meta().get("voxel", 0.0))
-    saved = training.step
+    saved, parts = training.step, {}
     while training.step < total and not run.stop:
         began = time.perf_counter()
         done = iterate(training, run, capture, rasterize)
         training.seconds += time.perf_counter() - began
-        step = training.step
+        step, parts = training.step, done.terms
         if done.edit is not None:
             yield Adjusted(step, done.edit)
         if step % run.log_every == 0 or step == total:
-            seen = stepped(training, done)
-            check_finite(seen)
-            yield seen
+            check_finite(step, parts)
+            yield stepped(training, done)
         if run.preview_every and (step % run.preview_every == 0 or step == total):
             yield preview(training, run, capture, rasterize)
         if folder and (step % run.save_every == 0 or step == total):
+            check_finite(step, parts)
             yield Saved(step, save(training, folder, run.keep))
             saved = step
         del done  # before the next frame needs its memory
         run.watch(training)
     if folder and saved != training.step:
+        check_finite(training.step, parts)
         yield Saved(training.step, save(training, folder, run.keep))
     if run.stop and training.step < total:
         yield Stopped(training.step, run.stop[0])
@@ -150,12 +151,12 @@ def without_graph(value: Any) -> Any:
     return value
 
 
-def check_finite(event: Stepped) -> None:
+def check_finite(step: int, parts: dict[str, Tensor]) -> None:
     """Raises RunError when the losses are no longer numbers: nothing is saved over the last good checkpoint."""
-    bad = [name for name, value in event.terms.items() if not math.isfinite(value)]
+    bad = [name for name, value in parts.items() if not math.isfinite(value)]
     if bad:
         raise RunError(
-            f"expected finite losses, found {', '.join(bad)} = {event.terms[bad[0]]} at iteration {event.step}; "
+            f"expected finite losses, found {', '.join(bad)} = {float(parts[bad[0]])} at iteration {step}; "
             "the last checkpoint is intact: look at the capture with `scene-experts info`, or lower the learning rates (--rates...)"
         )
 
