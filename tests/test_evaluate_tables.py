@@ -84,6 +84,7 @@ def test_terminal(runs: list[Path]) -> None:
         ("resolution", "cap1600", "--resolution"),
         ("split", "first:31", "--split"),
         ("view_count", 8, "--max-views"),
+        ("appearance", "half", "found rule in scaffold-gs and half in moe-gs.*--appearance"),
     ],
 )
 def test_refuses_other_protocols(runs: list[Path], key: str, value: Any, option: str) -> None:
@@ -107,6 +108,11 @@ def test_equal_recipes_are_told_apart_by_folder(runs: list[Path]) -> None:
     (runs[1] / "results.json").write_text(json.dumps(results("scaffold-gs", 27.0)))
     text = printed(runs, "markdown")
     assert "| a (scaffold-gs) |" in text and "| b (scaffold-gs) |" in text
+    again = runs[0] / "deeper" / "a"
+    again.mkdir(parents=True)
+    (again / "results.json").write_text(json.dumps(results("scaffold-gs", 26.0)))
+    text = printed([runs[0], again], "markdown")
+    assert f"| {runs[0]} (scaffold-gs) |" in text and f"| {again} (scaffold-gs) |" in text
 
 
 def test_beside_the_paper(runs: list[Path]) -> None:

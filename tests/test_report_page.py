@@ -56,9 +56,20 @@ def test_several_runs_stand_beside_each_other(tmp_path):
     text = write(runs, tmp_path / "both.html").read_text()
     assert "moe-gs, scaffold-gs on fox" in text and text.count("<option value='0.1'") == 2
     same = write([tmp_path / "a", run(tmp_path / "c")], tmp_path / "same.html").read_text()
-    assert "moe-gs (a)" in same and "moe-gs (c)" in same
+    assert "a (moe-gs)" in same and "c (moe-gs)" in same
     with pytest.raises(InputError, match="--out"):
         write(runs)
+
+
+def test_runs_that_were_not_scored_alike_are_no_rivals(tmp_path):
+    runs = [run(tmp_path / "a"), run(tmp_path / "b", "scaffold-gs")]
+    alike = write(runs, tmp_path / "alike.html").read_text()
+    assert "class=best" in alike and "Do not compare" not in alike
+    results = json.loads((runs[1] / "results.json").read_text())
+    write_json(runs[1] / "results.json", {**results, "capture": "kitchen"})
+    text = write(runs, tmp_path / "other.html").read_text()
+    assert "moe-gs, scaffold-gs on fox, kitchen" in text and "class=best" not in text
+    assert "Do not compare these scores:</b> expected the same capture, found fox in moe-gs and kitchen in scaffold-gs." in text
 
 
 def test_a_run_without_pictures_or_results(tmp_path):

@@ -27,8 +27,10 @@ PROTOCOL = {  # what must be equal before scores may be compared: key in results
     "split": ("split", "--split"),
     "views": ("views", "--views"),
     "view_count": ("number of views", "--max-views"),
+    "appearance": ("appearance codes", "--appearance"),
     "masked": ("use of masks", "--data"),
 }
+UNSAID = {"appearance": "rule"}  # what a results file without the key means
 
 
 @dataclass(frozen=True)
@@ -92,15 +94,23 @@ def load_results(run: Path, views: str = "test") -> dict[str, Any]:
     return results
 
 
-def check_protocol(names: Sequence[str], results: Sequence[dict[str, Any]]) -> None:
-    """Raises InputError naming the first difference in what was scored: resolution alone moves PSNR by up to half a dB."""
+def unlike(names: Sequence[str], results: Sequence[dict[str, Any]]) -> tuple[str, str] | None:
+    """The first difference in what was scored, in words, and the option that sets it; None where scores may be compared."""
     for name, other in zip(names[1:], results[1:]):
         for key, (what, option) in PROTOCOL.items():
-            if other.get(key) != results[0].get(key):
-                raise InputError(
-                    f"expected runs with the same {what}, found {results[0].get(key)} in {names[0]} and {other.get(key)} in {name}; "
-                    f"repeat one with the other's {option}, or add --mixed to see them beside each other all the same"
-                )
+            ours, theirs = (r.get(key, UNSAID.get(key)) for r in (results[0], other))
+            if ours != theirs:
+                return f"the same {what}, found {ours} in {names[0]} and {theirs} in {name}", option
+    return None
+
+
+def check_protocol(names: Sequence[str], results: Sequence[dict[str, Any]]) -> None:
+    """Raises InputError naming the first difference in what was scored: resolution alone moves PSNR by up to half a dB."""
+    if found := unlike(names, results):
+        raise InputError(
+            f"expected runs with {found[0]}; repeat one with the other's {found[1]}, "
+            f"or add --mixed to see them beside each other all the same"
+        )
 
 
 def table(names: Sequence[str], results: Sequence[dict[str, Any]], columns: Sequence[Column] = COLUMNS) -> Table:
@@ -168,11 +178,16 @@ def _width(table: Table) -> int:
 
 
 def row_names(runs: Sequence[Path], results: Sequence[dict[str, Any]]) -> list[str]:
-    """The recipe where it tells the runs apart, else the run folder's name with it."""
-    recipes = [str(result.get("recipe") or run.name) for run, result in zip(runs, results)]
-    if len(set(recipes)) == len(recipes):
-        return recipes
-    return [f"{run.name} ({recipe})" for run, recipe in zip(runs, recipes)]
+    """Names by which a reader tells runs apart (`told_apart`), the recipes taken from their results."""
+    return told_apart(runs, [str(result.get("recipe") or run.name) for run, result in zip(runs, results)])
+
+
+def told_apart(runs: Sequence[Path], recipes: Sequence[str]) -> list[str]:
+    """The recipe where it tells the runs apart, else the run folder's name with it, or the whole path where those are equal too."""
+    for names in (list(recipes), [f"{run.resolve().name} ({recipe})" for run, recipe in zip(runs, recipes)]):
+        if len(set(names)) == len(names):
+            return names
+    return [f"{run} ({recipe})" for run, recipe in zip(runs, recipes)]
 
 
 def compare_runs(runs: Sequence[Path], format: Format, mixed: bool, console: Console, paper: str | None = None) -> Table:

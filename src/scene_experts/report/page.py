@@ -6,7 +6,7 @@ import base64
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +18,7 @@ from PIL import Image
 from scene_experts import run_folder
 from scene_experts.config import RunConfig, to_json
 from scene_experts.errors import InputError
-from scene_experts.evaluate.tables import Table, load_results, table
+from scene_experts.evaluate.tables import Table, load_results, table, told_apart, unlike
 from scene_experts.io import read_json, write_bytes
 from scene_experts.report import chart
 from scene_experts.report.chart import Line
@@ -61,11 +61,9 @@ def source(run: Path) -> Source:
 
 
 def named(sources: list[Source]) -> list[Source]:
-    """Names that tell the runs apart: the recipe, with the folder's name where recipes repeat."""
-    names = [s.name for s in sources]
-    if len(set(names)) == len(names):
-        return sources
-    return [Source(f"{s.name} ({s.path.resolve().name})", s.path, s.config, s.results, s.per_view, s.metrics) for s in sources]
+    """With names that tell the runs apart."""
+    names = told_apart([s.path for s in sources], [s.name for s in sources])
+    return [replace(s, name=name) for s, name in zip(sources, names)]
 
 
 def metrics(path: Path) -> list[dict[str, Any]]:
@@ -82,15 +80,16 @@ def metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def page(sources: Sequence[Source]) -> str:
-    first = sources[0]
-    title = f"{', '.join(s.name for s in sources)} on {first.results.get('capture', '?')}"
-    r = first.results
+    r, names, results = sources[0].results, [s.name for s in sources], [s.results for s in sources]
+    title = f"{', '.join(names)} on {', '.join(dict.fromkeys(str(r.get('capture', '?')) for r in results))}"
     steps = f", {r['step']:,} iterations" if r.get("step") else ""
     facts = f"{r.get('view_count')} {r.get('views')} views ({r.get('split')}), {r.get('resolution')}{steps}"
     views, pictures = held_out(sources)
+    scores, other = table(names, results), unlike(names, results)
     parts = [
         f"<h1>{escape(title)}</h1><p class='soft'>{escape(facts)}</p>",
-        figures(table([s.name for s in sources], [s.results for s in sources])),
+        f"<p><b>Do not compare these scores:</b> expected {escape(other[0])}.</p>" if other else "",
+        figures(replace(scores, best=frozenset()) if other else scores),
         "<h2>Held-out views</h2><p class='soft'>Move over a picture, or drag the slider.</p>",
         f"<div class='views'>{views}</div>" if views else "<p>no pictures in this run folder</p>",
         "<h2>Training</h2>",
