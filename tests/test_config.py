@@ -33,6 +33,10 @@ def test_iterations_scale_windows_and_nothing_else():
     [
         ({"iterations": "many"}, "config.iterations"),
         ({"unheard_of": 1}, "unheard_of"),
+        (
+            {"rates": {"type": "Rates", "mix": {"type": "Rate", "first": 0.1}}},
+            r"the keys \['first', 'last'\] at config.rates.mix, found \['first'\]",
+        ),
         ({"scene": 3}, "config.scene"),
         ({"growth": {"type": "GrowAnchors", "scale_clamp": "never"}}, "config.growth.scale_clamp"),
         (

@@ -91,6 +91,11 @@ def test_json_both_ways(tmp_path):
     assert read_json(tmp_path / "x.json", "thing") == value
 
 
+def test_json_of_other_tools(tmp_path):
+    (tmp_path / "x.json").write_bytes(b"\xef\xbb\xbf" + '{"é": 1}'.encode())
+    assert read_json(tmp_path / "x.json", "thing") == {"é": 1}
+
+
 @pytest.mark.parametrize("data", [b"", b"{", b'{"a": 1', b"\xff\xfe\x00"])
 def test_unreadable_json(tmp_path, data):
     (tmp_path / "x.json").write_bytes(data)

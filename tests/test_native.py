@@ -44,6 +44,13 @@ def test_a_library_of_another_version_is_not_used(elsewhere, monkeypatch):
     assert native.load() is None and "does not fit" in native.why_not() and "portable" in native.why_not()
 
 
+def test_a_damaged_library_is_not_used(elsewhere):
+    (elsewhere / "_native").mkdir()
+    for name in native.LEVELS:
+        (elsewhere / "_native" / f"se_{name}{native._SUFFIX}").write_bytes(b"cut short")
+    assert native.load() is None and "does not fit" in native.why_not()
+
+
 def test_pointers():
     value = torch.arange(3.0)
     assert native.pointer(value).value == value.data_ptr() and native.pointer(value[1:]).value == value.data_ptr() + 4

@@ -149,7 +149,10 @@ def test_places_that_cannot_be_a_run_folder(tmp_path):
     assert not (tmp_path / "new").exists() and (tmp_path / "file").read_text() == "x"
 
 
-@pytest.mark.parametrize(("text", "said"), [("{", "unreadable"), ("[]", "format 1"), ('{"format": 99}', "format 1"), ("{}", "format 1")])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("{", "unreadable"), ("[]", "format 1"), ('{"format": 99}', "format 1"), ("{}", "format 1"), ('{"format": 1}', "the keys")],
+)
 def test_a_damaged_or_foreign_configuration(tmp_path, text, said):
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(InputError, match=said):

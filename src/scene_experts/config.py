@@ -197,6 +197,8 @@ def _from_object(kind: Any, value: Any, where: str) -> Any:
     known = {f.name for f in dataclasses.fields(kind)}
     unknown = set(value) - known - {"type"}
     _expect(not unknown, f"only the keys {sorted(known)}", where, sorted(unknown))
+    needed = [f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING]
+    _expect(not set(needed) - set(value), f"the keys {needed}", where, sorted(set(value) - {"type"}))
     return kind(**{name: from_json(hints[name], item, f"{where}.{name}") for name, item in value.items() if name in known})
 
 

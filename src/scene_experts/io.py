@@ -98,7 +98,7 @@ def read_json(path: Path, what: str) -> Any:
     """The JSON in `path`. `what` names it in the error, e.g. "run configuration"."""
     path = Path(path)
     try:
-        return json.loads(path.read_text())
+        return json.loads(path.read_bytes())  # UTF-8 whatever the locale, with or without a mark at its beginning
     except FileNotFoundError as error:
         raise InputError(f"expected a {what} at {path}, found no such file; check the path") from error
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

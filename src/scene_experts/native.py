@@ -39,13 +39,17 @@ def path(level: str) -> Path | None:
 
 @functools.cache
 def load(level: str | None = None) -> ctypes.CDLL | None:
-    """The library for `level` (None: the best of this processor), or None where none is installed or it is of another version."""
+    """The library for `level` (None: the best of this processor), or None where none is installed, damaged, or of another version."""
     for name in (level,) if level else levels():
         where = path(name)
         if where is None:
             continue
-        library = ctypes.CDLL(str(where))
-        if library.se_abi_version() == ABI_VERSION:
+        try:
+            library = ctypes.CDLL(str(where))
+            version = library.se_abi_version()
+        except (OSError, AttributeError):  # damaged, or built for another system
+            continue
+        if version == ABI_VERSION:
             library.level = name  # type: ignore[attr-defined]
             return library
     return None
@@ -58,7 +62,7 @@ def why_not() -> str | None:
     found = [name for name in LEVELS if path(name)]
     if not found:
         return "the compiled CPU library is not installed: install a C++20 compiler (g++ or clang++) and run `pip install .` again"
-    return f"the compiled CPU library ({', '.join(found)}) does not fit this processor or this version: run `pip install .` again"
+    return f"the compiled CPU library ({', '.join(found)}) does not fit this machine or this version: run `pip install .` again"
 
 
 def pointer(tensor: Tensor | None) -> ctypes.c_void_p:
