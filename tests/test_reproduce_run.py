@@ -1,5 +1,6 @@
 """The runner: skips, resumes, fails one by one, stops."""
 
+import signal
 import subprocess
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import pytest
 
 from records import record
 from scene_experts.config import RunConfig, to_json
+from scene_experts.errors import InputError
 from scene_experts.io import write_json
 from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec
@@ -55,6 +57,40 @@ def test_one_failure_does_not_lose_the_rest(runner):
     assert [f.spec.recipe for f in failures] == ["moe-gs"] and "expected luck" in failures[0].why
     assert [r.recipe for r in store.load(runner.records)] == ["scaffold-gs"]
     assert "expected luck" in last_line(failures[0].log)
+
+
+def test_a_picture_that_fails_does_not_lose_the_rest_either(runner):
+    def after(made, folder):
+        if made.recipe == "moe-gs":
+            raise InputError("expected experts, found none")
+
+    runner.after = after
+    failures = runner.make([spec(), spec("scaffold-gs")])
+    assert [(f.spec.recipe, f.why) for f in failures] == [("moe-gs", "expected experts, found none")]
+    assert {r.recipe for r in store.load(runner.records)} == {"moe-gs", "scaffold-gs"}
+
+
+def test_a_stop_between_training_and_scoring_leaves_both_for_the_next_time(runner):
+    command = runner.command
+
+    def stopping(args, slot, log):
+        runner.stop.set()
+        return command(args, slot, log)
+
+    runner.command = stopping
+    assert runner.make([spec()]) == [] and [args[0] for args in runner.calls] == ["train"] and store.load(runner.records) == []
+
+
+def test_a_stop_while_a_run_is_being_started_reaches_it(tmp_path, monkeypatch):
+    made = Runner(tmp_path, tmp_path)
+
+    class Popen(subprocess.Popen):
+        def __init__(self, args, **options):
+            super().__init__(["sleep", "60"], **options)
+            made.end()  # it is not yet among those that run
+
+    monkeypatch.setattr(subprocess, "Popen", Popen)
+    assert made.command(["train"], 0, tmp_path / "log") == -signal.SIGTERM
 
 
 def test_a_run_without_a_whole_checkpoint_begins_anew(runner):

@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from records import record
+from scene_experts.config import to_json
 from scene_experts.errors import InputError
+from scene_experts.io import write_json
 from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec, distinct
 from scene_experts.reproduce.store import POINTS, curves, find, load, of_run, of_specs, read, write
 
@@ -35,14 +37,26 @@ def test_changed_figures_are_refused(tmp_path):
     path.write_text(json.dumps(value))
     with pytest.raises(InputError, match="expected results as they were written"):
         read(path)
-    path.write_text("{}")
-    with pytest.raises(InputError, match="expected a record"):
-        read(path)
+    for other in ("{}", '{"format": 1}'):
+        path.write_text(other)
+        with pytest.raises(InputError, match="expected a record"):
+            read(path)
 
 
 def test_a_folder_without_results_is_refused(tmp_path):
     with pytest.raises(InputError, match="expected an evaluated run"):
         of_run(tmp_path, "fox")
+
+
+def test_a_training_scored_before_its_end_is_no_record(tmp_path):
+    made = record(iterations=3000)
+    write_json(tmp_path / "config.json", {"format": 1, **to_json(made.config)})
+    write_json(tmp_path / "per_view.json", made.per_view)
+    write_json(tmp_path / "results.json", {**made.results, "step": 1200})
+    with pytest.raises(InputError, match=r"scores of all 3,000 iterations in .* found those after 1,200"):
+        of_run(tmp_path, "fox")
+    write_json(tmp_path / "results.json", {**made.results, "step": 3000})
+    assert of_run(tmp_path, "fox").key == made.key
 
 
 def test_curves_keep_the_ends_and_skip_torn_lines(tmp_path):

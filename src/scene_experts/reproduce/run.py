@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from scene_experts.checkpoint import latest
+from scene_experts.errors import InputError, RunError
 from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import Spec
 
@@ -85,19 +86,24 @@ class Runner:
             shutil.rmtree(folder)  # it never came to a whole checkpoint
         for args in (train, ["eval", str(folder)]):
             code = self.command(args, slot, log)
+            if self.stop.is_set():
+                return None  # the next time goes on from here
             if code != 0:
-                if self.stop.is_set():
-                    return None
-                why = last_line(log) or f"exit code {code}"
-                self.say(f"{place} {spec.label}: FAILED: {why}")
-                return Failure(spec, why, log)
-        record = store.of_run(folder, spec.scene.name)
-        store.write(self.records, record)
-        self.say(f"{place} {spec.label}: {record.results['psnr']:.2f} dB, {(time.monotonic() - began) / 60:.1f} min")
-        self.after(spec, folder)
+                return self.failed(spec, last_line(log) or f"exit code {code}", log, place)
+        try:
+            record = store.of_run(folder, spec.scene.name)
+            store.write(self.records, record)
+            self.say(f"{place} {spec.label}: {record.results['psnr']:.2f} dB, {(time.monotonic() - began) / 60:.1f} min")
+            self.after(spec, folder)
+        except (InputError, RunError, OSError) as error:
+            return self.failed(spec, str(error), log, place)
         if self.discard:
             shutil.rmtree(folder, ignore_errors=True)
         return None
+
+    def failed(self, spec: Spec, why: str, log: Path, place: str) -> Failure:
+        self.say(f"{place} {spec.label}: FAILED: {why}")
+        return Failure(spec, why, log)
 
     def command(self, args: list[str], slot: int, log: Path) -> int:
         """Run `scene-experts ARGS` with the worker's share of the machine, its words going to the log; returns the exit code."""
@@ -120,6 +126,8 @@ class Runner:
             )
             with self._lock:
                 self._running.add(process)
+                if self.stop.is_set():  # `end` came while it was being started and did not see it
+                    process.send_signal(signal.SIGTERM)
             try:
                 return process.wait()
             finally:

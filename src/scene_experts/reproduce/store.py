@@ -15,8 +15,10 @@ from typing import Any
 
 from scene_experts.config import RunConfig, from_json, to_json
 from scene_experts.errors import InputError
+from scene_experts.evaluate.tables import load_results
 from scene_experts.io import read_json, write_json
 from scene_experts.reproduce.plan import Spec, identity
+from scene_experts.run_folder import read_config
 
 FORMAT = 1
 POINTS = 60  # samples of a curve over training
@@ -61,17 +63,21 @@ class Record:
 
 
 def of_run(run: Path, scene: str) -> Record:
-    """The record of an evaluated run folder. Raises InputError where it is not whole."""
+    """The record of an evaluated run folder. Raises InputError where it is not whole, or its training was scored before its end."""
     for name in ("config.json", "results.json", "per_view.json"):
         if not (run / name).is_file():
             raise InputError(f"expected an evaluated run with {name} in {run}, found none; run `scene-experts eval {run}` first")
-    config = read_json(run / "config.json", "run configuration")
-    config.pop("format", None)
+    config, results = read_config(run), load_results(run)
+    if results.get("step", config.train.iterations) != config.train.iterations:
+        raise InputError(
+            f"expected the scores of all {config.train.iterations:,} iterations in {run}, found those after {results['step']:,}; "
+            f"run `scene-experts train --resume` with the run's own flags to its end, then `scene-experts eval {run}`"
+        )
     views = read_json(run / "per_view.json", "scores by view")
     return Record(
         scene=scene,
-        config=from_json(RunConfig, config),
-        results=read_json(run / "results.json", "results file"),
+        config=config,
+        results=results,
         per_view={name: {k: facts[k] for k in PER_VIEW if facts.get(k) is not None} for name, facts in views.items()},
         curves=curves(run / "metrics.jsonl"),
     )
@@ -120,7 +126,8 @@ def write(store: Path, record: Record) -> Path:
 def read(path: Path) -> Record:
     """A record file. Raises InputError where it is none, or was changed by hand."""
     value = read_json(path, "record of a run")
-    if not isinstance(value, dict) or value.get("format") != FORMAT:
+    parts = {"scene", "config", "results", "per_view", "curves", "config_sha256", "results_sha256"}
+    if not isinstance(value, dict) or value.get("format") != FORMAT or not parts <= value.keys():
         raise InputError(f"expected a record of a run (format {FORMAT}) in {path}, found something else; remove it and reproduce again")
     for part in ("config", "results"):
         if digest(value[part]) != value[f"{part}_sha256"]:
