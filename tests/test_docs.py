@@ -79,9 +79,10 @@ def flags(part: object, prefix: str = "") -> set[str]:
     out: set[str] = set()
     for name, value in vars(part).items():
         flag = name.replace("_", "-")
-        out |= {prefix + flag} | ({f"{prefix}no-{flag}"} if isinstance(value, bool) else set())
-        if hasattr(value, "__dataclass_fields__"):
+        if hasattr(value, "__dataclass_fields__"):  # a part has flags and is none
             out |= flags(value, f"{prefix}{flag}.")
+        else:
+            out |= {prefix + flag} | ({f"{prefix}no-{flag}"} if isinstance(value, bool) else set())
     return out
 
 
