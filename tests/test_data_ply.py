@@ -49,6 +49,14 @@ def test_no_colours_are_grey(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_no_points(tmp_path: Path, kind: str) -> None:
+    axes = "".join(f"property float {a}\n" for a in "xyz")
+    (tmp_path / "p.ply").write_text(f"ply\nformat {kind} 1.0\nelement vertex 0\n{axes}end_header\n")
+    xyz, rgb = read_points(tmp_path / "p.ply")
+    assert xyz.shape == rgb.shape == (0, 3)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
 def test_damaged_files(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "p.ply"
     write(path, kind)

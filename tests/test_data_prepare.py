@@ -39,7 +39,7 @@ def test_splits(capture: Capture) -> None:
     assert prepare.hold_out(capture, "mod:5").split == "mod5"
 
 
-@pytest.mark.parametrize("split", ["mod1", "modx", "first:0", "half", "files", "first:10", ""])
+@pytest.mark.parametrize("split", ["mod1", "modx", "first:0", "half", "files", "first:10", "", "mod²", "first:²"])
 def test_bad_splits(capture: Capture, split: str) -> None:
     with pytest.raises(InputError, match="--split"):
         prepare.hold_out(capture, split)
@@ -85,6 +85,10 @@ def test_one_place_takes_its_extent_from_the_points(capture: Capture) -> None:
     assert alone.points is not None
     assert prepare.extent(alone) == pytest.approx(float((alone.points.xyz - eye).norm(dim=1).median()))
     assert prepare.extent(replace(alone, points=None)) == 1.0
+    noise = torch.full((3, 3), float("nan"), dtype=torch.float64)
+    noisy = Points(torch.cat((noise, alone.points.xyz)), torch.cat((alone.points.rgb[:3], alone.points.rgb)))
+    assert prepare.extent(replace(alone, points=noisy)) == prepare.extent(alone)
+    assert prepare.extent(replace(alone, points=Points(noise, alone.points.rgb[:3]))) == 1.0
 
 
 def test_scaling_and_normalising(capture: Capture) -> None:

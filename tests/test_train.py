@@ -237,6 +237,8 @@ def test_losses_that_are_no_numbers_end_the_run_and_keep_its_checkpoint(folder, 
 def test_more_anchors_than_the_cap_to_start_with_is_said(folder):
     with pytest.raises(InputError, match="at most 100 anchors to start with"):
         list(events(config(max_anchors=100), folder, stop_at=1))
+    with pytest.raises(InputError, match=r"at most 100 Gaussians to start with, found [0-9,]+; raise --max-anchors$"):
+        list(events(config("3dgs", max_anchors=100), folder, stop_at=1))
 
 
 def test_sparse_adam_moves_what_was_decoded(folder):

@@ -47,7 +47,8 @@ class Training:
         scene = cfg.scene.start(capture.points, capture.extent, [capture.views[i].camera for i in capture.train])
         cap, n = cfg.growth.max_anchors, len(scene.table)
         if 0 < cap < n:
-            raise InputError(f"expected at most {cap:,} anchors to start with, found {n:,}; raise --max-anchors or --scene.voxel-size")
+            what, also = ("anchors", " or --scene.voxel-size") if "voxel" in scene.meta() else ("Gaussians", "")
+            raise InputError(f"expected at most {cap:,} {what} to start with, found {n:,}; raise --max-anchors{also}")
         return cls(cfg, to_device(scene, device, dtype))
 
     def next_view(self, train: tuple[int, ...], ahead: int = 3) -> tuple[int, list[int]]:

@@ -35,6 +35,7 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         fields = [(line[2], _TYPES[line[1]]) for line in lines[first:last] if line[:1] == ["property"]]
         if kind == "ascii":
             rows = np.array([line.split() for line in data[start:].decode("ascii").splitlines()[:count]], dtype=np.float64)
+            rows = rows if len(rows) else rows.reshape(0, len(fields))
             columns = {name: rows[:, i] for i, (name, _) in enumerate(fields)}
             if len(rows) != count:
                 raise ValueError

@@ -39,9 +39,9 @@ def extent(capture: Capture) -> float:
     radius = 1.1 * float((xyz - middle).norm(dim=1).max())
     if radius > 1e-9 * max(1.0, float(middle.norm())):
         return radius
-    if capture.points is None:
-        return 1.0
-    return float((capture.points.xyz - middle).norm(dim=1).median()) or 1.0
+    away = (middle.new_zeros(0, 3) if capture.points is None else capture.points.xyz - middle).norm(dim=1)
+    away = away[away.isfinite()]
+    return float(away.median()) or 1.0 if len(away) else 1.0
 
 
 def near_plane(radius: float) -> float:
@@ -88,9 +88,9 @@ def hold_out(capture: Capture, split: str) -> Capture:
             raise InputError("expected a capture whose files hold a split for --split files, found a COLMAP capture; use --split mod8")
     elif split == "none":
         test = ()
-    elif split.startswith("mod") and every.isdigit() and int(every) >= 2:
+    elif split.startswith("mod") and every.isdecimal() and int(every) >= 2:
         test = tuple(i for i in indices if i % int(every) == 0)
-    elif split.startswith("first:") and first.isdigit() and int(first) >= 1:
+    elif split.startswith("first:") and first.isdecimal() and int(first) >= 1:
         test = tuple(indices[: int(first)])
     else:
         raise InputError(f"expected --split mod8 (or another modN), first:N, none or files, found {split!r}; choose one")

@@ -36,13 +36,11 @@ def read_blender(root: Path, background: Colour | None) -> Found:
         path = root / f"transforms_{part}.json"
         if part == "train" or path.is_file():
             meta = _meta(path)
-            angle = meta.get("camera_angle_x")
             for i, frame in enumerate(meta["frames"]):
                 name, image = _image(root, _text(frame, i, path), None)
                 lens = _lens(meta, frame, path) if "fl_x" in {**meta, **frame} else None
-                if lens is None and not (isinstance(angle, (int, float)) and 0 < angle < math.pi):
-                    raise InputError(f"expected camera_angle_x between 0 and pi in {path}, found {angle!r}; restore the file")
-                posed.append((image, Posed(name, image or root, lens, _pose(frame, path), None, float(angle or 0), part == "test")))
+                angle = _angle(meta, frame, path) if lens is None else 0.0
+                posed.append((image, Posed(name, image or root, lens, _pose(frame, path), None, angle, part == "test")))
     kept = _present(root, posed, warnings)
     if background is None:
         background = (1.0, 1.0, 1.0)
@@ -58,16 +56,16 @@ def read_nerfstudio(root: Path, images: str | None) -> Found:
     path = root / "transforms.json"
     meta = _meta(path)
     posed, warnings = [], []
+    tests = meta.get("test_filenames") or []
+    if not isinstance(tests, list):
+        raise InputError(f"expected test_filenames as a list in {path}, found {tests!r}; restore the file")
     for i, frame in enumerate(meta["frames"]):
         name, image = _image(root, _text(frame, i, path), images)
         lens = _lens(meta, frame, path)
         given = root / str(frame["mask_path"]) if frame.get("mask_path") else None
         mask = given if given is not None and given.is_file() else find_mask(root, _inside(name), image) if image else None
-        held = frame.get("file_path") in set(meta.get("test_filenames") or ())
-        angle = float({**meta, **frame}.get("camera_angle_x") or 0)
-        if lens is None and not 0 < angle < math.pi:
-            raise InputError(f"expected fl_x or camera_angle_x in {path}, found neither; add the focal length")
-        posed.append((image, Posed(name, image or root, lens, _pose(frame, path), mask, angle, held)))
+        angle = _angle(meta, frame, path) if lens is None else 0.0
+        posed.append((image, Posed(name, image or root, lens, _pose(frame, path), mask, angle, frame.get("file_path") in tests)))
     kept = _present(root, posed, warnings)
     return Found("nerfstudio", kept, _points(root, meta.get("ply_file_path")), warnings, None, "the file that ply_file_path names")
 
@@ -86,6 +84,14 @@ def _text(frame: dict[str, Any], index: int, path: Path) -> str:
     if not isinstance(value, str) or not value:
         raise InputError(f"expected a file_path in frame {index} of {path}, found {value!r}; restore the file")
     return value
+
+
+def _angle(meta: dict[str, Any], frame: dict[str, Any], path: Path) -> float:
+    """The horizontal angle of view of a frame without a focal length, radians."""
+    angle = {**meta, **frame}.get("camera_angle_x")
+    if not isinstance(angle, (int, float)) or not 0 < angle < math.pi:
+        raise InputError(f"expected fl_x, or camera_angle_x between 0 and pi, in {path}, found {angle!r}; add the focal length")
+    return float(angle)
 
 
 def _image(root: Path, file_path: str, images: str | None) -> tuple[str, Path | None]:
@@ -153,7 +159,7 @@ def _lens(meta: dict[str, Any], frame: dict[str, Any], path: Path) -> Lens | Non
         cx, cy = float(both.get("cx", width / 2)), float(both.get("cy", height / 2))
         k = [float(both.get(f"k{i}", 0.0) or 0.0) for i in range(1, 7)]
         p = [float(both.get(f"p{i}", 0.0) or 0.0) for i in (1, 2)]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"expected numbers for w, h, fl_x, fl_y, cx and cy in {path}, found {error}; restore the file") from None
     if model in _PINHOLES:
         return Lens("PINHOLE", width, height, (fx, fy, cx, cy))
