@@ -9,6 +9,7 @@ from scene_experts import run_folder
 from scene_experts.config import Data
 from scene_experts.errors import InputError
 from scene_experts.export import graph_points_in
+from scene_experts.export.ply import read_vertices, write_vertices
 from scene_experts.export.run import import_result
 from scene_experts.render import choose
 from test_export_graph_points import made  # noqa: F401  (a fixture)
@@ -43,6 +44,14 @@ def test_what_does_not_fit_is_told(made, tmp_path):  # noqa: F811
     (published / "scene.json").write_bytes((folder / "scene.json").read_bytes())
     with pytest.raises(InputError, match=r"networks of the scene at .*networks\.safetensors"):
         import_result(published, Data(capture.root), tmp_path / "theirs")
+    (published / "networks.safetensors").write_bytes((folder / "networks.safetensors").read_bytes())
+    whole = read_vertices(folder / "point_cloud.ply")
+    write_vertices(published / "point_cloud.ply", {name: column for name, column in whole.items() if name not in ("x", "scale_5")})
+    with pytest.raises(InputError, match=r"expected the columns of graph points in .*, found no x, scale_5"):
+        import_result(published, Data(capture.root), tmp_path / "theirs")
     about = json.loads((published / "scene.json").read_text())
+    (published / "scene.json").write_text(json.dumps({k: v for k, v in about.items() if k not in ("grid", "step")}))
+    with pytest.raises(InputError, match="expected grid, step in"):
+        import_result(published, Data(capture.root), tmp_path / "theirs")
     (published / "scene.json").write_text(json.dumps(about | {"kind": "anchors"}))
     assert graph_points_in.find_folder(published) is None and graph_points_in.find_folder(tmp_path) is None

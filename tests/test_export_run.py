@@ -118,6 +118,13 @@ def test_written_and_read_back_it_draws_the_same_picture(run, tmp_path, form):
     capture.images.close()
 
 
+def test_a_folder_of_another_name_keeps_its_step(run, tmp_path):
+    """Experts are drawn by the step: all of them at its beginning."""
+    (tmp_path / "shared").symlink_to(run.path / "point_cloud" / f"iteration_{STEPS}")
+    back = import_result(tmp_path / "shared", Data(run.config.data.path), tmp_path / "back")
+    assert run_folder.open_run(back).step == STEPS
+
+
 def test_the_cost_of_the_compact_file_is_measured_and_small(run, tmp_path):
     packable(run)
     lines = export_run(run.path, "compact", tmp_path / "file", rasterize=choose("auto", "cpu"))

@@ -78,6 +78,13 @@ def test_a_published_folder(tmp_path, split):
     assert facts["voxel_size"] == 0.01 and facts["add_dist"] == () and facts["appearance_dim"] == 16 and facts["scene"] is None
 
 
+def test_a_voxel_size_that_is_no_number_is_none(tmp_path):
+    published(tmp_path, 7)
+    for text in ("'auto'", "None", "[1]", "1e999"):
+        (tmp_path / "cfg_args").write_text(f"Namespace(voxel_size={text})")
+        assert read_scaffold_folder(tmp_path)[2]["voxel_size"] is None
+
+
 def test_the_distance_shows_in_the_width(tmp_path):
     published(tmp_path, 7, inputs=F + 4)
     assert read_scaffold_folder(tmp_path)[2]["add_dist"] == ("opacity", "cov", "color")
@@ -211,6 +218,9 @@ def test_damaged_descriptions_and_experts(tmp_path):
         ("[]", "expected a scene description of format 1"),
         (text[:40], "in JSON"),
         ('{"format": 1}', "expected F, K, recipe, voxel_size, world"),
+        (text.replace('"scale": 2.5', '"scale": 0'), "voxel_size and world as numbers"),
+        (text.replace('"world": {', '"world": 3, "worlds": {'), "voxel_size and world as numbers"),
+        (text.replace('"trained": 0.1', '"trained": null'), "voxel_size and world as numbers"),
     ):
         (folder / "scene.json").write_text(wrong)
         with pytest.raises(InputError, match=message):

@@ -47,6 +47,8 @@ def import_folder(folder: Path, data: Data, out: Path) -> Capture:
     Raises InputError where files are absent or damaged, or the capture is read into another world than the scene was trained in.
     """
     about = read_sidecar(folder / SIDECAR)
+    if absent := {"grid", "extent", "step", "train"} - about.keys():
+        raise InputError(f"expected {', '.join(sorted(absent))} in {folder / SIDECAR}, found none; copy the whole folder")
     world, cfg = world_in(about), from_json(Train, about.get("train"), "train")
     capture = run_folder.load_capture(data)
     capture.images.close()
@@ -68,10 +70,16 @@ def meta(about: dict[str, Any], cfg: Train, world: World, voxel: float) -> dict[
 
 
 def rows(path: Path, world: World, voxel: float) -> dict[str, Tensor]:
-    """The columns of the table, in the trained world: positions are on the lattice of half voxels, exactly."""
+    """The columns of the table, in the trained world: positions are on the lattice of half voxels, exactly.
+
+    Raises InputError where columns are absent.
+    """
     found = {name: torch.from_numpy(column.copy()) for name, column in read_vertices(path).items()}
     stack = lambda names: torch.stack([found[name] for name in names], dim=1)  # noqa: E731
-    features = sum(name.startswith("feats_") for name in found)
+    features = max(1, sum(name.startswith("feats_") for name in found))
+    needed = [*"xyz", *(f"feats_{i}" for i in range(features)), *(f"scale_{i}" for i in range(6))]
+    if absent := [name for name in needed if name not in found]:
+        raise InputError(f"expected the columns of graph points in {path}, found no {', '.join(absent)}; copy the whole folder")
     twice = (world.from_input(stack("xyz").double()) * (HALF / voxel)).round().long()
     return {
         "facts.cell": coarsen(twice, HALF),

@@ -136,15 +136,16 @@ def _read(source: Path, iteration: int | None) -> _Read:
         raise InputError(
             f"expected networks that see feature, direction and distance in {source}, found ones that see the level too; train it here"
         )
+    step = int((scene or {}).get("step") or facts["iteration"] or UNKNOWN)
     voxel, origin = float(facts["voxel_size"] or 0.0), (0.0, 0.0, 0.0)
     if facts["kind"] == "octree":  # its lattices are told by its own columns
-        return _Read(anchors, None, voxel, networks, facts["add_dist"], facts["iteration"] or UNKNOWN, scene)
+        return _Read(anchors, None, voxel, networks, facts["add_dist"], step, scene)
     if scene is not None:
         voxel, origin = lattice_to_input(float(scene["voxel_size"]["trained"]), world_in(scene))
     elif voxel <= 0:  # it was automatic and is written nowhere
         voxel = recover_voxel(anchors["xyz"]) or 0.0
     cells = cells_of(anchors["xyz"], voxel, origin) if voxel > 0 else None
-    return _Read(anchors, cells, voxel, networks, facts["add_dist"], facts["iteration"] or UNKNOWN, scene)
+    return _Read(anchors, cells, voxel, networks, facts["add_dist"], step, scene)
 
 
 def _config(read: _Read) -> Train:

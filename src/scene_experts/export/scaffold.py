@@ -7,6 +7,7 @@ files do not say (voxel size, world, recipe, experts per anchor). Everything in 
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -103,11 +104,15 @@ def read_scaffold_folder(path: Path, iteration: int | None = None) -> tuple[dict
         "K": K,
         "F": F,
         "kind": "octree" if "level" in anchors else "scaffold",
-        "voxel_size": scene["voxel_size"]["input"] if scene else cfg.get("voxel_size"),
+        "voxel_size": scene["voxel_size"]["input"] if scene else _number(cfg.get("voxel_size")),
         "cfg": cfg,
         "scene": scene,
     }
     return anchors, networks, facts | _inputs(networks, facts, str(folder))
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else None
 
 
 def _inputs(networks: dict[str, Network], facts: dict[str, Any], where: str) -> dict[str, Any]:
@@ -139,6 +144,14 @@ def read_sidecar(path: Path) -> dict[str, Any]:
     absent = {"K", "F", "voxel_size", "world", "recipe"} - value.keys()
     if absent:
         raise InputError(f"expected {', '.join(sorted(absent))} in the scene description {path}, found none; write the scene again")
+    try:
+        numbers = [*map(float, value["voxel_size"].values()), float(value["world"]["scale"]), *map(float, value["world"]["shift"])]
+        if len(numbers) != 6 or not numbers[2] > 0:
+            raise ValueError
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise InputError(
+            f"expected voxel_size and world as numbers in the scene description {path}, found others; write it again"
+        ) from None
     return value
 
 
