@@ -101,7 +101,7 @@ struct Work {
   float* logits;     // [CHUNK][Rp], then 4 times [Rp][CHUNK]
   float* feature;    // [CHUNK][Fp]: gradient
   float* weights;    // [CHUNK][shares]: the mixture's, gradient
-  float* size;       // [CHUNK][8]: exp(l) of offsets, 0, of scales, 0
+  float* size;       // [CHUNK][8]: exp(l) of offsets, 1, of scales, 1
   float* spread;     // [CHUNK * K][3]
   float* weight;     // lists: the mixture's weight, [CHUNK * shares]
   int *anchor, *place;   // lists: index in the chunk; anchor * shares + the place among its shares

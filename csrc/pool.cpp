@@ -18,14 +18,13 @@ struct Job {
   void* context = nullptr;
   int64_t n = 0, grain = 1, chunks = 0;
   int slots = 0;  // workers that may still join
-  std::atomic<int64_t> next{0}, done{0};
+  std::atomic<int64_t> next{0};
 
   void work(int worker) {
     for (;;) {
       const int64_t chunk = next.fetch_add(1, std::memory_order_relaxed);
       if (chunk >= chunks) return;
       body(context, chunk * grain, std::min(n, (chunk + 1) * grain), worker);
-      done.fetch_add(1, std::memory_order_release);
     }
   }
 };

@@ -1,8 +1,8 @@
 // The one vector type of the rasteriser: F16, sixteen floats, either the 4 x 4 pixels of a block or sixteen Gaussians; M16 is its mask.
 // Each instruction set implements the same functions (in one register, two, or four), so the algorithms are written once:
 //   load store bcast bcast4 (four floats, repeated), + - * /, fma(a, b, c) = a b + c, fnma = c - a b, min max sqrt ceil floor,
-//   ge gt & |, select(m, a, b), keep(m, a) = a or 0, mul_keep, min_keep, bits any, store_int (truncated),
-//   Exp2 (relative error below 4e-7; anything where p < -126), reciprocal (to rounding), split_exponent, transpose (16 x 16),
+//   ge gt &, select(m, a, b), keep(m, a) = a or 0, mul_keep, min_keep, bits any, store_int (truncated),
+//   Exp2 (relative error below 4e-7; anything where p < -126), split_exponent, transpose (16 x 16),
 //   load_pairs(p, a, b): p[0][0] p[1][0] ... and p[0][1] p[1][1] ...
 #pragma once
 #include <cstdint>

@@ -43,7 +43,6 @@ inline F16 floor(F16 a) { return {_mm256_floor_ps(a.lo), _mm256_floor_ps(a.hi)};
 inline M16 ge(F16 a, F16 b) { return {_mm256_cmp_ps(a.lo, b.lo, _CMP_GE_OQ), _mm256_cmp_ps(a.hi, b.hi, _CMP_GE_OQ)}; }
 inline M16 gt(F16 a, F16 b) { return {_mm256_cmp_ps(a.lo, b.lo, _CMP_GT_OQ), _mm256_cmp_ps(a.hi, b.hi, _CMP_GT_OQ)}; }
 inline M16 operator&(M16 a, M16 b) { return {_mm256_and_ps(a.lo, b.lo), _mm256_and_ps(a.hi, b.hi)}; }
-inline M16 operator|(M16 a, M16 b) { return {_mm256_or_ps(a.lo, b.lo), _mm256_or_ps(a.hi, b.hi)}; }
 inline F16 select(M16 m, F16 a, F16 b) { return {_mm256_blendv_ps(b.lo, a.lo, m.lo), _mm256_blendv_ps(b.hi, a.hi, m.hi)}; }
 inline F16 keep(M16 m, F16 a) { return {_mm256_and_ps(m.lo, a.lo), _mm256_and_ps(m.hi, a.hi)}; }
 inline F16 mul_keep(M16 m, F16 a, F16 b) { return keep(m, a * b); }
@@ -78,12 +77,6 @@ struct Exp2 {
     for (int k = 0; k < N; ++k) p[k] = {half(p[k].lo), half(p[k].hi)};
   }
 };
-
-inline F16 reciprocal(F16 a) {
-  const F16 r{_mm256_rcp_ps(a.lo), _mm256_rcp_ps(a.hi)}, one = bcast(1.0f);
-  const F16 s = fma(r, fnma(a, r, one), r);  // 12 bits, then 23
-  return s;
-}
 
 inline void split_exponent_half(__m256 a, __m256& m, __m256& e) {
   const __m256i b = _mm256_castps_si256(a);

@@ -33,7 +33,6 @@ inline F16 floor(F16 a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_IN
 inline M16 ge(F16 a, F16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
 inline M16 gt(F16 a, F16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)}; }
 inline M16 operator&(M16 a, M16 b) { return {_kand_mask16(a.m, b.m)}; }
-inline M16 operator|(M16 a, M16 b) { return {_kor_mask16(a.m, b.m)}; }
 inline F16 select(M16 m, F16 a, F16 b) { return {_mm512_mask_blend_ps(m.m, b.v, a.v)}; }
 inline F16 keep(M16 m, F16 a) { return {_mm512_maskz_mov_ps(m.m, a.v)}; }
 inline F16 mul_keep(M16 m, F16 a, F16 b) { return {_mm512_maskz_mul_ps(m.m, a.v, b.v)}; }
@@ -77,11 +76,6 @@ struct Exp2 {
   }
   static constexpr float kLinear = 0.69318771f, kQuadratic = 0.24022643f;  // least largest relative error on [-1/32, 1/32]
 };
-
-inline F16 reciprocal(F16 a) {
-  const __m512 r = _mm512_rcp14_ps(a.v);
-  return {_mm512_fmadd_ps(r, _mm512_fnmadd_ps(a.v, r, _mm512_set1_ps(1.0f)), r)};
-}
 
 // The first N of sixteen floats, the others 0.
 template <int N>

@@ -70,7 +70,6 @@ inline F16 max(F16 a, F16 b) { SE_ALL(F16, a.v[i] > b.v[i] ? a.v[i] : b.v[i]); }
 inline M16 ge(F16 a, F16 b) { SE_ALL(M16, a.v[i] >= b.v[i]); }
 inline M16 gt(F16 a, F16 b) { SE_ALL(M16, a.v[i] > b.v[i]); }
 inline M16 operator&(M16 a, M16 b) { SE_ALL(M16, a.v[i] & b.v[i]); }
-inline M16 operator|(M16 a, M16 b) { SE_ALL(M16, a.v[i] | b.v[i]); }
 inline F16 select(M16 m, F16 a, F16 b) { SE_ALL(F16, (V4)((m.v[i] & (I4)a.v[i]) | (~m.v[i] & (I4)b.v[i]))); }
 inline F16 keep(M16 m, F16 a) { SE_ALL(F16, (V4)(m.v[i] & (I4)a.v[i])); }
 inline F16 mul_keep(M16 m, F16 a, F16 b) { return keep(m, a * b); }
@@ -111,8 +110,6 @@ struct Exp2 {
     for (int k = 0; k < N; ++k) p[k] = single(p[k]);
   }
 };
-
-inline F16 reciprocal(F16 a) { return bcast(1.0f) / a; }
 
 // The first N of sixteen floats, the others 0.
 template <int N>
