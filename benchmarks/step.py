@@ -68,8 +68,8 @@ def main() -> None:
         for part, seconds in best[name].items():
             print(f"  {part:<14} {1e3 * seconds:7.2f} ms")
         against = f"{whole[name] / alone[name]:.2f} x raster alone ({1e3 * alone[name]:.1f} ms)"
-        print(f"  {'whole step':<14} {1e3 * whole[name]:7.2f} ms = {against}, {whole[name] / scalar[name]:.4f} x {peer.NAME}", end="")
-        print(f" ({1e3 * scalar[name]:.0f} ms)")
+        ratio = f"{whole[name] / scalar[name]:.4f} x {peer.NAME} ({1e3 * scalar[name]:.0f} ms)"
+        print(f"  {'whole step':<14} {1e3 * whole[name]:7.2f} ms = {against}, {ratio if scalar[name] < float('inf') else peer.WHY_NOT}")
     if both:
         print(f"{MIXTURE} step / {BASELINE} step{', same Gaussians' * args.same}: {whole[MIXTURE] / whole[BASELINE]:.2f}")
 

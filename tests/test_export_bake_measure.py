@@ -9,7 +9,7 @@ from PIL import Image
 from scene_experts.data.capture import load
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.export.bake import explicit
-from scene_experts.export.bake_measure import as_trained, counted, picture, scores
+from scene_experts.export.bake_measure import as_trained, counted, nothing_counted, picture, scores
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from synthetic import make_capture
@@ -43,6 +43,7 @@ def test_views_whose_mask_counts_nothing_are_not_scored(tmp_path):
     capture = load(folder)
     first, second = (capture.views[i] for i in capture.test[:2])
     capture.images.close()
+    assert nothing_counted(replace(capture, test=())) == "no view is held out" and "masks" in nothing_counted(capture)
     for view, value in ((first, 0), (second, 255)):
         name = folder / "masks" / f"{view.name}.png"
         name.parent.mkdir(parents=True, exist_ok=True)

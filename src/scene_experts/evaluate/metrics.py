@@ -78,7 +78,7 @@ class Perceptual:
         fetch: bool = False,
         progress: download.Progress | None = None,
     ) -> Perceptual:
-        """Load what this machine has; `fetch` downloads the rest first. Raises InputError when `explicit` holds no weights."""
+        """Load what this machine has; `fetch` downloads the rest first. Raises InputError when `explicit` names no weights."""
         networks, sources, absent = {}, {}, {}
         for net in dict.fromkeys(BACKBONE.values()):
             if fetch and weights.why_absent(net, explicit):

@@ -59,7 +59,8 @@ class Missing(Exception):
 def load(net: str, explicit: Path | None = None) -> tuple[dict[str, Tensor], str]:
     """The tensors of `net` ("vgg" or "alex"), named as `lpips.shapes` says, and a line on where they came from.
 
-    Raises Missing where there are none, InputError where `explicit` (or the environment variable) does not hold usable weights.
+    Raises Missing where there are none (a damaged or another file counts as none, and others are looked for), InputError where
+    `explicit` (or the environment variable) names nothing that could be weights.
     """
     notes: list[str] = []
     for source in sources(net, explicit, notes):

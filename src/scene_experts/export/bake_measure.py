@@ -15,8 +15,6 @@ from scene_experts.render import Rasterizer
 from scene_experts.scene.frozen import Draws
 from scene_experts.types import Camera
 
-NOTHING_HELD_OUT = "no view that counts is held out"
-
 
 @dataclass(frozen=True)
 class Score:
@@ -36,6 +34,11 @@ def as_trained(rasterize: Rasterizer, antialias: bool) -> Rasterizer:
 def counted(capture: Capture) -> list[int]:
     """The held-out views that can be scored: those whose mask leaves something."""
     return [i for i in capture.test if (mask := capture.frame(i).mask) is None or bool(mask.any())]
+
+
+def nothing_counted(capture: Capture) -> str:
+    """Why `counted` is empty, in words."""
+    return "the masks leave nothing of the held-out views" if capture.test else "no view is held out"
 
 
 @torch.no_grad()

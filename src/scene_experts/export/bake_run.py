@@ -15,7 +15,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.data.views import World
 from scene_experts.errors import InputError
 from scene_experts.export.bake import Bake, bake, explicit
-from scene_experts.export.bake_measure import NOTHING_HELD_OUT, as_trained, counted, scores
+from scene_experts.export.bake_measure import as_trained, counted, nothing_counted, scores
 from scene_experts.export.bake_refine import DRAWN_AT
 from scene_experts.export.bake_sums import Tell
 from scene_experts.export.html_page import capture_notes
@@ -159,7 +159,7 @@ def one_file(
         measured, line = measure(run, made, path, world, capture, views, rasterize, options.bake.refine.iterations > 0, tell)
         lines.append(line)
     elif options.measure:
-        absent = "the capture is gone" if capture is None else NOTHING_HELD_OUT
+        absent = "the capture is gone" if capture is None else nothing_counted(capture)
         lines.append(f"{absent}: what the file costs in PSNR was not measured")
     write_json(
         path.with_name(path.name + ".json"),

@@ -14,7 +14,7 @@ from scene_experts.config import Data, to_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
 from scene_experts.export import explicit, graph_points, graph_points_in
-from scene_experts.export.bake_measure import NOTHING_HELD_OUT, as_trained, counted, scores
+from scene_experts.export.bake_measure import as_trained, counted, nothing_counted, scores
 from scene_experts.export.cameras import write_cameras
 from scene_experts.export.compact import Compact, Sizes, read_compact, write_compact
 from scene_experts.export.extras import extra_networks, level_columns
@@ -106,7 +106,7 @@ def _cost_line(run: OpenRun, path: Path, rasterize: Rasterizer) -> str:
     try:
         views = len(counted(capture))
         if not views:
-            return f"{NOTHING_HELD_OUT}: the cost in PSNR was not measured"
+            return f"{nothing_counted(capture)}: the cost in PSNR was not measured"
         before, after = psnr_cost(run, capture, path, rasterize)
     finally:
         capture.images.close()
