@@ -15,6 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
+from scene_experts.data import store as module
 from scene_experts.data.images import Source, decode
 from scene_experts.data.lens import Lens
 from scene_experts.data.store import ImageStore, available_bytes
@@ -151,5 +152,31 @@ store.prefetch(range(40))
 
 
 def test_available_memory_is_plausible() -> None:
-    assert 1 << 20 < available_bytes() < 1 << 50
+    free = available_bytes()
+    assert free is not None and 1 << 20 < free < 1 << 50
     assert ImageStore([]).cache_bytes > 1 << 20
+
+
+def test_available_memory_counts_the_containers_limit_and_its_files_as_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    group = "/sys/fs/cgroup/"
+    files = {
+        "/proc/meminfo": "MemTotal: 100 kB\nMemAvailable: 8388608 kB\n",
+        f"{group}memory.max": f"{3 * 2**30}\n",
+        f"{group}memory.current": f"{3 * 2**30}\n",
+        f"{group}memory.stat": f"anon 5\ninactive_file {2**29}\n",
+    }
+
+    def read(path: Path | str) -> str:
+        if str(path) not in files:
+            raise FileNotFoundError(path)
+        return files[str(path)]
+
+    monkeypatch.setattr(module, "_read", read)
+    assert available_bytes() == 2**29, "full of files, not full"
+    del files[f"{group}memory.stat"]
+    assert available_bytes() == 0 and ImageStore([]).cache_bytes == 0
+    files[f"{group}memory.max"] = "max\n"
+    assert available_bytes() == 2**33
+    files.clear()
+    monkeypatch.setattr(module.os, "sysconf_names", {})
+    assert available_bytes() is None and ImageStore([]).cache_bytes == (4 << 30) // 3

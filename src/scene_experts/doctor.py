@@ -9,12 +9,12 @@ import platform
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from rich.console import Console
 
 from scene_experts import native
+from scene_experts.data.store import available_bytes
 
 PIN = "keep torch as it is with `pip install -c constraints.txt ...`, run in the project's folder"
 
@@ -139,24 +139,11 @@ def machine() -> Check:
 
 
 def memory() -> Check:
-    free = available_memory()
+    free = available_bytes()
     if free is None:
         return Check("memory", True, "unknown")
     fix = "less than 2 GiB is free: train at a lower --resolution, or cap growth with --max-memory"
     return Check("memory", free >= 2 * 2**30, f"{free / 2**30:.1f} GiB free", fix)
-
-
-def available_memory() -> int | None:
-    """Bytes that can still be used, the container's limit counted in; None where the system does not tell."""
-    found = []
-    for line in _lines("/proc/meminfo"):
-        if line.startswith("MemAvailable:"):
-            found.append(int(line.split()[1]) * 1024)
-    limit, used = _lines("/sys/fs/cgroup/memory.max"), _lines("/sys/fs/cgroup/memory.current")
-    if limit and used and limit[0].isdigit():
-        cached = sum(int(line.split()[1]) for line in _lines("/sys/fs/cgroup/memory.stat") if line.startswith("inactive_file "))
-        found.append(max(0, int(limit[0]) - int(used[0]) + cached))
-    return min(found) if found else None
 
 
 def lpips() -> Check:
@@ -170,11 +157,11 @@ def lpips() -> Check:
 
 
 def viewer() -> Check:
-    return _package("viser", "viewer", "the browser viewer, which no command uses yet")
+    return _package("viser", "viewer", "scenes in a browser: view, train --viewer")
 
 
 def sfm() -> Check:
-    return _package("pycolmap", "sfm", "turning photographs into captures, which no command does yet")
+    return _package("pycolmap", "sfm", "turning photographs into captures by hand: no command does it yet")
 
 
 def tensorboard() -> Check:
@@ -196,13 +183,6 @@ def _version(name: str) -> str | None:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return "version unknown"
-
-
-def _lines(path: str) -> list[str]:
-    try:
-        return Path(path).read_text().splitlines()
-    except OSError:
-        return []
 
 
 def _guarded(check: Callable[[], Check]) -> Check:

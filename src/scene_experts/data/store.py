@@ -10,6 +10,7 @@ import threading
 import weakref
 from collections import OrderedDict, deque
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from torch import Tensor
@@ -19,25 +20,36 @@ from scene_experts.data.images import Source, decode
 Decoded = tuple[Tensor, Tensor | None]  # rgb [H, W, 3] uint8, mask [H, W] uint8 or None
 
 
-def available_bytes() -> int:
-    """Memory this process may still take: the least of what the machine and its control group leave. 4 GiB where neither can be read."""
+def available_bytes() -> int | None:
+    """Memory this process may still take: the least of what the machine and its control group leave. None where neither can be read.
+
+    What a control group holds of files is given back when it is asked for, so it counts as free, as it does in MemAvailable.
+    """
     left = []
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        left += [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable")]
-    except (OSError, ValueError, IndexError):
-        pass
-    for limit, used in (
-        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-        ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+    with suppress(OSError, ValueError, KeyError):
+        left.append(1024 * _facts("/proc/meminfo")["MemAvailable:"])
+    group = Path("/sys/fs/cgroup")
+    for limit, used, stat, files in (
+        ("memory.max", "memory.current", "memory.stat", "inactive_file"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat", "total_inactive_file"),
     ):
-        try:
-            left.append(max(0, int(Path(limit).read_text()) - int(Path(used).read_text())))
-        except (OSError, ValueError):  # absent, or "max": no limit
-            continue
+        with suppress(OSError, ValueError):  # absent, or "max": no limit
+            free = int(_read(group / limit)) - int(_read(group / used))
+            with suppress(OSError, ValueError, KeyError):
+                free += _facts(group / stat)[files]
+            left.append(max(0, free))
     if not left and hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
         left.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    return min(left) if left else 4 << 30
+    return min(left) if left else None
+
+
+def _read(path: Path | str) -> str:
+    return Path(path).read_text()
+
+
+def _facts(path: Path | str) -> dict[str, int]:
+    """Numbers by name from lines such as "MemAvailable: 123 kB"."""
+    return {words[0]: int(words[1]) for line in _read(path).splitlines() if len(words := line.split()) > 1}
 
 
 class _Cache:
@@ -126,12 +138,15 @@ class ImageStore:
 
     What was used last and is not prefetched for later is dropped first.
 
-    `cache_bytes` None: a third of the memory available, which `available_bytes` takes from the machine and its control group.
+    `cache_bytes` None: a third of `available_bytes`, or of 4 GiB where the system does not tell.
     """
 
     def __init__(self, sources: Iterable[Source], cache_bytes: int | None = None) -> None:
         self.sources = tuple(sources)
-        self.cache_bytes = available_bytes() // 3 if cache_bytes is None else max(0, int(cache_bytes))
+        if cache_bytes is None:
+            free = available_bytes()
+            cache_bytes = (4 << 30 if free is None else free) // 3
+        self.cache_bytes = max(0, int(cache_bytes))
         self._cache = _Cache(self.sources, self.cache_bytes)
         self._thread: threading.Thread | None = None
 
