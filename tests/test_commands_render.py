@@ -35,6 +35,15 @@ def test_pictures_beside_each_other_and_the_path_as_a_file(run, tmp_path, capsys
     assert abs(first - second).mean() < 1
 
 
+def test_views_of_several_sizes_are_no_video(run, tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    args = ["render", str(run), "--path", "test", "--out"]
+    assert cli.main([*args, str(tmp_path / "frames")]) == 0
+    assert len({pictures.read(path).shape for path in (tmp_path / "frames").iterdir()}) == 2
+    assert cli.main([*args, str(tmp_path / "x.mp4")]) == 2 and not (tmp_path / "x.mp4").exists()
+    assert cli.main([*args, str(tmp_path / "x.mp4"), "--size", "48x32"]) == 0 and (tmp_path / "x.mp4").stat().st_size > 0
+
+
 def test_the_held_out_views_beside_another_run(run, tmp_path):
     args = ["render", str(run), "--path", "test", "--beside", str(run), "--out", str(tmp_path / "t"), "--only", "1", "2"]
     assert cli.main(args) == 0 and len(list((tmp_path / "t").glob("*.png"))) == 2

@@ -84,6 +84,7 @@ def render(args: list[str]) -> int:
         out = command.out or command.run / "renders" / f"{Path(command.path).stem}.mp4"
         if video.is_video(out):
             video.writer()  # says what is missing before the first frame is drawn
+            check_sizes(route)
         if command.save_path:
             save = path_files.write_nerfstudio if command.save_path.name.endswith(".nerfstudio.json") else path_files.write
             save(command.save_path, route, capture.world)
@@ -110,6 +111,16 @@ def check(command: RenderCommand) -> None:
     out = command.out
     if out is not None and out.suffix and not video.is_video(out) and not out.is_dir():
         raise InputError(f"expected --out as a folder or a file ending in {', '.join(video.VIDEO)}, found {out}; choose one of those")
+
+
+def check_sizes(route: CameraPath) -> None:
+    """Raises InputError for cameras of several sizes, as captured views may be: a video has one."""
+    sizes = sorted({(camera.width, camera.height) for camera in route.cameras})
+    if len(sizes) > 1:
+        first, last = (f"{width}x{height}" for width, height in (sizes[0], sizes[-1]))
+        raise InputError(
+            f"expected views of one size for a video, found {len(sizes)} sizes ({first} to {last}); give a folder as --out, or --size"
+        )
 
 
 def drawn(
