@@ -212,14 +212,3 @@ def test_too_little_memory_is_one_sentence(error, capsys, monkeypatch):
     monkeypatch.setattr(commands, "run", lambda *args: (_ for _ in ()).throw(RuntimeError("a fault of ours")))
     with pytest.raises(RuntimeError, match="a fault of ours"):
         cli.main(["info"])
-
-
-def test_waiting_threads_sleep_unless_the_user_says_otherwise(monkeypatch, capsys):
-    from scene_experts.cli import main
-
-    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-    main(["--version"])
-    assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
-    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
-    main(["--version"])
-    assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"

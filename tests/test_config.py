@@ -66,6 +66,8 @@ def test_impossible_settings_name_their_flag():
         "--growth.adjust.interval": replace(moe, growth=replace(moe.growth, adjust=replace(moe.growth.adjust, interval=0))),
         "--growth.hierarchy-factor of at least 2": replace(moe, growth=replace(moe.growth, hierarchy_factor=0)),
         "--seed of at most": replace(moe, seed=2**63 - 1),
+        "--loss.mean-opacity of at least 0, found -1": replace(moe, loss=replace(moe.loss, mean_opacity=-1.0)),
+        "--loss.dssim of at most 1, found 2": replace(moe, loss=replace(moe.loss, dssim=2.0)),
         "--scene.decoder.warmup": replace(moe, scene=replace(moe.scene, decoder=replace(moe.scene.decoder, warmup=-1))),
     }
     for said, cfg in wrong.items():

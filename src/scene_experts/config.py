@@ -112,6 +112,7 @@ def check(cfg: Train) -> None:
     if cfg.seed > LARGEST_SEED:
         raise InputError(f"expected --seed of at most {LARGEST_SEED}, found {cfg.seed}; give a smaller number")
     cfg.scene.check()
+    cfg.loss.check()
     cfg.growth.check()
     levels, grown = isinstance(getattr(cfg.scene, "select", None), Octree), isinstance(cfg.growth, GrowOctree)
     if levels != grown:

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from scene_experts import native, native_terms
+from scene_experts.errors import InputError, expect_at_least
 from scene_experts.types import Decoded, Render, Routing
 
 TAPS, SIGMA, C1, C2 = 11, 1.5, 0.01**2, 0.03**2
@@ -51,6 +52,13 @@ class Weights:
     """First iteration with the opacity hinge."""
     opacity_until: int | None = None
     """Last iteration with the opacity hinge; None: it never ends."""
+
+    def check(self) -> None:
+        """Raises InputError for weights that no training can have: below 0, or a share of 1 - SSIM beyond 1."""
+        names = ("dssim", "scale", "opacity", "load", "mean_opacity", "mean_size")
+        expect_at_least([(f"--loss.{name.replace('_', '-')}", getattr(self, name), 0) for name in names])
+        if self.dssim > 1:
+            raise InputError(f"expected --loss.dssim of at most 1, found {self.dssim}; L1 gets the rest of 1, so give a smaller number")
 
 
 def terms(
