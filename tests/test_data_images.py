@@ -100,6 +100,12 @@ def test_exif_is_applied_only_when_asked(tmp_path: Path) -> None:
     np.testing.assert_array_equal(rgb, pixels)
     rgb, _ = decode(Source(tmp_path / "a.png", pinhole(10, 16), (10, 16), turn=True))
     np.testing.assert_array_equal(rgb, np.rot90(pixels, -1))
+    stencil = np.zeros((10, 16), np.uint8)
+    stencil[:3] = 255
+    for mask in (stencil, np.ascontiguousarray(np.rot90(stencil, -1))):  # made of the stored pixels, or of the turned ones
+        Image.fromarray(mask).save(tmp_path / "m.png")
+        found = decode(Source(tmp_path / "a.png", pinhole(10, 16), (10, 16), mask=tmp_path / "m.png", turn=True))[1]
+        np.testing.assert_array_equal(found, np.rot90(stencil, -1))
 
 
 @pytest.mark.parametrize(

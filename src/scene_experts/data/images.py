@@ -169,7 +169,7 @@ def _to_8_bit(image: Image.Image) -> Image.Image:
 
 
 def _mask_file(source: Source) -> Image.Image | None:
-    """The mask file as L, at its own size."""
+    """The mask file as L, at its own size; lying where the photograph was turned, it is turned as its own EXIF or the photograph's says."""
     if source.mask is None:
         return None
     with _open(source.mask) as image:
@@ -177,8 +177,13 @@ def _mask_file(source: Source) -> Image.Image | None:
             out = image.getchannel("A") if image.mode == "RGBA" and image.convert("L").getextrema() == (0, 0) else image.convert("L")
         except (OSError, ValueError, SyntaxError) as error:
             raise _unreadable(source.mask, error) from error
-    upright = source.turn and (out.width > out.height) != (source.lens.width > source.lens.height)
-    return ImageOps.exif_transpose(out) if upright else out
+    if not source.turn or (out.width > out.height) == (source.lens.width > source.lens.height):
+        return out
+    exif = out.getexif()
+    if exif.get(_ORIENTATION, 1) == 1:
+        with _open(source.path) as photograph:
+            exif[_ORIENTATION] = photograph.getexif().get(_ORIENTATION, 1)
+    return ImageOps.exif_transpose(out)
 
 
 @functools.lru_cache(maxsize=2)  # neighbours in a capture share their camera
