@@ -57,6 +57,7 @@ def test_thinning_keeps_means_and_smoothing_lags():
     many = [(float(i), float(i)) for i in range(4000)]
     assert len(thinned(many)) == MOST and sum(y for _, y in thinned(many)) / MOST == pytest.approx(1999.5)
     assert smoothed([(0, 0.0), (1, 2.0), (2, 4.0)], window=2) == [(0, 0.0), (1, 1.0), (2, 3.0)]
+    assert smoothed([(0, 0.0), (1, float("nan")), (2, 4.0)], window=2) == [(0, 0.0), (2, 2.0)]  # the rest of the line stays
 
 
 def test_ticks_are_round():

@@ -61,7 +61,11 @@ def test_a_training_scored_before_its_end_is_no_record(tmp_path):
 
 def test_curves_keep_the_ends_and_skip_torn_lines(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    lines = [json.dumps({"step": s, "psnr": 1.0, "terms": {}}) for s in range(1, 1001)] + ['{"grown": 1, "step": 5}', '{"step": 99']
+    lines = [json.dumps({"step": s, "psnr": 1.0, "terms": {}}) for s in range(1, 1001)] + [
+        '{"grown": 1, "step": 5}',
+        '{"psnr": NaN, "step": 7}',
+        '{"step": 99',
+    ]
     path.write_text("\n".join(lines))
     found = curves(path)
     assert len(found) == POINTS and (found[0]["step"], found[-1]["step"]) == (1, 1000) and "terms" not in found[0]

@@ -81,8 +81,8 @@ def thinned(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def smoothed(points: Sequence[tuple[float, float]], window: int = 15) -> list[tuple[float, float]]:
-    """A running mean: single views differ more than iterations do."""
-    out, total = [], 0.0
+    """A running mean: single views differ more than iterations do. Points that are not finite are left out."""
+    points, out, total = [(x, y) for x, y in points if math.isfinite(y)], [], 0.0
     for i, (x, y) in enumerate(points):
         total += y - (points[i - window][1] if i >= window else 0.0)
         out.append((x, total / min(i + 1, window)))

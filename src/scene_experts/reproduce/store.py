@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -91,7 +92,7 @@ def curves(path: Path) -> list[dict[str, Any]]:
             found = json.loads(line)
         except ValueError:
             continue  # cut off by a crash
-        if isinstance(found, dict) and "psnr" in found:
+        if isinstance(found, dict) and math.isfinite(found.get("psnr", math.nan)):
             lines.append({k: found[k] for k in ("step", "seconds", "psnr", "anchors", "active", "routing", "entropy") if k in found})
     if len(lines) <= POINTS:
         return lines
