@@ -56,7 +56,8 @@ def test_the_page_shows_our_own_render_and_follows_the_controls(serving, browser
 
 
 def test_clients_come_and_go_and_nonsense_harms_nobody(serving, browser):  # noqa: F811
-    websockets, viser_module = pytest.importorskip("websockets.sync.client"), pytest.importorskip("viser")
+    websockets = pytest.importorskip("websockets.sync.client")
+    protocol = f"viser-v{pytest.importorskip('viser').__version__}"
     before = threading.active_count()
     for _ in range(10):
         page = browser.new_page()
@@ -65,9 +66,7 @@ def test_clients_come_and_go_and_nonsense_harms_nobody(serving, browser):  # noq
         page.close()
     for message in (b"\xff\x00nonsense", b"", "text"):
         try:
-            with websockets.connect(
-                serving.url.replace("http", "ws"), subprotocols=[f"viser-v{viser_module.__version__}"], open_timeout=5
-            ) as socket:
+            with websockets.connect(serving.url.replace("http", "ws"), subprotocols=[protocol], open_timeout=5) as socket:
                 socket.send(message)
         except Exception:  # being refused is fine
             pass
