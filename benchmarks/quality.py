@@ -19,8 +19,8 @@ COLUMNS = (
     ("LPIPS 3dgs", lambda r: score(r, "lpips_3dgs")),
     ("MB", lambda r: f"{r['size']['MB']:.1f}"),
     ("anchors", lambda r: f"{r['anchors']:,}"),
-    ("active %", lambda r: f"{100 * r['activation_ratio']:.1f}"),
-    ("sharpness", lambda r: f"{r['sharpness']['ratio']:.2f}"),
+    ("active %", lambda r: "-" if r["activation_ratio"] is None else f"{100 * r['activation_ratio']:.1f}"),  # 3DGS has no such share
+    ("sharpness", lambda r: "-" if r["sharpness"]["ratio"] is None else f"{r['sharpness']['ratio']:.2f}"),
     ("FPS", lambda r: f"{r['fps']['fps']:.0f}"),
     ("training", lambda r: f"{r['train_seconds'] / 60:.1f} min"),
 )
