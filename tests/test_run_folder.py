@@ -127,14 +127,15 @@ def test_resuming_may_move_the_capture_and_the_stop(run):
 
 
 def test_overwriting_removes_what_belonged_to_the_old_run_and_nothing_else(run):
-    for name in ("results.json", "per_view_train.json", "scene.compact", "notes.txt"):
+    (run / "previews").mkdir()
+    for name in ("results.json", "per_view_train.json", "scene.compact", "report.html", "previews/000030.png", "notes.txt"):
         (run / name).write_text("old")
     for name in ("iteration_20/scene.json", "iteration_7/mine.txt"):
         (run / "point_cloud" / name).parent.mkdir(parents=True)
         (run / "point_cloud" / name).write_text("old")
     other = RunConfig(RECIPES["scaffold-gs"][1], CONFIG.data)
     run_folder.check(run, other, resume=False, overwrite=True)
-    assert len(state(run)) == 9
+    assert len(state(run)) == 11
     run_folder.prepare(run, other, resume=False, overwrite=True)
     assert state(run).keys() == {"config.json", "notes.txt", "point_cloud/iteration_7/mine.txt"} and run_folder.read_config(run) == other
 

@@ -113,7 +113,8 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False)
     check(out, config, resume, overwrite)
     if overwrite:
         results = [out / f"{name}{suffix}.json" for name in ("results", "per_view") for suffix in ("", "_train", "_half")]
-        for old in [*(out / "checkpoints").glob("ckpt_*.safetensors"), *results, out / "scene.compact", out / "config.json"]:
+        others = [out / name for name in ("scene.compact", "report.html", "config.json")]
+        for old in [*(out / "checkpoints").glob("ckpt_*.safetensors"), *(out / "previews").glob("*.png"), *results, *others]:
             old.unlink(missing_ok=True)
         for sidecar in (out / "point_cloud").glob("iteration_*/scene.json"):  # a later iteration's would be taken for the new run's
             shutil.rmtree(sidecar.parent, ignore_errors=True)
