@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -31,6 +33,16 @@ def test_counts_follow_the_rule_over_two_views():
     observe.stop(table)
     assert not table.stats
     observe.stop(table)  # twice is fine
+
+
+def test_a_training_in_float64_counts_in_float64():
+    table = Table({"a": torch.zeros(2, 1, dtype=torch.float64)}, {})
+    observe.start(table, K)
+    decoded, render = view([1], [[0.1, -0.2, 0.3]], [3, 5], [4, 0], [[3.0, 4.0], [9.0, 9.0]])
+    decoded = replace(decoded, raw_opacity=torch.tensor([[0.1, -0.2, 0.3]], dtype=torch.float64))
+    observe.observe(table, decoded, replace(render, mean2d_grad=render.mean2d_grad.double()))
+    assert all(value.dtype == torch.float64 and not value.requires_grad for value in table.stats.values())
+    assert float(table.stats["opacity"][1]) == 0.1 + 0.3 and float(table.stats["grad"].sum()) == 5
 
 
 @pytest.mark.parametrize("K", [1, 4, 10, 33])

@@ -20,10 +20,10 @@ STATS = ("visits", "opacity", "grad", "count")
 
 
 def start(table: Table, K: int) -> None:
-    """Begin counting from zero."""
-    like = next(iter(table.columns().values()))
+    """Begin counting from zero, in the parameters' dtype."""
+    like = next(iter(table.params.values()))
     for name, shape in (("visits", ()), ("opacity", ()), ("grad", (K,)), ("count", (K,))):
-        table.stats[name] = torch.zeros(len(table), *shape, device=like.device)
+        table.stats[name] = like.new_zeros(len(table), *shape)
 
 
 def stop(table: Table) -> None:
