@@ -89,7 +89,7 @@ def test_help_and_version_do_not_load_torch():
     assert subprocess.run([sys.executable, "-c", probe], capture_output=True, check=False).returncode == 0
 
 
-@pytest.mark.parametrize("command", ["info", "train", "eval", "compare", "export", "import", "bench", "catalog", "download", "doctor"])
+@pytest.mark.parametrize("command", list(cli.COMMANDS))
 def test_every_command_has_help(command, capsys):
     code, out, _ = run(capsys, command, "--help")
     assert code == 0 and f"scene-experts {command}" in out

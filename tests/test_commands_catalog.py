@@ -103,3 +103,4 @@ def test_progress_with_and_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -
 def test_flags_of_a_scene() -> None:
     assert command.flags(one("garden"), None) == "--data catalog:garden"
     assert command.flags(one("garden"), Path("d")) == "--data d/mipnerf360/garden --resolution inria:4 --split mod8"
+    assert command.flags(one("garden"), Path("my d")).startswith("--data 'my d/mipnerf360/garden' ")

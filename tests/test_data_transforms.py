@@ -202,3 +202,6 @@ def test_auto_takes_the_split_that_the_file_names(tmp_path: Path) -> None:
     capture = load(tmp_path)
     assert (capture.split, capture.test, capture.train) == ("files", (1, 3), (0, 2, 4))
     assert load(tmp_path, split="mod8").test == (0,)
+    edit(tmp_path / "transforms.json", lambda m: m.pop("test_filenames"))
+    with pytest.raises(InputError, match=r"--split files, found no test views in transforms\.json"):
+        load(tmp_path, split="files")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,7 +58,7 @@ def flags(scene: Scene, to: Path | None) -> str:
     """How `train` is told to read a scene by the paper's protocol."""
     if to is None:
         return f"--data catalog:{scene.name}"
-    return f"--data {to / scene.path} --resolution {scene.resolution} --split {scene.split}"
+    return f"--data {shlex.quote(str(to / scene.path))} --resolution {scene.resolution} --split {scene.split}"
 
 
 @dataclass(frozen=True)

@@ -176,5 +176,5 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
         console.print(f"wrote {write_layout(done, capture)}", soft_wrap=True)
         for warning in warnings_of_layout(done):
             print(warning, file=sys.stderr)
-        console.print(f"next: {PROG} eval {command.out}", soft_wrap=True)
+        console.print(f"next: {shlex.join([PROG, 'eval', str(command.out)])}", soft_wrap=True)
     return 128 + signal.Signals[run.stop[0]] if run.stop else 0  # saved, but not whole: `train && eval` must not go on

@@ -84,8 +84,9 @@ def hold_out(capture: Capture, split: str) -> Capture:
     indices = range(len(capture.views))
     if split == "files":
         test = capture.test
-        if capture.kind == "colmap":
-            raise InputError("expected a capture whose files hold a split for --split files, found a COLMAP capture; use --split mod8")
+        if not test and capture.kind != "blender":
+            found = "a COLMAP capture" if capture.kind == "colmap" else "no test views in transforms.json"
+            raise InputError(f"expected a capture whose files hold a split for --split files, found {found}; use --split mod8")
     elif split == "none":
         test = ()
     elif split.startswith("mod") and every.isdecimal() and int(every) >= 2:
