@@ -160,10 +160,16 @@ def test_top_1_warns(caplog):
 
 
 def test_nonsense_is_refused():
-    with pytest.raises(InputError, match=r"--scene\.decoder.top-k between 1"):
-        Experts(num=2, top_k=3).build("color", D, H, OUT, F)
-    with pytest.raises(InputError, match=r"--scene\.decoder.num of at least 1"):
-        Experts(num=0).build("color", D, H, OUT, F)
+    for wrong, said in (
+        (Experts(num=2, top_k=3), r"--scene\.decoder\.top-k between 1"),
+        (Experts(top_k=0), r"--scene\.decoder\.top-k between 1"),
+        (Experts(num=0), r"--scene\.decoder\.num of at least 1"),
+        (Experts(warmup=-1), r"--scene\.decoder\.warmup"),
+    ):
+        with pytest.raises(InputError, match=said):
+            wrong.check()  # before a capture is read
+        with pytest.raises(InputError, match=said):
+            wrong.build("color", D, H, OUT, F)
 
 
 def test_with_distance_the_three_plain_networks_sum_to_7182():

@@ -64,16 +64,17 @@ class Experts:
 
     def check(self) -> None:
         """Raises InputError for numbers that no training can have."""
-        expect_at_least([("--scene.decoder.warmup", self.warmup, 0), ("--scene.decoder.router.noise-std", self.router.noise_std, 0)])
-
-    def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> MixtureHead | MLP:
-        if self.num < 1:
-            raise InputError(f"expected --scene.decoder.num of at least 1, found {self.num}; give a larger number")
+        expect_at_least([("--scene.decoder.num", self.num, 1), ("--scene.decoder.warmup", self.warmup, 0)])
+        expect_at_least([("--scene.decoder.router.noise-std", self.router.noise_std, 0)])
         if self.top_k is not None and not 1 <= self.top_k <= self.num:
             raise InputError(
                 f"expected --scene.decoder.top-k between 1 and the number of experts ({self.num}), found {self.top_k}; "
                 "change it or --scene.decoder.num"
             )
+
+    def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> MixtureHead | MLP:
+        """The head of an attribute: [A, inputs] and features [A, feature] to [A, outputs]. Raises InputError as `check` does."""
+        self.check()
         if self.num == 1 or attribute not in self.attributes:
             return MLP(attribute, inputs, hidden, outputs)
         if self.top_k == 1 and self.router.renormalise and attribute == self.attributes[0]:
