@@ -25,10 +25,13 @@ def to_lattice(points: Tensor, size: float) -> Tensor:
     Raises InputError for coordinates that are not finite or whose cell number does not fit (beyond 2^53 no float64 is exact).
     """
     if not size > 0:
-        raise InputError(f"a voxel size must be greater than 0, found {size}: pass a positive size or use the automatic one")
+        raise InputError(f"expected a voxel size above 0, found {size}; give one with --scene.voxel-size, or 0 for the automatic one")
     cells = torch.round(points.detach().to(torch.float64) / size)
     if not bool((cells.abs() < 2.0**53).all()):
-        raise InputError(f"points must be finite and near enough for voxels of {size:g}: remove far outliers or use larger voxels")
+        raise InputError(
+            f"expected points that are finite and near enough for voxels of {size:g}, found others; remove far outliers or give a larger "
+            f"--scene.voxel-size"
+        )
     return cells.to(torch.int64)
 
 
@@ -46,7 +49,8 @@ def pack(cells: Tensor) -> Tensor:
     if cells.numel() and not bool(((cells >= -AXIS_LIMIT) & (cells < AXIS_LIMIT)).all()):
         found = int(cells.abs().max())
         raise InputError(
-            f"voxel numbers must lie within {AXIS_LIMIT:,} of the origin, found {found:,}: remove far outliers or use larger voxels"
+            f"expected voxel numbers within {AXIS_LIMIT:,} of the origin, found {found:,}; remove far outliers or give a larger "
+            f"--scene.voxel-size"
         )
     x, y, z = (cells + AXIS_LIMIT).unbind(-1)
     return (x << (2 * AXIS_BITS)) | (y << AXIS_BITS) | z
@@ -103,7 +107,7 @@ def auto_voxel(points: Tensor, rule: VoxelRule = "squared_median", factor: float
     if not size > 0:
         size = _middle(spacing[spacing > 0])
     if not size > 0:
-        raise InputError("an automatic voxel size needs at least two different points: pass a voxel size")
+        raise InputError("expected two different points for an automatic voxel size, found none; give one with --scene.voxel-size")
     return factor * size
 
 
