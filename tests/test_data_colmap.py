@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from scene_experts.data.colmap import Model, Posed, find_model, read_model, write_model
 from scene_experts.errors import InputError
@@ -183,6 +184,25 @@ def test_poses_that_are_not_finite(tmp_path: Path, bad: dict) -> None:
     write_model(tmp_path, replace(made, images=(replace(made.images[0], **bad), *made.images[1:])))
     with pytest.raises(InputError, match="finite pose"):
         read_model(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["", "."])
+def test_images_without_a_name(tmp_path: Path, name: str) -> None:
+    made = model()
+    write_model(tmp_path, replace(made, images=(replace(made.images[0], name=name), *made.images[1:])))
+    with pytest.raises(InputError, match=r"a name for every image, found '\.?' for image 1"):
+        read_model(tmp_path)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_one_point(tmp_path: Path, text: bool) -> None:
+    made = model()
+    made = replace(made, ids=made.ids[:1], xyz=made.xyz[:1], rgb=made.rgb[:1], error=made.error[:1])
+    write_model(tmp_path, made, text=text)
+    got = read_model(tmp_path)
+    assert_same(got, made)
+    for array in (got.xyz, got.rgb, got.error):
+        assert torch.from_numpy(array).shape == array.shape
 
 
 def test_image_of_an_unknown_camera(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,9 +95,9 @@ def read_model(folder: Path, observations: bool = False) -> Model:
         cameras,
         images,
         points["id"].astype(np.int64),
-        np.ascontiguousarray(points["xyz"], dtype=np.float64),
-        np.ascontiguousarray(points["rgb"]),
-        np.ascontiguousarray(points["error"], dtype=np.float64),
+        np.array(points["xyz"], dtype=np.float64),  # copies: one row of a packed record counts as contiguous, with strides torch refuses
+        np.array(points["rgb"]),
+        np.array(points["error"], dtype=np.float64),
         {image.id: (seen["xy"].copy(), seen["point"].copy()) for image, seen in rows if seen is not None},
     )
 
@@ -110,6 +110,8 @@ def _check_images(images: tuple[Posed, ...], cameras: dict[int, Lens], path: Pat
     if not images:
         raise InputError(f"expected at least one registered image in {path}, found none; reconstruct the capture again")
     for image in images:
+        if not PurePosixPath(image.name).name:
+            raise InputError(f"expected a name for every image, found {image.name!r} for image {image.id} in {path}; restore the file")
         if not np.isfinite((*image.quaternion, *image.translation)).all() or not any(image.quaternion):
             raise InputError(f"expected a finite pose for every image, found {image.name} without one in {path}; remove that image from it")
         if image.camera_id not in cameras:
