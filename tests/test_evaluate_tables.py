@@ -97,9 +97,10 @@ def test_refuses_other_protocols(runs: list[Path], key: str, value: Any, option:
 def test_not_evaluated(tmp_path: Path, runs: list[Path]) -> None:
     with pytest.raises(InputError, match="scene-experts eval"):
         printed([*runs, tmp_path])
-    (tmp_path / "results.json").write_text("[1]")
-    with pytest.raises(InputError, match="something else"):
-        printed([tmp_path])
+    for wrong in ("[1]", '{"psnr": null}'):
+        (tmp_path / "results.json").write_text(wrong)
+        with pytest.raises(InputError, match="something else"):
+            printed([tmp_path])
     with pytest.raises(InputError, match="at least one"):
         printed([])
 

@@ -153,6 +153,8 @@ def test_the_world_without_an_earlier_export_comes_from_the_capture(folder, tmp_
     value["data"]["split"] = "first:3"  # of a run that was overwritten
     path.write_text(json.dumps(value))
     assert world_of(opened) == wanted
+    path.write_text("{torn")
+    assert world_of(opened) == wanted
 
 
 def test_another_capture_gives_no_world_and_a_catalogs_name_is_understood(folder, tmp_path, monkeypatch):

@@ -218,9 +218,12 @@ def test_damaged_descriptions_and_experts(tmp_path):
         ("[]", "expected a scene description of format 1"),
         (text[:40], "in JSON"),
         ('{"format": 1}', "expected F, K, recipe, voxel_size, world"),
-        (text.replace('"scale": 2.5', '"scale": 0'), "voxel_size and world as numbers"),
-        (text.replace('"world": {', '"world": 3, "worlds": {'), "voxel_size and world as numbers"),
-        (text.replace('"trained": 0.1', '"trained": null'), "voxel_size and world as numbers"),
+        (text.replace('"scale": 2.5', '"scale": 0'), "voxel_size, world, extent and step as numbers"),
+        (text.replace('"world": {', '"world": 3, "worlds": {'), "voxel_size, world, extent and step as numbers"),
+        (text.replace('"trained": 0.1', '"trained": null'), "voxel_size, world, extent and step as numbers"),
+        (text.replace('"step": 30000,', '"step": "x",'), "voxel_size, world, extent and step as numbers"),
+        (text.replace('"step": 30000,', '"step": 1, "extent": null, "scene": {},'), "voxel_size, world, extent and step as numbers"),
+        (text.replace('"step": 30000,', '"step": 1, "scene": 3,'), "voxel_size, world, extent and step as numbers"),
     ):
         (folder / "scene.json").write_text(wrong)
         with pytest.raises(InputError, match=message):

@@ -27,8 +27,8 @@ def test_metrics_previews_and_what_a_resumed_run_writes_again(tmp_path):
         record(Previewed(30, 0, torch.tensor([[[0.0, 0.5, 1.0]]])))
     assert [v["step"] for v in lines(tmp_path)] == [10, 20, 30, 30] and lines(tmp_path)[-1]["grown"] == 5
     assert Image.open(tmp_path / "previews" / "000030.png").getpixel((0, 0)) == (0, 128, 255)
-    with (tmp_path / "metrics.jsonl").open("a") as stream:
-        stream.write('{"step": 31, "cut o')  # killed while writing
+    with (tmp_path / "metrics.jsonl").open("ab") as stream:
+        stream.write(b'{"step": 31, "cut o\n\0\xff\xfe')  # killed while writing, and what a power cut leaves
     with Recorder(tmp_path, False, None) as record:
         record(Started(20, 30, 10))
         record(step(30))

@@ -81,6 +81,20 @@ def test_a_run_without_pictures_or_results(tmp_path):
         write([])
 
 
+def test_torn_and_foreign_files(tmp_path):
+    folder = run(tmp_path)
+    with (folder / "metrics.jsonl").open("ab") as stream:
+        stream.write(b"\xff\xfe\0\n")  # what a power cut leaves
+    assert "gate entropy" in write([folder]).read_text()
+    (folder / "test" / "gt" / "0.png").write_bytes(b"torn")
+    with pytest.raises(InputError, match=r"expected a picture at .* evaluate again"):
+        write([folder])
+    for wrong in ([1], {"a.png": 3}, {"a.png": {}}):
+        write_json(folder / "per_view.json", wrong)
+        with pytest.raises(InputError, match="expected scores by view in"):
+            write([folder])
+
+
 def test_an_imported_run_claims_no_training(tmp_path):
     folder = run(tmp_path)
     results = json.loads((folder / "results.json").read_text())

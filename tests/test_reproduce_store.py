@@ -66,7 +66,7 @@ def test_curves_keep_the_ends_and_skip_torn_lines(tmp_path):
         '{"psnr": NaN, "step": 7}',
         '{"step": 99',
     ]
-    path.write_text("\n".join(lines))
+    path.write_bytes("\n".join(lines).encode() + b"\n\xff\xfe")
     found = curves(path)
     assert len(found) == POINTS and (found[0]["step"], found[-1]["step"]) == (1, 1000) and "terms" not in found[0]
     assert curves(tmp_path / "none") == []

@@ -56,7 +56,7 @@ class Recorder:
 
     def truncate(self, step: int) -> None:
         """Drop lines beyond `step`: a resumed run writes them again."""
-        lines = self.path.read_text().splitlines() if self.path.exists() else []
+        lines = self.path.read_text(errors="replace").splitlines() if self.path.exists() else []  # a power cut may leave anything
         kept = [line for line in lines if _step(line) <= step] if step else []
         write_atomic(self.path, lambda temporary: temporary.write_text("".join(line + "\n" for line in kept)))
 

@@ -89,7 +89,7 @@ def load_results(run: Path, views: str = "test") -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"expected an evaluated run with {path.name} in {run}, found none; run `scene-experts eval {run}` first")
     results = read_json(path, "results file")
-    if not isinstance(results, dict) or "psnr" not in results:
+    if not isinstance(results, dict) or not isinstance(results.get("psnr"), (int, float)):
         raise InputError(f"expected results of `scene-experts eval` in {path}, found something else; evaluate the run again")
     return results
 

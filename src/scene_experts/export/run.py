@@ -219,7 +219,10 @@ def moved(run: OpenRun, data: Path | None) -> OpenRun:
 def world_of(run: OpenRun) -> World:
     """The world a run was trained in: from the description beside its exported anchors, else from its capture."""
     for path in sorted((run.path / "point_cloud").glob(f"iteration_*/{SIDECAR}"), key=lambda p: p.stat().st_mtime, reverse=True):
-        found = read_sidecar(path)
+        try:
+            found = read_sidecar(path)
+        except InputError:
+            continue  # the capture says it too
         if found.get("data") == _settings(run.config.data):
             return world_in(found)
     capture = run_folder.capture_of(run)

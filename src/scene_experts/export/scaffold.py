@@ -146,11 +146,12 @@ def read_sidecar(path: Path) -> dict[str, Any]:
         raise InputError(f"expected {', '.join(sorted(absent))} in the scene description {path}, found none; write the scene again")
     try:
         numbers = [*map(float, value["voxel_size"].values()), float(value["world"]["scale"]), *map(float, value["world"]["shift"])]
-        if len(numbers) != 6 or not numbers[2] > 0:
+        others = [float(value.get("extent", 1)), int(value.get("step", 0)), *dict(value.get("scene", {}))]
+        if len(numbers) != 6 or not numbers[2] > 0 or not others[0] > 0:
             raise ValueError
     except (AttributeError, KeyError, TypeError, ValueError):
         raise InputError(
-            f"expected voxel_size and world as numbers in the scene description {path}, found others; write it again"
+            f"expected voxel_size, world, extent and step as numbers in the scene description {path}, found others; write it again"
         ) from None
     return value
 

@@ -18,6 +18,7 @@ from PIL import Image
 from scene_experts import run_folder
 from scene_experts.config import RunConfig, to_json
 from scene_experts.errors import InputError
+from scene_experts.evaluate.pictures import read as read_picture
 from scene_experts.evaluate.tables import Table, load_results, table, told_apart, unlike
 from scene_experts.io import read_json, write_bytes
 from scene_experts.report import chart
@@ -56,7 +57,10 @@ def write(runs: Sequence[Path], out: Path | None = None) -> Path:
 def source(run: Path) -> Source:
     """Reads a run folder."""
     config, results = run_folder.read_config(run), load_results(run)
-    per_view = read_json(run / "per_view.json", "scores by view") if (run / "per_view.json").is_file() else {}
+    path = run / "per_view.json"
+    per_view = read_json(path, "scores by view") if path.is_file() else {}
+    if not isinstance(per_view, dict) or not all(isinstance(v, dict) and isinstance(v.get("file"), str) for v in per_view.values()):
+        raise InputError(f"expected scores by view in {path}, found something else; run `scene-experts eval {run}` again")
     return Source(config.train.recipe, run, config, results, per_view, metrics(run / "metrics.jsonl"))
 
 
@@ -69,7 +73,7 @@ def named(sources: list[Source]) -> list[Source]:
 def metrics(path: Path) -> list[dict[str, Any]]:
     """The lines of a training's metrics that are whole."""
     out = []
-    for line in path.read_text().splitlines() if path.is_file() else []:
+    for line in path.read_text(errors="replace").splitlines() if path.is_file() else []:  # a power cut may leave anything
         try:
             found = json.loads(line)
         except ValueError:
@@ -148,9 +152,8 @@ def held_out(sources: Sequence[Source]) -> tuple[str, dict[str, str]]:
 
 
 def encoded(path: Path) -> str:
-    """A picture as a data address: JPEG, at most LONGEST px."""
-    with Image.open(path) as opened:
-        picture = opened.convert("RGB")
+    """A picture as a data address: JPEG, at most LONGEST px. Raises InputError where it is unreadable."""
+    picture = Image.fromarray(read_picture(path))
     picture.thumbnail((LONGEST, LONGEST), Image.Resampling.LANCZOS)
     stream = io.BytesIO()
     picture.save(stream, format="JPEG", quality=QUALITY)

@@ -87,7 +87,7 @@ def of_run(run: Path, scene: str) -> Record:
 def curves(path: Path) -> list[dict[str, Any]]:
     """At most POINTS lines of a training's metrics, evenly spread, the last one among them."""
     lines = []
-    for line in path.read_text().splitlines() if path.is_file() else []:
+    for line in path.read_text(errors="replace").splitlines() if path.is_file() else []:
         try:
             found = json.loads(line)
         except ValueError:
