@@ -247,7 +247,7 @@ RUNS = {
     "resume with other numbers": ("moe-gs", ["--resume", "--loss.load", "0.5"]),
     "resume with another length": ("moe-gs", ["--resume", "--iterations", "8"]),
     "resume with another split": ("moe-gs", ["--resume", "--split", "none"]),
-    "overwrite with what cannot be": ("moe-gs", ["--overwrite", "--scene.decoder.num", "0"]),
+    "overwrite with what cannot be": ("moe-gs", ["--overwrite", "--scene.voxel-size", "1e-9"]),  # found out when the scene begins
 }
 
 
