@@ -58,3 +58,17 @@ def test_one_seed_leaves_room_for_what_another_would_change():
     one, four = difference(a[:1], b[:1]), difference(a, b)
     assert one is not None and one.low == pytest.approx(0.2 - 0.3) and one.verdict(1) == "undecided"
     assert four is not None and four.low == pytest.approx(0.2 - 0.3 / 2) and four.verdict(1) == "confirmed"
+
+
+def test_fit_is_paired_over_iterations_of_the_second_half():
+    a, b = (record(recipe, scene="x") for recipe in ("moe-gs", "scaffold-gs"))
+    end = a.config.train.iterations
+    for each, late in ((a, 31.5), (b, 31.0)):
+        shown = ((1, 10.0 * late), (end // 2 + 1, late), (end - 1, None), (end, late + 3))
+        each.curves[:] = [{"step": step, "psnr": psnr} for step, psnr in shown]
+    b.curves.pop()
+    d = difference([a], [b])
+    assert d is not None and d.fit == pytest.approx(0.5)
+    b.curves.clear()
+    d = difference([a], [b])
+    assert d is not None and d.fit is None

@@ -61,10 +61,11 @@ def opposite(verdict: Verdict) -> Verdict:
     return "contradicted" if verdict == "confirmed" else "confirmed" if verdict == "contradicted" else "undecided"
 
 
-def describe(d: Difference, unit: str = "dB") -> str:
+def describe(d: Difference) -> str:
+    fitted = "" if d.fit is None else f"; on training views {d.fit:+.2f} dB"
     return (
-        f"{d.mean:+.2f} {unit} (95 % interval {d.low:+.2f} to {d.high:+.2f}; "
-        f"{many(d.captures, 'capture')}, {many(d.views, 'view')}, {many(d.seeds, 'seed')})"
+        f"{d.mean:+.2f} dB (95 % interval {d.low:+.2f} to {d.high:+.2f}; "
+        f"{many(d.captures, 'capture')}, {many(d.views, 'view')}, {many(d.seeds, 'seed')}{fitted})"
     )
 
 

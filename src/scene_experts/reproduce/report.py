@@ -37,7 +37,8 @@ def write(
         page += [f"![{p.stem}]({p.name})\n" for p in made if p.suffix == ".png"]
     page += ["## The paper's claims", "", claims.to_markdown(claims.check(records))]
     page += ["Differences are paired over views and seeds; the interval is a bootstrap over both within these captures."]
-    page += [f"With one seed it is at least {SEED_NOISE} dB / sqrt(captures) to each side: what another seed changes.", ""]
+    page += [f"With one seed it is at least {SEED_NOISE} dB / sqrt(captures) to each side: what another seed changes."]
+    page += ["On training views: the same difference as the trainings showed it, over their second half, paired by iteration.", ""]
     path = out / "README.md"
     write_bytes(path, "\n".join(page).encode())
     return [*written, path]

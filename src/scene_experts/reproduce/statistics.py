@@ -52,6 +52,8 @@ class Difference:
     captures: int
     seeds: int
     views: int
+    fit: float | None = None
+    """A - B in PSNR (dB) on training views over the second half of the trainings: whether A fits better, generalised or not."""
 
     def verdict(self, sign: int) -> Verdict:
         """Whether A - B has the claimed sign (+1 or -1), its opposite, or may be either."""
@@ -92,4 +94,24 @@ def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -
     least = SEED_NOISE * sum(len(seeds) == 1 for seeds in blocks.values()) ** 0.5 / len(blocks)
     low, high = min(float(low), centre - least), max(float(high), centre + least)
     views = sum(len(next(iter(seeds.values()))) for seeds in blocks.values())
-    return Difference(centre, low, high, len(blocks), max(map(len, blocks.values())), views)
+    return Difference(centre, low, high, len(blocks), max(map(len, blocks.values())), views, fit(a, b))
+
+
+def fit(a: Sequence[Record], b: Sequence[Record]) -> float | None:
+    """Mean A - B in PSNR (dB) of the view trained on, paired over the iterations of the second half that both curves have.
+
+    The same seed shows the same views in the same order, whatever the recipe. Mean over seeds, then captures; None where nothing pairs.
+    """
+    theirs = {(r.scene, r.seed): training_psnr(r) for r in b}
+    found: dict[str, list[float]] = {}
+    for record in a:
+        mine, other = training_psnr(record), theirs.get((record.scene, record.seed), {})
+        steps = [step for step in mine if step in other and 2 * step > record.config.train.iterations]
+        if steps:
+            found.setdefault(record.scene, []).append(statistics.fmean(mine[step] - other[step] for step in steps))
+    return statistics.fmean(statistics.fmean(seeds) for seeds in found.values()) if found else None
+
+
+def training_psnr(record: Record) -> dict[int, float]:
+    """PSNR (dB) of the view of an iteration, by iteration."""
+    return {point["step"]: point["psnr"] for point in record.curves if point.get("psnr") is not None}
