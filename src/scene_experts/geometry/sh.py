@@ -62,8 +62,3 @@ def sh_to_rgb(sh: Tensor, directions: Tensor, degree: int) -> Tensor:
 def rgb_to_dc(rgb: Tensor) -> Tensor:
     """The constant coefficient that shows as `rgb` when all others are zero."""
     return (rgb - 0.5) / C0
-
-
-def dc_to_rgb(dc: Tensor) -> Tensor:
-    """The inverse of `rgb_to_dc`, not clamped."""
-    return dc * C0 + 0.5
