@@ -9,7 +9,7 @@ from PIL import Image
 from scene_experts.data.capture import load
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.export.bake import explicit
-from scene_experts.export.bake_measure import as_trained, counted, nothing_counted, picture, scores
+from scene_experts.export.bake_measure import counted, nothing_counted, picture, scores
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from synthetic import make_capture
@@ -31,11 +31,6 @@ def test_scores_are_means_over_views_of_8_bit_pictures(tmp_path):
         by_hand.append(psnr(image, capture.frame(index).rgb.float() / 255))
     assert found["b"].photographs == pytest.approx(sum(by_hand) / len(by_hand), abs=1e-6)
     capture.images.close()
-
-
-def test_the_rasteriser_is_the_runs():
-    draw = choose("auto", "cpu")
-    assert as_trained(draw, False) is draw and as_trained(draw, True) == replace(draw, antialias=True)  # type: ignore[type-var]
 
 
 def test_views_whose_mask_counts_nothing_are_not_scored(tmp_path):

@@ -1,11 +1,13 @@
 """The choice of a rasteriser: what `auto` takes, and what cannot be had."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from scene_experts import native, render
 from scene_experts.errors import InputError
-from scene_experts.render import NAMES, choose
+from scene_experts.render import NAMES, as_trained, choose
 from scene_experts.types import Camera, Gaussians
 
 
@@ -60,6 +62,13 @@ def test_channels_come_out_in_the_order_they_went_in(name):
     assert brightest[0] in (10, 11) and brightest[1] in (4, 5), "row about cy, column about cx"
     assert picture[10, 4, 0] > 0.7 and 0.4 < picture[10, 4, 1] < 0.5 and picture[10, 4, 2] < 0.15
     torch.testing.assert_close(picture[0, -1], torch.tensor([0.0, 0.1, 0.2]))
+
+
+def test_a_rasteriser_is_as_the_run_was_trained():
+    draw = choose("reference", "cpu")
+    assert as_trained(draw, False) is draw and as_trained(draw, True) == replace(draw, antialias=True)  # type: ignore[type-var]
+    plain = object()  # one that has no compensation
+    assert as_trained(plain, True) is plain  # type: ignore[arg-type]
 
 
 def test_gsplat_says_that_it_is_not_deterministic():

@@ -20,6 +20,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.errors import InputError, expect_at_least
 from scene_experts.evaluate.pictures import strip, to_8bit
 from scene_experts.progress import Bar
+from scene_experts.render import as_trained
 from scene_experts.scene.frozen import freeze
 from scene_experts.types import Camera
 from scene_experts.view import path_files, paths, video
@@ -133,9 +134,7 @@ def drawn(
         camera = camera.to(background.device)
         tiles = []
         for run, draws in zip(opened, frozen):
-            draw = rasterize
-            if getattr(rasterize, "antialias", run.cfg.antialias) != run.cfg.antialias:
-                draw = replace(rasterize, antialias=run.cfg.antialias)
+            draw = as_trained(rasterize, run.cfg.antialias)
             looks = [Look(mode, command.attribute, only) for mode in command.show]
             tiles += [paint(run.scene, camera, run.step, draw, background, look, draws) for look in looks]
         yield to_8bit(strip(tiles) if len(tiles) > 1 else tiles[0])

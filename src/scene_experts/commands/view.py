@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +12,7 @@ import tyro
 from scene_experts import run_folder
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import Device, Raster, backend
+from scene_experts.render import as_trained
 from scene_experts.scene.frozen import freeze
 from scene_experts.view.server import Viewer, check_port, viser
 
@@ -39,8 +40,7 @@ def view(args: list[str]) -> int:
     viser()  # says what is missing before anything is read
     device, rasterize = backend(command.device, command.rasterizer, False, False)
     opened = run_folder.open_run(command.run, device, command.step)
-    if getattr(rasterize, "antialias", opened.cfg.antialias) != opened.cfg.antialias:
-        rasterize = replace(rasterize, antialias=opened.cfg.antialias)  # type: ignore[type-var]
+    rasterize = as_trained(rasterize, opened.cfg.antialias)
     capture = run_folder.capture_of(opened, command.data)
     label = f"{opened.config.train.recipe} on {capture.name}"
     viewer = Viewer(

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from rich.console import Console
 
 from scene_experts import run_folder
 from scene_experts.evaluate.run import About, evaluate
 from scene_experts.progress import Bar
-
-if TYPE_CHECKING:
-    from scene_experts.render import Rasterizer
+from scene_experts.render import Rasterizer, as_trained
 
 
 def evaluate_run(
@@ -34,8 +31,7 @@ def evaluate_run(
     The rasteriser's antialiasing follows the run's recipe where it can. Raises InputError for anything that does not fit.
     """
     opened = run_folder.open_run(run, device, step)
-    if getattr(rasterize, "antialias", opened.cfg.antialias) != opened.cfg.antialias:
-        rasterize = replace(rasterize, antialias=opened.cfg.antialias)  # type: ignore[type-var]
+    rasterize = as_trained(rasterize, opened.cfg.antialias)
     capture = run_folder.capture_of(opened, data)
     about = About(
         recipe=opened.config.train.recipe,

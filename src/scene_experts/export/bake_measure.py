@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -22,13 +22,6 @@ class Score:
 
     photographs: float  # PSNR against the photographs
     first: float  # PSNR against the pictures of the first scene; 100 for that scene itself
-
-
-def as_trained(rasterize: Rasterizer, antialias: bool) -> Rasterizer:
-    """The rasteriser with the compensation that a run was trained with."""
-    if getattr(rasterize, "antialias", antialias) != antialias:
-        return replace(rasterize, antialias=antialias)  # type: ignore[type-var]
-    return rasterize
 
 
 def counted(capture: Capture) -> list[int]:

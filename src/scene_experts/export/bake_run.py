@@ -15,7 +15,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.data.views import World
 from scene_experts.errors import InputError
 from scene_experts.export.bake import Bake, bake, explicit
-from scene_experts.export.bake_measure import as_trained, counted, nothing_counted, scores
+from scene_experts.export.bake_measure import counted, nothing_counted, scores
 from scene_experts.export.bake_refine import DRAWN_AT
 from scene_experts.export.bake_sums import Tell
 from scene_experts.export.html_page import capture_notes
@@ -24,7 +24,7 @@ from scene_experts.export.splats import Splats, from_scene, to_columns
 from scene_experts.export.standard import FORMATS, read_standard, write_standard
 from scene_experts.io import check_writable, write_json
 from scene_experts.progress import clock
-from scene_experts.render import Rasterizer
+from scene_experts.render import Rasterizer, as_trained
 from scene_experts.run_folder import OpenRun
 from scene_experts.scene.anchors import AnchorScene
 from scene_experts.scene.explicit import GaussianScene

@@ -14,7 +14,7 @@ from scene_experts.config import Data, to_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
 from scene_experts.export import explicit, graph_points, graph_points_in
-from scene_experts.export.bake_measure import as_trained, counted, nothing_counted, scores
+from scene_experts.export.bake_measure import counted, nothing_counted, scores
 from scene_experts.export.cameras import write_cameras
 from scene_experts.export.compact import Compact, Sizes, read_compact, write_compact
 from scene_experts.export.extras import extra_networks, level_columns
@@ -29,7 +29,7 @@ from scene_experts.export.incoming import import_result as import_files
 from scene_experts.export.networks import is_plain, sequential
 from scene_experts.export.scaffold import SIDECAR, describe, read_sidecar, write_scaffold_folder
 from scene_experts.io import write_bytes
-from scene_experts.render import Rasterizer
+from scene_experts.render import Rasterizer, as_trained
 from scene_experts.run_folder import OpenRun
 from scene_experts.scene.anchors import ATTRIBUTES, AnchorScene
 from scene_experts.scene.experts import MixtureHead

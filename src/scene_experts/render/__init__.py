@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import warnings
+from dataclasses import replace
 from typing import Protocol
 
 import torch
@@ -65,6 +66,13 @@ def choose(name: str, device: torch.device | str, antialias: bool = False, deter
 
         return ReferenceRasterizer(antialias=antialias)
     raise InputError(f"there is no rasteriser `{name}`: choose one of {', '.join(NAMES)}")
+
+
+def as_trained(rasterize: Rasterizer, antialias: bool) -> Rasterizer:
+    """The rasteriser with the compensation that a run was trained with, where it has any."""
+    if getattr(rasterize, "antialias", antialias) != antialias:
+        return replace(rasterize, antialias=antialias)  # type: ignore[type-var]
+    return rasterize
 
 
 def _best(device: torch.device) -> str:
