@@ -17,9 +17,9 @@ def test_ours_stand_beside_the_papers():
     assert table.titles[:5] == ("", "PSNR", "SSIM", "LPIPS", "MB") and table.titles[5] == "PSNR (paper)"
     rows = {row[0]: row for row in table.rows}
     assert rows["MoE-GS"][1] == "24.50 ± 0.71" and rows["MoE-GS"][5] == "24.61"
-    assert rows["wo_MoE"][1] == "23.00" and rows["wo_CL"][1] == "-" and rows["wo_CL"][5] == "24.42"
-    assert (list(rows).index("MoE-GS"), 1) in table.best and (list(rows).index("wo_MoE"), 4) in table.best
-    assert any(note.startswith("no run: wo_CL") for note in table.notes) and "3,000, 30,000 iterations" in table.notes[0]
+    assert rows["w/o MoE"][1] == "23.00" and rows["w/o CL"][1] == "-" and rows["w/o CL"][5] == "24.42"
+    assert (list(rows).index("MoE-GS"), 1) in table.best and (list(rows).index("w/o MoE"), 4) in table.best
+    assert any(note.startswith("no run: w/o CL") for note in table.notes) and "3,000, 30,000 iterations" in table.notes[0]
 
 
 def test_own_captures_have_no_published_numbers():
@@ -42,8 +42,8 @@ def test_the_three_files():
     table = by_dataset(TABLE4, runs(), "TanksAndTemples", ["truck"])
     files = write_all("Table 4", {"T&T": table})
     assert files["md"].startswith("# Table 4") and "| MoE-GS |" in files["md"].replace("**", "")
-    assert "wo_MoE,23.00" in files["csv"]
-    assert r"wo\_CL" in to_latex(table, "T&T") and r"\caption{T\&T}" in to_latex(table, "T&T") and r"$\pm$" in files["tex"]
+    assert "w/o MoE,23.00" in files["csv"]
+    assert r"w/o L\_load" in to_latex(table, "T&T") and r"\caption{T\&T}" in to_latex(table, "T&T") and r"$\pm$" in files["tex"]
     assert escape("50 %") == r"50 \%"
 
 

@@ -15,10 +15,10 @@ DATASETS: dict[str, tuple[str, ...]] = {
 }
 METHODS = {"3DGS": "3dgs", "Scaffold-GS": "scaffold-gs", "SAGS": "sags", "Octree-GS": "octree-gs", "MoE-GS": "moe-gs"}
 ABLATION = {
-    "wo_MoE": "scaffold-gs-opacity",
-    "wo_CL": "moe-gs-no-cl",
-    "wo_L_load": "moe-gs-no-load",
-    "wo_L_opacity": "moe-gs-no-opacity",
+    "w/o MoE": "scaffold-gs-opacity",
+    "w/o CL": "moe-gs-no-cl",
+    "w/o L_load": "moe-gs-no-load",
+    "w/o L_opacity": "moe-gs-no-opacity",
     "MoE-GS": "moe-gs",
 }
 ROUTINGS = ("top1", "top2", "dense")
