@@ -15,7 +15,11 @@ def get(records, word):
 def test_without_runs_nothing_is_claimed():
     findings = check([])
     assert len(findings) >= 16 and all(f.verdict is None for f in findings)
-    assert to_markdown(findings).count("not run") == len(findings)
+    assert to_markdown(findings) == "These runs judge none of them.\n"
+    some = check([record("moe-gs"), record("scaffold-gs")])
+    table, others = to_markdown(some).split("Without the runs to judge by: ")
+    assert [f.claim for f in some if f.verdict] == [line.split(" | ")[0][2:] for line in table.splitlines()[2:] if line]
+    assert [f.claim for f in some if not f.verdict] == others.strip().rstrip(".").split("; ")
 
 
 def test_more_psnr_at_equal_size():

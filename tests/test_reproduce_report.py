@@ -22,3 +22,12 @@ def test_files_and_page(tmp_path):
     assert "(table4.md)" in page and "MoE-GS has more PSNR than Scaffold-GS | confirmed | +1.00 dB" in page
     assert "99" not in (tmp_path / "table4.md").read_text()
     assert "fern" in (tmp_path / "table4.md").read_text()
+
+
+def test_means_are_over_the_captures_that_every_row_has(tmp_path):
+    scenes = [Scene(name, OWN, tmp_path / name) for name in ("fox", "fern")]
+    runs = [record("moe-gs", "fox", psnr=30.0, views=1), record("scaffold-gs-opacity", "fox", psnr=29.0, views=1)]
+    report.write(tmp_path, [EXPERIMENTS["table4"]], scenes, [*runs, record("moe-gs", "fern", psnr=10.0, views=1)])
+    means, by_scene = (tmp_path / "table4.md").read_text().split("scene by scene")
+    assert "means over fox\n" in means and "| MoE-GS | **30.00** |" in means and "left out of the means" in means and "10.00" not in means
+    assert "10.00" in by_scene

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from records import record
-from scene_experts.reproduce.statistics import difference, mean
+from scene_experts.reproduce.statistics import difference, mean, shared
 
 
 def test_mean_over_scenes_spread_over_seeds():
@@ -72,3 +72,16 @@ def test_fit_is_paired_over_iterations_of_the_second_half():
     b.curves.clear()
     d = difference([a], [b])
     assert d is not None and d.fit is None
+
+
+def test_a_large_gain_on_one_of_three_captures_is_no_rule():
+    a = [record("moe-gs", scene=s, psnr=p, seed=k) for s, p in (("x", 32.0), ("y", 29.9), ("z", 29.9)) for k in (0, 1)]
+    b = [record("scaffold-gs", scene=s, seed=k) for s in "xyz" for k in (0, 1)]
+    d = difference(a, b)
+    assert d is not None and d.low > 0 and d.gains == 1 and d.verdict(1) == d.verdict(-1) == "undecided"
+
+
+def test_shared_scenes_are_those_of_every_recipe_that_ran():
+    runs = [record("moe-gs", scene="x"), record("moe-gs", scene="y"), record("scaffold-gs", scene="y")]
+    assert [(r.recipe, r.scene) for r in shared(runs, ["moe-gs", "scaffold-gs", "3dgs"])] == [("moe-gs", "y"), ("scaffold-gs", "y")]
+    assert shared([], ["moe-gs"]) == []

@@ -63,9 +63,10 @@ def opposite(verdict: Verdict) -> Verdict:
 
 def describe(d: Difference) -> str:
     fitted = "" if d.fit is None else f"; on training views {d.fit:+.2f} dB"
+    where = "" if d.captures == 1 else f", higher on {d.gains}"
     return (
         f"{d.mean:+.2f} dB (95 % interval {d.low:+.2f} to {d.high:+.2f}; "
-        f"{many(d.captures, 'capture')}, {many(d.views, 'view')}, {many(d.seeds, 'seed')}{fitted})"
+        f"{many(d.captures, 'capture')}{where}, {many(d.views, 'view')}, {many(d.seeds, 'seed')}{fitted})"
     )
 
 
@@ -158,6 +159,12 @@ def together(verdicts: Sequence[Verdict]) -> Verdict:
 
 
 def to_markdown(findings: Sequence[Finding]) -> str:
-    lines = ["| claim | verdict | measured |", "|---|---|---|"]
-    lines += [f"| {f.claim} | {f.verdict or 'not run'} | {f.measured} |" for f in findings]
-    return "\n".join(lines) + "\n"
+    """The judged ones as a table, and the others in a line."""
+    judged, others = [f for f in findings if f.verdict], [f.claim for f in findings if not f.verdict]
+    lines = ["| claim | verdict | measured |", "|---|---|---|", *(f"| {f.claim} | {f.verdict} | {f.measured} |" for f in judged)]
+    lines = [*lines, ""] if judged else []
+    if not judged:
+        return "These runs judge none of them.\n"
+    if others:
+        lines += [f"Without the runs to judge by: {'; '.join(others)}.", ""]
+    return "\n".join(lines)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from scene_experts.errors import InputError
 from scene_experts.io import write_bytes
 from scene_experts.reproduce.experiments import ROUTINGS, Experiment
-from scene_experts.reproduce.statistics import mean
+from scene_experts.reproduce.statistics import mean, of_recipe, shared
 from scene_experts.reproduce.store import Record
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # told apart by colour-blind readers
@@ -42,17 +42,6 @@ def save(figure: Any, path: Path) -> list[Path]:
         out.append(path.with_suffix(f".{ending}"))
     pyplot.close(figure)
     return out
-
-
-def of_recipe(records: Sequence[Record], recipe: str, scene: str | None = None) -> list[Record]:
-    return [r for r in records if r.recipe == recipe and (scene is None or r.scene == scene)]
-
-
-def shared(records: Sequence[Record], recipes: Iterable[str]) -> list[Record]:
-    """The records of recipes that have any, on the scenes that all of these have: lines over different scenes would compare scenes."""
-    by = {recipe: rows for recipe in recipes if (rows := of_recipe(records, recipe))}
-    scenes = set.intersection(*({r.scene for r in rows} for rows in by.values())) if by else set()
-    return [r for rows in by.values() for r in rows if r.scene in scenes]
 
 
 def relative_psnr(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str], path: Path) -> list[Path]:

@@ -16,7 +16,7 @@ from scene_experts.render import choose
 from scene_experts.reproduce import claims, figures, store, tables
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN, Scene, Spec
-from scene_experts.reproduce.statistics import SEED_NOISE
+from scene_experts.reproduce.statistics import SEED_NOISE, shared
 from scene_experts.reproduce.store import Record
 
 
@@ -53,7 +53,14 @@ def write_tables(out: Path, experiment: Experiment, scenes: Sequence[Scene], rec
         names = [s.name for s in scenes if s.dataset == dataset and (allowed is None or s.name in allowed)]
         done = [name for name in names if any(r.scene == name and r.recipe in experiment.rows.values() for r in records)]
         if done:
-            made[f"{dataset}: means over {', '.join(done)}"] = tables.by_dataset(experiment, records, dataset, done)
+            here = [r for r in records if r.scene in done]
+            every = {r.scene for r in shared(here, experiment.rows.values())}
+            even = [name for name in done if name in every] or done
+            table = tables.by_dataset(experiment, records, dataset, even)
+            if even != done:
+                missed = ", ".join(name for name in done if name not in even)
+                table = replace(table, notes=(*table.notes, f"left out of the means, as not every row has a run there: {missed}"))
+            made[f"{dataset}: means over {', '.join(even)}"] = table
             made[f"{dataset}: scene by scene"] = tables.by_scene(experiment, records, done)
     out_paths = []
     for ending, text in tables.write_all(experiment.title, made).items() if made else ():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,6 +14,17 @@ from scene_experts.reproduce.store import Record
 DRAWS = 4000
 SEED_NOISE = 0.3  # dB that another seed may change the difference of two runs on one capture by (docs/results.md: standard deviations)
 Verdict = Literal["confirmed", "contradicted", "undecided"]
+
+
+def of_recipe(records: Sequence[Record], recipe: str, scene: str | None = None) -> list[Record]:
+    return [r for r in records if r.recipe == recipe and (scene is None or r.scene == scene)]
+
+
+def shared(records: Sequence[Record], recipes: Iterable[str]) -> list[Record]:
+    """The records of recipes that have any, on the scenes that all of these have: means over different scenes would compare scenes."""
+    by = {recipe: rows for recipe in recipes if (rows := of_recipe(records, recipe))}
+    scenes = set.intersection(*({r.scene for r in rows} for rows in by.values())) if by else set()
+    return [r for rows in by.values() for r in rows if r.scene in scenes]
 
 
 @dataclass(frozen=True)
@@ -52,13 +63,19 @@ class Difference:
     captures: int
     seeds: int
     views: int
+    gains: int
+    """Captures on which A is above B."""
     fit: float | None = None
     """A - B in PSNR (dB) on training views over the second half of the trainings: whether A fits better, generalised or not."""
 
     def verdict(self, sign: int) -> Verdict:
-        """Whether A - B has the claimed sign (+1 or -1), its opposite, or may be either."""
-        low, high = (self.low, self.high) if sign > 0 else (-self.high, -self.low)
-        return "confirmed" if low > 0 else "contradicted" if high < 0 else "undecided"
+        """Whether A - B has the claimed sign (+1 or -1), its opposite, or may be either.
+
+        A sign is one where the interval and most of the captures have it: a large gain on one of three is no rule.
+        """
+        most = 2 * self.gains - self.captures
+        found = 1 if self.low > 0 and most > 0 else -1 if self.high < 0 and most < 0 else 0
+        return "undecided" if found == 0 else "confirmed" if found == sign else "contradicted"
 
 
 def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -> Difference | None:
@@ -94,7 +111,7 @@ def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -
     least = SEED_NOISE * sum(len(seeds) == 1 for seeds in blocks.values()) ** 0.5 / len(blocks)
     low, high = min(float(low), centre - least), max(float(high), centre + least)
     views = sum(len(next(iter(seeds.values()))) for seeds in blocks.values())
-    return Difference(centre, low, high, len(blocks), max(map(len, blocks.values())), views, fit(a, b))
+    return Difference(centre, low, high, len(blocks), max(map(len, blocks.values())), views, sum(c > 0 for c in centres), fit(a, b))
 
 
 def fit(a: Sequence[Record], b: Sequence[Record]) -> float | None:
