@@ -47,14 +47,14 @@ def test_one_run_is_one_file_that_needs_nothing_else(tmp_path):
     assert "$title" not in text and "$body" not in text
     pictures = json.loads(re.search(r"const pictures = (.+);</script>", text)[1])  # type: ignore[index]
     assert len(pictures) == 3 * 3
-    first = Image.open(io.BytesIO(base64.b64decode(pictures["0.0"].partition(",")[2])))
+    first = Image.open(io.BytesIO(base64.b64decode(pictures["0.0.0"].partition(",")[2])))
     assert first.size == (960, 480) and first.getpixel((5, 5))[0] > 200  # type: ignore[index]
 
 
 def test_several_runs_stand_beside_each_other(tmp_path):
     runs = [run(tmp_path / "a"), run(tmp_path / "b", "scaffold-gs")]
     text = write(runs, tmp_path / "both.html").read_text()
-    assert "moe-gs, scaffold-gs on fox" in text and text.count("<option value='0.1'") == 2
+    assert "moe-gs, scaffold-gs on fox" in text and text.count("<option value='0.0.1'") == 2
     same = write([tmp_path / "a", run(tmp_path / "c")], tmp_path / "same.html").read_text()
     assert "a (moe-gs)" in same and "c (moe-gs)" in same
     with pytest.raises(InputError, match="--out"):
@@ -70,6 +70,13 @@ def test_runs_that_were_not_scored_alike_are_no_rivals(tmp_path):
     text = write(runs, tmp_path / "other.html").read_text()
     assert "moe-gs, scaffold-gs on fox, kitchen" in text and "class=best" not in text
     assert "Do not compare these scores:</b> expected the same capture, found fox in moe-gs and kitchen in scaffold-gs." in text
+    assert "<h3>fox</h3>" in text and "<h3>kitchen</h3>" in text and "<h3>" not in alike
+    pictures = json.loads(re.search(r"const pictures = (.+);</script>", text)[1])  # type: ignore[index]
+    assert len(pictures) == 2 * 3 * 3  # of each its own photographs, renders and errors
+    per_view = json.loads((runs[1] / "per_view.json").read_text())
+    write_json(runs[1] / "per_view.json", {f"other-{name}": facts for name, facts in per_view.items()})
+    write_json(runs[1] / "results.json", results)
+    assert "no view that all of these runs held out" in write(runs, tmp_path / "apart.html").read_text()
 
 
 def test_a_run_without_pictures_or_results(tmp_path):

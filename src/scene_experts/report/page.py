@@ -88,19 +88,19 @@ def page(sources: Sequence[Source]) -> str:
     title = f"{', '.join(names)} on {', '.join(dict.fromkeys(str(r.get('capture', '?')) for r in results))}"
     steps = f", {r['step']:,} iterations" if r.get("step") else ""
     facts = f"{r.get('view_count')} {r.get('views')} views ({r.get('split')}), {r.get('resolution')}{steps}"
-    views, pictures = held_out(sources)
+    views, pictures = every_capture(sources)
     scores, other = table(names, results), unlike(names, results)
     parts = [
         f"<h1>{escape(title)}</h1><p class='soft'>{escape(facts)}</p>",
         f"<p><b>Do not compare these scores:</b> expected {escape(other[0])}.</p>" if other else "",
         figures(replace(scores, best=frozenset()) if other else scores),
         "<h2>Held-out views</h2><p class='soft'>Move over a picture, or drag the slider.</p>",
-        f"<div class='views'>{views}</div>" if views else "<p>no pictures in this run folder</p>",
+        views,
         "<h2>Training</h2>",
         f"<div class='charts'>{curves(sources)}</div>",
         experts(sources),
         "<h2>Scores by view</h2>",
-        by_view(sources),
+        *(by_view(group) for group in by_capture(sources).values()),
         "<h2>To repeat</h2>",
         *(command(s) for s in sources),
         f"<script>const pictures = {json.dumps(pictures)};</script>",
@@ -119,11 +119,37 @@ def figures(found: Table) -> str:
     return f"<div class='wide'><table><tr>{head}</tr>{''.join(rows)}</table></div>{notes}"
 
 
-def held_out(sources: Sequence[Source]) -> tuple[str, dict[str, str]]:
-    """The views with their sliders, and every picture they can show as a data address by key."""
+def by_capture(sources: Sequence[Source]) -> dict[str, list[Source]]:
+    """The runs of each capture: only those have views in common."""
+    groups: dict[str, list[Source]] = {}
+    for s in sources:
+        groups.setdefault(str(s.results.get("capture", "?")), []).append(s)
+    return groups
+
+
+def common(sources: Sequence[Source]) -> list[str]:
+    """Names of the views that all of them were scored on."""
+    return [name for name in sources[0].per_view if all(name in s.per_view for s in sources)]
+
+
+def every_capture(sources: Sequence[Source]) -> tuple[str, dict[str, str]]:
+    """The held-out views of each capture, and every picture that they can show as a data address by key."""
+    groups, pictures, parts = by_capture(sources), {}, []
+    for i, (capture, group) in enumerate(groups.items()):
+        views, shown = held_out(group, f"{i}.")
+        pictures |= shown
+        if len(groups) > 1:
+            parts.append(f"<h3>{escape(capture)}</h3>")
+        why = "no pictures in the run folder" if common(group) else "no view that all of these runs held out"
+        parts.append(f"<div class='views'>{views}</div>" if views else f"<p>{why}</p>")
+    return "\n".join(parts), pictures
+
+
+def held_out(sources: Sequence[Source], prefix: str) -> tuple[str, dict[str, str]]:
+    """The views of a capture with their sliders, and every picture they can show as a data address by key (from `prefix`)."""
     pictures: dict[str, str] = {}
     blocks = []
-    names = [name for name in sources[0].per_view if all(name in s.per_view for s in sources)]
+    names = common(sources)
     step = max(1, -(-len(names) // MOST_VIEWS))
     for n, name in enumerate(names[::step]):
         options = [("photograph", sources[0].path / "test" / "gt" / sources[0].per_view[name]["file"])]
@@ -133,11 +159,11 @@ def held_out(sources: Sequence[Source]) -> tuple[str, dict[str, str]]:
         if len(present) < 2:
             continue
         for i, (_, path) in enumerate(present):
-            pictures[f"{n}.{i}"] = encoded(path)
+            pictures[f"{prefix}{n}.{i}"] = encoded(path)
         scores = ", ".join(f"{s.name} {s.per_view[name]['psnr']:.2f} dB" for s in sources if "psnr" in s.per_view[name])
         pick = [
             "".join(
-                f"<option value='{n}.{i}'{' selected' if i == wanted else ''}>{escape(label)}</option>"
+                f"<option value='{prefix}{n}.{i}'{' selected' if i == wanted else ''}>{escape(label)}</option>"
                 for i, (label, _) in enumerate(present)
             )
             for wanted in (0, 1)

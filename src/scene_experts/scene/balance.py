@@ -2,8 +2,7 @@
 
 Each expert has a bias b_i that counts where experts are chosen and nowhere else:
     I = Top-k of g_i + b_i,   w_i = g_i / sum_{j in I} g_j,   then   b_i <- b_i + speed sign(mean_j c_j - c_i)
-with c_i the anchors of the view that chose expert i: crowded experts become harder to reach, and no gradient of a balancing loss bends the
-features. MoE-GS's L_load is the alternative; the recipe that uses this part leaves it out.
+with c_i the anchors of the view that chose expert i: no gradient of a balancing loss bends the features. L_load is the alternative.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 
 from scene_experts.errors import expect_at_least
 from scene_experts.scene.experts import Experts, MixtureHead, top_k
+from scene_experts.types import Routing
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,6 @@ class BalancedExperts(Experts):
         return BalancedHead
 
     def check(self) -> None:
-        """Raises InputError for numbers that no training can have."""
         super().check()
         expect_at_least([("--scene.decoder.speed", self.speed, 0)])
 
@@ -42,14 +41,20 @@ class BalancedHead(MixtureHead):
     def __init__(self, config: BalancedExperts, *shape: Any) -> None:
         super().__init__(config, *shape)
         self.router_balance = nn.Parameter(torch.zeros(config.num), requires_grad=False)
+        self.moved_at: int | None = None
 
     def choose(self, logits: Tensor, k: int) -> Tensor:
-        """Indices [A, k] of the largest biased gates, largest first; in training the biases then move."""
-        chosen = top_k(logits.softmax(dim=1) + self.router_balance, k)
-        if self.training and torch.is_grad_enabled():
-            count = torch.bincount(chosen.reshape(-1), minlength=self.config.num).to(logits.dtype)
+        """Indices [A, k] of the largest biased gates, largest first."""
+        return top_k(logits.softmax(dim=1) + self.router_balance, k)
+
+    def route(self, feature: Tensor, step: int, position: Tensor | None) -> tuple[Routing, Tensor]:
+        """As a mixture; in training the biases then move, once at each step."""
+        routing, w = super().route(feature, step, position)
+        if self.training and torch.is_grad_enabled() and routing.chosen is not None and step != self.moved_at:
+            count = torch.bincount(routing.chosen.reshape(-1), minlength=self.config.num).to(w.dtype)
             self.router_balance += self.config.speed * (count.mean() - count).sign()
-        return chosen
+            self.moved_at = step  # losses over the whole scene ask again
+        return routing, w
 
     def weights(self, step: int) -> None:
         """None: the kernels choose by the gates alone, so the composed form decodes."""
