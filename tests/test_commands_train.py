@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from scene_experts import run_folder
 from scene_experts.commands.train import check_settings, parse_train, train
 from scene_experts.errors import InputError
 from scene_experts.recipes import RECIPES
@@ -71,3 +72,12 @@ def test_a_finished_run_keeps_its_files_when_resumed(tmp_path, capsys):
     assert "nothing was left to train" in capsys.readouterr().out and (layout / "point_cloud.ply").read_bytes() == b"mine"
     (layout / "point_cloud.ply").unlink()
     assert train([*args, "--resume"]) == 0 and (layout / "point_cloud.ply").is_file()  # a run that was killed before it wrote them
+
+
+def test_two_trainings_into_one_folder(tmp_path):
+    capture = make_capture(tmp_path / "capture", views=9, size=(48, 32)).folder
+    args = ["scaffold-gs", "--data", str(capture), "--out", str(tmp_path / "run"), "--iterations", "3", "--preview-every", "0"]
+    with run_folder.held(tmp_path / "run"), pytest.raises(InputError, match="found a training at work"):
+        train(args)
+    assert [p.name for p in (tmp_path / "run").iterdir()] == [".lock"]
+    assert train(args) == 0

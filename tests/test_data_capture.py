@@ -194,6 +194,8 @@ def test_no_points(copy: Path) -> None:
     (copy / "sparse/0/points3D.bin").unlink()
     with pytest.raises(InputError, match=r"points3D\.bin.*--init random"):
         load(copy)
+    looked = load(copy, look=True)
+    assert looked.points is None and "no 3D points to start from: train with --init random" in looked.warnings
     capture = load(copy, init="random")
     assert capture.points is not None and len(capture.points.xyz) > 1000
 
@@ -237,3 +239,6 @@ def test_paths_that_are_no_captures(made: Synthetic, tmp_path: Path) -> None:
         load(tmp_path)
     with pytest.raises(InputError, match="found 10 photographs without camera poses; move them"):
         load(tmp_path / "images")
+    for part in ("images", "sparse"):
+        with pytest.raises(InputError, match=f"found a part of one; give the folder that holds it: {made.folder}$"):
+            load(made.folder / part)

@@ -150,6 +150,25 @@ def test_places_that_cannot_be_a_run_folder(tmp_path):
     assert not (tmp_path / "new").exists() and (tmp_path / "file").read_text() == "x"
 
 
+def test_one_training_holds_a_run_folder(tmp_path):
+    with run_folder.held(tmp_path / "run"):
+        with pytest.raises(InputError, match="found a training at work"), run_folder.held(tmp_path / "run"):
+            pass
+        with run_folder.held(tmp_path / "other"):
+            pass
+    with run_folder.held(tmp_path / "run"):
+        pass
+
+
+def test_a_file_system_without_locks_holds_nothing_up(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise NotImplementedError
+
+    monkeypatch.setattr(run_folder.FileLock, "acquire", refuse)
+    with run_folder.held(tmp_path), run_folder.held(tmp_path):
+        pass
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [("{", "unreadable"), ("[]", "format 1"), ('{"format": 99}', "format 1"), ("{}", "format 1"), ('{"format": 1}', "the keys")],

@@ -5,6 +5,7 @@ RUN/metrics.jsonl                    one line per logged iteration
 RUN/checkpoints/ckpt_NNNNNN.safetensors
 RUN/point_cloud/iteration_N/, RUN/cameras.json      the Scaffold-GS layout, in the capture's own frame
 RUN/previews/, RUN/test/, RUN/results.json, RUN/per_view.json
+RUN/.lock                            held by the training that writes there
 """
 
 from __future__ import annotations
@@ -13,11 +14,14 @@ import json
 import math
 import platform
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock, Timeout
 from torch import Tensor
 
 import scene_experts
@@ -108,6 +112,24 @@ def _difference(old: object, new: object, where: str = "") -> str:
     return "" if old == new else f"{where} was {old}, is now {new}"
 
 
+@contextmanager
+def held(out: Path) -> Iterator[None]:
+    """Hold `out` for one training; a process that dies lets go. Raises InputError where another training writes there."""
+    out.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(out / ".lock")
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise InputError(f"expected a run folder that nobody writes to, found a training at work in {out}; choose another --out") from None
+    except NotImplementedError:  # some network file systems know no locks
+        yield
+        return
+    try:
+        yield
+    finally:
+        lock.release()
+
+
 def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -> None:
     """Make `out` ready for a run that `check` admits: an overwritten run's checkpoints and results go, config.json is written."""
     check(out, config, resume, overwrite)
@@ -137,8 +159,8 @@ def named(data: Data) -> Data:
     return replace(data, path=path, resolution=resolution, split=split)
 
 
-def load_capture(data: Data, seed: int = 0) -> Capture:
-    """The capture that `data` describes."""
+def load_capture(data: Data, seed: int = 0, look: bool = False) -> Capture:
+    """The capture that `data` describes; `look` admits one without points, which nothing can be trained on."""
     if data.background and not all(math.isfinite(v) and 0 <= v <= 1 for v in data.background):
         raise InputError(f"expected --background as three numbers between 0 and 1, found {list(data.background)}; correct them")
     if data.near is not None and not 0 < data.near < math.inf:
@@ -155,6 +177,7 @@ def load_capture(data: Data, seed: int = 0) -> Capture:
         ignore_principal_point=data.ignore_principal_point,
         background=data.background,
         seed=seed,
+        look=look,
     )
     if data.near is None:
         return capture

@@ -105,4 +105,5 @@ def import_(args: list[str]) -> int:
 
     command = tyro.cli(ImportCommand, prog=f"{PROG} import", args=args)
     print(f"wrote {import_result(command.source, named(command.data), command.out, command.iteration)}")
+    print(f"next: {shlex.join([PROG, 'eval', str(command.out)])}")
     return 0

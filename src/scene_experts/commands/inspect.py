@@ -21,7 +21,7 @@ def info(args: list[str]) -> int:
         args=positional(args, "--data"),
         description="Say what a capture holds.",
     )
-    show(run_folder.load_capture(run_folder.named(data)), Console(highlight=False))
+    show(run_folder.load_capture(run_folder.named(data), look=True), Console(highlight=False))
     return 0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
@@ -151,10 +152,11 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
         run = replace(run, watch=live)
     previous = {s: signal.signal(s, stop) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with Recorder(command.out, command.tensorboard, capture) as record, Progress(console) as progress:
+        with ExitStack() as folder, Recorder(command.out, command.tensorboard, capture) as record, Progress(console) as progress:
             for event in training.train(command.cfg, run, capture, rasterize):
                 if isinstance(event, Started):  # what can fail before the first iteration has not: now the folder may change
                     finished = event.step if event.step == event.total else 0
+                    folder.enter_context(run_folder.held(command.out))
                     run_folder.prepare(command.out, run.config, command.resume, command.overwrite)
                 record(event)
                 progress(event)

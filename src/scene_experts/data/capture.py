@@ -37,6 +37,7 @@ def load(
     cache_bytes: int | None = None,
     missing: Literal["error", "drop"] = "error",
     seed: int = 0,
+    look: bool = False,
 ) -> Capture:
     """Load the capture in folder `path`: COLMAP (sparse/0, images), NeRF-synthetic (transforms_train.json), nerfstudio (transforms.json).
 
@@ -49,6 +50,7 @@ def load(
     background: RGB in [0, 1] behind the scene; None is black, and white for NeRF-synthetic.
     cache_bytes: room for decoded frames; None is a third of the free memory.  missing: what to do about absent images of a COLMAP capture.
     seed: of the random points.
+    look: admit a capture without points, with a warning; only to be looked at, as nothing can start from it.
 
     Raises InputError for anything that cannot be used, in one sentence that says what to change.
     """
@@ -63,7 +65,7 @@ def load(
     capture = prepare.measured(prepare.hold_out(capture, auto if split == "auto" else split))
     if normalise == "extent":
         capture = prepare.normalised(capture)
-    capture = _with_points(prepare.drop_outliers(capture), found, init, seed)
+    capture = _with_points(prepare.drop_outliers(capture), found, init, seed, look)
     return _finish(prepare.downscale(capture, policy))
 
 
@@ -92,9 +94,15 @@ def _read(root: Path, images: str | None, background: Colour | None, missing: st
     raise _no_capture(root)
 
 
+def _is_capture(root: Path) -> bool:
+    return colmap.find_model(root) is not None or any((root / f"transforms{end}.json").is_file() for end in ("", "_train"))
+
+
 def _no_capture(root: Path) -> InputError:
     """Why a folder is no capture, and what to do: photographs alone need poses first."""
     expected = f"expected a capture in {root} (COLMAP's sparse/0 beside images, transforms_train.json or transforms.json), found"
+    if _is_capture(root.absolute().parent):
+        return InputError(f"{expected} a part of one; give the folder that holds it: {root.absolute().parent}")
     for folder in (root, root / "images"):
         photos = sum(p.suffix.lower() in EXTENSIONS for p in folder.iterdir()) if folder.is_dir() else 0
         if photos:
@@ -186,9 +194,11 @@ def _fitted(view: Posed) -> tuple[Lens, bool]:
     )
 
 
-def _with_points(capture: Capture, found: Found, init: str, seed: int) -> Capture:
+def _with_points(capture: Capture, found: Found, init: str, seed: int, look: bool) -> Capture:
     if init == "random":
         return prepare.random_points(capture, seed=seed)
+    if capture.points is None and look:
+        return replace(capture, warnings=(*capture.warnings, "no 3D points to start from: train with --init random"))
     if capture.points is None:
         raise InputError(
             f"expected 3D points in {found.points_from} of {capture.root}, found none; start from random ones with --init random"
