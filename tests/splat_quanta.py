@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from scene_experts.export.sort import morton_order
-from scene_experts.export.splats import Splats
+from scene_experts.export.formats.sort import morton_order
+from scene_experts.export.formats.splats import Splats
 from scene_experts.geometry.sh import C0
 
 

@@ -10,8 +10,8 @@ from scene_experts import run_folder, train
 from scene_experts.commands.files import ExportCommand, export, import_
 from scene_experts.config import Data, RunConfig
 from scene_experts.errors import InputError, RunError
+from scene_experts.export.formats.standard import FORMATS, read_standard
 from scene_experts.export.run import write_layout
-from scene_experts.export.standard import FORMATS, read_standard
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.mlp import MLP

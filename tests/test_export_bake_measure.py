@@ -8,8 +8,8 @@ from PIL import Image
 
 from scene_experts.data.capture import load
 from scene_experts.evaluate.metrics import psnr
-from scene_experts.export.bake import explicit
-from scene_experts.export.bake_measure import counted, nothing_counted, picture, scores
+from scene_experts.export.bake.bake import explicit
+from scene_experts.export.bake.measure import counted, nothing_counted, picture, scores
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from synthetic import make_capture

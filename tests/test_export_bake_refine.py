@@ -5,9 +5,9 @@ from dataclasses import replace
 import torch
 
 from scene_experts.data.capture import load
-from scene_experts.export.bake import explicit
-from scene_experts.export.bake_refine import DRAWN_AT, Refine, refine
-from scene_experts.export.bake_views import Views
+from scene_experts.export.bake.bake import explicit
+from scene_experts.export.bake.refine import DRAWN_AT, Refine, refine
+from scene_experts.export.bake.views import Views
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from synthetic import make_capture

@@ -13,13 +13,13 @@ from scene_experts.config import Data, RunConfig
 from scene_experts.data.views import World
 from scene_experts.errors import InputError
 from scene_experts.evaluate.metrics import psnr
-from scene_experts.export.bake import Bake
-from scene_experts.export.bake_measure import picture
-from scene_experts.export.bake_refine import DRAWN_AT, Refine
-from scene_experts.export.bake_run import Options, export_standard, scene_of
+from scene_experts.export.bake.bake import Bake
+from scene_experts.export.bake.measure import picture
+from scene_experts.export.bake.refine import DRAWN_AT, Refine
+from scene_experts.export.bake.run import Options, export_standard, scene_of
+from scene_experts.export.formats.splats import from_scene
+from scene_experts.export.formats.standard import FORMATS, read_standard
 from scene_experts.export.run import write_layout
-from scene_experts.export.splats import from_scene
-from scene_experts.export.standard import FORMATS, read_standard
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.anchors import AnchorScene

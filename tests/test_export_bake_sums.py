@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch.nn import functional
 
-from scene_experts.export import bake_sums
-from scene_experts.export.bake import explicit
-from scene_experts.export.bake_sums import add_up, contributions, fit_harmonics, hidden, solved
+from scene_experts.export.bake import sums as bake_sums
+from scene_experts.export.bake.bake import explicit
+from scene_experts.export.bake.sums import add_up, contributions, fit_harmonics, hidden, solved
 from scene_experts.geometry.sh import basis
 from scene_experts.render import choose
 from scene_experts.types import Camera, Decoded, Gaussians

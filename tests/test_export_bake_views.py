@@ -7,8 +7,8 @@ import torch
 
 from scene_experts.data.capture import load
 from scene_experts.errors import InputError
-from scene_experts.export import bake_views
-from scene_experts.export.bake_views import NEIGHBOURS, Views, neighbours
+from scene_experts.export.bake import views as bake_views
+from scene_experts.export.bake.views import NEIGHBOURS, Views, neighbours
 from scene_experts.view.paths import FREE
 from synthetic import make_capture
 

@@ -12,10 +12,10 @@ from scene_experts.config import Data, RunConfig
 from scene_experts.data.capture import load
 from scene_experts.errors import InputError
 from scene_experts.export import explicit
-from scene_experts.export.bake_run import Options, export_standard
+from scene_experts.export.bake.run import Options, export_standard
+from scene_experts.export.formats.standard import FORMATS, read_standard, write_standard
 from scene_experts.export.ply import read_vertices, write_vertices
 from scene_experts.export.run import export_run, import_result
-from scene_experts.export.standard import FORMATS, read_standard, write_standard
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from synthetic import make_capture

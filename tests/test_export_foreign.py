@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 import torch
 
-from scene_experts.export.pack import turned
+from scene_experts.export.formats.pack import turned
+from scene_experts.export.formats.splats import Splats
+from scene_experts.export.formats.standard import FORMATS, read_standard, write_standard
 from scene_experts.export.ply import read_gaussian_ply
-from scene_experts.export.splats import Splats
-from scene_experts.export.standard import FORMATS, read_standard, write_standard
 from splat_quanta import check, differences, quanta, scene
 
 PYTHON = os.environ.get("SCENE_EXPERTS_FOREIGN_PYTHON", sys.executable)
@@ -122,7 +122,7 @@ def test_we_read_what_splat_transform_writes(tmp_path, format):
 
 def test_our_gltf_has_the_accessors_of_splat_transform_s(tmp_path):
     """It writes glTF and reads none: the same scene, attribute by attribute."""
-    from test_export_gltf import column, parsed
+    from test_export_formats_gltf import column, parsed
 
     s = scene(300, 3)
     write_standard(tmp_path / "a.ply", s, "ply", {})

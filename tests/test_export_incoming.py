@@ -10,7 +10,7 @@ from scene_experts import checkpoint, run_folder
 from scene_experts.config import Data
 from scene_experts.errors import InputError
 from scene_experts.export.frame import cell_positions
-from scene_experts.export.networks import write_torchscript
+from scene_experts.export.layout.networks import write_torchscript
 from scene_experts.export.ply import read_vertices, write_anchor_ply, write_vertices
 from scene_experts.export.run import export_run, import_result
 from scene_experts.render import choose

@@ -12,9 +12,9 @@ from scene_experts import run_folder
 from scene_experts.config import Data, RunConfig, Train
 from scene_experts.errors import InputError
 from scene_experts.export.compact import read_compact
+from scene_experts.export.layout.scaffold import read_scaffold_folder
 from scene_experts.export.ply import read_anchor_ply
 from scene_experts.export.run import export_run, import_result, psnr_cost, world_of, write_compact_run, write_layout
-from scene_experts.export.scaffold import read_scaffold_folder
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.mix import FeatureBank

@@ -78,9 +78,9 @@ def check_unused(command: ExportCommand) -> None:
 
 
 def _standard(command: ExportCommand, args: list[str], rasterize: Rasterizer) -> list[str]:
-    from scene_experts.export.bake import Bake
-    from scene_experts.export.bake_refine import Refine
-    from scene_experts.export.bake_run import Options, export_standard
+    from scene_experts.export.bake.bake import Bake
+    from scene_experts.export.bake.refine import Refine
+    from scene_experts.export.bake.run import Options, export_standard
 
     how = Bake(command.sh_degree, command.max_gaussians, command.prune, Refine(command.refine))
     options = Options(how, command.frame, command.levels, command.measure, shlex.join([PROG, "export", *args]))

@@ -22,7 +22,7 @@ from scene_experts.checkpoint import read_tensors, write_tensors
 from scene_experts.errors import InputError
 from scene_experts.export.frame import Network, cell_positions
 from scene_experts.export.lattice_code import AXIS_BITS, decode_steps, encode_steps, morton, unmorton
-from scene_experts.export.networks import check_networks, flat_names, from_flat_names
+from scene_experts.export.layout.networks import check_networks, flat_names, from_flat_names
 
 KIND, FORMAT = "compact scene", 1
 Code = Literal["float32", "float16", "uint16", "uint8"]

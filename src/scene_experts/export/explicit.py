@@ -19,12 +19,12 @@ from scene_experts import checkpoint, run_folder
 from scene_experts.config import Data, RunConfig, Train, from_json, to_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
-from scene_experts.export.cfg_args import cfg_args_text
+from scene_experts.export.formats.splats import from_scene, to_columns
+from scene_experts.export.formats.standard import FORMATS, format_of, read_standard
 from scene_experts.export.incoming import UNKNOWN
+from scene_experts.export.layout.cfg_args import cfg_args_text
+from scene_experts.export.layout.scaffold import SIDECAR, SIDECAR_FORMAT, iteration_folder, read_sidecar
 from scene_experts.export.ply import read_vertices, write_gaussian_ply
-from scene_experts.export.scaffold import SIDECAR, SIDECAR_FORMAT, iteration_folder, read_sidecar
-from scene_experts.export.splats import from_scene, to_columns
-from scene_experts.export.standard import FORMATS, format_of, read_standard
 from scene_experts.io import read_json, write_bytes, write_json
 from scene_experts.recipes import gs_3d
 from scene_experts.run_folder import OpenRun

@@ -16,8 +16,8 @@ from scene_experts.checkpoint import write_tensors
 from scene_experts.config import to_json
 from scene_experts.data.views import World
 from scene_experts.errors import InputError
+from scene_experts.export.layout.scaffold import SIDECAR, SIDECAR_FORMAT
 from scene_experts.export.ply import ANCHOR_OPACITY, write_vertices
-from scene_experts.export.scaffold import SIDECAR, SIDECAR_FORMAT
 from scene_experts.io import write_json
 from scene_experts.run_folder import OpenRun
 from scene_experts.scene.graph_points import GraphScene

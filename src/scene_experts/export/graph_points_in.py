@@ -19,8 +19,8 @@ from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
 from scene_experts.export.graph_points import KIND, NETWORKS
 from scene_experts.export.incoming import check_world, world_in
+from scene_experts.export.layout.scaffold import SIDECAR, iteration_folder, read_sidecar
 from scene_experts.export.ply import read_vertices
-from scene_experts.export.scaffold import SIDECAR, iteration_folder, read_sidecar
 from scene_experts.geometry.voxel import coarsen
 from scene_experts.scene.graph_points import CHANNELS, HALF
 

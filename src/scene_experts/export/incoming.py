@@ -14,7 +14,6 @@ from scene_experts.config import Data, RunConfig, Train, from_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
 from scene_experts.export.compact import Compact, read_compact
-from scene_experts.export.extras import level_facts, levels_in, published_levels, trained_names
 from scene_experts.export.frame import (
     Network,
     anchors_from_input,
@@ -24,7 +23,8 @@ from scene_experts.export.frame import (
     networks_from_input,
     recover_voxel,
 )
-from scene_experts.export.scaffold import read_scaffold_folder
+from scene_experts.export.layout.extras import level_facts, levels_in, published_levels, trained_names
+from scene_experts.export.layout.scaffold import read_scaffold_folder
 from scene_experts.recipes import octree_gs, scaffold_gs
 from scene_experts.scene.anchors import ATTRIBUTES, Anchors
 from scene_experts.scene.levels import Levels

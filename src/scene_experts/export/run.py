@@ -14,10 +14,8 @@ from scene_experts.config import Data, to_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
 from scene_experts.export import explicit, graph_points, graph_points_in
-from scene_experts.export.bake_measure import counted, nothing_counted, scores
-from scene_experts.export.cameras import write_cameras
+from scene_experts.export.bake.measure import counted, nothing_counted, scores
 from scene_experts.export.compact import Compact, Sizes, read_compact, write_compact
-from scene_experts.export.extras import extra_networks, level_columns
 from scene_experts.export.frame import (
     Network,
     anchors_to_input,
@@ -26,8 +24,10 @@ from scene_experts.export.frame import (
 )
 from scene_experts.export.incoming import compact_anchors, run_tensors, world_in
 from scene_experts.export.incoming import import_result as import_files
-from scene_experts.export.networks import is_plain, sequential
-from scene_experts.export.scaffold import SIDECAR, describe, read_sidecar, write_scaffold_folder
+from scene_experts.export.layout.cameras import write_cameras
+from scene_experts.export.layout.extras import extra_networks, level_columns
+from scene_experts.export.layout.networks import is_plain, sequential
+from scene_experts.export.layout.scaffold import SIDECAR, describe, read_sidecar, write_scaffold_folder
 from scene_experts.io import write_bytes
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.run_folder import OpenRun
@@ -57,7 +57,7 @@ def export_run(
 ) -> list[str]:
     """Write the newest checkpoint of a run (or the one at `step`) as "anchors" (the Scaffold-GS layout) or "compact"; says what it wrote.
 
-    Standard files of Gaussians are `bake_run`'s.
+    Standard files of Gaussians are `bake/run`'s.
     out: folder for anchors, file or folder for compact; inside the run folder by default.
     rasterize: what to draw the held-out views with, to say what a compact file costs in PSNR; None leaves that out.
     data: where the capture is now, if it moved.
