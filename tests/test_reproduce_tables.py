@@ -18,7 +18,10 @@ def test_ours_stand_beside_the_papers():
     rows = {row[0]: row for row in table.rows}
     assert rows["MoE-GS"][1] == "24.50 ± 0.71" and rows["MoE-GS"][5] == "24.61"
     assert rows["w/o MoE"][1] == "23.00" and rows["w/o CL"][1] == "-" and rows["w/o CL"][5] == "24.42"
+    assert not table.best and "w/o MoE: no run on truck with seed 1" in table.notes  # means over other seeds are no rivals
+    table = by_dataset(TABLE4, [r for r in runs() if r.seed == 0], "TanksAndTemples", ["truck"])
     assert (list(rows).index("MoE-GS"), 1) in table.best and (list(rows).index("w/o MoE"), 4) in table.best
+    table = by_dataset(TABLE4, runs(), "TanksAndTemples", ["truck"])
     assert any(note.startswith("no run: w/o CL") for note in table.notes) and "3,000, 30,000 iterations" in table.notes[0]
 
 
@@ -36,6 +39,9 @@ def test_table_3_is_of_one_column():
 def test_scene_by_scene():
     table = by_scene(TABLE4, runs(), ["truck", "train"])
     assert table.titles == ("PSNR", "truck", "train") and dict(zip([r[0] for r in table.rows], table.rows))["MoE-GS"][2] == "-"
+    assert not table.best
+    alike = by_scene(TABLE4, [r for r in runs() if r.seed == 0], ["truck", "train"])
+    assert alike.best == {([r[0] for r in alike.rows].index("MoE-GS"), 1)}
 
 
 def test_the_three_files():

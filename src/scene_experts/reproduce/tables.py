@@ -34,6 +34,11 @@ def rows_of(experiment: Experiment, records: Sequence[Record], scenes: Sequence[
     return {name: [r for r in records if r.recipe == recipe and r.scene in scenes] for name, recipe in experiment.rows.items()}
 
 
+def drawn(records: Sequence[Record]) -> set[tuple[str, int]]:
+    """What a mean is over: scenes and seeds."""
+    return {(r.scene, r.seed) for r in records}
+
+
 def by_dataset(experiment: Experiment, records: Sequence[Record], dataset: str, scenes: Sequence[str]) -> Table:
     """One row per method: our columns, then the paper's for this data set where it has them. Means over `scenes`."""
     found = rows_of(experiment, records, scenes)
@@ -41,10 +46,10 @@ def by_dataset(experiment: Experiment, records: Sequence[Record], dataset: str, 
     titles = ["", *(COLUMNS[c].title for c in experiment.columns)]
     titles += [f"{COLUMNS[c].title} (paper)" for c in experiment.columns] if theirs else []
     rows, values = [], []
-    every = {r.scene for some in found.values() for r in some}
+    every = drawn([r for some in found.values() for r in some])
     for name in experiment.rows:
         means = [mean(found[name], c) for c in experiment.columns]
-        fair = {r.scene for r in found[name]} == every  # a mean over fewer scenes is no rival
+        fair = drawn(found[name]) == every  # a mean over fewer scenes or other seeds is no rival
         values.append([m.value if m and fair else None for m in means])
         cells = [text(m, c) for m, c in zip(means, experiment.columns)]
         if theirs:
@@ -60,9 +65,12 @@ def by_scene(experiment: Experiment, records: Sequence[Record], scenes: Sequence
     """PSNR (or the experiment's first column) of each method on each scene."""
     found, column = rows_of(experiment, records, scenes), experiment.columns[0]
     rows, values = [], []
+    every = {scene: {r.seed for some in found.values() for r in some if r.scene == scene} for scene in scenes}
     for name in experiment.rows:
-        means = [mean([r for r in found[name] if r.scene == scene], column) for scene in scenes]
-        values.append([m.value if m else None for m in means])
+        here = [[r for r in found[name] if r.scene == scene] for scene in scenes]
+        means = [mean(some, column) for some in here]
+        fair = [{r.seed for r in some} == every[scene] for some, scene in zip(here, scenes)]
+        values.append([m.value if m and f else None for m, f in zip(means, fair)])
         rows.append((name, *(text(m, column) for m in means)))
     return Table((COLUMNS[column].title, *scenes), tuple(rows), best(values, [column] * len(scenes)))
 
@@ -104,11 +112,15 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
     sizes = sorted({r.config.data.resolution for r in records})
     seeds = sorted({r.seed for r in records})
     out = [f"{', '.join(f'{n:,}' for n in lengths)} iterations; resolution {', '.join(sizes)}; seeds {', '.join(map(str, seeds))}"]
-    every, none = {r.scene for r in records}, [name for name, rows in found.items() if not rows]
+    every, none = drawn(records), [name for name, rows in found.items() if not rows]
     for name, rows in found.items():
-        lacking = sorted(every - {r.scene for r in rows})
+        scenes = {r.scene for r in rows}
+        lacking = sorted({scene for scene, _ in every} - scenes)
         if rows and lacking:
             out.append(f"{name}: no run on {', '.join(lacking)}")
+        fewer = sorted((scene, seed) for scene, seed in every - drawn(rows) if scene in scenes)
+        if fewer:
+            out.append(f"{name}: no run on {', '.join(f'{scene} with seed {seed}' for scene, seed in fewer)}")
     if none:
         out.append(f"no run: {'; '.join(none)}")
     return tuple(out)
