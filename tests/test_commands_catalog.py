@@ -47,8 +47,10 @@ def test_a_scene_from_its_source_to_a_trained_run(
     assert "9" in capsys.readouterr().out
     flags = ["--iterations", "2", "--rasterizer", "reference", "--device", "cpu", "--preview-every", "0"]
     assert cli.main(["train", "moe-gs", "--data", "catalog:bungeenerf/rome", "--out", str(tmp_path / "run"), *flags]) == 0
-    data = run_folder.read_config(tmp_path / "run").data
-    assert data == Data(captures / "bungeenerf" / "rome", resolution="as-is", split="mod8")
+    config = run_folder.read_config(tmp_path / "run")
+    data = config.data
+    assert data == Data(captures / "bungeenerf" / "rome", resolution="as-is", split="mod8", normalise="none")
+    assert (config.train.scene.voxel_rule, config.train.growth.init_factor) == ("squared_median", 128)
     assert json.loads((data.path / "source.json").read_text())["data_set"] == "BungeeNeRF"
 
 
@@ -57,7 +59,8 @@ def test_another_folder_is_named_in_the_next_step(
 ) -> None:
     to = tmp_path / "elsewhere"
     assert cli.main(["download", "rome", "--to", str(to), "--mirror", server.url, "--no-keep-archives"]) == 0
-    assert f"--data {to / 'bungeenerf' / 'rome'} --resolution as-is --split mod8 --out RUN" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"--data {to / 'bungeenerf' / 'rome'} --resolution as-is --split mod8 --normalise none --scene.voxel-rule squared_median" in said
     assert not captures.exists() and [p.name for p in (to / "archives").iterdir()] == ["checksums.json"]
 
 
@@ -102,5 +105,6 @@ def test_progress_with_and_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -
 
 def test_flags_of_a_scene() -> None:
     assert command.flags(one("garden"), None) == "--data catalog:garden"
-    assert command.flags(one("garden"), Path("d")) == "--data d/mipnerf360/garden --resolution inria:4 --split mod8"
+    said = command.flags(one("garden"), Path("d"))
+    assert said == "--data d/mipnerf360/garden --resolution inria:4 --split mod8 --normalise none --scene.voxel-size 0.001"
     assert command.flags(one("garden"), Path("my d")).startswith("--data 'my d/mipnerf360/garden' ")

@@ -46,6 +46,17 @@ def test_an_unknown_recipe_names_the_nearest():
         parse_train(["moegs", *PLACES])
 
 
+def test_a_scene_of_the_paper_brings_its_numbers_and_flags_have_the_last_word():
+    for data in (["--data", "catalog:truck"], ["--data=catalog:truck"], ["-s", "catalog:tandt/truck"]):
+        made = parse_train(["scaffold-gs", *data, "--out", "run"])
+        assert (made.data.normalise, made.cfg.scene.voxel_size) == ("none", 0.01)
+    made = parse_train(["scaffold-gs", "--data", "catalog:truck", "--out", "run", "--scene.voxel-size", "0", "--normalise", "extent"])
+    assert (made.data.normalise, made.cfg.scene.voxel_size) == ("extent", 0.0)
+    assert parse_train(["3dgs", "--data", "catalog:truck", "--out", "run"]).data.normalise == "none"
+    made = parse_train(["scaffold-gs", "--data", "truck", "--out", "run"])
+    assert (made.data.normalise, made.cfg.scene.voxel_size) == ("extent", 0.0)
+
+
 def test_flags_reach_the_parts_of_explicit_recipes():
     made = parse_train(["3dgs", *PLACES, "--growth.grad-threshold", "0.001", "--rates.means.first", "0.01", "--scene.sh-degree", "1"])
     assert (made.cfg.growth.grad_threshold, made.cfg.rates.means.first, made.cfg.scene.sh_degree) == (0.001, 0.01, 1)  # type: ignore[union-attr]

@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 
 from scene_experts.commands.train import parse_train
+from scene_experts.config import flags_of
 from scene_experts.data import catalog
 from scene_experts.errors import InputError
+from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS
 from scene_experts.reproduce.plan import COLLECTIONS, OWN, Scale, Scene, Spec, own_scenes, paper_scenes, specs
 
@@ -37,7 +39,7 @@ def test_what_changes_numbers_changes_the_key_and_the_place_does_not():
     others = [
         replace(spec, seed=1),
         replace(spec, recipe="scaffold-gs"),
-        replace(spec, scale=Scale(7000)),
+        replace(spec, scale=Scale(iterations=7000)),
         replace(spec, scale=Scale(resolution="longest:400")),
         replace(spec, scene=replace(FOX, name="kermit")),
         replace(spec, scene=replace(FOX, options={"normalise": "none"})),
@@ -47,9 +49,12 @@ def test_what_changes_numbers_changes_the_key_and_the_place_does_not():
 
 
 def test_scale():
-    assert Scale.of(1.0) == Scale(30_000, None)
-    assert Scale.of(0.25) == Scale(7500, "longest:400")
-    assert Scale.of(0.25, 3000, "as-is") == Scale(3000, "as-is")
+    assert Scale.of(1.0) == Scale()
+    assert Scale.of(0.25) == Scale(0.25, None, "longest:400")
+    assert Scale.of(0.25, 3000, "as-is") == Scale(0.25, 3000, "as-is")
+    lengths = {r: [Spec(FOX, r, 0, s).train.iterations for s in (Scale(), Scale(0.25), Scale(iterations=3000))] for r in RECIPES}
+    assert lengths["moe-gs"] == lengths["3dgs"] == [30_000, 7500, 3000]
+    assert lengths["octree-gs"] == lengths["octree-moe-gs"] == [40_000, 10_000, 3000]  # each recipe's own schedule
     for wrong in (0.0, 1.5, float("nan")):
         with pytest.raises(InputError, match="--scale"):
             Scale.of(wrong)
@@ -75,6 +80,22 @@ def test_the_papers_scenes_are_found_with_their_protocol(tmp_path):
     spec = Spec(scene, "moe-gs", 0, Scale())
     made = parse_train(spec.arguments(tmp_path / "run")[1:])
     assert made.data == spec.data and made.data.normalise == "none"
+    assert made.cfg == spec.train and made.cfg.scene.voxel_size == 0.001
+
+
+def test_the_papers_scenes_bring_the_numbers_of_their_scripts():
+    rome = Scene("rome", "BungeeNeRF", Path("rome"), {}, catalog.BUNGEENERF.numbers)
+    octree = Spec(rome, "octree-gs", 0, Scale()).train.scene.select
+    assert (octree.base_layer, octree.visible_threshold, octree.dist_ratio) == (10, 0.0, 0.99)
+    moe = Spec(rome, "moe-gs", 0, Scale()).train
+    assert (moe.scene.voxel_rule, moe.growth.init_factor) == ("squared_median", 128)
+    assert Spec(rome, "3dgs", 0, Scale()).train == RECIPES["3dgs"][1]  # has none of them
+    for recipe in RECIPES:
+        spec = Spec(rome, recipe, 0, Scale())
+        assert parse_train(spec.arguments(Path("run"))[1:]).cfg == spec.train
+    for collection in catalog.COLLECTIONS:  # every place is one of a recipe
+        for place, _ in collection.numbers:
+            assert any(flags_of(cfg, [(place, 0)]) for _, cfg in RECIPES.values()), place
 
 
 def test_the_catalog_and_the_experiments_know_the_same_scenes():

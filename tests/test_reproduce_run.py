@@ -16,7 +16,7 @@ from scene_experts.reproduce.run import Runner, last_line
 
 
 def spec(recipe="moe-gs", seed=0, scene="fox"):
-    return Spec(Scene(scene, OWN, Path("captures") / scene), recipe, seed, Scale(3000))
+    return Spec(Scene(scene, OWN, Path("captures") / scene), recipe, seed, Scale(iterations=3000))
 
 
 class Fake(Runner):

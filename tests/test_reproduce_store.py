@@ -25,7 +25,7 @@ def test_a_record_comes_back_as_it_was_without_the_place_of_the_capture(tmp_path
 
 
 def test_a_run_is_found_by_its_spec(tmp_path):
-    spec = Spec(Scene("fox", OWN, Path("anywhere/fox")), "moe-gs", 0, Scale(3000))
+    spec = Spec(Scene("fox", OWN, Path("anywhere/fox")), "moe-gs", 0, Scale(iterations=3000))
     assert find([record(seed=1), record()], spec) is not None
     assert find([record(seed=1), record(iterations=7000)], spec) is None
 
@@ -81,9 +81,12 @@ def test_columns():
 def test_a_run_counts_for_every_recipe_of_the_same_numbers(tmp_path):
     """Five experts with Top-2 in Figure 6 are the main recipe, two layers in Figure 7 are Scaffold-GS."""
     scene = Scene("fox", OWN, tmp_path)
-    pair = [Spec(scene, recipe, 0, Scale(3000)) for recipe in ("moe-gs", "moe-gs-e5-top2")]
-    assert distinct([*pair, Spec(scene, "moe-gs-e4-top2", 0, Scale(3000))]) == [pair[0], Spec(scene, "moe-gs-e4-top2", 0, Scale(3000))]
+    pair = [Spec(scene, recipe, 0, Scale(iterations=3000)) for recipe in ("moe-gs", "moe-gs-e5-top2")]
+    assert distinct([*pair, Spec(scene, "moe-gs-e4-top2", 0, Scale(iterations=3000))]) == [
+        pair[0],
+        Spec(scene, "moe-gs-e4-top2", 0, Scale(iterations=3000)),
+    ]
     write(tmp_path, record("moe-gs", "fox"))
     found = of_specs(load(tmp_path), pair)
     assert [r.recipe for r in found] == ["moe-gs", "moe-gs-e5-top2"] and [r.key for r in found] == [s.key for s in pair]
-    assert find(load(tmp_path), Spec(scene, "moe-gs-e5-top1", 0, Scale(3000))) is None
+    assert find(load(tmp_path), Spec(scene, "moe-gs-e5-top1", 0, Scale(iterations=3000))) is None

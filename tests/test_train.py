@@ -241,6 +241,25 @@ def test_more_anchors_than_the_cap_to_start_with_is_said(folder):
         list(events(config("3dgs", max_anchors=100), folder, stop_at=1))
 
 
+def test_more_gaussians_than_the_recipes_own_cap_start_and_none_is_added(folder, caplog):
+    made = config("3dgs-mcmc")
+    made = replace(made, growth=replace(made.growth, max_anchors=100))
+    done = list(events(made, folder, stop_at=3))
+    assert isinstance(done[-1], Finished) and "more than the recipe's 100: none will be added" in caplog.text
+
+
+def test_the_routing_of_the_whole_scene_is_told_beside_the_views(folder, monkeypatch):
+    def stepped():
+        return [e for e in events(config(), folder, stop_at=20, log_every=10) if isinstance(e, Stepped)]
+
+    for event in stepped():
+        for shares in (event.scene_routing, event.scene_gates, event.routing):
+            assert shares.keys() == {"opacity", "cov", "color"} and all(sum(v) == pytest.approx(1, abs=1e-3) for v in shares.values())
+    monkeypatch.setattr("scene_experts.train.ROUTED", 5)
+    few = stepped()
+    assert few[-1].scene_gates != event.scene_gates and few[-1].psnr == event.psnr  # a smaller sample, the same training
+
+
 def test_sparse_adam_moves_what_was_decoded(folder):
     capture, rasterize = load(folder), choose("reference", "cpu")
     cfg = replace(config(), sparse_adam=True)

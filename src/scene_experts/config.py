@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import types as pytypes
 import typing
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -127,6 +128,34 @@ def check(cfg: Train) -> None:
         if isinstance(rate, Rate) and not (rate.first > 0 < rate.last or rate.first == rate.last == 0):
             flag = f"--rates.{name.replace('_', '-')}"
             raise InputError(f"expected {flag} to run between two rates above 0, or to be 0 throughout, found {rate.first} and {rate.last}")
+
+
+def with_numbers(cfg: Train, numbers: Sequence[tuple[str, Any]]) -> Train:
+    """`cfg` with values at dotted places, as ("scene.voxel_size", 0.001); places that this recipe does not have are passed over."""
+    for place, value in numbers:
+        if _has(cfg, place):
+            cfg = _put(cfg, place.split("."), value)
+    return cfg
+
+
+def flags_of(cfg: Train, numbers: Sequence[tuple[str, Any]]) -> list[str]:
+    """The arguments of `train` that say the same."""
+    found = [(place, value) for place, value in numbers if _has(cfg, place)]
+    return [word for place, value in found for word in (flag(place), str(value))]
+
+
+def flag(place: str) -> str:
+    """The flag of a dotted place, as --scene.voxel-size."""
+    return f"--{place.replace('_', '-')}"
+
+
+def _has(value: Any, place: str) -> bool:
+    first, _, rest = place.partition(".")
+    return hasattr(value, first) and (not rest or _has(getattr(value, first), rest))
+
+
+def _put(part: Any, place: list[str], value: Any) -> Any:
+    return replace(part, **{place[0]: value if len(place) == 1 else _put(getattr(part, place[0]), place[1:], value)})
 
 
 def to_json(value: Any) -> Any:

@@ -25,12 +25,14 @@ class Stepped:
     psnr: float  # of the training view where its mask counts, dB
     anchors: int
     visible: int  # anchors this view decoded
-    gaussians: int  # of them drawn
+    gaussians: int  # handed to the rasteriser: of these anchors, with positive opacity
     active: float  # share of decoded Gaussians with positive opacity
     seconds: float  # of training so far, without saving and previews
-    routing: dict[str, list[float]]  # mean share of assignments per expert, by attribute
+    routing: dict[str, list[float]]  # share of this view's assignments per expert, by attribute; of its gates while dense
     balance: dict[str, float] = field(default_factory=dict)  # L_load^S / k, or L_load^D while dense, by attribute: 1 is perfect balance
     entropy: dict[str, float] = field(default_factory=dict)  # of the gates, by attribute: 1 all experts alike, 0 one alone
+    scene_routing: dict[str, list[float]] = field(default_factory=dict)  # as routing, of anchors all over the scene
+    scene_gates: dict[str, list[float]] = field(default_factory=dict)  # their mean gate per expert
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from pathlib import Path
 
 import torch
@@ -17,6 +18,8 @@ from scene_experts.memory import Largest
 from scene_experts.optim import Adam
 from scene_experts.scene import Scene
 from scene_experts.table import Table
+
+log = logging.getLogger(__name__)
 
 
 class Training:
@@ -45,10 +48,12 @@ class Training:
             raise InputError("expected at least one training view, found none; choose another --split")
         torch.manual_seed(cfg.seed)
         scene = cfg.scene.start(capture.points, capture.extent, [capture.views[i].camera for i in capture.train])
-        cap, n = cfg.growth.max_anchors, len(scene.table)
+        cap, n = cfg.max_anchors, len(scene.table)
         if 0 < cap < n:
             what, also = ("anchors", " or --scene.voxel-size") if "voxel" in scene.meta() else ("Gaussians", "")
             raise InputError(f"expected at most {cap:,} {what} to start with, found {n:,}; raise --max-anchors{also}")
+        if 0 < cfg.growth.max_anchors < n:
+            log.warning("starts with %s rows, more than the recipe's %s: none will be added", f"{n:,}", f"{cfg.growth.max_anchors:,}")
         return cls(cfg, to_device(scene, device, dtype))
 
     def next_view(self, train: tuple[int, ...], ahead: int = 3) -> tuple[int, list[int]]:

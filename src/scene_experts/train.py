@@ -23,9 +23,10 @@ from scene_experts.render import Rasterizer
 from scene_experts.state import Training, resume, save
 from scene_experts.strategy import Edit, Strategy
 from scene_experts.transfer import upload
-from scene_experts.types import Decoded, Render
+from scene_experts.types import Decoded, Render, Routing
 
 log = logging.getLogger(__name__)
+ROUTED = 16_384  # anchors whose routing a training's figures are of: their shares are within half a percent of all anchors'
 
 
 @dataclass(frozen=True)
@@ -168,17 +169,12 @@ def stepped(training: Training, done: Iteration) -> Stepped:
     error = done.render.image.clamp(0, 1).sub_(done.target).square_()
     mse = float(error.mean() if done.mask is None else (error.mean(2) * done.mask).sum() / done.mask.sum().clamp_min(1e-12))
     raw = decoded.raw_opacity
-    shares, balance, entropy = {}, {}, {}
+    balance, entropy = {}, {}
     for attribute, r in decoded.routing.items():
         A, E = r.gates.shape
-        if r.chosen is None:
-            share, value = r.gates.sum(0) / max(A, 1), load_dense(r.gates)
-        else:
-            k = r.chosen.shape[1]
-            share, value = torch.bincount(r.chosen.reshape(-1), minlength=E) / max(A * k, 1), load_sparse(r.gates, r.chosen) / k
-        balance[attribute] = float(value)
+        balance[attribute] = float(load_dense(r.gates) if r.chosen is None else load_sparse(r.gates, r.chosen) / r.chosen.shape[1])
         entropy[attribute] = float(torch.special.entr(r.gates).sum()) / max(A, 1) / math.log(E)
-        shares[attribute] = [round(float(c), 4) for c in share]
+    scene = training.scene.routing(training.step, ROUTED) if decoded.routing else {}
     return Stepped(
         step=training.step,
         terms={k: float(v) for k, v in done.terms.items()},
@@ -188,10 +184,19 @@ def stepped(training: Training, done: Iteration) -> Stepped:
         gaussians=len(decoded.gaussians),
         active=float((raw > 0).float().mean()) if raw is not None and raw.numel() else 0.0,
         seconds=training.seconds,
-        routing=shares,
+        routing={attribute: use(r) for attribute, r in decoded.routing.items()},
         balance=balance,
         entropy=entropy,
+        scene_routing={attribute: use(r) for attribute, r in scene.items()},
+        scene_gates={attribute: use(Routing(r.gates, None)) for attribute, r in scene.items()},
     )
+
+
+def use(r: Routing) -> list[float]:
+    """Each expert's share of the assignments, or of the gates while dense."""
+    A, E = r.gates.shape
+    share = r.gates.sum(0) / max(A, 1) if r.chosen is None else torch.bincount(r.chosen.reshape(-1), minlength=E) / max(r.chosen.numel(), 1)
+    return [round(float(c), 4) for c in share]
 
 
 @torch.no_grad()

@@ -14,9 +14,11 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from rich.table import Table
 
 from scene_experts.cli import PROG
+from scene_experts.config import flag, flags_of
 from scene_experts.data.catalog import COLLECTIONS, SCENES, Scene, select
 from scene_experts.data.obtain import captures_dir, obtain, present
 from scene_experts.errors import InputError
+from scene_experts.recipes import RECIPES
 
 SAY_EVERY = 15.0  # seconds between lines where there is no terminal
 
@@ -58,7 +60,8 @@ def flags(scene: Scene, to: Path | None) -> str:
     """How `train` is told to read a scene by the paper's protocol."""
     if to is None:
         return f"--data catalog:{scene.name}"
-    return f"--data {shlex.quote(str(to / scene.path))} --resolution {scene.resolution} --split {scene.split}"
+    numbers = shlex.join(flags_of(RECIPES["moe-gs"][1], scene.collection.numbers))
+    return f"--data {shlex.quote(str(to / scene.path))} --resolution {scene.resolution} --split {scene.split} --normalise none {numbers}"
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,7 @@ def table(scenes: tuple[Scene, ...] | list[Scene], root: Path) -> Table:
 def described(scene: Scene, root: Path) -> list[str]:
     """Everything about a scene, and how to get it by hand."""
     c, a = scene.collection, scene.collection.archive
+    numbers = " ".join(f"{flag(place)} {value}" for place, value in c.numbers)
     lines = [
         f"{scene.name}: {c.title} ({c.source})",
         f"  licence     {c.licence}",
@@ -109,6 +113,7 @@ def described(scene: Scene, root: Path) -> list[str]:
         f"  SHA-256     {a.sha256 or 'not published; the first download is kept for comparison'}",
         f"  in it       {' or '.join(scene.inside)}",
         f"  protocol    --resolution {scene.resolution} --split {scene.split}" + (f"; others use {scene.also}" if scene.also else ""),
+        f"              --normalise none and, in recipes that have them, {numbers}",
         f"  views       {scene.views or 'not known here'}",
         f"  place       {root / scene.path}" + (" (here)" if present(root, scene) else " (not here)"),
     ]

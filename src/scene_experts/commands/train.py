@@ -17,8 +17,9 @@ from scene_experts import run_folder
 from scene_experts import train as training
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import Device, Raster, backend
-from scene_experts.config import Data, RunConfig, Train, check
+from scene_experts.config import Data, RunConfig, Train, check, with_numbers
 from scene_experts.data.capture import Capture
+from scene_experts.data.catalog import PREFIX, Numbers, one
 from scene_experts.errors import InputError, expect_at_least, nearest
 from scene_experts.events import Started
 from scene_experts.memory import reuse_freed
@@ -100,8 +101,9 @@ def parse_train(args: list[str]) -> TrainCommand:
             f"expected a recipe, found '{args[0]}'{nearest(args[0], RECIPES)}; there are {', '.join(RECIPES)}; see {PROG} train --help"
         )
     chosen = {args[0]: RECIPES[args[0]]} if args and args[0] in RECIPES else RECIPES
+    data, numbers = of_the_catalog(args)
     defaults = {
-        name: (text, TrainCommand(data=Data(path=tyro.MISSING), out=tyro.MISSING, cfg=cfg))  # type: ignore[arg-type]
+        name: (text, TrainCommand(data=data, out=tyro.MISSING, cfg=with_numbers(cfg, numbers)))  # type: ignore[arg-type]
         for name, (text, cfg) in chosen.items()
     }
     if len(defaults) == 1:
@@ -115,6 +117,14 @@ def parse_train(args: list[str]) -> TrainCommand:
             config=(tyro.conf.AvoidSubcommands,),
         )
     return tyro.extras.overridable_config_cli(defaults, args=args, prog=f"{PROG} train", description=flags_of_all())
+
+
+def of_the_catalog(args: list[str]) -> tuple[Data, Numbers]:
+    """The defaults that a scene of the paper brings (its own units, its data set's numbers); flags have the last word."""
+    named = next((word for arg in args if (word := arg.removeprefix("--data=")).startswith(PREFIX)), None)
+    if named is None:
+        return Data(path=tyro.MISSING), ()  # type: ignore[arg-type]
+    return Data(path=tyro.MISSING, normalise="none"), one(named).collection.numbers  # type: ignore[arg-type]
 
 
 def flags_of_all() -> str:

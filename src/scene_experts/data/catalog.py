@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from scene_experts.errors import InputError, nearest
 
 PREFIX = "catalog:"
+Numbers = tuple[tuple[str, float | int | str], ...]
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ class Collection:
     archive: Archive
     licence: str  # as its owner states it
     source: str  # who made it
+    numbers: Numbers = ()
+    """What the scripts of Scaffold-GS and Octree-GS set for its scenes, by where a training keeps it; in the captures' own units."""
 
 
 @dataclass(frozen=True)
@@ -86,17 +89,39 @@ BUNGEE = Archive(
     notes="with COLMAP reconstructions by the authors of Scaffold-GS; also at https://pan.baidu.com/s/1AUYUJojhhICSKO2JrmOnCA, code 4whv",
 )
 
-MIPNERF360 = Collection("mipnerf360", "Mip-NeRF 360", MIP360, "not stated", "Barron et al., CVPR 2022")
+_OCTREE = ("scene.select.base_layer", 10)
+MIPNERF360 = Collection(
+    "mipnerf360", "Mip-NeRF 360", MIP360, "not stated", "Barron et al., CVPR 2022", (("scene.voxel_size", 0.001), _OCTREE)
+)
 TANDT = Collection(
     "tandt",
     "Tanks and Temples",
     TANDT_DB,
     "https://www.tanksandtemples.org/license/ names CC BY 4.0 and, in the same text, non-commercial research only",
     "Knapitsch et al., SIGGRAPH 2017",
+    (("scene.voxel_size", 0.01), _OCTREE, ("scene.select.visible_threshold", 0.9)),
 )
-DEEP_BLENDING = Collection("db", "Deep Blending", TANDT_DB, "not stated", "Hedman et al., SIGGRAPH Asia 2018")
+DEEP_BLENDING = Collection(
+    "db",
+    "Deep Blending",
+    TANDT_DB,
+    "not stated",
+    "Hedman et al., SIGGRAPH Asia 2018",
+    (("scene.voxel_size", 0.005), ("scene.select.base_layer", 12), ("scene.select.visible_threshold", 0.9)),
+)
 BUNGEENERF = Collection(
-    "bungeenerf", "BungeeNeRF", BUNGEE, "not stated; rendered with Google Earth Studio, whose terms apply", "Xiangli et al., ECCV 2022"
+    "bungeenerf",
+    "BungeeNeRF",
+    BUNGEE,
+    "not stated; rendered with Google Earth Studio, whose terms apply",
+    "Xiangli et al., ECCV 2022",
+    (
+        ("scene.voxel_rule", "squared_median"),
+        ("growth.init_factor", 128),
+        _OCTREE,
+        ("scene.select.visible_threshold", 0.0),
+        ("scene.select.dist_ratio", 0.99),
+    ),
 )
 
 _CAP = "cap1600 (Scaffold-GS, Octree-GS and their kin: full-size photographs, at most 1600 px wide)"

@@ -220,7 +220,8 @@ def experts(sources: Sequence[Source]) -> str:
             values = shares.get("share") or shares.get("mean_gate")
             if values:
                 bars.append(chart.bars(f"{s.name}: {attribute}", values))
-            routed = [(m["step"], m["routing"][attribute]) for m in s.metrics if attribute in m.get("routing", {})]
+            found = [(m["step"], m.get("scene_routing") or m.get("routing") or {}) for m in s.metrics]
+            routed = [(step, shares[attribute]) for step, shares in found if attribute in shares]
             lines = [Line(f"expert {e + 1}", [(x, 100 * v[e]) for x, v in routed]) for e in range(len(routed[0][1]))] if routed else []
             charts.append(chart.lines(f"{s.name}: share of {attribute}", lines, "%"))
         entropy = sorted({a for m in s.metrics for a in m.get("entropy", {})})

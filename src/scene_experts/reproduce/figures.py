@@ -65,19 +65,21 @@ def relative_psnr(experiment: Experiment, records: Sequence[Record], scenes: Seq
 
 
 def shares(experiment: Experiment, records: Sequence[Record], scene: str, path: Path, attribute: str = "cov") -> list[Path]:
-    """Figure 3: share of the assignments per expert over training, one panel per row."""
+    """Figure 3: share of the assignments per expert over training (of the gates while dense), one panel per row."""
     found = [(name, of_recipe(records, recipe, scene)) for name, recipe in experiment.rows.items()]
     found = [(name, min(rows, key=lambda r: r.seed)) for name, rows in found if rows]
     if not found:
         return []
     figure, axes = canvas(len(found))
     for axis, (name, record) in zip(axes[0], found):
-        points = [(c["step"], c["routing"][attribute]) for c in record.curves if attribute in c.get("routing", {})]
+        whose = "scene_routing" if any("scene_routing" in c for c in record.curves) else "routing"  # older records: a view's anchors
+        points = [(c["step"], c[whose][attribute]) for c in record.curves if attribute in c.get(whose, {})]
         for e in range(len(points[0][1]) if points else 0):
             axis.plot([s for s, _ in points], [100 * v[e] for _, v in points], color=COLOURS[e], label=f"expert {e + 1}")
         decoder = getattr(record.config.train.scaled().scene, "decoder", None)
         axis.axvline(getattr(decoder, "warmup", 0), color="grey", linestyle=":", linewidth=1, label="end of the dense warm-up")
-        axis.set(title=f"{name} ({scene})", xlabel="iteration", ylabel=f"share of {attribute} assignments, %", ylim=(0, 100))
+        axis.set(title=f"{name} ({scene})", xlabel="iteration", ylim=(0, 100))
+        axis.set_ylabel(f"share of {attribute} assignments, % (dense: of gates)")
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
     return save(figure, path)

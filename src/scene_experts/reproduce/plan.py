@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from scene_experts.config import SCHEDULE, Data, Train, to_json
+from scene_experts.config import Data, Train, flags_of, to_json, with_numbers
 from scene_experts.data import catalog
 from scene_experts.data.obtain import present
 from scene_experts.errors import InputError
@@ -23,19 +23,21 @@ OWN = "captures"  # the name of the user's own captures among the data sets
 
 @dataclass(frozen=True)
 class Scene:
-    """A capture to train on. `options`: what its protocol sets in Data (resolution, split, normalise, ...)."""
+    """A capture to train on. `options`: what its protocol sets in Data (resolution, split, normalise, ...); `numbers`: in Train."""
 
     name: str
     dataset: str
     path: Path
     options: dict[str, Any] = field(default_factory=dict, hash=False)
+    numbers: catalog.Numbers = ()
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How large an experiment is: iterations of the rescaled schedule, and the picture's size (None: as the protocol says)."""
+    """How large an experiment is: the share of each recipe's schedule, or iterations, and the picture's size (None: the protocol's)."""
 
-    iterations: int = SCHEDULE
+    share: float = 1.0
+    iterations: int | None = None  # in place of the share, the same for all recipes
     resolution: str | None = None
 
     @classmethod
@@ -46,7 +48,11 @@ class Scale:
         if iterations is not None and iterations < 1:
             raise InputError(f"expected --iterations of at least 1, found {iterations}; give a larger number or leave it out")
         smaller = f"longest:{max(16, round(FULL_SIDE * scale))}" if scale < 1 else None
-        return cls(iterations or max(1, round(SCHEDULE * scale)), resolution or smaller)
+        return cls(scale, iterations, resolution or smaller)
+
+    def length(self, cfg: Train) -> int:
+        """Iterations of a recipe: Octree-GS is written for 40,000, the others for 30,000."""
+        return self.iterations or max(1, round(cfg.schedule * self.share))
 
 
 @dataclass(frozen=True)
@@ -60,7 +66,8 @@ class Spec:
 
     @property
     def train(self) -> Train:
-        return replace(RECIPES[self.recipe][1], iterations=self.scale.iterations, seed=self.seed)
+        cfg = with_numbers(RECIPES[self.recipe][1], self.scene.numbers)
+        return replace(cfg, iterations=self.scale.length(cfg), seed=self.seed)
 
     @property
     def data(self) -> Data:
@@ -90,7 +97,8 @@ class Spec:
     def arguments(self, out: Path) -> list[str]:
         """The arguments of `scene-experts train` that make it."""
         args = ["train", self.recipe, "--data", str(self.scene.path), "--out", str(out)]
-        args += ["--iterations", str(self.scale.iterations), "--seed", str(self.seed), "--preview-every", "0"]
+        args += ["--iterations", str(self.train.iterations), "--seed", str(self.seed), "--preview-every", "0"]
+        args += flags_of(self.train, self.scene.numbers)
         for name, value in vars(self.data).items():
             if name != "path" and value != getattr(Data(path=self.scene.path), name):
                 args += [f"--{name.replace('_', '-')}", str(value)]
@@ -121,7 +129,7 @@ def paper_scenes(root: Path) -> list[Scene]:
     for scene in catalog.SCENES:
         if present(root, scene):
             options = {"resolution": scene.resolution, "split": scene.split, "normalise": "none"}
-            found.append(Scene(scene.name, COLLECTIONS[scene.collection.key], root / scene.path, options))
+            found.append(Scene(scene.name, COLLECTIONS[scene.collection.key], root / scene.path, options, scene.collection.numbers))
     return found
 
 

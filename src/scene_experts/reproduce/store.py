@@ -23,6 +23,7 @@ from scene_experts.run_folder import read_config
 
 FORMAT = 1
 POINTS = 60  # samples of a curve over training
+CURVES = ("step", "seconds", "psnr", "anchors", "active", "routing", "entropy", "scene_routing", "scene_gates")
 PER_VIEW = ("psnr", "ssim", "lpips", "lpips_3dgs", "activation_ratio", "gaussians_rendered")
 
 
@@ -93,7 +94,7 @@ def curves(path: Path) -> list[dict[str, Any]]:
         except ValueError:
             continue  # cut off by a crash
         if isinstance(found, dict) and math.isfinite(found.get("psnr", math.nan)):
-            lines.append({k: found[k] for k in ("step", "seconds", "psnr", "anchors", "active", "routing", "entropy") if k in found})
+            lines.append({k: found[k] for k in CURVES if k in found})
     if len(lines) <= POINTS:
         return lines
     return [lines[round(i * (len(lines) - 1) / (POINTS - 1))] for i in range(POINTS)]

@@ -33,8 +33,8 @@ class Scene(Protocol):
 
     def __call__(self, camera: Camera, step: int, training: bool, cull: Cull) -> Decoded: ...
 
-    def routing(self, step: int) -> dict[str, Routing]:
-        """Routing of every row, by attribute; empty without experts."""
+    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
+        """Routing of every row (of at most `most`, evenly spread), by attribute; empty without experts."""
         ...
 
     def scene_opacity(self, camera: Camera, step: int) -> Tensor | None:

@@ -241,9 +241,10 @@ class AnchorScene(nn.Module):
         x = torch.cat([seen, direction] + ([distance] if "opacity" in self.config.add_dist else []), dim=1)
         return self.heads["opacity"](x, feature, step, self.table.facts["xyz"] / self.extent)[0]
 
-    def routing(self, step: int) -> dict[str, Routing]:
-        """Routing of every anchor, by attribute: it does not depend on the camera."""
-        feature, position = self.table.params["feature"], self.table.facts["xyz"] / self.extent
+    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
+        """Routing of every anchor (of at most `most`, evenly spread), by attribute: it does not depend on the camera."""
+        every = max(1, -(-len(self.table) // most)) if most else 1
+        feature, position = self.table.params["feature"][::every], self.table.facts["xyz"][::every] / self.extent
         found = {a: self.heads[a].routing(feature, step, position) for a in ATTRIBUTES}
         return {a: r for a, r in found.items() if r is not None}
 

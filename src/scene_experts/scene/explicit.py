@@ -129,7 +129,7 @@ class GaussianScene(nn.Module):
         )
         return Decoded(gaussians, rows, None, {})
 
-    def routing(self, step: int) -> dict[str, Routing]:
+    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
         """Nothing: there are no experts."""
         return {}
 

@@ -246,7 +246,7 @@ class GraphScene(nn.Module):
         own, strongest = self.encode(everyone)
         return self.opacity(torch.cat([own, self.view(everyone, camera)], dim=1), strongest)
 
-    def routing(self, step: int) -> dict[str, Routing]:
+    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
         """There are no experts."""
         return {}
 
