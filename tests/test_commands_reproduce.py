@@ -6,6 +6,7 @@ from records import record
 from scene_experts import cli
 from scene_experts.commands.reproduce import ReproduceCommand, experiments_of, scenes_of
 from scene_experts.errors import InputError
+from scene_experts.io import write_json
 from scene_experts.reproduce import store
 from synthetic import make_capture
 
@@ -49,6 +50,18 @@ def test_tables_of_what_is_done_without_running_the_rest(tmp_path, capsys):
     assert not (tmp_path / "out" / "runs").exists()
 
 
+def test_a_run_whose_checkpoints_are_gone_costs_its_picture_alone(tmp_path, capsys):
+    (tmp_path / "fox").mkdir()
+    args = ["--captures", str(tmp_path / "fox"), "--out", str(tmp_path / "out"), "--iterations", "3000", "--recipes", "moe-gs-e3-top2"]
+    made = record("moe-gs-e3-top2", "fox")
+    store.write(tmp_path / "out" / "records", made)
+    folder = tmp_path / "out" / "runs" / "fox" / "moe-gs-e3-top2" / f"seed0-{made.key}"
+    write_json(folder / "results.json", made.results)
+    assert cli.main(["reproduce", "fig5", *args]) == 0
+    said = capsys.readouterr().out
+    assert "no picture of moe-gs-e3-top2 on fox, seed 0: expected" in said and "wrote" in said
+
+
 def recipes_of(capsys, *args: str) -> tuple[int, set[str], set[str]]:
     """How many runs a plan has, and their recipes and seeds."""
     assert cli.main(["reproduce", *args, "--dry-run"]) == 0
@@ -86,5 +99,7 @@ def test_names_that_are_none(tmp_path, capsys):
         experiments_of(ReproduceCommand(()))
     with pytest.raises(InputError, match="expected the paper's scenes"):
         scenes_of(ReproduceCommand(("table1",), data=tmp_path))
+    with pytest.raises(InputError, match="expected --scenes among the captures box, found bax"):
+        scenes_of(ReproduceCommand(("table1",), captures=(tmp_path / "box",), scenes=("bax",)))
     with pytest.raises(InputError, match="expected rome"):
         scenes_of(ReproduceCommand(("table1",), data=tmp_path, scenes=("rome",)))

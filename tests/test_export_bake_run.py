@@ -16,7 +16,7 @@ from scene_experts.evaluate.metrics import psnr
 from scene_experts.export.bake.bake import Bake
 from scene_experts.export.bake.measure import picture
 from scene_experts.export.bake.refine import DRAWN_AT, Refine
-from scene_experts.export.bake.run import Options, export_standard, scene_of
+from scene_experts.export.bake.run import Options, export_standard, files, scene_of
 from scene_experts.export.formats.splats import from_scene
 from scene_experts.export.formats.standard import FORMATS, read_standard
 from scene_experts.export.run import write_layout
@@ -139,9 +139,10 @@ def test_levels_of_detail_become_one_file_each(tmp_path):
     assert isinstance(scene, AnchorScene) and isinstance(scene.select, LevelSelector)
     options = Options(replace(SHORT, refine=Refine(iterations=0)), levels=True)
     lines = export_standard(run, "ply", tmp_path / "out.ply", None, choose("auto", "cpu"), options)
-    files = sorted(tmp_path.glob("out_level*.ply"))
+    written = sorted(tmp_path.glob("out_level*.ply"))
     count = len(scene.table.facts["level"].unique())
-    assert len(files) == count > 1 and len(lines) == 3 * count
-    sizes = [len(read_standard(file)) for file in files]
+    assert len(written) == count > 1 and len(lines) == 3 * count
+    sizes = [len(read_standard(file)) for file in written]
     assert sizes == sorted(set(sizes))  # a level without anchors gets no file
     assert json.loads((tmp_path / "out_level1.ply.json").read_text())["level"] == 1
+    assert files(run_folder.open_run(run), tmp_path / "bare", True)[0][1].name == "bare_level0"

@@ -13,6 +13,7 @@ from scene_experts.io import write_json
 from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec
 from scene_experts.reproduce.run import Runner, last_line
+from scene_experts.run_folder import held
 
 
 def spec(recipe="moe-gs", seed=0, scene="fox"):
@@ -98,6 +99,15 @@ def test_a_run_without_a_whole_checkpoint_begins_anew(runner):
     (folder / "checkpoints").mkdir(parents=True)
     (folder / "config.json").write_text("torn")
     assert runner.make([spec()]) == [] and "--resume" not in runner.calls[0]
+
+
+def test_a_run_that_another_process_is_at_is_left_alone(runner):
+    folder = spec().folder(runner.runs)
+    folder.mkdir(parents=True)
+    (folder / "metrics.jsonl").write_text("the other's")
+    with held(folder):
+        (failure,) = runner.make([spec()])
+    assert "found a training at work" in failure.why and (folder / "metrics.jsonl").read_text() == "the other's" and not runner.calls
 
 
 def test_run_folders_go_when_asked_after_what_else_is_taken(runner):

@@ -128,16 +128,19 @@ def test_resuming_may_move_the_capture_and_the_stop(run):
 
 def test_overwriting_removes_what_belonged_to_the_old_run_and_nothing_else(run):
     (run / "previews").mkdir()
-    for name in ("results.json", "per_view_train.json", "scene.compact", "report.html", "previews/000030.png", "notes.txt"):
+    (run / "test" / "renders").mkdir(parents=True)
+    exported = ["scene.compact", "scene.ply", "scene.ply.json", "scene_level1.compressed.ply", "scene.html", "test/renders/1.png"]
+    mine = ["notes.txt", "scene.blend", "scenery.ply"]
+    for name in (*exported, *mine, "results.json", "per_view_train.json", "report.html", "previews/000030.png"):
         (run / name).write_text("old")
     for name in ("iteration_20/scene.json", "iteration_7/mine.txt"):
         (run / "point_cloud" / name).parent.mkdir(parents=True)
         (run / "point_cloud" / name).write_text("old")
     other = RunConfig(RECIPES["scaffold-gs"][1], CONFIG.data)
     run_folder.check(run, other, resume=False, overwrite=True)
-    assert len(state(run)) == 11
+    assert len(state(run)) == 18
     run_folder.prepare(run, other, resume=False, overwrite=True)
-    assert state(run).keys() == {"config.json", "notes.txt", "point_cloud/iteration_7/mine.txt"} and run_folder.read_config(run) == other
+    assert state(run).keys() == {"config.json", *mine, "point_cloud/iteration_7/mine.txt"} and run_folder.read_config(run) == other
 
 
 def test_places_that_cannot_be_a_run_folder(tmp_path):

@@ -35,6 +35,7 @@ def test_the_reference_gives_test_view_i_the_code_of_training_view_i():
     codes = Codes(4, (1, 2, 3, 5), "index")
     for number, other in enumerate((0, 4, 6)):
         assert torch.equal(codes(replace(CAMERA, id=other)), codes.table[number])
+    torch.testing.assert_close(codes(replace(CAMERA, id=-1)), codes.table.mean(0))  # a free camera is no test view
 
 
 def test_a_folded_code_is_a_bias():

@@ -15,6 +15,12 @@ from scene_experts.view.panel import number_of_experts, positions
 def test_experts_are_counted():
     assert number_of_experts(started("moe-gs")) == 5 and number_of_experts(started("scaffold-gs")) == 0
     assert positions(started("moe-gs")).shape[1] == 3
+    balanced = started("moe-gs-balance")
+    balanced.train()
+    state, before = torch.random.get_rng_state(), [h.router_balance.clone() for h in balanced.heads.values()]
+    assert number_of_experts(balanced) == 5  # and changes nothing of a training
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert all(torch.equal(h.router_balance, b) for h, b in zip(balanced.heads.values(), before))
 
 
 def test_one_expert_alone(viewer):  # noqa: F811
@@ -37,9 +43,9 @@ def test_cameras_and_anchors_come_and_go(viewer):  # noqa: F811
 
 def test_curves_follow_a_training(viewer):  # noqa: F811
     viewer.panel.train()
-    viewer.panel.said = 0.0
     for step in (10, 20):
-        viewer.panel.said = 0.0
+        viewer.panel.followed = 0.0
+        viewer.panel.drawn(0.1, viewer.capture.views[0].camera)  # somebody moves
         viewer.panel.event(Stepped(step, {"l1": 0.1, "dssim": 0.2}, 20.0 + step, 100, 50, 400, 0.5, 1.0, {}))
     assert viewer.panel.curves["psnr"] == [30.0, 40.0] and viewer.panel.curves["loss"] == [pytest.approx(0.3)] * 2
     plots = dict(viewer.panel.charts)

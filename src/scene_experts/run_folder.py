@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import math
 import platform
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -39,6 +40,7 @@ from scene_experts.scene import Scene
 from scene_experts.state import scene_from, to_device
 
 FORMAT = 1
+EXPORTED = re.compile(r"scene(_level\d+)?\.(compact|((compressed\.)?ply|splat|spz|sog|glb|html)(\.json)?)")  # what `export` calls its files
 
 
 @dataclass(frozen=True)
@@ -135,9 +137,12 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False)
     check(out, config, resume, overwrite)
     if overwrite:
         results = [out / f"{name}{suffix}.json" for name in ("results", "per_view") for suffix in ("", "_train", "_half")]
-        others = [out / name for name in ("scene.compact", "report.html", "config.json")]
+        exported = [path for path in out.glob("scene*.*") if EXPORTED.fullmatch(path.name)]
+        others = [*exported, out / "report.html", out / "config.json"]
         for old in [*(out / "checkpoints").glob("ckpt_*.safetensors"), *(out / "previews").glob("*.png"), *results, *others]:
             old.unlink(missing_ok=True)
+        for pictures in (f"{views}{half}" for views in ("test", "train") for half in ("", "_half")):
+            shutil.rmtree(out / pictures, ignore_errors=True)
         for sidecar in (out / "point_cloud").glob("iteration_*/scene.json"):  # a later iteration's would be taken for the new run's
             shutil.rmtree(sidecar.parent, ignore_errors=True)
     write_json(out / "config.json", {"format": FORMAT, **to_json(config)})

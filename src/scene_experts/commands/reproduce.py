@@ -96,9 +96,12 @@ def reproduce(args: list[str]) -> int:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-    for spec in wanted:  # pictures of runs that were done before this figure was asked for
+    for spec in () if command.tables_only else wanted:  # pictures of runs that were done before this figure was asked for
         if not (command.out / f"fig5_{spec.scene.name}.png").is_file() and (spec.folder(runs) / "results.json").is_file():
-            draw(spec, spec.folder(runs))
+            try:
+                draw(spec, spec.folder(runs))
+            except InputError as error:
+                say(f"no picture of {spec.label}: {error}")
     for path in report.write(command.out, chosen, scenes, store.of_specs(store.load(records), shown), said(command, scenes)):
         say(f"wrote {path}")
     if runner.stop.is_set():
@@ -151,6 +154,9 @@ def scenes_of(command: ReproduceCommand) -> list[Scene]:
     root = command.data or captures_dir()
     scenes = own_scenes(command.captures) if command.captures else paper_scenes(root)
     unknown = set(command.scenes) - {s.name for s in scenes}
+    if unknown and command.captures:
+        names = ", ".join(s.name for s in scenes)
+        raise InputError(f"expected --scenes among the captures {names}, found {', '.join(sorted(unknown))}; correct it")
     if unknown or not scenes:
         what = ", ".join(sorted(unknown)) or "the paper's scenes"
         raise InputError(f"expected {what} in {root}, found none; fetch scenes with `{PROG} download`, or give --captures DIR...")

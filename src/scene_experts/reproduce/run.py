@@ -18,6 +18,7 @@ from scene_experts.checkpoint import latest
 from scene_experts.errors import InputError, RunError
 from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import Spec
+from scene_experts.run_folder import held
 
 Say = Callable[[str], None]
 
@@ -83,7 +84,11 @@ class Runner:
         if latest(folder / "checkpoints") is not None:
             train.append("--resume")
         elif folder.exists():
-            shutil.rmtree(folder)  # it never came to a whole checkpoint
+            try:
+                with held(folder):
+                    shutil.rmtree(folder)  # it never came to a whole checkpoint
+            except InputError as error:
+                return self.failed(spec, str(error), log, place)
         for args in (train, ["eval", str(folder)]):
             code = self.command(args, slot, log)
             if self.stop.is_set():

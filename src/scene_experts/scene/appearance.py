@@ -39,7 +39,7 @@ class Codes(nn.Module):
         if camera.id in self.fitted:
             return self.fitted[camera.id]
         row = self.row.get(camera.id)
-        if row is None and self.rule == "index":
+        if row is None and self.rule == "index" and camera.id >= 0:  # below 0: a free camera, at no view's place
             row = (camera.id - sum(view < camera.id for view in self.views)) % len(self.views)  # its number among the other views
         return self.table.mean(dim=0) if row is None else self.table[row]
 

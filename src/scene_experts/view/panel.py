@@ -40,7 +40,7 @@ class Panel:
     ) -> None:
         self.server, self.capture, self.current, self.changed, self.go = server, capture, current, changed, go
         self.curves: dict[str, list[float]] = {"step": [], "psnr": [], "loss": []}
-        self.said, self.charts, self.pause = 0.0, [], None
+        self.said, self.followed, self.charts, self.pause = 0.0, 0.0, [], None
         self.status = server.gui.add_markdown("")
         scene, _ = current()
         self.experts = number_of_experts(scene)
@@ -141,7 +141,7 @@ class Panel:
 
     def drawn(self, seconds: float, camera: Camera) -> None:
         now = time.monotonic()
-        if now - self.said > 0.5:
+        if now - self.said > 0.5 and not self.charts:  # a training tells of itself
             self.said = now
             self.tell(f"{camera.width} x {camera.height} px, {1000 * seconds:.0f} ms")
 
@@ -202,8 +202,8 @@ class Panel:
                 self.curves["step"].append(float(event.step))
                 self.curves["psnr"].append(event.psnr)
                 self.curves["loss"].append(sum(event.terms.values()))
-                if time.monotonic() - self.said > EVERY:
-                    self.said = time.monotonic()
+                if time.monotonic() - self.followed > EVERY:
+                    self.followed = time.monotonic()
                     self.redraw(event)
                     self.changed()  # the scene has moved on
             case Stopped() | Finished():
@@ -220,11 +220,12 @@ class Panel:
             plot.data = (np.array(self.curves["step"][::step]), np.array(self.curves[key][::step]))
 
 
+@torch.no_grad()  # with gradients, routing would be taken for a training's: noise would be drawn, biases moved
 def number_of_experts(scene: Scene) -> int:
     """Experts per attribute; 0 for a scene without a mixture."""
     if not isinstance(scene, AnchorScene):
         return 0
-    return max((w.gates.shape[1] for w in scene.routing(1).values()), default=0) if len(scene.table) else 0
+    return max((w.gates.shape[1] for w in scene.routing(1, 1).values()), default=0) if len(scene.table) else 0
 
 
 def positions(scene: Scene) -> torch.Tensor:

@@ -10,8 +10,9 @@ import numpy as np
 
 from scene_experts.errors import InputError, RunError
 from scene_experts.evaluate import pictures
-from scene_experts.io import write_atomic
+from scene_experts.io import read_json, write_atomic, write_json
 
+NOTE = "frames.json"
 VIDEO = (".mp4", ".mov", ".mkv", ".webm")
 
 
@@ -56,6 +57,8 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: i
         finally:
             if stream is not None:
                 stream.close()
+        if stream is not None and (whole := ffmpeg.count_frames_and_secs(str(temporary))[0]) != count:  # its exit code is not told
+            raise RuntimeError(f"{whole} of {count} frames arrived")
 
     try:
         write_atomic(path, encode)
@@ -67,13 +70,32 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: i
 
 
 def write_pictures(folder: Path, frames: Iterable[np.ndarray]) -> int:
-    """Write frames as 00000.png, 00001.png, ...; frames of an earlier and longer path beyond them go; how many."""
+    """Write frames as 00000.png, 00001.png, ... and how many into frames.json; those of an earlier and longer path go; how many.
+
+    Raises InputError, before the first frame is drawn, for a folder that holds such pictures of somebody else.
+    """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"expected a folder for pictures at {folder}, found a file; choose another --out")
+    earlier, note = [folder / f"{i:05d}.png" for i in range(_earlier(folder))], folder / NOTE
+    foreign = set(folder.glob("[0-9][0-9][0-9][0-9][0-9].png")) - set(earlier)
+    if foreign:
+        raise InputError(f"expected a folder whose pictures may be replaced at {folder}, found {min(foreign).name}; choose another --out")
     count = 0
     for count, frame in enumerate(frames, 1):
+        if count > len(earlier):
+            write_json(note, {"frames": count})  # first: a picture without a note would be taken for somebody else's
         pictures.write(folder / f"{count - 1:05d}.png", frame)
-    for old in folder.glob("[0-9][0-9][0-9][0-9][0-9].png"):
-        if int(old.stem) >= count:
-            old.unlink()
+    for old in earlier[count:]:
+        old.unlink(missing_ok=True)
+    write_json(note, {"frames": count})
     return count
+
+
+def _earlier(folder: Path) -> int:
+    """How many pictures an earlier call left in `folder`."""
+    try:
+        found = read_json(folder / NOTE, "note of the frames")
+    except InputError:
+        return 0
+    count = found.get("frames") if isinstance(found, dict) else None
+    return count if isinstance(count, int) and 0 <= count < 100_000 else 0

@@ -133,9 +133,9 @@ def files(run: OpenRun, path: Path, levels: bool) -> list[tuple[int | None, Path
     select = run.scene.select if isinstance(run.scene, AnchorScene) else None
     if not isinstance(select, LevelSelector):
         raise InputError(f"expected a run with levels of detail for --levels, found one of '{run.config.train.recipe}'; leave --levels out")
-    stem, suffixes = path.name.partition(".")[::2]
+    stem, dot, suffixes = path.name.partition(".")
     held = run.scene.table.facts["level"].unique().tolist()  # levels that growth never reached would repeat the one before
-    return [(level, path.with_name(f"{stem}_level{level}.{suffixes}")) for level in range(select.lattices.count) if level in held]
+    return [(level, path.with_name(f"{stem}_level{level}{dot}{suffixes}")) for level in range(select.lattices.count) if level in held]
 
 
 def one_file(
