@@ -130,6 +130,16 @@ def test_beside_a_description_of_more_harmonics_the_file_says_the_degree(made, t
     assert opened.step == 90 and opened.scene.config.sh_degree == 0
 
 
+def test_spz_says_by_itself_whether_it_is_antialiased(made, tmp_path):
+    run, folder = made
+    layout = explicit.write_folder(run_folder.open_run(run), run_folder.load_capture(Data(folder)).world, tmp_path / "result")
+    for asked in (False, True):
+        file = tmp_path / f"{asked}.spz"
+        write_standard(file, read_standard(layout / "point_cloud.ply"), "spz", {"antialias": asked})
+        out = import_result(file, Data(folder), tmp_path / f"{asked}")
+        assert run_folder.read_config(out).train.antialias is asked
+
+
 def test_the_description_beside_a_file_is_heard(made, tmp_path):
     run, folder = made
     to_ply(run, tmp_path / "scene.ply")

@@ -108,6 +108,7 @@ def test_damaged_files(tmp_path):
         refused(words)
     for change, words in (
         (lambda d: d["accessors"][0].update(count=10**9), "beyond the file"),
+        (lambda d: d["accessors"][0].update(count=float("inf")), "do not fit"),
         (lambda d: d["bufferViews"][0].update(byteOffset=-4), "beyond the file"),
         (lambda d: d["accessors"][0].update(componentType=1), "do not fit"),
         (lambda d: d["accessors"][3].update(count=19), "several lengths"),

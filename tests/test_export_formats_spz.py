@@ -81,6 +81,20 @@ def test_version_4(tmp_path, degree):
         assert torch.equal(getattr(found, name), getattr(wanted, name))
 
 
+@pytest.mark.parametrize("asked", [False, True])
+def test_the_flag_of_antialiasing(tmp_path, asked):
+    s = scene(50, 1)
+    spz.write_spz(tmp_path / "a.spz", s, {"antialias": asked})
+    assert gzip.decompress((tmp_path / "a.spz").read_bytes())[14] == int(asked) and spz.is_antialiased(tmp_path / "a.spz") is asked
+    data = bytearray(version_4(s))
+    data[14] = int(asked)
+    (tmp_path / "b.spz").write_bytes(data)
+    assert spz.is_antialiased(tmp_path / "b.spz") is asked
+    for broken in (b"", b"NGSP", b"\x1f\x8b rubbish"):
+        (tmp_path / "c.spz").write_bytes(broken)
+        assert spz.is_antialiased(tmp_path / "c.spz") is False
+
+
 def test_damaged_files(tmp_path):
     good = spz.spz_bytes(scene(30, 2))
     raw = gzip.decompress(good)

@@ -1,5 +1,6 @@
 """Published Scaffold-GS results become runs: drawn with their own anchors and networks, or refused in one sentence."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -149,14 +150,15 @@ def test_a_published_feature_bank_and_codes_are_drawn(tmp_path, folder):
     capture.images.close()
 
 
-def test_a_published_octree_draws_the_levels_its_distances_ask_for(tmp_path, folder):
-    scene = published(tmp_path / "result")
+@pytest.mark.parametrize(("fork", "rule"), [(2, "round"), (3, "floor")])
+def test_a_published_octree_draws_the_levels_its_distances_ask_for(tmp_path, folder, fork, rule):
+    scene = published(tmp_path / "result", f"Namespace(voxel_size={VOXEL}, fork={fork}, dist2level={rule!r}, add_level=False)")
     path = tmp_path / "result" / "point_cloud" / "iteration_30000" / "point_cloud.ply"
     torch.manual_seed(2)
     n, edge, standard, origin = 800, 0.4, 6.0, torch.tensor([-3.0, -3.0, -3.0])
     level = torch.randint(0, 3, (n,))
-    cell = torch.stack([torch.randint(0, 15 * 2 ** int(j), (3,)) for j in level])
-    xyz = origin + cell * (edge / 2**level)[:, None]
+    cell = torch.stack([torch.randint(0, 15 * fork ** int(j), (3,)) for j in level])
+    xyz = origin + cell * (edge / fork**level)[:, None]
     info, extra = torch.zeros(n), torch.rand(n)
     info[0], info[1] = edge, standard
     columns = {"level": level, "extra_level": extra, "info": info}
@@ -166,7 +168,11 @@ def test_a_published_octree_draws_the_levels_its_distances_ask_for(tmp_path, fol
     for j in range(3):  # the same lattice, counted from an anchor of level 0
         off = table.facts["cell"][level == j] - cell[level == j]
         assert (off == off[0]).all()
-    r = (xyz + (edge / 2 / 2**level)[:, None] - camera.position).norm(dim=1)
-    asked = (torch.log2(standard / r) + extra).round().clamp(0, 2)
+    r = (xyz + (edge / 2 / fork**level)[:, None] - camera.position).norm(dim=1)
+    asked = getattr(torch, rule)(torch.log(standard / r) / math.log(fork) + extra).clamp(0, 2)
     assert opened.scene.select(table, camera, 30_000, False).tolist() == (level <= asked).nonzero().squeeze(1).tolist()
+    assert (opened.config.train.scene.select.fork, opened.config.train.scene.select.rule) == (fork, rule)
+    with pytest.raises(InputError, match="found ones that see the level too"):
+        (tmp_path / "result" / "cfg_args").write_text("Namespace(add_level=True)")
+        import_result(tmp_path / "result", Data(folder), tmp_path / "other")
     assert opened.config.train.recipe == "octree-gs" and opened.scene.heads["color"].w1.shape == scene.heads["color"].w1.shape

@@ -49,3 +49,14 @@ def test_published_files_must_say_what_the_levels_are():
     assert (found.count, found.edge, found.standard, found.origin) == (3, 0.5, 8.0, (3.0, 4.0, 5.0))
     with pytest.raises(InputError, match="column info"):
         published_levels({**anchors, "info": torch.zeros(3)}, [])
+    for rule, ours in (("floor", "floor"), ("ceil", "ceil"), ("progressive", "blend")):
+        found = published_levels(anchors, [], {"fork": 3, "dist2level": rule})
+        assert (found.fork, found.rule) == (3, ours)
+    for cfg in ({"fork": 1}, {"fork": "2"}, {"dist2level": "nearest"}, {"dist2level": [1]}):
+        with pytest.raises(InputError, match="in cfg_args"):
+            published_levels(anchors, [], cfg)
+
+
+def test_a_bank_of_other_inputs_is_refused():
+    with pytest.raises(InputError, match="found one of 3; train the scene here"):
+        rescaled({"w1": torch.zeros(1, 32, 3)}, 2.0)

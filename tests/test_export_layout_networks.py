@@ -81,6 +81,8 @@ def test_plain_is_one_expert_without_a_router():
         ("color", "w2", torch.zeros(4, 30, 32)),
         ("opacity", "router_b", torch.zeros(4)),
         ("cov", "w1", None),
+        ("cov", "w1", torch.zeros(32, 35)),
+        ("cov", "b2", torch.zeros(70)),
     ],
 )
 def test_networks_that_do_not_fit_together(attribute, name, value):

@@ -155,5 +155,12 @@ def test_an_absent_file_and_values_that_are_not_finite(tmp_path):
     ply.write_anchor_ply(tmp_path / "p.ply", xyz, offsets, feature, scaling)
     with pytest.raises(InputError, match=r"expected finite feature in .*, found 1 anchors"):
         ply.read_anchor_ply(tmp_path / "p.ply")
+    xyz, offsets, feature, scaling = anchors()
+    for name, value in (("level", float("nan")), ("level", 1e9), ("level", -3.0), ("extra_level", float("inf")), ("info", float("nan"))):
+        levels = {column: torch.ones(len(xyz)) for column in ("level", "extra_level", "info")}
+        levels[name][2] = value
+        ply.write_anchor_ply(tmp_path / "p.ply", xyz, offsets, feature, scaling, levels)
+        with pytest.raises(InputError, match="expected finite levels between 0 and 64"):
+            ply.read_anchor_ply(tmp_path / "p.ply")
     with pytest.raises(InputError, match="expected Gaussians of 3DGS"):
         ply.read_gaussian_ply(tmp_path / "p.ply")

@@ -20,6 +20,7 @@ from scene_experts.config import Data, RunConfig, Train, from_json, to_json
 from scene_experts.data.views import Capture, World
 from scene_experts.errors import InputError
 from scene_experts.export.formats.splats import from_scene, to_columns
+from scene_experts.export.formats.spz import is_antialiased
 from scene_experts.export.formats.standard import FORMATS, format_of, read_standard
 from scene_experts.export.incoming import UNKNOWN
 from scene_experts.export.layout.cfg_args import cfg_args_text
@@ -124,14 +125,14 @@ def read_columns(path: Path, world: World) -> dict[str, Tensor]:
 
 
 def _antialias(path: Path) -> bool:
-    """Whether the description that `export` writes beside a standard file says that its scene was trained with antialiasing.
+    """Whether an SPZ file, or the description that `export` writes beside a standard file, says that it is to be antialiased.
 
     Raises InputError where it says that the file is not in the capture's own frame.
     """
     beside = path.with_name(path.name + ".json")
     found = read_json(beside, "description of a file") if beside.is_file() else None
     if not isinstance(found, dict):
-        return False
+        return path.is_file() and format_of(path) == "spz" and is_antialiased(path)
     if found.get("frame") == "trained":
         raise InputError(
             f"expected a file in the capture's own frame, found {path} in the trained one; export it again with --frame capture"

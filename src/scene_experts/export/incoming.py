@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +23,14 @@ from scene_experts.export.frame import (
     networks_from_input,
     recover_voxel,
 )
-from scene_experts.export.layout.extras import level_facts, levels_in, published_levels, trained_names
+from scene_experts.export.layout.extras import RULES, level_facts, levels_in, published_levels, trained_names
 from scene_experts.export.layout.scaffold import read_scaffold_folder
 from scene_experts.recipes import octree_gs, scaffold_gs
 from scene_experts.scene.anchors import ATTRIBUTES, Anchors
 from scene_experts.scene.levels import Levels
 from scene_experts.scene.mix import FeatureBank
 from scene_experts.scene.mlp import Plain
+from scene_experts.scene.select import Octree
 
 UNKNOWN = 0  # the step of files that do not say how long they were trained
 
@@ -45,6 +46,7 @@ class _Read:
     add_dist: tuple[str, ...]
     step: int  # 0 where nothing says it
     scene: dict[str, Any] | None  # our description
+    cfg: dict[str, Any] = field(default_factory=dict)  # cfg_args
 
 
 def import_result(source: Path, data: Data, out: Path, iteration: int | None = None) -> Capture:
@@ -81,7 +83,7 @@ def _plain_values(read: _Read, capture: Capture) -> dict[str, Any]:
         return dict(read.scene.get("scene", {}))
     out: dict[str, Any] = {}
     if "level" in read.anchors:
-        out["levels"] = published_levels(read.anchors, [capture.views[i].camera for i in capture.train]).meta()
+        out["levels"] = published_levels(read.anchors, [capture.views[i].camera for i in capture.train], read.cfg).meta()
     if "appearance" in read.networks:
         codes = len(read.networks["appearance"]["table"])
         if codes != len(capture.train):
@@ -132,14 +134,15 @@ def _read(source: Path, iteration: int | None) -> _Read:
         return _Read(compact_anchors(c), c.cells, c.voxel, c.networks, add_dist, int(c.sidecar["step"]), c.sidecar)
     anchors, networks, facts = read_scaffold_folder(source, iteration)
     scene, spare = facts["scene"], {a: n["w1"].shape[2] - facts["F"] - 3 for a, n in networks.items() if a in ATTRIBUTES}
-    if max(spare["opacity"], spare["cov"], spare["color"] - facts["appearance_dim"]) > 1:
+    by_level = scene is None and facts["kind"] == "octree" and facts["cfg"].get("add_level") is True
+    if by_level or max(spare["opacity"], spare["cov"], spare["color"] - facts["appearance_dim"]) > 1:
         raise InputError(
             f"expected networks that see feature, direction and distance in {source}, found ones that see the level too; train it here"
         )
     step = int((scene or {}).get("step") or facts["iteration"] or UNKNOWN)
     voxel, origin = float(facts["voxel_size"] or 0.0), (0.0, 0.0, 0.0)
     if facts["kind"] == "octree":  # its lattices are told by its own columns
-        return _Read(anchors, None, voxel, networks, facts["add_dist"], step, scene)
+        return _Read(anchors, None, voxel, networks, facts["add_dist"], step, scene, facts["cfg"])
     if scene is not None:
         voxel, origin = lattice_to_input(float(scene["voxel_size"]["trained"]), world_in(scene))
     elif voxel <= 0:  # it was automatic and is written nowhere
@@ -161,7 +164,8 @@ def _config(read: _Read) -> Train:
     if "appearance" in read.networks:
         scene = replace(scene, appearance=read.networks["appearance"]["table"].shape[1])
     if "level" in read.anchors:
-        return replace(octree_gs, scene=replace(scene, select=octree_gs.scene.select), iterations=length)  # type: ignore[union-attr]
+        fork, rule = read.cfg.get("fork", 2), RULES[str(read.cfg.get("dist2level", "round"))]
+        return replace(octree_gs, scene=replace(scene, select=Octree(fork=fork, rule=rule)), iterations=length)
     return replace(scaffold_gs, scene=scene, iterations=length)
 
 

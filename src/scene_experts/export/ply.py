@@ -28,6 +28,7 @@ _TYPES = {
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 HEADER_LIMIT = 1 << 20
+MOST_LEVELS = 64  # of detail
 ANCHOR_OPACITY = math.log(0.1 / 0.9)  # logit(0.1): Scaffold-GS stores it and never uses it
 
 
@@ -162,8 +163,11 @@ def read_anchor_ply(path: Path) -> dict[str, Tensor]:
     out["opacity"] = _stack(columns, ["opacity"], path)[:, 0]
     out["rotation"] = _stack(columns, [f"rot_{i}" for i in range(4)], path)
     if "level" in columns:
-        out["level"] = _stack(columns, ["level"], path)[:, 0].round().long()
-        out |= {name: _stack(columns, [name], path)[:, 0] for name in ("extra_level", "info") if name in columns}
+        out |= {name: _stack(columns, [name], path)[:, 0] for name in ("level", "extra_level", "info") if name in columns}
+        levels = [out[name] for name in ("level", "extra_level", "info") if name in out]
+        if not all(value.isfinite().all() for value in levels) or not ((levels[0] >= 0) & (levels[0] <= MOST_LEVELS)).all():
+            raise InputError(f"expected finite levels between 0 and {MOST_LEVELS} in {path}, found others; export the result again")
+        out["level"] = out["level"].round().long()
     for name in ("xyz", "offsets", "feature", "log_scaling"):
         bad = int((~out[name].isfinite()).flatten(1).any(1).sum())
         if bad:

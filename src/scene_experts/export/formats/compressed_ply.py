@@ -116,11 +116,15 @@ def _elements(path: Path, text: str) -> dict[str, tuple[int, np.dtype[Any]]]:
             elif words[:1] == ["property"]:
                 found[name][1].append((words[2], types[words[1]]))
         order, widths = list(found), {key: [column for column, _ in columns] for key, (_, columns) in found.items()}
+        kinds = {key: {kind for _, kind in columns} for key, (_, columns) in found.items()}
         if (
             order not in (["chunk", "vertex"], ["chunk", "vertex", "sh"])
             or "format binary_little_endian" not in text
             or widths["chunk"] != _RANGES
             or widths["vertex"] != _PACKED
+            or kinds["chunk"] != {"<f4"}
+            or kinds["vertex"] != {"<u4"}
+            or not kinds.get("sh", set()) <= {"u1"}
             or sorted(widths.get("sh", [])) != sorted(f"f_rest_{i}" for i in range(len(widths.get("sh", []))))
             or len(widths.get("sh", [])) not in (0, 9, 24, 45)
             or any(count < 0 for count, _ in found.values())

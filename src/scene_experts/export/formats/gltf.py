@@ -80,7 +80,7 @@ def read_glb(path: Path) -> Splats:
         primitives = [p for mesh in scene.get("meshes", []) for p in mesh["primitives"] if NAME in p.get("extensions", {})]
         found = [_read_primitive(path, scene, data, p["attributes"]) for p in primitives]
         none_meant = NAME in scene.get("extensionsUsed", [])
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise damaged(path, WHAT, f"Gaussians that do not fit together ({error})") from None
     if not found:
         if none_meant:

@@ -37,6 +37,7 @@ from scene_experts.io import write_bytes
 MAGIC, HEADER = 0x5053474E, struct.Struct("<IIIBBBB")
 V4_HEADER = struct.Struct("<IIIBBBBI12x")
 WHAT = "SPZ"
+ANTIALIASED, _FLAGS = 1, 14  # a bit of the header's flags, and where these are in every version
 _STREAMS = ("positions", "alphas", "colors", "scales", "rotations", "sh")
 _COLOR = 0.15  # of a byte's range for each unit of the constant harmonic
 _MAX_BITS = 20  # of a position's fraction
@@ -44,12 +45,12 @@ _ROTATION = 511 * np.sqrt(2)
 
 
 def write_spz(path: Path, splats: Splats, note: dict[str, Any]) -> None:
-    """Write SPZ version 3; it has no room for a note."""
-    write_bytes(path, spz_bytes(splats))
+    """Write SPZ version 3; of a note it has room for `antialias` alone."""
+    write_bytes(path, spz_bytes(splats, antialias=bool(note.get("antialias", False))))
 
 
-def spz_bytes(splats: Splats, first_step: int = 1, rest_step: int = 1) -> bytes:
-    """The bytes of an SPZ file, version 3.
+def spz_bytes(splats: Splats, first_step: int = 1, rest_step: int = 1, antialias: bool = False) -> bytes:
+    """The bytes of an SPZ file, version 3; antialias: whether it is to be drawn with the compensation of the 0.3 px blur.
 
     first_step, rest_step: harmonics of degree 1 and above are kept in multiples of so many 1/128. The format's first writer has 8 and 16,
     which saves a third of the bytes and costs a trained scene up to 20 dB against its own picture; 1 keeps all that a byte holds.
@@ -66,7 +67,7 @@ def spz_bytes(splats: Splats, first_step: int = 1, rest_step: int = 1) -> bytes:
     colors = to_bytes(s.sh[:, 0].double().numpy() * _COLOR + 0.5)
     scales = np.clip(np.rint((s.log_scales.double().numpy() + 10) * 16), 0, 255).astype(np.uint8)
     sh = _harmonics(s.sh[:, 1:].double().numpy(), first_step, rest_step)
-    head = HEADER.pack(MAGIC, 3, len(s), s.degree, bits, 0, 0)
+    head = HEADER.pack(MAGIC, 3, len(s), s.degree, bits, ANTIALIASED if antialias else 0, 0)
     streams = (positions, to_bytes(alphas(s)), colors, scales, _pack_quats(unit_quats(s)), sh)
     return gzip.compress(head + b"".join(part.tobytes() for part in streams), 6, mtime=0)
 
@@ -75,6 +76,17 @@ def read_spz(path: Path) -> Splats:
     """The Gaussians of an SPZ file of version 1 to 4. Raises InputError for other or damaged files."""
     data = path.read_bytes()
     return decode_spz(data, path)
+
+
+def is_antialiased(path: Path) -> bool:
+    """Whether an SPZ file says that it is to be drawn with antialiasing; False for files that no reader takes."""
+    with path.open("rb") as stream:
+        data = stream.read(4096)
+    try:
+        head = data if data[:4] == b"NGSP" else zlib.decompressobj(31).decompress(data, HEADER.size)
+    except zlib.error:
+        return False
+    return len(head) > _FLAGS and bool(head[_FLAGS] & ANTIALIASED)
 
 
 def decode_spz(data: bytes, path: Path) -> Splats:

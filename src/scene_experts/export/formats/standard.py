@@ -64,7 +64,7 @@ def write_standard(path: Path, splats: Splats, format: str, note: Note) -> None:
     """Write `splats` to `path` in a format of `FORMATS`, atomically.
 
     note: how the file was made (plain JSON values), kept where the format has room for it. What a page shows beside the scene (camera,
-    cameras, background, antialias, title: see `html_page`) is for html alone.
+    cameras, background, antialias, title: see `html_page`) is for html alone, `antialias` for spz too.
     Raises InputError for an unknown format and for values that are not finite; RunError when the disk is full.
     """
     if format not in FORMATS:
@@ -74,7 +74,7 @@ def write_standard(path: Path, splats: Splats, format: str, note: Note) -> None:
         bad = int((~value.isfinite()).reshape(len(splats), -1).any(1).sum()) if len(splats) else 0
         if bad:
             raise InputError(f"expected finite {name}, found {bad:,} Gaussians with others; make them again")
-    kept = note if format == "html" else {name: value for name, value in note.items() if name not in PAGE_NOTES}
+    kept = note if format in ("html", "spz") else {name: value for name, value in note.items() if name not in PAGE_NOTES}
     FORMATS[format].write(Path(path), splats, kept)
 
 

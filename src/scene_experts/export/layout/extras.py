@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -11,10 +11,11 @@ from torch import Tensor
 from scene_experts.errors import InputError
 from scene_experts.export.frame import Network
 from scene_experts.scene.anchors import AnchorScene
-from scene_experts.scene.levels import Levels, centres
+from scene_experts.scene.levels import LevelRule, Levels, centres
 from scene_experts.scene.select import LevelSelector
 from scene_experts.types import Camera
 
+RULES: dict[str, LevelRule] = {"round": "round", "floor": "floor", "ceil": "ceil", "progressive": "blend"}  # dist2level
 BANK_DISTANCE = 3  # the feature bank's input: direction, distance
 
 
@@ -40,8 +41,13 @@ def extra_networks(scene: AnchorScene, scale: float) -> dict[str, Network]:
 
 
 def rescaled(bank: Network, scale: float) -> Network:
-    """A feature bank whose distances are `scale` times as short."""
+    """A feature bank whose distances are `scale` times as short. Raises InputError for one with other inputs."""
     w1 = bank["w1"].clone()
+    if w1.shape[2] != BANK_DISTANCE + 1:
+        raise InputError(
+            f"expected a feature bank that sees direction and distance ({BANK_DISTANCE + 1} numbers), found one of {w1.shape[2]}; "
+            "train the scene here"
+        )
     w1[:, :, BANK_DISTANCE] = w1[:, :, BANK_DISTANCE] * scale
     return bank | {"w1": w1}
 
@@ -54,16 +60,22 @@ def trained_names(networks: dict[str, Network], scale: float) -> dict[str, Netwo
     return out
 
 
-def published_levels(anchors: dict[str, Tensor], cameras: Sequence[Camera], fork: int = 2) -> Levels:
+def published_levels(anchors: dict[str, Tensor], cameras: Sequence[Camera], cfg: Mapping[str, Any] | None = None) -> Levels:
     """The levels of an Octree-GS result (input unit, in which it was trained): any anchor of the coarsest level marks the lattice, whose
-    origin no file keeps. Raises InputError where `info` says nothing."""
+    origin no file keeps. cfg: its cfg_args (fork, dist2level). Raises InputError where `info` says nothing, or these nothing known."""
+    fork, rule = (cfg or {}).get("fork", 2), RULES.get(str((cfg or {}).get("dist2level", "round")))
+    if not isinstance(fork, int) or not 2 <= fork <= 16 or rule is None:
+        raise InputError(
+            f"expected a fork of 2 to 16 and a dist2level among {', '.join(RULES)} in cfg_args, found {fork} and "
+            f"{(cfg or {}).get('dist2level')}; correct the file"
+        )
     level, info = anchors["level"], anchors.get("info", torch.zeros(0))
     if len(level) < 2 or not (info[:2] > 0).all():
         raise InputError("expected the cell edge and the distance of Octree-GS in its column info, found none; export the result again")
     first = int(level.min())
     x, y, z = anchors["xyz"][int((level == first).nonzero()[0])].tolist()
     count = int(level.max()) + 1
-    return Levels(count, count // 2, fork, float(info[0]), (x, y, z), float(info[1]), "round", 0.0, centres(cameras))
+    return Levels(count, count // 2, fork, float(info[0]), (x, y, z), float(info[1]), rule, 0.0, centres(cameras))
 
 
 def level_facts(levels: Levels, anchors: dict[str, Tensor], exact: bool) -> dict[str, Tensor]:

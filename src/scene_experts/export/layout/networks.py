@@ -173,6 +173,8 @@ def check_networks(networks: dict[str, Network], where: str) -> None:
         n = networks.get(attribute, {})
         if not {"w1", "b1", "w2", "b2"} <= n.keys():
             raise InputError(f"expected the networks of {', '.join(ATTRIBUTES)} in {where}, found {sorted(networks)}; write the file again")
+        if any(n[name].ndim != rank for name, rank in (("w1", 3), ("b1", 2), ("w2", 3), ("b2", 2))):
+            raise InputError(f"expected stacked {attribute} networks in {where}, found tensors of other shapes; write the file again")
         (E, H, _), out = n["w1"].shape, n["w2"].shape[1]
         shapes = {"b1": (E, H), "w2": (E, out, H), "b2": (E, out), "router_b": (E,)}
         wrong = [name for name, shape in shapes.items() if name in n and n[name].shape != shape]

@@ -47,7 +47,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
             reader.collect(decode(reader.record("data.pkl")), "", found, 0)
     except NotData as error:
         raise InputError(f"expected nothing but tensors in {path}, found otherwise: {error}; do not use this file, get it again") from None
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, NotImplementedError, OSError, EOFError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError) as error:
         raise InputError(
             f"expected a TorchScript or torch.save archive at {path}, found another or damaged file ({error}); get it again"
         ) from None
