@@ -232,26 +232,28 @@ float* partial_sums(int64_t floats) {
 }  // namespace
 
 // Gradients of the table's rows and of all weights.
-SE_EXPORT void se_decode_backward(const Decode* decode) {
-  const Decode& d = *decode;
-  const Sizes s(d);
-  const Packed packed(d, s, true);
-  const Layout layout(d, s);
-  const int64_t grain = std::max<int64_t>(1, (d.chunks() + BUFFERS - 1) / BUFFERS) * CHUNK;
-  const int64_t buffers = std::max<int64_t>(1, (d.A + grain - 1) / grain);
-  float* sums = partial_sums(buffers * layout.total);
-  if (!d.A) std::fill_n(sums, layout.total, 0.f);
-  const int threads = static_cast<int>(d.threads);
-  parallel_for(d.A, grain, threads, [&](int64_t begin, int64_t end, int) {
-    float* own = sums + begin / grain * layout.total;
-    std::fill_n(own, layout.total, 0.f);
-    Backward pass(d, s, packed, layout, own);
-    for (int64_t at = begin; at < end; at += CHUNK) pass.run(at, std::min<int64_t>(end, at + CHUNK));
+SE_EXPORT int se_decode_backward(const Decode* decode) {
+  return guarded([&] {
+    const Decode& d = *decode;
+    const Sizes s(d);
+    const Packed packed(d, s, true);
+    const Layout layout(d, s);
+    const int64_t grain = std::max<int64_t>(1, (d.chunks() + BUFFERS - 1) / BUFFERS) * CHUNK;
+    const int64_t buffers = std::max<int64_t>(1, (d.A + grain - 1) / grain);
+    float* sums = partial_sums(buffers * layout.total);
+    if (!d.A) std::fill_n(sums, layout.total, 0.f);
+    const int threads = static_cast<int>(d.threads);
+    parallel_for(d.A, grain, threads, [&](int64_t begin, int64_t end, int) {
+      float* own = sums + begin / grain * layout.total;
+      std::fill_n(own, layout.total, 0.f);
+      Backward pass(d, s, packed, layout, own);
+      for (int64_t at = begin; at < end; at += CHUNK) pass.run(at, std::min<int64_t>(end, at + CHUNK));
+    });
+    parallel_for(layout.total, 4096, threads, [&](int64_t begin, int64_t end, int) {
+      for (int64_t b = 1; b < buffers; ++b)
+        for (int64_t i = begin; i < end; ++i) sums[i] += sums[b * layout.total + i];
+    });
+    each_expert(d, [&](int i, int e) { write_expert(d, s, layout.experts[i][e], sums, i, e); });
+    write_routers(d, s, layout, sums);
   });
-  parallel_for(layout.total, 4096, threads, [&](int64_t begin, int64_t end, int) {
-    for (int64_t b = 1; b < buffers; ++b)
-      for (int64_t i = begin; i < end; ++i) sums[i] += sums[b * layout.total + i];
-  });
-  each_expert(d, [&](int i, int e) { write_expert(d, s, layout.experts[i][e], sums, i, e); });
-  write_routers(d, s, layout, sums);
 }

@@ -4,6 +4,7 @@
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
+#include <exception>
 #include <mutex>
 #include <thread>
 #include <vector>
@@ -19,12 +20,19 @@ struct Job {
   int64_t n = 0, grain = 1, chunks = 0;
   int slots = 0;  // workers that may still join
   std::atomic<int64_t> next{0};
+  std::atomic<bool> failed{false};
+  std::exception_ptr error;  // the first one thrown; the caller throws it again when everybody has left
 
-  void work(int worker) {
-    for (;;) {
-      const int64_t chunk = next.fetch_add(1, std::memory_order_relaxed);
-      if (chunk >= chunks) return;
-      body(context, chunk * grain, std::min(n, (chunk + 1) * grain), worker);
+  void work(int worker) noexcept {
+    try {
+      for (;;) {
+        const int64_t chunk = next.fetch_add(1, std::memory_order_relaxed);
+        if (chunk >= chunks) return;
+        body(context, chunk * grain, std::min(n, (chunk + 1) * grain), worker);
+      }
+    } catch (...) {
+      if (!failed.exchange(true)) error = std::current_exception();
+      next.store(chunks, std::memory_order_relaxed);
     }
   }
 };
@@ -60,7 +68,10 @@ class Pool {
     bool wake;
     {
       std::lock_guard lock(mutex_);
-      while (static_cast<int>(workers_.size()) < threads - 1) workers_.emplace_back([this] { loop(); });
+      try {
+        while (static_cast<int>(workers_.size()) < threads - 1) workers_.emplace_back([this] { loop(); });
+      } catch (const std::exception&) {  // no room for another: those that there are do the work
+      }
       job_ = &job;
       joined_ = 0;
       job.slots = threads - 1;
@@ -145,11 +156,12 @@ void parallel_chunks(int64_t n, int64_t grain, int threads, void (*body)(void*, 
   std::unique_lock lock(run_mutex, std::defer_lock);
   if (threads <= 1 || !lock.try_lock()) {
     job.work(0);
-    return;
+  } else {
+    pool().run(job, threads);
   }
-  pool().run(job, threads);
+  if (job.error) std::rethrow_exception(job.error);
 }
 
 }  // namespace se
 
-SE_EXPORT int se_abi_version() { return 4; }
+SE_EXPORT int se_abi_version() { return 5; }

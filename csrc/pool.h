@@ -8,7 +8,7 @@ namespace se {
 
 // Runs body(context, begin, end, worker) over [0, n) in chunks of `grain`, on at most `threads` workers, the caller being worker 0.
 // Which worker takes which chunk is not fixed; chunk boundaries are (multiples of grain), so results that depend on the chunk
-// alone are the same for every number of threads.
+// alone are the same for every number of threads. What a body throws is thrown to the caller, once, after all have left.
 void parallel_chunks(int64_t n, int64_t grain, int threads, void (*body)(void*, int64_t, int64_t, int), void* context);
 
 template <class F>

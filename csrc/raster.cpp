@@ -114,7 +114,7 @@ SE_EXPORT int se_raster_forward(const SeRasterForward* a, void** state) {
     else
       spare().give(std::move(s));
     return 0;
-  } catch (const std::bad_alloc&) {
+  } catch (const std::exception&) {
     spare().clear();
     return 1;
   }
@@ -132,7 +132,7 @@ SE_EXPORT int se_raster_backward(void* state, const SeRasterBackward* a) {
     project_backward(s, a->in, a->out, rows, a->threads);
     stages.done();
     return 0;
-  } catch (const std::bad_alloc&) {
+  } catch (const std::exception&) {
     spare().clear();
     return 1;
   }

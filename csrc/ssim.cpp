@@ -229,17 +229,20 @@ class Band {
 }  // namespace
 
 // out[0] = mean |x - y|, out[1] = 1 - mean SSIM; gradient (may be null) = d (weight_l1 out[0] + weight_ssim out[1]) / dx.
-SE_EXPORT void se_photometric(const float* x, const float* y, int64_t H, int64_t W, float weight_l1, float weight_ssim, int threads,
-                              float* gradient, double* out) {
-  const Picture picture{x, y, H, 3 * W, weight_l1, weight_ssim, gradient};
-  const int64_t bands = (H + BAND - 1) / BAND;
-  std::vector<double> sums(2 * bands, 0.0);
-  parallel_for(H, BAND, threads, [&](int64_t begin, int64_t end, int) {
-    Scratch scratch(picture.row);
-    Band(picture, scratch).run(begin, end, &sums[2 * (begin / BAND)]);
+// Returns 1 where memory ran out.
+SE_EXPORT int se_photometric(const float* x, const float* y, int64_t H, int64_t W, float weight_l1, float weight_ssim, int threads,
+                             float* gradient, double* out) {
+  return guarded([&] {
+    const Picture picture{x, y, H, 3 * W, weight_l1, weight_ssim, gradient};
+    const int64_t bands = (H + BAND - 1) / BAND;
+    std::vector<double> sums(2 * bands, 0.0);
+    parallel_for(H, BAND, threads, [&](int64_t begin, int64_t end, int) {
+      Scratch scratch(picture.row);
+      Band(picture, scratch).run(begin, end, &sums[2 * (begin / BAND)]);
   });
   out[0] = out[1] = 0;
   for (int64_t b = 0; b < bands; ++b) out[0] += sums[2 * b], out[1] += sums[2 * b + 1];
   const double n = static_cast<double>(H) * 3 * W;
   out[0] /= n, out[1] /= n;
+  });
 }

@@ -1,6 +1,8 @@
 """The compiled library is found, refused when it is of another version, and its absence explained."""
 
 import ctypes
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -66,3 +68,41 @@ def test_pointers():
 def test_levels_follow_the_processor(monkeypatch, capability, expected):
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
     assert native.levels() == expected
+
+
+SHORT = """
+import resource, torch
+from pathlib import Path
+from scene_experts import losses
+from scene_experts.errors import RunError
+from scene_experts.render import choose
+from scene_experts.types import Camera, Gaussians
+
+torch.set_num_threads(THREADS)
+x, y, n = torch.rand(22, 200_000, 3), torch.rand(22, 200_000, 3), 300_000
+means = torch.rand(n, 3) - 0.5 + torch.tensor([0, 0, 2.0])
+g = Gaussians(means, torch.rand(n, 4), torch.full((n, 3), 0.02), torch.rand(n), torch.rand(n, 3), torch.arange(n))
+camera, draw = Camera(torch.eye(4), torch.tensor([[300.0, 0, 160], [0, 300, 100], [0, 0, 1]]), 320, 200, id=0), choose("cpu", "cpu")
+work = {"loss": lambda: losses.photometric(x, y, 0.2), "picture": lambda: draw(g, camera, torch.zeros(3))}["WHAT"]
+pages = int(Path("/proc/self/statm").read_text().split()[0])
+limits = resource.getrlimit(resource.RLIMIT_AS)
+resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + (16 << 20), limits[1]))
+try:
+    work()
+    print("no shortage")
+except RunError as error:
+    print(error)
+resource.setrlimit(resource.RLIMIT_AS, limits)
+work()
+print("went on")
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux") or native.load() is None, reason="needs the compiled library and Linux's limits")
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(("what", "said"), [("loss", "the photometric loss"), ("picture", "drawing 300,000 Gaussians")])
+def test_out_of_memory_is_an_error_that_a_process_survives(what, said, threads):
+    code = SHORT.replace("WHAT", what).replace("THREADS", str(threads))
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[0].startswith(f"{said} ran out of memory: use fewer") and done.stdout.endswith("went on\n")

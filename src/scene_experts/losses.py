@@ -160,7 +160,7 @@ class _Photometric(torch.autograd.Function):
         found = torch.empty(2, dtype=torch.float64)
         library = native.load()
         assert library is not None
-        library.se_photometric(
+        code = library.se_photometric(
             native.pointer(x),
             native.pointer(y),
             ctypes.c_int64(x.shape[0]),
@@ -171,6 +171,7 @@ class _Photometric(torch.autograd.Function):
             native.pointer(gradient),
             native.pointer(found),
         )
+        native.done(code, "the photometric loss")
         ctx.l1_weight = 1 - lambda_dssim
         if gradient is not None:
             ctx.save_for_backward(x, y, gradient)

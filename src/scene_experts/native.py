@@ -9,14 +9,17 @@ from __future__ import annotations
 import ctypes
 import functools
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 import scene_experts
+from scene_experts.errors import RunError
 
-ABI_VERSION = 4
+ABI_VERSION = 5
 LEVELS = ("avx512", "avx2", "portable")  # best first
 _SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 
@@ -53,6 +56,20 @@ def load(level: str | None = None) -> ctypes.CDLL | None:
             library.level = name  # type: ignore[attr-defined]
             return library
     return None
+
+
+def bound(functions: Mapping[str, Sequence[Any]], level: str | None = None) -> ctypes.CDLL | None:
+    """The library with the argument types of functions that return nothing; None where `load` gives none."""
+    library = load(level)
+    for name, types in functions.items() if library else ():
+        getattr(library, name).argtypes, getattr(library, name).restype = list(types), None
+    return library
+
+
+def done(code: int, what: str) -> None:
+    """Raises RunError where a function of the library returned that memory ran out in `what`."""
+    if code:
+        raise RunError(f"{what} ran out of memory: use fewer Gaussians (--max-anchors, --max-memory) or smaller pictures (--resolution)")
 
 
 def why_not() -> str | None:

@@ -78,15 +78,15 @@ def _loaded() -> ctypes.CDLL:
 
 @cache
 def _library() -> ctypes.CDLL | None:
-    library = native.load()
-    if library is None or not hasattr(library, "se_hinge"):  # built before this was
-        return None
     address, count, real, threads = ctypes.c_void_p, ctypes.c_int64, ctypes.c_float, ctypes.c_int32
-    library.se_term_chunks.argtypes, library.se_term_chunks.restype = [count], count
-    library.se_volume.argtypes = [address, count, address, threads]
-    library.se_volume_backward.argtypes = [address, count, real, address, threads]
-    library.se_hinge.argtypes = [address, count, real, address, threads]
-    library.se_hinge_backward.argtypes = [address, count, real, real, address, threads]
-    for name in ("se_volume", "se_volume_backward", "se_hinge", "se_hinge_backward"):
-        getattr(library, name).restype = None
+    library = native.bound(
+        {
+            "se_volume": [address, count, address, threads],
+            "se_volume_backward": [address, count, real, address, threads],
+            "se_hinge": [address, count, real, address, threads],
+            "se_hinge_backward": [address, count, real, real, address, threads],
+        }
+    )
+    if library is not None:
+        library.se_term_chunks.argtypes, library.se_term_chunks.restype = [count], count
     return library

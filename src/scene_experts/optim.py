@@ -110,9 +110,4 @@ def _by_torch(parameter: Tensor, state: dict[str, Tensor], rows: Tensor | None, 
 
 @functools.cache
 def _library() -> ctypes.CDLL | None:
-    library = native.load()
-    if library is None or not hasattr(library, "se_adam_step"):  # built before this file was
-        return None
-    library.se_adam_step.argtypes = [ctypes.POINTER(_Tensor), ctypes.c_int64, *[ctypes.c_double] * 3, ctypes.c_int32]
-    library.se_adam_step.restype = None
-    return library
+    return native.bound({"se_adam_step": [ctypes.POINTER(_Tensor), ctypes.c_int64, *[ctypes.c_double] * 3, ctypes.c_int32]})

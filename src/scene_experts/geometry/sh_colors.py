@@ -65,11 +65,5 @@ class _Colors(torch.autograd.Function):
 
 @functools.cache
 def _library(level: str | None = None) -> ctypes.CDLL | None:
-    library = native.load(level)
-    if library is None or not hasattr(library, "se_sh_forward"):  # built before this file was
-        return None
     P, L, I = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32
-    library.se_sh_forward.argtypes = [P, P, P, P, L, L, I, P, P, I]
-    library.se_sh_backward.argtypes = [P] * 10 + [L, L, I, I]
-    library.se_sh_forward.restype = library.se_sh_backward.restype = None
-    return library
+    return native.bound({"se_sh_forward": [P, P, P, P, L, L, I, P, P, I], "se_sh_backward": [P] * 10 + [L, L, I, I]}, level)

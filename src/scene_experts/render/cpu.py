@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from scene_experts import native
-from scene_experts.errors import InputError, RunError
+from scene_experts.errors import InputError
 from scene_experts.types import Camera, Gaussians, Render
 
 
@@ -119,8 +119,8 @@ class _Draw(torch.autograd.Function):
         args = _Forward(_camera(camera), how.antialias, how._threads(), len(means), *where)
         state = c_void_p()
         keep = any(ctx.needs_input_grad)
-        if library.se_raster_forward(ctypes.byref(args), ctypes.byref(state) if keep else None):
-            raise RunError(f"drawing {len(means)} Gaussians ran out of memory: train with fewer Gaussians or smaller pictures")
+        code = library.se_raster_forward(ctypes.byref(args), ctypes.byref(state) if keep else None)
+        native.done(code, f"drawing {len(means):,} Gaussians")
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
         if keep:
@@ -138,8 +138,8 @@ class _Draw(torch.autograd.Function):
         how: CpuRasterizer = ctx.how
         where = [None if t is None else t.data_ptr() for t in (*plain, *up, *outputs)]
         args = _Backward(how.deterministic, how._threads(), *where)
-        if ctx.state.library.se_raster_backward(c_void_p(ctx.state.address), ctypes.byref(args)):
-            raise RunError("the backward pass of the picture ran out of memory: train with fewer Gaussians or smaller pictures")
+        code = ctx.state.library.se_raster_backward(c_void_p(ctx.state.address), ctypes.byref(args))
+        native.done(code, "the backward pass of the picture")
         return *outputs[:5], outputs[6], None, None, None
 
 

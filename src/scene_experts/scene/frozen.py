@@ -131,7 +131,7 @@ class Frozen:
                 native_decode.set_pointers(head, base=base)
             library = native.load()
             assert library is not None
-            library.se_decode_fold(ctypes.byref(call))
+            native.done(library.se_decode_fold(ctypes.byref(call)), native_decode.WHAT)
         del alive
         return tuple(Kept(None if c is not None else g, c, m, b) for g, c, m, b in zip(gates, chosen, mix, bases))
 

@@ -128,12 +128,11 @@ def _columns(found: Tensor, weight: Tensor) -> list[tuple[Tensor, Tensor, Tensor
 
 @functools.cache
 def _library() -> ctypes.CDLL | None:
-    library = native.load()
-    if library is None or not hasattr(library, "se_graph_reverse"):  # built before this file was
-        return None
     P, L, I, R = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32, ctypes.c_float
-    library.se_graph_reverse.argtypes = [P, L, L, P, P]
-    library.se_graph_forward.argtypes = [*[P] * 5, L, L, L, R, P, P, I]
-    library.se_graph_backward.argtypes = [*[P] * 7, L, L, L, R, P, P, P, I]
-    library.se_graph_reverse.restype = library.se_graph_forward.restype = library.se_graph_backward.restype = None
-    return library
+    return native.bound(
+        {
+            "se_graph_reverse": [P, L, L, P, P],
+            "se_graph_forward": [*[P] * 5, L, L, L, R, P, P, I],
+            "se_graph_backward": [*[P] * 7, L, L, L, R, P, P, P, I],
+        }
+    )

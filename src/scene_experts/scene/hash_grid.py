@@ -160,10 +160,6 @@ def _fits(*tensors: Tensor) -> bool:
 
 @functools.cache
 def _library() -> ctypes.CDLL | None:
-    library = native.load()
-    if library is None or not hasattr(library, "se_grid_forward"):  # built before this file was
-        return None
     P, L = ctypes.c_void_p, ctypes.c_int64
-    library.se_grid_forward.argtypes = library.se_grid_backward.argtypes = [P, P, P, P, L, L, L, P, ctypes.c_int32]
-    library.se_grid_forward.restype = library.se_grid_backward.restype = None
-    return library
+    types = [P, P, P, P, L, L, L, P, ctypes.c_int32]
+    return native.bound({"se_grid_forward": types, "se_grid_backward": types})

@@ -19,6 +19,7 @@ from scene_experts.scene.mlp import CHANNELS, HeadWeights
 from scene_experts.types import Gaussians, Routing
 
 ATTRIBUTES = ("opacity", "cov", "color")  # the library's order
+WHAT = "the decode"
 CHUNK = 256  # anchors per unit of work (csrc/decode.h)
 TENSORS = ("router_w", "router_b", "w1", "b1", "middle_w", "middle_b", "w2", "b2")
 T = len(TENSORS)
@@ -137,7 +138,7 @@ def route(call: _Decode) -> None:
     """Fills in the gates, chosen experts and weights that `set_routing` points to, and nothing else."""
     library = native.load()
     assert library is not None
-    library.se_decode_route(ctypes.byref(call))
+    native.done(library.se_decode_route(ctypes.byref(call)), WHAT)
 
 
 def run(call: _Decode) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor]:
@@ -147,12 +148,12 @@ def run(call: _Decode) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor]:
     assert library is not None
     raw, starts = torch.empty(call.A, call.K), torch.zeros(-(-call.A // CHUNK) + 1, dtype=torch.int64)
     set_pointers(call, raw=raw, starts=starts)
-    library.se_decode_begin.restype = ctypes.c_int64
-    M = library.se_decode_begin(ctypes.byref(call))
+    native.done(library.se_decode_begin(ctypes.byref(call)), WHAT)
+    M = int(starts[-1])
     means, quats, scales, colors = torch.empty(M, 3), torch.empty(M, 4), torch.empty(M, 3), torch.empty(M, 3)
     opacities, per_length, source = torch.empty(M), torch.empty(M), torch.empty(M, dtype=torch.int64)
     set_pointers(call, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, per_length=per_length, source=source)
-    library.se_decode_emit(ctypes.byref(call))
+    native.done(library.se_decode_emit(ctypes.byref(call)), WHAT)
     return (means, quats, scales, opacities, colors, source), raw, starts, per_length
 
 
@@ -199,7 +200,7 @@ class _DecodeFunction(torch.autograd.Function):
             set_pointers(head, d_gates=given[7 + i], **{f"d_{name}": d_weights[T * i + j] for j, name in enumerate(TENSORS)})
         library = native.load()
         assert library is not None
-        library.se_decode_backward(ctypes.byref(call))
+        native.done(library.se_decode_backward(ctypes.byref(call)), "the backward pass of the decode")
         wanted = ctx.needs_input_grad[1:]
         return None, *(g if want else None for g, want in zip([*d_columns, *d_weights], wanted))
 

@@ -161,10 +161,5 @@ def _signed_binomials() -> Tensor:
 
 @functools.cache
 def _library(level: str | None = None) -> ctypes.CDLL | None:
-    library = native.load(level)
-    if library is None or not hasattr(library, "se_noise"):  # built before this file was
-        return None
     P, F = ctypes.c_void_p, ctypes.c_float
-    library.se_noise.argtypes = [P, P, P, P, P, ctypes.c_int64, F, F, F, ctypes.c_int32]
-    library.se_noise.restype = None
-    return library
+    return native.bound({"se_noise": [P, P, P, P, P, ctypes.c_int64, F, F, F, ctypes.c_int32]}, level)

@@ -81,11 +81,5 @@ def _drawn_by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) 
 
 @functools.cache
 def _library() -> ctypes.CDLL | None:
-    library = native.load()
-    if library is None or not hasattr(library, "se_observe_rows"):  # built before this file was
-        return None
     P, L, I = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32
-    library.se_observe_rows.argtypes = [P, P, L, L, P, P, I]
-    library.se_observe_drawn.argtypes = [P, P, P, L, P, P, I]
-    library.se_observe_rows.restype = library.se_observe_drawn.restype = None
-    return library
+    return native.bound({"se_observe_rows": [P, P, L, L, P, P, I], "se_observe_drawn": [P, P, P, L, P, P, I]})
