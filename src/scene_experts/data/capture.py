@@ -198,8 +198,8 @@ def _with_points(capture: Capture, found: Found, init: str, seed: int, look: boo
     if init == "random":
         return prepare.random_points(capture, seed=seed)
     if capture.points is None and found.kind == "blender":  # such captures have none; 3DGS starts them from random ones
-        started = prepare.random_points(capture, seed=seed)
-        return replace(started, warnings=(*started.warnings, f"no 3D points: {len(started.points.xyz):,} random ones to start from"))
+        note = f"no 3D points: {prepare.RANDOM_POINTS:,} random ones to start from"
+        return prepare.random_points(replace(capture, warnings=(*capture.warnings, note)), seed=seed)
     if capture.points is None and look:
         return replace(capture, warnings=(*capture.warnings, "no 3D points to start from: train with --init random"))
     if capture.points is None:

@@ -19,6 +19,7 @@ from scene_experts.data.views import Capture, View, World
 from scene_experts.errors import InputError
 from scene_experts.types import Camera, Points
 
+RANDOM_POINTS = 10_000  # as 3DGS starts NeRF-synthetic scenes
 NORMAL_EXTENT = 5.0  # R of a capture trained in a normalised world
 _FAR_VIEW = 50.0  # a camera further from the median camera than this many median distances was mislocated
 _FAR_POINT = (50.0, 20.0)  # a point further than both 50 R and 20 median distances from the cameras is noise
@@ -180,7 +181,7 @@ def drop_outliers(capture: Capture) -> Capture:
     return replace(capture, points=Points(xyz[keep], capture.points.rgb[keep]), warnings=(*capture.warnings, note))
 
 
-def random_points(capture: Capture, count: int = 10_000, seed: int = 0) -> Capture:
+def random_points(capture: Capture, count: int = RANDOM_POINTS, seed: int = 0) -> Capture:
     """The capture with `count` near-grey points spread uniformly, in place of any it has.
 
     NeRF-synthetic scenes: the cube [-1.3, 1.3]^3 of their own frame, as 3DGS does. Others: the box of the training cameras and of what lies
