@@ -41,6 +41,14 @@ def test_numbers_no_training_can_have_name_their_flag(flag, value):
         check_settings(parse_train(["moe-gs", *PLACES, flag, value]))
 
 
+def test_a_memory_cap_needs_a_system_that_tells(monkeypatch):
+    made = parse_train(["moe-gs", "--data", "capture", "--out", "run", "--max-memory", "4"])
+    check_settings(made)
+    monkeypatch.setattr("scene_experts.commands.train.used_bytes", lambda device: 0)
+    with pytest.raises(InputError, match="use --max-anchors"):
+        check_settings(made)
+
+
 def test_an_unknown_recipe_names_the_nearest():
     with pytest.raises(InputError, match="did you mean 'moe-gs'"):
         parse_train(["moegs", *PLACES])

@@ -68,6 +68,7 @@ def test_the_page_in_a_browser(tmp_path):
     playwright = pytest.importorskip("playwright.sync_api")
     s, first, second = blobs(), pose(3), pose(4, 3.0)
     write_html(tmp_path / "a.html", s, {"camera": first, "cameras": [first, second], "background": BACKGROUND, "title": "<b>"})
+    write_html(tmp_path / "b.html", s, {"camera": second, "cameras": [first, second], "background": BACKGROUND, "title": "<b>"})
     with playwright.sync_playwright() as p:
         browser = p.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
@@ -96,6 +97,13 @@ def test_the_page_in_a_browser(tmp_path):
         assert psnr(shot(), start) > 40
         page.keyboard.press("]")
         assert psnr(shot(), moved) > 40
+        other = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        other.goto((tmp_path / "b.html").as_uri())  # one that starts at the second of its poses
+        other.wait_for_function("window.sceneExperts", timeout=60_000)
+        for key, there in (("]", first), ("[", second)):
+            other.keyboard.press(key)
+            np.testing.assert_allclose(other.evaluate("sceneExperts.pose()")["position"], there["position"], atol=1e-6)
+        other.close()
         page.mouse.move(160, 120)
         page.mouse.down()
         page.mouse.move(220, 140, steps=5)

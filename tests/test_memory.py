@@ -56,6 +56,14 @@ def test_memory_is_counted_where_the_scene_is(monkeypatch):
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's own setting")
+def test_where_no_process_file_is_the_most_ever_held_counts(monkeypatch):
+    held = memory.used_bytes(torch.device("cpu"))
+    monkeypatch.setattr(memory.Path, "read_text", lambda self: (_ for _ in ()).throw(FileNotFoundError()))
+    assert memory.used_bytes(torch.device("cpu")) >= 0.9 * held
+    monkeypatch.setitem(sys.modules, "resource", None)
+    assert memory.used_bytes(torch.device("cpu")) == 0
+
+
 def test_freed_arrays_are_used_again():
     script = (
         "import resource, torch; from scene_experts.memory import reuse_freed; took = reuse_freed()\n"

@@ -1,4 +1,4 @@
-"""Fills the virtual environment it runs in: torch (the caller's, if it has one; else the pinned CPU build), then the project, editable.
+"""Fills the virtual environment it runs in: torch (the caller's, if it has one; else the pinned version), then the project.
 
 Usage: .venv/bin/python tools/environment.py PYTHON    where PYTHON is the interpreter whose torch may be used.
 """
@@ -36,18 +36,19 @@ def borrow(python: str) -> Path | None:
 
 def main() -> None:
     constraints = ["-c", str(CONSTRAINTS)]
+    borrowed, relaxed = Path(sysconfig.get_path("purelib")) / "borrowed-torch.pth", Path(sys.prefix) / "constraints.txt"
     if not has_torch():
         folder = borrow(sys.argv[1])
         if folder:
             print(f"using the torch installed in {folder}")
-            (Path(sysconfig.get_path("purelib")) / "borrowed-torch.pth").write_text(f"{folder}\n")
-            rest = [line for line in CONSTRAINTS.read_text().splitlines() if not line.startswith("torch==")]
-            relaxed = Path(sys.prefix) / "constraints.txt"
-            relaxed.write_text("\n".join(rest) + "\n")
-            constraints = ["-c", str(relaxed)]
+            borrowed.write_text(f"{folder}\n")
         else:
-            print("installing torch (CPU build)")
+            print(f"installing torch (for another build of it, a CPU one say, install that for {sys.argv[1]} first: it is then used)")
             pip("torch", *constraints)
+    if borrowed.exists():  # a later run too must not fetch the pinned one beside it
+        rest = [line for line in CONSTRAINTS.read_text().splitlines() if not line.startswith("torch==")]
+        relaxed.write_text("\n".join(rest) + "\n")
+        constraints = ["-c", str(relaxed)]
     print("building scene-experts")
     pip("-e", ".[test]", *constraints)
 

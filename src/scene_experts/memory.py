@@ -77,8 +77,17 @@ def used_bytes(device: torch.device) -> int:
         return torch.cuda.memory_reserved(device)
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError):
+    except (OSError, ValueError, IndexError, AttributeError):
+        return _most_used()
+
+
+def _most_used() -> int:
+    """The most that this process ever held resident, where the system tells that alone (macOS)."""
+    try:
+        import resource
+    except ImportError:
         return 0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def reuse_freed() -> bool:

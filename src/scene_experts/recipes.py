@@ -1,4 +1,4 @@
-"""The methods and ablations of the paper, a few lines each. No other source file knows a recipe by name.
+"""The methods and ablations of the paper, a few lines each. Nothing that trains, draws or scores knows a recipe by name.
 
 3DGS: Kerbl et al., SIGGRAPH 2023.  3DGS-MCMC: Kheradmand et al., NeurIPS 2024.
 Scaffold-GS: Lu et al., CVPR 2024.  Octree-GS: Ren et al., 2024.  SAGS: Ververas et al., ECCV 2024.
@@ -17,14 +17,13 @@ from scene_experts.scene.experts import Experts, Router
 from scene_experts.scene.explicit import Explicit, ExplicitRates
 from scene_experts.scene.graph_points import GraphPoints, GraphRates
 from scene_experts.scene.mix import FeatureBank
-from scene_experts.scene.mlp import Plain
+from scene_experts.scene.mlp import ATTRIBUTES, Plain
 from scene_experts.scene.select import Octree
 from scene_experts.strategy.grow_octree import GrowOctree
 from scene_experts.strategy.grow_points import GrowPoints
 from scene_experts.strategy.mcmc import MCMC
 from scene_experts.strategy.split_clone import SplitClone
 
-ALL = ("opacity", "cov", "color")
 EXPERTS = Experts(num=5, top_k=2, warmup=1500)
 
 scaffold_gs = Train(recipe="scaffold-gs", scene=Anchors(decoder=Plain()), loss=Weights(scale=0.01))
@@ -81,7 +80,7 @@ RECIPES: dict[str, tuple[str, Train]] = {
     "moe-gs-no-cl": ("without curriculum: Top-2 from the first iteration (Table 4)", _moe("moe-gs-no-cl", warmup=0)),
     "moe-gs-no-load": ("without the load-balancing losses (Table 4)", _moe("moe-gs-no-load", loss=replace(moe_gs.loss, load=0.0))),
     "moe-gs-no-opacity": ("without the opacity hinge (Table 4)", _moe("moe-gs-no-opacity", loss=replace(moe_gs.loss, opacity=0.0))),
-    "moe-gs-dist": ("the decoders also see the distance, as the paper's text has it", _moe("moe-gs-dist", add_dist=ALL)),
+    "moe-gs-dist": ("the decoders also see the distance, as the paper's text has it", _moe("moe-gs-dist", add_dist=ATTRIBUTES)),
     "moe-gs-posrouter": ("the routers also see the anchor's position (appendix)", _moe("moe-gs-posrouter", router=Router(input_pos=True))),
     "moe-gs-balance": (
         "experts kept in use by biases instead of L_load (Wang et al. 2024; not in the paper)",

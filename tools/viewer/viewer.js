@@ -71,11 +71,11 @@ class Page {
     this.wake();
   }
 
-  home() { this.index = 0; this.setPose(settings.pose); }
+  home() { this.index = settings.index ?? 0; this.setPose(settings.pose); }
 
   step(by) {
     const n = settings.poses.length;
-    this.index = ((this.index ?? 0) + by + n) % n;
+    this.index = ((this.index ?? settings.index ?? 0) + by + n) % n;
     this.setPose(settings.poses[this.index]);
   }
 

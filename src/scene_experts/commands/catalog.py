@@ -14,11 +14,10 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from rich.table import Table
 
 from scene_experts.cli import PROG
-from scene_experts.config import flag, flags_of
+from scene_experts.config import Train, flag, flags_of
 from scene_experts.data.catalog import COLLECTIONS, SCENES, Scene, select
 from scene_experts.data.obtain import captures_dir, obtain, present
 from scene_experts.errors import InputError
-from scene_experts.recipes import RECIPES
 
 SAY_EVERY = 15.0  # seconds between lines where there is no terminal
 
@@ -60,7 +59,7 @@ def flags(scene: Scene, to: Path | None) -> str:
     """How `train` is told to read a scene by the paper's protocol."""
     if to is None:
         return f"--data catalog:{scene.name}"
-    numbers = shlex.join(flags_of(RECIPES["moe-gs"][1], scene.collection.numbers))
+    numbers = shlex.join(flags_of(Train(""), scene.collection.numbers))
     return f"--data {shlex.quote(str(to / scene.path))} --resolution {scene.resolution} --split {scene.split} --normalise none {numbers}"
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import tyro
 from rich.console import Console
 
@@ -22,7 +23,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.data.catalog import PREFIX, Numbers, one
 from scene_experts.errors import InputError, expect_at_least, nearest
 from scene_experts.events import Started
-from scene_experts.memory import reuse_freed
+from scene_experts.memory import reuse_freed, used_bytes
 from scene_experts.progress import Progress
 from scene_experts.recipes import RECIPES
 from scene_experts.record import Recorder
@@ -143,6 +144,8 @@ def check_settings(command: TrainCommand) -> None:
     stop_at = 1 if command.stop_at is None else command.stop_at
     numbers = [("--save-every", command.save_every, 1), ("--preview-every", command.preview_every, 0), ("--stop-at", stop_at, 1)]
     expect_at_least([*numbers, ("--max-memory", command.max_memory, 0)])
+    if command.max_memory > 0 and not used_bytes(torch.device("cpu")):
+        raise InputError(f"expected a system that tells a process's memory for --max-memory, found {sys.platform}; use --max-anchors")
     check(command.cfg)
 
 

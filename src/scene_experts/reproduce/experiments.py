@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from scene_experts.recipes import RECIPES
-
 DATASETS: dict[str, tuple[str, ...]] = {
     "MipNeRF360": ("bicycle", "bonsai", "counter", "garden", "kitchen", "room", "stump"),
     "TanksAndTemples": ("truck", "train"),
@@ -109,8 +107,3 @@ EXPERIMENTS: dict[str, Experiment] = {
         ),
     )
 }
-
-
-def missing_recipes() -> set[str]:
-    """Recipes that an experiment names and this version does not have."""
-    return {recipe for e in EXPERIMENTS.values() for recipe in e.rows.values()} - set(RECIPES)

@@ -33,8 +33,6 @@ class Mean:
 
     value: float
     spread: float | None
-    seeds: int
-    scenes: tuple[str, ...]
 
 
 def mean(records: Sequence[Record], column: str) -> Mean | None:
@@ -48,9 +46,9 @@ def mean(records: Sequence[Record], column: str) -> Mean | None:
     }
     if not by_seed:  # no seed has every scene: the scenes' own means, and no spread
         own = [statistics.fmean(v for (_, s), v in found.items() if s == scene) for scene in scenes]
-        return Mean(statistics.fmean(own), None, 0, tuple(scenes))
+        return Mean(statistics.fmean(own), None)
     means = [statistics.fmean(values) for values in by_seed.values()]
-    return Mean(statistics.fmean(means), statistics.stdev(means) if len(means) > 1 else None, len(means), tuple(scenes))
+    return Mean(statistics.fmean(means), statistics.stdev(means) if len(means) > 1 else None)
 
 
 @dataclass(frozen=True)

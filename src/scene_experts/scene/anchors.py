@@ -24,13 +24,12 @@ from scene_experts.scene import native_decode, triton_decode
 from scene_experts.scene.appearance import Codes, TestRule, fold
 from scene_experts.scene.experts import Experts, MixtureHead
 from scene_experts.scene.mix import FeatureBank, OwnFeature
-from scene_experts.scene.mlp import CHANNELS, MLP, HeadWeights, Plain
+from scene_experts.scene.mlp import ATTRIBUTES, CHANNELS, MLP, HeadWeights, Plain
 from scene_experts.scene.select import AllAnchors, Octree, Selector, faded, visible_rows
 from scene_experts.schedule import Rate
 from scene_experts.table import Table
 from scene_experts.types import Camera, Decoded, Gaussians, Points, Routing
 
-ATTRIBUTES = ("opacity", "cov", "color")
 VoxelChoice = Literal["neighbours", "squared_median", "median_nn"]
 EPS = 1e-12  # keeps directions and quaternions finite where their length is 0
 

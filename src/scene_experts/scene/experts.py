@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from scene_experts.errors import InputError, expect_at_least
-from scene_experts.scene.mlp import ACTIVATIONS, MLP, HeadWeights, linear_init
+from scene_experts.scene.mlp import ACTIVATIONS, ATTRIBUTES, MLP, HeadWeights, linear_init
 from scene_experts.types import Routing
 
 log = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ class Experts:
     """Experts per anchor after the warm-up; None keeps the dense mixture for good."""
     warmup: int = 1500
     """Iterations of the dense mixture before Top-k (rescaled by --iterations)."""
-    attributes: tuple[str, ...] = ("opacity", "cov", "color")
+    attributes: tuple[str, ...] = ATTRIBUTES
     """Which attributes get experts; the others keep one network."""
     mix: Literal["post_activation", "pre_activation"] = "post_activation"
     expert_init: Literal["independent", "clone_jitter"] = "independent"

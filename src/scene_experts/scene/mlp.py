@@ -13,6 +13,7 @@ from torch.nn import functional
 from scene_experts.errors import InputError, expect_at_least
 from scene_experts.types import Routing
 
+ATTRIBUTES = ("opacity", "cov", "color")  # what is decoded, in the compiled library's order
 ACTIVATIONS = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid}  # the last layer of each attribute
 CHANNELS = {"opacity": 1, "cov": 7, "color": 3}  # values per Gaussian: opacity; 3 scale + 4 rotation; RGB
 

@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from scene_experts import native
-from scene_experts.scene.mlp import CHANNELS, HeadWeights
+from scene_experts.scene.mlp import ATTRIBUTES, CHANNELS, HeadWeights
 from scene_experts.types import Gaussians, Routing
 
-ATTRIBUTES = ("opacity", "cov", "color")  # the library's order
 WHAT = "the decode"
 CHUNK = 256  # anchors per unit of work (csrc/decode.h)
 TENSORS = ("router_w", "router_b", "w1", "b1", "middle_w", "middle_b", "w2", "b2")

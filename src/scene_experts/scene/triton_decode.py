@@ -16,10 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scene_experts.scene.mlp import CHANNELS, HeadWeights
+from scene_experts.scene.mlp import ATTRIBUTES, CHANNELS, HeadWeights
 from scene_experts.types import Gaussians, Routing
 
-ATTRIBUTES = ("opacity", "cov", "color")
 ACTIVATION = {"opacity": 0, "cov": 1, "color": 2}  # tanh, none, sigmoid of triton_kernels.py
 TENSORS = ("router_w", "router_b", "w1", "b1", "w2", "b2")
 PRECISION = "ieee"  # of the products: "ieee" is float32 throughout, "tf32x3" nearly so on tensor cores, "tf32" is not

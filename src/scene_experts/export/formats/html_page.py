@@ -93,6 +93,7 @@ def page_settings(splats: Splats, note: Mapping[str, Any]) -> dict[str, Any]:
         "count": len(splats),
         "pose": first,
         "poses": poses,
+        "index": poses.index(first) if first in poses else 0,
         "fov": first["fov"],
         "up": up.tolist(),
         "distance": distance,

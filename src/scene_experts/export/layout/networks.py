@@ -20,8 +20,8 @@ from scene_experts.errors import InputError
 from scene_experts.export.frame import Network
 from scene_experts.export.layout import torch_archive
 from scene_experts.io import write_bytes
+from scene_experts.scene.mlp import ATTRIBUTES
 
-ATTRIBUTES = ("opacity", "cov", "color")
 FILES = {"opacity": "opacity_mlp.pt", "cov": "cov_mlp.pt", "color": "color_mlp.pt"}
 EXTRA_FILES = {"feature_bank": "feature_bank_mlp.pt", "appearance": "embedding_appearance.pt"}
 ACTIVATIONS = {"opacity": "tanh", "cov": "none", "color": "sigmoid"}
