@@ -42,6 +42,16 @@ def test_initial_anchors_sit_on_the_lattice_one_per_voxel():
         AnchorScene.from_points(Anchors(), Points(points[:0], torch.zeros(0, 3, dtype=torch.uint8)), 5.0)
 
 
+def test_a_chosen_voxel_that_keeps_nearly_every_point_is_said(caplog):
+    points = Points(
+        torch.rand(100, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)), torch.zeros(100, 3, dtype=torch.uint8)
+    )
+    for config, said in ((Anchors(), False), (Anchors(voxel_size=0.3), False), (Anchors(voxel_size=1e-5), True)):
+        caplog.clear()
+        AnchorScene.from_points(config, points, 5.0)
+        assert ("keep nearly every point (100 of 100)" in caplog.text) == said
+
+
 def test_voxel_rules():
     grid = torch.cartesian_prod(*[torch.arange(6.0, dtype=torch.float64)] * 3) * 0.2
     assert voxel_size(grid, "median_nn") == pytest.approx(0.2)

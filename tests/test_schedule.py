@@ -11,6 +11,9 @@ def test_adjustments_of_scaffold_gs_run_from_1600_to_14900():
 
 
 def test_a_shorter_training_scales_the_window_and_keeps_the_interval():
+    for every in (Every(1500, 15_000, 100), Every(350, 3500, 100), Every(0, 10, 3)):
+        for last in (0, 9, 10, 1600, 3000, 30_000):
+            assert every.count(last) == sum(every.due(i) for i in range(1, last + 1))
     assert Every(1500, 15_000, 100).scaled(0.1) == Every(150, 1500, 100)
 
 

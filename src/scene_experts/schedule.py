@@ -17,6 +17,10 @@ class Every:
     def due(self, step: int) -> bool:
         return self.start < step < self.stop and step % self.interval == 0
 
+    def count(self, last: int) -> int:
+        """How often it is true in iterations 1 to `last`."""
+        return sum(self.due(step) for step in range(self.interval, min(self.stop, last + 1), self.interval))
+
     def scaled(self, factor: float) -> Every:
         """The same window in a training `factor` times as long; the interval stays."""
         return replace(self, start=round(self.start * factor), stop=round(self.stop * factor))

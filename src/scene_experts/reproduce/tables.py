@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from scene_experts.config import Train
 from scene_experts.evaluate.tables import Table, paper, to_csv, to_markdown
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN
@@ -108,10 +109,11 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
     records = [r for rows in found.values() for r in rows]
     if not records:
         return ("no run of this table is done",)
-    lengths = sorted({r.config.train.iterations for r in records})
+    lengths = sorted({(r.config.train.iterations, adjustments(r.config.train)) for r in records})
     sizes = sorted({r.config.data.resolution for r in records})
     seeds = sorted({r.seed for r in records})
-    out = [f"{', '.join(f'{n:,}' for n in lengths)} iterations; resolution {', '.join(sizes)}; seeds {', '.join(map(str, seeds))}"]
+    made = ", ".join(f"{n:,} iterations ({many} adjustments of density)" for n, many in lengths)
+    out = [f"{made}; resolution {', '.join(sizes)}; seeds {', '.join(map(str, seeds))}"]
     every, none = drawn(records), [name for name, rows in found.items() if not rows]
     for name, rows in found.items():
         scenes = {r.scene for r in rows}
@@ -124,6 +126,11 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
     if none:
         out.append(f"no run: {'; '.join(none)}")
     return tuple(out)
+
+
+def adjustments(train: Train) -> int:
+    """How often density control acts: a short training adjusts as often per iteration, so more rarely in all."""
+    return train.scaled().growth.adjust.count(train.iterations)
 
 
 def to_latex(table: Table, caption: str) -> str:

@@ -7,6 +7,7 @@ mu = x_v + O_v * exp(l_v)[0:3]  (paper eq. 2). Anchors never move; `strategy.gro
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,6 +32,8 @@ from scene_experts.table import Table
 from scene_experts.types import Camera, Decoded, Gaussians, Points, Routing
 
 VoxelChoice = Literal["neighbours", "squared_median", "median_nn"]
+log = logging.getLogger(__name__)
+NEARLY_ALL = 0.95  # of the points in voxels of their own: the lattice does next to nothing
 EPS = 1e-12  # keeps directions and quaternions finite where their length is 0
 
 
@@ -126,6 +129,11 @@ class AnchorScene(nn.Module):
             raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
         voxel = config.voxel_size or voxel_size(points.xyz, config.voxel_rule)
         facts, voxel, select = config.select.begin(points.xyz, voxel, cameras)
+        chosen = config.voxel_size or config.voxel_rule != "neighbours"
+        if chosen and isinstance(select, AllAnchors) and len(facts["xyz"]) > NEARLY_ALL * len(points.xyz):
+            log.warning(
+                "voxels of %.4g units keep nearly every point (%s of %s)", voxel, *(f"{len(x):,}" for x in (facts["xyz"], points.xyz))
+            )
         scale = knn_d2(facts["xyz"].float().double()).clamp_min(1e-7).sqrt().log().float()
         n = len(scale)
         params = {
