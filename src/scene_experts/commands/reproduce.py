@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +17,7 @@ from scene_experts.errors import InputError, RunError, expect_at_least, nearest
 from scene_experts.reproduce import report, store
 from scene_experts.reproduce.experiments import EXPERIMENTS, Experiment
 from scene_experts.reproduce.plan import Scale, Scene, Spec, distinct, own_scenes, paper_scenes, specs
-from scene_experts.reproduce.run import Runner
+from scene_experts.reproduce.run import Failure, Runner, Say
 
 
 @dataclass(frozen=True)
@@ -60,57 +61,91 @@ class ReproduceCommand:
     """Write the tables and figures of what is done, and run nothing."""
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What a command asks for: `shown` are the runs of its tables, `wanted` those of them that are different trainings."""
+
+    experiments: list[Experiment]
+    scenes: list[Scene]
+    shown: list[Spec]
+    wanted: list[Spec]
+    records: Path
+    runs: Path
+
+
 def reproduce(args: list[str]) -> int:
     command = tyro.cli(ReproduceCommand, prog=f"{PROG} reproduce", args=args)
     expect_at_least([("--workers", command.workers, 1), *(("--seeds", seed, 0) for seed in command.seeds)])
-    chosen = experiments_of(command)
-    scenes = scenes_of(command)
-    scale = Scale.of(command.scale, command.iterations, command.resolution)
-    chosen = rows_of(chosen, command.recipes) if command.recipes else chosen
-    shown = specs(chosen, scenes, command.seeds or (0,), scale)
-    wanted = distinct(shown)
-    records, runs = command.records or command.out / "records", command.runs or command.out / "runs"
+    plan = planned(command)
     console = Console(highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
-    if not wanted:
+    if not plan.wanted:
         say("nothing to run: these scenes are in none of these experiments")
     for run in command.adopt:
-        say(f"adopted {report.adopt(run, records)}")
+        say(f"adopted {report.adopt(run, plan.records)}")
     if command.dry_run:
-        there = store.load(records)
-        done = [store.find(there, spec) is not None for spec in wanted]
-        for spec, is_done in zip(wanted, done):
-            say(f"{'done   ' if is_done else 'to run '} {spec.label}")
-        say(f"{len(wanted)} runs, {sum(done)} of them done")
+        tell(plan, say)
         return 0
-    figure5 = set(EXPERIMENTS["fig5"].rows.values()) if any(e.name == "fig5" for e in chosen) else set()
-
-    def draw(spec: Spec, folder: Path) -> None:
-        if spec.recipe in figure5 and spec.seed == min(command.seeds or (0,)):
-            report.expert_strip(spec, folder, command.out)
-
-    runner = Runner(runs, records, command.workers, command.devices, command.discard, say, draw)
-    previous = {s: signal.signal(s, lambda *_: runner.end()) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        failures = [] if command.tables_only else runner.make(wanted)
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-    for spec in () if command.tables_only else wanted:  # pictures of runs that were done before this figure was asked for
-        if not (command.out / f"fig5_{spec.scene.name}.png").is_file() and (spec.folder(runs) / "results.json").is_file():
-            try:
-                draw(spec, spec.folder(runs))
-            except InputError as error:
-                say(f"no picture of {spec.label}: {error}")
-    for path in report.write(command.out, chosen, scenes, store.of_specs(store.load(records), shown), said(command, scenes)):
+    runner = Runner(plan.runs, plan.records, command.workers, command.devices, command.discard, say, artist(command, plan))
+    failures = [] if command.tables_only else made(runner, plan, command.out)
+    found = store.of_specs(store.load(plan.records), plan.shown)
+    for path in report.write(command.out, plan.experiments, plan.scenes, found, said(command, plan.scenes)):
         say(f"wrote {path}")
     if runner.stop.is_set():
         say("stopped; give the same command again to go on")
         return 130
     if failures:
         lines = "; ".join(f"{f.spec.label}: {f.why} ({f.log})" for f in failures)
-        raise RunError(f"expected {len(wanted)} runs to end well, found {len(failures)} that failed, the rest is done: {lines}")
+        raise RunError(f"expected {len(plan.wanted)} runs to end well, found {len(failures)} that failed, the rest is done: {lines}")
     return 0
+
+
+def planned(command: ReproduceCommand) -> Plan:
+    """Raises InputError for experiments, scenes or recipes that are none."""
+    chosen, scenes = experiments_of(command), scenes_of(command)
+    scale = Scale.of(command.scale, command.iterations, command.resolution)
+    chosen = rows_of(chosen, command.recipes) if command.recipes else chosen
+    shown = specs(chosen, scenes, command.seeds or (0,), scale)
+    records, runs = command.records or command.out / "records", command.runs or command.out / "runs"
+    return Plan(chosen, scenes, shown, distinct(shown), records, runs)
+
+
+def tell(plan: Plan, say: Say) -> None:
+    """Which runs are done and which are not."""
+    there = store.load(plan.records)
+    done = [store.find(there, spec) is not None for spec in plan.wanted]
+    for spec, is_done in zip(plan.wanted, done):
+        say(f"{'done   ' if is_done else 'to run '} {spec.label}")
+    say(f"{len(plan.wanted)} runs, {sum(done)} of them done")
+
+
+def artist(command: ReproduceCommand, plan: Plan) -> Callable[[Spec, Path], None]:
+    """Draws Figure 5 from a run folder where the figure is asked for and the run is one of it, with the first seed."""
+    figure5 = set(EXPERIMENTS["fig5"].rows.values()) if any(e.name == "fig5" for e in plan.experiments) else set()
+
+    def draw(spec: Spec, folder: Path) -> None:
+        if spec.recipe in figure5 and spec.seed == min(command.seeds or (0,)):
+            report.expert_strip(spec, folder, command.out)
+
+    return draw
+
+
+def made(runner: Runner, plan: Plan, out: Path) -> list[Failure]:
+    """Makes what is not done, and the pictures in `out` of what was done before they were asked for; returns the runs that failed."""
+    previous = {s: signal.signal(s, lambda *_: runner.end()) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        failures = runner.make(plan.wanted)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    for spec in plan.wanted:
+        folder = spec.folder(plan.runs)
+        if (folder / "results.json").is_file() and not report.strip_path(out, spec).is_file():
+            try:
+                runner.after(spec, folder)
+            except InputError as error:
+                runner.say(f"no picture of {spec.label}: {error}")
+    return failures
 
 
 def said(command: ReproduceCommand, scenes: list[Scene]) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -92,27 +92,32 @@ def evaluate(
         _compose(folder, names[name], captions)
         per_view[name] = {"file": names[name], **scored, **facts}
         tell("rendering and scoring", n + 1, len(chosen))
-    speed = timing.measure(scene, cameras, step, rasterize, background)
     results = {
         "format": FORMAT,
         **_means(per_view, perceptual),
         **_scene_facts(scene, step),
         "gaussians_rendered": _mean(per_view, "gaussians_rendered"),
         "activation_ratio": _mean(per_view, "activation_ratio"),
-        "fps": asdict(speed),
-        "capture": capture.name,
-        "views": views,
-        **({"appearance": appearance} if half else {}),
-        "view_count": len(chosen),
-        "split": capture.split,
-        "resolution": capture.resolution,
-        "mean_pixels": round(sum(c.width * c.height for c in cameras) / len(cameras)),
+        "fps": asdict(timing.measure(scene, cameras, step, rasterize, background)),
+        **_views_scored(capture, views, cameras, appearance),
         **_about(about or About(), step, rasterize, perceptual),
         "evaluation_seconds": time.perf_counter() - began,
     }
     write_json(out / f"per_view{suffix}.json", per_view)
     write_json(out / f"results{suffix}.json", results)
     return results
+
+
+def _views_scored(capture: Capture, views: str, cameras: Sequence[Camera], appearance: str) -> dict[str, Any]:
+    return {
+        "capture": capture.name,
+        "views": views,
+        **({"appearance": appearance} if appearance == "half" else {}),
+        "view_count": len(cameras),
+        "split": capture.split,
+        "resolution": capture.resolution,
+        "mean_pixels": round(sum(c.width * c.height for c in cameras) / len(cameras)),
+    }
 
 
 def _chosen(capture: Capture, views: str, appearance: str) -> tuple[int, ...]:

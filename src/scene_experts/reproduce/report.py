@@ -84,8 +84,13 @@ def write_figures(out: Path, experiment: Experiment, scenes: Sequence[Scene], re
     return []
 
 
+def strip_path(out: Path, spec: Spec) -> Path:
+    """Where `expert_strip` puts its picture."""
+    return out / f"fig5_{spec.scene.name}.png"
+
+
 def expert_strip(spec: Spec, run: Path, out: Path, attribute: str = "color") -> Path:
-    """Figure 5 of one run: the first held-out view whole, then each expert's anchors alone; as OUT/fig5_<scene>.png."""
+    """Figure 5 of one run: the first held-out view whole, then each expert's anchors alone; at `strip_path`."""
     opened = run_folder.open_run(run)
     capture = run_folder.load_capture(replace(opened.config.data, path=spec.scene.path), spec.seed)
     try:
@@ -95,7 +100,7 @@ def expert_strip(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
         whole, each = expert_pictures.alone(opened.scene, capture.views[index].camera, opened.step, rasterize, background, attribute)
     finally:
         capture.images.close()
-    path = out / f"fig5_{spec.scene.name}.png"
+    path = strip_path(out, spec)
     captions = [f"all {attribute} experts", *(f"expert {i + 1}" for i in range(len(each)))]
     pictures.write(path, pictures.row([pictures.to_8bit(p) for p in (whole, *each)], captions))
     return path
