@@ -51,7 +51,7 @@ def test_between_keyframes_the_camera_moves_and_size_and_speed_can_be_others(tmp
     path_files.write(tmp_path / "p.json", path(3), World())
     back = path_files.read(tmp_path / "p.json", World(), CAMERA, size=(32, 24), fps=40.0)
     assert len(back) == 9 and back.fps == 40.0 and (back.cameras[0].width, back.cameras[0].height) == (32, 24)
-    assert path_files.fov(back.cameras[2]) == pytest.approx(50.5, abs=1e-3)
+    assert math.degrees(back.cameras[2].fov) == pytest.approx(50.5, abs=1e-3)
     path_files.write(tmp_path / "p.json", path(3), World(), loop=True)
     assert len(path_files.read(tmp_path / "p.json", World(), CAMERA)) == 3
 
@@ -59,7 +59,7 @@ def test_between_keyframes_the_camera_moves_and_size_and_speed_can_be_others(tmp
 def test_the_way_back_of_a_loop_turns_the_field_of_view_back(tmp_path):
     path_files.write(tmp_path / "p.json", path(3), World(), loop=True, play_fps=20.0)  # 50, 51, 52 degrees at 0, 0.1, 0.2 s
     back = path_files.read(tmp_path / "p.json", World(), CAMERA)
-    assert [path_files.fov(camera) for camera in back.cameras] == pytest.approx([50, 50.5, 51, 51.5, 52, 51], abs=1e-3)
+    assert [math.degrees(camera.fov) for camera in back.cameras] == pytest.approx([50, 50.5, 51, 51.5, 52, 51], abs=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -94,6 +94,10 @@ class Data:
     background: tuple[float, float, float] | None = None
     """RGB in [0, 1] behind the scene; None takes the capture kind's own (black; white for NeRF-synthetic)."""
 
+    def settings(self) -> dict[str, Any]:
+        """How the capture is read, as plain JSON; not where it lies."""
+        return {name: value for name, value in to_json(self).items() if name != "path"}
+
 
 @dataclass(frozen=True)
 class RunConfig:

@@ -16,6 +16,7 @@ Frames and units
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -62,6 +63,11 @@ class Camera:
     @property
     def cy(self) -> float:
         return self.pinhole[3]
+
+    @property
+    def fov(self) -> float:
+        """Vertical field of view of a camera with its principal point in the middle, radians."""
+        return 2.0 * math.atan(self.height / (2.0 * self.fy))
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
         """The same camera with its tensors on `device` and of `dtype`."""

@@ -6,7 +6,6 @@ views="train" the same in OUT/train, OUT/results_train.json and OUT/per_view_tra
 
 from __future__ import annotations
 
-import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import scene_experts
+from scene_experts import run_folder
 from scene_experts.errors import InputError
 from scene_experts.evaluate import halves, pictures, timing
 from scene_experts.evaluate.experts import expert_shares
@@ -256,11 +255,6 @@ def _about(about: About, step: int, rasterize: Rasterizer, perceptual: Perceptua
         "lpips_weights": perceptual.sources,
         "versions": {
             "training": about.versions,
-            "evaluation": {
-                "scene-experts": scene_experts.__version__,
-                "torch": torch.__version__,
-                "python": platform.python_version(),
-                "machine": platform.machine(),
-            },
+            "evaluation": run_folder.versions(),
         },
     }

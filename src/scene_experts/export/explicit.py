@@ -49,7 +49,7 @@ def write_file(scene: GaussianScene, world: World, path: Path) -> None:
 
 def write_folder(run: OpenRun, world: World, out: Path) -> Path:
     """Write out/point_cloud/iteration_<step>/ and out/cfg_args; returns the iteration's folder."""
-    scene, data = scene_of(run), {name: value for name, value in to_json(run.config.data).items() if name != "path"}
+    scene, data = scene_of(run), run.config.data.settings()
     folder = out / "point_cloud" / f"iteration_{run.step}"
     write_file(scene, world, folder / "point_cloud.ply")
     about = {

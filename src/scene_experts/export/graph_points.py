@@ -56,7 +56,7 @@ def write_folder(run: OpenRun, world: World, out: Path) -> Path:
         "extent": scene.extent,
         "grid": grid,
         "train": to_json(run.config.train),
-        "data": {name: value for name, value in to_json(run.config.data).items() if name != "path"},
+        "data": run.config.data.settings(),
     }
     write_json(folder / SIDECAR, about)
     return folder

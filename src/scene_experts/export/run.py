@@ -192,14 +192,9 @@ def sidecar_of(run: OpenRun, world: World) -> dict[str, Any]:
             "extent": scene.extent,
             "scene": scene.meta(),
             "train": to_json(run.config.train),
-            "data": _settings(run.config.data),
+            "data": run.config.data.settings(),
         },
     )
-
-
-def _settings(data: Data) -> dict[str, Any]:
-    """How a capture was read, without where it lies."""
-    return {name: value for name, value in to_json(data).items() if name != "path"}
 
 
 def anchors_of(run: OpenRun) -> AnchorScene:
@@ -223,7 +218,7 @@ def world_of(run: OpenRun) -> World:
             found = read_sidecar(path)
         except InputError:
             continue  # the capture says it too
-        if found.get("data") == _settings(run.config.data):
+        if found.get("data") == run.config.data.settings():
             return world_in(found)
     capture = run_folder.capture_of(run)
     capture.images.close()

@@ -107,8 +107,7 @@ class Spec:
 
 def identity(scene: str, train: Train, data: Data) -> str:
     """The hash that names a run: scene, recipe with all numbers, how the capture is read; not where it lies."""
-    settings = {k: v for k, v in to_json(data).items() if k != "path"}
-    text = json.dumps([scene, to_json(train), settings], sort_keys=True)
+    text = json.dumps([scene, to_json(train), data.settings()], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

@@ -158,7 +158,7 @@ class Panel:
             rotation = view.camera.world_to_cam[:3, :3].T
             frustum = self.server.scene.add_camera_frustum(
                 name,
-                fov=2 * float(np.arctan(view.camera.height / (2 * view.camera.fy))),
+                fov=view.camera.fov,
                 aspect=view.camera.width / view.camera.height,
                 scale=0.03 * self.capture.extent,
                 color=(213, 94, 0) if i in self.capture.test else (0, 114, 178),

@@ -28,7 +28,7 @@ def write(path: Path, cameras: CameraPath, world: World, loop: bool = False, pla
     play_fps: frames a second to draw between keyframes that are further apart.
     """
     keys = [
-        {"time": i / cameras.fps, "camera_to_world": to_world(camera, world).tolist(), "fov": fov(camera)}
+        {"time": i / cameras.fps, "camera_to_world": to_world(camera, world).tolist(), "fov": math.degrees(camera.fov)}
         for i, camera in enumerate(cameras.cameras)
     ]
     first = cameras.cameras[0]
@@ -49,7 +49,7 @@ def write_nerfstudio(path: Path, cameras: CameraPath, world: World) -> None:
     entries = [
         {
             "camera_to_world": (to_world(camera, world) @ OPENGL).flatten().tolist(),
-            "fov": fov(camera),
+            "fov": math.degrees(camera.fov),
             "aspect": camera.width / camera.height,
         }
         for camera in cameras.cameras
@@ -168,11 +168,6 @@ def to_world(camera: Camera, world: World) -> Tensor:
     out[:3, :3] = pose[:3, :3].T
     out[:3, 3] = world.to_input(-(pose[:3, :3].T @ pose[:3, 3]))
     return out
-
-
-def fov(camera: Camera) -> float:
-    """Vertical field of view, degrees."""
-    return math.degrees(2 * math.atan(camera.height / (2 * camera.fy)))
 
 
 def linear(x: Tensor, y: Tensor, t: float) -> float:

@@ -215,7 +215,7 @@ def lens(cameras: Sequence[Camera], size: tuple[int, int] | None = None) -> Came
     """A camera of `size` px with the median vertical field of view of `cameras`, its principal point in the middle."""
     middle = sorted(cameras, key=lambda c: c.height / c.fy)[len(cameras) // 2]
     width, height = size or (middle.width, middle.height)
-    return with_fov(middle, 2 * math.atan(middle.height / (2 * middle.fy)), width, height)
+    return with_fov(middle, middle.fov, width, height)
 
 
 def with_fov(camera: Camera, fov: float, width: int, height: int) -> Camera:

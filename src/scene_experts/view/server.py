@@ -152,7 +152,7 @@ class Viewer:
                 client.handle.camera.wxyz = tuple(matrix_to_quat(rotation).tolist())
                 client.handle.camera.position = tuple(place.tolist())
                 client.handle.camera.look_at = tuple((place + distance * rotation[:, 2]).tolist())
-                client.handle.camera.fov = 2 * np.arctan(camera.height / (2 * camera.fy))
+                client.handle.camera.fov = camera.fov
             client.at_view, client.arriving = view, time.monotonic() + 1.0
             client.wanted, client.moved = True, time.monotonic()
         self.changed.set()
@@ -190,7 +190,7 @@ class Viewer:
         full = camera.width * camera.height
         if moving:
             share = min(1.0, max(SMALLEST, (goal / (client.seconds_a_pixel * full)) ** 0.5))
-            camera = with_fov(camera, fov_of(camera), max(16, round(camera.width * share)), max(16, round(camera.height * share)))
+            camera = with_fov(camera, camera.fov, max(16, round(camera.width * share)), max(16, round(camera.height * share)))
         scene, step = self.current()
         picture = to_8bit(self.picture(client, scene, step, camera))
         if client.handle.client_id not in self.clients:  # it went away meanwhile
@@ -254,8 +254,3 @@ class Viewer:
 
     def close(self) -> None:
         self.server.stop()
-
-
-def fov_of(camera: Camera) -> float:
-    """Vertical field of view, radians."""
-    return 2 * float(np.arctan(camera.height / (2 * camera.fy)))
