@@ -128,7 +128,7 @@ def experts(by: dict[str, list[Record]]) -> Finding:
     pairs = [(r, d) for r, d in zip(ROUTINGS, found) if d is not None]
     if not pairs:
         return Finding(claim, None, "no runs")
-    return Finding(claim, together([d.verdict(1) for _, d in pairs]), "; ".join(f"{r}: five over two {describe(d)}" for r, d in pairs))
+    return parts(claim, [(f"{r}, five over two", d.verdict(1), d) for r, d in pairs])
 
 
 def dense(by: dict[str, list[Record]]) -> Finding:
@@ -147,15 +147,14 @@ def depth(by: dict[str, list[Record]]) -> Finding:
     pairs = [(n, d) for n, d in found if d is not None]
     if not pairs:
         return Finding(claim, None, "no runs")
-    verdicts: list[Verdict] = [opposite(d.verdict(1)) for _, d in pairs]
-    return Finding(claim, together(verdicts), "; ".join(f"{n} over 2: {describe(d)}" for n, d in pairs))
+    return parts(claim, [(f"{n} over 2", opposite(d.verdict(1)), d) for n, d in pairs])
 
 
-def together(verdicts: Sequence[Verdict]) -> Verdict:
-    """One verdict for a claim in several parts: contradicted by any, confirmed by all."""
-    if "contradicted" in verdicts:
-        return "contradicted"
-    return "confirmed" if all(v == "confirmed" for v in verdicts) else "undecided"
+def parts(claim: str, found: Sequence[tuple[str, Verdict, Difference]]) -> Finding:
+    """A claim in several parts, each with its verdict: contradicted by any, confirmed by all."""
+    verdicts = {verdict for _, verdict, _ in found}
+    one: Verdict = "contradicted" if "contradicted" in verdicts else "confirmed" if verdicts == {"confirmed"} else "undecided"
+    return Finding(claim, one, "; ".join(f"{name}: {verdict}, {describe(d)}" for name, verdict, d in found))
 
 
 def to_markdown(findings: Sequence[Finding]) -> str:

@@ -109,10 +109,13 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
     records = [r for rows in found.values() for r in rows]
     if not records:
         return ("no run of this table is done",)
-    lengths = sorted({(r.config.train.iterations, adjustments(r.config.train)) for r in records})
+    lengths: dict[int, set[int]] = {}
+    for r in records:
+        lengths.setdefault(r.config.train.iterations, set()).add(adjustments(r.config.train))
     sizes = sorted({r.config.data.resolution for r in records})
     seeds = sorted({r.seed for r in records})
-    made = ", ".join(f"{n:,} iterations ({many} adjustments of density)" for n, many in lengths)
+    between = {n: " to ".join(str(m) for m in sorted({min(many), max(many)})) for n, many in lengths.items()}
+    made = ", ".join(f"{n:,} iterations ({many} adjustments of density)" for n, many in sorted(between.items()))
     out = [f"{made}; resolution {', '.join(sizes)}; seeds {', '.join(map(str, seeds))}"]
     every, none = drawn(records), [name for name, rows in found.items() if not rows]
     for name, rows in found.items():
