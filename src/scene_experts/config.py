@@ -155,7 +155,8 @@ def flag(place: str) -> str:
 
 def _has(value: Any, place: str) -> bool:
     first, _, rest = place.partition(".")
-    return hasattr(value, first) and (not rest or _has(getattr(value, first), rest))
+    known = dataclasses.is_dataclass(value) and first in {f.name for f in dataclasses.fields(value)}
+    return known and (not rest or _has(getattr(value, first), rest))
 
 
 def _put(part: Any, place: list[str], value: Any) -> Any:
