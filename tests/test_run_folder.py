@@ -143,6 +143,24 @@ def test_overwriting_removes_what_belonged_to_the_old_run_and_nothing_else(run):
     assert state(run).keys() == {"config.json", *mine, "point_cloud/iteration_7/mine.txt"} and run_folder.read_config(run) == other
 
 
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_folders_of_somebody_else_are_left_alone(tmp_path, overwrite):
+    capture = tmp_path / "capture"
+    (capture / "test").mkdir(parents=True)
+    (capture / "test" / "r_0.png").write_text("a photograph")
+    (tmp_path / "project" / "train").mkdir(parents=True)
+    for name in ("config.json", "report.html", "train/notes.txt"):
+        (tmp_path / "project" / name).write_text("{}")
+    before = state(tmp_path)
+    config = replace(CONFIG, data=Data(capture))
+    with pytest.raises(InputError, match="found the capture's"):
+        run_folder.prepare(capture, config, resume=False, overwrite=overwrite)
+    for folder, found in (("project", "config.json"), ("capture", "test")):
+        with pytest.raises(InputError, match=f"expected a new or empty folder or an earlier run at .*, found {found} in it"):
+            run_folder.prepare(tmp_path / folder, CONFIG, resume=False, overwrite=overwrite)
+    assert state(tmp_path) == before
+
+
 def test_places_that_cannot_be_a_run_folder(tmp_path):
     (tmp_path / "file").write_text("x")
     for place in (tmp_path / "file", tmp_path / "file" / "below" / "it"):

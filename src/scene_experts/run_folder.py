@@ -78,6 +78,10 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
         json.dumps(to_json(config), allow_nan=False)
     except ValueError:
         raise InputError("expected finite numbers in every setting, found nan or infinity; correct the flag") from None
+    if out.resolve() == config.data.path.resolve():
+        raise InputError(f"expected a folder of its own for the run, found the capture's at {out}; choose another --out")
+    if foreign := _foreign(out):
+        raise InputError(f"expected a new or empty folder or an earlier run at {out}, found {foreign} in it; choose another --out")
     if resume and overwrite:
         raise InputError("expected --resume (go on) or --overwrite (begin anew), found both; leave one out")
     if resume and not (out / "config.json").is_file():
@@ -88,6 +92,19 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
         imported = config.command.startswith("import ")
         advice = "choose another --out" if imported else "add --resume to go on, --overwrite to begin anew, or choose another --out"
         raise InputError(f"expected a new or empty run folder, found checkpoints in {out}; {advice}")
+
+
+def _foreign(out: Path) -> str:
+    """The first thing in a folder that is no run of ours; empty where there is nothing to lose."""
+    if any((out / "checkpoints").glob("ckpt_*.safetensors")):
+        return ""
+    try:
+        if "format" in read_json(out / "config.json", "run configuration"):  # type: ignore[operator]
+            return ""
+    except (InputError, TypeError):
+        pass
+    found = sorted(path.name for path in out.iterdir() if path.name not in (".lock", "paths")) if out.is_dir() else []
+    return found[0] if found else ""
 
 
 def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
@@ -141,8 +158,9 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False)
         others = [*exported, out / "report.html", out / "config.json"]
         for old in [*(out / "checkpoints").glob("ckpt_*.safetensors"), *(out / "previews").glob("*.png"), *results, *others]:
             old.unlink(missing_ok=True)
-        for pictures in (f"{views}{half}" for views in ("test", "train") for half in ("", "_half")):
-            shutil.rmtree(out / pictures, ignore_errors=True)
+        for scored in (out / f"{views}{half}" for views in ("test", "train") for half in ("", "_half")):
+            for pictures in ("renders", "gt", "errors", "side_by_side", "masks"):  # and nothing else that may lie there
+                shutil.rmtree(scored / pictures, ignore_errors=True)
         for sidecar in (out / "point_cloud").glob("iteration_*/scene.json"):  # a later iteration's would be taken for the new run's
             shutil.rmtree(sidecar.parent, ignore_errors=True)
     write_json(out / "config.json", {"format": FORMAT, **to_json(config)})
