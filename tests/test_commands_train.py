@@ -87,7 +87,7 @@ def test_a_finished_run_keeps_its_files_when_resumed(tmp_path, capsys):
     assert train(args) == 0
     layout = tmp_path / "run" / "point_cloud" / "iteration_3"
     (layout / "point_cloud.ply").write_bytes(b"mine")
-    assert train([*args, "--resume"]) == 0
+    assert train([*args, "--resume"]) == 0 and "--resume" not in run_folder.read_config(tmp_path / "run").command
     assert "nothing was left to train" in capsys.readouterr().out and (layout / "point_cloud.ply").read_bytes() == b"mine"
     (layout / "point_cloud.ply").unlink()
     assert train([*args, "--resume"]) == 0 and (layout / "point_cloud.ply").is_file()  # a run that was killed before it wrote them

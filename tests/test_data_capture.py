@@ -239,6 +239,8 @@ def test_paths_that_are_no_captures(made: Synthetic, tmp_path: Path) -> None:
         load(tmp_path)
     with pytest.raises(InputError, match="found 10 photographs without camera poses; move them"):
         load(tmp_path / "images")
+    with pytest.raises(InputError, match=f"found its reconstruction alone; give the folder that holds it: {made.folder}$"):
+        load(made.folder / "sparse/0")
     for part in ("images", "sparse"):
         with pytest.raises(InputError, match=f"found a part of one; give the folder that holds it: {made.folder}$"):
             load(made.folder / part)

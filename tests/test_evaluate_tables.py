@@ -168,3 +168,18 @@ def test_a_file_that_knows_nothing_of_its_training_has_no_figures_of_it() -> Non
     place = [found.titles.index(title) for title in ("steps", "of", "train s")]
     assert [found.rows[0][j] for j in place] == ["4,000", "7,000", "100"] and [found.rows[1][j] for j in place] == ["-"] * 3
     assert not {"steps", "of", "train s"} & set(tables.table(["b"], [imported]).titles)
+
+
+def test_what_was_trained_on_after_it_was_scored_is_said(tmp_path):
+    for step in (231, 400):
+        (tmp_path / "checkpoints").mkdir(exist_ok=True)
+        (tmp_path / "checkpoints" / f"ckpt_{step:06d}.safetensors").touch()
+    found = tables.outdated(["moe-gs", "other"], [tmp_path, tmp_path / "none"], [{"step": 231}, {"step": 5}])
+    assert found == [f"moe-gs was scored at iteration 231 and is at 400 now: run `scene-experts eval {tmp_path}` again"]
+    assert tables.outdated(["moe-gs"], [tmp_path], [{"step": 400}]) == tables.outdated(["moe-gs"], [tmp_path], [{}]) == []
+
+
+def test_an_absent_score_says_whose_it_is():
+    one, two = {"psnr": 1.0, "lpips": 0.2}, {"psnr": 2.0, "absent": {"lpips": "not asked for"}}
+    assert tables.table(["a", "b"], [one, two]).notes == ("lpips of b absent: not asked for",)
+    assert tables.table(["b"], [two]).notes == ("lpips absent: not asked for",)

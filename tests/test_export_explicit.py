@@ -140,12 +140,15 @@ def test_spz_says_by_itself_whether_it_is_antialiased(made, tmp_path):
         assert run_folder.read_config(out).train.antialias is asked
 
 
-def test_the_description_beside_a_file_is_heard(made, tmp_path):
+def test_the_description_beside_a_file_is_heard(made, tmp_path, caplog):
     run, folder = made
     to_ply(run, tmp_path / "scene.ply")
     about = json.loads((tmp_path / "scene.ply.json").read_text())
     (tmp_path / "scene.ply.json").write_text(json.dumps(about | {"antialias": True}))
     assert run_folder.read_config(import_result(tmp_path / "scene.ply", Data(folder), tmp_path / "again")).train.antialias
+    assert not caplog.records
+    import_result(tmp_path / "scene.ply", Data(folder, split="none"), tmp_path / "elsewhere")
+    assert "was made on other views" in caplog.text
     export_standard(run, "ply", tmp_path / "scene.ply", None, choose("auto", "cpu"), Options(frame="trained", measure=False))
     with pytest.raises(InputError, match="in the trained one; export it again with --frame capture"):
         import_result(tmp_path / "scene.ply", Data(folder), tmp_path / "other")

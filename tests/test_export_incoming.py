@@ -117,7 +117,7 @@ def test_what_cannot_be_drawn_is_refused(tmp_path, folder):
         import_result(root, Data(folder), tmp_path / "run")
     assert not (tmp_path / "run").exists()
     (iteration / "embedding_appearance.pt").unlink()
-    with pytest.raises(InputError, match="expected a Scaffold-GS result"):
+    with pytest.raises(InputError, match="expected a result folder or a file of a scene"):
         import_result(tmp_path / "absent", Data(folder), tmp_path / "run")
     plain = read_vertices(iteration / "point_cloud.ply")
     write_vertices(iteration / "point_cloud.ply", {**plain, "level": plain["x"] * 0, "extra_level": plain["x"] * 0, "info": plain["x"] * 0})

@@ -70,6 +70,12 @@ def test_runs_that_were_not_scored_alike_are_no_rivals(tmp_path):
     text = write(runs, tmp_path / "other.html").read_text()
     assert "moe-gs, scaffold-gs on fox, kitchen" in text and "class=best" not in text
     assert "Do not compare these scores:</b> expected the same capture, found fox in moe-gs and kitchen in scaffold-gs." in text
+    assert "moe-gs: 3 test views (mod8), as-is, 3,000 iterations<br>scaffold-gs: 3 test" not in alike  # said once where all are alike
+    write_json(runs[1] / "results.json", {**results, "capture": "kitchen", "split": "files", "step": 231, "iterations": 3000})
+    write_json(runs[1] / "checkpoints" / "ckpt_000400.safetensors", {})
+    text = write(runs, tmp_path / "other.html").read_text()
+    assert "scaffold-gs: 3 test views (files), as-is, 231 of 3,000 iterations" in text
+    assert "scaffold-gs was scored at iteration 231 and is at 400 now: run `scene-experts eval" in text
     assert "<h3>fox</h3>" in text and "<h3>kitchen</h3>" in text and "<h3>" not in alike
     pictures = json.loads(re.search(r"const pictures = (.+);</script>", text)[1])  # type: ignore[index]
     assert len(pictures) == 2 * 3 * 3  # of each its own photographs, renders and errors

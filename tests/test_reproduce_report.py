@@ -31,3 +31,10 @@ def test_means_are_over_the_captures_that_every_row_has(tmp_path):
     means, by_scene = (tmp_path / "table4.md").read_text().split("scene by scene")
     assert "means over fox\n" in means and "| MoE-GS | **30.00** |" in means and "left out of the means" in means and "10.00" not in means
     assert "10.00" in by_scene
+
+
+def test_short_trainings_are_said_to_be_no_judges():
+    assert report.short_runs([record(iterations=30_000)]) == report.short_runs([]) == []
+    (line, _) = report.short_runs([record(iterations=3000), record(iterations=200)])
+    assert "3,000 iterations with 13 adjustments of density, not of 30,000 and 134: what they leave open" in line
+    assert "**they say nothing of the paper**" in report.short_runs([record(iterations=200)])[0]

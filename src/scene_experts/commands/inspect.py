@@ -19,7 +19,7 @@ def info(args: list[str]) -> int:
         Annotated[Data, tyro.conf.arg(name="")],
         prog=f"{PROG} info",
         args=positional(args, "--data"),
-        description="Say what a capture holds.",
+        description="Say what a capture holds; `info CAPTURE` does too.",
     )
     show(run_folder.load_capture(run_folder.named(data), look=True), Console(highlight=False))
     return 0

@@ -75,7 +75,7 @@ def train(args: list[str]) -> int:
     reuse_freed()
     console = Console(highlight=False)
     device, rasterize = backend(command.device, command.rasterizer, command.cfg.antialias, command.deterministic)
-    line = shlex.join([PROG, "train", *args])
+    line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # what makes the whole run
     config = RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, run_folder.versions())
     run_folder.check(command.out, config, command.resume, command.overwrite)
     capture = run_folder.load_capture(command.data, command.cfg.seed)

@@ -120,6 +120,11 @@ def _read_colmap(root: Path, images: str, missing: str) -> Found:
     twice = next((a for a, b in pairwise(names) if a == b), None)
     if twice is not None:
         raise InputError(f"expected every image once in {folder}, found {twice} twice; remove one of its poses")
+    above = next((p for p in (root.absolute().parent, root.absolute().parent.parent) if (p / images).is_dir()), None)
+    if not (root / images).is_dir() and above is not None and folder.samefile(root):
+        raise InputError(
+            f"expected the folder of a capture at {root}, found its reconstruction alone; give the folder that holds it: {above}"
+        )
     match = match_images(root / images, names)
     warnings = list(match.warnings)
     if match.absent and (missing == "error" or not match.found):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -94,6 +94,16 @@ def load_results(run: Path, views: str = "test") -> dict[str, Any]:
     return results
 
 
+def outdated(names: Sequence[str], runs: Sequence[Path], results: Sequence[dict[str, Any]]) -> list[str]:
+    """In a sentence each: the runs that were trained on after they were scored."""
+    out = []
+    for name, run, found in zip(names, runs, results):
+        newest = max((int(p.stem[5:]) for p in (run / "checkpoints").glob("ckpt_*.safetensors") if p.stem[5:].isdigit()), default=0)
+        if newest > (found.get("step") or newest):
+            out.append(f"{name} was scored at iteration {found['step']:,} and is at {newest:,} now: run `scene-experts eval {run}` again")
+    return out
+
+
 def unlike(names: Sequence[str], results: Sequence[dict[str, Any]]) -> tuple[str, str] | None:
     """The first difference in what was scored, in words, and the option that sets it; None where scores may be compared."""
     for name, other in zip(names[1:], results[1:]):
@@ -124,17 +134,19 @@ def table(names: Sequence[str], results: Sequence[dict[str, Any]], columns: Sequ
             winner = max(texts, key=lambda i: columns[j].best * (values[i][j] or 0.0))
             best |= {(i, place + 1) for i, text in texts.items() if text == texts[winner]}
     rows = tuple((name, *(columns[j].text(row[j]) for j in used)) for name, row in zip(names, values))
-    return Table(("run", *(columns[j].title for j in used)), rows, frozenset(best), _notes(results))
+    return Table(("run", *(columns[j].title for j in used)), rows, frozenset(best), _notes(names, results))
 
 
-def _notes(results: Sequence[dict[str, Any]]) -> tuple[str, ...]:
+def _notes(names: Sequence[str], results: Sequence[dict[str, Any]]) -> tuple[str, ...]:
     """Why scores are absent, each reason once with the scores it explains."""
     reasons: dict[str, list[str]] = {}
     for result in results:
         for metric, reason in (result.get("absent") or {}).items():
             if metric not in (known := reasons.setdefault(reason, [])):
                 known.append(metric)
-    return tuple(f"{', '.join(metrics)} absent: {reason}" for reason, metrics in reasons.items())
+    lacking = {reason: [n for n, r in zip(names, results) if reason in (r.get("absent") or {}).values()] for reason in reasons}
+    where = {reason: "" if len(of) == len(results) else f" of {', '.join(of)}" for reason, of in lacking.items()}
+    return tuple(f"{', '.join(metrics)}{where[reason]} absent: {reason}" for reason, metrics in reasons.items())
 
 
 def to_markdown(table: Table) -> str:
@@ -205,6 +217,7 @@ def compare_runs(runs: Sequence[Path], format: Format, mixed: bool, console: Con
         names = [f"{name} on {result.get('capture')}, {result.get('resolution')}" for name, result in zip(names, results)]
     published = paper_results(paper) if paper else {}
     made = table([*names, *published], [*results, *published.values()])
+    made = replace(made, notes=(*made.notes, *outdated(names, [Path(run) for run in runs], results)))
     if format == "table":
         if not mixed:
             console.print(_title(results[0]), markup=False, soft_wrap=True)

@@ -7,6 +7,7 @@ From the trained world to the capture's frame lengths scale and positions move; 
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from dataclasses import replace
@@ -31,6 +32,7 @@ from scene_experts.recipes import gs_3d
 from scene_experts.run_folder import OpenRun
 from scene_experts.scene.explicit import Explicit, GaussianScene
 
+log = logging.getLogger(__name__)
 KIND = "gaussians"  # in our description of a scene
 
 
@@ -124,14 +126,20 @@ def read_columns(path: Path, world: World) -> dict[str, Tensor]:
     return to_columns(found, world)
 
 
+def _beside(path: Path) -> dict[str, Any]:
+    """The description that `export` writes beside a standard file; empty where there is none."""
+    file = path.with_name(path.name + ".json")
+    found = read_json(file, "description of a file") if file.is_file() else None
+    return found if isinstance(found, dict) else {}
+
+
 def _antialias(path: Path) -> bool:
     """Whether an SPZ file, or the description that `export` writes beside a standard file, says that it is to be antialiased.
 
     Raises InputError where it says that the file is not in the capture's own frame.
     """
-    beside = path.with_name(path.name + ".json")
-    found = read_json(beside, "description of a file") if beside.is_file() else None
-    if not isinstance(found, dict):
+    found = _beside(path)
+    if not found:
         return path.is_file() and format_of(path) == "spz" and is_antialiased(path)
     if found.get("frame") == "trained":
         raise InputError(
@@ -151,6 +159,11 @@ def import_file(path: Path, data: Data, out: Path, iteration: int | None = None)
     about: dict[str, Any] = read_sidecar(beside) if beside.is_file() else {}
     capture = run_folder.load_capture(data)
     capture.images.close()
+    made_on = _beside(path).get("capture")
+    if made_on not in (None, "", capture.fingerprint()):
+        log.warning(
+            "%s was made on other views than those of %s: is it that capture, read as then (--split, --resolution)?", path, capture.root
+        )
     columns = read_columns(path, capture.world)
     named = re.fullmatch(r"iteration_(\d+)", path.parent.name)
     step = int(about.get("step") or iteration or (int(named[1]) if named else UNKNOWN))

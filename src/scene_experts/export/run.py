@@ -227,6 +227,8 @@ def world_of(run: OpenRun) -> World:
 
 def import_result(source: Path, data: Data, out: Path, iteration: int | None = None) -> Path:
     """Make the run folder `out` of a result folder, compact file (`incoming`) or PLY file of 3DGS, with its layout; returns it."""
+    if not Path(source).exists():
+        raise InputError(f"expected a result folder or a file of a scene at {source}, found nothing; check the path")
     if graph := graph_points_in.find_folder(source, iteration):
         capture = graph_points_in.import_folder(graph, data, out)
         write_layout(run_folder.open_run(out), capture)

@@ -19,7 +19,7 @@ from scene_experts import run_folder
 from scene_experts.config import RunConfig, to_json
 from scene_experts.errors import InputError
 from scene_experts.evaluate.pictures import read as read_picture
-from scene_experts.evaluate.tables import Table, load_results, table, told_apart, unlike
+from scene_experts.evaluate.tables import Table, load_results, outdated, table, told_apart, unlike
 from scene_experts.io import read_json, write_bytes
 from scene_experts.report import chart
 from scene_experts.report.chart import Line
@@ -84,14 +84,16 @@ def metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def page(sources: Sequence[Source]) -> str:
-    r, names, results = sources[0].results, [s.name for s in sources], [s.results for s in sources]
+    names, results = [s.name for s in sources], [s.results for s in sources]
     title = f"{', '.join(names)} on {', '.join(dict.fromkeys(str(r.get('capture', '?')) for r in results))}"
-    steps = f", {r['step']:,} iterations" if r.get("step") else ""
-    facts = f"{r.get('view_count')} {r.get('views')} views ({r.get('split')}), {r.get('resolution')}{steps}"
-    views, pictures = every_capture(sources)
+    facts = [about(s.results) for s in sources]
+    said = facts[:1] if len(set(facts)) == 1 else [f"{name}: {fact}" for name, fact in zip(names, facts)]
+    groups = by_capture(sources)
+    views, pictures = every_capture(groups)
     scores, other = table(names, results), unlike(names, results)
     parts = [
-        f"<h1>{escape(title)}</h1><p class='soft'>{escape(facts)}</p>",
+        f"<h1>{escape(title)}</h1><p class='soft'>{'<br>'.join(map(escape, said))}</p>",
+        *(f"<p><b>{escape(line)}.</b></p>" for line in outdated(names, [s.path for s in sources], results)),
         f"<p><b>Do not compare these scores:</b> expected {escape(other[0])}.</p>" if other else "",
         figures(replace(scores, best=frozenset()) if other else scores),
         "<h2>Held-out views</h2><p class='soft'>Move over a picture, or drag the slider.</p>",
@@ -100,13 +102,20 @@ def page(sources: Sequence[Source]) -> str:
         f"<div class='charts'>{curves(sources)}</div>",
         experts(sources),
         "<h2>Scores by view</h2>",
-        *(by_view(group) for group in by_capture(sources).values()),
+        *((f"<h3>{escape(capture)}</h3>" if len(groups) > 1 else "") + by_view(group) for capture, group in groups.items()),
         "<h2>To repeat</h2>",
         *(command(s) for s in sources),
         f"<script>const pictures = {json.dumps(pictures)};</script>",
     ]
     template = Template(files("scene_experts.report").joinpath("page.html").read_text())
     return template.safe_substitute(title=escape(title), body="\n".join(parts))
+
+
+def about(r: dict[str, Any]) -> str:
+    """What was scored, of which training."""
+    whole = f" of {r['iterations']:,}" if r.get("step") and (r.get("iterations") or 0) > r["step"] else ""
+    steps = f", {r['step']:,}{whole} iterations" if r.get("step") else ""
+    return f"{r.get('view_count')} {r.get('views')} views ({r.get('split')}), {r.get('resolution')}{steps}"
 
 
 def figures(found: Table) -> str:
@@ -132,9 +141,10 @@ def common(sources: Sequence[Source]) -> list[str]:
     return [name for name in sources[0].per_view if all(name in s.per_view for s in sources)]
 
 
-def every_capture(sources: Sequence[Source]) -> tuple[str, dict[str, str]]:
+def every_capture(groups: dict[str, list[Source]]) -> tuple[str, dict[str, str]]:
     """The held-out views of each capture, and every picture that they can show as a data address by key."""
-    groups, pictures, parts = by_capture(sources), {}, []
+    pictures: dict[str, str] = {}
+    parts = []
     for i, (capture, group) in enumerate(groups.items()):
         views, shown = held_out(group, f"{i}.")
         pictures |= shown
@@ -189,9 +199,11 @@ def encoded(path: Path) -> str:
 def curves(sources: Sequence[Source]) -> str:
     """Charts over the training: PSNR, losses, anchors, active share, visible anchors, speed."""
 
-    def series(key: str, factor: float = 1.0, smooth: bool = True) -> list[Line]:
+    def series(key: str, factor: float = 1.0, smooth: bool = True, anchored: bool = False) -> list[Line]:
         out = []
         for s in sources:
+            if anchored and s.results.get("activation_ratio") is None:  # explicit Gaussians: all are as they are
+                continue
             points = [(m["step"], m[key] * factor) for m in s.metrics if isinstance(m.get(key), (int, float)) and "psnr" in m]
             out.append(Line(s.name, chart.smoothed(points) if smooth else points))
         return out
@@ -206,7 +218,7 @@ def curves(sources: Sequence[Source]) -> str:
     parts += [
         chart.lines("anchors", series("anchors", smooth=False)),
         chart.lines("Gaussians drawn", series("gaussians")),
-        chart.lines("active Gaussians", series("active", 100), "%"),
+        chart.lines("active Gaussians", series("active", 100, anchored=True), "%"),
         chart.lines("training time", series("seconds", 1 / 60, smooth=False), "minutes"),
     ]
     return "".join(parts)
