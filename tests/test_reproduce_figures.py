@@ -25,6 +25,9 @@ def test_no_runs_no_charts(tmp_path):
 def test_figure_3_and_7_and_6(tmp_path):
     pair = [record("moe-gs-e3-top2"), record("moe-gs-e3-no-load")]
     assert whole(figures.shares(EXPERIMENTS["fig3"], pair, "fox", tmp_path / "fig3"))
+    first = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    figures.shares(EXPERIMENTS["fig3"], pair, "fox", tmp_path / "fig3")
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == first  # the same bytes again
     depths = [record(f"scaffold-gs-depth{n}", seed=s, psnr=30 - n + s) for n in (2, 3) for s in (0, 1)]
     assert whole(figures.layers(EXPERIMENTS["fig7"], depths, tmp_path / "fig7"))
     assert whole(figures.cost(EXPERIMENTS["fig6"], [record("moe-gs-e2-top1"), record("moe-gs-e5-top1")], tmp_path / "fig6"))

@@ -31,9 +31,10 @@ def canvas(columns: int = 1, width: float = 6.4, height: float = 3.8) -> tuple[A
 
 
 def save(figure: Any, path: Path) -> list[Path]:
-    """Write PNG and SVG beside each other, each whole or not at all."""
-    from matplotlib import pyplot
+    """Write PNG and SVG beside each other, each whole or not at all; the same bytes each time."""
+    from matplotlib import pyplot, rcParams
 
+    rcParams["svg.hashsalt"] = "scene-experts"  # names of parts in the file
     out = []
     for ending in ("png", "svg"):
         stream = io.BytesIO()
