@@ -111,3 +111,17 @@ def test_automatic_size_with_coincident_points() -> None:
         voxel.auto_voxel(points)
     points[:4, 0] = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64)
     assert voxel.auto_voxel(points) > 0
+
+
+def test_the_rules_for_a_voxel():
+    grid = torch.cartesian_prod(*[torch.arange(6.0, dtype=torch.float64)] * 3) * 0.2
+    assert voxel.voxel_size(grid, "median_nn") == pytest.approx(0.2)
+    assert voxel.voxel_size(grid, "squared_median") == pytest.approx(0.04)
+    assert voxel.voxel_size(grid, "neighbours") == pytest.approx(0.05)
+
+
+def test_coinciding_points_still_have_a_voxel_size():
+    spread = torch.rand(10, 3, dtype=torch.float64)
+    assert voxel.voxel_size(torch.cat([spread] + [spread[:1]] * 30), "neighbours") > 0
+    with pytest.raises(InputError, match="two different points"):
+        voxel.voxel_size(spread[:1].repeat(5, 1), "neighbours")

@@ -9,7 +9,7 @@ import torch
 from scene_experts import native
 from scene_experts.errors import InputError
 from scene_experts.recipes import RECIPES
-from scene_experts.scene.anchors import ATTRIBUTES, Anchors, AnchorScene, Rates, voxel_size
+from scene_experts.scene.anchors import ATTRIBUTES, Anchors, AnchorScene, Rates
 from scene_experts.scene.experts import Experts, Router
 from scene_experts.scene.mix import FeatureBank
 from scene_experts.types import Camera, Points
@@ -50,13 +50,6 @@ def test_a_chosen_voxel_that_keeps_nearly_every_point_is_said(caplog):
         caplog.clear()
         AnchorScene.from_points(config, points, 5.0)
         assert ("keep nearly every point (100 of 100)" in caplog.text) == said
-
-
-def test_voxel_rules():
-    grid = torch.cartesian_prod(*[torch.arange(6.0, dtype=torch.float64)] * 3) * 0.2
-    assert voxel_size(grid, "median_nn") == pytest.approx(0.2)
-    assert voxel_size(grid, "squared_median") == pytest.approx(0.04)
-    assert voxel_size(grid, "neighbours") == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize("add_dist", [(), ATTRIBUTES])
@@ -177,13 +170,6 @@ def test_new_rows_have_the_columns_of_the_table():
     made = scene(Anchors(), n=5)
     made.table.append(made.new_rows(torch.tensor([[16, 0, -16]]), 0.16, torch.ones(1, 32)))
     assert len(made.table) == 6 and float(made.table.params["log_scaling"][5, 0].detach()) == pytest.approx(math.log(0.16))
-
-
-def test_coinciding_points_still_have_a_voxel_size():
-    spread = torch.rand(10, 3, dtype=torch.float64)
-    assert voxel_size(torch.cat([spread] + [spread[:1]] * 30), "neighbours") > 0
-    with pytest.raises(InputError, match="two different points"):
-        voxel_size(spread[:1].repeat(5, 1), "neighbours")
 
 
 def test_the_native_decode_refuses_heads_it_has_no_code_for():

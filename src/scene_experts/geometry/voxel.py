@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from scene_experts.errors import InputError
-from scene_experts.geometry.neighbours import knn_d2, nearest
+from scene_experts.geometry.neighbours import knn_d2, median_neighbour_distance, nearest
 
 VoxelRule = Literal["squared_median", "median_nn"]
+VoxelChoice = Literal["neighbours", "squared_median", "median_nn"]
 AXIS_BITS = 21
 AXIS_LIMIT = 1 << (AXIS_BITS - 1)  # cells of an axis lie in [-AXIS_LIMIT, AXIS_LIMIT)
 
@@ -87,6 +88,17 @@ def scatter_max(values: Tensor, group: Tensor, groups: int) -> Tensor:
     """Element-wise maximum [groups, F] over the rows of `values` [P, F] with each `group` [P] number; 0 for a group with no row."""
     out = values.new_zeros((groups, values.shape[1]))
     return out.scatter_reduce(0, group[:, None].expand_as(values), values, reduce="amax", include_self=False)
+
+
+def voxel_size(points: Tensor, rule: VoxelChoice) -> float:
+    """The lattice's edge by rule, from points [P, 3], in their unit: a quarter of their median neighbour distance, or as `auto_voxel`.
+
+    Raises InputError if no two points differ.
+    """
+    if rule != "neighbours":
+        return auto_voxel(points, rule)
+    spacing = median_neighbour_distance(points)
+    return 0.25 * spacing if spacing > 0 else auto_voxel(points, "median_nn", 0.25)  # more than half of the points coincide
 
 
 def auto_voxel(points: Tensor, rule: VoxelRule = "squared_median", factor: float = 1.0) -> float:

@@ -19,8 +19,8 @@ from torch.nn import functional
 
 from scene_experts import native
 from scene_experts.errors import InputError, expect_at_least
-from scene_experts.geometry.neighbours import knn_d2, median_neighbour_distance
-from scene_experts.geometry.voxel import auto_voxel
+from scene_experts.geometry.neighbours import knn_d2
+from scene_experts.geometry.voxel import VoxelChoice, voxel_size
 from scene_experts.scene import native_decode, triton_decode
 from scene_experts.scene.appearance import Codes, TestRule, fold
 from scene_experts.scene.experts import Experts, MixtureHead
@@ -31,7 +31,6 @@ from scene_experts.schedule import Rate
 from scene_experts.table import Table
 from scene_experts.types import Camera, Decoded, Gaussians, Points, Routing
 
-VoxelChoice = Literal["neighbours", "squared_median", "median_nn"]
 log = logging.getLogger(__name__)
 NEARLY_ALL = 0.95  # of the points in voxels of their own: the lattice does next to nothing
 EPS = 1e-12  # keeps directions and quaternions finite where their length is 0
@@ -131,9 +130,7 @@ class AnchorScene(nn.Module):
         facts, voxel, select = config.select.begin(points.xyz, voxel, cameras)
         chosen = config.voxel_size or config.voxel_rule != "neighbours"
         if chosen and isinstance(select, AllAnchors) and len(facts["xyz"]) > NEARLY_ALL * len(points.xyz):
-            log.warning(
-                "voxels of %.4g units keep nearly every point (%s of %s)", voxel, *(f"{len(x):,}" for x in (facts["xyz"], points.xyz))
-            )
+            log.warning("voxels of %.4g units keep nearly every point (%d of %d)", voxel, len(facts["xyz"]), len(points.xyz))
         scale = knn_d2(facts["xyz"].float().double()).clamp_min(1e-7).sqrt().log().float()
         n = len(scale)
         params = {
@@ -289,14 +286,6 @@ def no_kernels(device: torch.device) -> str | None:
     if device.type == "cuda":
         return triton_decode.available()
     return native.why_not() if device.type == "cpu" else f"no kernels for {device.type}"
-
-
-def voxel_size(points: Tensor, rule: VoxelChoice) -> float:
-    """The lattice's edge by rule, from points [P, 3] in trained world units. Raises InputError if no two points differ."""
-    if rule != "neighbours":
-        return auto_voxel(points, rule)
-    spacing = median_neighbour_distance(points)
-    return 0.25 * spacing if spacing > 0 else auto_voxel(points, "median_nn", 0.25)  # more than half of the points coincide
 
 
 @dataclass(frozen=True)

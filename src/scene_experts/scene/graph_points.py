@@ -20,9 +20,9 @@ from torch.nn import functional
 from scene_experts.errors import InputError, expect_at_least
 from scene_experts.geometry.curvature import curvature, flatter, pairs_to_halve
 from scene_experts.geometry.neighbours import knn_d2
-from scene_experts.geometry.voxel import coarsen, to_lattice, unique_cells
+from scene_experts.geometry.voxel import VoxelChoice, coarsen, to_lattice, unique_cells, voxel_size
 from scene_experts.scene import Cull
-from scene_experts.scene.anchors import EPS, VoxelChoice, voxel_size
+from scene_experts.scene.anchors import EPS
 from scene_experts.scene.graph import Graph, blended
 from scene_experts.scene.hash_grid import HashGrid
 from scene_experts.scene.mlp import CHANNELS
