@@ -11,7 +11,9 @@ from scene_experts.config import to_json
 from scene_experts.errors import InputError
 from scene_experts.io import write_json
 from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec, distinct
-from scene_experts.reproduce.store import POINTS, curves, find, load, of_run, of_specs, read, write
+from scene_experts.reproduce.store import POINTS, curves, expect_of_captures, find, load, of_run, of_specs, read, write
+from scene_experts.run_folder import load_capture
+from synthetic import make_capture
 
 
 def test_a_record_comes_back_as_it_was_without_the_place_of_the_capture(tmp_path):
@@ -28,6 +30,18 @@ def test_a_run_is_found_by_its_spec(tmp_path):
     spec = Spec(Scene("fox", OWN, Path("anywhere/fox")), "moe-gs", 0, Scale(iterations=3000))
     assert find([record(seed=1), record()], spec) is not None
     assert find([record(seed=1), record(iterations=7000)], spec) is None
+
+
+def test_records_of_another_capture_of_the_same_name_are_refused(tmp_path):
+    box = make_capture(tmp_path / "box", views=9)
+    spec = Spec(Scene("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
+    capture = load_capture(spec.data)
+    own = replace(record(scene="box"), per_view={capture.views[i].name: {"psnr": 30.0} for i in capture.test})
+    expect_of_captures([own], [spec])
+    expect_of_captures([record(scene="box", seed=1)], [spec])  # counts as no run that is asked for
+    with pytest.raises(InputError, match=r"found scores of 0\.png, 1\.png, 2\.png and 1 more, so of another capture of that name; rename"):
+        expect_of_captures([record(scene="box")], [spec])
+    expect_of_captures([record(scene="box")], [replace(spec, scene=replace(spec.scene, path=tmp_path / "gone"))])
 
 
 def test_changed_figures_are_refused(tmp_path):

@@ -83,6 +83,7 @@ def reproduce(args: list[str]) -> int:
         say("nothing to run: these scenes are in none of these experiments")
     for run in command.adopt:
         say(f"adopted {report.adopt(run, plan.records)}")
+    store.expect_of_captures(store.load(plan.records), plan.wanted)
     if command.dry_run:
         tell(plan, say)
         return 0

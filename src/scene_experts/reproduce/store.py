@@ -19,7 +19,7 @@ from scene_experts.errors import InputError
 from scene_experts.evaluate.tables import load_results
 from scene_experts.io import read_json, write_json
 from scene_experts.reproduce.plan import Spec, identity
-from scene_experts.run_folder import read_config
+from scene_experts.run_folder import load_capture, read_config
 
 FORMAT = 1
 POINTS = 60  # samples of a curve over training
@@ -152,6 +152,30 @@ def find(records: Sequence[Record], spec: Spec) -> Record | None:
     key, numbers = spec.key, spec.numbers
     found = next((r for r in records if r.key == key), None) or next((r for r in records if r.numbers == numbers), None)
     return found and replace(found, config=replace(found.config, train=spec.train))
+
+
+def expect_of_captures(records: Sequence[Record], specs: Sequence[Spec]) -> None:
+    """Raises InputError where a record that counts as one of `specs` scored other views than its capture holds out: another of that name.
+
+    One run of each scene is looked at. A capture that cannot be read is for its training to complain about.
+    """
+    for spec, record in {spec.scene.name: (spec, record) for spec in specs if (record := find(records, spec))}.values():
+        try:
+            capture = load_capture(spec.data)
+        except InputError:
+            continue
+        capture.images.close()
+        there, scored = sorted(capture.views[i].name for i in capture.test), sorted(record.per_view)
+        if there != scored:
+            raise InputError(
+                f"expected records of '{spec.scene.name}' with the views that {spec.scene.path} holds out ({few(there)}), "
+                f"found scores of {few(scored)}, so of another capture of that name; rename the folder, or give it --records of its own"
+            )
+
+
+def few(names: Sequence[str]) -> str:
+    """The first of many names."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def of_specs(records: Sequence[Record], specs: Sequence[Spec]) -> list[Record]:
