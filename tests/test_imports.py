@@ -17,7 +17,7 @@ LAYERS = [
     {"config"},
     {"recipes", "events", "memory", "state", "train"},
     {"run_folder", "progress", "record"},
-    {"evaluate", "export", "report", "reproduce", "view", "doctor", "bench"},
+    {"evaluate", "export", "report", "reproduce", "view", "doctor", "bench", "sfm"},
     {"cli", "commands", "__main__"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

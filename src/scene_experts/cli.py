@@ -11,6 +11,7 @@ from scene_experts.errors import InputError, RunError, nearest
 
 PROG = "scene-experts"
 COMMANDS = {
+    "capture": "poses and points of photographs or of a video: a capture to train on",
     "info": "what a capture holds: views, sizes, cameras, points, split, warnings",
     "train": "train a scene on a capture",
     "eval": "render and score the held-out views of a run",

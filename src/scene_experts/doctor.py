@@ -161,7 +161,7 @@ def viewer() -> Check:
 
 
 def sfm() -> Check:
-    return _package("pycolmap", "sfm", "turning photographs into captures by hand: no command does it yet")
+    return _package("pycolmap", "sfm", "poses of photographs: capture")
 
 
 def tensorboard() -> Check:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 
 HANDLERS: dict[str, tuple[str, str]] = {
+    "capture": ("capture", "capture"),
     "info": ("inspect", "info"),
     "train": ("train", "train"),
     "eval": ("evaluate", "evaluate"),

@@ -1,0 +1,86 @@
+"""`scene-experts capture`: photographs or a video to a capture that `train` takes."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+
+from scene_experts.cli import PROG
+from scene_experts.commands.shared import positional
+from scene_experts.errors import InputError, expect_at_least
+from scene_experts.progress import Bar, clock
+from scene_experts.sfm import run
+from scene_experts.sfm.pairs import Matching
+
+FEW = 0.9  # a smaller share of photographs with a pose is worth a word of advice
+
+
+@dataclass(frozen=True)
+class CaptureCommand:
+    """Find poses and points of photographs, or of a video's sharpest frames (COLMAP, in a process of its own): what `train` needs.
+
+    The same command goes on where it was stopped.
+    """
+
+    photos: Path
+    """Folder of photographs (JPEG, PNG, ...; subfolders too), or a video. May be given first, without a name."""
+    out: Path
+    """Folder of the capture: OUT/images, OUT/sparse/0, OUT/capture.json."""
+    frames: int = run.Options.frames
+    """Of a video: how many frames to take, the sharpest of as many stretches."""
+    matching: Matching = run.Options.matching
+    """Which photographs are compared: all with all, or neighbours in order of names (a video, a walk). auto: all up to 300."""
+    camera_model: run.CameraModel = run.Options.camera_model
+    """COLMAP's model of the lens. Photographs of one size, camera and focal length share one."""
+    mapper: run.Mapper = run.Options.mapper
+    """COLMAP's incremental mapper or GLOMAP's; auto: the first, and where it leaves a tenth without pose, the better of both."""
+    max_side: int = run.Options.max_side
+    """Longest side, px, at which features are sought; the photographs stay as they are."""
+    threads: int = run.Options.threads
+    """0: all cores this process may use."""
+    seed: int = run.Options.seed
+    overwrite: bool = False
+    """Replace poses that are there."""
+
+
+def capture(args: list[str]) -> int:
+    command = tyro.cli(CaptureCommand, prog=f"{PROG} capture", args=positional(args, "--photos"))
+    least = {"frames": 3, "max_side": 64, "threads": 0, "seed": 0}
+    expect_at_least([(f"--{name.replace('_', '-')}", getattr(command, name), low) for name, low in least.items()])
+    if command.out.resolve() == command.photos.resolve():
+        raise InputError(f"expected --out beside the photographs, found {command.out} for both; choose another --out")
+    console = Console(highlight=False)
+    say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
+    options = run.Options(**{name: getattr(command, name) for name in vars(run.Options())})
+    with Bar(console) as bar:
+        note = run.make(command.photos, command.out, options, overwrite=command.overwrite, say=say, progress=bar)
+    for line in told(note):
+        say(line)
+    say(f"next: {PROG} train moe-gs --data {shlex.quote(str(command.out))} --out RUN")
+    return 0
+
+
+def told(note: dict[str, Any]) -> list[str]:
+    """What was found, and what to do where it is little."""
+    have, all_, without = note["with_pose"], note["photographs"], note["without_pose"]
+    lines = [
+        f"{have} of {all_} photographs have a pose: {note['points']:,} points, {note['observations']:.0f} seen in a photograph, "
+        f"{note['error']:.2f} px off on average; {note['mapper']} mapper, {clock(note['seconds'])} min"
+    ]
+    if without:
+        lines.append(f"without a pose: {', '.join(without[:8])}" + (f" and {len(without) - 8} more" if len(without) > 8 else ""))
+    if len(note["models"]) > 1:
+        parts = ", ".join(map(str, note["models"]))
+        lines.append(
+            f"warning: the photographs fall into parts that share nothing ({parts} photographs); the largest is kept: take some in between"
+        )
+    if have < FEW * all_:
+        lines.append(
+            "warning: each thing should be in three photographs or more, from different places and sharp; --matching exhaustive may help"
+        )
+    return lines
