@@ -2,10 +2,11 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from records import record
-from scene_experts.reproduce.statistics import difference, mean, shared
+from scene_experts.reproduce.statistics import SEED_SD, SEED_WEIGHT, difference, interval, mean, shared, student, whole_seeds
 
 
 def test_mean_over_scenes_spread_over_seeds():
@@ -20,16 +21,36 @@ def test_mean_over_scenes_spread_over_seeds():
 def test_a_seed_that_lacks_a_scene_does_not_move_the_mean():
     runs = [record(scene=s, seed=k, psnr=p, views=1) for s, k, p in (("a", 0, 30), ("b", 0, 20), ("a", 1, 99))]
     found = mean(runs, "psnr")
-    assert found is not None and found.value == 25
+    assert found is not None and found.value == 25 and whole_seeds(runs) == {0}
 
 
-def test_equal_gains_on_every_view_leave_no_doubt():
+def test_equal_gains_on_every_view_leave_the_doubt_of_other_seeds():
     a = [record("moe-gs", scene=s, seed=k, psnr=30.5) for s in "xy" for k in (0, 1)]
     b = [record("scaffold-gs", scene=s, seed=k, psnr=30.0) for s in "xy" for k in (0, 1)]
     d = difference(a, b)
-    assert d is not None and d.mean == pytest.approx(0.5) and d.low == pytest.approx(0.5) and d.high == pytest.approx(0.5)
-    assert (d.captures, d.seeds, d.views) == (2, 2, 8)
+    pooled = math.sqrt(SEED_WEIGHT * SEED_SD**2 / (SEED_WEIGHT + 2))  # seeds that agree lower it
+    assert d is not None and d.mean == pytest.approx(0.5)
+    assert d.high - 0.5 == pytest.approx(0.5 - d.low) == pytest.approx(student(SEED_WEIGHT + 2) * pooled / 2)
+    assert (d.captures, d.seeds, d.views) == (2, (2, 2), 8)
     assert (d.verdict(1), d.verdict(-1)) == ("confirmed", "contradicted")
+
+
+@pytest.mark.parametrize(("freedom", "value"), [(2, 4.303), (4, 2.776), (10, 2.228), (30, 2.042), (1e9, 1.960)])
+def test_quantiles_of_student(freedom, value):
+    assert student(freedom) == pytest.approx(value, rel=0.01)
+
+
+@pytest.mark.parametrize(("captures", "seeds", "views"), [(1, 1, 7), (7, 1, 9), (1, 2, 32), (7, 3, 9), (3, 3, 3)])
+def test_intervals_hold_the_truth_as_often_as_they_say(captures, seeds, views):
+    random, held = np.random.default_rng(0), 0
+    for _ in range(600):
+        truth = random.normal(0, 0.3, captures)
+        seed = random.normal(0, SEED_SD, (captures, seeds, 1))
+        view = random.normal(0, 0.4, (captures, 1, views))
+        rest = random.normal(0, 0.3, (captures, seeds, views))
+        centre, half = interval(list(truth[:, None, None] + seed + view + rest))
+        held += abs(centre - truth.mean()) <= half
+    assert held / 600 >= 0.93
 
 
 def test_gains_here_and_losses_there_are_undecided():
@@ -40,13 +61,9 @@ def test_gains_here_and_losses_there_are_undecided():
     assert d is not None and abs(d.mean) < 1e-9 and d.low < 0 < d.high and d.verdict(1) == "undecided"
 
 
-def test_the_interval_is_that_of_the_mean_of_the_views():
-    a, b = ([record(recipe, views=400, seed=k) for k in (0, 1)] for recipe in ("moe-gs", "scaffold-gs"))
-    for each in a:
-        for i, view in enumerate(each.per_view):
-            each.per_view[view]["psnr"] += 1.0 if i % 2 else -1.0
-    d = difference(a, b)
-    assert d is not None and d.high - d.low == pytest.approx(2 * 1.96 / math.sqrt(400), rel=0.1)
+def test_one_view_alone_is_as_uncertain_as_views_are():
+    d = difference([record("moe-gs", views=1, psnr=30.5)], [record("scaffold-gs", views=1)])
+    assert d is not None and d.low < 0 < d.high < math.inf
 
 
 def test_only_what_both_have_is_paired():
@@ -54,10 +71,11 @@ def test_only_what_both_have_is_paired():
 
 
 def test_one_seed_leaves_room_for_what_another_would_change():
-    a, b = ([record(recipe, scene=s, psnr=p) for s in "wxyz"] for recipe, p in (("moe-gs", 30.2), ("scaffold-gs", 30.0)))
-    one, four = difference(a[:1], b[:1]), difference(a, b)
-    assert one is not None and one.low == pytest.approx(0.2 - 0.3) and one.verdict(1) == "undecided"
-    assert four is not None and four.low == pytest.approx(0.2 - 0.3 / 2) and four.verdict(1) == "confirmed"
+    a, b = ([record(recipe, scene=s, psnr=p) for s in "vwxyz"] for recipe, p in (("moe-gs", 30.3), ("scaffold-gs", 30.0)))
+    one, five = difference(a[:1], b[:1]), difference(a, b)
+    width = student(SEED_WEIGHT) * SEED_SD
+    assert one is not None and one.low == pytest.approx(0.3 - width) and one.verdict(1) == "undecided"
+    assert five is not None and five.low == pytest.approx(0.3 - width / math.sqrt(5)) and five.verdict(1) == "confirmed"
 
 
 def test_fit_is_paired_over_iterations_of_the_second_half():

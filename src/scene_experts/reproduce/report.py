@@ -17,7 +17,7 @@ from scene_experts.render import choose
 from scene_experts.reproduce import claims, figures, store, tables
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN, Scene, Spec
-from scene_experts.reproduce.statistics import SEED_NOISE, shared
+from scene_experts.reproduce.statistics import SEED_SD, SEED_WEIGHT, shared
 from scene_experts.reproduce.store import Record
 
 SHORT = 2000  # iterations; fewer hardly leave the dense warm-up
@@ -39,8 +39,10 @@ def write(
         page += [f"## {experiment.title}", "", ", ".join(f"[{p.name}]({p.name})" for p in made) or "No run is done yet.", ""]
         page += [f"![{p.stem}]({p.name})\n" for p in made if p.suffix == ".png"]
     page += ["## The paper's claims", "", *short_runs(records), claims.to_markdown(claims.check(records))]
-    page += ["Differences are paired over views and seeds; the interval is a bootstrap over both within these captures."]
-    page += [f"With one seed it is at least {SEED_NOISE} dB / sqrt(captures) to each side: what another seed changes."]
+    page += ["Differences are paired over views and seeds; the interval is of other views and other seeds on these captures (Student's t)."]
+    page += [
+        f"What another seed changes: pooled over captures with {SEED_SD} dB for each, which counts as {SEED_WEIGHT} degrees of freedom."
+    ]
     page += ["On training views: the same difference as the trainings showed it, over their second half, paired by iteration.", ""]
     path = out / "README.md"
     write_bytes(path, "\n".join(page).encode())

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scene_experts.reproduce.store import Record
 
-DRAWS = 4000
-SEED_NOISE = 0.3  # dB that another seed may change the difference of two runs on one capture by (docs/results.md: standard deviations)
+SEED_SD = 0.2  # dB: standard deviation over seeds of the difference of two runs on one capture (measured: docs/results.md)
+SEED_WEIGHT = 4  # degrees of freedom that SEED_SD counts for beside those of the seeds at hand
+VIEW_SD = 0.4  # dB: the same over the views of a capture, where there is one view alone
 Verdict = Literal["confirmed", "contradicted", "undecided"]
 
 
@@ -35,6 +37,12 @@ class Mean:
     spread: float | None
 
 
+def whole_seeds(records: Sequence[Record]) -> set[int]:
+    """The seeds of a recipe's records that have all of its scenes."""
+    scenes, seeds = {r.scene for r in records}, {r.seed for r in records}
+    return {seed for seed in seeds if {r.scene for r in records if r.seed == seed} == scenes}
+
+
 def mean(records: Sequence[Record], column: str) -> Mean | None:
     """Mean over scenes of a column, per seed, then over the seeds that have every scene. None where nothing has it."""
     found = {(r.seed, r.scene): value for r in records if (value := r.value(column)) is not None}
@@ -53,18 +61,19 @@ def mean(records: Sequence[Record], column: str) -> Mean | None:
 
 @dataclass(frozen=True)
 class Difference:
-    """A - B: the mean over captures with its 95 % interval, from differences paired over views and seeds."""
+    """A - B in PSNR (dB): the mean over captures with its 95 % interval, from differences paired over views and seeds."""
 
     mean: float
     low: float
     high: float
     captures: int
-    seeds: int
+    seeds: tuple[int, int]
+    """Fewest and most seeds of a capture."""
     views: int
     gains: int
     """Captures on which A is above B."""
     fit: float | None = None
-    """A - B in PSNR (dB) on training views over the second half of the trainings: whether A fits better, generalised or not."""
+    """A - B on training views over the second half of the trainings: whether A fits better, generalised or not."""
 
     def verdict(self, sign: int) -> Verdict:
         """Whether A - B has the claimed sign (+1 or -1), its opposite, or may be either.
@@ -76,40 +85,61 @@ class Difference:
         return "undecided" if found == 0 else "confirmed" if found == sign else "contradicted"
 
 
-def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -> Difference | None:
-    """Differences of a per-view metric between two recipes, on the captures, seeds and views that both have.
-
-    The interval is a bootstrap within captures: views and seeds are drawn anew, captures stay, so it speaks of these captures alone.
-    One seed cannot tell what another would change: the interval is then at least SEED_NOISE / sqrt(captures) to each side.
-    None where nothing pairs.
-    """
+def difference(a: Sequence[Record], b: Sequence[Record]) -> Difference | None:
+    """The difference in PSNR of two recipes, on the captures, seeds and views that both have. None where nothing pairs."""
     theirs = {(r.scene, r.seed): r for r in b}
     blocks: dict[str, dict[int, dict[str, float]]] = {}
     for record in a:
         other = theirs.get((record.scene, record.seed))
         if other is None:
             continue
-        views = [v for v in record.per_view if metric in record.per_view[v] and metric in other.per_view.get(v, {})]
+        views = [v for v in record.per_view if "psnr" in record.per_view[v] and "psnr" in other.per_view.get(v, {})]
         if views:
-            paired = {v: record.per_view[v][metric] - other.per_view[v][metric] for v in views}
+            paired = {v: record.per_view[v]["psnr"] - other.per_view[v]["psnr"] for v in views}
             blocks.setdefault(record.scene, {})[record.seed] = paired
     if not blocks:
         return None
-    random = np.random.default_rng(0)
-    drawn, centres = np.zeros(DRAWS), []
+    grids = []
     for seeds in blocks.values():
         common = sorted(set.intersection(*(set(views) for views in seeds.values())))
-        grid = np.array([[views[v] for v in common] for views in seeds.values()])  # [S, V]
-        centres.append(grid.mean())
-        s = random.integers(0, grid.shape[0], (DRAWS, grid.shape[0]))
-        v = random.integers(0, grid.shape[1], (DRAWS, grid.shape[1]))
-        drawn += grid[s[:, :, None], v[:, None, :]].mean((1, 2)) / len(blocks)
-    low, high = np.quantile(drawn, [0.025, 0.975])
-    centre = float(np.mean(centres))
-    least = SEED_NOISE * sum(len(seeds) == 1 for seeds in blocks.values()) ** 0.5 / len(blocks)
-    low, high = min(float(low), centre - least), max(float(high), centre + least)
-    views = sum(len(next(iter(seeds.values()))) for seeds in blocks.values())
-    return Difference(centre, low, high, len(blocks), max(map(len, blocks.values())), views, sum(c > 0 for c in centres), fit(a, b))
+        grids.append(np.array([[views[v] for v in common] for views in seeds.values()]))
+    centre, half = interval(grids)
+    counts = [len(grid) for grid in grids]
+    views, gains = sum(grid.shape[1] for grid in grids), sum(bool(grid.mean() > 0) for grid in grids)
+    return Difference(centre, centre - half, centre + half, len(grids), (min(counts), max(counts)), views, gains, fit(a, b))
+
+
+def interval(grids: Sequence[NDArray[np.float64]]) -> tuple[float, float]:
+    """The mean over captures of differences [seeds, views] (dB), and half the width of its 95 % interval.
+
+    The interval is of other views and other seeds on these captures: captures stay. Two variances add: that of a capture's mean over views,
+    from its views (means over seeds); and that over seeds, one for all captures, from those that have several seeds and from SEED_SD, which
+    counts as SEED_WEIGHT more of them. Student's t, with the degrees of freedom of the sum by Satterthwaite (1946).
+    """
+    terms: list[tuple[float, int]] = []  # variance of the mean, degrees of freedom
+    squares, freedom = SEED_WEIGHT * SEED_SD**2, SEED_WEIGHT
+    for grid in grids:
+        views = grid.mean(0)
+        variance = float(views.var(ddof=1)) if len(views) > 1 else VIEW_SD**2
+        terms.append((variance / len(views) / len(grids) ** 2, max(1, len(views) - 1)))
+        squares += float(np.square(grid.mean(1) - grid.mean()).sum())
+        freedom += len(grid) - 1
+    terms.append((squares / freedom * sum(1 / len(grid) for grid in grids) / len(grids) ** 2, freedom))
+    total = sum(variance for variance, _ in terms)
+    together = total**2 / sum(variance**2 / degrees for variance, degrees in terms)
+    return float(np.mean([grid.mean() for grid in grids])), student(together) * total**0.5
+
+
+def student(freedom: float) -> float:
+    """The 97.5 % quantile of Student's t, by its expansion about the normal one (Abramowitz and Stegun 26.7.5); 1 % off at 2 degrees."""
+    z = 1.959964
+    terms = (
+        (z**3 + z) / 4,
+        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
+        (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
+    )
+    return z + sum(term / freedom ** (k + 1) for k, term in enumerate(terms))
 
 
 def fit(a: Sequence[Record], b: Sequence[Record]) -> float | None:

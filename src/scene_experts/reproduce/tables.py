@@ -9,7 +9,7 @@ from scene_experts.config import Train
 from scene_experts.evaluate.tables import Table, paper, to_csv, to_markdown
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN
-from scene_experts.reproduce.statistics import Mean, mean
+from scene_experts.reproduce.statistics import Mean, mean, whole_seeds
 from scene_experts.reproduce.store import Record
 
 
@@ -116,7 +116,9 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
     seeds = sorted({r.seed for r in records})
     between = {n: " to ".join(str(m) for m in sorted({min(many), max(many)})) for n, many in lengths.items()}
     made = ", ".join(f"{n:,} iterations ({many} adjustments of density)" for n, many in sorted(between.items()))
-    out = [f"{made}; resolution {', '.join(sizes)}; seeds {', '.join(map(str, seeds))}"]
+    whole = sorted(set.intersection(*(whole_seeds(rows) for rows in found.values() if rows)))
+    counted = f" (means are of {', '.join(map(str, whole))}, the others lack scenes)" if whole and whole != seeds else ""
+    out = [f"{made}; resolution {', '.join(sizes)}; seeds {', '.join(map(str, seeds))}{counted}"]
     every, none = drawn(records), [name for name, rows in found.items() if not rows]
     for name, rows in found.items():
         scenes = {r.scene for r in rows}
