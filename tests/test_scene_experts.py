@@ -65,10 +65,16 @@ def test_gathered_form_equals_masked_form_in_value_and_gradient(k):
         torch.testing.assert_close(fast, masked, rtol=1e-9, atol=1e-10)
 
 
-def test_all_experts_chosen_equals_dense():
-    h = head(top_k=5)
-    x, f = data()
-    torch.testing.assert_close(h(x, f, SPARSE)[0], h(x, f, 1)[0])
+def test_all_experts_chosen_equals_dense_in_value_and_gradient():
+    h, found = head(top_k=5), []
+    for step in (SPARSE, 1):
+        h.zero_grad()
+        x, f = (part.clone().requires_grad_() for part in data())
+        y, _ = h(x, f, step)
+        y.square().sum().backward()
+        found.append([y.detach(), x.grad, f.grad, *(p.grad for p in h.parameters())])
+    for sparse, dense in zip(*found):
+        torch.testing.assert_close(sparse, dense, rtol=1e-9, atol=1e-10)
 
 
 def test_dense_for_good():
