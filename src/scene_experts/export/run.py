@@ -44,7 +44,7 @@ _LATTICE_TOLERANCE = 1e-3  # voxels
 
 
 def write_layout(run: OpenRun, capture: Capture, out: Path | None = None) -> Path:
-    """Write point_cloud/iteration_<step>/, cameras.json and (not for SAGS) cfg_args below `out`, the run folder; returns the iteration's."""
+    """Write point_cloud/iteration_<step>/, cameras.json and (not for SAGS) cfg_args below `out`, the run folder; the iteration's folder."""
     out = out or run.path
     own = {GaussianScene: explicit.write_folder, GraphScene: graph_points.write_folder}
     folder = own.get(type(run.scene), _write_anchors)(run, capture.world, out)
