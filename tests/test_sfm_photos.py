@@ -49,15 +49,34 @@ def test_a_camera_is_one_size_maker_and_focal_length(tmp_path):
     assert by_camera(find(tmp_path)) == [["1.jpg", "3.jpg"], ["2.jpg"], ["4.jpg"], ["5.jpg"]]
 
 
+def test_photographs_that_are_shown_turned_are_written_upright(tmp_path):
+    source, target = tmp_path / "photos", tmp_path / "images"
+    source.mkdir()
+    picture = Image.new("RGB", (40, 30))
+    picture.paste((255, 0, 0), (0, 0, 40, 10))  # red at the top, which belongs to the right once it is turned
+    for i, orientation in enumerate((6, 1, 6)):
+        exif = Image.Exif()
+        exif[0x0112], exif[0x0110] = orientation, "A"
+        picture.save(source / f"{i}.jpg", exif=exif, quality=95)
+    for _ in range(2):
+        found = copy(find(source), source, target)
+    assert [p.size for p in found] == [(30, 40), (40, 30), (30, 40)] and by_camera(found) == [["0.jpg", "2.jpg"], ["1.jpg"]]
+    assert find(target) == found
+    with Image.open(target / "0.jpg") as turned:
+        assert turned.getpixel((28, 20))[0] > 200 and turned.getpixel((2, 20))[0] < 60
+    assert (target / "1.jpg").read_bytes() == (source / "1.jpg").read_bytes()
+    assert [p.orientation for p in copy(find(source), source, source)] == [6, 1, 6]
+
+
 def test_copies_have_no_blanks_in_their_names_and_are_made_once(tmp_path):
     source, target = tmp_path / "my photos", tmp_path / "out" / "images"
     for i in range(3):
         photo(source / "a b" / f"IMG ({i}).jpg")
     found = find(source)
     copy(found, source, target)
-    copy(found, source, target)
+    there = copy(found, source, target)
     assert sorted(p.name for p in target.rglob("*.jpg")) == ["IMG_(0).jpg", "IMG_(1).jpg", "IMG_(2).jpg"]
-    assert by_camera(found) == [["a_b/IMG_(0).jpg", "a_b/IMG_(1).jpg", "a_b/IMG_(2).jpg"]]
+    assert by_camera(there) == [["a_b/IMG_(0).jpg", "a_b/IMG_(1).jpg", "a_b/IMG_(2).jpg"]]
     with pytest.raises(InputError, match="expected names without blanks"):
         copy(found, source, source)
     (target / "a_b" / "IMG_(1).jpg").write_bytes(b"another")

@@ -78,6 +78,27 @@ def test_photographs_that_fit_nowhere_leave_the_reason_and_no_poses(tmp_path, mo
     assert not (tmp_path / "out" / MODEL).exists()
 
 
+def test_frames_of_a_video_are_taken_once_and_of_another_one_not_at_all(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "reconstructed", answer())
+    taken = []
+
+    def take(video, folder, count, progress):
+        taken.append(count)
+        black(folder)
+
+    monkeypatch.setattr(run.frames, "take", take)
+    video = tmp_path / "walk.mp4"
+    video.write_bytes(b"frames")
+    for options, message in [
+        (Options(), "fit together"),
+        (Options(), "fit together"),
+        (Options(frames=9), "found some; choose another --out"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            run.make(video, tmp_path / "out", options, say=lambda _: None)
+    assert taken == [Options().frames]
+
+
 def test_the_same_request_finds_its_database_again_and_another_does_not(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "reconstructed", answer())
     source, kept = black(tmp_path / "photos"), tmp_path / "out" / WORK / "database.db"

@@ -22,6 +22,7 @@ from scene_experts.sfm.pairs import Matching, pairs
 from scene_experts.sfm.photos import Photo
 
 WORK, MODEL, LOG, NOTE = "sfm", "sparse/0", "colmap.log", "capture.json"
+FRAMES = ".frames"  # beside the frames of a video: of which, and how many were asked for
 INSTALL = "pip install 'scene-experts[sfm]'"
 
 CameraModel = Literal[
@@ -60,7 +61,7 @@ def make(
     found = gathered(source, out, options, progress)
     groups = photos.by_camera(found)
     say(f"{len(found)} photographs, {len(groups)} camera{'s' if len(groups) > 1 else ''}")
-    names = [photo.stored for photo in found]
+    names = [photo.name for photo in found]
     request = {
         "database": str(work / "database.db"),
         "images": str(out / "images"),
@@ -90,15 +91,20 @@ def make(
 
 def gathered(source: Path, out: Path, options: Options, progress: Told) -> list[Photo]:
     """The photographs, in `out`/images."""
-    images = out / "images"
+    images, note = out / "images", out / "images" / FRAMES
     if not frames.is_video(source):
         found = photos.find(source)
-        photos.copy(found, source, images)
-        return found
-    if not list(images.glob("frame_*.jpg")):
+        return photos.copy(found, source, images)
+    mark = f"{source.name} {source.stat().st_size} {options.frames}"
+    if not note.is_file() or note.read_text() != mark:
+        if images.exists():
+            raise InputError(
+                f"expected no pictures at {images} but the {options.frames} frames of {source.name}, found some; choose another --out"
+            )
         part = out / "images.part"
         shutil.rmtree(part, ignore_errors=True)
         frames.take(source, part, options.frames, progress)
+        (part / FRAMES).write_text(mark)
         part.rename(images)
     return photos.find(images)
 
@@ -153,7 +159,7 @@ def noted(result: dict[str, Any], found: list[Photo], options: Options, seconds:
         "format": 1,
         "photographs": len(found),
         "with_pose": len(registered),
-        "without_pose": [photo.stored for photo in found if photo.stored not in registered],
+        "without_pose": [photo.name for photo in found if photo.name not in registered],
         **facts,
         "options": asdict(options),
         "seconds": round(seconds, 1),
