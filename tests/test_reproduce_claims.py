@@ -30,6 +30,18 @@ def test_more_psnr_at_equal_size():
     assert get(runs, "more PSNR than Scaffold-GS").verdict == "contradicted" and get(runs, "at most as large").verdict == "contradicted"
 
 
+def test_other_scores_are_judged_by_their_own_sign_and_noise():
+    ours = [record("moe-gs", scene=s) for s in "vwxyz"]
+    theirs = [record("scaffold-gs", scene=s) for s in "vwxyz"]
+    for records, lpips, ssim in ((ours, 0.19, 0.902), (theirs, 0.2, 0.901)):
+        for each in records:
+            for scores in each.per_view.values():
+                scores.update(lpips_3dgs=lpips, ssim=ssim)
+    found = get([*ours, *theirs], "less LPIPS")
+    assert found.verdict == "confirmed" and found.measured.startswith("-0.0100 (95 % interval -0.01") and "dB" not in found.measured
+    assert get([*ours, *theirs], "more SSIM").verdict == "undecided"
+
+
 def test_activation_is_judged_by_its_levels():
     pair = lambda low, high: [record("scaffold-gs", active=low), record("scaffold-gs-opacity", active=high)]  # noqa: E731
     assert get(pair(0.37, 0.65), "share of active").verdict == "confirmed"

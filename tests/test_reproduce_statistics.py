@@ -28,7 +28,7 @@ def test_equal_gains_on_every_view_leave_the_doubt_of_other_seeds():
     a = [record("moe-gs", scene=s, seed=k, psnr=30.5) for s in "xy" for k in (0, 1)]
     b = [record("scaffold-gs", scene=s, seed=k, psnr=30.0) for s in "xy" for k in (0, 1)]
     d = difference(a, b)
-    pooled = math.sqrt(SEED_WEIGHT * SEED_SD**2 / (SEED_WEIGHT + 2))  # seeds that agree lower it
+    pooled = math.sqrt(SEED_WEIGHT * SEED_SD["psnr"] ** 2 / (SEED_WEIGHT + 2))  # seeds that agree lower it
     assert d is not None and d.mean == pytest.approx(0.5)
     assert d.high - 0.5 == pytest.approx(0.5 - d.low) == pytest.approx(student(SEED_WEIGHT + 2) * pooled / 2)
     assert (d.captures, d.seeds, d.views) == (2, (2, 2), 8)
@@ -45,10 +45,10 @@ def test_intervals_hold_the_truth_as_often_as_they_say(captures, seeds, views):
     random, held = np.random.default_rng(0), 0
     for _ in range(600):
         truth = random.normal(0, 0.3, captures)
-        seed = random.normal(0, SEED_SD, (captures, seeds, 1))
+        seed = random.normal(0, SEED_SD["psnr"], (captures, seeds, 1))
         view = random.normal(0, 0.4, (captures, 1, views))
         rest = random.normal(0, 0.3, (captures, seeds, views))
-        centre, half = interval(list(truth[:, None, None] + seed + view + rest))
+        centre, half = interval(list(truth[:, None, None] + seed + view + rest), SEED_SD["psnr"], 0.4)
         held += abs(centre - truth.mean()) <= half
     assert held / 600 >= 0.93
 
@@ -73,7 +73,7 @@ def test_only_what_both_have_is_paired():
 def test_one_seed_leaves_room_for_what_another_would_change():
     a, b = ([record(recipe, scene=s, psnr=p) for s in "vwxyz"] for recipe, p in (("moe-gs", 30.3), ("scaffold-gs", 30.0)))
     one, five = difference(a[:1], b[:1]), difference(a, b)
-    width = student(SEED_WEIGHT) * SEED_SD
+    width = student(SEED_WEIGHT) * SEED_SD["psnr"]
     assert one is not None and one.low == pytest.approx(0.3 - width) and one.verdict(1) == "undecided"
     assert five is not None and five.low == pytest.approx(0.3 - width / math.sqrt(5)) and five.verdict(1) == "confirmed"
 

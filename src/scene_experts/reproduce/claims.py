@@ -32,11 +32,14 @@ def check(records: Sequence[Record]) -> list[Finding]:
             get("moe-gs-dist"),
             get("scaffold-gs"),
         ),
+        better("MoE-GS has more SSIM than Scaffold-GS", get("moe-gs"), get("scaffold-gs"), "ssim"),
+        better("MoE-GS has less LPIPS (3DGS's variant) than Scaffold-GS", get("moe-gs"), get("scaffold-gs"), "lpips_3dgs"),
         size("MoE-GS is at most as large as Scaffold-GS", get("moe-gs"), get("scaffold-gs")),
         better("MoE-GS has more PSNR than 3DGS", get("moe-gs"), get("3dgs")),
         better("MoE-GS has more PSNR than Octree-GS", get("moe-gs"), get("octree-gs")),
         better("MoE-GS has more PSNR than SAGS", get("moe-gs"), get("sags")),
         better("experts help: MoE-GS over 'w/o MoE'", get("moe-gs"), get("scaffold-gs-opacity")),
+        better("experts lower LPIPS (3DGS's variant): MoE-GS over 'w/o MoE'", get("moe-gs"), get("scaffold-gs-opacity"), "lpips_3dgs"),
         better("the curriculum helps: MoE-GS over 'w/o CL'", get("moe-gs"), get("moe-gs-no-cl")),
         better("L_load helps: MoE-GS over 'w/o L_load'", get("moe-gs"), get("moe-gs-no-load")),
         better("L_opacity helps: MoE-GS over 'w/o L_opacity'", get("moe-gs"), get("moe-gs-no-opacity")),
@@ -49,17 +52,15 @@ def check(records: Sequence[Record]) -> list[Finding]:
         top1(by),
         dense(by),
         depth(by),
-        better("the position in the router does not help", get("moe-gs-posrouter"), get("moe-gs"), no_gain=True),
+        parts("the position in the router does not help", by, {"": ("moe-gs-posrouter", "moe-gs")}, useless),
     ]
     return out
 
 
-def better(claim: str, a: list[Record], b: list[Record], no_gain: bool = False) -> Finding:
-    """A has more PSNR than B, paired; with `no_gain`, that A is not better than B."""
-    d = difference(a, b)
-    if d is None:
-        return Finding(claim, None, "no runs")
-    return Finding(claim, useless(d) if no_gain else d.verdict(1), describe(d))
+def better(claim: str, a: list[Record], b: list[Record], metric: str = "psnr") -> Finding:
+    """A scores better than B, paired."""
+    d = difference(a, b, metric)
+    return Finding(claim, None, "no runs") if d is None else Finding(claim, d.verdict(-1 if metric.startswith("lpips") else 1), describe(d))
 
 
 def useless(d: Difference) -> Verdict:
@@ -73,11 +74,12 @@ def close(d: Difference) -> Verdict:
 
 
 def describe(d: Difference) -> str:
-    fitted = "" if d.fit is None else f"; on training views {d.fit:+.2f} dB"
+    number = "+.2f" if d.metric == "psnr" else "+.4f"
+    fitted = "" if d.fit is None or d.metric != "psnr" else f"; on training views {d.fit:+.2f} dB"
     where = "" if d.captures == 1 else f", higher on {d.gains}"
     seeds = many(d.seeds[1], "seed") if d.seeds[0] == d.seeds[1] else f"{d.seeds[0]} to {d.seeds[1]} seeds"
     return (
-        f"{d.mean:+.2f} dB (95 % interval {d.low:+.2f} to {d.high:+.2f}; "
+        f"{d.mean:{number}}{' dB' if d.metric == 'psnr' else ''} (95 % interval {d.low:{number}} to {d.high:{number}}; "
         f"{many(d.captures, 'capture')}{where}, {many(d.views, 'view')}, {seeds}{fitted})"
     )
 
@@ -164,7 +166,7 @@ def parts(claim: str, by: dict[str, list[Record]], pairs: dict[str, tuple[str, s
     verdicts = {name: judge(d) for name, d in found.items()}
     every = set(verdicts.values())
     one: Verdict = "contradicted" if "contradicted" in every else "confirmed" if every == {"confirmed"} else "undecided"
-    return Finding(claim, one, "; ".join(f"{name}: {verdicts[name]}, {describe(d)}" for name, d in found.items()))
+    return Finding(claim, one, "; ".join(f"{name}: {verdicts[name]}, {describe(d)}" if name else describe(d) for name, d in found.items()))
 
 
 def to_markdown(findings: Sequence[Finding]) -> str:

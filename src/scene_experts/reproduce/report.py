@@ -41,7 +41,7 @@ def write(
     page += ["## The paper's claims", "", *short_runs(records), claims.to_markdown(claims.check(records))]
     page += ["Differences are paired over views and seeds; the interval is of other views and other seeds on these captures (Student's t)."]
     page += [
-        f"What another seed changes: pooled over captures with {SEED_SD} dB for each, which counts as {SEED_WEIGHT} degrees of freedom."
+        f"What another seed changes: pooled over captures with {SEED_SD['psnr']} dB for each, which counts as {SEED_WEIGHT} degrees of freedom."
     ]
     page += ["On training views: the same difference as the trainings showed it, over their second half, paired by iteration.", ""]
     path = out / "README.md"

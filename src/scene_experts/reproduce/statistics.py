@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from scene_experts.reproduce.store import Record
 
-SEED_SD = 0.2  # dB: standard deviation over seeds of the difference of two runs on one capture (measured: docs/results.md)
+SEED_SD = {"psnr": 0.2, "ssim": 0.002, "lpips_3dgs": 0.004}
+"""Standard deviation over seeds of the difference of two runs on one capture (measured: docs/results.md); PSNR in dB."""
+VIEW_SD = {"psnr": 0.4, "ssim": 0.003, "lpips_3dgs": 0.004}
+"""The same over the views of a capture, for captures of one view."""
 SEED_WEIGHT = 4  # degrees of freedom that SEED_SD counts for beside those of the seeds at hand
-VIEW_SD = 0.4  # dB: the same over the views of a capture, where there is one view alone
 Verdict = Literal["confirmed", "contradicted", "undecided"]
 
 
@@ -61,7 +63,7 @@ def mean(records: Sequence[Record], column: str) -> Mean | None:
 
 @dataclass(frozen=True)
 class Difference:
-    """A - B in PSNR (dB): the mean over captures with its 95 % interval, from differences paired over views and seeds."""
+    """A - B in a score: the mean over captures with its 95 % interval, from differences paired over views and seeds. PSNR in dB."""
 
     mean: float
     low: float
@@ -73,7 +75,8 @@ class Difference:
     gains: int
     """Captures on which A is above B."""
     fit: float | None = None
-    """A - B on training views over the second half of the trainings: whether A fits better, generalised or not."""
+    """A - B in PSNR (dB) on training views over the second half of the trainings: whether A fits better, generalised or not."""
+    metric: str = "psnr"
 
     def verdict(self, sign: int) -> Verdict:
         """Whether A - B has the claimed sign (+1 or -1), its opposite, or may be either.
@@ -85,17 +88,17 @@ class Difference:
         return "undecided" if found == 0 else "confirmed" if found == sign else "contradicted"
 
 
-def difference(a: Sequence[Record], b: Sequence[Record]) -> Difference | None:
-    """The difference in PSNR of two recipes, on the captures, seeds and views that both have. None where nothing pairs."""
+def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -> Difference | None:
+    """The difference of two recipes in a score of SEED_SD, on the captures, seeds and views that both have. None where nothing pairs."""
     theirs = {(r.scene, r.seed): r for r in b}
     blocks: dict[str, dict[int, dict[str, float]]] = {}
     for record in a:
         other = theirs.get((record.scene, record.seed))
         if other is None:
             continue
-        views = [v for v in record.per_view if "psnr" in record.per_view[v] and "psnr" in other.per_view.get(v, {})]
+        views = [v for v in record.per_view if metric in record.per_view[v] and metric in other.per_view.get(v, {})]
         if views:
-            paired = {v: record.per_view[v]["psnr"] - other.per_view[v]["psnr"] for v in views}
+            paired = {v: record.per_view[v][metric] - other.per_view[v][metric] for v in views}
             blocks.setdefault(record.scene, {})[record.seed] = paired
     if not blocks:
         return None
@@ -103,24 +106,24 @@ def difference(a: Sequence[Record], b: Sequence[Record]) -> Difference | None:
     for seeds in blocks.values():
         common = sorted(set.intersection(*(set(views) for views in seeds.values())))
         grids.append(np.array([[views[v] for v in common] for views in seeds.values()]))
-    centre, half = interval(grids)
+    centre, half = interval(grids, SEED_SD[metric], VIEW_SD[metric])
     counts = [len(grid) for grid in grids]
     views, gains = sum(grid.shape[1] for grid in grids), sum(bool(grid.mean() > 0) for grid in grids)
-    return Difference(centre, centre - half, centre + half, len(grids), (min(counts), max(counts)), views, gains, fit(a, b))
+    return Difference(centre, centre - half, centre + half, len(grids), (min(counts), max(counts)), views, gains, fit(a, b), metric)
 
 
-def interval(grids: Sequence[NDArray[np.float64]]) -> tuple[float, float]:
-    """The mean over captures of differences [seeds, views] (dB), and half the width of its 95 % interval.
+def interval(grids: Sequence[NDArray[np.float64]], seed_sd: float, view_sd: float) -> tuple[float, float]:
+    """The mean over captures of differences [seeds, views], and half the width of its 95 % interval.
 
     The interval is of other views and other seeds on these captures: captures stay. Two variances add: that of a capture's mean over views,
-    from its views (means over seeds); and that over seeds, one for all captures, from those that have several seeds and from SEED_SD, which
+    from its views (means over seeds); and that over seeds, one for all captures, from those that have several seeds and from `seed_sd`, which
     counts as SEED_WEIGHT more of them. Student's t, with the degrees of freedom of the sum by Satterthwaite (1946).
     """
     terms: list[tuple[float, int]] = []  # variance of the mean, degrees of freedom
-    squares, freedom = SEED_WEIGHT * SEED_SD**2, SEED_WEIGHT
+    squares, freedom = SEED_WEIGHT * seed_sd**2, SEED_WEIGHT
     for grid in grids:
         views = grid.mean(0)
-        variance = float(views.var(ddof=1)) if len(views) > 1 else VIEW_SD**2
+        variance = float(views.var(ddof=1)) if len(views) > 1 else view_sd**2
         terms.append((variance / len(views) / len(grids) ** 2, max(1, len(views) - 1)))
         squares += float(np.square(grid.mean(1) - grid.mean()).sum())
         freedom += len(grid) - 1
