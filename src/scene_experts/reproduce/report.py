@@ -40,9 +40,8 @@ def write(
         page += [f"![{p.stem}]({p.name})\n" for p in made if p.suffix == ".png"]
     page += ["## The paper's claims", "", *short_runs(records), claims.to_markdown(claims.check(records))]
     page += ["Differences are paired over views and seeds; the interval is of other views and other seeds on these captures (Student's t)."]
-    page += [
-        f"What another seed changes: pooled over captures with {SEED_SD['psnr']} dB for each, which counts as {SEED_WEIGHT} degrees of freedom."
-    ]
+    noise = f"{SEED_SD['psnr']} dB, which counts as {SEED_WEIGHT} degrees of freedom"
+    page += [f"What another seed changes is one standard deviation for all captures, pooled from the seeds at hand and from {noise}."]
     page += ["On training views: the same difference as the trainings showed it, over their second half, paired by iteration.", ""]
     path = out / "README.md"
     write_bytes(path, "\n".join(page).encode())
