@@ -115,9 +115,10 @@ def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -
 def interval(grids: Sequence[NDArray[np.float64]], seed_sd: float, view_sd: float) -> tuple[float, float]:
     """The mean over captures of differences [seeds, views], and half the width of its 95 % interval.
 
-    The interval is of other views and other seeds on these captures: captures stay. Two variances add: that of a capture's mean over views,
-    from its views (means over seeds); and that over seeds, one for all captures, from those with several seeds and from `seed_sd`, which counts
-    as SEED_WEIGHT more of them. Student's t, with the degrees of freedom of the sum by Satterthwaite (1946). `view_sd`: for captures of one view.
+    The interval is of other views and other seeds on these captures: captures stay. Two variances add: that of a capture's mean over
+    views, from its views (means over seeds; `view_sd` for a single view); and that over seeds, one for all captures, from those with
+    several seeds and from `seed_sd`, which counts as SEED_WEIGHT more of them. Student's t, with the degrees of freedom of the sum by
+    Satterthwaite (1946).
     """
     terms: list[tuple[float, int]] = []  # variance of the mean, degrees of freedom
     squares, freedom = SEED_WEIGHT * seed_sd**2, SEED_WEIGHT
