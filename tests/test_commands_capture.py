@@ -12,7 +12,8 @@ NOTE = {
     "observations": 400.4,
     "error": 0.51,
     "mapper": "global",
-    "models": [3],
+    "apart": [],
+    "all_compared": True,
     "seconds": 61,
 }
 
@@ -21,12 +22,13 @@ def test_what_was_found_and_what_to_do():
     assert told(NOTE) == [
         "3 of 3 photographs have a pose: 1,200 points, 400 seen in a photograph, 0.51 px off on average; global mapper, 1:01 min"
     ]
-    few = told({**NOTE, "photographs": 30, "without_pose": [f"{i}.jpg" for i in range(27)], "models": [3, 2]})
+    few = told({**NOTE, "photographs": 30, "without_pose": [f"{i}.jpg" for i in range(27)], "apart": [2], "all_compared": False})
     assert few[1] == "without a pose: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, 5.jpg, 6.jpg, 7.jpg and 19 more"
-    assert "(3, 2 photographs)" in few[2] and "three photographs or more" in few[3]
+    assert "2 of these fit together, but not with the others" in few[2] and "--matching exhaustive --overwrite" in few[3]
 
 
 def test_a_capture_and_the_next_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("scene_experts.sfm.run.importlib.util.find_spec", lambda name: name)
     said = {**NOTE, "registered": ["0.jpg", "1.jpg", "2.jpg"], "cameras": []}
     monkeypatch.setattr("scene_experts.sfm.run.reconstructed", answer(**said))
     assert cli.main(["capture", str(black(tmp_path / "photos")), "--out", str(tmp_path / "box")]) == 0
@@ -37,9 +39,9 @@ def test_a_capture_and_the_next_command(tmp_path, monkeypatch, capsys):
 def test_unusable_input_is_told(tmp_path, capsys):
     folder = str(black(tmp_path / "photos"))
     for args, words in [
-        ([folder, "--out", folder], "expected --out beside the photographs"),
+        ([folder, "--out", folder], "expected a folder of its own for the capture"),
         ([folder, "--out", str(tmp_path / "o"), "--max-side", "8"], "expected --max-side of at least 64"),
-        ([str(tmp_path / "none"), "--out", str(tmp_path / "o")], "expected a folder of photographs or a video"),
+        ([str(tmp_path / "none"), "--out", str(tmp_path / "o")], "expected a folder of photographs or a video at"),
     ]:
         assert cli.main(["capture", *args]) == 2
         assert words in capsys.readouterr().err

@@ -235,7 +235,7 @@ def test_paths_that_are_no_captures(made: Synthetic, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected a capture in"):
         load(tmp_path)
     shutil.copytree(made.folder / "images", tmp_path / "images")
-    with pytest.raises(InputError, match="found 10 photographs without camera poses; run `colmap automatic_reconstructor"):
+    with pytest.raises(InputError, match="found 10 photographs without camera poses; run `scene-experts capture "):
         load(tmp_path)
     with pytest.raises(InputError, match="found 10 photographs without camera poses; move them"):
         load(tmp_path / "images")

@@ -11,7 +11,8 @@ import torch
 from scene_experts.data import load
 from scene_experts.errors import InputError, RunError
 from scene_experts.sfm import run
-from scene_experts.sfm.run import LOG, MODEL, NOTE, WORK, Options
+from scene_experts.sfm.run import LOG, NOTE, Options
+from scene_experts.sfm.work import NAME, PLACES
 from test_sfm_photos import photo
 
 DEMO = Path(__file__).parent.parent / "demo" / "buddha"
@@ -42,12 +43,12 @@ def test_poses_of_photographs_are_those_that_are_known(tmp_path):
     steps = []
     note = run.make(source, out, Options(max_side=640, threads=2), say=lambda _: None, progress=lambda *a: steps.append(a))
     assert note == json.loads((out / NOTE).read_text()) and note["with_pose"] == 8 and note["error"] < 1.0
-    assert not (out / WORK).exists() and {s[0] for s in steps} >= {"features", "matches", "poses (incremental)"}
+    assert not (out / NAME).exists() and {s[0] for s in steps} >= {"features", "matches", "poses (incremental)"}
     made, known = load(out, split="none", normalise="none"), load(DEMO, split="none", normalise="none")
     theirs = centres(known, TOGETHER)
     off = (aligned(centres(made, TOGETHER), theirs) - theirs).norm(dim=1)
     assert off.max() < 0.03 * torch.cdist(theirs, theirs).max(), off
-    with pytest.raises(InputError, match=r"expected no poses at .* yet"):
+    with pytest.raises(InputError, match=r"expected no capture in .* yet, found one"):
         run.make(source, out, Options())
 
 
@@ -62,8 +63,8 @@ def answer(**said):
 
     def reconstructed(request, log, say, progress):
         reconstructed.requests.append(request)
-        model = Path(request["sparse"])
-        model.mkdir(parents=True, exist_ok=True)
+        model = Path(request["model"])
+        model.mkdir(parents=True)
         (model / "cameras.bin").write_bytes(b"new")
         return {"step": "done", "version": "0", "registered": [], **said}
 
@@ -71,41 +72,62 @@ def answer(**said):
     return reconstructed
 
 
-def test_photographs_that_fit_nowhere_leave_the_reason_and_no_poses(tmp_path, monkeypatch):
+FOUND = {
+    "registered": ["0.jpg", "2.jpg"],
+    "mapper": "incremental",
+    "apart": [],
+    "points": 5,
+    "error": 0.5,
+    "observations": 3.0,
+    "cameras": [],
+}
+
+
+@pytest.fixture(autouse=True)
+def with_pycolmap(monkeypatch, request):
+    """Whether pycolmap is installed matters to the test of the poses alone."""
+    if "known" not in request.node.name:
+        monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: name)
+
+
+def make(source, out, options=Options(), **more):  # noqa: B008
+    return run.make(source, out, options, say=lambda _: None, **more)
+
+
+def test_photographs_that_fit_nowhere_leave_the_reason_and_nothing_else(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "reconstructed", answer())
     with pytest.raises(InputError, match="found none that fit together"):
-        run.make(black(tmp_path / "photos"), tmp_path / "out", Options(), say=lambda _: None)
-    assert not (tmp_path / "out" / MODEL).exists()
+        make(black(tmp_path / "photos"), tmp_path / "out")
+    assert [p.name for p in (tmp_path / "out").iterdir()] == [NAME]
+    with pytest.raises(InputError, match="found one that is not whole; give its `scene-experts capture PHOTOS"):
+        load(tmp_path / "out")
 
 
-def test_frames_of_a_video_are_taken_once_and_of_another_one_not_at_all(tmp_path, monkeypatch):
+def test_frames_of_a_video_are_taken_once(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "reconstructed", answer())
     taken = []
 
     def take(video, folder, count, progress):
         taken.append(count)
-        black(folder)
+        black(folder, count)
+        return list(range(count))
 
     monkeypatch.setattr(run.frames, "take", take)
     video = tmp_path / "walk.mp4"
     video.write_bytes(b"frames")
-    for options, message in [
-        (Options(), "fit together"),
-        (Options(), "fit together"),
-        (Options(frames=9), "found some; choose another --out"),
-    ]:
+    for count, message in [(5, "fit together"), (5, "fit together"), (4, "fit together"), (2, "a video of at least 3 frames")]:
         with pytest.raises(InputError, match=message):
-            run.make(video, tmp_path / "out", options, say=lambda _: None)
-    assert taken == [Options().frames]
+            make(video, tmp_path / "out", Options(frames=count))
+    assert taken == [5, 4, 2]
 
 
 def test_the_same_request_finds_its_database_again_and_another_does_not(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "reconstructed", answer())
-    source, kept = black(tmp_path / "photos"), tmp_path / "out" / WORK / "database.db"
+    source, kept = black(tmp_path / "photos"), tmp_path / "out" / NAME / "database" / "colmap.db"
 
     def ask(options=Options()):  # noqa: B008
-        with pytest.raises(InputError):
-            run.make(source, tmp_path / "out", options, say=lambda _: None)
+        with pytest.raises(InputError, match="fit together"):
+            make(source, tmp_path / "out", options)
 
     ask()
     kept.write_bytes(b"features")
@@ -113,26 +135,70 @@ def test_the_same_request_finds_its_database_again_and_another_does_not(tmp_path
     assert kept.exists()
     ask(Options(max_side=800))
     assert not kept.exists()
+    kept.write_bytes(b"features")
+    photo(source / "1.jpg", size=(64, 48), model="B")  # another photograph of the same name
+    ask(Options(max_side=800))
+    assert not kept.exists()
 
 
 def test_new_poses_take_the_place_of_old_ones_whole(tmp_path, monkeypatch):
-    worker = answer(registered=["0.jpg", "2.jpg"], mapper="incremental", models=[2], points=5, error=0.5, observations=3.0, cameras=[])
+    worker = answer(**FOUND)
     monkeypatch.setattr(run, "reconstructed", worker)
-    model = tmp_path / "out" / MODEL
-    model.mkdir(parents=True)
-    (model / "cameras.txt").write_text("old")
-    note = run.make(black(tmp_path / "photos"), tmp_path / "out", Options(), overwrite=True, say=lambda _: None)
-    assert [p.name for p in model.iterdir()] == ["cameras.bin"] and list(model.parent.iterdir()) == [model]
-    assert note["without_pose"] == ["1.jpg"] and note["with_pose"] == 2
+    out = tmp_path / "out"
+    note = make(black(tmp_path / "photos"), out)
+    assert note["without_pose"] == ["1.jpg"] and note["with_pose"] == 2 and note["copied"] and note["all_compared"]
     assert worker.requests[0]["pairs"] == [("0.jpg", "1.jpg"), ("0.jpg", "2.jpg"), ("1.jpg", "2.jpg")]
+    (out / PLACES["model"] / "frames.bin").write_bytes(b"old")
+    make(black(tmp_path / "others", 4), out, overwrite=True)
+    assert [p.name for p in (out / PLACES["model"]).iterdir()] == ["cameras.bin"]
+    assert sorted(p.name for p in out.iterdir()) == sorted(place.split("/")[0] for place in PLACES.values())
+    assert len(list((out / "images").iterdir())) == 4
+
+
+def test_a_capture_s_own_images_stay_as_they_are(tmp_path, monkeypatch):
+    worker = answer(**FOUND)
+    monkeypatch.setattr(run, "reconstructed", worker)
+    images = black(tmp_path / "images")
+    (images / "notes.txt").write_text("mine")
+    assert not make(images, tmp_path)["copied"] and worker.requests[0]["images"] == str(images)
+    assert (images / "notes.txt").exists()
+    with pytest.raises(InputError, match=r"expected no images at .*found others; choose another --out"):
+        make(black(tmp_path.parent / "elsewhere"), tmp_path, overwrite=True)
+
+
+def test_what_is_somebody_s_is_not_touched(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "reconstructed", answer(**FOUND))
+    out = tmp_path / "out"
+    for inside in (f"{NAME}/done", "sparse/photos", "images/more"):
+        with pytest.raises(InputError, match="expected photographs outside of"):
+            make(black(out / inside), out)
+        assert len(list((out / inside).iterdir())) == 3
+    with pytest.raises(InputError, match="expected a folder of its own for the capture"):
+        make(black(tmp_path / "photos"), tmp_path / "photos")
+    (tmp_path / "old" / "sparse").mkdir(parents=True)
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / "old" / "sparse" / f"{name}.bin").write_bytes(b"")
+    with pytest.raises(InputError, match=r"expected no capture in .* yet, found one"):
+        make(tmp_path / "photos", tmp_path / "old")
+
+
+def test_what_is_no_folder_and_no_video_is_told(tmp_path, monkeypatch):
+    with pytest.raises(InputError, match="found one photograph at"):
+        make(photo(tmp_path / "1.jpg"), tmp_path / "out")
+    with pytest.raises(InputError, match="found nothing; correct the path"):
+        make(tmp_path / "none", tmp_path / "out")
+    monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"found none; pip install 'scene-experts\[sfm\]'"):
+        make(black(tmp_path / "photos"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     ("code", "error", "message"),
     [
         ("print('{\"step\": \"missing\", \"why\": \"no module\"}')", InputError, r"expected pycolmap .*no module.*scene-experts\[sfm\]"),
-        ("import os; print('{\"step\": \"features\"}', flush=True); os.abort()", RunError, "after 'features'; its words"),
-        ("import sys; sys.exit(3)", RunError, "exit code 3 after 'nothing'"),
+        ("import os; print('{\"step\": \"features\"}', flush=True); os.abort()", RunError, "code -6.*: it said nothing; all"),
+        ("import sys; sys.exit('E20261122 10:00 1 sqlite.h:9] disk is full')", RunError, "exit code 1.*: disk is full; all of its words"),
     ],
 )  # fmt: skip
 def test_a_worker_that_fails_is_told(tmp_path, monkeypatch, code, error, message):

@@ -2,9 +2,12 @@
 
 import ast
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 from scene_experts.sfm import worker
 
@@ -22,30 +25,34 @@ def test_it_imports_nothing_of_this_project_nor_what_pycolmap_does_not_bear():
 
 
 def test_it_says_so_where_pycolmap_is_missing(tmp_path):
-    ask = json.dumps({"sparse": str(tmp_path)})
+    ask = json.dumps({"seed": 0}) + "\n"
     code = f"import sys, runpy; sys.modules['pycolmap'] = None; runpy.run_path({str(SOURCE)!r}, run_name='__main__')"
     done = subprocess.run([sys.executable, "-c", code], input=ask, capture_output=True, text=True)
     assert done.returncode == 0 and json.loads(done.stdout)["step"] == "missing"
 
 
-class Model:
-    """A reconstruction with `count` photographs."""
+class Image:
+    def __init__(self, name):
+        self.name = name
 
-    def __init__(self, count, written):
-        self.images, self.cameras = {}, {}
-        self.count, self.written = count, written
+
+class Model:
+    """A reconstruction with the photographs `names`."""
+
+    def __init__(self, names, written):
+        self.images, self.cameras, self.written = {i: Image(name) for i, name in enumerate(names)}, {}, written
 
     def num_reg_images(self):
-        return self.count
+        return len(self.images)
 
     def num_points3D(self):
-        return 10 * self.count
+        return 10 * len(self.images)
 
     def write_binary(self, folder):
-        self.written.append((self.count, folder))
+        self.written.append("".join(image.name for image in self.images.values()))
 
     def reg_image_ids(self):
-        return []
+        return list(self.images)
 
     def compute_mean_reprojection_error(self):
         return 0.5
@@ -53,30 +60,53 @@ class Model:
     compute_mean_observations_per_reg_image = compute_mean_reprojection_error
 
 
-def reconstruct(tmp_path, monkeypatch, incremental, at_once, mapper="auto"):
-    """Which mappers ran and which model was written, for models of these sizes; None: the mapper fails."""
-    ran, written = [], []
+@pytest.fixture
+def reconstruct(tmp_path, monkeypatch):
+    """Which mappers ran and which model was written, for models of these photographs; None: the mapper fails."""
+    calls = []
 
-    def mapping(name, sizes):
-        def run(colmap, ask, out, total):
-            ran.append(name)
-            if sizes is None:
-                raise RuntimeError("no good pair")
-            return {i: Model(size, written) for i, size in enumerate(sizes)}
+    def reconstructed(incremental, at_once, mapper="auto"):
+        ran, written = [], []
 
-        return run
+        def mapping(name, models):
+            def run(colmap, ask, out, total):
+                ran.append(name)
+                if models is None:
+                    raise RuntimeError("no good pair")
+                return {i: Model(names, written) for i, names in enumerate(models)}
 
-    monkeypatch.setattr(worker, "MAPPERS", {"incremental": mapping("incremental", incremental), "global": mapping("global", at_once)})
-    ask = {"sparse": str(tmp_path), "groups": [["x"] * 10], "mapper": mapper}
-    return ran, written, worker.poses(None, ask)
+            return run
+
+        calls.append(None)
+        monkeypatch.setattr(worker, "MAPPERS", {"incremental": mapping("incremental", incremental), "global": mapping("global", at_once)})
+        folder = tmp_path / str(len(calls))
+        ask = {"maps": str(folder / "maps"), "model": str(folder / "model"), "groups": [list("abcdefghij")], "mapper": mapper}
+        return ran, written, worker.poses(None, ask)
+
+    return reconstructed
 
 
-def test_the_second_mapper_is_tried_where_the_first_leaves_many_out(tmp_path, monkeypatch, capsys):
-    ran, written, found = reconstruct(tmp_path, monkeypatch, [9, 3], [10])
-    assert ran == ["incremental"] and written == [(9, str(tmp_path))] and found["models"] == [9, 3]
-    ran, written, found = reconstruct(tmp_path, monkeypatch, [4], [7])
-    assert ran == ["incremental", "global"] and written[0][0] == 7 and found["mapper"] == "global" and found["models"] == [7]
-    ran, written, found = reconstruct(tmp_path, monkeypatch, [4], None)
-    assert written[0][0] == 4 and found["mapper"] == "incremental" and "no good pair" in capsys.readouterr().out
-    ran, written, found = reconstruct(tmp_path, monkeypatch, [], [], mapper="global")
+def test_the_second_mapper_is_tried_where_the_first_leaves_many_out(reconstruct, capsys):
+    ran, written, found = reconstruct(["abcdefghi", "abj"], ["abcdefghij"])
+    assert ran == ["incremental"] and written == ["abcdefghi"] and found["registered"] == list("abcdefghi")
+    assert found["apart"] == [1]  # of the second model, j alone is nowhere else
+    ran, written, found = reconstruct(["abcd"], ["abcdefg"])
+    assert ran == ["incremental", "global"] and written == ["abcdefg"] and found["mapper"] == "global" and found["apart"] == []
+    ran, written, found = reconstruct(["abcd"], None)
+    assert written == ["abcd"] and found["mapper"] == "incremental" and "no good pair" in capsys.readouterr().out
+    ran, written, found = reconstruct([], [], mapper="global")
     assert ran == ["global"] and not written and found == {"registered": []}
+
+
+def test_it_ends_when_the_process_that_started_it_is_gone(tmp_path):
+    """The parent is killed while a (false) pycolmap sleeps."""
+    (tmp_path / "pycolmap.py").write_text("import time; print('here', flush=True); time.sleep(60)")
+    code = "import os, subprocess, sys; p = subprocess.Popen([sys.executable, sys.argv[1]], stdin=subprocess.PIPE); " \
+        "p.stdin.write(b'{\"seed\": 0}\\n'); p.stdin.flush(); print(p.pid, flush=True); import time; time.sleep(60)"  # fmt: skip
+    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    parent = subprocess.Popen([sys.executable, "-c", code, str(SOURCE)], stdout=subprocess.PIPE, text=True, env=env)
+    said = {parent.stdout.readline().strip(), parent.stdout.readline().strip()}
+    parent.kill()
+    assert "here" in said
+    assert parent.stdout.read() == ""  # ends when the worker, which holds the other end, does
+    parent.wait()

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import shlex
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +18,7 @@ from scene_experts.commands.shared import positional
 from scene_experts.errors import InputError, expect_at_least
 from scene_experts.progress import Bar, clock
 from scene_experts.sfm import run
+from scene_experts.sfm.frames import MOST
 from scene_experts.sfm.pairs import Matching
 
 FEW = 0.9  # a smaller share of photographs with a pose is worth a word of advice
@@ -24,11 +28,12 @@ FEW = 0.9  # a smaller share of photographs with a pose is worth a word of advic
 class CaptureCommand:
     """Find poses and points of photographs, or of a video's sharpest frames (COLMAP, in a process of its own): what `train` needs.
 
-    The same command goes on where it was stopped.
+    `capture PHOTOS --out CAPTURE` copies the photographs into CAPTURE/images: blanks in names become _, those that EXIF turns are written
+    upright. The same command goes on where it was stopped.
     """
 
     photos: Path
-    """Folder of photographs (JPEG, PNG, ...; subfolders too), or a video. May be given first, without a name."""
+    """Folder of photographs (JPEG, PNG, ...; subfolders too), or a video. CAPTURE/images itself stays as it is."""
     out: Path
     """Folder of the capture: OUT/images, OUT/sparse/0, OUT/capture.json."""
     frames: int = run.Options.frames
@@ -44,25 +49,42 @@ class CaptureCommand:
     threads: int = run.Options.threads
     """0: all cores this process may use."""
     seed: int = run.Options.seed
+    """Of COLMAP's random choices."""
     overwrite: bool = False
-    """Replace poses that are there."""
+    """Replace the poses that are there, once new ones are whole, and the images that an earlier `capture` copied."""
 
 
 def capture(args: list[str]) -> int:
     command = tyro.cli(CaptureCommand, prog=f"{PROG} capture", args=positional(args, "--photos"))
     least = {"frames": 3, "max_side": 64, "threads": 0, "seed": 0}
     expect_at_least([(f"--{name.replace('_', '-')}", getattr(command, name), low) for name, low in least.items()])
-    if command.out.resolve() == command.photos.resolve():
-        raise InputError(f"expected --out beside the photographs, found {command.out} for both; choose another --out")
+    if command.frames > MOST:
+        raise InputError(f"expected --frames of at most {MOST:,}, found {command.frames:,}; give fewer: 100 to 300 make a scene")
     console = Console(highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
     options = run.Options(**{name: getattr(command, name) for name in vars(run.Options())})
-    with Bar(console) as bar:
+    with ended_as_interrupted(), Bar(console) as bar:
         note = run.make(command.photos, command.out, options, overwrite=command.overwrite, say=say, progress=bar)
     for line in told(note):
         say(line)
     say(f"next: {PROG} train moe-gs --data {shlex.quote(str(command.out))} --out RUN")
     return 0
+
+
+@contextmanager
+def ended_as_interrupted() -> Iterator[None]:
+    """SIGTERM and SIGHUP end the work as Ctrl-C does: COLMAP's process with it."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    signals = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    previous = {number: signal.signal(number, interrupt) for number in signals}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def told(note: dict[str, Any]) -> list[str]:
@@ -74,13 +96,10 @@ def told(note: dict[str, Any]) -> list[str]:
     ]
     if without:
         lines.append(f"without a pose: {', '.join(without[:8])}" + (f" and {len(without) - 8} more" if len(without) > 8 else ""))
-    if len(note["models"]) > 1:
-        parts = ", ".join(map(str, note["models"]))
-        lines.append(
-            f"warning: the photographs fall into parts that share nothing ({parts} photographs); the largest is kept: take some in between"
-        )
+    if note["apart"]:
+        parts = ", ".join(map(str, note["apart"]))
+        lines.append(f"warning: {parts} of these fit together, but not with the others: take photographs in between")
     if have < FEW * all_:
-        lines.append(
-            "warning: each thing should be in three photographs or more, from different places and sharp; --matching exhaustive may help"
-        )
+        more = "" if note["all_compared"] else "; --matching exhaustive --overwrite may find more"
+        lines.append(f"warning: each thing should be in three photographs or more, from different places and sharp{more}")
     return lines

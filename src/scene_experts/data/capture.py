@@ -94,21 +94,23 @@ def _read(root: Path, images: str | None, background: Colour | None, missing: st
     raise _no_capture(root)
 
 
-def _is_capture(root: Path) -> bool:
+def is_capture(root: Path) -> bool:
+    """Whether a folder holds poses of a kind that `load` reads."""
     return colmap.find_model(root) is not None or any((root / f"transforms{end}.json").is_file() for end in ("", "_train"))
 
 
 def _no_capture(root: Path) -> InputError:
     """Why a folder is no capture, and what to do: photographs alone need poses first."""
     expected = f"expected a capture in {root} (COLMAP's sparse/0 beside images, transforms_train.json or transforms.json), found"
-    if _is_capture(root.absolute().parent):
+    if is_capture(root.absolute().parent):
         return InputError(f"{expected} a part of one; give the folder that holds it: {root.absolute().parent}")
     for folder in (root, root / "images"):
         photos = sum(p.suffix.lower() in EXTENSIONS for p in folder.iterdir()) if folder.is_dir() else 0
         if photos:
-            move = "" if folder != root else "move them into its folder images and "
-            steps = f"{move}run `colmap automatic_reconstructor --workspace_path {root} --image_path {root / 'images'} --dense 0`"
-            return InputError(f"{expected} {photos} photographs without camera poses; {steps}")
+            out = "CAPTURE" if folder == root else str(root)
+            return InputError(f"{expected} {photos} photographs without camera poses; run `scene-experts capture {folder} --out {out}`")
+    if (root / ".capture").is_dir():
+        return InputError(f"{expected} one that is not whole; give its `scene-experts capture PHOTOS --out {root}` again")
     return InputError(f"{expected} none of them; point to the folder that holds them")
 
 

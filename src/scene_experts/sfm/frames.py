@@ -14,15 +14,11 @@ from PIL import Image
 from scene_experts.errors import InputError
 from scene_experts.io import write_atomic
 
-VIDEO = (".mp4", ".mov", ".mkv", ".webm", ".m4v", ".avi")
 LOOK = 480  # px: the width at which sharpness is judged
 QUALITY = 95
+MOST = 5000  # frames: more have no room in one command of ffmpeg's
 
 Told = Callable[[str, int, int], None]
-
-
-def is_video(path: Path) -> bool:
-    return path.is_file() and path.suffix.lower() in VIDEO
 
 
 def take(video: Path, folder: Path, count: int, progress: Told) -> list[str]:
@@ -31,17 +27,17 @@ def take(video: Path, folder: Path, count: int, progress: Told) -> list[str]:
     The frames of a video are divided into `count` stretches of the same length, and of each the sharpest is taken.
     Raises InputError where imageio-ffmpeg is missing or the file is no video.
     """
-    grades = []
-    for picture in read(video, f"scale={LOOK}:-2,format=gray", "gray", 1):
+    grades, expected, pictures = [], *read(video, f"scale={LOOK}:-2,format=gray", "gray", 1)
+    for picture in pictures:
         grades.append(sharpness(picture[..., 0]))
-        progress("looking for sharp frames", len(grades), 0)
+        progress("looking for sharp frames", len(grades), max(expected, len(grades)))
     chosen = sharpest(grades, count)
     if not chosen:
         raise InputError(f"expected a video with frames at {video}, found none; convert it to mp4 or take its frames by another tool")
     names = [f"frame_{i + 1:05d}.jpg" for i in range(len(chosen))]
     wanted = "+".join(rf"eq(n\,{index})" for index in chosen)
     folder.mkdir(parents=True, exist_ok=True)
-    for i, (name, picture) in enumerate(zip(names, read(video, f"select={wanted}", "rgb24", 3))):
+    for i, (name, picture) in enumerate(zip(names, read(video, f"select={wanted}", "rgb24", 3)[1])):
         image = Image.fromarray(picture)
         write_atomic(folder / name, lambda temporary, image=image: image.save(temporary, "JPEG", quality=QUALITY, subsampling=0))
         progress("frames", i + 1, len(names))
@@ -61,21 +57,27 @@ def sharpness(gray: np.ndarray) -> float:
     return float(laplacian.var())
 
 
-def read(video: Path, filters: str, pixels: str, channels: int) -> Iterator[np.ndarray]:
-    """The frames [H, W, channels] uint8 that ffmpeg's `filters` leave of a video, none doubled or dropped for its clock.
+def read(video: Path, filters: str, pixels: str, channels: int) -> tuple[int, Iterator[np.ndarray]]:
+    """About how many frames a video has, and those [H, W, channels] uint8 that ffmpeg's `filters` leave, none doubled or dropped.
 
     Raises InputError where imageio-ffmpeg is missing or the file cannot be read.
     """
     ffmpeg = reader()
     options = ["-vf", filters, "-fps_mode", "passthrough"]
     frames = ffmpeg.read_frames(str(video), pix_fmt=pixels, bpp=channels, bits_per_pixel=8 * channels, output_params=options)
-    try:
-        width, height = next(frames)["size"]
-        for frame in frames:
-            yield np.frombuffer(frame, np.uint8).reshape(height, width, channels)
-    except (OSError, RuntimeError, ValueError) as error:
-        why = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
-        raise InputError(f"expected a video that ffmpeg reads at {video}, found one it does not ({why}); convert it to mp4") from error
+
+    def guarded() -> Iterator[Any]:
+        try:
+            yield from frames
+        except (OSError, RuntimeError, ValueError) as error:
+            why = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
+            raise InputError(f"expected a video that ffmpeg reads at {video}, found one it does not ({why}); convert it to mp4") from error
+
+    stream = guarded()
+    facts = next(stream)
+    width, height = facts["size"]
+    count = int(facts.get("fps", 0) * min(facts.get("duration", 0), 1e6))
+    return count, (np.frombuffer(frame, np.uint8).reshape(height, width, channels) for frame in stream)
 
 
 def reader() -> Any:

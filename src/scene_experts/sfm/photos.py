@@ -1,68 +1,93 @@
-"""The photographs of a folder: found, looked at, grouped by the camera that took them, copied into a capture."""
+"""The photographs of a folder: found, looked at, grouped by the camera that took them, made ready for COLMAP."""
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from PIL import Image, ImageOps
 
-from scene_experts.data.images import probe
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.errors import InputError
-from scene_experts.io import write_atomic
+from scene_experts.io import read_json, write_atomic, write_json
 
 FEWEST = 3  # photographs: fewer than that have no scene in common
-ELSEWHERE = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw")  # photographs that COLMAP and Pillow do not read
+ELSEWHERE = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw")  # photographs that Pillow does not read
+PLAIN = ("JPEG", "MPO", "PNG", "BMP", "TIFF")  # what COLMAP reads
+MASKS = (".mask.png", "_mask.png")  # behind the stem of a photograph beside them
+COPIED = "copied.json"
 _MAKE, _MODEL, _ORIENTATION, _EXIF, _FOCAL, _LENS = 0x010F, 0x0110, 0x0112, 0x8769, 0x920A, 0xA434
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph: its name below its folder, its stored size in pixels, what says which camera took it, and its EXIF orientation."""
+    """A photograph: its name below its folder, its size in pixels, what says which camera took it.
+
+    orientation: EXIF's, 1 to 8.  suffix: of the file it must be written as, because COLMAP does not read the one it is; "" where it does.
+    stamp: bytes and time of the file.  mask: the name of the file that says which pixels count, where one lies beside it.
+    """
 
     name: str
     size: tuple[int, int]
     camera: tuple[str, ...] = ()
     orientation: int = 1
+    suffix: str = ""
+    stamp: tuple[int, int] = (0, 0)
+    mask: str = ""
 
     @property
     def stored(self) -> str:
-        """Its name in the capture: COLMAP's lists of pairs know no blanks."""
-        return re.sub(r"\s+", "_", self.name)
+        """Its name in the capture: in COLMAP's lists of pairs blanks divide names, and a first # begins a comment."""
+        name = re.sub(r"\s+", "_", self.name)
+        name = "_" + name[1:] if name.startswith("#") else name
+        return str(PurePosixPath(name).with_suffix(self.suffix)) if self.suffix else name
 
     @property
     def upright(self) -> Photo:
         """As it is in the capture: under its stored name, turned as it is to be looked at."""
         size = (self.size[1], self.size[0]) if self.orientation in (5, 6, 7, 8) else self.size
-        return Photo(self.stored, size, self.camera)
+        return Photo(self.stored, size, self.camera, stamp=self.stamp)
 
 
-def find(folder: Path) -> list[Photo]:
-    """The photographs below `folder`, "2.jpg" before "10.jpg". Raises InputError where there are too few or one is not readable."""
-    if not folder.is_dir():
-        raise InputError(f"expected a folder of photographs or a video at {folder}, found none; correct the path")
-    files = [
-        path for path in folder.rglob("*") if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    ]
-    photos = sorted(
-        (path for path in files if path.suffix.lower() in EXTENSIONS), key=lambda path: natural(path.relative_to(folder).as_posix())
-    )
-    if len(photos) < FEWEST:
+def find(folder: Path, but: Path | None = None) -> list[Photo]:
+    """The photographs below `folder` and not below `but`, "2.jpg" before "10.jpg". Every one is decoded, at an eighth of its size.
+
+    Raises InputError where there are too few, or one is not whole or has a name that cannot be kept.
+    """
+    files = below(folder, but)
+    names = sorted((path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in EXTENSIONS), key=natural)
+    masks = masks_of(names)
+    names = [name for name in names if name not in masks.values()]
+    if len(names) < FEWEST:
         raw = sorted({path.suffix.lower() for path in files} & set(ELSEWHERE))
         advice = f"save the {', '.join(raw)} files as JPEG" if raw else "take more: tens, each showing most of what the one before shows"
-        raise InputError(f"expected at least {FEWEST} photographs ({', '.join(EXTENSIONS)}) in {folder}, found {len(photos)}; {advice}")
-    found = [Photo(path.relative_to(folder).as_posix(), probe(path)[0], *said(path)) for path in photos]
+        raise InputError(f"expected at least {FEWEST} photographs ({', '.join(EXTENSIONS)}) in {folder}, found {len(names)}; {advice}")
+    found = [look(folder, name, masks.get(name, "")) for name in names]
     for one, other in pairwise(sorted(found, key=lambda photo: photo.stored)):
         if one.stored == other.stored:
             raise InputError(
-                f"expected names that differ by more than blanks in {folder}, found '{one.name}' and '{other.name}'; rename one"
+                f"expected names that differ by more than blanks or kind in {folder}, found '{one.name}' and '{other.name}'; rename one"
             )
     return found
+
+
+def below(folder: Path, but: Path | None) -> list[Path]:
+    """The files below `folder`, links followed, hidden ones and those below `but` left out."""
+    out, seen = [], set()
+    for place, folders, files in os.walk(folder, followlinks=True):
+        here = Path(place).resolve()
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        if here in seen or (but is not None and here == but.resolve() and here != folder.resolve()):
+            folders.clear()
+            continue
+        seen.add(here)
+        out += [path for name in files if not name.startswith(".") and (path := Path(place) / name).is_file()]
+    return out
 
 
 def natural(name: str) -> list[tuple[int, str]]:
@@ -70,17 +95,40 @@ def natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name)]
 
 
-def said(path: Path) -> tuple[tuple[str, ...], int]:
-    """What a photograph states: maker, model, lens and focal length (empty where it states none), and its orientation (1 to 8)."""
-    with Image.open(path) as image:
-        try:
+def masks_of(names: Sequence[str]) -> dict[str, str]:
+    """Masks that lie beside photographs, by the name of the photograph."""
+    there = set(names)
+    stems = ((name, str(PurePosixPath(name).with_suffix(""))) for name in names)
+    return {name: f"{stem}{ending}" for name, stem in stems for ending in MASKS if f"{stem}{ending}" in there}
+
+
+def look(folder: Path, name: str, mask: str) -> Photo:
+    """What a photograph is and states. Raises InputError where it is not whole."""
+    path = folder / name
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        raise InputError(f"expected names in UTF-8 in {folder}, found {name!r}; rename the file") from None
+    try:
+        with Image.open(path) as image:
+            size, form, alpha = image.size, image.format, "A" in image.getbands()
             exif = image.getexif()
             inner = exif.get_ifd(_EXIF)
-        except (OSError, ValueError, SyntaxError):
-            return (), 1
-    camera = (exif.get(_MAKE), exif.get(_MODEL), inner.get(_LENS), inner.get(_FOCAL))
+            image.draft(None, (max(1, size[0] // 8), max(1, size[1] // 8)))
+            image.load()
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"expected a whole photograph at {path}, found one that is not ({error}); replace it or take it away") from error
+    stated = (exif.get(_MAKE), exif.get(_MODEL), inner.get(_LENS), inner.get(_FOCAL))
     turned = exif.get(_ORIENTATION, 1)
-    return tuple(str(value).strip() for value in camera) if any(camera) else (), turned if turned in range(1, 9) else 1
+    return Photo(
+        name,
+        size,
+        tuple(str(value).strip() for value in stated) if any(stated) else (),
+        turned if turned in range(1, 9) else 1,
+        "" if form in PLAIN else ".png" if alpha else ".jpg",
+        (path.stat().st_size, path.stat().st_mtime_ns),
+        mask,
+    )
 
 
 def by_camera(photos: Sequence[Photo]) -> list[list[str]]:
@@ -91,36 +139,58 @@ def by_camera(photos: Sequence[Photo]) -> list[list[str]]:
     return list(groups.values())
 
 
-def copy(photos: Sequence[Photo], source: Path, target: Path) -> list[Photo]:
-    """Put the photographs into folder `target` under their stored names, those that EXIF turns upright; returns them as they are there.
+def in_place(photos: Sequence[Photo], folder: Path) -> list[Photo]:
+    """The photographs of a capture's own folder of images, which stay as they are. Raises InputError where COLMAP cannot take one so."""
+    if other := next((photo for photo in photos if photo.name != photo.stored), None):
+        raise InputError(f"expected photographs as COLMAP takes them in {folder}, found '{other.name}'; make a new capture of them (--out)")
+    return list(photos)
 
-    COLMAP takes the stored pixels, and a scene of sideways photographs would lie on its side. Photographs that are there already, of the
-    same time and, unless turned, the same size, stay. With `target` = `source` all stay as they are.
-    Raises InputError where another file of such a name is there, and where `target` is `source` and a name would change.
+
+def copy(photos: Sequence[Photo], source: Path, target: Path) -> list[Photo]:
+    """Make folder `target` hold the photographs under their stored names and nothing else; returns them as they are there.
+
+    Those that EXIF turns are written upright, with hardly a loss: COLMAP takes the stored pixels, and a scene of sideways photographs would
+    lie on its side. Copies that are there already stay.
     """
-    if source.resolve() == target.resolve():
-        if blank := next((photo.name for photo in photos if photo.name != photo.stored), None):
-            raise InputError(f"expected names without blanks in {source}, found '{blank}'; rename it, or give another --out")
-        return list(photos)
-    for photo in photos:
-        old, new = source / photo.name, target / photo.stored
-        if new.exists():
-            there, ours = new.stat(), old.stat()
-            if int(there.st_mtime) != int(ours.st_mtime) or (photo.orientation == 1 and there.st_size != ours.st_size):
-                raise InputError(f"expected {new} to be a copy of {old}, found another file; choose another --out")
-            continue
-        new.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(new, lambda temporary, old=old, turned=photo.orientation != 1: transfer(old, temporary, turned))
+    note = target.with_name(COPIED)
+    kept: dict[str, list[int]] = read_json(note, "list of copies") if note.is_file() else {}
+    wanted = {photo.stored: photo for photo in photos}
+    masks = {str(target / stem(photo)) + ending(photo.mask) for photo in photos if photo.mask}
+    for path in [path for path in target.rglob("*") if path.is_file()]:
+        if path.relative_to(target).as_posix() not in wanted and str(path) not in masks:
+            path.unlink()
+    for name, photo in wanted.items():
+        new = target / name
+        if not new.is_file() or tuple(kept.get(name, ())) != photo.stamp:
+            transfer(source / photo.name, new, photo.orientation, photo.suffix)
+            if photo.mask:
+                transfer(source / photo.mask, Path(f"{target / stem(photo)}{ending(photo.mask)}"), photo.orientation)
+            kept[name] = list(photo.stamp)
+    write_json(note, {name: stamp for name, stamp in kept.items() if name in wanted})
     return [photo.upright for photo in photos]
 
 
-def transfer(old: Path, new: Path, turned: bool) -> None:
-    """Copy a photograph with its time; a turned one is written anew, with hardly a loss, its EXIF block without the orientation."""
-    if not turned:
-        shutil.copy2(old, new)
+def stem(photo: Photo) -> str:
+    return str(PurePosixPath(photo.stored).with_suffix(""))
+
+
+def ending(mask: str) -> str:
+    return next(end for end in MASKS if mask.endswith(end))
+
+
+def transfer(old: Path, new: Path, orientation: int, suffix: str = "") -> None:
+    """Copy a photograph, or write it anew: turned upright, or as another kind of file (`suffix`)."""
+    new.parent.mkdir(parents=True, exist_ok=True)
+    if orientation == 1 and not suffix:
+        write_atomic(new, lambda temporary: shutil.copyfile(old, temporary))
         return
     with Image.open(old) as image:
+        form = {".jpg": "JPEG", ".png": "PNG"}.get(suffix) or ("JPEG" if image.format == "MPO" else image.format)
+        image.getexif()[_ORIENTATION] = orientation  # that of the photograph, for its mask too
         upright = ImageOps.exif_transpose(image)
-        options = {"quality": 96, "subsampling": 0} if image.format == "JPEG" else {}
-        upright.save(new, image.format, exif=upright.getexif(), **options)
-    shutil.copystat(old, new)
+    if form == "JPEG":
+        upright = upright if upright.mode in ("L", "RGB", "CMYK") else upright.convert("RGB")
+        options = {"quality": 96, "subsampling": 0}
+    else:
+        options = {}
+    write_atomic(new, lambda temporary: upright.save(temporary, form, exif=upright.getexif(), **options))

@@ -10,6 +10,7 @@ import json
 import os
 import sys
 import tempfile
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,9 @@ def features(colmap: Any, ask: dict[str, Any]) -> None:
                 ask["database"], ask["images"], some,
                 camera_mode=colmap.CameraMode.SINGLE, reader_options=reader, extraction_options=options, device=colmap.Device.cpu,
             )  # fmt: skip
-            camera, _ = known(colmap, ask["database"], names)
+            camera, lacking = known(colmap, ask["database"], names)
+            if unread := [name for name in some if name in lacking]:
+                tell(step="unread", names=unread)
             done += len(some)
             tell(step="features", done=done, total=total)
 
@@ -76,28 +79,29 @@ def poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
     """Reconstruct, and write the best model; says what it is."""
     total = sum(map(len, ask["groups"]))
     found: list[tuple[str, Any]] = []
-    with tempfile.TemporaryDirectory(dir=ask["sparse"]) as folder:
-        for mapper in ("incremental", "global") if ask["mapper"] == "auto" else (ask["mapper"],):
-            out = Path(folder) / mapper
-            out.mkdir()
-            tell(step=f"poses ({mapper})", done=0, total=total)
-            try:
-                models = MAPPERS[mapper](colmap, ask, str(out), total)
-            except Exception as error:  # a mapper that gives up is told of, and the other one may do
-                tell(step="failed", mapper=mapper, why=str(error))
-                continue
-            found += [(mapper, model) for model in models.values()]
-            if found and max(model.num_reg_images() for _, model in found) >= ENOUGH * total:
-                break
-        if not found:
-            return {"registered": []}
-        mapper, best = max(found, key=lambda one: (one[1].num_reg_images(), one[1].num_points3D()))
-        best.write_binary(ask["sparse"])
-    images = [best.images[i] for i in best.reg_image_ids()]
+    for mapper in ("incremental", "global") if ask["mapper"] == "auto" else (ask["mapper"],):
+        out = Path(ask["maps"]) / mapper
+        out.mkdir(parents=True)
+        tell(step=f"poses ({mapper})", done=0, total=total)
+        try:
+            models = MAPPERS[mapper](colmap, ask, str(out), total)
+        except Exception as error:  # a mapper that gives up is told of, and the other one may do
+            tell(step="failed", mapper=mapper, why=str(error))
+            continue
+        found += [(mapper, model) for model in models.values()]
+        if found and max(model.num_reg_images() for _, model in found) >= ENOUGH * total:
+            break
+    if not found:
+        return {"registered": []}
+    mapper, best = max(found, key=lambda one: (one[1].num_reg_images(), one[1].num_points3D()))
+    os.makedirs(ask["model"])
+    best.write_binary(ask["model"])
+    have = posed(best)
+    others = [posed(model) - have for one, model in found if one == mapper]
     return {
         "mapper": mapper,
-        "registered": sorted(image.name for image in images),
-        "models": sorted((model.num_reg_images() for one, model in found if one == mapper), reverse=True),
+        "registered": sorted(have),
+        "apart": sorted(map(len, filter(None, others)), reverse=True),
         "points": best.num_points3D(),
         "error": best.compute_mean_reprojection_error(),
         "observations": best.compute_mean_observations_per_reg_image(),
@@ -106,6 +110,11 @@ def poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
             for c in best.cameras.values()
         ],
     }
+
+
+def posed(model: Any) -> set[str]:
+    """The names of the photographs with a pose in a model."""
+    return {model.images[i].name for i in model.reg_image_ids()}
 
 
 def incremental(colmap: Any, ask: dict[str, Any], out: str, total: int) -> dict[int, Any]:
@@ -132,19 +141,26 @@ def at_once(colmap: Any, ask: dict[str, Any], out: str, total: int) -> dict[int,
 MAPPERS = {"incremental": incremental, "global": at_once}
 
 
+def watch() -> None:
+    """End this process when the one that started it is gone: its end of standard input closes then."""
+    sys.stdin.read()
+    os._exit(1)
+
+
 def main() -> int:
-    ask = json.load(sys.stdin)
+    ask = json.loads(sys.stdin.readline())
+    threading.Thread(target=watch, daemon=True).start()
     try:
         import pycolmap as colmap
     except ImportError as error:
         tell(step="missing", why=str(error))
         return 0
-    os.makedirs(ask["sparse"], exist_ok=True)
     colmap.set_random_seed(ask["seed"])
     features(colmap, ask)
     matches(colmap, ask)
     tell(step="done", version=colmap.__version__, **poses(colmap, ask))
-    return 0
+    sys.stdout.flush()
+    os._exit(0)  # the thread that waits would hold the interpreter's end up
 
 
 if __name__ == "__main__":
