@@ -9,7 +9,7 @@ import pytest
 
 from scene_experts import io
 from scene_experts.errors import InputError, RunError
-from scene_experts.io import read_json, write_atomic, write_bytes, write_json
+from scene_experts.io import locked, read_json, write_atomic, write_bytes, write_json
 
 
 def names(folder):
@@ -116,3 +116,19 @@ def test_cache_folders(monkeypatch, tmp_path):
     assert io.cache_dir() == Path.home() / ".cache" / "scene-experts"
     monkeypatch.setattr(io.sys, "platform", "darwin")
     assert io.cache_dir() == Path.home() / "Library" / "Caches" / "scene-experts"
+
+
+def test_a_lock_is_held_once_and_let_go(tmp_path):
+    with locked(tmp_path / ".lock", "busy"), pytest.raises(InputError, match="busy"), locked(tmp_path / ".lock", "busy"):
+        pass
+    with locked(tmp_path / ".lock", "busy"):
+        pass
+
+
+def test_a_file_system_without_locks_holds_nothing_up(tmp_path, monkeypatch):
+    def refuse(self, blocking):
+        raise NotImplementedError
+
+    monkeypatch.setattr(io.FileLock, "acquire", refuse)
+    with locked(tmp_path / ".lock", "busy"), locked(tmp_path / ".lock", "busy"):
+        pass

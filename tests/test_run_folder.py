@@ -181,15 +181,6 @@ def test_one_training_holds_a_run_folder(tmp_path):
         pass
 
 
-def test_a_file_system_without_locks_holds_nothing_up(tmp_path, monkeypatch):
-    def refuse(*_, **__):
-        raise NotImplementedError
-
-    monkeypatch.setattr(run_folder.FileLock, "acquire", refuse)
-    with run_folder.held(tmp_path), run_folder.held(tmp_path):
-        pass
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [("{", "unreadable"), ("[]", "format 1"), ('{"format": 99}', "format 1"), ("{}", "format 1"), ('{"format": 1}', "the keys")],

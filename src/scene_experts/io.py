@@ -1,4 +1,4 @@
-"""Files written whole or not at all."""
+"""Files written whole or not at all, and locks."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from scene_experts.errors import InputError, RunError
 
@@ -64,6 +67,23 @@ def check_writable(path: Path) -> None:
             pass
     except OSError as error:
         raise _unwritable(path, error) from error
+
+
+@contextmanager
+def locked(path: Path, busy: str) -> Iterator[None]:
+    """Hold the lock file `path` for this process; one that dies lets go. Raises InputError(busy) where another holds it."""
+    lock = FileLock(path)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise InputError(busy) from None
+    except NotImplementedError:  # some network file systems know no locks
+        yield
+        return
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def new_file_mode(most: int) -> int:

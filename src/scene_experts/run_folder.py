@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock, Timeout
 from torch import Tensor
 
 import scene_experts
@@ -35,7 +34,7 @@ from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.data.obtain import resolve
 from scene_experts.errors import InputError
-from scene_experts.io import read_json, write_json
+from scene_experts.io import locked, read_json, write_json
 from scene_experts.scene import Scene
 from scene_experts.state import scene_from, to_device
 
@@ -135,18 +134,9 @@ def _difference(old: object, new: object, where: str = "") -> str:
 def held(out: Path) -> Iterator[None]:
     """Hold `out` for one training; a process that dies lets go. Raises InputError where another training writes there."""
     out.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(out / ".lock")
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        raise InputError(f"expected a run folder that nobody writes to, found a training at work in {out}; choose another --out") from None
-    except NotImplementedError:  # some network file systems know no locks
+    busy = f"expected a run folder that nobody writes to, found a training at work in {out}; choose another --out"
+    with locked(out / ".lock", busy):
         yield
-        return
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -> None:

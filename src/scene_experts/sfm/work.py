@@ -7,10 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
-from scene_experts.errors import InputError
-from scene_experts.io import check_writable
+from scene_experts.io import check_writable, locked
 
 NAME, DONE, WHOLE = ".capture", "done", "whole"
 PLACES = {"images": "images", "model": "sparse/0", "capture.json": "capture.json"}
@@ -25,19 +22,10 @@ def opened(out: Path) -> Iterator[Path]:
     """
     work = out / NAME
     check_writable(work / ".lock")
-    lock = FileLock(work / ".lock")
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        raise InputError(f"expected {out} for this capture alone, found another process making one there; wait for it") from None
-    except NotImplementedError:  # some network file systems know no locks
-        pass
-    try:
+    with locked(work / ".lock", f"expected {out} for this capture alone, found another process making one there; wait for it"):
         if (work / WHOLE).exists():
             publish(out)
         yield work
-    finally:
-        lock.release()
 
 
 def publish(out: Path) -> None:
