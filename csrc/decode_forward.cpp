@@ -92,9 +92,10 @@ SE_EXPORT int se_decode_begin(const Decode* decode) {
     }
     d.starts[chunk.begin / CHUNK + 1] = drawn;
   });
+  if (code) return code;  // the counts are not whole
   d.starts[0] = 0;
   for (int64_t c = 0; c < d.chunks(); ++c) d.starts[c + 1] += d.starts[c];
-  return code;
+  return 0;
 }
 
 // Covariances and colours, and all Gaussians of positive opacity in the order of anchors and slots.

@@ -1,6 +1,7 @@
 """The compiled library is found, refused when it is of another version, and its absence explained."""
 
 import ctypes
+import os
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -106,3 +107,14 @@ def test_out_of_memory_is_an_error_that_a_process_survives(what, said, threads):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[0].startswith(f"{said} ran out of memory: use fewer") and done.stdout.endswith("went on\n")
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not bind processes to cores")
+def test_cores_are_those_that_this_process_may_use():
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        assert native.cores() == 1
+    finally:
+        os.sched_setaffinity(0, before)
+    assert native.cores() == len(before)

@@ -132,7 +132,7 @@ def triton() -> Check:
 
 
 def machine() -> Check:
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    usable = native.cores()
     threads = torch.get_num_threads()
     fix = f"set OMP_NUM_THREADS to {usable} at most: more threads than cores slow training down"
     return Check("cores", threads <= usable, f"{usable} usable of {os.cpu_count()}, torch uses {threads} threads", fix)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import platform
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +33,7 @@ class Machine:
 
 def describe(threads: int) -> Machine:
     """The machine without its rates."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = native.cores()
     library = native.load()
     installed = tuple(level for level in native.levels() if native.path(level))
     return Machine(processor(), cores, threads, getattr(library, "level", None), installed, torch.__version__)

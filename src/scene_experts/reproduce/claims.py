@@ -44,7 +44,7 @@ def check(records: Sequence[Record]) -> list[Finding]:
         better("L_load helps: MoE-GS over 'w/o L_load'", get("moe-gs"), get("moe-gs-no-load")),
         better("L_opacity helps: MoE-GS over 'w/o L_opacity'", get("moe-gs"), get("moe-gs-no-opacity")),
         better("experts help without the curriculum too: 'w/o CL' over 'w/o MoE'", get("moe-gs-no-cl"), get("scaffold-gs-opacity")),
-        size("L_opacity keeps the scene small: MoE-GS is smaller than 'w/o L_opacity'", get("moe-gs"), get("moe-gs-no-opacity")),
+        size("L_opacity costs no size: MoE-GS is at most as large as 'w/o L_opacity'", get("moe-gs"), get("moe-gs-no-opacity")),
         better("L_opacity helps Scaffold-GS alone", get("scaffold-gs-opacity"), get("scaffold-gs")),
         activation(get("scaffold-gs"), get("scaffold-gs-opacity")),
         balance(get("moe-gs-e3-top2"), get("moe-gs-e3-no-load")),

@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from scene_experts import native
 from scene_experts.data.capture import is_capture
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.errors import InputError, RunError
@@ -78,7 +79,7 @@ def make(
             "model": str(desk / work.DONE / "model"),
             "groups": groups,
             "pairs": [(names[i], names[j]) for i, j in matched],
-            "threads": options.threads or usable(),
+            "threads": options.threads or native.cores(),
             "max_side": options.max_side,
             "camera_model": options.camera_model,
             "mapper": options.mapper,
@@ -214,8 +215,3 @@ def noted(result: dict[str, Any], found: list[Photo], options: Options, seconds:
         "seconds": round(seconds, 1),
         "pycolmap": result.get("version"),
     }
-
-
-def usable() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
