@@ -100,7 +100,7 @@ def test_the_second_mapper_is_tried_where_the_first_leaves_many_out(reconstruct,
 
 def test_it_ends_when_the_process_that_started_it_is_gone(tmp_path):
     """The parent is killed while a (false) pycolmap sleeps."""
-    (tmp_path / "pycolmap.py").write_text("import time; print('here', flush=True); time.sleep(60)")
+    (tmp_path / "pycolmap.py").write_text("import time\ndef set_random_seed(seed):\n    print('here', flush=True)\n    time.sleep(60)\n")
     code = "import os, subprocess, sys; p = subprocess.Popen([sys.executable, sys.argv[1]], stdin=subprocess.PIPE); " \
         "p.stdin.write(b'{\"seed\": 0}\\n'); p.stdin.flush(); print(p.pid, flush=True); import time; time.sleep(60)"  # fmt: skip
     env = {**os.environ, "PYTHONPATH": str(tmp_path)}

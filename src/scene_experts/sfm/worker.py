@@ -149,12 +149,12 @@ def watch() -> None:
 
 def main() -> int:
     ask = json.loads(sys.stdin.readline())
-    threading.Thread(target=watch, daemon=True).start()
     try:
         import pycolmap as colmap
     except ImportError as error:
         tell(step="missing", why=str(error))
         return 0
+    threading.Thread(target=watch, daemon=True).start()
     colmap.set_random_seed(ask["seed"])
     features(colmap, ask)
     matches(colmap, ask)
