@@ -119,3 +119,31 @@ def test_names_that_are_no_text_are_told(tmp_path):
         pytest.skip("this file system has names in UTF-8 alone")
     with pytest.raises(InputError, match="expected names in UTF-8"):
         find(tmp_path)
+
+
+def test_grey_of_sixteen_bits_is_written_with_eight(tmp_path):
+    """COLMAP does not read it, and Pillow's own conversion cuts it off at 255."""
+    source, target = tmp_path / "photos", tmp_path / "work" / "images"
+    source.mkdir()
+    deep = np.linspace(0, 65535, 40 * 30).astype(np.uint16).reshape(30, 40)
+    for name in ("a.png", "b.tif", "c.png"):
+        Image.fromarray(deep).save(source / name)
+    there = copy(find(source), source, target)
+    assert [p.name for p in there] == ["a.png", "b.png", "c.png"]
+    for one in there:
+        with Image.open(target / one.name) as picture:
+            assert picture.mode == "L" and np.abs(np.asarray(picture) - deep / 257).max() <= 0.5
+    with pytest.raises(InputError, match="expected photographs as COLMAP takes them"):
+        in_place(find(source), source)
+
+
+def test_a_changed_mask_is_copied_again(tmp_path):
+    source, target = tmp_path / "photos", tmp_path / "work" / "images"
+    for i in range(3):
+        photo(source / f"{i}.jpg")
+    for value in (255, 0):
+        Image.new("L", (40, 30), value).save(source / "0_mask.png")
+        os.utime(source / "0_mask.png", (1, 1 + value))
+        copy(find(source), source, target)
+        with Image.open(target / "0_mask.png") as mask:
+            assert mask.getextrema() == (value, value)

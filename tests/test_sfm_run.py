@@ -3,10 +3,14 @@
 import importlib.util
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from scene_experts.data import load
 from scene_experts.errors import InputError, RunError
@@ -40,6 +44,11 @@ def test_poses_of_photographs_are_those_that_are_known(tmp_path):
     source.mkdir()
     for name in TOGETHER:
         shutil.copy(DEMO / "images" / name, source / name)
+    top = np.zeros((544, 800), np.uint8)
+    top[:400] = 255  # of two views the lower quarter does not count
+    for name in TOGETHER[:2]:
+        with Image.open(source / name) as picture:
+            Image.fromarray(top).resize(picture.size, Image.Resampling.NEAREST).save(source / f"{Path(name).stem}_mask.png")
     steps = []
     note = run.make(source, out, Options(max_side=640, threads=2), say=lambda _: None, progress=lambda *a: steps.append(a))
     assert note == json.loads((out / NOTE).read_text()) and note["with_pose"] == 8 and note["error"] < 1.0
@@ -48,8 +57,20 @@ def test_poses_of_photographs_are_those_that_are_known(tmp_path):
     theirs = centres(known, TOGETHER)
     off = (aligned(centres(made, TOGETHER), theirs) - theirs).norm(dim=1)
     assert off.max() < 0.03 * torch.cdist(theirs, theirs).max(), off
+    lowest = lowest_features(out)
+    assert max(lowest[name] for name in TOGETHER[:2]) < 0.75 and max(lowest.values()) > 0.9, lowest
     with pytest.raises(InputError, match=r"expected no capture in .* yet, found one"):
         run.make(source, out, Options())
+
+
+def lowest_features(capture: Path) -> dict[str, float]:
+    """By photograph, where its lowest feature lies: 0 at the top edge, 1 at the bottom. pycolmap is asked in a process of its own."""
+    code = (
+        "import json, sys, pycolmap; found = pycolmap.Reconstruction(sys.argv[1]).images.values(); "
+        "print(json.dumps({i.name: max(p.xy[1] for p in i.points2D) / i.camera.height for i in found}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(capture / "sparse" / "0")], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
 
 
 def black(folder: Path, count: int = 3) -> Path:

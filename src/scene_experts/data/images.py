@@ -150,7 +150,7 @@ def _pixels(source: Source) -> Image.Image:
     with _open(source.path) as image:
         try:
             image.load()
-            out = _to_8_bit(ImageOps.exif_transpose(image) if source.turn else image)
+            out = to_8_bit(ImageOps.exif_transpose(image) if source.turn else image)
         except (OSError, ValueError, SyntaxError) as error:  # Pillow's decoders raise all three for damaged files
             raise _unreadable(source.path, error) from error
     expected = (source.lens.width, source.lens.height)
@@ -159,7 +159,8 @@ def _pixels(source: Source) -> Image.Image:
     return out
 
 
-def _to_8_bit(image: Image.Image) -> Image.Image:
+def to_8_bit(image: Image.Image) -> Image.Image:
+    """A picture of any of Pillow's modes as L, RGB or RGBA."""
     if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey: Pillow's own conversion would clip at 255
         deep = np.asarray(image).astype(np.float64)
         return Image.fromarray(np.clip(np.rint(deep / 257), 0, 255).astype(np.uint8))
@@ -174,7 +175,7 @@ def _mask_file(source: Source) -> Image.Image | None:
         return None
     with _open(source.mask) as image:
         try:
-            out = image.getchannel("A") if image.mode == "RGBA" and image.convert("L").getextrema() == (0, 0) else image.convert("L")
+            out = mask_of(image)
         except (OSError, ValueError, SyntaxError) as error:
             raise _unreadable(source.mask, error) from error
     if not source.turn or (out.width > out.height) == (source.lens.width > source.lens.height):
@@ -184,6 +185,11 @@ def _mask_file(source: Source) -> Image.Image | None:
         with _open(source.path) as photograph:
             exif[_ORIENTATION] = photograph.getexif().get(_ORIENTATION, 1)
     return ImageOps.exif_transpose(out)
+
+
+def mask_of(image: Image.Image) -> Image.Image:
+    """What a mask file says, as L (255: counts): its alpha where all its colours are black, else its brightness."""
+    return image.getchannel("A") if image.mode == "RGBA" and image.convert("L").getextrema() == (0, 0) else image.convert("L")
 
 
 @functools.lru_cache(maxsize=2)  # neighbours in a capture share their camera

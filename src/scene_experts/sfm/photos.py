@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image, ImageOps
 
+from scene_experts.data.images import to_8_bit
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.errors import InputError
 from scene_experts.io import read_json, write_atomic, write_json
@@ -29,7 +30,7 @@ class Photo:
     """A photograph: its name below its folder, its size in pixels, what says which camera took it.
 
     orientation: EXIF's, 1 to 8.  suffix: of the file it must be written as, because COLMAP does not read the one it is; "" where it does.
-    stamp: bytes and time of the file.  mask: the name of the file that says which pixels count, where one lies beside it.
+    stamp: bytes and time of the file, and of its mask.  mask: the name of the file that says which pixels count, where one lies beside it.
     """
 
     name: str
@@ -37,7 +38,7 @@ class Photo:
     camera: tuple[str, ...] = ()
     orientation: int = 1
     suffix: str = ""
-    stamp: tuple[int, int] = (0, 0)
+    stamp: tuple[int, ...] = (0, 0)
     mask: str = ""
 
     @property
@@ -111,7 +112,7 @@ def look(folder: Path, name: str, mask: str) -> Photo:
         raise InputError(f"expected names in UTF-8 in {folder}, found {name!r}; rename the file") from None
     try:
         with Image.open(path) as image:
-            size, form, alpha = image.size, image.format, "A" in image.getbands()
+            size, plain, png = image.size, image.format in PLAIN and not deep(image), "A" in image.getbands() or deep(image)
             exif = image.getexif()
             inner = exif.get_ifd(_EXIF)
             image.draft(None, (max(1, size[0] // 8), max(1, size[1] // 8)))
@@ -125,10 +126,20 @@ def look(folder: Path, name: str, mask: str) -> Photo:
         size,
         tuple(str(value).strip() for value in stated) if any(stated) else (),
         turned if turned in range(1, 9) else 1,
-        "" if form in PLAIN else ".png" if alpha else ".jpg",
-        (path.stat().st_size, path.stat().st_mtime_ns),
+        "" if plain else ".png" if png else ".jpg",
+        stamp(path) + (stamp(folder / mask) if mask else ()),
         mask,
     )
+
+
+def deep(image: Image.Image) -> bool:
+    """Whether a picture is grey of more than 8 bits, which COLMAP does not read."""
+    return image.mode.startswith("I") or image.mode == "F"
+
+
+def stamp(path: Path) -> tuple[int, int]:
+    """Bytes and time of a file."""
+    return path.stat().st_size, path.stat().st_mtime_ns
 
 
 def by_camera(photos: Sequence[Photo]) -> list[list[str]]:
@@ -188,9 +199,10 @@ def transfer(old: Path, new: Path, orientation: int, suffix: str = "") -> None:
         form = {".jpg": "JPEG", ".png": "PNG"}.get(suffix) or ("JPEG" if image.format == "MPO" else image.format)
         image.getexif()[_ORIENTATION] = orientation  # that of the photograph, for its mask too
         upright = ImageOps.exif_transpose(image)
+        exif, upright = upright.getexif(), to_8_bit(upright) if deep(upright) else upright
     if form == "JPEG":
         upright = upright if upright.mode in ("L", "RGB", "CMYK") else upright.convert("RGB")
         options = {"quality": 96, "subsampling": 0}
     else:
         options = {}
-    write_atomic(new, lambda temporary: upright.save(temporary, form, exif=upright.getexif(), **options))
+    write_atomic(new, lambda temporary: upright.save(temporary, form, exif=exif, **options))

@@ -21,7 +21,7 @@ from scene_experts.data.capture import is_capture
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.errors import InputError, RunError
 from scene_experts.io import read_json, write_json
-from scene_experts.sfm import frames, photos, work, worker
+from scene_experts.sfm import frames, masks, photos, work, worker
 from scene_experts.sfm.pairs import Matching, pairs
 from scene_experts.sfm.photos import Photo
 
@@ -71,10 +71,12 @@ def make(
         say(f"{len(found)} photographs, {len(groups)} camera{'s' if len(groups) > 1 else ''}")
         names = [photo.name for photo in found]
         matched = pairs(len(names), options.matching)
-        prepare(desk, found, options)
+        masked = masks.write(found, images, desk / "masks")
+        prepare(desk, found, options, masked)
         request = {
             "database": str(desk / "database" / "colmap.db"),
             "images": str(images),
+            "masks": str(desk / "masks") if masked else "",
             "maps": str(desk / "maps"),
             "model": str(desk / work.DONE / "model"),
             "groups": groups,
@@ -140,9 +142,12 @@ def taken(video: Path, images: Path, options: Options, progress: Told) -> list[P
     return photos.find(images)
 
 
-def prepare(desk: Path, found: list[Photo], options: Options) -> None:
-    """Room for this request, with the database of the same photographs, looked at the same way, if there is one."""
-    facts = [[(photo.name, photo.size, photo.camera, photo.stamp) for photo in found], options.camera_model, options.max_side]
+def prepare(desk: Path, found: list[Photo], options: Options, masked: list[str]) -> None:
+    """Room for this request, with the database of the same photographs, looked at the same way, if there is one.
+
+    masked: what says that masks are the same.
+    """
+    facts = [[(photo.name, photo.size, photo.camera, photo.stamp) for photo in found], options.camera_model, options.max_side, masked]
     mark = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
     database, note = desk / "database", desk / "database" / "of.txt"
     if not note.is_file() or note.read_text() != mark:

@@ -35,6 +35,8 @@ def features(colmap: Any, ask: dict[str, Any]) -> None:
             some, missing = missing[:CHUNK], missing[CHUNK:]
             reader = colmap.ImageReaderOptions()
             reader.camera_model = ask["camera_model"]
+            if ask["masks"]:
+                reader.mask_path = ask["masks"]
             if camera is not None:
                 reader.existing_camera_id = camera
             colmap.extract_features(
