@@ -300,6 +300,9 @@ OTHERS = {
     "import of a text": ["import", "TMP/file", "--data", "MADE", "--out", "TMP/r"],
     "import to a file": ["import", "RUN", "--data", "MADE", "--out", "TMP/file"],
     "eval of another step": ["eval", "RUN", "--step", "3"],
+    "eval of an empty name": ["eval", ""],
+    "export to an empty name": ["export", "RUN", "--out", ""],
+    "export to an empty name, joined": ["export", "RUN", "--out="],
     "eval with weights from nowhere": ["eval", "RUN", "--lpips-weights", "TMP/absent"],
     "eval with a capture from nowhere": ["eval", "RUN", "--data", "TMP/absent"],
 }

@@ -145,8 +145,11 @@ def test_print_results(tmp_path: Path) -> None:
 def test_a_table_tells_a_shorter_training_from_one_cut_off() -> None:
     short, cut = results("moe-gs", 27.0, step=7000, iterations=7000), results("moe-gs", 26.0, step=7000, iterations=30_000)
     made = tables.table(["short", "cut"], [short, cut])
-    place = made.titles.index("steps")
-    assert made.titles[place + 1] == "of" and [row[place : place + 2] for row in made.rows] == [("7,000", "7,000"), ("7,000", "30,000")]
+    place = made.titles.index("iterations")
+    assert made.titles[place + 1] == "of schedule" and [row[place : place + 2] for row in made.rows] == [
+        ("7,000", "7,000"),
+        ("7,000", "30,000"),
+    ]
 
 
 @pytest.mark.parametrize("width", [10, 40, 80, 200])
@@ -165,9 +168,9 @@ def test_a_file_that_knows_nothing_of_its_training_has_no_figures_of_it() -> Non
     trained = results("moe-gs", 27.0, step=4000, iterations=7000)
     imported = results("scaffold-gs", 26.0, step=0, iterations=0, train_seconds=0.0)
     found = tables.table(["a", "b"], [trained, imported])
-    place = [found.titles.index(title) for title in ("steps", "of", "train s")]
+    place = [found.titles.index(title) for title in ("iterations", "of schedule", "train s")]
     assert [found.rows[0][j] for j in place] == ["4,000", "7,000", "100"] and [found.rows[1][j] for j in place] == ["-"] * 3
-    assert not {"steps", "of", "train s"} & set(tables.table(["b"], [imported]).titles)
+    assert not {"iterations", "of schedule", "train s"} & set(tables.table(["b"], [imported]).titles)
 
 
 def test_what_was_trained_on_after_it_was_scored_is_said(tmp_path):
@@ -183,3 +186,9 @@ def test_an_absent_score_says_whose_it_is():
     one, two = {"psnr": 1.0, "lpips": 0.2}, {"psnr": 2.0, "absent": {"lpips": "not asked for"}}
     assert tables.table(["a", "b"], [one, two]).notes == ("lpips of b absent: not asked for",)
     assert tables.table(["b"], [two]).notes == ("lpips absent: not asked for",)
+
+
+def test_rows_are_called_what_they_are() -> None:
+    anchors, explicit = results("moe-gs", 27.0), results("3dgs", 26.0, activation_ratio=None)
+    assert "anchors" in tables.table(["a"], [anchors]).titles and "Gaussians" in tables.table(["b"], [explicit]).titles
+    assert "anchors or Gaussians" in tables.table(["a", "b"], [anchors, explicit]).titles

@@ -60,6 +60,7 @@ def dispatch(args: list[str]) -> int:
     try:
         from scene_experts import commands  # imports torch: not needed for the help above
 
+        expect_no_empty(rest)
         return commands.run(command, rest)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -83,6 +84,14 @@ def dispatch(args: list[str]) -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
+
+
+def expect_no_empty(args: Sequence[str]) -> None:
+    """Raises InputError for an empty value: of a path it would be the current folder, as where a shell's variable is not set."""
+    for place, arg in enumerate(args):
+        if not arg or (arg.startswith("--") and arg.endswith("=")):
+            before = arg or (args[place - 1] if place else "the command")
+            raise InputError(f"expected a value after {before}, found an empty one; give one, or leave it out")
 
 
 def out_of_memory(error: Exception) -> bool:

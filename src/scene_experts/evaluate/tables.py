@@ -65,8 +65,8 @@ COLUMNS = (
     Column("active %", ("activation_ratio",), 1, 100.0),
     Column("sharpness", ("sharpness", "ratio"), 2),
     Column("FPS", ("fps", "fps"), 1, best=1),
-    Column("steps", ("step",), counted=True),
-    Column("of", ("iterations",), counted=True),  # the schedule's length: with fewer steps a training was cut off, not short
+    Column("iterations", ("step",), counted=True),
+    Column("of schedule", ("iterations",), counted=True),  # the schedule's length: with fewer steps a training was cut off, not short
     Column("train s", ("train_seconds",), counted=True),
 )
 
@@ -134,7 +134,14 @@ def table(names: Sequence[str], results: Sequence[dict[str, Any]], columns: Sequ
             winner = max(texts, key=lambda i: columns[j].best * (values[i][j] or 0.0))
             best |= {(i, place + 1) for i, text in texts.items() if text == texts[winner]}
     rows = tuple((name, *(columns[j].text(row[j]) for j in used)) for name, row in zip(names, values))
-    return Table(("run", *(columns[j].title for j in used)), rows, frozenset(best), _notes(names, results))
+    titles = tuple(columns[j].title if columns[j].path != ("anchors",) else _counted_as(results) for j in used)
+    return Table(("run", *titles), rows, frozenset(best), _notes(names, results))
+
+
+def _counted_as(results: Sequence[dict[str, Any]]) -> str:
+    """What the rows of the scenes are: explicit scenes (which have no share of active Gaussians) hold Gaussians themselves."""
+    explicit = {result.get("activation_ratio") is None for result in results if result.get("anchors") is not None}
+    return "Gaussians" if explicit == {True} else "anchors" if explicit == {False} else "anchors or Gaussians"
 
 
 def _notes(names: Sequence[str], results: Sequence[dict[str, Any]]) -> tuple[str, ...]:
