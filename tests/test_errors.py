@@ -6,7 +6,7 @@ import os
 import pytest
 
 from scene_experts import cli, commands
-from scene_experts.errors import InputError, RunError, nearest
+from scene_experts.errors import InputError, RunError, few, nearest
 
 
 @pytest.mark.parametrize(
@@ -42,3 +42,7 @@ def test_neither_is_the_other_and_a_fault_of_ours_is_not_hidden(monkeypatch):
 def test_a_word_like_a_known_one_is_hinted_at():
     assert nearest("exprt", ["export", "eval"]) == "; did you mean 'export'?"
     assert nearest("zzz", ["export", "eval"]) == ""
+
+
+def test_of_many_names_the_first_are_told():
+    assert few(["a", "b", "c"]) == "a, b, c" and few(["a", "b", "c", "d"]) == "a, b, c and 1 more" and few([], 8) == ""

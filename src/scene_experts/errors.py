@@ -1,7 +1,7 @@
 """The two ways a command ends badly. Every message says what was expected, what was found and what to do, in one sentence."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 class InputError(Exception):
@@ -23,3 +23,8 @@ def nearest(word: str, words: Iterable[str]) -> str:
     """A hint at the known words most like an unknown one: "; did you mean 'moe-gs'?", or nothing."""
     like = difflib.get_close_matches(word, list(words), 3, 0.6)
     return f"; did you mean {' or '.join(repr(found) for found in like)}?" if like else ""
+
+
+def few(names: Sequence[str], most: int = 3) -> str:
+    """The first of many names, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import positional
-from scene_experts.errors import InputError, expect_at_least
+from scene_experts.errors import InputError, expect_at_least, few
 from scene_experts.progress import Bar, clock
 from scene_experts.sfm import run
 from scene_experts.sfm.frames import MOST
@@ -95,7 +95,7 @@ def told(note: dict[str, Any]) -> list[str]:
         f"{note['error']:.2f} px off on average; {note['mapper']} mapper, {clock(note['seconds'])} min"
     ]
     if without:
-        lines.append(f"without a pose: {', '.join(without[:8])}" + (f" and {len(without) - 8} more" if len(without) > 8 else ""))
+        lines.append(f"without a pose: {few(without, 8)}")
     if note["apart"]:
         parts = ", ".join(map(str, note["apart"]))
         lines.append(f"warning: {parts} of these fit together, but not with the others: take photographs in between")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from scene_experts.config import RunConfig, from_json, to_json
-from scene_experts.errors import InputError
+from scene_experts.errors import InputError, few
 from scene_experts.evaluate.tables import load_results
 from scene_experts.io import read_json, write_json
 from scene_experts.reproduce.plan import Spec, identity
@@ -171,11 +171,6 @@ def expect_of_captures(records: Sequence[Record], specs: Sequence[Spec]) -> None
                 f"expected records of '{spec.scene.name}' with the views that {spec.scene.path} holds out ({few(there)}), "
                 f"found scores of {few(scored)}, so of another capture of that name; rename the folder, or give it --records of its own"
             )
-
-
-def few(names: Sequence[str]) -> str:
-    """The first of many names."""
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def of_specs(records: Sequence[Record], specs: Sequence[Spec]) -> list[Record]:
