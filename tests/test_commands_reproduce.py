@@ -4,7 +4,7 @@ import pytest
 
 from records import record
 from scene_experts import cli
-from scene_experts.commands.reproduce import ReproduceCommand, experiments_of, scenes_of
+from scene_experts.commands.reproduce import ReproduceCommand, experiments_of, planned, scenes_of
 from scene_experts.errors import InputError
 from scene_experts.io import write_json
 from scene_experts.reproduce import store
@@ -52,6 +52,7 @@ def test_tables_of_what_is_done_without_running_the_rest(tmp_path, capsys):
 
 def test_a_run_whose_checkpoints_are_gone_costs_its_picture_alone(tmp_path, capsys):
     (tmp_path / "fox").mkdir()
+    (tmp_path / "fox" / "transforms.json").touch()
     args = ["--captures", str(tmp_path / "fox"), "--out", str(tmp_path / "out"), "--iterations", "3000", "--recipes", "moe-gs-e3-top2"]
     made = record("moe-gs-e3-top2", "fox")
     store.write(tmp_path / "out" / "records", made)
@@ -66,12 +67,14 @@ def recipes_of(capsys, *args: str) -> tuple[int, set[str], set[str]]:
     """How many runs a plan has, and their recipes and seeds."""
     assert cli.main(["reproduce", *args, "--dry-run"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith(("done ", "to run "))]
-    return len(lines), {line[-5] for line in lines}, {line[-1] for line in lines}
+    at = [line.index("on") for line in lines]
+    return len(lines), {line[i - 1] for line, i in zip(lines, at)}, {line[i + 3].rstrip(":") for line, i in zip(lines, at)}
 
 
 def test_the_plans_of_the_results_page_are_one_command_each(tmp_path, capsys):
     for name in ("bonsai", "fox", "buddha"):
         (tmp_path / name).mkdir()
+        (tmp_path / name / "transforms.json").touch()
     captures = ["--captures", *(str(tmp_path / name) for name in ("bonsai", "fox", "buddha"))]
     suite = ["table1", "table3", "table4", "fig1b", "fig3", "fig5", "fig6", "fig7"]
     count, recipes, _ = recipes_of(capsys, *suite, *captures, "--iterations", "3000", "--resolution", "longest:400")
@@ -84,6 +87,7 @@ def test_the_plans_of_the_results_page_are_one_command_each(tmp_path, capsys):
 
 def test_a_failure_is_told_at_the_end(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "transforms.json").touch()
     assert cli.main(["reproduce", "fig5", "--captures", str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 1
     found = capsys.readouterr()
     assert "FAILED" in found.out and "1 that failed" in found.err and "Traceback" not in found.err
@@ -91,6 +95,7 @@ def test_a_failure_is_told_at_the_end(tmp_path, capsys):
 
 def test_names_that_are_none(tmp_path, capsys):
     (tmp_path / "box").mkdir()
+    (tmp_path / "note").touch()
     assert cli.main(["reproduce", "table3", "--captures", str(tmp_path / "box"), "--recipes", "scafold-gs", "--dry-run"]) == 2
     assert "did you mean 'scaffold-gs'" in capsys.readouterr().err
     with pytest.raises(InputError, match="did you mean 'table1'"):
@@ -101,5 +106,11 @@ def test_names_that_are_none(tmp_path, capsys):
         scenes_of(ReproduceCommand(("table1",), data=tmp_path))
     with pytest.raises(InputError, match="expected --scenes among the captures box, found bax"):
         scenes_of(ReproduceCommand(("table1",), captures=(tmp_path / "box",), scenes=("bax",)))
+    with pytest.raises(InputError, match=r"expected a capture in .*box .*found"):
+        planned(ReproduceCommand(("table1",), captures=(tmp_path / "box",), dry_run=True))
+    with pytest.raises(InputError, match=r"expected a folder at .*, found a file"):
+        planned(ReproduceCommand(("table1",), captures=(tmp_path / "box",), out=tmp_path / "note"))
+    for flag in ("--captures", "--seeds", "--devices"):
+        assert cli.main(["reproduce", "table3", flag, "--dry-run"]) == 2 and f"values after {flag}, found none" in capsys.readouterr().err
     with pytest.raises(InputError, match="expected rome"):
         scenes_of(ReproduceCommand(("table1",), data=tmp_path, scenes=("rome",)))

@@ -9,7 +9,7 @@ import scene_experts
 
 SOURCE = Path(scene_experts.__file__).parent
 LAYERS = [
-    {"errors", "io", "native", "transfer", "types", "__init__"},
+    {"errors", "io", "native", "signals", "transfer", "types", "__init__"},
     {"geometry", "native_terms"},
     {"table", "schedule", "checkpoint", "optim"},
     {"data", "render", "scene", "losses"},

@@ -8,10 +8,11 @@ import pytest
 from scene_experts.commands.train import parse_train
 from scene_experts.config import flags_of
 from scene_experts.data import catalog
+from scene_experts.data.images import check_policy, target_size
 from scene_experts.errors import InputError
 from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS
-from scene_experts.reproduce.plan import COLLECTIONS, OWN, Scale, Scene, Spec, own_scenes, paper_scenes, specs
+from scene_experts.reproduce.plan import COLLECTIONS, OWN, Scale, Scene, Spec, own_scenes, paper_scenes, smaller, specs
 
 FOX = Scene("fox", OWN, Path("captures/fox"))
 
@@ -31,7 +32,7 @@ def test_the_arguments_make_the_run_that_the_key_names(tmp_path):
     spec = Spec(replace(FOX, options={"split": "none"}), "moe-gs", 3, Scale.of(0.1))
     made = parse_train(spec.arguments(tmp_path)[1:])
     assert made.cfg == spec.train and made.data == spec.data and made.out == tmp_path
-    assert (made.cfg.iterations, made.data.resolution, made.data.split) == (3000, "longest:160", "none")
+    assert (made.cfg.iterations, made.data.resolution, made.data.split) == (3000, "share:0.1", "none")
 
 
 def test_what_changes_numbers_changes_the_key_and_the_place_does_not():
@@ -50,7 +51,7 @@ def test_what_changes_numbers_changes_the_key_and_the_place_does_not():
 
 def test_scale():
     assert Scale.of(1.0) == Scale()
-    assert Scale.of(0.25) == Scale(0.25, None, "longest:400")
+    assert Scale.of(0.25) == Scale(0.25, None, None) and Spec(FOX, "moe-gs", 0, Scale(0.25)).data.resolution == "share:0.25"
     assert Scale.of(0.25, 3000, "as-is") == Scale(0.25, 3000, "as-is")
     lengths = {r: [Spec(FOX, r, 0, s).train.iterations for s in (Scale(), Scale(0.25), Scale(iterations=3000))] for r in RECIPES}
     assert lengths["moe-gs"] == lengths["3dgs"] == [30_000, 7500, 3000]
@@ -60,6 +61,18 @@ def test_scale():
             Scale.of(wrong)
     with pytest.raises(InputError, match="--iterations"):
         Scale.of(1.0, 0)
+    with pytest.raises(InputError, match="--resolution"):
+        Scale.of(1.0, None, "huge")
+
+
+def test_a_smaller_scale_is_a_smaller_picture_whatever_the_protocol():
+    scales = (1.0, 0.95, 0.5, 0.1)
+    for policy, full in (("auto", (4946, 3286)), ("auto", (684, 385)), ("longest:800", (4946, 3286)), ("as-is", (684, 385))):
+        sizes = [target_size(check_policy(smaller(policy, s) if s < 1 else policy), full) for s in scales]
+        assert all(abs(w - s * sizes[0][0]) <= 1 and abs(h - s * sizes[0][1]) <= 1 for s, (w, h) in zip(scales, sizes)), policy
+    # inria:4 reads images_4, which is 1237 px wide of 4946
+    assert target_size(check_policy(smaller("inria:4", 0.5)), (4946, 3286))[0] == 618
+    assert max(target_size(check_policy(smaller("auto", 0.001)), (684, 385))) == 16
 
 
 def test_own_captures_need_folders_and_names_of_their_own(tmp_path):

@@ -36,5 +36,7 @@ def test_means_are_over_the_captures_that_every_row_has(tmp_path):
 def test_short_trainings_are_said_to_be_no_judges():
     assert report.short_runs([record(iterations=30_000)]) == report.short_runs([]) == []
     (line, _) = report.short_runs([record(iterations=3000), record(iterations=200)])
-    assert "3,000 iterations with 13 adjustments of density, not of 30,000 and 134: what they leave open" in line
+    assert "3,000 iterations with 13 adjustments of density, not of 30,000 and 134 (Scaffold-GS's): what they leave open" in line
+    several = report.short_runs([record("octree-gs"), record()])[0]
+    assert "3,000 iterations with 13 to 17 adjustments" in several
     assert "**they say nothing of the paper**" in report.short_runs([record(iterations=200)])[0]

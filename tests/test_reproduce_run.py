@@ -107,7 +107,11 @@ def test_a_run_that_another_process_is_at_is_left_alone(runner):
     (folder / "metrics.jsonl").write_text("the other's")
     with held(folder):
         (failure,) = runner.make([spec()])
-    assert "found a training at work" in failure.why and (folder / "metrics.jsonl").read_text() == "the other's" and not runner.calls
+    assert (
+        "found one at work there; once it has ended, give the same command" in failure.why
+        and (folder / "metrics.jsonl").read_text() == "the other's"
+        and not runner.calls
+    )
 
 
 def test_run_folders_go_when_asked_after_what_else_is_taken(runner):

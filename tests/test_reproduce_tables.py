@@ -2,7 +2,7 @@
 
 from records import record
 from scene_experts.reproduce.experiments import EXPERIMENTS
-from scene_experts.reproduce.tables import by_dataset, by_scene, escape, published, to_latex, write_all
+from scene_experts.reproduce.tables import by_dataset, by_scene, escape, expert_shares, published, to_latex, write_all
 
 TABLE4, TABLE3 = EXPERIMENTS["table4"], EXPERIMENTS["table3"]
 
@@ -51,7 +51,8 @@ def test_the_three_files():
     table = by_dataset(TABLE4, runs(), "TanksAndTemples", ["truck"])
     files = write_all("Table 4", {"T&T": table})
     assert files["md"].startswith("# Table 4") and "| MoE-GS |" in files["md"].replace("**", "")
-    assert "w/o MoE,23.00" in files["csv"]
+    assert files["csv"].splitlines()[0] == "table,row,column,value,spread"
+    assert "T&T,w/o MoE,PSNR,23.00," in files["csv"] and "T&T,MoE-GS,PSNR,24.50,0.71" in files["csv"] and "w/o CL,PSNR," not in files["csv"]
     assert r"w/o L\_load" in to_latex(table, "T&T") and r"\caption{T\&T}" in to_latex(table, "T&T") and r"$\pm$" in files["tex"]
     assert escape("50 %") == r"50 \%"
 
@@ -61,3 +62,19 @@ def test_a_row_that_lacks_a_scene_is_no_rival():
         TABLE4, [*runs(), record("scaffold-gs-opacity", "train", 0, psnr=10.0, views=1)], "TanksAndTemples", ["truck", "train"]
     )
     assert (list(TABLE4.rows).index("MoE-GS"), 1) not in table.best and "MoE-GS: no run on train" in table.notes
+
+
+def test_notes_say_which_seeds_each_mean_is_of():
+    pair = [record("moe-gs", s, seed, psnr=24.0 + seed) for s in ("truck", "train") for seed in (0, 1)]
+    lacking = [record("scaffold-gs-opacity", s, seed) for s, seed in (("truck", 0), ("truck", 1), ("train", 0))]
+    found = by_dataset(TABLE4, [*pair, *lacking], "TanksAndTemples", ["truck", "train"]).notes
+    assert "w/o MoE: means of seeds 0, the others lack scenes" in found and not any("MoE-GS: means" in note for note in found)
+
+
+def test_shares_of_experts_at_the_end():
+    experts = {"cov": {"share": [0.5, 0.3, 0.2], "per_anchor": [1.0, 0.6, 0.4], "mean_gate": [0.4, 0.3, 0.3], "entropy": 0.5}}
+    table = expert_shares(EXPERIMENTS["fig3"], [record("moe-gs-e3-top2", seed=1), record("moe-gs-e3-top2", experts=experts)], "fox")
+    assert table is not None and table.rows == (("with L_load: cov", "50.0", "30.0", "20.0", "100.0", "60.0", "40.0", "0.50"),)
+    assert table.titles[3:5] == ("expert 3", "expert 1, of anchors")
+    dense = {"cov": {"share": None, "per_anchor": None, "mean_gate": [0.5, 0.5], "entropy": 1.0}}
+    assert expert_shares(EXPERIMENTS["fig3"], [record("moe-gs-e3-top2", experts=dense)], "fox") is None

@@ -76,7 +76,7 @@ class Data:
     images: str | None = None
     """Image folder inside the capture, e.g. images_4."""
     resolution: Annotated[str, tyro.conf.arg(aliases=["-r"])] = "auto"
-    """as-is, factor:N, longest:PX, cap1600, inria:N, or auto (cap1600)."""
+    """as-is, factor:N, longest:PX, cap1600, share:S (of what cap1600 gives), inria:N, or auto (cap1600)."""
     split: str = "auto"
     """mod8 (every 8th view is held out), mod:N, first:N, none, files, or auto: files where the capture brings its own split, else mod8."""
     missing: Literal["error", "drop"] = "error"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from scene_experts.signals import follow_parent
+
 HANDLERS: dict[str, tuple[str, str]] = {
     "capture": ("capture", "capture"),
     "info": ("inspect", "info"),
@@ -26,5 +28,6 @@ HANDLERS: dict[str, tuple[str, str]] = {
 
 def run(command: str, args: list[str]) -> int:
     """Run a command of HANDLERS; returns its exit code."""
+    follow_parent()
     module, function = HANDLERS[command]
     return getattr(import_module(f"{__name__}.{module}"), function)(args)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +17,7 @@ from scene_experts.progress import Bar, clock
 from scene_experts.sfm import run
 from scene_experts.sfm.frames import MOST
 from scene_experts.sfm.pairs import Matching
+from scene_experts.signals import handled
 
 FEW = 0.9  # a smaller share of photographs with a pose is worth a word of advice
 
@@ -63,7 +61,7 @@ def capture(args: list[str]) -> int:
     console = Console(highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
     options = run.Options(**{name: getattr(command, name) for name in vars(run.Options())})
-    with ended_as_interrupted(), Bar(console) as bar:
+    with handled(interrupt), Bar(console) as bar:
         note = run.make(command.photos, command.out, options, overwrite=command.overwrite, say=say, progress=bar)
     for line in told(note):
         say(line)
@@ -71,20 +69,9 @@ def capture(args: list[str]) -> int:
     return 0
 
 
-@contextmanager
-def ended_as_interrupted() -> Iterator[None]:
-    """SIGTERM and SIGHUP end the work as Ctrl-C does: COLMAP's process with it."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    signals = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    previous = {number: signal.signal(number, interrupt) for number in signals}
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+def interrupt(*_: object) -> None:
+    """SIGTERM and a closed terminal end the work as Ctrl-C does: COLMAP's process with it."""
+    raise KeyboardInterrupt
 
 
 def told(note: dict[str, Any]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,8 +15,9 @@ from scene_experts.data.obtain import captures_dir
 from scene_experts.errors import InputError, RunError, expect_at_least, nearest
 from scene_experts.reproduce import report, store
 from scene_experts.reproduce.experiments import EXPERIMENTS, Experiment
-from scene_experts.reproduce.plan import Scale, Scene, Spec, distinct, own_scenes, paper_scenes, specs
+from scene_experts.reproduce.plan import Scale, Scene, Spec, distinct, expect_captures, own_scenes, paper_scenes, specs
 from scene_experts.reproduce.run import Failure, Runner, Say
+from scene_experts.signals import handled
 
 
 @dataclass(frozen=True)
@@ -39,14 +39,14 @@ class ReproduceCommand:
     records: Path | None = None
     """Folder for records of finished runs, which count as done; OUT/records by default. Experiments of several sizes may share one."""
     scale: float = 1.0
-    """1 is the paper's size; less shortens the schedule and the longest side (of 1,600 px) together."""
+    """1 is the paper's size; less shortens the schedule and the pictures' sides together."""
     iterations: int | None = None
     """Length of each training, in place of what --scale gives."""
     resolution: str | None = None
     """Resolution policy (as-is, longest:PX, ...), in place of what --scale gives."""
     seeds: tuple[int, ...] = (0,)
-    workers: int = 1
-    """Runs at a time, each in a process of its own."""
+    workers: int | None = None
+    """Runs at a time, each in a process of its own; by default one, or one for each of --devices."""
     devices: tuple[str, ...] = ()
     """CUDA devices to share among the workers, by index."""
     recipes: tuple[str, ...] = ()
@@ -74,8 +74,10 @@ class Plan:
 
 
 def reproduce(args: list[str]) -> int:
+    expect_values(args)
     command = tyro.cli(ReproduceCommand, prog=f"{PROG} reproduce", args=args)
-    expect_at_least([("--workers", command.workers, 1), *(("--seeds", seed, 0) for seed in command.seeds)])
+    workers = command.workers if command.workers is not None else max(1, len(command.devices))
+    expect_at_least([("--workers", workers, 1), *(("--seeds", seed, 0) for seed in command.seeds)])
     plan = planned(command)
     console = Console(highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
@@ -87,7 +89,7 @@ def reproduce(args: list[str]) -> int:
     if command.dry_run:
         tell(plan, say)
         return 0
-    runner = Runner(plan.runs, plan.records, command.workers, command.devices, command.discard, say, artist(command, plan))
+    runner = Runner(plan.runs, plan.records, workers, command.devices, command.discard, say, artist(command, plan))
     failures = [] if command.tables_only else made(runner, plan, command.out)
     found = store.of_specs(store.load(plan.records), plan.shown)
     for path in report.write(command.out, plan.experiments, plan.scenes, found, said(command, plan.scenes)):
@@ -97,15 +99,30 @@ def reproduce(args: list[str]) -> int:
         return 130
     if failures:
         lines = "; ".join(f"{f.spec.label}: {f.why} ({f.log})" for f in failures)
-        raise RunError(f"expected {len(plan.wanted)} runs to end well, found {len(failures)} that failed, the rest is done: {lines}")
+        raise RunError(
+            f"expected {len(plan.wanted)} runs to end well, found {len(failures)} that failed (what ended well is kept): {lines}"
+        )
     return 0
 
 
+def expect_values(args: list[str]) -> None:
+    """Raises InputError for an option that lists things and lists none: it would be as if it were not given."""
+    several = {f"--{name}" for name, value in vars(ReproduceCommand(())).items() if isinstance(value, tuple)}
+    for flag, after in zip(args, [*args[1:], "--"]):
+        if flag in several and after.startswith("--"):
+            raise InputError(f"expected one or more values after {flag}, found none; give some, or leave it out")
+
+
 def planned(command: ReproduceCommand) -> Plan:
-    """Raises InputError for experiments, scenes or recipes that are none."""
+    """Raises InputError for experiments, scenes or recipes that are none, and for folders that are files."""
+    for folder in (command.out, command.runs, command.records):
+        if folder and folder.exists() and not folder.is_dir():
+            raise InputError(f"expected a folder at {folder}, found a file; choose another --out, --runs or --records")
     chosen, scenes = experiments_of(command), scenes_of(command)
     scale = Scale.of(command.scale, command.iterations, command.resolution)
     chosen = rows_of(chosen, command.recipes) if command.recipes else chosen
+    if not command.tables_only:
+        expect_captures(scenes)
     shown = specs(chosen, scenes, command.seeds or (0,), scale)
     records, runs = command.records or command.out / "records", command.runs or command.out / "runs"
     return Plan(chosen, scenes, shown, distinct(shown), records, runs)
@@ -116,7 +133,7 @@ def tell(plan: Plan, say: Say) -> None:
     there = store.load(plan.records)
     done = [store.find(there, spec) is not None for spec in plan.wanted]
     for spec, is_done in zip(plan.wanted, done):
-        say(f"{'done   ' if is_done else 'to run '} {spec.label}")
+        say(f"{'done   ' if is_done else 'to run '} {spec.label}: {spec.train.iterations:,} iterations, {spec.data.resolution}")
     say(f"{len(plan.wanted)} runs, {sum(done)} of them done")
 
 
@@ -133,15 +150,11 @@ def artist(command: ReproduceCommand, plan: Plan) -> Callable[[Spec, Path], None
 
 def made(runner: Runner, plan: Plan, out: Path) -> list[Failure]:
     """Makes what is not done, and the pictures in `out` of what was done before they were asked for; returns the runs that failed."""
-    previous = {s: signal.signal(s, lambda *_: runner.end()) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with handled(lambda *_: runner.end()):
         failures = runner.make(plan.wanted)
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
     for spec in plan.wanted:
         folder = spec.folder(plan.runs)
-        if (folder / "results.json").is_file() and not report.strip_path(out, spec).is_file():
+        if (folder / "results.json").is_file() and not report.strip_path(out, spec.scene.name).is_file():
             try:
                 runner.after(spec, folder)
             except InputError as error:

@@ -28,6 +28,7 @@ from scene_experts.progress import Progress
 from scene_experts.recipes import RECIPES
 from scene_experts.record import Recorder
 from scene_experts.render import Rasterizer
+from scene_experts.signals import handled
 from scene_experts.train import Run
 from scene_experts.view.live import Live
 from scene_experts.view.server import check_port, viser
@@ -150,7 +151,7 @@ def check_settings(command: TrainCommand) -> None:
 
 
 def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasterizer, console: Console) -> int:
-    """Train, show and record; Ctrl-C and SIGTERM save and end the run."""
+    """Train, show and record; Ctrl-C, SIGTERM and a closed terminal save and end the run."""
 
     def stop(number: int, _: object) -> None:
         if run.stop:
@@ -163,24 +164,22 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
         label = f"{command.cfg.recipe} on {capture.name}"
         live = Live(capture, rasterize, lambda: bool(run.stop), command.port, label, command.out / "paths", say)
         run = replace(run, watch=live)
-    previous = {s: signal.signal(s, stop) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with ExitStack() as folder, Recorder(command.out, command.tensorboard, capture) as record, Progress(console) as progress:
-            for event in training.train(command.cfg, run, capture, rasterize):
-                if isinstance(event, Started):  # what can fail before the first iteration has not: now the folder may change
-                    finished = event.step if event.step == event.total else 0
-                    folder.enter_context(run_folder.held(command.out))
-                    run_folder.prepare(command.out, run.config, command.resume, command.overwrite)
-                record(event)
-                progress(event)
-                if live:
-                    live.event(event)
-    finally:
-        if live:
-            live.close()
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-        capture.images.close()
+    with handled(stop):
+        try:
+            with ExitStack() as folder, Recorder(command.out, command.tensorboard, capture) as record, Progress(console) as progress:
+                for event in training.train(command.cfg, run, capture, rasterize):
+                    if isinstance(event, Started):  # what can fail before the first iteration has not: now the folder may change
+                        finished = event.step if event.step == event.total else 0
+                        folder.enter_context(run_folder.held(command.out))
+                        run_folder.prepare(command.out, run.config, command.resume, command.overwrite)
+                    record(event)
+                    progress(event)
+                    if live:
+                        live.event(event)
+        finally:
+            if live:
+                live.close()
+            capture.images.close()
     if finished and (command.out / f"point_cloud/iteration_{finished}/point_cloud.ply").is_file():
         console.print("nothing was left to train: the run's files stay as they are", soft_wrap=True)
     elif not run.stop:

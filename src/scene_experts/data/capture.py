@@ -42,7 +42,7 @@ def load(
     """Load the capture in folder `path`: COLMAP (sparse/0, images), NeRF-synthetic (transforms_train.json), nerfstudio (transforms.json).
 
     images: folder of the photographs, relative to `path`, e.g. "images_4"; intrinsics follow the size found there.
-    resolution: "auto" (= "cap1600"), "as-is", "cap1600", "factor:N", "longest:N", or "inria:N" (the folder images_N as it is).
+    resolution: "auto" (= "cap1600"), "as-is", "cap1600", "factor:N", "longest:N", "share:S", or "inria:N" (the folder images_N as it is).
     split: "auto" (files for NeRF-synthetic and where transforms.json names test views, else mod8), "modN", "first:N", "none", "files".
     normalise: "extent" trains in a world centred on the mean training camera with extent 5; "none" in the capture's own.
     init: "points" needs 3D points; "random" replaces them by random ones.
@@ -91,7 +91,7 @@ def _read(root: Path, images: str | None, background: Colour | None, missing: st
         return transforms.read_blender(root, background)
     if (root / "transforms.json").is_file():
         return transforms.read_nerfstudio(root, images)
-    raise _no_capture(root)
+    raise no_capture(root)
 
 
 def is_capture(root: Path) -> bool:
@@ -99,7 +99,7 @@ def is_capture(root: Path) -> bool:
     return colmap.find_model(root) is not None or any((root / f"transforms{end}.json").is_file() for end in ("", "_train"))
 
 
-def _no_capture(root: Path) -> InputError:
+def no_capture(root: Path) -> InputError:
     """Why a folder is no capture, and what to do: photographs alone need poses first."""
     expected = f"expected a capture in {root} (COLMAP's sparse/0 beside images, transforms_train.json or transforms.json), found"
     if is_capture(root.absolute().parent):

@@ -69,7 +69,8 @@ def target_size(policy: str, size: Size) -> Size:
     """Width and height that resolution `policy` makes of an image of `size`.
 
     "as-is" and "inria:N" (which reads the folder images_N) keep it; "cap1600" caps the width at 1600 px, sizes cut to whole pixels as
-    Scaffold-GS does; "factor:N" divides by N and rounds; "longest:N" caps the longer side at N px. Nothing is ever enlarged.
+    Scaffold-GS does; "factor:N" divides by N and rounds; "longest:N" caps the longer side at N px; "share:S" takes S of what "cap1600"
+    gives, 16 px of the longer side at least. Nothing is ever enlarged.
     """
     w, h = size
     kind, _, number = policy.partition(":")
@@ -80,7 +81,11 @@ def target_size(policy: str, size: Size) -> Size:
         return max(1, int(w / scale)), max(1, int(h / scale))
     if kind == "factor":
         return max(1, round(w / float(number))), max(1, round(h / float(number)))
-    scale = min(1.0, int(number) / max(w, h))
+    if kind == "share":
+        w, h = target_size("cap1600", size)
+        scale = max(float(number), min(1.0, 16 / max(w, h)))
+    else:
+        scale = min(1.0, int(number) / max(w, h))
     return max(1, round(w * scale)), max(1, round(h * scale))
 
 
@@ -90,12 +95,14 @@ def check_policy(policy: str) -> str:
         return "cap1600" if policy == "auto" else policy
     kind, _, number = policy.partition(":")
     try:
-        good = (kind == "factor" and float(number) >= 1) or (kind in ("longest", "inria") and int(number) >= 1)
+        good = (kind == "factor" and float(number) >= 1) or (kind == "share" and 0 < float(number) <= 1)
+        good = good or (kind in ("longest", "inria") and int(number) >= 1)
     except ValueError:
         good = False
     if not good:
         raise InputError(
-            f"expected --resolution auto, as-is, cap1600, factor:N, longest:N or inria:N with N >= 1, found {policy!r}; choose one"
+            f"expected --resolution auto, as-is, cap1600, factor:N, longest:N or inria:N with N >= 1, or share:S with S in (0, 1], "
+            f"found {policy!r}; choose one"
         )
     return policy
 

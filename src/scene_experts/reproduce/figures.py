@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from PIL import Image
 
 from scene_experts.errors import InputError
 from scene_experts.io import write_bytes
@@ -45,6 +48,17 @@ def save(figure: Any, path: Path) -> list[Path]:
     return out
 
 
+def framed(picture: Path) -> Path:
+    """The SVG beside a PNG: a frame of its size that holds it."""
+    with Image.open(picture) as image:
+        width, height = image.size
+    data = base64.b64encode(picture.read_bytes()).decode()
+    address = f'xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" viewBox="0 0 {width} {height}"'
+    held = f'<image width="{width}" height="{height}" href="data:image/png;base64,{data}"/>'
+    write_bytes(picture.with_suffix(".svg"), f"<svg {address}>{held}</svg>\n".encode())
+    return picture.with_suffix(".svg")
+
+
 def relative_psnr(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str], path: Path) -> list[Path]:
     """Figure 1(b): PSNR relative to the first row (3DGS) in percent, scenes in order of Scaffold-GS's anchors."""
     anchors = {s: m.value for s in scenes if (m := mean(of_recipe(records, "scaffold-gs", s), "anchors"))}
@@ -69,6 +83,7 @@ def shares(experiment: Experiment, records: Sequence[Record], scene: str, path: 
     """Figure 3: share of the assignments per expert over training (of the gates while dense), one panel per row."""
     found = [(name, of_recipe(records, recipe, scene)) for name, recipe in experiment.rows.items()]
     found = [(name, min(rows, key=lambda r: r.seed)) for name, rows in found if rows]
+    found = [(name, record) for name, record in found if any(attribute in c.get("routing", {}) for c in record.curves)]
     if not found:
         return []
     figure, axes = canvas(len(found))

@@ -11,12 +11,13 @@ from typing import Any
 
 from scene_experts.config import Data, Train, flags_of, to_json, with_numbers
 from scene_experts.data import catalog
+from scene_experts.data.capture import is_capture, no_capture
+from scene_experts.data.images import check_policy
 from scene_experts.data.obtain import present
 from scene_experts.errors import InputError
 from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import Experiment
 
-FULL_SIDE = 1600  # the longest side of the paper's protocol, px
 COLLECTIONS = {"mipnerf360": "MipNeRF360", "tandt": "TanksAndTemples", "db": "DeepBlending", "bungeenerf": "BungeeNeRF"}
 OWN = "captures"  # the name of the user's own captures among the data sets
 
@@ -42,17 +43,26 @@ class Scale:
 
     @classmethod
     def of(cls, scale: float, iterations: int | None = None, resolution: str | None = None) -> Scale:
-        """`scale` in (0, 1] shortens the schedule and the longest side together; the other two override it. Raises InputError."""
+        """`scale` in (0, 1] shortens the schedule and the pictures' sides together; the other two override it. Raises InputError."""
         if not 0 < scale <= 1:
             raise InputError(f"expected --scale above 0 and at most 1, found {scale}; 1 is the paper's own size")
         if iterations is not None and iterations < 1:
             raise InputError(f"expected --iterations of at least 1, found {iterations}; give a larger number or leave it out")
-        smaller = f"longest:{max(16, round(FULL_SIDE * scale))}" if scale < 1 else None
-        return cls(scale, iterations, resolution or smaller)
+        return cls(scale, iterations, check_policy(resolution) if resolution and resolution != "auto" else resolution)
 
     def length(self, cfg: Train) -> int:
         """Iterations of a recipe: Octree-GS is written for 40,000, the others for 30,000."""
         return self.iterations or max(1, round(cfg.schedule * self.share))
+
+
+def smaller(policy: str, share: float) -> str:
+    """The resolution policy that gives `share` of the sides that `policy` gives; what inria:N reads is made of the full photographs."""
+    kind, _, number = policy.partition(":")
+    if kind in ("inria", "factor", "as-is"):
+        return f"factor:{float(number or 1) / share:g}"
+    if kind == "longest":
+        return f"longest:{max(16, round(int(number) * share))}"
+    return f"share:{(float(number) if kind == 'share' else 1.0) * share:g}"
 
 
 @dataclass(frozen=True)
@@ -74,6 +84,8 @@ class Spec:
         options = dict(self.scene.options)
         if self.scale.resolution:
             options["resolution"] = self.scale.resolution
+        elif self.scale.share < 1:
+            options["resolution"] = smaller(options.get("resolution", "auto"), self.scale.share)
         return Data(path=self.scene.path, **options)
 
     @property
@@ -120,6 +132,13 @@ def own_scenes(captures: Sequence[Path]) -> list[Scene]:
         if sum(other.name == scene.name for other in scenes) > 1:
             raise InputError(f"expected captures of different names, found several called '{scene.name}'; rename or link one of them")
     return scenes
+
+
+def expect_captures(scenes: Sequence[Scene]) -> None:
+    """Raises InputError for a scene whose folder is no capture: all of its runs would fail."""
+    for scene in scenes:
+        if not is_capture(scene.path):
+            raise no_capture(scene.path)
 
 
 def paper_scenes(root: Path) -> list[Scene]:

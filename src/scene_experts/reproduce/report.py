@@ -34,7 +34,7 @@ def write(
     for experiment in experiments:
         made = [*write_tables(out, experiment, scenes, records), *write_figures(out, experiment, scenes, records)]
         if experiment.name == "fig5":
-            made += sorted(out.glob("fig5_*.png"))
+            made += [p for s in scenes for p in (strip_path(out, s.name), strip_path(out, s.name).with_suffix(".svg")) if p.is_file()]
         written += made
         page += [f"## {experiment.title}", "", ", ".join(f"[{p.name}]({p.name})" for p in made) or "No run is done yet.", ""]
         page += [f"![{p.stem}]({p.name})\n" for p in made if p.suffix == ".png"]
@@ -53,11 +53,12 @@ def short_runs(records: Sequence[Record]) -> list[str]:
     length = max((r.config.train.iterations for r in records), default=SCHEDULE)
     if length >= SCHEDULE:
         return []
-    made = max(tables.adjustments(r.config.train) for r in records if r.config.train.iterations == length)
+    counts = {tables.adjustments(r.config.train) for r in records if r.config.train.iterations == length}
+    made = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
     few = "what they leave open or contradict may hold in longer ones"
     if length < SHORT:
         few = "so little has grown and been learnt by then that **they say nothing of the paper**"
-    size = f"{length:,} iterations with {made} adjustments of density, not of {SCHEDULE:,} and 134"
+    size = f"{length:,} iterations with {made} adjustments of density, not of {SCHEDULE:,} and 134 (Scaffold-GS's)"
     return [f"The verdicts are of trainings of {size}: {few}.", ""]
 
 
@@ -79,6 +80,9 @@ def write_tables(out: Path, experiment: Experiment, scenes: Sequence[Scene], rec
                 table = replace(table, notes=(*table.notes, f"left out of the means, as not every row has a run there: {missed}"))
             made[f"{dataset}: means over {', '.join(even)}"] = table
             made[f"{dataset}: scene by scene"] = tables.by_scene(experiment, records, done)
+        if experiment.name == "fig3":
+            shared_out = {name: found for name in done if (found := tables.expert_shares(experiment, records, name))}
+            made |= {f"{name}: share of the assignments at the end, %": found for name, found in shared_out.items()}
     out_paths = []
     for ending, text in tables.write_all(experiment.title, made).items() if made else ():
         path = out / f"{experiment.name}.{ending}"
@@ -93,7 +97,9 @@ def write_figures(out: Path, experiment: Experiment, scenes: Sequence[Scene], re
     if experiment.name == "fig1b":
         return figures.relative_psnr(experiment, records, names, out / "fig1b")
     if experiment.name == "fig3":
-        return [path for name in names for path in figures.shares(experiment, records, name, out / f"fig3_{name}")]
+        drawn = [(name, attribute) for name in names for attribute in ("cov", "opacity", "color")]  # the paper shows the first
+        places = {pair: f"fig3_{pair[0]}{'' if pair[1] == 'cov' else '_' + pair[1]}" for pair in drawn}
+        return [path for (name, a), place in places.items() for path in figures.shares(experiment, records, name, out / place, a)]
     if experiment.name == "fig6":
         return figures.cost(experiment, records, out / "fig6")
     if experiment.name == "fig7":
@@ -101,9 +107,9 @@ def write_figures(out: Path, experiment: Experiment, scenes: Sequence[Scene], re
     return []
 
 
-def strip_path(out: Path, spec: Spec) -> Path:
+def strip_path(out: Path, scene: str) -> Path:
     """Where `expert_strip` puts its picture."""
-    return out / f"fig5_{spec.scene.name}.png"
+    return out / f"fig5_{scene}.png"
 
 
 def expert_strip(spec: Spec, run: Path, out: Path, attribute: str = "color") -> Path:
@@ -117,9 +123,10 @@ def expert_strip(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
         whole, each = expert_pictures.alone(opened.scene, capture.views[index].camera, opened.step, rasterize, background, attribute)
     finally:
         capture.images.close()
-    path = strip_path(out, spec)
+    path = strip_path(out, spec.scene.name)
     captions = [f"all {attribute} experts", *(f"expert {i + 1}" for i in range(len(each)))]
     pictures.write(path, pictures.row([pictures.to_8bit(p) for p in (whole, *each)], captions))
+    figures.framed(path)
     return path
 
 

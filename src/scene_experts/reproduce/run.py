@@ -14,11 +14,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from scene_experts import native
 from scene_experts.checkpoint import latest
 from scene_experts.errors import InputError, RunError
 from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import Spec
 from scene_experts.run_folder import held
+from scene_experts.signals import PARENT
 
 Say = Callable[[str], None]
 
@@ -81,14 +83,16 @@ class Runner:
         began = time.monotonic()
         self.say(f"{place} {spec.label}")
         train = spec.arguments(folder)
-        if latest(folder / "checkpoints") is not None:
-            train.append("--resume")
-        elif folder.exists():
+        if folder.exists():
             try:
                 with held(folder):
-                    shutil.rmtree(folder)  # it never came to a whole checkpoint
-            except InputError as error:
-                return self.failed(spec, str(error), log, place)
+                    if latest(folder / "checkpoints") is None:
+                        shutil.rmtree(folder)  # it never came to a whole checkpoint
+                    else:
+                        train.append("--resume")
+            except InputError:
+                why = f"expected {folder} for this training alone, found one at work there; once it has ended, give the same command again"
+                return self.failed(spec, why, log, place)
         for args in (train, ["eval", str(folder)]):
             code = self.command(args, slot, log)
             if self.stop.is_set():
@@ -112,9 +116,9 @@ class Runner:
 
     def command(self, args: list[str], slot: int, log: Path) -> int:
         """Run `scene-experts ARGS` with the worker's share of the machine, its words going to the log; returns the exit code."""
-        environment = dict(os.environ)
+        environment = {**os.environ, PARENT: str(os.getpid())}
         if self.workers > 1:
-            environment["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // self.workers))
+            environment["OMP_NUM_THREADS"] = str(max(1, native.cores() // self.workers))
         if self.devices:
             environment["CUDA_VISIBLE_DEVICES"] = self.devices[slot % len(self.devices)]
         with log.open("a") as stream:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from scene_experts.config import Train
-from scene_experts.evaluate.tables import Table, paper, to_csv, to_markdown
+from scene_experts.evaluate.tables import Table, paper, to_markdown
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN
 from scene_experts.reproduce.statistics import Mean, mean, whole_seeds
@@ -76,6 +78,25 @@ def by_scene(experiment: Experiment, records: Sequence[Record], scenes: Sequence
     return Table((COLUMNS[column].title, *scenes), tuple(rows), best(values, [column] * len(scenes)))
 
 
+def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str) -> Table | None:
+    """How each attribute's experts share the whole scene at the end: % of the assignments (of N k, then of the N anchors), first seed.
+
+    None where no row has experts there.
+    """
+    rows: list[tuple[str, ...]] = []
+    for name, recipe in experiment.rows.items():
+        record = min((r for r in records if r.recipe == recipe and r.scene == scene), key=lambda r: r.seed, default=None)
+        for attribute, found in (record.results.get("experts") or {}).items() if record else ():
+            if found["share"]:
+                cells = [*found["share"], *found["per_anchor"]]
+                rows.append((f"{name}: {attribute}", *(f"{100 * cell:.1f}" for cell in cells), f"{found['entropy']:.2f}"))
+    if not rows:
+        return None
+    experts = range(1, len(rows[0]) // 2)
+    titles = ("", *(f"expert {e}" for e in experts), *(f"expert {e}, of anchors" for e in experts), "gate entropy")
+    return Table(titles, tuple(rows))
+
+
 def published(experiment: Experiment, dataset: str) -> dict[str, list[float]]:
     """The paper's numbers by row for a data set; empty where it prints none."""
     if experiment.paper is None or dataset == OWN:
@@ -116,9 +137,12 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
     seeds = sorted({r.seed for r in records})
     between = {n: " to ".join(str(m) for m in sorted({min(many), max(many)})) for n, many in lengths.items()}
     made = ", ".join(f"{n:,} iterations ({many} adjustments of density)" for n, many in sorted(between.items()))
-    whole = sorted(set.intersection(*(whole_seeds(rows) for rows in found.values() if rows)))
-    counted = f" (means are of {', '.join(map(str, whole))}, the others lack scenes)" if whole and whole != seeds else ""
-    out = [f"{made}; resolution {', '.join(sizes)}; seeds {', '.join(map(str, seeds))}{counted}"]
+    out = [f"{made}; resolution {', '.join(sizes)}; seeds {', '.join(map(str, seeds))}"]
+    for name, rows in found.items():
+        whole = sorted(whole_seeds(rows))
+        if rows and whole != seeds:
+            counted = f"means of seeds {', '.join(map(str, whole))}, the others lack scenes" if whole else "no seed has every scene"
+            out.append(f"{name}: {counted}")
     every, none = drawn(records), [name for name, rows in found.items() if not rows]
     for name, rows in found.items():
         scenes = {r.scene for r in rows}
@@ -156,11 +180,25 @@ def escape(cell: str) -> str:
     return cell
 
 
+def to_csv(tables: dict[str, Table]) -> str:
+    """One line a cell: table, row, column, value, spread over seeds. What is absent is left out."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(("table", "row", "column", "value", "spread"))
+    for name, table in tables.items():
+        for row in table.rows:
+            for title, cell in zip(table.titles[1:], row[1:]):
+                value, _, spread = cell.partition(" ± ")
+                if value != "-":
+                    writer.writerow((name, row[0], f"{table.titles[0]} {title}".strip(), value, spread))
+    return out.getvalue()
+
+
 def write_all(title: str, tables: dict[str, Table]) -> dict[str, str]:
     """Files of an experiment by ending: one Markdown page, one CSV, one LaTeX file, its tables one after the other."""
     markdown = f"# {title}\n\n" + "\n".join(f"## {name}\n\n{to_markdown(table)}" for name, table in tables.items())
     return {
         "md": markdown,
-        "csv": "\n".join(f"# {name}\n{to_csv(table)}" for name, table in tables.items()),
+        "csv": to_csv(tables),
         "tex": "\n".join(to_latex(table, f"{title}. {name}") for name, table in tables.items()),
     }
