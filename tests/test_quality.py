@@ -76,7 +76,7 @@ def test_held_out_psnr_stays_within_three_sigma_of_the_recorded_seeds(name, reci
 
 def test_growth_pays(captures, monkeypatch):
     """A weaker claim than it should be: on the training views. On brighton's three held-out views growth does not pay within 800 iterations
-    (19.92 dB with, 20.11 dB without at seed 0; seeds spread by 0.17 dB), as docs/results.md says."""
+    (19.92 dB with, 20.11 dB without at seed 0; seeds spread by 0.17 dB)."""
     brighton = captures["brighton"]
     with_growth = held_out(brighton, "moe-gs", monkeypatch=monkeypatch, views="train")
     without = held_out(brighton, "moe-gs", grow=False, monkeypatch=monkeypatch, views="train")
