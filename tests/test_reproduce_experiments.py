@@ -2,8 +2,10 @@
 
 import pytest
 
+from scene_experts.commands.reproduce import ReproduceCommand, experiments_of
 from scene_experts.evaluate.tables import paper
-from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS
+from scene_experts.recipes import RECIPES
+from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS, OURS
 
 
 def test_all_of_the_paper_is_there():
@@ -24,3 +26,15 @@ def test_a_figure_has_its_own_scenes():
     fig3 = EXPERIMENTS["fig3"]
     assert fig3.shows("BungeeNeRF", "quebec") and not fig3.shows("BungeeNeRF", "rome") and not fig3.shows("DeepBlending", "playroom")
     assert EXPERIMENTS["table1"].scenes_of("TanksAndTemples") == ("truck", "train")
+
+
+def test_all_is_what_the_paper_shows():
+    names = {e.name for e in experiments_of(ReproduceCommand(("all",)))}
+    assert names == EXPERIMENTS.keys() - set(OURS) and "extras" in EXPERIMENTS
+    grown_from = {"3dgs-mcmc": "3dgs", "scaffold-gs-bank": "scaffold-gs", "octree-moe-gs": "octree-gs", "moe-gs-balance": "moe-gs"}
+    recipes = set(EXPERIMENTS["extras"].rows.values())
+    assert all({recipe, origin} <= recipes for recipe, origin in grown_from.items())
+
+
+def test_every_recipe_can_be_asked_for():
+    assert RECIPES.keys() == {recipe for e in EXPERIMENTS.values() for recipe in e.rows.values()}

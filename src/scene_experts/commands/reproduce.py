@@ -14,7 +14,7 @@ from scene_experts.cli import PROG
 from scene_experts.data.obtain import captures_dir
 from scene_experts.errors import InputError, RunError, expect_at_least, nearest
 from scene_experts.reproduce import report, store
-from scene_experts.reproduce.experiments import EXPERIMENTS, Experiment
+from scene_experts.reproduce.experiments import EXPERIMENTS, OURS, Experiment
 from scene_experts.reproduce.plan import Scale, Scene, Spec, distinct, expect_captures, own_scenes, paper_scenes, specs
 from scene_experts.reproduce.run import Failure, Runner, Say
 from scene_experts.signals import handled
@@ -25,7 +25,7 @@ class ReproduceCommand:
     """Make the paper's tables and figures: runs what is missing, goes on with what was interrupted, reuses what is done."""
 
     experiments: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """table1, table2, table3, table4, fig1b, fig3, fig5, fig6, fig7, appendix, or all."""
+    """table1, table2, table3, table4, fig1b, fig3, fig5, fig6, fig7, appendix, or all of them; or extras, which the paper has not."""
     captures: tuple[Path, ...] = ()
     """Your own captures, in place of the paper's scenes."""
     data: Path | None = None
@@ -190,7 +190,7 @@ def experiments_of(command: ReproduceCommand) -> list[Experiment]:
         raise InputError(f"expected what to reproduce ({', '.join(EXPERIMENTS)}, or all), found nothing; name one or more")
     names = list(dict.fromkeys(command.experiments))
     if "all" in names:  # on one's own captures table 2 is table 1 again
-        names = [name for name in EXPERIMENTS if name != "table2" or not command.captures]
+        names = [name for name in EXPERIMENTS if name not in OURS and (name != "table2" or not command.captures)]
     for name in names:
         if name not in EXPERIMENTS:
             hint = nearest(name, EXPERIMENTS)

@@ -19,6 +19,16 @@ ABLATION = {
     "w/o L_opacity": "moe-gs-no-opacity",
     "MoE-GS": "moe-gs",
 }
+BEYOND = {
+    "3DGS": "3dgs",
+    "3DGS, MCMC": "3dgs-mcmc",
+    "Scaffold-GS": "scaffold-gs",
+    "Scaffold-GS, feature bank": "scaffold-gs-bank",
+    "Octree-GS": "octree-gs",
+    "Octree-GS with experts": "octree-moe-gs",
+    "MoE-GS": "moe-gs",
+    "MoE-GS, balanced by biases": "moe-gs-balance",
+}
 ROUTINGS = ("top1", "top2", "dense")
 
 
@@ -105,5 +115,10 @@ EXPERIMENTS: dict[str, Experiment] = {
             {"MoE-GS": "moe-gs", "router with position": "moe-gs-posrouter", "networks with distance": "moe-gs-dist"},
             ("DeepBlending", "TanksAndTemples"),
         ),
+        Experiment(
+            "extras", "Beyond the paper: recipes beside those they grew from", BEYOND, ("MipNeRF360", "DeepBlending", "TanksAndTemples")
+        ),
     )
 }
+OURS = ("extras",)
+"""What the paper does not show: not among `all`."""
