@@ -40,6 +40,7 @@ def test_brighton_from_photographs_to_scores(recipe, tmp_path):
     assert len(per_view) == after["view_count"] and np.mean([v["psnr"] for v in per_view.values()]) == pytest.approx(after["psnr"])
     for kind in ("renders", "gt", "errors", "side_by_side"):
         assert len(list((tmp_path / "test" / kind).iterdir())) == after["view_count"]
+    assert {path.stem for path in (tmp_path / "test" / "experts").glob("*.png")} == set(after["experts"])
     losses = [
         sum(row["terms"].values()) for row in map(json.loads, (tmp_path / "metrics.jsonl").read_text().splitlines()) if "terms" in row
     ]

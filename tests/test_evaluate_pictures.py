@@ -69,7 +69,8 @@ def test_unreadable_picture(tmp_path: Path) -> None:
 
 
 def test_clear_leaves_other_files(tmp_path: Path) -> None:
-    pictures.write(tmp_path / "renders" / "old.png", np.zeros((2, 2), np.uint8))
+    for kind in ("renders", "experts"):
+        pictures.write(tmp_path / kind / "old.png", np.zeros((2, 2), np.uint8))
     (tmp_path / "mine.txt").write_text("keep")
     pictures.clear(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
@@ -79,3 +80,17 @@ def test_a_strip_has_a_white_gap():
     left, right = torch.zeros(5, 7, 3), torch.full((5, 6, 3), 0.5)
     made = pictures.strip([left, right], gap=2)
     assert made.shape == (5, 15, 3) and (made[:, 7:9] == 1).all() and (made[:, 9:] == 0.5).all()
+
+
+def test_captions_of_a_wide_row_grow_with_it():
+    part = np.zeros((20, 400, 3), np.uint8)
+    narrow, wide = (pictures.row([part] * n, ["expert 1"] * n) for n in (3, 6))
+    assert narrow.shape[0] == pictures.BAR + 20 and wide.shape[0] == 2 * pictures.BAR + 20
+    ink = [np.flatnonzero((sheet[:-20, :400] < 128).any(axis=(1, 2))) for sheet in (narrow, wide)]
+    assert np.ptp(ink[1]) > 1.6 * np.ptp(ink[0]) > 0
+
+
+def test_narrowed_keeps_what_is_narrow_enough():
+    part = np.full((30, 60, 3), 7, np.uint8)
+    assert pictures.narrowed(part, 60) is part
+    assert pictures.narrowed(part, 20).shape == (10, 20, 3) and (pictures.narrowed(part, 20) == 7).all()

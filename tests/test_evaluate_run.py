@@ -59,7 +59,8 @@ class FakeScene:
     K = K
     file_values = 9
 
-    def __init__(self) -> None:
+    def __init__(self, routed: bool = True) -> None:
+        self.routed = routed
         params = {"feature": torch.zeros(N, F), "offsets": torch.zeros(N, K, 3), "log_scaling": torch.zeros(N, 6)}
         self.table = FakeTable(params)
 
@@ -69,10 +70,12 @@ class FakeScene:
         gaussians = Gaussians(torch.zeros(m, 3), torch.zeros(m, 4), torch.ones(m, 3), torch.ones(m), torch.ones(m, 3), torch.arange(m))
         raw = torch.full((2, K), -0.5)
         raw[0, :3] = 0.5
-        return Decoded(gaussians, torch.tensor([0, 4]), raw, {})
+        return Decoded(
+            gaussians, torch.tensor([0, 4]), raw, {a: Routing(r.gates[::4], r.chosen[::4]) for a, r in self.routing(step).items()}
+        )
 
-    def routing(self, step: int) -> dict[str, Routing]:
-        return {"color": Routing(torch.full((N, 2), 0.5), torch.tensor([[0]] * 3 + [[1]] * 3))}
+    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
+        return {"color": Routing(torch.full((N, 2), 0.5), torch.tensor([[0]] * 3 + [[1]] * 3))} if self.routed else {}
 
     def network_tensors(self) -> dict[str, Tensor]:
         return {"color.w1": torch.zeros(10, 5)}
@@ -111,8 +114,8 @@ def no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(weights, "load", load)
 
 
-def evaluated(out: Path, capture: Any = None, rasterize: Any = None, **options: Any) -> dict[str, Any]:
-    return evaluate(FakeScene(), capture or FakeCapture(), rasterize or FakeRasterizer(), out, step=700, **options)  # type: ignore[arg-type]
+def evaluated(out: Path, capture: Any = None, rasterize: Any = None, scene: Any = None, **options: Any) -> dict[str, Any]:
+    return evaluate(scene or FakeScene(), capture or FakeCapture(), rasterize or FakeRasterizer(), out, step=700, **options)  # type: ignore[arg-type]
 
 
 def test_files_and_figures(tmp_path: Path) -> None:
@@ -195,6 +198,22 @@ def test_pictures_of_an_earlier_split_go(tmp_path: Path) -> None:
     evaluated(tmp_path)
     evaluated(tmp_path, FakeCapture(test=(1,), train=(0, 2, 3)))
     assert [p.name for p in (tmp_path / "test" / "renders").rglob("*.png")] == ["1.png"]
+
+
+def test_a_strip_of_one_view_by_expert(tmp_path: Path) -> None:
+    evaluated(tmp_path, lpips=False)
+    folder = tmp_path / "test" / "experts"
+    assert [p.name for p in folder.iterdir()] == ["color.png"]
+    sheet, drawn = pictures.read(folder / "color.png"), pictures.read(tmp_path / "test" / "renders" / "day" / "0.png")
+    assert sheet.shape == (pictures.BAR + H, 3 * W + 2 * pictures.GAP, 3)
+    for i in range(3):  # the rasteriser draws the first view whatever it is given
+        assert np.array_equal(sheet[pictures.BAR :, i * (W + pictures.GAP) :][:, :W], drawn)
+    pictures.write(folder / "opacity.png", drawn)  # as an evaluation of another scene left it
+    evaluated(tmp_path, lpips=False)
+    evaluated(tmp_path, lpips=False, views="train")
+    assert [p.name for p in folder.iterdir()] == ["color.png"] and (tmp_path / "train" / "experts" / "color.png").is_file()
+    evaluated(tmp_path, lpips=False, scene=FakeScene(routed=False))
+    assert not folder.exists() and (tmp_path / "test" / "renders" / "day" / "0.png").is_file()
 
 
 def test_photograph_of_another_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,6 +51,32 @@ def test_one_run_is_one_file_that_needs_nothing_else(tmp_path):
     assert first.size == (960, 480) and first.getpixel((5, 5))[0] > 200  # type: ignore[index]
 
 
+def strips(text):
+    """The sizes of the strips of a page, by their attribute."""
+    found = re.findall(r"<img class='strip' alt='(\w+) experts' src='data:image/jpeg;base64,([^']+)'>", text)
+    return {attribute: Image.open(io.BytesIO(base64.b64decode(data))).size for attribute, data in found}
+
+
+def test_strips_of_each_experts_anchors(tmp_path):
+    folder = run(tmp_path)
+    assert not strips(write([folder]).read_text())
+    results = json.loads((folder / "results.json").read_text())
+    shares = {"share": [0.5, 0.3, 0.2], "k": 2}
+    write_json(folder / "results.json", {**results, "experts": dict.fromkeys(("opacity", "cov", "color"), shares)})
+    (folder / "test" / "experts").mkdir()
+    for attribute in ("opacity", "cov", "color"):
+        Image.new("RGB", (2900, 400), "red").save(folder / "test" / "experts" / f"{attribute}.png")
+    text = write([folder]).read_text()
+    assert strips(text) == dict.fromkeys(("color", "opacity", "cov"), (1600, 221)) and list(strips(text)) == ["color", "opacity", "cov"]
+    assert "0.png: <span class='soft'>the anchors routed to each expert, drawn alone; with Top-2 every anchor is in 2 pictures." in text
+    open_part = re.sub(r"<details>.*?</details>", "", text)
+    assert list(strips(open_part)) == ["color"]
+    (folder / "test" / "experts" / "color.png").unlink()
+    write_json(folder / "results.json", {**results, "experts": {"cov": {"mean_gate": [0.5, 0.3, 0.2], "k": None}}})
+    dense = write([folder]).read_text()
+    assert list(strips(dense)) == ["cov"] and "the mixture is dense" in dense and "Top-" not in dense.partition("To repeat")[0]
+
+
 def test_several_runs_stand_beside_each_other(tmp_path):
     runs = [run(tmp_path / "a"), run(tmp_path / "b", "scaffold-gs")]
     text = write(runs, tmp_path / "both.html").read_text()

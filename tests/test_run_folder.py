@@ -128,8 +128,17 @@ def test_resuming_may_move_the_capture_and_the_stop(run):
 
 def test_overwriting_removes_what_belonged_to_the_old_run_and_nothing_else(run):
     (run / "previews").mkdir()
-    (run / "test" / "renders").mkdir(parents=True)
-    exported = ["scene.compact", "scene.ply", "scene.ply.json", "scene_level1.compressed.ply", "scene.html", "test/renders/1.png"]
+    for kind in ("renders", "experts"):
+        (run / "test" / kind).mkdir(parents=True)
+    exported = [
+        "scene.compact",
+        "scene.ply",
+        "scene.ply.json",
+        "scene_level1.compressed.ply",
+        "scene.html",
+        "test/renders/1.png",
+        "test/experts/cov.png",
+    ]
     mine = ["notes.txt", "scene.blend", "scenery.ply"]
     for name in (*exported, *mine, "results.json", "per_view_train.json", "report.html", "previews/000030.png"):
         (run / name).write_text("old")
@@ -138,7 +147,7 @@ def test_overwriting_removes_what_belonged_to_the_old_run_and_nothing_else(run):
         (run / "point_cloud" / name).write_text("old")
     other = RunConfig(RECIPES["scaffold-gs"][1], CONFIG.data)
     run_folder.check(run, other, resume=False, overwrite=True)
-    assert len(state(run)) == 18
+    assert len(state(run)) == 19
     run_folder.prepare(run, other, resume=False, overwrite=True)
     assert state(run).keys() == {"config.json", *mine, "point_cloud/iteration_7/mine.txt"} and run_folder.read_config(run) == other
 

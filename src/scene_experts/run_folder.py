@@ -40,6 +40,7 @@ from scene_experts.state import scene_from, to_device
 
 FORMAT = 1
 EXPORTED = re.compile(r"scene(_level\d+)?\.(compact|((compressed\.)?ply|splat|spz|sog|glb|html)(\.json)?)")  # what `export` calls its files
+PICTURES = ("renders", "gt", "errors", "side_by_side", "masks", "experts")  # the folders of an evaluation's pictures
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False)
         for old in [*(out / "checkpoints").glob("ckpt_*.safetensors"), *(out / "previews").glob("*.png"), *results, *others]:
             old.unlink(missing_ok=True)
         for scored in (out / f"{views}{half}" for views in ("test", "train") for half in ("", "_half")):
-            for pictures in ("renders", "gt", "errors", "side_by_side", "masks"):  # and nothing else that may lie there
+            for pictures in PICTURES:  # and nothing else that may lie there
                 shutil.rmtree(scored / pictures, ignore_errors=True)
         for sidecar in (out / "point_cloud").glob("iteration_*/scene.json"):  # a later iteration's would be taken for the new run's
             shutil.rmtree(sidecar.parent, ignore_errors=True)

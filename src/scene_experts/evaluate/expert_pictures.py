@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from scene_experts.evaluate import pictures
 from scene_experts.types import Camera, Decoded, Gaussians
 
 if TYPE_CHECKING:
     from scene_experts.render import Rasterizer
     from scene_experts.scene import Scene
+
+WIDEST = 480  # px of a picture in an evaluation's strip
 
 
 def keep(gaussians: Gaussians, mask: Tensor) -> Gaussians:
@@ -43,3 +48,26 @@ def alone(
     mine = chosen_by(decoded, attribute, scene.K)
     draw = lambda gaussians: rasterize(gaussians, camera, background).image.clamp(0, 1)  # noqa: E731
     return draw(decoded.gaussians), [draw(keep(decoded.gaussians, mine[:, e])) for e in range(mine.shape[1])]
+
+
+def strip(
+    scene: Scene,
+    camera: Camera,
+    step: int,
+    rasterize: Rasterizer,
+    background: Tensor,
+    attribute: str = "color",
+    widest: int | None = None,
+) -> np.ndarray:
+    """The pictures of `alone` in a row under captions, uint8 [H', W', 3]; each at most `widest` px wide where that is given."""
+    whole, each = alone(scene, camera, step, rasterize, background, attribute)
+    parts = [pictures.to_8bit(picture) for picture in (whole, *each)]
+    captions = [f"all {attribute} experts", *(f"expert {i + 1}" for i in range(len(each)))]
+    return pictures.row(parts if widest is None else [pictures.narrowed(part, widest) for part in parts], captions)
+
+
+def write(folder: Path, scene: Scene, camera: Camera, step: int, rasterize: Rasterizer, background: Tensor) -> None:
+    """Write FOLDER/experts/<attribute>.png, the strip of one view, for each attribute that has experts; nothing where none has."""
+    for attribute in scene.routing(step, 1):
+        sheet = strip(scene, camera, step, rasterize, background, attribute, WIDEST)
+        pictures.write(folder / "experts" / f"{attribute}.png", sheet)

@@ -1,4 +1,4 @@
-"""The pictures of an evaluation on disk: renders, photographs, errors and the three beside each other, as 8-bit PNG."""
+"""The pictures of an evaluation on disk: renders, photographs, errors and the three beside each other, each expert alone, as 8-bit PNG."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from torch import Tensor
 
 from scene_experts.errors import InputError
 from scene_experts.io import write_atomic
+from scene_experts.run_folder import PICTURES
 
-FOLDERS = ("renders", "gt", "errors", "side_by_side", "masks")
 WORST = 0.25  # mean absolute error over RGB that is drawn brightest; the same for all views, so that they compare
-GAP, BAR = 4, 22  # px between the pictures, and of the caption above them
+GAP, BAR, TYPE = 4, 22, 13  # px between the pictures, of the caption above them, and of its type
+PAGE = 1200  # px; a wider row is likely shown at this width, so its captions are set larger
 # evenly spaced, dark to light
 HEAT = ((0, 0, 0), (40, 12, 84), (120, 28, 109), (200, 64, 62), (246, 141, 32), (252, 206, 80), (255, 255, 236))
 PAPER, INK = (255, 255, 255), (40, 40, 40)
@@ -42,7 +43,7 @@ def file_names(views: Iterable[str]) -> dict[str, str]:
 
 def clear(folder: Path) -> None:
     """Remove the pictures of an earlier evaluation."""
-    for name in FOLDERS:
+    for name in PICTURES:
         shutil.rmtree(folder / name, ignore_errors=True)
 
 
@@ -58,6 +59,14 @@ def read(path: Path, mode: str = "RGB") -> np.ndarray:
             return np.array(picture.convert(mode))
     except OSError as error:
         raise InputError(f"expected a picture at {path}, found none that can be read ({error}); evaluate again") from error
+
+
+def narrowed(pixels: np.ndarray, widest: int) -> np.ndarray:
+    """uint8 [H, W, 3], made smaller where it is wider than `widest` px."""
+    h, w = pixels.shape[:2]
+    if w <= widest:
+        return pixels
+    return np.asarray(Image.fromarray(pixels).resize((widest, max(1, round(h * widest / w))), Image.Resampling.LANCZOS))
 
 
 def heat(error: np.ndarray) -> np.ndarray:
@@ -82,27 +91,28 @@ def side_by_side(photo: np.ndarray, render: np.ndarray, errors: np.ndarray, capt
 
 
 def row(parts: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
-    """Pictures of one size beside each other, each under its caption."""
-    return np.asarray(_row(parts, captions))
+    """Pictures of one size beside each other, each under its caption, which can be read at `PAGE` px too."""
+    return np.asarray(_row(parts, captions, max(1.0, len(parts) * parts[0].shape[1] / PAGE)))
 
 
-def _row(parts: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
+def _row(parts: Sequence[np.ndarray], captions: Sequence[str], scale: float = 1.0) -> Image.Image:
     h, w = parts[0].shape[:2]
-    sheet = Image.new("RGB", (len(parts) * (w + GAP) - GAP, BAR + h), PAPER)
+    bar = round(BAR * scale)
+    sheet = Image.new("RGB", (len(parts) * (w + GAP) - GAP, bar + h), PAPER)
     draw = ImageDraw.Draw(sheet)
     for i, (pixels, caption) in enumerate(zip(parts, captions)):
         left = i * (w + GAP)
-        sheet.paste(Image.fromarray(pixels), (left, BAR))
-        text, font = _fit(draw, caption, w - 8)
-        draw.text((left + 4, BAR // 2), text, fill=INK, font=font, anchor="lm")
+        sheet.paste(Image.fromarray(pixels), (left, bar))
+        text, font = _fit(draw, caption, w - 8, round(TYPE * scale))
+        draw.text((left + 4, bar // 2), text, fill=INK, font=font, anchor="lm")
     return sheet
 
 
-def _fit(draw: ImageDraw.ImageDraw, text: str, room: int) -> tuple[str, ImageFont.ImageFont | ImageFont.FreeTypeFont]:
-    """`text` in the largest type of 9 to 13 px in which it fits, without its last parts (two spaces apart) where it never does."""
+def _fit(draw: ImageDraw.ImageDraw, text: str, room: int, largest: int) -> tuple[str, ImageFont.ImageFont | ImageFont.FreeTypeFont]:
+    """`text` in the largest type of 9 to `largest` px in which it fits, without its last parts (two spaces apart) where it never does."""
     parts, font = text.split("  "), ImageFont.load_default(9)
     while True:
-        for size in range(13, 8, -1):
+        for size in range(largest, 8, -1):
             font = ImageFont.load_default(size)
             if draw.textlength("  ".join(parts), font=font) <= room:
                 return "  ".join(parts), font

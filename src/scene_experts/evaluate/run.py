@@ -1,7 +1,8 @@
 """Evaluates a trained scene: renders held-out views to disk, scores the 8-bit files, and states everything the scores depend on.
 
-OUT/test/{renders,gt,errors,side_by_side}/<view name>.png (masks/ too where the capture has any), OUT/results.json, OUT/per_view.json. With
-views="train" the same in OUT/train, OUT/results_train.json and OUT/per_view_train.json; with appearance="half" in OUT/test_half and so on.
+OUT/test/{renders,gt,errors,side_by_side}/<view name>.png (masks/ too where the capture has any), OUT/results.json, OUT/per_view.json; of a
+scene with experts OUT/test/experts/<attribute>.png too, the first view by the anchors of each expert alone. With views="train" the same in
+OUT/train, OUT/results_train.json and OUT/per_view_train.json; with appearance="half" in OUT/test_half and so on.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from scene_experts import run_folder
 from scene_experts.errors import InputError
-from scene_experts.evaluate import halves, pictures, timing
+from scene_experts.evaluate import expert_pictures, halves, pictures, timing
 from scene_experts.evaluate.experts import expert_shares
 from scene_experts.evaluate.metrics import VARIANTS, Perceptual, score
 from scene_experts.io import write_json
@@ -91,6 +92,7 @@ def evaluate(
         _compose(folder, names[name], captions)
         per_view[name] = {"file": names[name], **scored, **facts}
         tell("rendering and scoring", n + 1, len(chosen))
+    expert_pictures.write(folder, scene, cameras[0], step, rasterize, background)
     results = {
         "format": FORMAT,
         **_means(per_view, perceptual),

@@ -26,7 +26,7 @@ from scene_experts.report.chart import Line
 
 NAME = "report.html"
 MOST_VIEWS = 8  # pictures are most of a page's bytes
-LONGEST = 960  # px; larger pictures are made smaller for the page
+LONGEST, LONGEST_STRIP = 960, 1600  # px; larger pictures, and strips of several, are made smaller for the page
 QUALITY = 88  # of its JPEGs
 
 
@@ -187,10 +187,10 @@ def held_out(sources: Sequence[Source], prefix: str) -> tuple[str, dict[str, str
     return "\n".join(blocks), pictures
 
 
-def encoded(path: Path) -> str:
-    """A picture as a data address: JPEG, at most LONGEST px. Raises InputError where it is unreadable."""
+def encoded(path: Path, longest: int = LONGEST) -> str:
+    """A picture as a data address: JPEG, at most `longest` px. Raises InputError where it is unreadable."""
     picture = Image.fromarray(read_picture(path))
-    picture.thumbnail((LONGEST, LONGEST), Image.Resampling.LANCZOS)
+    picture.thumbnail((longest, longest), Image.Resampling.LANCZOS)
     stream = io.BytesIO()
     picture.save(stream, format="JPEG", quality=QUALITY)
     return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
@@ -225,7 +225,7 @@ def curves(sources: Sequence[Source]) -> str:
 
 
 def experts(sources: Sequence[Source]) -> str:
-    """How anchors are shared: bars at the end, lines over the training, gate entropy. Empty without experts."""
+    """How anchors are shared: bars at the end, a view by each expert's, lines over the training, gate entropy. Empty without experts."""
     bars, charts = [], []
     for s in sources:
         for attribute, shares in (s.results.get("experts") or {}).items():
@@ -241,8 +241,25 @@ def experts(sources: Sequence[Source]) -> str:
         charts.append(chart.lines(f"{s.name}: gate entropy (1: all experts alike)", lines))
     if not bars:
         return ""
+    alone = "".join(map(strips, sources))
     note = "<p class='soft'>Share of the assignments of all anchors (of the gates, while dense); equal shares are perfect balance.</p>"
-    return f"<h2>Experts</h2>{note}{''.join(bars)}<div class='charts'>{''.join(charts)}</div>"
+    return f"<h2>Experts</h2>{note}{''.join(bars)}{alone}<div class='charts'>{''.join(charts)}</div>"
+
+
+def strips(s: Source) -> str:
+    """A held-out view by the anchors of each expert: those of colour open, the other attributes' folded. Empty without such pictures."""
+    found = {a: s.path / "test" / "experts" / f"{a}.png" for a in s.results.get("experts") or {}}
+    present = sorted((a for a, path in found.items() if path.is_file()), key=lambda a: a != "color")
+    if not present:
+        return ""
+    images = [f"<img class='strip' alt='{escape(a)} experts' src='{encoded(found[a], LONGEST_STRIP)}'>" for a in present]
+    folded = "".join(f"<details><summary>{escape(a)}</summary>{image}</details>" for a, image in zip(present[1:], images[1:]))
+    k = s.results["experts"][present[0]].get("k")
+    how = f"routed to each expert, drawn alone; with Top-{k} every anchor is in {k} picture{'' if k == 1 else 's'}"
+    if k is None:
+        how = "whose largest gate is each expert's, drawn alone; the mixture is dense"
+    view = escape(next(iter(s.per_view), "a held-out view"))
+    return f"<p><b>{escape(s.name)}</b>, {view}: <span class='soft'>the anchors {how}.</span></p>{images[0]}{folded}"
 
 
 def by_view(sources: Sequence[Source]) -> str:

@@ -120,12 +120,11 @@ def expert_strip(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
         index = (capture.test or capture.train)[0]
         rasterize = choose("auto", "cpu", antialias=opened.cfg.antialias)
         background = torch.tensor(capture.background)
-        whole, each = expert_pictures.alone(opened.scene, capture.views[index].camera, opened.step, rasterize, background, attribute)
+        sheet = expert_pictures.strip(opened.scene, capture.views[index].camera, opened.step, rasterize, background, attribute)
     finally:
         capture.images.close()
     path = strip_path(out, spec.scene.name)
-    captions = [f"all {attribute} experts", *(f"expert {i + 1}" for i in range(len(each)))]
-    pictures.write(path, pictures.row([pictures.to_8bit(p) for p in (whole, *each)], captions))
+    pictures.write(path, sheet)
     figures.framed(path)
     return path
 
