@@ -31,10 +31,11 @@ def test_a_figure_has_its_own_scenes():
 def test_all_is_what_the_paper_shows():
     names = {e.name for e in experiments_of(ReproduceCommand(("all",)))}
     assert names == EXPERIMENTS.keys() - set(OURS) and "extras" in EXPERIMENTS
-    grown_from = {"3dgs-mcmc": "3dgs", "scaffold-gs-bank": "scaffold-gs", "octree-moe-gs": "octree-gs", "moe-gs-balance": "moe-gs"}
+    grown_from = {"3dgs-mcmc": "3dgs", "scaffold-gs-bank": "scaffold-gs", "octree-moe-gs": "octree-gs"}
     recipes = set(EXPERIMENTS["extras"].rows.values())
     assert all({recipe, origin} <= recipes for recipe, origin in grown_from.items())
 
 
-def test_every_recipe_can_be_asked_for():
-    assert RECIPES.keys() == {recipe for e in EXPERIMENTS.values() for recipe in e.rows.values()}
+def test_every_recipe_but_the_walk_through_s_has_a_row():
+    """docs/adding-a-method.md says of that one how to give it a row; its part is named nowhere but in its file and the recipes."""
+    assert RECIPES.keys() - {recipe for e in EXPERIMENTS.values() for recipe in e.rows.values()} == {"moe-gs-balance"}

@@ -12,6 +12,14 @@ from scene_experts.signals import PARENT, ending, handled
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="a system without SIGHUP")
 
 
+@pytest.fixture(autouse=True)
+def in_a_terminal():
+    """The tests themselves may run under `nohup`."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 def test_a_closed_terminal_ends_a_command_unless_it_was_started_to_outlive_it():
     assert ending() == [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)

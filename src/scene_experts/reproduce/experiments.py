@@ -27,7 +27,6 @@ BEYOND = {
     "Octree-GS": "octree-gs",
     "Octree-GS with experts": "octree-moe-gs",
     "MoE-GS": "moe-gs",
-    "MoE-GS, balanced by biases": "moe-gs-balance",
 }
 ROUTINGS = ("top1", "top2", "dense")
 
