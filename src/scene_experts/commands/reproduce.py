@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 
 from scene_experts.cli import PROG
+from scene_experts.data import catalog
 from scene_experts.data.obtain import captures_dir
 from scene_experts.errors import InputError, RunError, expect_at_least, nearest
 from scene_experts.reproduce import report, store
@@ -206,6 +207,9 @@ def scenes_of(command: ReproduceCommand) -> list[Scene]:
     if unknown and command.captures:
         names = ", ".join(s.name for s in scenes)
         raise InputError(f"expected --scenes among the captures {names}, found {', '.join(sorted(unknown))}; correct it")
+    known = [scene.name for scene in catalog.SCENES]
+    for name in sorted(unknown - set(known)):
+        raise InputError(f"expected --scenes of the catalog, found '{name}'{nearest(name, known)}; see `{PROG} catalog`")
     if unknown or not scenes:
         what = ", ".join(sorted(unknown)) or "the paper's scenes"
         raise InputError(f"expected {what} in {root}, found none; fetch scenes with `{PROG} download`, or give --captures DIR...")
