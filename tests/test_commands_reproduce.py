@@ -4,6 +4,7 @@ import pytest
 
 from records import record
 from scene_experts import cli
+from scene_experts.commands import reproduce
 from scene_experts.commands.reproduce import ReproduceCommand, experiments_of, planned, scenes_of
 from scene_experts.errors import InputError
 from scene_experts.io import write_json
@@ -116,3 +117,17 @@ def test_names_that_are_none(tmp_path, capsys):
         scenes_of(ReproduceCommand(("table1",), data=tmp_path, scenes=("roma",)))
     with pytest.raises(InputError, match="expected rome"):
         scenes_of(ReproduceCommand(("table1",), data=tmp_path, scenes=("rome",)))
+
+
+@pytest.mark.parametrize(("given", "workers"), [((), 1), (("--devices", "0", "1"), 2), (("--devices", "0", "1", "--workers", "1"), 1)])
+def test_every_device_has_a_worker_unless_told_otherwise(given, workers, tmp_path, monkeypatch):
+    seen = []
+
+    def runner(runs, records, count, *others):
+        seen.append(count)
+        raise InputError("expected no more, found enough; stop")
+
+    monkeypatch.setattr(reproduce, "Runner", runner)
+    (tmp_path / "fox").mkdir()
+    args = ["--captures", str(tmp_path / "fox"), "--out", str(tmp_path / "out"), "--tables-only", *given]
+    assert cli.main(["reproduce", "table3", *args]) == 2 and seen == [workers]
