@@ -14,12 +14,12 @@ from dataclasses import replace
 
 import torch
 
-from scene_experts import native
-from scene_experts.scene.anchors import Anchors, AnchorScene
-from scene_experts.scene.experts import Experts
-from scene_experts.scene.mlp import Plain
-from scene_experts.table import Table
-from scene_experts.types import Camera, Decoded
+from scene_experts.core.table import Table
+from scene_experts.core.types import Camera, Decoded
+from scene_experts.native import library as native
+from scene_experts.scene.anchors.experts import Experts
+from scene_experts.scene.anchors.mlp import Plain
+from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 
 SPARSE = 1_000_000  # an iteration after the warm-up
 

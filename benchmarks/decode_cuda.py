@@ -16,12 +16,12 @@ from statistics import median
 
 import torch
 
-from scene_experts.scene import triton_decode
-from scene_experts.scene.anchors import Anchors, AnchorScene
-from scene_experts.scene.experts import Experts
-from scene_experts.scene.mlp import Plain
-from scene_experts.table import Table
-from scene_experts.types import Camera, Decoded
+from scene_experts.core.table import Table
+from scene_experts.core.types import Camera, Decoded
+from scene_experts.scene.anchors import triton_decode
+from scene_experts.scene.anchors.experts import Experts
+from scene_experts.scene.anchors.mlp import Plain
+from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 
 SPARSE = 1_000_000  # an iteration after the dense phase
 WARM_UP = 3  # first rounds that do not count: they compile

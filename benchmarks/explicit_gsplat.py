@@ -11,14 +11,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from scene_experts import checkpoint
+from scene_experts.core import checkpoint
+from scene_experts.core.transfer import upload
+from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.sh import rgb_to_dc
-from scene_experts.losses import photometric
-from scene_experts.optim import Adam
-from scene_experts.transfer import upload
-from scene_experts.types import Camera
+from scene_experts.training.losses import photometric
+from scene_experts.training.optim import Adam
 
 Draw = Callable[[dict[str, Tensor], Camera, int, Tensor], Tensor]
 RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "dc": 2.5e-3, "rest": 2.5e-3 / 20}  # 3DGS's

@@ -20,8 +20,8 @@ from scene_experts.bench.step import AT, work
 from scene_experts.evaluate import timing
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
-from scene_experts.run_folder import load_capture, open_run
-from scene_experts.scene.frozen import freeze
+from scene_experts.scene.anchors.frozen import freeze
+from scene_experts.training.run_folder import load_capture, open_run
 
 KINDS = (
     *("scaffold-gs", "moe-gs", "moe-gs-dist", "moe-gs-posrouter"),

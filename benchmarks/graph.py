@@ -12,11 +12,12 @@ from collections.abc import Callable
 
 import torch
 
-from scene_experts.scene import graph, hash_grid
-from scene_experts.scene.graph import Graph, blended
-from scene_experts.scene.graph_points import GraphPoints, GraphScene
-from scene_experts.table import Table
-from scene_experts.types import Camera
+from scene_experts.core.table import Table
+from scene_experts.core.types import Camera
+from scene_experts.scene.graph import hash_grid
+from scene_experts.scene.graph import network as graph
+from scene_experts.scene.graph.network import Graph, blended
+from scene_experts.scene.graph.scene import GraphPoints, GraphScene
 
 
 def make(points: int) -> GraphScene:

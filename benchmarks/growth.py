@@ -12,11 +12,11 @@ import time
 
 import torch
 
-from scene_experts.scene.anchors import Anchors, AnchorScene
+from scene_experts.core.table import Table
+from scene_experts.core.types import Decoded, Gaussians, Render
+from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 from scene_experts.strategy import observe
 from scene_experts.strategy.grow import GrowAnchors
-from scene_experts.table import Table
-from scene_experts.types import Decoded, Gaussians, Render
 
 VOXEL, K, F = 0.01, 10, 32
 

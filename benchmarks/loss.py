@@ -13,8 +13,8 @@ from collections.abc import Callable
 
 import torch
 
-from scene_experts import native
-from scene_experts.losses import l1, photometric, ssim
+from scene_experts.native import library as native
+from scene_experts.training.losses import l1, photometric, ssim
 
 
 def composed(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

@@ -17,16 +17,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from scene_experts import memory
-from scene_experts.config import Data, RunConfig
+from scene_experts.core.schedule import Every
+from scene_experts.core.types import Camera, Gaussians, Points, Render
 from scene_experts.data.capture import Capture, load
-from scene_experts.events import Adjusted
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
-from scene_experts.schedule import Every
-from scene_experts.state import Training
-from scene_experts.train import Run, iterate, train
-from scene_experts.types import Camera, Gaussians, Points, Render
+from scene_experts.training import memory
+from scene_experts.training.config import Data, RunConfig
+from scene_experts.training.events import Adjusted
+from scene_experts.training.loop import Run, iterate, train
+from scene_experts.training.state import Training
 
 
 def status(name: str) -> int:

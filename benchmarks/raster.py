@@ -24,10 +24,10 @@ from torch import Tensor
 
 import raster_threads
 from raster_scene import read, scene, synthetic
-from scene_experts import native
+from scene_experts.core.types import Camera, Gaussians
+from scene_experts.native import library as native
 from scene_experts.render import cpu
 from scene_experts.render.reference import ReferenceRasterizer
-from scene_experts.types import Camera, Gaussians
 
 PEER = Path(__file__).parent / "peer"
 STAGES = ("project", "bin", "blend", "blend backward", "project backward")

@@ -18,9 +18,9 @@ from pathlib import Path
 import torch
 
 from raster_scene import scene, synthetic
-from scene_experts import native
+from scene_experts.core.types import Gaussians
+from scene_experts.native import library as native
 from scene_experts.render.cpu import CpuRasterizer
-from scene_experts.types import Gaussians
 
 CASES = ((20_000, 400, 301), (100_000, 800, 544))
 NAMES = ("image", "alpha", "depth", "radii", "mean2d", "means", "quats", "scales", "opacities", "colors")

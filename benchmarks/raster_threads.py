@@ -20,9 +20,9 @@ from pathlib import Path
 import torch
 
 from raster_scene import read, scene, synthetic
-from scene_experts import native
+from scene_experts.core.types import Camera, Gaussians
+from scene_experts.native import library as native
 from scene_experts.render.cpu import CpuRasterizer
-from scene_experts.types import Camera, Gaussians
 
 CHUNKS = 4096  # of multiply-adds: about as long as a frame
 

@@ -23,7 +23,7 @@ import matplotlib
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-from scene_experts.io import write_atomic, write_bytes
+from scene_experts.core.io import write_atomic, write_bytes
 
 Row = tuple[int, str, float | None, float | None]  # size, what, seconds, peak MiB above the imports
 SIZES: dict[str, tuple[list[int], list[int]]] = {  # whole, quick

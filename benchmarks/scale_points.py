@@ -19,21 +19,21 @@ import numpy as np
 import torch
 from PIL import Image
 
-from scene_experts import checkpoint
 from scene_experts.bench import cloud, raster, step
 from scene_experts.bench.measure import clock_for, least
-from scene_experts.config import Data, RunConfig
+from scene_experts.core import checkpoint
+from scene_experts.core.types import Gaussians
 from scene_experts.data.capture import load
-from scene_experts.data.colmap import Model, Posed, write_model
 from scene_experts.data.lens import Lens
+from scene_experts.data.readers.colmap import Model, Posed, write_model
 from scene_experts.data.views import World
-from scene_experts.export.run import write_compact_run
-from scene_experts.losses import photometric
+from scene_experts.files.export import write_compact_run
 from scene_experts.render import choose
-from scene_experts.run_folder import OpenRun
-from scene_experts.state import Training, save
 from scene_experts.strategy import observe
-from scene_experts.types import Gaussians
+from scene_experts.training.config import Data, RunConfig
+from scene_experts.training.losses import photometric
+from scene_experts.training.run_folder import OpenRun
+from scene_experts.training.state import Training, save
 
 Row = tuple[str, float | None, int | None]
 WIDTH, HEIGHT = 800, 544

@@ -12,10 +12,10 @@ import time
 
 import torch
 
-from scene_experts import native
 from scene_experts.bench import peer, raster
 from scene_experts.bench.step import BASELINE, MIXTURE, PARTS, Work, alike, work
-from scene_experts.types import Gaussians
+from scene_experts.core.types import Gaussians
+from scene_experts.native import library as native
 
 
 def target_of(pixels: torch.Tensor, step: Work) -> float:

@@ -23,17 +23,17 @@ from typing import Any
 import torch
 
 import explicit_gsplat
-from scene_experts import train as training
-from scene_experts.config import Data, RunConfig, Train
+from scene_experts.core.io import write_atomic
+from scene_experts.core.transfer import upload
 from scene_experts.data.capture import Capture, load
 from scene_experts.evaluate import timing
-from scene_experts.events import Finished, Stepped
-from scene_experts.io import write_atomic
 from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer, choose
-from scene_experts.state import Training, resume
-from scene_experts.train import Run
-from scene_experts.transfer import upload
+from scene_experts.training import loop as training
+from scene_experts.training.config import Data, RunConfig, Train
+from scene_experts.training.events import Finished, Stepped
+from scene_experts.training.loop import Run
+from scene_experts.training.state import Training, resume
 
 PEER = "gsplat, explicit"
 SPARE = 25.0  # seconds of a slice kept for saving

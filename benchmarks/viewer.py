@@ -24,12 +24,13 @@ from pathlib import Path
 
 import torch
 
-from scene_experts import run_folder, train
 from scene_experts.data.capture import Capture
 from scene_experts.geometry.rotation import matrix_to_quat
 from scene_experts.render import Rasterizer, choose
-from scene_experts.run_folder import OpenRun
-from scene_experts.scene.frozen import freeze
+from scene_experts.scene.anchors.frozen import freeze
+from scene_experts.training import loop as train
+from scene_experts.training import run_folder
+from scene_experts.training.run_folder import OpenRun
 from scene_experts.view import paths, server
 from scene_experts.view.live import Live
 from scene_experts.view.server import Viewer

@@ -22,7 +22,7 @@ constexpr int BLOCK = 48;    // anchors of one expert at a time
 constexpr int BUFFERS = 16;  // partial sums of weight gradients
 constexpr int COV = 7;       // 3 scale, 4 rotation
 
-// Plain C structures, mirrored by scene/native_decode.py: pointers first, then 64-bit integers.
+// Plain C structures, mirrored by scene/anchors/native_decode.py: pointers first, then 64-bit integers.
 struct Head {
   const float *router_w, *router_b, *w1, *b1, *wm, *bm, *w2, *b2;  // [E,F or F+3] or null, [E] or null, [E,H,D], [E,H], [E,L,H,H],
                                                                    // [E,L,H], [E,out,H], [E,out]

@@ -1,5 +1,5 @@
-// What a point learns from its neighbours in a graph (scene/graph.py has the definition), and a multi-resolution hash grid
-// (scene/hash_grid.py), forward and backward. Every output row, or every level of the grid, belongs to one worker, which adds in a fixed
+// What a point learns from its neighbours in a graph (scene/graph/network.py has the definition), and a multi-resolution hash grid
+// (scene/graph/hash_grid.py), forward and backward. Every output row, or every level of the grid, belongs to one worker, which adds in a fixed
 // order: the bits do not depend on the number of threads.
 #include <algorithm>
 #include <cmath>

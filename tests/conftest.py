@@ -1,6 +1,4 @@
 import os
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -8,8 +6,6 @@ import torch
 # One thread, here and in the commands that tests start: small tensors gain nothing from more, and on a busy machine lose much.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 torch.set_num_threads(1)
-
-sys.path.insert(0, str(Path(__file__).parent))  # tests import tests/synthetic.py
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -115,8 +115,12 @@ def imported(files: Path, out: Path) -> dict[str, object]:
     """Digests of runs made of exported files."""
     found: dict[str, object] = {}
     for format in ("compact", "anchors", "ply", "spz", "sog", "glb", "splat", "compressed-ply"):
-        source = files / format if format == "anchors" else next((p for p in sorted((files / format).glob("scene.*")) if p.suffix != ".json"), None)
-        if source is None or not any(source.parent.glob("scene.*")) and format != "anchors":
+        source = (
+            files / format
+            if format == "anchors"
+            else next((p for p in sorted((files / format).glob("scene.*")) if p.suffix != ".json"), None)
+        )
+        if source is None or (not any(source.parent.glob("scene.*")) and format != "anchors"):
             continue
         target = out / format
         shutil.rmtree(target, ignore_errors=True)

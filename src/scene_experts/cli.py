@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
-from scene_experts.errors import InputError, RunError, nearest
+from scene_experts.core.errors import InputError, RunError, nearest
 
 PROG = "scene-experts"
 COMMANDS = {
@@ -58,7 +58,7 @@ def dispatch(args: list[str]) -> int:
         return 2
     logging.basicConfig(level=logging.WARNING, format="warning: %(message)s")
     try:
-        from scene_experts import commands  # imports torch: not needed for the help above
+        from scene_experts import commands
 
         expect_no_empty(rest)
         return commands.run(command, rest)

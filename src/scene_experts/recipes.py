@@ -9,20 +9,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from scene_experts.config import Train
-from scene_experts.losses import Weights
-from scene_experts.scene.anchors import Anchors
-from scene_experts.scene.balance import BalancedExperts
-from scene_experts.scene.experts import Experts, Router
-from scene_experts.scene.explicit import Explicit, ExplicitRates
-from scene_experts.scene.graph_points import GraphPoints, GraphRates
-from scene_experts.scene.mix import FeatureBank
-from scene_experts.scene.mlp import ATTRIBUTES, Plain
-from scene_experts.scene.select import Octree
+from scene_experts.scene.anchors.balance import BalancedExperts
+from scene_experts.scene.anchors.experts import Experts, Router
+from scene_experts.scene.anchors.features import FeatureBank
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, Plain
+from scene_experts.scene.anchors.scene import Anchors
+from scene_experts.scene.anchors.select import Octree
+from scene_experts.scene.gaussians import Explicit, ExplicitRates
+from scene_experts.scene.graph.scene import GraphPoints, GraphRates
 from scene_experts.strategy.grow_octree import GrowOctree
 from scene_experts.strategy.grow_points import GrowPoints
 from scene_experts.strategy.mcmc import MCMC
 from scene_experts.strategy.split_clone import SplitClone
+from scene_experts.training.config import Train
+from scene_experts.training.losses import Weights
 
 EXPERTS = Experts(num=5, top_k=2, warmup=1500)
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from scene_experts.core.types import Camera, Gaussians
 from scene_experts.geometry.neighbours import knn_d2
-from scene_experts.types import Camera, Gaussians
 
 POINTS = 138_766  # of the made cloud: as many as the garden's
 

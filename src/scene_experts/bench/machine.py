@@ -9,9 +9,9 @@ from pathlib import Path
 
 import torch
 
-from scene_experts import native
 from scene_experts.bench import peer
 from scene_experts.bench.measure import Clock, clock_for, least
+from scene_experts.native import library as native
 
 CHUNKS = 100  # of the arithmetic loop, about a millisecond
 

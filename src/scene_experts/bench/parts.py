@@ -8,15 +8,15 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from scene_experts import native
 from scene_experts.bench.machine import Machine
 from scene_experts.bench.measure import Clock, Figure, Missing, Result, Subject, clock_for, least
-from scene_experts.losses import dissimilarity, l1, photometric
-from scene_experts.scene.anchors import ATTRIBUTES, Anchors, AnchorScene
-from scene_experts.scene.experts import Experts
-from scene_experts.scene.mlp import CHANNELS, Plain
-from scene_experts.table import Table
-from scene_experts.types import Camera, Decoded
+from scene_experts.core.table import Table
+from scene_experts.core.types import Camera, Decoded
+from scene_experts.native import library as native
+from scene_experts.scene.anchors.experts import Experts
+from scene_experts.scene.anchors.mlp import CHANNELS, Plain
+from scene_experts.scene.anchors.scene import ATTRIBUTES, Anchors, AnchorScene
+from scene_experts.training.losses import dissimilarity, l1, photometric
 
 DECODE, LOSS = "decode, one thread", "loss, one thread"
 SPARSE = 1_000_000  # an iteration after every warm-up

@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from scene_experts import native
 from scene_experts.bench.measure import Clock
+from scene_experts.core.types import Camera, Gaussians
+from scene_experts.native import library as native
 from scene_experts.render import cpu
-from scene_experts.types import Camera, Gaussians
 
 NAME = "scalar C++ peer"
 WHY_NOT = "the scalar C++ peer is not installed: install a C++20 compiler (g++ or clang++) and run `pip install .` again"

@@ -11,10 +11,10 @@ from torch import Tensor
 from scene_experts.bench import cloud, peer
 from scene_experts.bench.machine import Machine
 from scene_experts.bench.measure import Clock, Figure, Missing, Result, Subject, clock_for, least
+from scene_experts.core.types import Camera, Gaussians
 from scene_experts.render import Rasterizer
 from scene_experts.render.cpu import CpuRasterizer
 from scene_experts.render.reference import ReferenceRasterizer
-from scene_experts.types import Camera, Gaussians
 
 GROUP = "rasteriser, one thread"
 REFERENCE = "pure-torch reference"

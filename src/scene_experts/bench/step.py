@@ -14,13 +14,13 @@ from torch import Tensor
 from scene_experts.bench import raster
 from scene_experts.bench.machine import Machine, multiply_adds
 from scene_experts.bench.measure import Clock, Figure, Missing, Result, Subject, clock_for, least
-from scene_experts.losses import terms
+from scene_experts.core.types import Camera, Points
 from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer, choose
 from scene_experts.render.cpu import CpuRasterizer
-from scene_experts.scene.anchors import Anchors, AnchorScene
-from scene_experts.state import Training
-from scene_experts.types import Camera, Points
+from scene_experts.scene.anchors.scene import Anchors, AnchorScene
+from scene_experts.training.losses import terms
+from scene_experts.training.state import Training
 
 MIXTURE, BASELINE = "moe-gs", "scaffold-gs"
 GROUP, THREADS = "whole step", "threads"

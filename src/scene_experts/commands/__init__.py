@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from scene_experts.signals import follow_parent
+from scene_experts.core.signals import follow_parent
 
 HANDLERS: dict[str, tuple[str, str]] = {
     "capture": ("capture", "capture"),

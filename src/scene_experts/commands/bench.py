@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from scene_experts.bench.run import run
+from scene_experts.bench.table import run
 from scene_experts.cli import PROG
 
 

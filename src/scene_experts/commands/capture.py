@@ -12,12 +12,12 @@ from rich.console import Console
 
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import positional
-from scene_experts.errors import InputError, expect_at_least, few
-from scene_experts.progress import Bar, clock
-from scene_experts.sfm import run
+from scene_experts.core.errors import InputError, expect_at_least, few
+from scene_experts.core.signals import handled
+from scene_experts.sfm import reconstruct as run
 from scene_experts.sfm.frames import MOST
 from scene_experts.sfm.pairs import Matching
-from scene_experts.signals import handled
+from scene_experts.training.progress import Bar, clock
 
 FEW = 0.9  # a smaller share of photographs with a pose is worth a word of advice
 

@@ -14,10 +14,10 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from rich.table import Table
 
 from scene_experts.cli import PROG
-from scene_experts.config import Train, flag, flags_of
-from scene_experts.data.catalog import COLLECTIONS, SCENES, Scene, select
-from scene_experts.data.obtain import captures_dir, obtain, present
-from scene_experts.errors import InputError
+from scene_experts.core.errors import InputError
+from scene_experts.data.fetch.catalog import COLLECTIONS, SCENES, Scene, select
+from scene_experts.data.fetch.obtain import captures_dir, obtain, present
+from scene_experts.training.config import Train, flag, flags_of
 
 SAY_EVERY = 15.0  # seconds between lines where there is no terminal
 

@@ -12,12 +12,12 @@ from rich.console import Console
 
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import backend
-from scene_experts.config import Data
-from scene_experts.errors import InputError
-from scene_experts.memory import reuse_freed
-from scene_experts.progress import Bar
+from scene_experts.core.errors import InputError
 from scene_experts.render import Rasterizer
-from scene_experts.run_folder import named
+from scene_experts.training.config import Data
+from scene_experts.training.memory import reuse_freed
+from scene_experts.training.progress import Bar
+from scene_experts.training.run_folder import named
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class ExportCommand:
 
 
 def export(args: list[str]) -> int:
-    from scene_experts.export.run import export_run
+    from scene_experts.files.export import export_run
 
     command = tyro.cli(ExportCommand, prog=f"{PROG} export", args=args)
     rasterize = backend("cpu", "auto", False, False)[1]
@@ -78,9 +78,9 @@ def check_unused(command: ExportCommand) -> None:
 
 
 def _standard(command: ExportCommand, args: list[str], rasterize: Rasterizer) -> list[str]:
-    from scene_experts.export.bake.bake import Bake
-    from scene_experts.export.bake.refine import Refine
-    from scene_experts.export.bake.run import Options, export_standard
+    from scene_experts.files.bake.bake import Bake
+    from scene_experts.files.bake.export import Options, export_standard
+    from scene_experts.files.bake.refine import Refine
 
     how = Bake(command.sh_degree, command.max_gaussians, command.prune, Refine(command.refine))
     options = Options(how, command.frame, command.levels, command.measure, shlex.join([PROG, "export", *args]))
@@ -101,7 +101,7 @@ class ImportCommand:
 
 
 def import_(args: list[str]) -> int:
-    from scene_experts.export.run import import_result
+    from scene_experts.files.export import import_result
 
     command = tyro.cli(ImportCommand, prog=f"{PROG} import", args=args)
     print(f"wrote {import_result(command.source, named(command.data), command.out, command.iteration)}")

@@ -7,11 +7,11 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from scene_experts import run_folder
 from scene_experts.cli import COMMANDS, PROG
 from scene_experts.commands.shared import positional
-from scene_experts.config import Data
 from scene_experts.data.report import show
+from scene_experts.training import run_folder
+from scene_experts.training.config import Data
 
 
 def info(args: list[str]) -> int:
@@ -26,7 +26,7 @@ def info(args: list[str]) -> int:
 
 
 def doctor(args: list[str]) -> int:
-    from scene_experts import doctor as checks
+    from scene_experts.commands import doctor as checks
 
     tyro.cli(lambda: None, prog=f"{PROG} doctor", args=args, description=COMMANDS["doctor"])
     return checks.run(Console(highlight=False))

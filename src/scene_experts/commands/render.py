@@ -13,16 +13,16 @@ import torch
 import tyro
 from rich.console import Console
 
-from scene_experts import run_folder
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import Device, Raster, backend
+from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
-from scene_experts.errors import InputError, expect_at_least
 from scene_experts.evaluate.pictures import strip, to_8bit
-from scene_experts.progress import Bar
 from scene_experts.render import as_trained
-from scene_experts.scene.frozen import freeze
-from scene_experts.types import Camera
+from scene_experts.scene.anchors.frozen import freeze
+from scene_experts.training import run_folder
+from scene_experts.training.progress import Bar
 from scene_experts.view import path_files, paths, video
 from scene_experts.view.paint import Look, Mode, paint
 from scene_experts.view.panel import number_of_experts

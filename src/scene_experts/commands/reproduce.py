@@ -11,14 +11,14 @@ import tyro
 from rich.console import Console
 
 from scene_experts.cli import PROG
-from scene_experts.data import catalog
-from scene_experts.data.obtain import captures_dir
-from scene_experts.errors import InputError, RunError, expect_at_least, nearest
+from scene_experts.core.errors import InputError, RunError, expect_at_least, nearest
+from scene_experts.core.signals import handled
+from scene_experts.data.fetch import catalog
+from scene_experts.data.fetch.obtain import captures_dir
 from scene_experts.reproduce import report, store
 from scene_experts.reproduce.experiments import EXPERIMENTS, OURS, Experiment
 from scene_experts.reproduce.plan import Scale, Scene, Spec, distinct, expect_captures, own_scenes, paper_scenes, specs
-from scene_experts.reproduce.run import Failure, Runner, Say
-from scene_experts.signals import handled
+from scene_experts.reproduce.runner import Failure, Runner, Say
 
 
 @dataclass(frozen=True)

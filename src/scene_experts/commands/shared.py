@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 
-from scene_experts.errors import InputError
+from scene_experts.core.errors import InputError
 from scene_experts.render import Rasterizer, choose
 
 Device = Literal["auto", "cpu", "cuda"]

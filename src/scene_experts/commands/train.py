@@ -14,22 +14,22 @@ import torch
 import tyro
 from rich.console import Console
 
-from scene_experts import run_folder
-from scene_experts import train as training
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import Device, Raster, backend
-from scene_experts.config import Data, RunConfig, Train, check, with_numbers
+from scene_experts.core.errors import InputError, expect_at_least, nearest
+from scene_experts.core.signals import handled
 from scene_experts.data.capture import Capture
-from scene_experts.data.catalog import PREFIX, Numbers, one
-from scene_experts.errors import InputError, expect_at_least, nearest
-from scene_experts.events import Started
-from scene_experts.memory import reuse_freed, used_bytes
-from scene_experts.progress import Progress
+from scene_experts.data.fetch.catalog import PREFIX, Numbers, one
 from scene_experts.recipes import RECIPES
-from scene_experts.record import Recorder
 from scene_experts.render import Rasterizer
-from scene_experts.signals import handled
-from scene_experts.train import Run
+from scene_experts.training import loop as training
+from scene_experts.training import run_folder
+from scene_experts.training.config import Data, RunConfig, Train, check, with_numbers
+from scene_experts.training.events import Started
+from scene_experts.training.loop import Run
+from scene_experts.training.memory import reuse_freed, used_bytes
+from scene_experts.training.progress import Progress
+from scene_experts.training.record import Recorder
 from scene_experts.view.live import Live
 from scene_experts.view.server import check_port, viser
 
@@ -183,8 +183,8 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
     if finished and (command.out / f"point_cloud/iteration_{finished}/point_cloud.ply").is_file():
         console.print("nothing was left to train: the run's files stay as they are", soft_wrap=True)
     elif not run.stop:
-        from scene_experts.export.run import warnings_of_layout, write_layout
-        from scene_experts.run_folder import open_run
+        from scene_experts.files.export import warnings_of_layout, write_layout
+        from scene_experts.training.run_folder import open_run
 
         done = open_run(command.out)
         console.print(f"wrote {write_layout(done, capture)}", soft_wrap=True)

@@ -9,11 +9,11 @@ from typing import Annotated
 
 import tyro
 
-from scene_experts import run_folder
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import Device, Raster, backend
 from scene_experts.render import as_trained
-from scene_experts.scene.frozen import freeze
+from scene_experts.scene.anchors.frozen import freeze
+from scene_experts.training import run_folder
 from scene_experts.view.server import Viewer, check_port, viser
 
 

@@ -10,15 +10,16 @@ from typing import Literal
 import numpy as np
 import torch
 
-from scene_experts.data import colmap, prepare, transforms
-from scene_experts.data.found import Colour, Found, Posed
+from scene_experts.core.errors import InputError
+from scene_experts.core.types import Camera, Points
+from scene_experts.data import prepare
 from scene_experts.data.images import Source, check_policy, probe
 from scene_experts.data.lens import Lens, pinhole_of, without_principal_point
 from scene_experts.data.match import EXTENSIONS, absent_error, find_mask, match_images, plain_name
+from scene_experts.data.readers import colmap, transforms
+from scene_experts.data.readers.found import Colour, Found, Posed
 from scene_experts.data.store import ImageStore
 from scene_experts.data.views import Capture, Frame, View, World
-from scene_experts.errors import InputError
-from scene_experts.types import Camera, Points
 
 __all__ = ["Capture", "Frame", "View", "World", "load"]
 

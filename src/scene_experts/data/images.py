@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
+from scene_experts.core.errors import InputError
 from scene_experts.data.lens import Lens, pinhole_of
-from scene_experts.errors import InputError
 
 Size = tuple[int, int]  # width, height
 _ORIENTATION = 0x0112  # EXIF tag; 5 to 8 swap the axes

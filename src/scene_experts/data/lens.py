@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_experts.errors import InputError
+from scene_experts.core.errors import InputError
 
 Array = NDArray[np.floating]
 

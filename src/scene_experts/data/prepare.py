@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scene_experts.core.errors import InputError
+from scene_experts.core.types import Camera, Points
 from scene_experts.data.images import check_policy, target_size
 from scene_experts.data.lens import pinhole_of
 from scene_experts.data.store import ImageStore
 from scene_experts.data.views import Capture, View, World
-from scene_experts.errors import InputError
-from scene_experts.types import Camera, Points
 
 RANDOM_POINTS = 10_000  # as 3DGS starts NeRF-synthetic scenes
 NORMAL_EXTENT = 5.0  # R of a capture trained in a normalised world

@@ -11,8 +11,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from scene_experts.core.types import Camera, Points
 from scene_experts.data.store import ImageStore
-from scene_experts.types import Camera, Points
 
 Kind = Literal["colmap", "blender", "nerfstudio"]
 

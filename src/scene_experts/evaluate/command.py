@@ -7,10 +7,10 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from scene_experts import run_folder
-from scene_experts.evaluate.run import About, evaluate
-from scene_experts.progress import Bar
+from scene_experts.evaluate.score import About, evaluate
 from scene_experts.render import Rasterizer, as_trained
+from scene_experts.training import run_folder
+from scene_experts.training.progress import Bar
 
 
 def evaluate_run(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from scene_experts.data.download import Progress, fetch
+from scene_experts.data.fetch.download import Progress, fetch
 from scene_experts.evaluate import weights
 
 TORCHVISION = "https://download.pytorch.org/models"

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scene_experts.core.types import Camera, Decoded, Gaussians
 from scene_experts.evaluate import pictures
-from scene_experts.types import Camera, Decoded, Gaussians
 
 if TYPE_CHECKING:
     from scene_experts.render import Rasterizer

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import torch
 
-from scene_experts.types import Routing
+from scene_experts.core.types import Routing
 
 
 class Routed(Protocol):

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from scene_experts.errors import InputError
-from scene_experts.scene.appearance import Codes
-from scene_experts.types import Camera
+from scene_experts.core.errors import InputError
+from scene_experts.core.types import Camera
+from scene_experts.scene.anchors.appearance import Codes
 
 if TYPE_CHECKING:
     from scene_experts.data.capture import Capture

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from scene_experts.errors import InputError
+from scene_experts.core.errors import InputError
 
 SHIFT = (-0.030, -0.088, -0.188)  # what LPIPS subtracts from RGB in [-1, 1] and divides by: ImageNet's statistics in that range
 SCALE = (0.458, 0.448, 0.450)

@@ -15,10 +15,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from scene_experts import losses
-from scene_experts.errors import InputError
+from scene_experts.core.errors import InputError
 from scene_experts.evaluate import download, weights
 from scene_experts.evaluate.lpips import Lpips
+from scene_experts.training import losses
 
 VARIANTS = {
     "psnr": "PSNR in dB per view over all pixels and channels of the 8-bit pictures, 100 at most; mean over views",

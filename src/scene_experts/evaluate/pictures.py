@@ -11,9 +11,9 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from scene_experts.errors import InputError
-from scene_experts.io import write_atomic
-from scene_experts.run_folder import PICTURES
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import write_atomic
+from scene_experts.training.run_folder import PICTURES
 
 WORST = 0.25  # mean absolute error over RGB that is drawn brightest; the same for all views, so that they compare
 GAP, BAR, TYPE = 4, 22, 13  # px between the pictures, of the caption above them, and of its type

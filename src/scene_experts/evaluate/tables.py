@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from scene_experts.errors import InputError
-from scene_experts.io import read_json
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import read_json
 
 Format = Literal["table", "markdown", "csv"]
 PROTOCOL = {  # what must be equal before scores may be compared: key in results.json, name, option that sets it

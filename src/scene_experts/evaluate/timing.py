@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from scene_experts.scene.frozen import freeze
-from scene_experts.types import Camera
+from scene_experts.core.types import Camera
+from scene_experts.scene.anchors.frozen import freeze
 
 if TYPE_CHECKING:
     from scene_experts.render import Rasterizer

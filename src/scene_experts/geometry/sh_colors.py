@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scene_experts import native
 from scene_experts.geometry.sh import MAX_DEGREE, sh_to_rgb
+from scene_experts.native import library as native
 
 
 def sh_colors(means: Tensor, dc: Tensor, rest: Tensor, rows: Tensor | None, position: Tensor, degree: int) -> Tensor:

@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from scene_experts.errors import InputError
+from scene_experts.core.errors import InputError
 from scene_experts.geometry.neighbours import knn_d2, median_neighbour_distance, nearest
 
 VoxelRule = Literal["squared_median", "median_nn"]

@@ -13,9 +13,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from scene_experts import native
-from scene_experts.errors import InputError
-from scene_experts.types import Camera, Gaussians, Render
+from scene_experts.core.errors import InputError
+from scene_experts.core.types import Camera, Gaussians, Render
+from scene_experts.native import library as native
 
 NAMES = ("auto", "reference", "cpu", "gsplat")
 

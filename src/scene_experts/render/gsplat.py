@@ -19,9 +19,9 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from scene_experts.errors import InputError
+from scene_experts.core.errors import InputError
+from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.render.reference import BLUR, MIN_COMPENSATION, TILE, ReferenceRasterizer, project, visible, watch_mean2d
-from scene_experts.types import Camera, Gaussians, Render
 
 
 @functools.cache

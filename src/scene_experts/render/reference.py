@@ -33,8 +33,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.geometry.rotation import covariance
-from scene_experts.types import Camera, Gaussians, Render
 
 BLUR = 0.3  # px^2, added to the diagonal of the 2D covariance
 MAX_ALPHA = 0.99

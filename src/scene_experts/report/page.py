@@ -15,14 +15,14 @@ from typing import Any
 
 from PIL import Image
 
-from scene_experts import run_folder
-from scene_experts.config import RunConfig, to_json
-from scene_experts.errors import InputError
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import read_json, write_bytes
 from scene_experts.evaluate.pictures import read as read_picture
 from scene_experts.evaluate.tables import Table, load_results, outdated, table, told_apart, unlike
-from scene_experts.io import read_json, write_bytes
 from scene_experts.report import chart
 from scene_experts.report.chart import Line
+from scene_experts.training import run_folder
+from scene_experts.training.config import RunConfig, to_json
 
 NAME = "report.html"
 MOST_VIEWS = 8  # pictures are most of a page's bytes

@@ -10,8 +10,8 @@ from typing import Any
 
 from PIL import Image
 
-from scene_experts.errors import InputError
-from scene_experts.io import write_bytes
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import write_bytes
 from scene_experts.reproduce.experiments import ROUTINGS, Experiment
 from scene_experts.reproduce.statistics import mean, of_recipe, shared
 from scene_experts.reproduce.store import Record

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from scene_experts.config import Data, Train, flags_of, to_json, with_numbers
-from scene_experts.data import catalog
+from scene_experts.core.errors import InputError
 from scene_experts.data.capture import is_capture, no_capture
+from scene_experts.data.fetch import catalog
+from scene_experts.data.fetch.obtain import present
 from scene_experts.data.images import check_policy
-from scene_experts.data.obtain import present
-from scene_experts.errors import InputError
 from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import Experiment
+from scene_experts.training.config import Data, Train, flags_of, to_json, with_numbers
 
 COLLECTIONS = {"mipnerf360": "MipNeRF360", "tandt": "TanksAndTemples", "db": "DeepBlending", "bungeenerf": "BungeeNeRF"}
 OWN = "captures"  # the name of the user's own captures among the data sets

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import torch
 
-from scene_experts import run_folder
-from scene_experts.config import SCHEDULE
+from scene_experts.core.io import write_bytes
 from scene_experts.evaluate import expert_pictures, pictures
 from scene_experts.evaluate.tables import Table
-from scene_experts.io import write_bytes
 from scene_experts.render import choose
 from scene_experts.reproduce import claims, figures, store, tables
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN, Scene, Spec
 from scene_experts.reproduce.statistics import SEED_SD, SEED_WEIGHT, shared
 from scene_experts.reproduce.store import Record
+from scene_experts.training import run_folder
+from scene_experts.training.config import SCHEDULE
 
 SHORT = 2000  # iterations; fewer hardly leave the dense warm-up
 

@@ -14,12 +14,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from scene_experts.config import RunConfig, from_json, to_json
-from scene_experts.errors import InputError, few
+from scene_experts.core.errors import InputError, few
+from scene_experts.core.io import read_json, write_json
 from scene_experts.evaluate.tables import load_results
-from scene_experts.io import read_json, write_json
 from scene_experts.reproduce.plan import Spec, identity
-from scene_experts.run_folder import load_capture, read_config
+from scene_experts.training.config import RunConfig, from_json, to_json
+from scene_experts.training.run_folder import load_capture, read_config
 
 FORMAT = 1
 POINTS = 60  # samples of a curve over training

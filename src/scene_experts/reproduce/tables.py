@@ -7,12 +7,12 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from scene_experts.config import Train
 from scene_experts.evaluate.tables import Table, paper, to_markdown
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN
 from scene_experts.reproduce.statistics import Mean, mean, whole_seeds
 from scene_experts.reproduce.store import Record
+from scene_experts.training.config import Train
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from scene_experts.table import Table
-from scene_experts.types import Camera, Decoded, Points, Routing
+from scene_experts.core.table import Table
+from scene_experts.core.types import Camera, Decoded, Points, Routing
 
 Cull = Callable[[Tensor, Tensor, Camera], Tensor]
 """The rasteriser's visibility test: means [n, 3], scales [n, 3], camera -> [n] bool."""

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from scene_experts.errors import InputError
-from scene_experts.io import write_atomic
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import write_atomic
 
 LOOK = 480  # px: the width at which sharpness is judged
 QUALITY = 95

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from PIL import Image, ImageOps
 
+from scene_experts.core.errors import InputError
 from scene_experts.data.images import mask_of
 from scene_experts.data.match import find_mask
-from scene_experts.errors import InputError
 from scene_experts.sfm.photos import Photo
 from scene_experts.sfm.work import remove
 

@@ -12,10 +12,10 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image, ImageOps
 
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import read_json, write_atomic, write_json
 from scene_experts.data.images import to_8_bit
 from scene_experts.data.match import EXTENSIONS
-from scene_experts.errors import InputError
-from scene_experts.io import read_json, write_atomic, write_json
 
 FEWEST = 3  # photographs: fewer than that have no scene in common
 ELSEWHERE = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw")  # photographs that Pillow does not read

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from scene_experts.io import check_writable, locked
+from scene_experts.core.io import check_writable, locked
 
 NAME, DONE, WHOLE = ".capture", "done", "whole"
 PLACES = {"images": "images", "model": "sparse/0", "capture.json": "capture.json"}

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import torch
 
-from scene_experts.types import Decoded, Render
+from scene_experts.core.types import Decoded, Render
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from typing import Literal, Self
 
 import torch
 
-from scene_experts.errors import expect_at_least
-from scene_experts.scene.anchors import AnchorScene
-from scene_experts.schedule import Every
+from scene_experts.core.errors import expect_at_least
+from scene_experts.core.schedule import Every
+from scene_experts.core.types import Decoded, Render
+from scene_experts.scene.anchors.scene import AnchorScene
 from scene_experts.strategy import Edit, observe
-from scene_experts.types import Decoded, Render
 
 
 @dataclass(frozen=True)

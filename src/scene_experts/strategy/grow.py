@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from scene_experts.errors import expect_at_least
+from scene_experts.core.errors import expect_at_least
+from scene_experts.core.table import Table
 from scene_experts.geometry.voxel import AXIS_LIMIT, coarsen, in_set, pack, scatter_max
-from scene_experts.scene.anchors import AnchorScene
+from scene_experts.scene.anchors.scene import AnchorScene
 from scene_experts.strategy.control import AnchorControl
-from scene_experts.table import Table
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from scene_experts.errors import InputError
-from scene_experts.scene.anchors import AnchorScene
-from scene_experts.scene.levels import Levels
-from scene_experts.scene.select import LevelSelector
-from scene_experts.schedule import Every
+from scene_experts.core.errors import InputError
+from scene_experts.core.schedule import Every
+from scene_experts.scene.anchors.levels import Levels
+from scene_experts.scene.anchors.scene import AnchorScene
+from scene_experts.scene.anchors.select import LevelSelector
 from scene_experts.strategy.control import AnchorControl
 from scene_experts.strategy.grow import empty_cells, slot_points, strongest
 

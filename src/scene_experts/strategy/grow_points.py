@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from scene_experts.scene.graph_points import GraphScene
+from scene_experts.core.types import Decoded, Render
+from scene_experts.scene.graph.scene import GraphScene
 from scene_experts.strategy.grow import GrowAnchors
-from scene_experts.types import Decoded, Render
 
 
 @dataclass(frozen=True)

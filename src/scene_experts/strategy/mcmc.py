@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from scene_experts import native
-from scene_experts.errors import expect_at_least
+from scene_experts.core.errors import expect_at_least
+from scene_experts.core.schedule import Every
+from scene_experts.core.types import Decoded, Render
 from scene_experts.geometry.rotation import normalise_quats, quat_to_matrix
-from scene_experts.scene.explicit import GaussianScene
-from scene_experts.schedule import Every
+from scene_experts.native import library as native
+from scene_experts.scene.gaussians import GaussianScene
 from scene_experts.strategy import Edit
-from scene_experts.types import Decoded, Render
 
 MOST = 51  # Gaussians that one is shared among at most
 _SHARP = 100.0  # how steeply the noise fades with opacity

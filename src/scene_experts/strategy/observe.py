@@ -12,9 +12,9 @@ import functools
 import torch
 from torch import Tensor
 
-from scene_experts import native
-from scene_experts.table import Table
-from scene_experts.types import Decoded, Render
+from scene_experts.core.table import Table
+from scene_experts.core.types import Decoded, Render
+from scene_experts.native import library as native
 
 STATS = ("visits", "opacity", "grad", "count")
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from scene_experts.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.schedule import Every
+from scene_experts.core.types import Decoded, Render
 from scene_experts.geometry.rotation import normalise_quats, quat_to_matrix
-from scene_experts.scene.explicit import GaussianScene
-from scene_experts.schedule import Every
+from scene_experts.scene.gaussians import GaussianScene
 from scene_experts.strategy import Edit, observe
-from scene_experts.types import Decoded, Render
 
 SHRINK = 1.6  # a half of a split Gaussian is this much smaller (3DGS: 0.8 N for N = 2 halves)
 

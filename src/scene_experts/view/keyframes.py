@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
-from scene_experts.types import Camera
 from scene_experts.view import path_files
 from scene_experts.view.paths import CameraPath, interpolate, pose, with_fov
 

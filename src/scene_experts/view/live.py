@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from scene_experts.data.capture import Capture
-from scene_experts.events import Event
 from scene_experts.render import Rasterizer
+from scene_experts.training.events import Event
 from scene_experts.view.server import Viewer
 
 SHARE = 0.12  # of a training's time that drawing may take

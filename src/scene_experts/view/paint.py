@@ -8,12 +8,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from scene_experts.errors import InputError
+from scene_experts.core.errors import InputError
+from scene_experts.core.types import Camera, Decoded, Gaussians, Render
 from scene_experts.evaluate.expert_pictures import chosen_by, keep
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Scene
-from scene_experts.scene.frozen import Draws
-from scene_experts.types import Camera, Decoded, Gaussians, Render
+from scene_experts.scene.anchors.frozen import Draws
 
 Mode = Literal["picture", "depth", "alpha", "experts", "entropy", "activation"]
 MODES: tuple[Mode, ...] = ("picture", "depth", "alpha", "experts", "entropy", "activation")

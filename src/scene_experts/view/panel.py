@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
-from scene_experts.events import Event, Finished, Stepped, Stopped
 from scene_experts.geometry.rotation import matrix_to_quat
 from scene_experts.scene import Scene
-from scene_experts.scene.anchors import ATTRIBUTES, AnchorScene
-from scene_experts.scene.select import LevelSelector
-from scene_experts.types import Camera
+from scene_experts.scene.anchors.scene import ATTRIBUTES, AnchorScene
+from scene_experts.scene.anchors.select import LevelSelector
+from scene_experts.training.events import Event, Finished, Stepped, Stopped
 from scene_experts.view.keyframes import Keyframes
 from scene_experts.view.paint import MODES, Look
 from scene_experts.view.paths import best_view

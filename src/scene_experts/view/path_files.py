@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import read_json, write_json
+from scene_experts.core.types import Camera
 from scene_experts.data.views import World
-from scene_experts.errors import InputError
-from scene_experts.io import read_json, write_json
-from scene_experts.types import Camera
 from scene_experts.view.paths import CameraPath, interpolate, with_fov
 
 FORMAT = 1

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from scene_experts.core.errors import InputError
+from scene_experts.core.types import Camera
 from scene_experts.data.views import Capture
-from scene_experts.errors import InputError
 from scene_experts.geometry.rotation import common_up, matrix_to_quat, normalise_quats, quat_to_matrix
-from scene_experts.types import Camera
 
 NAMES = ("auto", "orbit", "spiral", "views")
 FREE = -1  # the id of a camera that is none of the capture's views: what belongs to a view (appearance codes) must not be taken

@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 import torch
 
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
-from scene_experts.errors import InputError, RunError
 from scene_experts.evaluate.pictures import to_8bit
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Scene
-from scene_experts.scene.frozen import Draws
-from scene_experts.scene.select import capped
-from scene_experts.types import Camera
+from scene_experts.scene.anchors.frozen import Draws
+from scene_experts.scene.anchors.select import capped
 from scene_experts.view.paint import paint
 from scene_experts.view.panel import Panel
 from scene_experts.view.paths import around, best_view, pose, with_fov

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from scene_experts.errors import InputError, RunError
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.io import read_json, write_atomic, write_json
 from scene_experts.evaluate import pictures
-from scene_experts.io import read_json, write_atomic, write_json
 
 NOTE = "frames.json"
 VIDEO = (".mp4", ".mov", ".mkv", ".webm")

@@ -1,0 +1,192 @@
+"""Says which backends work on this machine, why the others do not, and what to install."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from rich.console import Console
+
+from scene_experts.data.store import available_bytes
+from scene_experts.native import library as native
+
+PIN = "keep torch as it is with `pip install -c constraints.txt ...`, run in the project's folder"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the report."""
+
+    name: str
+    ok: bool
+    found: str  # version, level, or why it is absent
+    fix: str = ""  # what to install or run; empty where nothing is missing
+    needed: bool = False  # nothing can be trained without it
+
+
+def diagnose() -> list[Check]:
+    """Look at everything the package can use. Nothing is installed, downloaded or changed, and no check raises."""
+    checks = (python, pytorch, cuda, native_library, gsplat, triton, machine, memory, lpips, viewer, sfm, tensorboard)
+    return [_guarded(check) for check in checks]
+
+
+def run(console: Console) -> int:
+    """Print the report; returns the exit code: 0 where a capture can be trained here, else 1."""
+    checks = diagnose()
+    console.print(render(checks), markup=False, soft_wrap=True)
+    return exit_code(checks)
+
+
+def exit_code(checks: list[Check]) -> int:
+    """0 where everything that training needs is here, else 1."""
+    return 0 if all(check.ok for check in checks if check.needed) else 1
+
+
+def render(checks: list[Check]) -> str:
+    """The report as plain text: one line per check, what to do about an absent part below it, and a verdict."""
+    width = max(len(check.name) for check in checks)
+    lines = []
+    for check in checks:
+        mark = "ok    " if check.ok else "MISSING" if check.needed else "absent"
+        lines.append(f"{mark:<8}{check.name:<{width}}  {check.found}")
+        if check.fix and not check.ok:
+            lines.append(f"{'':<8}{'':<{width}}  -> {check.fix}")
+    return "\n".join([*lines, "", verdict(checks)])
+
+
+def verdict(checks: list[Check]) -> str:
+    """One sentence: what a training would run on."""
+    if exit_code(checks):
+        return "A capture cannot be trained here yet: mend what is MISSING above."
+    by_name = {check.name: check for check in checks}
+    if by_name["CUDA"].ok and by_name["gsplat"].ok:
+        return "Ready: training runs on CUDA through gsplat."
+    if by_name["CPU library"].ok:
+        return "Ready: training runs on the CPU with the compiled library."
+    return "Ready, but slow: training runs in plain torch, tens of times slower than with the compiled CPU library."
+
+
+def python() -> Check:
+    found = f"{platform.python_version()} ({platform.system()} {platform.machine()})"
+    return Check("Python", sys.version_info >= (3, 11), found, "install Python 3.11 or newer", needed=True)
+
+
+def pytorch() -> Check:
+    numbers = [int("".join(filter(str.isdigit, part)) or 0) for part in torch.__version__.split("+")[0].split(".")[:2]]
+    fix = f"install torch 2.7 or newer; {PIN}"
+    return Check("torch", tuple(numbers) >= (2, 7), f"{torch.__version__}, CPU {torch.backends.cpu.get_cpu_capability()}", fix, needed=True)
+
+
+def cuda() -> Check:
+    if torch.cuda.is_available():
+        names = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
+        return Check("CUDA", True, "; ".join(f"{p.name}, {p.total_memory / 2**30:.0f} GiB" for p in names))
+    if torch.version.cuda is None and torch.version.hip is None:
+        fix = f"only for an NVIDIA GPU: install a CUDA build of torch {torch.__version__.split('+')[0]}"
+        return Check("CUDA", False, "this torch is built without it", fix)
+    found = f"torch is built for CUDA {torch.version.cuda} but finds no device"
+    return Check("CUDA", False, found, "check the NVIDIA driver with nvidia-smi")
+
+
+def native_library() -> Check:
+    reason = native.why_not()
+    if reason is None:
+        return Check("CPU library", True, f"{native.load().level}, up to {native.threads()} threads")  # type: ignore[union-attr]
+    why, _, fix = reason.partition(": ")
+    return Check("CPU library", False, f"{why}; the slow torch reference is used instead", fix)
+
+
+def gsplat() -> Check:
+    version = _version("gsplat")
+    if version is None:
+        if not torch.cuda.is_available():
+            return Check("gsplat", False, "not installed (it only runs on CUDA)")
+        return Check("gsplat", False, "not installed", f"pip install 'scene-experts[cuda]' for training on this GPU; {PIN}")
+    if not torch.cuda.is_available():
+        return Check("gsplat", False, f"{version} is installed, but it needs a CUDA device", "use the CPU library: --rasterizer cpu")
+    try:
+        from scene_experts.render import gsplat as adapter
+
+        reason = adapter.available()
+    except Exception as error:  # a broken compiled extension may raise anything when imported
+        reason = f"{type(error).__name__}: {error}"
+    found = version if reason is None else f"{version}: {reason}"
+    return Check("gsplat", reason is None, found, "install it again for this torch and CUDA")
+
+
+def triton() -> Check:
+    version = _version("triton")
+    if not torch.cuda.is_available():
+        return Check("triton", False, f"{version or 'not installed'} (it only runs on CUDA)")
+    from scene_experts.scene.anchors import triton_decode
+
+    reason = triton_decode.available()
+    why, _, fix = (reason or "").partition(": ")
+    return Check("triton", reason is None, version or "unknown" if reason is None else f"{why}; anchors are decoded in plain torch", fix)
+
+
+def machine() -> Check:
+    usable = native.cores()
+    threads = torch.get_num_threads()
+    fix = f"set OMP_NUM_THREADS to {usable} at most: more threads than cores slow training down"
+    return Check("cores", threads <= usable, f"{usable} usable of {os.cpu_count()}, torch uses {threads} threads", fix)
+
+
+def memory() -> Check:
+    free = available_bytes()
+    if free is None:
+        return Check("memory", True, "unknown")
+    fix = "less than 2 GiB is free: train at a lower --resolution, or cap growth with --max-memory"
+    return Check("memory", free >= 2 * 2**30, f"{free / 2**30:.1f} GiB free", fix)
+
+
+def lpips() -> Check:
+    from scene_experts.evaluate import weights
+
+    reasons = {net: reason for net in ("vgg", "alex") if (reason := weights.why_absent(net))}
+    if not reasons:
+        return Check("LPIPS weights", True, f"found for VGG and AlexNet (kept in {weights.cache_dir()})")
+    why = "; ".join(reason.removesuffix(f": {weights.HOW}") for reason in reasons.values())
+    return Check("LPIPS weights", False, f"{why}; scores are written without them", weights.HOW)
+
+
+def viewer() -> Check:
+    return _package("viser", "viewer", "scenes in a browser: view, train --viewer")
+
+
+def sfm() -> Check:
+    return _package("pycolmap", "sfm", "poses of photographs: capture")
+
+
+def tensorboard() -> Check:
+    return _package("tensorboard", "tensorboard", "train --tensorboard")
+
+
+def _package(name: str, extra: str, purpose: str) -> Check:
+    """An optional package, looked up without importing it: pycolmap corrupts the heap of a process that also uses Pillow."""
+    version = _version(name)
+    if version is not None:
+        return Check(name, True, version)
+    return Check(name, False, f"not installed (only for {purpose})", f"pip install 'scene-experts[{extra}]'; {PIN}")
+
+
+def _version(name: str) -> str | None:
+    if importlib.util.find_spec(name) is None:
+        return None
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "version unknown"
+
+
+def _guarded(check: Callable[[], Check]) -> Check:
+    try:
+        return check()
+    except Exception as error:  # the report must reach the user whatever is broken here
+        return Check(check.__name__.replace("_", " "), False, f"the check itself failed: {type(error).__name__}: {error}", "report this")

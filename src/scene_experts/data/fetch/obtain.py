@@ -1,0 +1,167 @@
+"""Scenes of the catalog on this machine: fetched, checked and unpacked below one folder, and found there again.
+
+ROOT/archives/360_v2.zip             as published; shared by its scenes, fetched once
+ROOT/archives/checksums.json         what the first download of each was, for comparison
+ROOT/mipnerf360/bonsai/              a scene: images/, sparse/0/, and source.json, which says where it came from
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.io import cache_dir, read_json, write_json
+from scene_experts.data.fetch.archive import extract
+from scene_experts.data.fetch.catalog import PREFIX, Archive, Scene, one
+from scene_experts.data.fetch.download import Say, fetch, sha256, web_address
+
+VARIABLE = "SCENE_EXPERTS_CAPTURES"
+Progress = Callable[[str, int, int], None]  # what, bytes so far, bytes in all (0: unknown)
+
+
+def captures_dir() -> Path:
+    """The folder of downloaded scenes: $SCENE_EXPERTS_CAPTURES, else `captures` in this user's cache folder."""
+    return Path(os.environ.get(VARIABLE) or cache_dir() / "captures")
+
+
+def present(root: Path, scene: Scene) -> bool:
+    """Whether the scene lies below `root`, downloaded or put there by hand."""
+    return all((root / scene.path / name).is_dir() for name in ("images", "sparse"))
+
+
+def resolve(path: Path, resolution: str, split: str) -> tuple[Path, str, str]:
+    """Folder, resolution and split of a capture named `catalog:SCENE`: the paper's protocol where those are "auto". Others as they are.
+
+    Raises InputError for an unknown scene and for one that is not on this machine.
+    """
+    if not str(path).startswith(PREFIX):
+        return path, resolution, split
+    scene, root = one(str(path)), captures_dir()
+    if not present(root, scene):
+        raise InputError(
+            f"expected the scene {scene.name} at {root / scene.path}, found none; fetch it with `scene-experts download {scene.name}`, "
+            f"or set {VARIABLE} to the folder you gave as --to"
+        )
+    return root / scene.path, scene.resolution if resolution == "auto" else resolution, scene.split if split == "auto" else split
+
+
+def obtain(
+    scenes: Sequence[Scene],
+    root: Path,
+    *,
+    mirrors: Sequence[str] = (),
+    keep: bool = True,
+    say: Say = print,
+    progress: Progress | None = None,
+) -> None:
+    """Put `scenes` below `root`; those already there are left alone, and an archive that several share is fetched once.
+
+    mirrors: addresses of folders (or of the archive itself) to try before the owners'.  keep: leave the archives for other scenes.
+    Raises InputError for a mirror that is no web address, RunError when a source fails; what was got until then stays.
+    """
+    for mirror in mirrors:
+        web_address(mirror)
+    missing = [scene for scene in scenes if not present(root, scene)]
+    for scene in scenes:
+        if scene not in missing:
+            say(f"{scene.name} is at {root / scene.path}")
+    for archive in dict.fromkeys(scene.collection.archive for scene in missing):
+        path, digest, url = _archive(archive, root, mirrors, say, progress)
+        for scene in missing:
+            if scene.collection.archive == archive:
+                _unpack(scene, path, digest, root, say, progress)
+                _record(root, archive, digest, url)  # not before it has shown to be whole: later ones are compared with it
+        if not keep:
+            path.unlink()
+
+
+def _unpack(scene: Scene, archive: Path, digest: str, root: Path, say: Say, progress: Progress | None) -> None:
+    into = root / scene.path
+    if into.exists():
+        raise RunError(f"expected images and sparse in {into}, found a folder without them; move it away and run the command again")
+    told = (lambda done, total: progress(f"unpacking {scene.name}", done, total)) if progress else None
+    out = extract(archive, scene.name, into, scene.inside, told)
+    collection = scene.collection
+    write_json(
+        into / "source.json",
+        {
+            "scene": scene.name,
+            "data_set": collection.title,
+            "by": collection.source,
+            "licence": collection.licence,
+            "page": collection.archive.page,
+            "archive": collection.archive.name,
+            "archive_sha256": digest,
+            "inside": out.inside,
+            "resolution": scene.resolution,
+            "split": scene.split,
+        },
+    )
+    photographs = sum(p.is_file() for p in (into / "images").iterdir())
+    if scene.views is not None and photographs != scene.views:
+        say(f"warning: expected {scene.views} photographs of {scene.name}, found {photographs}: the owner may have changed the archive")
+    say(f"{scene.name}: {out.files} files, {out.bytes / 1e6:,.0f} MB at {into}")
+
+
+def _archive(archive: Archive, root: Path, mirrors: Sequence[str], say: Say, progress: Progress | None) -> tuple[Path, str, str]:
+    """The archive's file, its SHA-256 and where it was fetched from; nothing where it is there already."""
+    path = root / "archives" / archive.name
+    known = _recorded(root).get(archive.name, {})
+    digest = archive.sha256 or known.get("sha256")
+    if path.is_file():
+        return path, _verified(archive, path, known, root, say), known.get("from", "")
+    urls = [m if m.endswith(archive.name) else f"{m.rstrip('/')}/{archive.name}" for m in mirrors]
+    told = (lambda done, total: progress(archive.name, done, total)) if progress else None
+    got = fetch(
+        [*urls, *archive.urls], path, digest, size=archive.bytes, progress=told, say=say, advice=_by_hand(archive, path, root, known)
+    )
+    if not digest:
+        say(f"{archive.name}: SHA-256 {got.sha256} (none is published; later downloads are compared with this one)")
+    return path, got.sha256, got.url
+
+
+def _verified(archive: Archive, path: Path, known: dict, root: Path, say: Say) -> str:
+    """The SHA-256 of an archive that is there, from this tool or put there by hand; only a new or changed file is read for it."""
+    about = path.stat()
+    if known and known.get("bytes") == about.st_size and known.get("changed") == about.st_mtime_ns:
+        return str(known["sha256"])
+    found = sha256(path)
+    digest = archive.sha256 or known.get("sha256")
+    if digest and found != digest:
+        raise RunError(
+            f"expected SHA-256 {digest[:12]}... of {path}, found {found[:12]}...; remove the file and run the command again"
+            + ("" if archive.sha256 else f" (or, if its owner published a new version, remove its entry in {_record_file(root)})")
+        )
+    say(f"using {path}")
+    return found
+
+
+def _by_hand(archive: Archive, path: Path, root: Path, known: dict) -> str:
+    """What is left to do when no address works."""
+    text = f"get {archive.name} ({archive.size}) by hand from {archive.page} and put it at {path}"
+    if known and not archive.sha256:
+        text += f"; if its owner published a new version, remove its entry in {_record_file(root)}"
+    return text
+
+
+def _record_file(root: Path) -> Path:
+    return root / "archives" / "checksums.json"
+
+
+def _recorded(root: Path) -> dict[str, dict]:
+    file = _record_file(root)
+    found = read_json(file, "record of checksums") if file.is_file() else {}
+    if not isinstance(found, dict) or not all(isinstance(v, dict) and isinstance(v.get("sha256"), str) for v in found.values()):
+        raise InputError(f"expected a record of checksums at {file}, found something else; remove it")
+    return found
+
+
+def _record(root: Path, archive: Archive, digest: str, url: str) -> None:
+    about, known = (root / "archives" / archive.name).stat(), _recorded(root)
+    entry = {"sha256": digest, "bytes": about.st_size, "changed": about.st_mtime_ns, "from": url}
+    if {k: known.get(archive.name, {}).get(k) for k in entry} != entry:
+        when = datetime.now(UTC).isoformat(timespec="seconds")
+        write_json(_record_file(root), {**known, archive.name: {**entry, "when": when}})

@@ -1,0 +1,73 @@
+"""All parameters of baked Gaussians together, moved until their pictures are those of the scene that they stand for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from scene_experts.core.schedule import Rate
+from scene_experts.files.bake.sums import Tell
+from scene_experts.files.bake.views import Views
+from scene_experts.render import Rasterizer
+from scene_experts.scene.anchors.frozen import Draws
+from scene_experts.scene.gaussians import GaussianScene
+from scene_experts.training.losses import photometric
+from scene_experts.training.optim import Adam
+
+DRAWN_AT = 3  # the step at which baked scenes are drawn: all degrees are in use from it on
+
+
+@dataclass(frozen=True)
+class Refine:
+    """How baked Gaussians are refined. Learning rates run log-linearly from first to last; that of means is multiplied by the extent."""
+
+    iterations: int = 1000
+    free: float = 0.6  # share of iterations that look from free views
+    dssim: float = 0.2  # weight of 1 - SSIM in the loss, L1 has the rest
+    means: Rate = Rate(0.00012, 0.000005)
+    log_scales: Rate = Rate(0.015, 0.0015)
+    quats: Rate = Rate(0.006, 0.0006)
+    raw_opacity: Rate = Rate(0.09, 0.009)
+    sh_dc: Rate = Rate(0.015, 0.0015)
+    sh_rest: Rate = Rate(0.003, 0.0003)
+
+
+def refine(
+    scene: GaussianScene,
+    draws: Draws,
+    step: int,
+    views: Views,
+    background: Tensor,
+    rasterize: Rasterizer,
+    how: Refine,
+    seed: int,
+    tell: Tell,
+) -> None:
+    """Move the columns of `scene` until it draws what `draws` does at `step`, over `background` [3].
+
+    It looks from the training views, each once an epoch in random order, and from free views around them.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    groups = scene.rate_groups().items()
+    optimizer = Adam([{"params": params, "name": name, "lr": 0.0} for name, params in groups])
+    free = (torch.rand(how.iterations, generator=generator) < how.free).tolist()
+    queue: list[int] = []
+    for i, is_free in enumerate(free):
+        if not is_free and not queue:
+            queue = torch.randperm(len(views), generator=generator).tolist()
+        camera = views.free(generator) if is_free else views.cameras[queue.pop()]
+        with torch.no_grad():
+            target = rasterize(draws(camera, step, False, rasterize.visible).gaussians, camera, background).image.clamp_(0, 1)
+        for group in optimizer.param_groups:
+            rate: Rate = getattr(how, group["name"])
+            group["lr"] = rate.at(i + 1, how.iterations) * (scene.extent if group["name"] == "means" else 1.0)
+        image = rasterize(scene(camera, DRAWN_AT, True, rasterize.visible).gaussians, camera, background).image
+        loss = sum(photometric(image, target, how.dssim))
+        assert isinstance(loss, Tensor)
+        if loss.requires_grad:
+            loss.backward()
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        tell("refining", i + 1, how.iterations)

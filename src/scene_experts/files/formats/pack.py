@@ -1,0 +1,106 @@
+"""What the packed formats share: unit quaternions, the smallest three of their components, opacities in a byte, turned frames, limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from scene_experts.core.errors import InputError
+from scene_experts.files.formats.splats import Splats
+
+Floats = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+MAX_GAUSSIANS = 50_000_000  # of a compressed file; more are refused before memory is taken for them
+MAX_RATIO = 200  # bytes out of one byte in, above _SMALL: what real scenes never reach
+_SMALL = 1 << 26
+_EDGE = 0.25 / 255  # a byte of 0 or 255 is read as this far inside, so that logits stay finite
+_SIGNS = {  # of x, y, z after half a turn about an axis
+    "x": (1, -1, -1),
+    "z": (-1, -1, 1),
+}
+_PARITY = (  # how often x, y, z occur in each harmonic, by coefficient: (odd x, odd y, odd z)
+    (0, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 0), (1, 1, 0), (0, 1, 1), (0, 0, 0), (1, 0, 1), (0, 0, 0),
+    (0, 1, 0), (1, 1, 1), (0, 1, 0), (0, 0, 1), (1, 0, 0), (0, 0, 1), (1, 0, 0),
+)  # fmt: skip
+
+
+def damaged(path: Path, what: str, found: object) -> InputError:
+    """The error for a file that claims to be of a format and does not hold together."""
+    return InputError(f"expected a whole {what} file at {path}, found {found}; copy it again or write it anew")
+
+
+def check_size(path: Path, what: str, count: int, raw: int, stored: int) -> None:
+    """Raises InputError where a file declares more Gaussians, or unpacks to more bytes, than its `stored` bytes can honestly hold."""
+    if count > MAX_GAUSSIANS:
+        raise damaged(path, what, f"{count:,} Gaussians declared, above the limit of {MAX_GAUSSIANS:,}")
+    if raw > _SMALL and raw > MAX_RATIO * stored:
+        raise damaged(path, what, f"{stored:,} bytes that unpack to {raw:,}")
+
+
+def unit_quats(splats: Splats) -> Floats:
+    """Quaternions [N, 4] (w, x, y, z) of length 1; the identity where the length is 0."""
+    q = splats.quats.double().numpy()
+    length = np.linalg.norm(q, axis=1, keepdims=True)
+    return np.where(length > 0, q / np.where(length > 0, length, 1), [1.0, 0, 0, 0])
+
+
+def smallest_three(quats: Floats) -> tuple[NDArray[np.intp], Floats]:
+    """The index of the largest component [N], and the others [N, 3] in order, for the sign that makes the largest positive."""
+    largest = np.abs(quats).argmax(1)
+    rows = np.arange(len(quats))
+    signed = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
+    return largest, signed[np.arange(4) != largest[:, None]].reshape(-1, 3)
+
+
+def from_smallest_three(largest: NDArray[Any], rest: Floats) -> Floats:
+    """Unit quaternions [N, 4], the inverse of `smallest_three`."""
+    out = np.empty((len(rest), 4))
+    kept = np.arange(4) != np.asarray(largest)[:, None]
+    out[kept] = rest.ravel()
+    out[~kept] = np.sqrt(np.maximum(0.0, 1 - (rest * rest).sum(1)))
+    return out / np.linalg.norm(out, axis=1, keepdims=True)
+
+
+def alphas(splats: Splats) -> Floats:
+    """Opacities [N] in (0, 1)."""
+    return splats.opacity_logit.double().sigmoid().numpy()
+
+
+def to_bytes(values: Floats) -> Bytes:
+    """round(255 v), clipped to a byte."""
+    return np.clip(np.rint(values * 255), 0, 255).astype(np.uint8)
+
+
+def byte_logits(values: NDArray[Any]) -> NDArray[np.float32]:
+    """Logits [N] of opacities stored as bytes."""
+    return logits(np.asarray(values, np.float64) / 255, _EDGE)
+
+
+def logits(opacity: Floats, edge: float = 1e-7) -> NDArray[np.float32]:
+    """Logits [N] of opacities in [0, 1], taken at least `edge` inside, so that they are finite."""
+    a = np.clip(opacity, edge, 1 - edge)
+    return np.log(a / (1 - a)).astype(np.float32)
+
+
+def turned(splats: Splats, axis: Literal["x", "z"]) -> Splats:
+    """The Gaussians after half a turn of the frame about an axis; twice is nothing. Scales keep their axes."""
+    signs = np.array(_SIGNS[axis])
+    harmonics = np.prod(np.where(np.array(_PARITY[: splats.sh.shape[1]]) == 1, signs, 1), axis=1)
+    vector = torch.from_numpy(signs).float()
+    return Splats(
+        splats.means * vector,
+        splats.log_scales,
+        splats.quats * torch.cat([torch.ones(1), vector]),
+        splats.opacity_logit,
+        splats.sh * torch.from_numpy(harmonics).float()[:, None],
+    )
+
+
+def tensor(values: NDArray[Any]) -> torch.Tensor:
+    """A float32 tensor of its own memory."""
+    return torch.from_numpy(np.array(values, dtype=np.float32, order="C"))

@@ -1,0 +1,207 @@
+"""PlayCanvas's SOG, version 2: a zip of lossless WebP pictures with a byte or two per value, and a palette for the harmonics.
+
+Positions are 16 bits of sign(x) ln(1 + |x|) between each axis's ends; log scales and colours indices into 256 levels; rotations the
+smallest three in a byte each; harmonics above the constant one of at most 65,536 rows, whose values are indices into 256 levels as well.
+Gaussians are sorted along the Morton curve and fill the pictures row by row.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import write_bytes
+from scene_experts.files.formats.clusters import codebook, nearest_levels, palette
+from scene_experts.files.formats.pack import (
+    MAX_GAUSSIANS,
+    Bytes,
+    Floats,
+    alphas,
+    byte_logits,
+    damaged,
+    from_smallest_three,
+    smallest_three,
+    tensor,
+    to_bytes,
+    unit_quats,
+)
+from scene_experts.files.formats.sort import morton_order
+from scene_experts.files.formats.splats import Splats
+
+WHAT = "SOG"
+PALETTE = 1 << 16
+_COLUMNS = 64  # rows of the palette beside each other
+_COEFFICIENTS = (0, 3, 8, 15)
+_META_LIMIT, _FILE_LIMIT = 1 << 20, 1 << 30
+_BROKEN = (  # what zipfile, json, Pillow and numpy raise for parts that are wrong
+    zipfile.BadZipFile, zlib.error, KeyError, IndexError, ValueError, TypeError, AttributeError, OSError, EOFError, RuntimeError,
+    Image.DecompressionBombError,
+)  # fmt: skip
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # the same scene, the same bytes
+
+
+def write_sog(path: Path, splats: Splats, note: dict[str, Any]) -> None:
+    """Write the .sog file, the note in meta.json's asset."""
+    write_bytes(path, sog_bytes(splats, note))
+
+
+def sog_bytes(splats: Splats, note: dict[str, Any]) -> bytes:
+    """The bytes of a .sog file. Raises InputError for no Gaussians at all: its pictures cannot be empty."""
+    if not len(splats):
+        raise InputError("expected Gaussians to write as SOG, found none; choose another format or keep more of them")
+    s = splats.rows(morton_order(splats.means))
+    n = len(s)
+    width = -(-int(np.ceil(np.sqrt(n))) // 4) * 4
+    height = -(-n // (4 * width)) * 4
+    files: dict[str, bytes] = {}
+
+    def save(name: str, pixels: NDArray[Any]) -> str:
+        files[name] = _webp(pixels, width, height)
+        return name
+
+    place = _squeeze(s.means.double().numpy())
+    mins, maxs = place.min(0), place.max(0)
+    level = np.rint((place - mins) / np.where(maxs > mins, maxs - mins, 1) * 65535).astype(np.uint16)
+    largest, rest = smallest_three(unit_quats(s))
+    quats = np.concatenate([to_bytes(rest * np.sqrt(0.5) + 0.5), (252 + largest)[:, None]], 1)
+    scales, dc = s.log_scales.double().numpy(), s.sh[:, 0].double().numpy()
+    scale_book, color_book = codebook(scales), codebook(dc)
+    colors = np.concatenate([nearest_levels(dc, color_book), to_bytes(alphas(s))[:, None]], 1)
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": "scene-experts", **({"scene-experts": note} if note else {})},
+        "count": n,
+        "means": {
+            "mins": mins.tolist(),
+            "maxs": maxs.tolist(),
+            "files": [save("means_l.webp", level & 255), save("means_u.webp", level >> 8)],
+        },
+        "scales": {"codebook": scale_book.tolist(), "files": [save("scales.webp", nearest_levels(scales, scale_book))]},
+        "quats": {"files": [save("quats.webp", quats)]},
+        "sh0": {"codebook": color_book.tolist(), "files": [save("sh0.webp", colors)]},
+    }
+    if s.degree:
+        meta["shN"], centroids, labels = _harmonics(s)
+        save("shN_labels.webp", labels)
+        files["shN_centroids.webp"] = centroids
+    return _zip({"meta.json": json.dumps(meta, allow_nan=False, default=str).encode()} | files)
+
+
+def read_sog(path: Path) -> Splats:
+    """The Gaussians of a .sog file of version 2. Raises InputError for other or damaged files."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _decode(path, lambda name, limit: _member(archive, name, limit))
+    except _BROKEN as error:
+        raise damaged(path, WHAT, f"parts that do not fit together ({error})") from None
+
+
+def _decode(path: Path, member: Callable[[str, int], bytes]) -> Splats:
+    meta = json.loads(member("meta.json", _META_LIMIT))
+    n = meta["count"]
+    if meta["version"] != 2 or not isinstance(n, int) or not 0 < n <= MAX_GAUSSIANS:
+        raise ValueError(f"version {meta['version']} with {n} Gaussians")
+
+    def pixels(part: str, i: int = 0) -> Bytes:
+        picture = _picture(member(meta[part]["files"][i], _FILE_LIMIT), 4 * n + 65536)
+        if picture.shape[0] * picture.shape[1] < n:
+            raise ValueError(f"a picture for {part} of too few pixels")
+        return picture.reshape(-1, 4)[:n]
+
+    book = lambda part: np.array(meta[part]["codebook"], np.float64).reshape(-1)  # noqa: E731
+    mins, maxs = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
+    level = pixels("means", 0)[:, :3].astype(np.int64) + (pixels("means", 1)[:, :3].astype(np.int64) << 8)
+    means = _stretch(mins + (maxs - mins) * (level / 65535))
+    rest, colors = pixels("quats"), pixels("sh0")
+    if (rest[:, 3] < 252).any():
+        raise ValueError("rotations of another kind")
+    quats = from_smallest_three(rest[:, 3] - 252, (rest[:, :3] / 255 - 0.5) * np.sqrt(2))
+    scales = book("scales")[pixels("scales")[:, :3]]
+    sh = book("sh0")[colors[:, :3]][:, None]
+    if meta.get("shN"):
+        sh = np.concatenate([sh, _read_harmonics(meta["shN"], pixels("shN", 1), member, book("shN"))], 1)
+    if not all(np.isfinite(part).all() for part in (means, scales, sh)):
+        raise ValueError("values that are no numbers")
+    return Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(colors[:, 3])), tensor(sh))
+
+
+def _harmonics(splats: Splats) -> tuple[dict[str, Any], bytes, NDArray[Any]]:
+    """Its part of meta.json, the picture of the palette, and the index of each Gaussian's row in two bytes."""
+    n, coefficients = len(splats), _COEFFICIENTS[splats.degree]
+    size = min(PALETTE, max(1, int(1024 * 2.0 ** np.floor(np.log2(n / 1024)))))
+    rows, label = palette(splats.sh[:, 1:].reshape(n, -1), size)
+    book = codebook(rows.numpy())
+    pixels = nearest_levels(rows.numpy(), book).reshape(-1, 3)
+    lines = -(-len(rows) // _COLUMNS)
+    index = label.numpy()
+    meta = {
+        "count": len(rows),
+        "bands": splats.degree,
+        "codebook": book.tolist(),
+        "files": ["shN_centroids.webp", "shN_labels.webp"],
+    }
+    return meta, _webp(pixels, _COLUMNS * coefficients, lines), np.stack([index & 255, index >> 8, np.zeros_like(index)], 1)
+
+
+def _read_harmonics(meta: dict[str, Any], labels: Bytes, member: Callable[[str, int], bytes], book: Floats) -> Floats:
+    """Harmonics above the constant, [N, C, 3]."""
+    coefficients, count = _COEFFICIENTS[meta["bands"]], int(meta["count"])
+    picture = _picture(member(meta["files"][0], _FILE_LIMIT), PALETTE * coefficients + 65536)
+    rows = picture.shape[0] * _COLUMNS
+    index = labels[:, 0].astype(np.int64) + (labels[:, 1].astype(np.int64) << 8)
+    if coefficients == 0 or picture.shape[1] != _COLUMNS * coefficients or not 0 < count <= min(rows, PALETTE) or index.max() >= count:
+        raise ValueError("a palette of another size")
+    return book[picture.reshape(rows, coefficients, 4)[:, :, :3][index]]
+
+
+def _squeeze(x: Floats) -> Floats:
+    return np.sign(x) * np.log1p(np.abs(x))
+
+
+def _stretch(x: Floats) -> Floats:
+    return np.sign(x) * np.expm1(np.abs(x))
+
+
+def _webp(values: NDArray[Any], width: int, height: int) -> bytes:
+    """Values [N, 3 or 4], row by row in a lossless picture; alpha is opaque where there are three, and in pixels beyond N."""
+    pixels = np.zeros((width * height, 4), np.uint8)
+    pixels[:, 3] = 255
+    pixels[: len(values), : values.shape[1]] = values
+    stream = io.BytesIO()
+    Image.fromarray(pixels.reshape(height, width, 4), "RGBA").save(stream, "WEBP", lossless=True, exact=True, quality=75, method=4)
+    return stream.getvalue()
+
+
+def _picture(data: bytes, limit: int) -> Bytes:
+    """Pixels [H, W, 4] of a WebP picture of at most `limit` pixels."""
+    with Image.open(io.BytesIO(data), formats=["WEBP"]) as picture:
+        if picture.width * picture.height > limit:
+            raise ValueError(f"a picture of {picture.width} x {picture.height} pixels")
+        return np.asarray(picture.convert("RGBA"))
+
+
+def _member(archive: zipfile.ZipFile, name: object, limit: int) -> bytes:
+    """One file of the archive, at most `limit` bytes."""
+    info = archive.getinfo(str(name))
+    if info.file_size > limit:
+        raise ValueError(f"{name} of {info.file_size:,} bytes")
+    with archive.open(info) as stream:
+        return stream.read(limit)
+
+
+def _zip(files: dict[str, bytes]) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:  # stored: pictures are compressed already
+        for name, data in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
+    return stream.getvalue()

@@ -1,0 +1,60 @@
+"""Experts kept in use without a loss (Wang et al. 2024, "Auxiliary-loss-free load balancing strategy for mixture-of-experts").
+
+Each expert has a bias b_i that counts where experts are chosen and nowhere else:
+    I = Top-k of g_i + b_i,   w_i = g_i / sum_{j in I} g_j,   then   b_i <- b_i + speed sign(mean_j c_j - c_i)
+with c_i the anchors of the view that chose expert i: no gradient of a balancing loss bends the features. L_load is the alternative.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from scene_experts.core.errors import expect_at_least
+from scene_experts.core.types import Routing
+from scene_experts.scene.anchors.experts import Experts, MixtureHead, top_k
+
+
+@dataclass(frozen=True)
+class BalancedExperts(Experts):
+    """E experts whose shares a bias evens out."""
+
+    speed: float = 0.001
+    """How far a bias moves in an iteration; gates are between 0 and 1."""
+
+    def head(self) -> type[BalancedHead]:
+        return BalancedHead
+
+    def check(self) -> None:
+        super().check()
+        expect_at_least([("--scene.decoder.speed", self.speed, 0)])
+
+
+class BalancedHead(MixtureHead):
+    """A mixture whose choice is biased. `router_balance` [E] is no parameter of the optimiser: it moves with every training view."""
+
+    config: BalancedExperts
+
+    def __init__(self, config: BalancedExperts, *shape: Any) -> None:
+        super().__init__(config, *shape)
+        self.router_balance = nn.Parameter(torch.zeros(config.num), requires_grad=False)
+        self.moved_at: int | None = None
+
+    def choose(self, logits: Tensor, k: int) -> Tensor:
+        """Indices [A, k] of the largest biased gates, largest first."""
+        return top_k(logits.softmax(dim=1) + self.router_balance, k)
+
+    def route(self, feature: Tensor, step: int, position: Tensor | None) -> tuple[Routing, Tensor]:
+        """As a mixture; in training the biases then move, once at each step."""
+        routing, w = super().route(feature, step, position)
+        if self.training and torch.is_grad_enabled() and routing.chosen is not None and step != self.moved_at:
+            count = torch.bincount(routing.chosen.reshape(-1), minlength=self.config.num).to(w.dtype)
+            self.router_balance += self.config.speed * (count.mean() - count).sign()
+            self.moved_at = step  # losses over the whole scene ask again
+        return routing, w
+
+    def weights(self, step: int) -> None:
+        """None: the kernels choose by the gates alone, so the composed form decodes."""

@@ -1,0 +1,203 @@
+"""The paper's mixture of experts (section 3.2) on one page: router, dense mixture, Top-k mixture, curriculum.
+
+Symbols: A anchors, F feature size, D input size, E experts, k chosen. g = softmax(R(f)) (eq. 3) depends on the anchor's feature alone.
+    dense  (eq. 4)  y = sum_i g_i E_i(z)                          for the first `warmup` iterations
+    sparse (eq. 5)  y = sum_{i in Top-k} w_i E_i(z),  w_i = g_i / sum_{j in Top-k} g_j, which is the softmax over the k chosen logits
+The losses that keep experts in use, L_load^S and L_load^D (eq. 6, 7), are in `losses.py`.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.types import Routing
+from scene_experts.scene.anchors.mlp import ACTIVATIONS, ATTRIBUTES, MLP, HeadWeights, linear_init
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Router:
+    """How gates are made. The defaults are the paper's "simple linear layer"; the rest are switches for its open questions."""
+
+    bias: bool = True
+    init: Literal["default", "zeros"] = "default"
+    renormalise: bool = True
+    """Weights of the chosen experts sum to 1 (eq. 5). With k = 1 the router then gets no gradient from the picture, only from L_load."""
+    noise_std: float = 0.0
+    """Standard deviation of Gaussian noise on the logits in training."""
+    detach_feature: bool = False
+    """Do not let the gates train the features."""
+    input_pos: bool = False
+    """Append the anchor's position (divided by the scene's extent) to the router's input: the appendix's negative result."""
+
+
+@dataclass(frozen=True)
+class Experts:
+    """E experts of the attribute's own shape behind a linear router."""
+
+    num: int = 5
+    top_k: int | None = 2
+    """Experts per anchor after the warm-up; None keeps the dense mixture for good."""
+    warmup: int = 1500
+    """Iterations of the dense mixture before Top-k (rescaled by --iterations)."""
+    attributes: tuple[str, ...] = ATTRIBUTES
+    """Which attributes get experts; the others keep one network."""
+    mix: Literal["post_activation", "pre_activation"] = "post_activation"
+    expert_init: Literal["independent", "clone_jitter"] = "independent"
+    load_scope: Literal["visible", "all"] = "visible"
+    """Over which anchors L_load balances."""
+    form: Literal["fast", "masked"] = "fast"
+    """How torch computes Top-k: anchors gathered per expert, or all experts with zero weights (the slow, obvious reference)."""
+    router: Router = Router()
+
+    def scaled(self, factor: float) -> Experts:
+        """The same in a training `factor` times as long: the dense warm-up scales."""
+        return replace(self, warmup=round(self.warmup * factor))
+
+    def check(self) -> None:
+        """Raises InputError for numbers that no training can have."""
+        expect_at_least([("--scene.decoder.num", self.num, 1), ("--scene.decoder.warmup", self.warmup, 0)])
+        expect_at_least([("--scene.decoder.router.noise-std", self.router.noise_std, 0)])
+        if self.top_k is not None and not 1 <= self.top_k <= self.num:
+            raise InputError(
+                f"expected --scene.decoder.top-k between 1 and the number of experts ({self.num}), found {self.top_k}; "
+                "change it or --scene.decoder.num"
+            )
+
+    def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> MixtureHead | MLP:
+        """The head of an attribute: [A, inputs] and features [A, feature] to [A, outputs]. Raises InputError as `check` does."""
+        self.check()
+        if self.num == 1 or attribute not in self.attributes:
+            return MLP(attribute, inputs, hidden, outputs)
+        if self.top_k == 1 and self.router.renormalise and attribute == self.attributes[0]:
+            log.warning("with top_k 1 and renormalised weights the picture does not train the routers; only L_load does")
+        return self.head()(self, attribute, inputs, hidden, outputs, feature)
+
+    def head(self) -> type[MixtureHead]:
+        """What decodes an attribute that has experts; variants of the routing give their own."""
+        return MixtureHead
+
+
+def top_k(logits: Tensor, k: int) -> Tensor:
+    """Indices [A, k] of the k largest logits [A, E], largest first, ties to the lowest index on every device."""
+    remaining, chosen = logits.detach(), []
+    for _ in range(k):
+        best = remaining.argmax(dim=1, keepdim=True)  # the first of equal maxima
+        chosen.append(best)
+        remaining = remaining.scatter(1, best, -torch.inf)
+    return torch.cat(chosen, dim=1)
+
+
+class MixtureHead(nn.Module):
+    """A sparsely gated mixture of E two-layer networks for one attribute."""
+
+    def __init__(self, config: Experts, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> None:
+        super().__init__()
+        self.config, self.attribute = config, attribute
+        E = config.num
+        self.w1 = nn.Parameter(torch.cat([linear_init((1, hidden, inputs), inputs).data for _ in range(E)]))
+        self.b1 = nn.Parameter(torch.cat([linear_init((1, hidden), inputs).data for _ in range(E)]))
+        self.w2 = nn.Parameter(torch.cat([linear_init((1, outputs, hidden), hidden).data for _ in range(E)]))
+        self.b2 = nn.Parameter(torch.cat([linear_init((1, outputs), hidden).data for _ in range(E)]))
+        if config.expert_init == "clone_jitter":
+            for p in (self.w1, self.b1, self.w2, self.b2):
+                p.data[1:] = p.data[:1] * (1.0 + 0.01 * torch.randn_like(p.data[1:]))
+        router_inputs = feature + (3 if config.router.input_pos else 0)
+        self.router_w = linear_init((E, router_inputs), router_inputs)
+        self.router_b = linear_init((E,), router_inputs) if config.router.bias else None
+        if config.router.init == "zeros":
+            nn.init.zeros_(self.router_w)
+            if self.router_b is not None:
+                nn.init.zeros_(self.router_b)
+
+    def k(self, step: int) -> int | None:
+        """Experts per anchor at `step`; None while dense. The first `warmup` iterations (1 .. warmup) are dense."""
+        return None if self.config.top_k is None or step <= self.config.warmup else self.config.top_k
+
+    def logits(self, feature: Tensor, position: Tensor | None) -> Tensor:
+        router = self.config.router
+        x = feature.detach() if router.detach_feature else feature
+        if router.input_pos:
+            if position is None:
+                raise ValueError("expected anchor positions for a router with input_pos, found none")
+            x = torch.cat([x, position], dim=1)
+        y = functional.linear(x, self.router_w, self.router_b)
+        if router.noise_std > 0 and self.training and torch.is_grad_enabled():
+            y = y + router.noise_std * torch.randn_like(y)
+        return y
+
+    def route(self, feature: Tensor, step: int, position: Tensor | None) -> tuple[Routing, Tensor]:
+        """Routing, and the mixture's weights: [A, E] while dense, [A, k] after."""
+        logits = self.logits(feature, position)
+        gates = logits.softmax(dim=1)  # eq. 3
+        k = self.k(step)
+        if k is None:
+            return Routing(gates, None), gates
+        chosen = self.choose(logits, k)
+        picked = logits.gather(1, chosen).softmax(dim=1) if self.config.router.renormalise else gates.gather(1, chosen)  # eq. 5
+        return Routing(gates, chosen), picked
+
+    def choose(self, logits: Tensor, k: int) -> Tensor:
+        """Indices [A, k] of the experts that decode each anchor, from logits [A, E]."""
+        return top_k(logits, k)
+
+    def routing(self, feature: Tensor, step: int, position: Tensor | None = None) -> Routing:
+        return self.route(feature, step, position)[0]
+
+    def forward(self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None) -> tuple[Tensor, Routing | None]:
+        """x [A, D], feature [A, F] -> activated mixture [A, out], routing."""
+        routing, w = self.route(feature, step, position)
+        if routing.chosen is None:
+            y = self.all_experts(x, w)
+        elif self.config.form == "masked":
+            y = self.all_experts(x, torch.zeros_like(routing.gates).scatter(1, routing.chosen, w))
+        else:
+            y = self.chosen_experts(x, routing.chosen, w)
+        return (ACTIVATIONS[self.attribute](y) if self.config.mix == "pre_activation" else y), routing
+
+    def expert(self, i: int, x: Tensor) -> Tensor:
+        """One expert's outputs, activated unless the mixture is taken before the activation."""
+        y = functional.linear(functional.relu(functional.linear(x, self.w1[i], self.b1[i])), self.w2[i], self.b2[i])
+        return ACTIVATIONS[self.attribute](y) if self.config.mix == "post_activation" else y
+
+    def all_experts(self, x: Tensor, w: Tensor) -> Tensor:
+        """sum_i w_i E_i(x) with every expert computed; w [A, E]."""
+        return sum((w[:, i : i + 1] * self.expert(i, x) for i in range(self.config.num)), start=x.new_zeros(()))  # type: ignore[return-value]
+
+    def chosen_experts(self, x: Tensor, chosen: Tensor, w: Tensor) -> Tensor:
+        """The same with each expert computed for the anchors that chose it: anchors sorted by expert, results added back."""
+        A, k = chosen.shape
+        order = chosen.reshape(-1).argsort(stable=True)
+        counts = torch.bincount(chosen.reshape(-1), minlength=self.config.num).tolist()
+        rows = torch.div(order, k, rounding_mode="floor")
+        parts = [self.expert(i, part) for i, part in enumerate(x.index_select(0, rows).split(counts)) if len(part)]
+        if not parts:
+            return x.new_zeros(A, self.w2.shape[1])
+        y = torch.cat(parts) * w.reshape(-1, 1).index_select(0, order)
+        return torch.zeros(A, y.shape[1], dtype=y.dtype, device=y.device).index_add(0, rows, y)
+
+    def aligned(self, x: Tensor, feature: Tensor, step: int, position: Tensor | None, K: int) -> tuple[Tensor, Routing]:
+        """Covariance outputs [A, K * 7] mixed after flipping quaternions into the hemisphere of each anchor's first expert."""
+        routing, w = self.route(feature, step, position)
+        if routing.chosen is not None:
+            w = torch.zeros_like(routing.gates).scatter(1, routing.chosen, w)
+        y = torch.stack([self.expert(i, x) for i in range(self.config.num)], dim=1).reshape(len(x), self.config.num, K, 7)
+        first = routing.gates.argmax(dim=1)[:, None, None, None].expand(-1, 1, K, 4)
+        reference = y[..., 3:].gather(1, first)
+        sign = torch.where((y[..., 3:] * reference).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+        y = torch.cat([y[..., :3], y[..., 3:] * sign.detach()], dim=-1)
+        return (w[:, :, None, None] * y).sum(1).reshape(len(x), K * 7), routing
+
+    def weights(self, step: int) -> HeadWeights | None:
+        r = self.config.router
+        if self.config.mix != "post_activation" or not r.renormalise or r.noise_std > 0 or r.detach_feature:
+            return None
+        return HeadWeights(self.router_w, self.router_b, self.w1, self.b1, self.w2, self.b2, self.k(step), position=r.input_pos)

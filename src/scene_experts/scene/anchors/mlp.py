@@ -1,0 +1,107 @@
+"""A decoder head: anchor feature and viewing direction in, K values of one attribute out (Scaffold-GS's network, two linear layers)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.types import Routing
+
+ATTRIBUTES = ("opacity", "cov", "color")  # what is decoded, in the compiled library's order
+ACTIVATIONS = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid}  # the last layer of each attribute
+CHANNELS = {"opacity": 1, "cov": 7, "color": 3}  # values per Gaussian: opacity; 3 scale + 4 rotation; RGB
+
+
+@dataclass(frozen=True)
+class HeadWeights:
+    """The tensors of a head, for kernels and files. A plain network is E = 1 without a router.
+
+    k: experts chosen per anchor; None means dense (all of them, weighted by their gates).
+    """
+
+    router_w: Tensor | None  # [E, F], or [E, F + 3] where the router sees the anchor's position
+    router_b: Tensor | None  # [E]
+    w1: Tensor  # [E, H, D]
+    b1: Tensor  # [E, H]
+    w2: Tensor  # [E, out, H]
+    b2: Tensor  # [E, out]
+    k: int | None
+    middle_w: Tensor | None = None  # [E, L, H, H]: L hidden layers between the first and the last
+    middle_b: Tensor | None = None  # [E, L, H]
+    position: bool = False  # the router sees the anchor's position, divided by the scene's extent
+
+
+class Head(Protocol):
+    """What decodes one attribute; the form of the arithmetic hides behind it."""
+
+    def __call__(self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None) -> tuple[Tensor, Routing | None]: ...
+
+    def weights(self, step: int) -> HeadWeights | None:
+        """The tensors in use at `step`, or None where they do not say all (unusual switches)."""
+        ...
+
+    def routing(self, feature: Tensor, step: int, position: Tensor | None = None) -> Routing | None:
+        """Who decodes what; None without experts. It depends on the anchor's feature alone, never on the view."""
+        ...
+
+
+def linear_init(shape: tuple[int, ...], fan_in: int) -> nn.Parameter:
+    """PyTorch's default for a linear layer's weights and biases: uniform in +-1/sqrt(fan_in)."""
+    bound = 1.0 / math.sqrt(fan_in)
+    return nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
+
+
+@dataclass(frozen=True)
+class Plain:
+    """One network per attribute, as in Scaffold-GS. `depth` counts linear layers (the paper's Figure 7 goes to 6)."""
+
+    depth: int = 2
+
+    def scaled(self, factor: float) -> Plain:
+        """It has no schedule."""
+        return self
+
+    def check(self) -> None:
+        """Raises InputError for a network without a hidden layer."""
+        expect_at_least([("--scene.decoder.depth", self.depth, 2)])
+
+    def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> MLP:
+        return MLP(attribute, inputs, hidden, outputs, self.depth)
+
+
+class MLP(nn.Module):
+    """Linear - ReLU - (Linear - ReLU)* - Linear - activation; weights stacked with a leading expert axis of 1."""
+
+    def __init__(self, attribute: str, inputs: int, hidden: int, outputs: int, depth: int = 2) -> None:
+        super().__init__()
+        if depth < 2:
+            raise InputError(f"expected a depth of at least 2 linear layers, found {depth}; give a larger number")
+        self.attribute = attribute
+        self.w1 = linear_init((1, hidden, inputs), inputs)
+        self.b1 = linear_init((1, hidden), inputs)
+        self.middle = nn.ModuleList(nn.Linear(hidden, hidden) for _ in range(depth - 2))
+        self.w2 = linear_init((1, outputs, hidden), hidden)
+        self.b2 = linear_init((1, outputs), hidden)
+
+    def forward(self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None) -> tuple[Tensor, Routing | None]:
+        """x [A, D] -> activated outputs [A, out]; no routing."""
+        h = functional.relu(functional.linear(x, self.w1[0], self.b1[0]))
+        for layer in self.middle:
+            h = functional.relu(layer(h))
+        return ACTIVATIONS[self.attribute](functional.linear(h, self.w2[0], self.b2[0])), None
+
+    def weights(self, step: int) -> HeadWeights | None:
+        if not self.middle:
+            return HeadWeights(None, None, self.w1, self.b1, self.w2, self.b2, None)
+        middle_w = torch.stack([layer.weight for layer in self.middle])[None]  # type: ignore[misc]
+        middle_b = torch.stack([layer.bias for layer in self.middle])[None]  # type: ignore[misc]
+        return HeadWeights(None, None, self.w1, self.b1, self.w2, self.b2, None, middle_w, middle_b)
+
+    def routing(self, feature: Tensor, step: int, position: Tensor | None = None) -> Routing | None:
+        return None

@@ -1,0 +1,231 @@
+"""The decode of an anchor scene as one operation of the compiled CPU library: gather -> direction -> routing -> experts -> Gaussians.
+
+The same mathematics as `AnchorScene.decode_composed` (its oracle), forward and backward, with the anchors of each expert gathered so that
+Top-k costs k networks instead of E. Backward computes the hidden layers again instead of storing them. Gradients are the same bits for
+every number of threads. Symbols as in `types.py`; D inputs, H hidden units and L middle layers of a head.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scene_experts.core.types import Gaussians, Routing
+from scene_experts.native import library as native
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, HeadWeights
+
+WHAT = "the decode"
+CHUNK = 256  # anchors per unit of work (csrc/decode.h)
+TENSORS = ("router_w", "router_b", "w1", "b1", "middle_w", "middle_b", "w2", "b2")
+T = len(TENSORS)
+
+
+class _Head(ctypes.Structure):
+    """`Head` of csrc/decode.h."""
+
+    _fields_ = [
+        *[(name, ctypes.c_void_p) for name in (*TENSORS, "gates", "chosen", "mix", "base", *(f"d_{t}" for t in TENSORS), "d_gates")],
+        *[(name, ctypes.c_int64) for name in ("E", "k", "H", "L", "out", "distance", "position")],
+    ]
+
+
+class _Decode(ctypes.Structure):
+    """`Decode` of csrc/decode.h."""
+
+    _fields_ = [
+        *[(name, ctypes.c_void_p) for name in ("rows", "xyz", "feature", "log_scaling", "offsets", "camera", "raw", "starts")],
+        *[(name, ctypes.c_void_p) for name in ("means", "quats", "scales", "opacities", "colors", "per_length", "source")],
+        *[(name, ctypes.c_void_p) for name in ("d_means", "d_quats", "d_scales", "d_opacities", "d_colors", "d_raw")],
+        *[(name, ctypes.c_void_p) for name in ("d_feature", "d_log_scaling", "d_offsets")],
+        *[(name, ctypes.c_int64) for name in ("A", "N", "K", "F", "threads", "ascending", "frozen")],
+        ("extent", ctypes.c_double),
+        ("heads", _Head * 3),
+    ]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is not differentiated."""
+
+    rows: Tensor  # [A] int64
+    xyz: Tensor  # [N, 3]
+    camera: Tensor  # [3]
+    k: tuple[int, int, int]  # 0: dense
+    distance: tuple[int, int, int]
+    position: tuple[int, int, int]  # the router sees it
+    extent: float
+    ascending: bool
+
+
+def decode(
+    rows: Tensor,
+    xyz: Tensor,
+    feature: Tensor,
+    log_scaling: Tensor,
+    offsets: Tensor,
+    camera_position: Tensor,
+    heads: dict[str, HeadWeights],
+    with_dist: dict[str, bool],
+    extent: float = 1.0,
+) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
+    """Gaussians of positive opacity in the order of (row, slot), raw opacities [A, K], and routing of the heads that have a router.
+
+    rows [A] int64, each at most once; xyz [N, 3], feature [N, F], log_scaling [N, 6], offsets [N, K, 3], camera_position [3]; heads and
+    with_dist by attribute ("opacity", "cov", "color"), D = F + 3 (+ 1 with the distance); a router that sees positions sees xyz / extent.
+    All float32 on the CPU. Differentiable in feature, log_scaling, offsets and every tensor of the heads; not in xyz and the camera. Raises
+    ValueError for shapes that do not fit, IndexError for rows outside of the table.
+    """
+    found = [heads[a] for a in ATTRIBUTES]
+    distance = tuple(int(with_dist[a]) for a in ATTRIBUTES)
+    _check(xyz, feature, log_scaling, offsets, found, distance)
+    rows = rows.contiguous()
+    ascending = len(rows) > 0 and bool((rows[1:] > rows[:-1]).all())
+    if len(rows):
+        low, high = (int(rows[0]), int(rows[-1])) if ascending else (int(rows.min()), int(rows.max()))
+        if low < 0 or high >= len(xyz):
+            raise IndexError(f"expected rows from 0 to {len(xyz) - 1}, found {low} to {high}")
+    plan = planned(rows, xyz, camera_position, heads, with_dist, extent, ascending)
+    weights = [getattr(h, name) for h in found for name in TENSORS]
+    out = _DecodeFunction.apply(plan, feature, log_scaling, offsets, *weights)
+    means, quats, scales, opacities, colors, source, raw = out[:7]
+    routing = {a: Routing(gates, chosen) for a, gates, chosen in zip(ATTRIBUTES, out[7:10], out[10:13]) if gates is not None}
+    return Gaussians(means, quats, scales, opacities, colors, source), raw, routing
+
+
+def planned(
+    rows: Tensor, xyz: Tensor, camera: Tensor, heads: dict[str, HeadWeights], with_dist: dict[str, bool], extent: float, ascending: bool
+) -> Plan:
+    """Plain values for the library; arguments as those of `decode`."""
+    found = [heads[a] for a in ATTRIBUTES]
+    k = tuple(h.k or 0 if h.router_w is not None else 0 for h in found)
+    distance, position = tuple(int(with_dist[a]) for a in ATTRIBUTES), tuple(int(h.position) for h in found)
+    camera = camera.detach().to(torch.float32).contiguous()
+    return Plan(rows.contiguous(), xyz.detach().contiguous(), camera, k, distance, position, extent, ascending)  # type: ignore[arg-type]
+
+
+def _check(xyz: Tensor, feature: Tensor, log_scaling: Tensor, offsets: Tensor, heads: list[HeadWeights], distance: tuple[int, ...]) -> None:
+    N, F, K = len(xyz), feature.shape[1], offsets.shape[1]
+    wanted = [("xyz", xyz, (N, 3)), ("feature", feature, (N, F)), ("log_scaling", log_scaling, (N, 6)), ("offsets", offsets, (N, K, 3))]
+    for a, h, extra in zip(ATTRIBUTES, heads, distance):
+        E, H, out = h.w1.shape[0], h.w1.shape[1], K * CHANNELS[a]
+        wanted += [(f"{a}.w1", h.w1, (E, H, F + 3 + extra)), (f"{a}.b1", h.b1, (E, H))]
+        wanted += [(f"{a}.w2", h.w2, (E, out, H)), (f"{a}.b2", h.b2, (E, out))]
+        if h.middle_w is not None and h.middle_b is not None:
+            L = h.middle_w.shape[1]
+            wanted += [(f"{a}.middle_w", h.middle_w, (E, L, H, H)), (f"{a}.middle_b", h.middle_b, (E, L, H))]
+        if h.router_w is None:
+            if E != 1:
+                raise ValueError(f"expected one expert for {a} without a router, found {E}")
+            continue
+        if h.k is not None and not 1 <= h.k <= E:
+            raise ValueError(f"expected k between 1 and {E} for {a}, found {h.k}")
+        wanted += [(f"{a}.router_w", h.router_w, (E, F + 3 * h.position))] + (
+            [] if h.router_b is None else [(f"{a}.router_b", h.router_b, (E,))]
+        )
+    for name, tensor, shape in wanted:
+        if tuple(tensor.shape) != shape or tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            raise ValueError(
+                f"expected {name} of shape {shape}, float32 on the CPU, found {tuple(tensor.shape)} {tensor.dtype} {tensor.device}"
+            )
+
+
+def route(call: _Decode) -> None:
+    """Fills in the gates, chosen experts and weights that `set_routing` points to, and nothing else."""
+    library = native.load()
+    assert library is not None
+    native.done(library.se_decode_route(ctypes.byref(call)), WHAT)
+
+
+def run(call: _Decode) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor]:
+    """Decodes what `prepared` and `set_routing` put together: the fields of Gaussians, raw opacities [A, K], and for the backward pass the
+    first Gaussian of each chunk and the inverse lengths of the quaternions before their normalisation [M]."""
+    library = native.load()
+    assert library is not None
+    raw, starts = torch.empty(call.A, call.K), torch.zeros(-(-call.A // CHUNK) + 1, dtype=torch.int64)
+    set_pointers(call, raw=raw, starts=starts)
+    native.done(library.se_decode_begin(ctypes.byref(call)), WHAT)
+    M = int(starts[-1])
+    means, quats, scales, colors = torch.empty(M, 3), torch.empty(M, 4), torch.empty(M, 3), torch.empty(M, 3)
+    opacities, per_length, source = torch.empty(M), torch.empty(M), torch.empty(M, dtype=torch.int64)
+    set_pointers(call, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, per_length=per_length, source=source)
+    native.done(library.se_decode_emit(ctypes.byref(call)), WHAT)
+    return (means, quats, scales, opacities, colors, source), raw, starts, per_length
+
+
+class _DecodeFunction(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, plan: Plan, feature: Tensor, log_scaling: Tensor, offsets: Tensor, *weights: Tensor | None) -> tuple:
+        columns = [t.detach().contiguous() for t in (feature, log_scaling, offsets)]
+        weights = tuple(None if t is None else t.detach().contiguous() for t in weights)
+        A = len(plan.rows)
+        call = prepared(plan, columns, weights)
+        gates, chosen, mix = [], [], []
+        for i, k in enumerate(plan.k):
+            routed, E = weights[T * i] is not None, call.heads[i].E
+            gates.append(torch.empty(A, E) if routed else None)
+            chosen.append(torch.empty(A, k, dtype=torch.int64) if routed and k else None)
+            mix.append(torch.empty(A, k) if routed and k else None)
+        set_routing(call, gates, chosen, mix)
+        (means, quats, scales, opacities, colors, source), raw, starts, per_length = run(call)
+        made = (means, quats, scales, opacities, colors)
+        ctx.plan = plan
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(source, *(c for c in chosen if c is not None))
+        ctx.save_for_backward(*columns, *weights, raw, starts, *made, per_length, *gates, *chosen, *mix)
+        return means, quats, scales, opacities, colors, source, raw, *gates, *chosen
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple:
+        plan: Plan = ctx.plan
+        saved = ctx.saved_tensors
+        columns, weights, made, routing = saved[:3], saved[3 : 3 + 3 * T], saved[3 + 3 * T : 11 + 3 * T], saved[11 + 3 * T :]
+        raw, starts, means, quats, scales, opacities, colors, per_length = made
+        call = prepared(plan, columns, weights)
+        set_pointers(
+            call, raw=raw, starts=starts, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, per_length=per_length
+        )
+        set_routing(call, routing[:3], routing[3:6], routing[6:])
+        given = [None if g is None else g.contiguous() for g in upstream]
+        set_pointers(call, d_means=given[0], d_quats=given[1], d_scales=given[2], d_opacities=given[3], d_colors=given[4], d_raw=given[6])
+        # Ascending rows: the library writes every row of the table, zeros where nothing was seen.
+        fresh = torch.empty_like if plan.ascending else torch.zeros_like
+        d_columns, d_weights = [fresh(t) for t in columns], [None if t is None else torch.empty_like(t) for t in weights]
+        set_pointers(call, d_feature=d_columns[0], d_log_scaling=d_columns[1], d_offsets=d_columns[2])
+        for i, head in enumerate(call.heads):
+            set_pointers(head, d_gates=given[7 + i], **{f"d_{name}": d_weights[T * i + j] for j, name in enumerate(TENSORS)})
+        library = native.load()
+        assert library is not None
+        native.done(library.se_decode_backward(ctypes.byref(call)), "the backward pass of the decode")
+        wanted = ctx.needs_input_grad[1:]
+        return None, *(g if want else None for g, want in zip([*d_columns, *d_weights], wanted))
+
+
+def prepared(plan: Plan, columns: Any, weights: Any) -> _Decode:
+    """The structure with all inputs in it. The tensors must outlive the call."""
+    feature, log_scaling, offsets = columns
+    call = _Decode(
+        A=len(plan.rows), N=len(plan.xyz), K=offsets.shape[1], F=feature.shape[1], threads=native.threads(), ascending=plan.ascending
+    )
+    call.extent = plan.extent
+    set_pointers(call, rows=plan.rows, xyz=plan.xyz, feature=feature, log_scaling=log_scaling, offsets=offsets, camera=plan.camera)
+    for i, head in enumerate(call.heads):
+        own = dict(zip(TENSORS, weights[T * i : T * i + T]))
+        set_pointers(head, **own)
+        head.E, head.H, head.out = own["w1"].shape[0], own["w1"].shape[1], own["w2"].shape[1]
+        head.L = 0 if own["middle_w"] is None else own["middle_w"].shape[1]
+        head.k, head.distance, head.position = plan.k[i], plan.distance[i], plan.position[i]
+    return call
+
+
+def set_pointers(structure: ctypes.Structure, **tensors: Tensor | None) -> None:
+    for name, tensor in tensors.items():
+        setattr(structure, name, native.pointer(tensor))
+
+
+def set_routing(call: _Decode, gates: Any, chosen: Any, mix: Any) -> None:
+    for head, g, c, m in zip(call.heads, gates, chosen, mix):
+        set_pointers(head, gates=g, chosen=c, mix=m)

@@ -1,0 +1,312 @@
+"""Anchors (Scaffold-GS): select -> cull -> decode -> Gaussians.
+
+An anchor v sits on an integer voxel lattice and carries a feature f, a log-scaling l and K offsets O. Seen from a camera,
+three heads turn (f, viewing direction) into the opacity, covariance and colour of K Gaussians at
+mu = x_v + O_v * exp(l_v)[0:3]  (paper eq. 2). Anchors never move; `strategy.grow` adds and removes them.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.schedule import Rate
+from scene_experts.core.table import Table
+from scene_experts.core.types import Camera, Decoded, Gaussians, Points, Routing
+from scene_experts.geometry.neighbours import knn_d2
+from scene_experts.geometry.voxel import VoxelChoice, voxel_size
+from scene_experts.native import library as native
+from scene_experts.scene.anchors import native_decode, triton_decode
+from scene_experts.scene.anchors.appearance import Codes, TestRule, fold
+from scene_experts.scene.anchors.experts import Experts, MixtureHead
+from scene_experts.scene.anchors.features import FeatureBank, OwnFeature
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, HeadWeights, Plain
+from scene_experts.scene.anchors.select import AllAnchors, Octree, Selector, faded, visible_rows
+
+log = logging.getLogger(__name__)
+NEARLY_ALL = 0.95  # of the points in voxels of their own: the lattice does next to nothing
+EPS = 1e-12  # keeps directions and quaternions finite where their length is 0
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """What an anchor scene is made of."""
+
+    K: int = 10
+    """Gaussians per anchor."""
+    F: int = 32
+    """Feature size."""
+    hidden: int = 32
+    """Width of the decoder networks."""
+    add_dist: tuple[str, ...] = ()
+    """Attributes whose networks also see the distance to the camera."""
+    voxel_size: float = 0.0
+    """Edge of the finest lattice in trained world units; 0 takes `voxel_rule`."""
+    voxel_rule: VoxelChoice = "neighbours"
+    """neighbours: a quarter of the median neighbour distance; the others are Scaffold-GS's rule as coded and as documented."""
+    quat_align: bool = False
+    """Flip each expert's quaternion into the hemisphere of the anchor's first expert before mixing (composed decode only)."""
+    decode: Literal["auto", "composed", "native"] = "auto"
+    """Which implementation decodes: the fused native one where it covers the scene, or the composed torch form."""
+    decoder: Plain | Experts = Plain()
+    select: AllAnchors | Octree = AllAnchors()
+    """Which anchors a camera uses."""
+    mix: OwnFeature | FeatureBank = OwnFeature()
+    """What the decoders see of an anchor's feature."""
+    appearance: int = 0
+    """Size of a code per training view that the colour network sees; 0 is none."""
+    test_appearance: TestRule = "mean"
+    """The code of a view that was not trained on: the mean of all, or (Scaffold-GS's quirk) that of the training view of the same index."""
+
+    def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
+        """One anchor per occupied voxel of the point cloud."""
+        return AnchorScene.from_points(self, points, extent, cameras)
+
+    def load(self, table: Table, meta: dict[str, Any]) -> AnchorScene:
+        """The scene of a checkpoint, its networks fresh."""
+        return AnchorScene(self, table, float(meta["voxel"]), float(meta["extent"]), self.select.restored(meta), meta.get("views", ()))
+
+    def scaled(self, factor: float) -> Anchors:
+        """The same in a training `factor` times as long."""
+        return replace(self, decoder=self.decoder.scaled(factor), select=self.select.scaled(factor))
+
+    def check(self) -> None:
+        """Raises InputError for settings that no training can have."""
+        expect_at_least([(f"--scene.{name}", getattr(self, name), 1) for name in ("K", "F", "hidden")])
+        expect_at_least([("--scene.voxel-size", self.voxel_size, 0), ("--scene.appearance", self.appearance, 0)])
+        self.decoder.check()
+        self.select.check()
+        self.mix.check(self.F)
+        unknown = {*self.add_dist, *getattr(self.decoder, "attributes", ())} - set(ATTRIBUTES)
+        if unknown:
+            raise InputError(f"expected attributes among {', '.join(ATTRIBUTES)}, found {', '.join(sorted(unknown))}; correct the flag")
+
+
+class AnchorScene(nn.Module):
+    """N anchors and three decoder heads. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], offsets [N,K,3], log_scaling [N,6]."""
+
+    def __init__(
+        self, config: Anchors, table: Table, voxel: float, extent: float, select: Selector | None = None, views: Sequence[int] = ()
+    ) -> None:
+        """voxel: edge of the finest lattice cell; extent: the scene's R; both in trained world units. views: the training cameras' ids."""
+        super().__init__()
+        self.config, self.table, self.voxel, self.extent = config, table, voxel, extent
+        self.select = select or AllAnchors()
+        heads: dict[str, nn.Module] = {}
+        for attribute in ATTRIBUTES:
+            inputs = config.mix.width(config.F) + 3 + (attribute in config.add_dist) + (config.appearance if attribute == "color" else 0)
+            heads[attribute] = config.decoder.build(attribute, inputs, config.hidden, config.K * CHANNELS[attribute], config.F)
+        self.heads: Mapping[str, MLP | MixtureHead] = nn.ModuleDict(heads)  # type: ignore[assignment]
+        self.mix = config.mix.build(config.F)
+        self.codes = Codes(config.appearance, views, config.test_appearance) if config.appearance else None
+
+    @property
+    def K(self) -> int:
+        return self.config.K
+
+    @property
+    def file_values(self) -> int:
+        """float32 values that an anchor takes in the Scaffold-GS file: 79 for K = 10, F = 32."""
+        return 3 + 3 + 3 * self.K + self.config.F + 1 + 6 + 4  # position, normal, offsets, feature, opacity, scaling, rotation
+
+    def meta(self) -> dict[str, Any]:
+        views = {"views": list(self.codes.views)} if self.codes else {}
+        return {"voxel": self.voxel, "extent": self.extent, **self.select.meta(), **views}
+
+    @classmethod
+    def from_points(cls, config: Anchors, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
+        """One anchor per occupied voxel of the point cloud (of each level). Raises InputError when there are no points."""
+        if len(points.xyz) == 0:
+            raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
+        voxel = config.voxel_size or voxel_size(points.xyz, config.voxel_rule)
+        facts, voxel, select = config.select.begin(points.xyz, voxel, cameras)
+        chosen = config.voxel_size or config.voxel_rule != "neighbours"
+        if chosen and isinstance(select, AllAnchors) and len(facts["xyz"]) > NEARLY_ALL * len(points.xyz):
+            log.warning("voxels of %.4g units keep nearly every point (%d of %d)", voxel, len(facts["xyz"]), len(points.xyz))
+        scale = knn_d2(facts["xyz"].float().double()).clamp_min(1e-7).sqrt().log().float()
+        n = len(scale)
+        params = {
+            "feature": torch.zeros(n, config.F),
+            "offsets": torch.zeros(n, config.K, 3),
+            "log_scaling": scale[:, None].repeat(1, 6),
+        }
+        table = Table(params, {**facts, "xyz": facts["xyz"].float()})
+        return cls(config, table, voxel, extent, select, [c.id for c in cameras])
+
+    def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
+        """Rows for anchors born at lattice cells [n, 3] of `level` with scaling `size` and features [n, F]; offsets start at 0."""
+        n = len(cells)
+        facts = self.select.places(cells, self.voxel, level)
+        return {
+            **{name: value.to(feature.dtype) if value.is_floating_point() else value for name, value in facts.items()},
+            "feature": feature,
+            "offsets": feature.new_zeros(n, self.K, 3),
+            "log_scaling": feature.new_full((n, 6), math.log(size)),
+        }
+
+    def forward(self, camera: Camera, step: int, training: bool, cull: Callable[[Tensor, Tensor, Camera], Tensor]) -> Decoded:
+        """The Gaussians that `camera` sees at `step`. `cull(means, scales, camera)` is the rasteriser's visibility test."""
+        table = self.table
+        scales = table.params["log_scaling"].detach()[:, :3].contiguous().exp()  # with gaps between its rows exp takes 7 times as long
+        rows = visible_rows(self.select(table, camera, step, training), table.facts["xyz"], scales, camera, cull)
+        decoded = self.decode(rows, camera, step)
+        decoded = faded(decoded, self.select.fade(table, rows, camera, step, training), len(table), self.K)
+        return self.with_global_routing(decoded, step) if training else decoded
+
+    def decode(self, rows: Tensor, camera: Camera, step: int) -> Decoded:
+        """Gaussians of the given anchors [A], by the device's fused kernels where they cover the scene, else in plain torch."""
+        weights = self.native_weights(step)
+        if weights is None:
+            return self.decode_composed(rows, camera, step)
+        if self.codes is not None:
+            weights["color"] = fold(weights["color"], self.codes(camera))
+        p = self.table.params
+        with_dist = {a: a in self.config.add_dist for a in ATTRIBUTES}
+        xyz, columns = self.table.facts["xyz"], (p["feature"], p["log_scaling"], p["offsets"])
+        fused = native_decode if rows.device.type == "cpu" else triton_decode
+        made = fused.decode(rows, xyz, *columns, camera.position, weights, with_dist, self.extent)
+        return Decoded(made[0], rows, made[1], made[2])
+
+    def native_weights(self, step: int) -> dict[str, HeadWeights] | None:
+        """The heads' tensors for the fused decode (compiled on the CPU, Triton on CUDA), or None where it does not apply."""
+        feature = self.table.params["feature"]
+        why = no_kernels(feature.device)
+        why = why or ("--scene.quat-align" if self.config.quat_align else "a feature bank" if self.mix is not None else None)
+        why = why or (f"tensors of {feature.dtype}" if feature.dtype != torch.float32 else None)
+        if self.config.decode == "composed" or why:
+            if self.config.decode == "native":
+                raise InputError(f"expected a scene that the native decode covers, found {why}; use --scene.decode auto")
+            return None
+        weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
+        wide = lambda a, w: feature.is_cuda and not triton_decode.covers(a, w, self.config.F, self.K)  # noqa: E731
+        without = next((a for a, w in weights.items() if w is None or wide(a, w)), None)
+        if without and self.config.decode == "native":
+            raise InputError(
+                f"expected a {without} head that the native decode covers, found switches it has no code for; use --scene.decode auto"
+            )
+        return None if without else weights  # type: ignore[return-value]
+
+    def inputs(self, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+        """Feature [A, F], unit direction camera -> anchor [A, 3], distance [A, 1]."""
+        v = self.table.facts["xyz"].index_select(0, rows) - camera.position.to(self.table.facts["xyz"])
+        distance = v.norm(dim=1, keepdim=True)
+        return self.table.params["feature"].index_select(0, rows), v / distance.clamp_min(EPS), distance
+
+    def decode_composed(self, rows: Tensor, camera: Camera, step: int) -> Decoded:
+        """The definition, in plain torch: one head call per attribute, then mask, activate and place."""
+        p, K = self.table.params, self.K
+        feature, direction, distance = self.inputs(rows, camera)
+        seen = feature if self.mix is None else self.mix(self.table, rows, direction, distance)
+        position = self.table.facts["xyz"].index_select(0, rows) / self.extent
+        out: dict[str, Tensor] = {}
+        routing: dict[str, Routing] = {}
+        for attribute in ATTRIBUTES:
+            head = self.heads[attribute]
+            x = torch.cat([seen, direction] + ([distance] if attribute in self.config.add_dist else []), dim=1)
+            if attribute == "color" and self.codes is not None:
+                x = torch.cat([x, self.codes(camera).expand(len(x), -1)], dim=1)
+            if attribute == "cov" and self.config.quat_align and isinstance(head, MixtureHead):
+                out[attribute], found = head.aligned(x, feature, step, position, K)
+            else:
+                out[attribute], found = head(x, feature, step, position)
+            if found is not None:
+                routing[attribute] = found
+        raw = out["opacity"]  # [A, K]
+        keep = (raw > 0).reshape(-1).nonzero().squeeze(1)  # strictly positive opacity is drawn
+        anchor = torch.div(keep, K, rounding_mode="floor")
+        row = rows.index_select(0, anchor)
+        scaling = p["log_scaling"].index_select(0, row).exp()
+        cov = out["cov"].reshape(-1, 7).index_select(0, keep)
+        source = row * K + (keep - anchor * K)
+        offset = p["offsets"].reshape(-1, 3).index_select(0, source)
+        gaussians = Gaussians(
+            means=self.table.facts["xyz"].index_select(0, row) + offset * scaling[:, :3],  # eq. 2
+            quats=functional.normalize(cov[:, 3:], dim=1, eps=EPS),
+            scales=scaling[:, 3:] * cov[:, :3].sigmoid(),
+            opacities=raw.reshape(-1).index_select(0, keep),
+            colors=out["color"].reshape(-1, 3).index_select(0, keep),
+            source=source,
+        )
+        return Decoded(gaussians, rows, raw, routing)
+
+    def scene_opacity(self, camera: Camera, step: int) -> Tensor:
+        """Raw opacities [N, K] of every anchor from `camera`, whether it sees them or not."""
+        everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
+        feature, direction, distance = self.inputs(everyone, camera)
+        seen = feature if self.mix is None else self.mix(self.table, everyone, direction, distance)
+        x = torch.cat([seen, direction] + ([distance] if "opacity" in self.config.add_dist else []), dim=1)
+        return self.heads["opacity"](x, feature, step, self.table.facts["xyz"] / self.extent)[0]
+
+    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
+        """Routing of every anchor (of at most `most`, evenly spread), by attribute: it does not depend on the camera."""
+        every = max(1, -(-len(self.table) // most)) if most else 1
+        feature, position = self.table.params["feature"][::every], self.table.facts["xyz"][::every] / self.extent
+        found = {a: self.heads[a].routing(feature, step, position) for a in ATTRIBUTES}
+        return {a: r for a, r in found.items() if r is not None}
+
+    def with_global_routing(self, decoded: Decoded, step: int) -> Decoded:
+        """For `load_scope = all`: the routing of all anchors in place of the visible ones', so that L_load balances the whole scene."""
+        decoder = self.config.decoder
+        if isinstance(decoder, Experts) and decoder.load_scope == "all" and decoded.routing:
+            return replace(decoded, routing=self.routing(step))
+        return decoded
+
+    def rate_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by the name of their learning rate: one group per column, per head and per router."""
+        groups = {name: [self.table.params[name]] for name in ("feature", "offsets", "log_scaling")}
+        for attribute in ATTRIBUTES:
+            head = self.heads[attribute]
+            named = dict(head.named_parameters())  # type: ignore[attr-defined]
+            groups[attribute] = [p for name, p in named.items() if not name.startswith("router")]
+            routers = [p for name, p in named.items() if name.startswith("router")]
+            if routers:
+                groups[f"{attribute}.router"] = routers
+        if self.mix is not None:
+            groups["mix"] = list(self.mix.parameters())
+        if self.codes is not None:
+            groups["appearance"] = [self.codes.table]
+        return groups
+
+    def network_tensors(self) -> dict[str, Tensor]:
+        """Every tensor of the decoder by name (`opacity.w1`, ...), for files."""
+        parts: dict[str, Any] = {**self.heads, "mix": self.mix, "appearance": self.codes}
+        return {f"{part}.{name}": p for part, module in parts.items() if module is not None for name, p in module.named_parameters()}
+
+
+def no_kernels(device: torch.device) -> str | None:
+    """None where `device` has fused kernels; else why not."""
+    if device.type == "cuda":
+        return triton_decode.available()
+    return native.why_not() if device.type == "cpu" else f"no kernels for {device.type}"
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Learning rates (Scaffold-GS's). `offsets` is multiplied by the scene's extent R."""
+
+    feature: Rate = Rate(0.0075, 0.0075)
+    offsets: Rate = Rate(0.01, 0.0001)
+    log_scaling: Rate = Rate(0.007, 0.007)
+    opacity: Rate = Rate(0.002, 0.00002)
+    cov: Rate = Rate(0.004, 0.004)
+    color: Rate = Rate(0.008, 0.00005)
+    mix: Rate = Rate(0.01, 0.00001)
+    """The feature bank's network."""
+    appearance: Rate = Rate(0.05, 0.0005)
+    router_scale: float = 1.0
+    """Routers follow their attribute's rate times this."""
+
+    def at(self, group: str, step: int, total: int, extent: float) -> float:
+        """The rate of a group of `rate_groups` at `step` of `total`."""
+        attribute, _, router = group.partition(".")
+        rate: Rate = getattr(self, attribute)
+        factor = self.router_scale if router else extent if attribute == "offsets" else 1.0
+        return rate.at(step, total) * factor

@@ -1,0 +1,248 @@
+"""Which anchors a camera uses, before the visibility filter: all of them, or those of the levels that its distance asks for (Octree-GS)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import accumulate
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.table import Table
+from scene_experts.core.types import Camera, Decoded
+from scene_experts.geometry.voxel import to_lattice, unique_cells
+from scene_experts.scene.anchors import levels as lattices
+from scene_experts.scene.anchors.levels import LevelRule, Levels, blended, whole
+
+
+class Selector(Protocol):
+    """Who is drawn, and where anchors may stand."""
+
+    def __call__(self, table: Table, camera: Camera, step: int, training: bool) -> Tensor | None:
+        """Row indices [S] int64, ascending, that may be drawn, or None for all of them."""
+        ...
+
+    def fade(self, table: Table, rows: Tensor, camera: Camera, step: int, training: bool) -> Tensor | None:
+        """Factors [A] in [0, 1] on the opacities of `rows`, or None for 1 throughout."""
+        ...
+
+    def places(self, cells: Tensor, voxel: float, level: int) -> dict[str, Tensor]:
+        """The facts of anchors born at cells [n, 3] of `level`; positions in float64."""
+        ...
+
+    def meta(self) -> dict[str, Any]:
+        """What a checkpoint must keep beside the table."""
+        ...
+
+
+@dataclass(frozen=True)
+class AllAnchors:
+    """Every anchor, as in Scaffold-GS."""
+
+    def __call__(self, table: Table, camera: Camera, step: int, training: bool) -> Tensor | None:
+        return None
+
+    def fade(self, table: Table, rows: Tensor, camera: Camera, step: int, training: bool) -> Tensor | None:
+        return None
+
+    def places(self, cells: Tensor, voxel: float, level: int) -> dict[str, Tensor]:
+        return {"cell": cells, "xyz": cells.double() * voxel}
+
+    def meta(self) -> dict[str, Any]:
+        return {}
+
+    def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
+        """One anchor per occupied voxel of points [P, 3]: facts of the rows, the finest cell's edge, the selector."""
+        cells, _ = unique_cells(to_lattice(points, voxel))
+        return self.places(cells, voxel, 0), voxel, self
+
+    def restored(self, meta: dict[str, Any]) -> Selector:
+        return self
+
+    def scaled(self, factor: float) -> AllAnchors:
+        return self
+
+    def check(self) -> None:
+        """Everything is possible."""
+
+
+@dataclass(frozen=True)
+class Octree:
+    """Levels of detail (Ren et al., Octree-GS): anchors on several lattices, each camera using a level the nearer it is."""
+
+    fork: int = 2
+    """Cells of a level are so many times as small as the level's before."""
+    count: int = 0
+    """Number of levels; 0 takes it from the distances between training cameras and points."""
+    first: int = -1
+    """Coarse-to-fine training begins with levels 0 to this; -1 takes half of them."""
+    base_layer: int = -1
+    """Level 0 divides the scene's cube in fork^base_layer cells an axis; -1 adapts it to `coarseness`."""
+    coarseness: float = 4.0
+    """Edge of a cell of the middle level (count / 2 - 1) in voxels of the scene's rule, where base_layer is -1."""
+    dist_ratio: float = 0.999
+    """Quantile of the distances that count as the farthest; one minus it, as the nearest."""
+    visible_threshold: float = -1.0
+    """Weed out anchors that no larger share of the training cameras asks for; below 0: the mean share."""
+    rule: LevelRule = "round"
+    """How a real-valued level becomes a whole one; blend fades the finest level's opacity in by the fraction."""
+    coarse_to_fine: bool = True
+    """Train the coarser half of the levels first and let finer ones in one by one."""
+    coarse_until: int = 10_000
+    """The iteration after which all levels are in use (rescaled by --iterations)."""
+    coarse_factor: float = 1.5
+    """Until then each finer level is let in after a time so many times as long as the next."""
+    extend: float = 1.1
+    """The cube is so many times as large as the points' bounding cube."""
+    parity_cube: bool = False
+    """Octree-GS's quirk: the cube's ends are scaled about the origin and not about its centre."""
+
+    def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
+        """Anchors in the occupied cells of every level, weeded: facts of the rows, the finest cell's edge, the selector."""
+        levels = self.levels(points, voxel, cameras)
+        cells, level = lattices.occupied(levels, points)
+        xyz = torch.cat([levels.positions(cells[level == i], i) for i in range(levels.count)])
+        if self.visible_threshold < 0:
+            levels = replace(levels, threshold=float(levels.share(xyz.float(), level).mean()))
+        rows = levels.wanted(xyz.float(), level).nonzero().squeeze(1)
+        facts = {"cell": cells[rows], "xyz": xyz[rows], "level": level[rows], "extra_level": torch.zeros(len(rows))}
+        return facts, levels.size(levels.count - 1), LevelSelector(self, levels)
+
+    def levels(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> Levels:
+        """The lattices for points [P, 3] and training cameras. Raises InputError where there is no
+        camera, and for more cells than can be told apart."""
+        if not cameras:
+            raise InputError("expected training cameras to choose levels of detail from, found none; choose another --split")
+        far, near = lattices.distances(points, cameras, self.dist_ratio)
+        count = self.count or lattices.level_count(far, near, self.fork)
+        low, cube = lattices.cube(points, self.extend, self.parity_cube)
+        layer = self.base_layer
+        if layer < 0:
+            layer = round(math.log(cube / (self.coarseness * voxel), self.fork)) - count // 2 + 1
+        finest = math.floor(math.log(lattices.MOST_CELLS, self.fork))
+        if layer > finest:
+            raise InputError(
+                f"expected at most {self.fork}^{finest} cells an axis at level 0, found {self.fork}^{layer}; "
+                "lower --scene.select.base-layer, or where it adapts itself, remove points far from all others"
+            )
+        edge = cube / float(self.fork) ** layer
+        count = lattices.within_reach(count, edge, cube, self.fork)
+        first = min(count // 2 if self.first < 0 else self.first, count - 1)
+        threshold = max(self.visible_threshold, 0.0)
+        return Levels(count, first, self.fork, edge, (low, low, low), far, self.rule, threshold, lattices.centres(cameras))
+
+    def restored(self, meta: dict[str, Any]) -> Selector:
+        return LevelSelector(self, Levels.from_meta(meta["levels"]))
+
+    def scaled(self, factor: float) -> Octree:
+        return replace(self, coarse_until=round(self.coarse_until * factor))
+
+    def turns(self, levels: Levels) -> list[float]:
+        """The iterations after which one more level is in use: turns shrink by `coarse_factor`, the last ends at `coarse_until`."""
+        m, q = levels.count - 1 - levels.first, 1.0 / self.coarse_factor
+        if m < 1:
+            return []
+        return list(accumulate(q**i / sum(q**j for j in range(m)) * self.coarse_until for i in range(m)))
+
+    def check(self) -> None:
+        """Raises InputError for numbers that no training can have."""
+        expect_at_least(
+            [("--scene.select.fork", self.fork, 2), ("--scene.select.count", self.count, 0), ("--scene.select.first", self.first, -1)]
+        )
+        expect_at_least([("--scene.select.coarse-until", self.coarse_until, 0), ("--scene.select.extend", self.extend, 1)])
+        bounds = [
+            ("dist-ratio", self.dist_ratio, 0.5 < self.dist_ratio <= 1, "above 0.5 and at most 1"),
+            ("visible-threshold", self.visible_threshold, self.visible_threshold < 1, "below 1"),
+            ("coarseness", self.coarseness, self.coarseness > 0, "above 0"),
+            ("coarse-factor", self.coarse_factor, self.coarse_factor > 0, "above 0"),
+        ]
+        for name, value, possible, wanted in bounds:
+            if not possible:
+                raise InputError(f"expected --scene.select.{name} {wanted}, found {value}; correct it or leave it out")
+
+
+@dataclass(frozen=True)
+class LevelSelector:
+    """The levels of a scene in use: an anchor is drawn where its level is no finer than what its distance asks for."""
+
+    config: Octree
+    lattices: Levels
+    cap: int | None = None
+    """No finer level than this, whatever the distance (a viewer's level of detail)."""
+
+    def __call__(self, table: Table, camera: Camera, step: int, training: bool) -> Tensor:
+        asked = self.asked(table.facts["xyz"], table.facts["level"], table.facts["extra_level"], camera)
+        return (table.facts["level"] <= whole(asked, self.lattices.rule, self.top(step, training))).nonzero().squeeze(1)
+
+    def fade(self, table: Table, rows: Tensor, camera: Camera, step: int, training: bool) -> Tensor | None:
+        if self.lattices.rule != "blend":
+            return None
+        xyz, level, extra = (table.facts[name].index_select(0, rows) for name in ("xyz", "level", "extra_level"))
+        asked = blended(self.asked(xyz, level, extra, camera), self.top(step, training))
+        return torch.where(level == asked.floor().long(), asked.frac(), torch.ones_like(asked))
+
+    def asked(self, xyz: Tensor, level: Tensor, extra: Tensor, camera: Camera) -> Tensor:
+        """Real-valued levels [n] with each anchor's own addition."""
+        return self.lattices.asked(xyz, level, camera.position) + extra
+
+    def top(self, step: int, training: bool) -> int:
+        """Levels in use: all of them, or while a coarse-to-fine training lasts, those let in before `step`."""
+        count = self.lattices.count
+        if training and self.config.coarse_to_fine:
+            count = self.lattices.first + 1 + sum(turn < step for turn in self.config.turns(self.lattices))
+        return min(count, self.lattices.count if self.cap is None else max(self.cap, 0) + 1)
+
+    def capped(self, level: int | None) -> LevelSelector:
+        """The same with no finer level than `level`; None lifts the cap."""
+        return replace(self, cap=level)
+
+    def coarse(self, step: int) -> bool:
+        """Whether finer levels are still being let in at `step`."""
+        turns = self.config.turns(self.lattices) if self.config.coarse_to_fine else []
+        return bool(turns) and step <= turns[-1]
+
+    def places(self, cells: Tensor, voxel: float, level: int) -> dict[str, Tensor]:
+        n = len(cells)
+        xyz = self.lattices.positions(cells, level)
+        return {"cell": cells, "xyz": xyz, "level": torch.full_like(cells[:, 0], level), "extra_level": xyz.new_zeros(n)}
+
+    def meta(self) -> dict[str, Any]:
+        return {"levels": self.lattices.meta()}
+
+
+@contextmanager
+def capped(scene: Any, level: int | None) -> Iterator[None]:
+    """`scene` (any) drawing no finer level than `level` meanwhile; as it is where `level` is None and where it has no levels."""
+    whole = getattr(scene, "select", None)
+    if level is None or not isinstance(whole, LevelSelector):
+        yield
+        return
+    scene.select = whole.capped(level)
+    try:
+        yield
+    finally:
+        scene.select = whole
+
+
+def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera: Camera, cull) -> Tensor:
+    """Rows [A] of the selected anchors whose own ellipsoid touches the picture. means [N, 3], scales [N, 3]; no gradient."""
+    with torch.no_grad():
+        if selected is None:
+            return cull(means, scales, camera).nonzero().squeeze(1)
+        return selected[cull(means.index_select(0, selected), scales.index_select(0, selected), camera)]
+
+
+def faded(decoded: Decoded, fade: Tensor | None, rows: int, K: int) -> Decoded:
+    """`decoded` with the opacities of its anchors, raw and drawn, times `fade` [A]; `rows`: of the whole table."""
+    if fade is None or decoded.raw_opacity is None:
+        return decoded
+    of_row = fade.new_ones(rows).index_copy(0, decoded.rows, fade)
+    gaussians = decoded.gaussians
+    factor = of_row.index_select(0, torch.div(gaussians.source, K, rounding_mode="floor"))
+    gaussians = replace(gaussians, opacities=gaussians.opacities * factor)
+    return replace(decoded, gaussians=gaussians, raw_opacity=decoded.raw_opacity * fade[:, None])

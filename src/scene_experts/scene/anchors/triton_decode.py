@@ -1,0 +1,255 @@
+"""The decode of an anchor scene on CUDA as a few Triton kernels: gather -> direction -> routing -> experts -> Gaussians.
+
+The same mathematics as `AnchorScene.decode_composed` (its oracle), forward and backward. Anchors are sorted by their set of chosen experts,
+so that Top-k costs k networks instead of E and no [A, k, outputs] is ever stored; the host waits once, for the number of Gaussians.
+Backward computes the hidden layers again. No sum uses atomics: the same inputs give the same bits on one device. Symbols as in `types.py`.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scene_experts.core.types import Gaussians, Routing
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, HeadWeights
+
+ACTIVATION = {"opacity": 0, "cov": 1, "color": 2}  # tanh, none, sigmoid of triton_kernels.py
+TENSORS = ("router_w", "router_b", "w1", "b1", "w2", "b2")
+PRECISION = "ieee"  # of the products: "ieee" is float32 throughout, "tf32x3" nearly so on tensor cores, "tf32" is not
+BLOCK = 32  # anchors a program works on: with the paper's sizes the largest that keeps (nearly) all in registers
+BLOCK_WEIGHTS = 16  # the same in the kernel of the weights' gradients, which holds a network's gradient in registers
+MOST_EXPERTS = 30  # a set of experts is the bits of an int32
+WIDEST = 256  # outputs, padded
+
+
+@functools.cache
+def available() -> str | None:
+    """None where the kernels can run; else one sentence that says why not and what to do. A CUDA device is not asked for."""
+    try:
+        importlib.import_module("triton")
+    except Exception as error:  # a broken installation raises almost anything
+        reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
+        return f"triton cannot be imported ({reason[0]}): install it with `pip install scene-experts[cuda]`, or decode in plain torch"
+    if not torch.cuda.is_available():
+        return None
+    if torch.cuda.get_device_capability()[0] < 8:
+        return "the Triton decode needs a GPU of compute capability 8.0 or newer: decode in plain torch"
+    try:  # Triton builds its launcher with the system's C compiler
+        _kernels().probe[(1,)](torch.zeros(1, device="cuda"))
+    except Exception as error:
+        reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
+        return f"triton cannot compile here ({reason[0]}): install a C compiler, or decode in plain torch"
+    return None
+
+
+def covers(attribute: str, h: HeadWeights, F: int, K: int) -> bool:
+    """Whether the kernels have code and room for a network (two layers, held in registers) and for its number of experts."""
+    E, H = h.w1.shape[:2]
+    fits = padded(F + 5) <= 64 and padded(H) <= 64 and padded(K * CHANNELS[attribute]) <= WIDEST
+    return h.middle_w is None and fits and E <= MOST_EXPERTS
+
+
+def padded(n: int, least: int = 16) -> int:
+    """The power of two that a tile's side of n needs."""
+    return max(least, 1 << (n - 1).bit_length())
+
+
+@dataclass(frozen=True)
+class _Head:
+    """One attribute as the kernels see it."""
+
+    attribute: str
+    E: int
+    k: int  # 0: dense, or no router
+    routed: bool
+    distance: bool
+    position: bool  # the router sees it
+    sizes: dict[str, Any]  # the compile-time constants of its three kernels
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What is not differentiated."""
+
+    rows: Tensor  # [A] int64
+    xyz: Tensor  # [N, 3]
+    camera: Tensor  # [3]
+    heads: tuple[_Head, _Head, _Head]
+    extent: float
+
+    def order(self, keys: Tensor) -> Tensor:
+        """The anchors sorted by their sets of experts, [A] int64."""
+        return keys.argsort(stable=True)
+
+
+def decode(
+    rows: Tensor,
+    xyz: Tensor,
+    feature: Tensor,
+    log_scaling: Tensor,
+    offsets: Tensor,
+    camera_position: Tensor,
+    heads: dict[str, HeadWeights],
+    with_dist: dict[str, bool],
+    extent: float = 1.0,
+) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
+    """Gaussians of positive opacity in the order of (row, slot), raw opacities [A, K], and routing of the heads that have a router.
+
+    rows [A] int64, each at most once and inside of the table (not checked: that would wait for the device); xyz [N, 3], feature [N, F],
+    log_scaling [N, 6], offsets [N, K, 3], camera_position [3]; heads and with_dist by attribute ("opacity", "cov", "color"), D = F + 3
+    (+ 1 with the distance); a router that sees positions sees xyz / extent. All float32 on one device. Differentiable in feature,
+    log_scaling, offsets and every tensor of the heads; not in xyz and the camera. Raises ValueError for shapes that do not fit.
+    """
+    F, K = feature.shape[1], offsets.shape[1]
+    made = tuple(_head(a, heads[a], with_dist[a], F, K) for a in ATTRIBUTES)
+    plan = _Plan(rows.contiguous(), xyz.detach().contiguous(), camera_position.detach().to(xyz).contiguous(), made, extent)  # type: ignore[arg-type]
+    weights = [getattr(heads[a], name) for a in ATTRIBUTES for name in TENSORS]
+    means, quats, scales, opacities, colors, source, raw, *routing = _Decode.apply(plan, feature, log_scaling, offsets, *weights)
+    found = {a: Routing(routing[i], routing[3 + i]) for i, a in enumerate(ATTRIBUTES) if routing[i] is not None}
+    return Gaussians(means, quats, scales, opacities, colors, source), raw, found
+
+
+def _head(attribute: str, h: HeadWeights, distance: bool, F: int, K: int) -> _Head:
+    E, H, D = h.w1.shape
+    C = CHANNELS[attribute]
+    if F + 3 + distance != D or tuple(h.w2.shape) != (E, K * C, H):
+        expected = f"{attribute} weights [E, H, {F + 3 + distance}] and [E, {K * C}, H]"
+        raise ValueError(f"expected {expected}, found {tuple(h.w1.shape)} and {tuple(h.w2.shape)}")
+    if h.middle_w is not None:
+        raise ValueError(f"expected networks of two layers, found {2 + h.middle_w.shape[1]} for {attribute}")
+    routed = h.router_w is not None
+    if not routed and E != 1:
+        raise ValueError(f"expected one expert for {attribute} without a router, found {E}")
+    if h.router_w is not None and h.router_w.shape[1] != F + 3 * h.position:
+        raise ValueError(f"expected {attribute} router weights [{E}, {F + 3 * h.position}], found {tuple(h.router_w.shape)}")
+    if routed and h.k is not None and not 1 <= h.k <= E:
+        raise ValueError(f"expected k between 1 and {E} for {attribute}, found {h.k}")
+    sizes: dict[str, Any] = {"E": E, "F": F, "H": H, "K": K, "C": C, "DISTANCE": int(distance), "ROUTED": routed}
+    sizes |= {"SPARSE": routed and h.k is not None, "ACT": ACTIVATION[attribute], "COMPACT": attribute != "opacity"}
+    sizes |= {"XP": padded(D + 1), "HP": padded(H), "COLS": padded(K * C), "PRECISION": PRECISION}
+    return _Head(attribute, E, (h.k or 0) if routed else 0, routed, distance, h.position, sizes)
+
+
+def _kernels() -> ModuleType:
+    return importlib.import_module("scene_experts.scene.anchors.triton_kernels")
+
+
+def _parts(device: torch.device, experts: int, blocks: int) -> int:
+    """Programs that share the weights' gradient of one expert: enough for the device, the same number on every run."""
+    units = torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 2
+    return max(1, min(blocks, 2 * units // experts))
+
+
+class _Decode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, plan: _Plan, feature: Tensor, log_scaling: Tensor, offsets: Tensor, *weights: Tensor | None) -> tuple:
+        columns = [t.detach().contiguous() for t in (feature, log_scaling, offsets)]
+        weights = tuple(None if t is None else t.detach().contiguous() for t in weights)
+        A, K = len(plan.rows), offsets.shape[1]
+        routes = [_route(plan, head, columns[0], weights[6 * i : 6 * i + 6]) for i, head in enumerate(plan.heads)]
+        raw = feature.new_empty(A, K)
+        _forward(plan, 0, routes, columns[0], weights, raw, raw)
+        counted = (raw > 0).view(-1).cumsum(0, dtype=torch.int32)
+        M = int(counted[-1]) if A else 0  # the one place where the host waits for the device
+        dst = torch.where(raw.view(-1) > 0, counted - 1, -1)
+        cov, colors = feature.new_empty(M, 7), feature.new_empty(M, 3)
+        _forward(plan, 1, routes, columns[0], weights, dst, cov)
+        _forward(plan, 2, routes, columns[0], weights, dst, colors)
+        means, quats, scales, opacities = (feature.new_empty(M, *shape) for shape in ((3,), (4,), (3,), ()))
+        source = torch.empty(M, dtype=torch.int64, device=raw.device)
+        if M:
+            arguments = (plan.rows, plan.xyz, columns[2], columns[1], raw, cov, dst, means, quats, scales, opacities, source, A)
+            _kernels().place[(-(-A // BLOCK),)](*arguments, K=K, B=BLOCK, KP=padded(K, 1))
+        gates, chosen = [r[0] for r in routes], [r[2] for r in routes]
+        ctx.plan = plan
+        ctx.mark_non_differentiable(source, *(c for c in chosen if c is not None))
+        ctx.save_for_backward(*columns, *weights, dst, cov, quats, *(t for r in routes for t in (r[0], r[1], r[3], r[4])))
+        return means, quats, scales, opacities, colors, source, raw, *gates, *chosen
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple:
+        plan: _Plan = ctx.plan
+        saved = ctx.saved_tensors
+        columns, weights, (dst, cov, quats) = saved[:3], saved[3:21], saved[21:24]
+        routes = [(*saved[24 + 4 * i : 26 + 4 * i], None, *saved[26 + 4 * i : 28 + 4 * i]) for i in range(3)]
+        A, K = len(plan.rows), columns[2].shape[1]
+        d_means, d_quats, d_scales, d_opacities, d_colors, _, d_raw = (g.contiguous() for g in upstream[:7])
+        d_gates = [None if g is None else g.contiguous() for g in upstream[7:10]]
+        d_feature, d_log_scaling, d_offsets = (torch.zeros_like(t) for t in columns)
+        d_cov, d_all = torch.empty_like(cov), cov.new_empty(A, K)
+        if A:
+            given = (plan.rows, columns[2], columns[1], cov, dst, quats, d_means, d_quats, d_scales, d_opacities, d_raw)
+            grid = (-(-A // BLOCK),)
+            _kernels().place_backward[grid](*given, d_offsets, d_log_scaling, d_cov, d_all, A, K=K, B=BLOCK, KP=padded(K, 1))
+        d_weights: list[Tensor | None] = []
+        for i, d_out in enumerate((d_all, d_cov, d_colors)):
+            d_weights += _backward(plan, i, routes[i], columns[0], weights, dst, d_out, d_gates[i], d_feature)
+        wanted = ctx.needs_input_grad[1:]
+        return None, *(g if want else None for g, want in zip([d_feature, d_log_scaling, d_offsets, *d_weights], wanted))
+
+
+def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Tensor | None, ...]:
+    """gates [A, E], mix [A, E] (the gates while dense), chosen [A, k], keys [A] and order [A]; None for what a head has not."""
+    if not head.routed:
+        return (None,) * 5
+    A, device = len(plan.rows), feature.device
+    gates = feature.new_empty(A, head.E)
+    mix, chosen, keys = gates, None, None
+    if head.k:
+        mix, chosen = torch.empty_like(gates), torch.empty(A, head.k, dtype=torch.int64, device=device)
+        keys = torch.empty(A, dtype=torch.int32, device=device)
+    if A:
+        bias = weights[1]
+        sizes = {"F": feature.shape[1], "E": head.E, "TOP": head.k, "BIAS": bias is not None, "POSITION": head.position}
+        sizes |= {"FP": padded(feature.shape[1]), "EP": padded(head.E), "B": BLOCK, "PRECISION": PRECISION}
+        unused = plan.rows  # stands for arrays that a kernel's constants say it does not touch
+        arguments = [plan.rows, plan.xyz, feature, weights[0], bias, gates, mix, chosen, keys]
+        _kernels().route[(-(-A // BLOCK),)](*(unused if t is None else t for t in arguments), A, plan.extent, **sizes)
+    return gates, mix, chosen, keys, None if keys is None else plan.order(keys)
+
+
+def _forward(plan: _Plan, i: int, routes: Any, feature: Tensor, weights: Any, dst: Tensor, out: Tensor) -> None:
+    """Fills `out` with attribute i of every slot (opacity) or of the drawn ones."""
+    A = len(plan.rows)
+    if not out.numel():
+        return
+    _, mix, _, keys, order = routes[i]
+    arguments = [plan.rows, order, keys, mix, plan.xyz, feature, plan.camera, *weights[6 * i + 2 : 6 * i + 6], dst, out]
+    _kernels().head_forward[(-(-A // BLOCK),)](*(plan.rows if t is None else t for t in arguments), A, **plan.heads[i].sizes, B=BLOCK)
+
+
+def _backward(
+    plan: _Plan, i: int, route: Any, feature: Tensor, weights: Any, dst: Tensor, d_out: Tensor, d_gates: Tensor | None, d_feature: Tensor
+) -> list[Tensor | None]:
+    """The gradients of attribute i's six tensors; adds its part to `d_feature`."""
+    head, own, A = plan.heads[i], weights[6 * i : 6 * i + 6], len(plan.rows)
+    gates, mix, _, keys, order = route
+    if not A:
+        return [None if t is None else torch.zeros_like(t) for t in own]
+    d_logits = None if gates is None else torch.empty_like(gates)
+    shared = [plan.rows, order, keys, mix]
+    arguments = [*shared, gates, plan.xyz, feature, plan.camera, own[0], *own[2:], dst, d_out, d_gates, d_logits, d_feature]
+    grid = (-(-A // BLOCK),)
+    _kernels().head_backward[grid](
+        *(plan.rows if t is None else t for t in arguments), A, **head.sizes, B=BLOCK, EP=padded(head.E), POSITION=head.position
+    )
+    blocks = -(-A // BLOCK_WEIGHTS)
+    parts = [t.new_empty(_parts(t.device, head.E, blocks), *t.shape) for t in own[2:]]
+    arguments = [*shared, plan.xyz, feature, plan.camera, *own[2:], dst, d_out, *parts]
+    _kernels().weight_backward[(head.E, len(parts[0]))](
+        *(plan.rows if t is None else t for t in arguments), A, blocks, **head.sizes, B=BLOCK_WEIGHTS
+    )
+    found: list[Tensor | None] = [None, None]
+    if d_logits is not None:
+        seen = feature.index_select(0, plan.rows)
+        if head.position:
+            seen = torch.cat([seen, plan.xyz.index_select(0, plan.rows) / plan.extent], dim=1)
+        found[0] = d_logits.T @ seen
+        found[1] = None if own[1] is None else d_logits.sum(0)
+    return [*found, *(part.sum(0) for part in parts)]

@@ -1,0 +1,165 @@
+"""Explicit Gaussians (3DGS, Kerbl et al. 2023): every row of the table is one Gaussian whose colour is a sum of spherical harmonics.
+
+Columns: means [N, 3], log_scales [N, 3], quats [N, 4] (w, x, y, z; normalised at use), raw_opacity [N] (logits), and the harmonics
+sh_dc [N, 3] and sh_rest [N, (degree + 1)^2 - 1, 3]. The degree in use grows from 0 by one every `sh_ramp` iterations.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.schedule import Rate
+from scene_experts.core.table import Table
+from scene_experts.core.types import Camera, Decoded, Gaussians, Points, Routing
+from scene_experts.geometry.neighbours import knn_d2
+from scene_experts.geometry.sh import MAX_DEGREE, rgb_to_dc
+from scene_experts.geometry.sh_colors import sh_colors
+from scene_experts.scene import Cull
+
+COLUMNS = ("means", "log_scales", "quats", "raw_opacity", "sh_dc", "sh_rest")
+FILE_VALUES = 3 + 3 + 1 + 3 + 4  # position, normal, opacity, scale and rotation of a row of the 3DGS file; the harmonics come on top
+_EPS = 1e-12
+_ROUND = 1.001  # a Gaussian is looked for as a ball of its largest axis and this, so that rounding loses none
+
+
+@dataclass(frozen=True)
+class Explicit:
+    """What a scene of explicit Gaussians is made of."""
+
+    sh_degree: int = 3
+    """Highest degree of the spherical harmonics, 0 to 3."""
+    sh_ramp: int = 1000
+    """Iterations until the next degree is used; the first is 0."""
+    opacity: float = 0.1
+    """Opacity of every Gaussian at the start."""
+    size: float = 1.0
+    """Size of a Gaussian at the start, in distances to its nearest neighbours."""
+
+    def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> GaussianScene:
+        """One Gaussian per point of the cloud. Raises InputError when there are none."""
+        if len(points.xyz) == 0:
+            raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
+        n = len(points.xyz)
+        size = knn_d2(points.xyz.double()).clamp_min(1e-7).sqrt() * self.size
+        quats = torch.zeros(n, 4)
+        quats[:, 0] = 1.0
+        params = {
+            "means": points.xyz.float().clone(),
+            "log_scales": size.log().float()[:, None].repeat(1, 3),
+            "quats": quats,
+            "raw_opacity": torch.full((n,), math.log(self.opacity / (1 - self.opacity))),
+            "sh_dc": rgb_to_dc(points.rgb.float() / 255.0),
+            "sh_rest": torch.zeros(n, (self.sh_degree + 1) ** 2 - 1, 3),
+        }
+        return GaussianScene(self, Table(params, {}), extent)
+
+    def load(self, table: Table, meta: dict[str, Any]) -> GaussianScene:
+        """The scene of a checkpoint. Raises InputError where its columns are others."""
+        if set(table.params) != set(COLUMNS) or table.params["sh_rest"].shape[1] != (self.sh_degree + 1) ** 2 - 1:
+            raise InputError("expected the columns of explicit Gaussians in the checkpoint, found others; use its own run folder")
+        return GaussianScene(self, table, float(meta["extent"]))
+
+    def scaled(self, factor: float) -> Explicit:
+        """The same in a training `factor` times as long."""
+        return replace(self, sh_ramp=max(1, round(self.sh_ramp * factor)))
+
+    def check(self) -> None:
+        """Raises InputError for settings that no training can have."""
+        expect_at_least([("--scene.sh-degree", self.sh_degree, 0), ("--scene.sh-ramp", self.sh_ramp, 1)])
+        if self.sh_degree > MAX_DEGREE:
+            raise InputError(f"expected --scene.sh-degree of at most {MAX_DEGREE}, found {self.sh_degree}; give a lower degree")
+        if not 0 < self.opacity < 1 or not 0 < self.size < math.inf:
+            raise InputError(
+                f"expected --scene.opacity between 0 and 1 and --scene.size above 0, found {self.opacity} and {self.size}; correct them"
+            )
+
+
+class GaussianScene(nn.Module):
+    """N Gaussians as rows of a table (see the module's text for its columns)."""
+
+    def __init__(self, config: Explicit, table: Table, extent: float) -> None:
+        """extent: the scene's R in trained world units."""
+        super().__init__()
+        self.config, self.table, self.extent = config, table, extent
+
+    @property
+    def K(self) -> int:
+        return 1
+
+    @property
+    def file_values(self) -> int:
+        """float32 values that a row takes in the 3DGS file: 62 at degree 3."""
+        return FILE_VALUES + 3 * (self.config.sh_degree + 1) ** 2
+
+    def degree(self, step: int) -> int:
+        """The degree of the harmonics in use at `step`: all of them at 0, where a training has none yet and a file that does not say
+        how long it was trained has what it has."""
+        return min(self.config.sh_degree, step // self.config.sh_ramp) if step else self.config.sh_degree
+
+    def forward(self, camera: Camera, step: int, training: bool, cull: Cull) -> Decoded:
+        """The Gaussians that may touch the picture of `camera`; `cull` is the rasteriser's visibility test.
+
+        Each is looked for as a ball of its largest axis, which holds the Gaussian: what is left out would not have been drawn.
+        """
+        p = self.table.params
+        with torch.no_grad():
+            ball = p["log_scales"].amax(1, keepdim=True).exp_().mul_(_ROUND).expand(-1, 3)
+            rows = cull(p["means"].detach(), ball, camera).nonzero().squeeze(1)
+        return replace(self.decode(rows, camera, step), population=(p["raw_opacity"], p["log_scales"]))
+
+    def decode(self, rows: Tensor, camera: Camera, step: int) -> Decoded:
+        """Gaussians of the given rows [A], as `camera` sees their colours at `step`."""
+        p = self.table.params
+        means = p["means"].index_select(0, rows)
+        gaussians = Gaussians(
+            means=means,
+            quats=functional.normalize(p["quats"].index_select(0, rows), dim=1, eps=_EPS),
+            scales=p["log_scales"].index_select(0, rows).exp(),
+            opacities=p["raw_opacity"].index_select(0, rows).sigmoid(),
+            colors=sh_colors(means, p["sh_dc"], p["sh_rest"], rows, camera.position.to(means), self.degree(step)),
+            source=rows,
+        )
+        return Decoded(gaussians, rows, None, {})
+
+    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
+        """Nothing: there are no experts."""
+        return {}
+
+    def scene_opacity(self, camera: Camera, step: int) -> None:
+        """None: opacity is no network's output."""
+
+    def rate_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by the name of their learning rate: one group per column."""
+        return {name: [self.table.params[name]] for name in COLUMNS}
+
+    def network_tensors(self) -> dict[str, Tensor]:
+        """Nothing: everything learned is a column."""
+        return {}
+
+    def meta(self) -> dict[str, Any]:
+        return {"extent": self.extent}
+
+
+@dataclass(frozen=True)
+class ExplicitRates:
+    """Learning rates (3DGS's). `means` is multiplied by the scene's extent R."""
+
+    means: Rate = Rate(0.00016, 0.0000016)
+    log_scales: Rate = Rate(0.005, 0.005)
+    quats: Rate = Rate(0.001, 0.001)
+    raw_opacity: Rate = Rate(0.05, 0.05)
+    sh_dc: Rate = Rate(0.0025, 0.0025)
+    sh_rest: Rate = Rate(0.000125, 0.000125)
+
+    def at(self, group: str, step: int, total: int, extent: float) -> float:
+        """The rate of a group of `rate_groups` at `step` of `total`."""
+        rate: Rate = getattr(self, group)
+        return rate.at(step, total) * (extent if group == "means" else 1.0)

@@ -1,0 +1,165 @@
+"""A multi-resolution hash grid (Mueller et al., Instant Neural Graphics Primitives, 2022): a place in, learned features out.
+
+Level l divides the unit cube in N_l = floor(base growth^l) cells an axis. Features sit at the cells' corners and are blended trilinearly.
+A level with more corners than the table has rows shares rows among them by a hash. The compiled library does the same where there is one.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.native import library as native
+
+PRIMES = (1, 2_654_435_761, 805_459_861)  # eq. 4 of the paper
+INITIAL = 1e-4  # features start uniform in +-INITIAL
+LARGEST = 24  # 2^24 rows a level, the most that the paper tries
+
+
+@dataclass(frozen=True)
+class HashGrid:
+    """Size of the grid."""
+
+    levels: int = 16
+    features: int = 2
+    """Features a level."""
+    log2_table: int = 15
+    """A level has at most 2^log2_table rows."""
+    base: int = 16
+    """Cells an axis at the coarsest level."""
+    growth: float = 1.447
+    """Cells an axis grow by this factor from level to level."""
+    coordinates: Literal["box", "world"] = "box"
+    """box: places within the cube around the starting points; world: as they are, outside of [0, 1] too, as SAGS's code feeds them."""
+
+    @property
+    def width(self) -> int:
+        """Features of a place."""
+        return self.levels * self.features
+
+    def check(self) -> None:
+        """Raises InputError for sizes that no grid can have."""
+        names = ("levels", "features", "log2_table", "base", "growth")
+        expect_at_least([(f"--scene.grid.{name.replace('_', '-')}", getattr(self, name), 1) for name in names])
+        if self.log2_table > LARGEST:
+            raise InputError(f"expected --scene.grid.log2-table of at most {LARGEST}, found {self.log2_table}; give a smaller number")
+
+    def resolutions(self) -> list[int]:
+        """Cells an axis of every level."""
+        return [math.floor(self.base * self.growth**level) for level in range(self.levels)]
+
+    def rows(self) -> list[int]:
+        """Rows of every level's table: its corners, or 2^log2_table where there are more."""
+        return [min((cells + 1) ** 3, 1 << self.log2_table) for cells in self.resolutions()]
+
+    def build(self, low: tuple[float, ...], edge: float) -> Grid:
+        return Grid(self, low, edge)
+
+
+class Grid(nn.Module):
+    """The learned table [rows of all levels, features] and the cube that it covers: its low corner and its edge, world units."""
+
+    def __init__(self, config: HashGrid, low: tuple[float, ...], edge: float) -> None:
+        super().__init__()
+        self.config, self.low, self.edge = config, low, edge
+        self.table = nn.Parameter(torch.empty(sum(config.rows()), config.features).uniform_(-INITIAL, INITIAL))
+
+    def unit(self, xyz: Tensor) -> Tensor:
+        """World places [A, 3] in the grid's own coordinates: in [0, 1] within the cube, clamped to it outside."""
+        if self.config.coordinates == "world":
+            return xyz
+        return ((xyz - xyz.new_tensor(self.low)) / self.edge).clamp(0, 1)
+
+    def forward(self, xyz: Tensor) -> Tensor:
+        """Features [A, levels * features] (level by level) at world places [A, 3], which get no gradient."""
+        return encode(self.table, self.unit(xyz), self.config)
+
+
+def encode(table: Tensor, unit: Tensor, config: HashGrid) -> Tensor:
+    """Features [A, levels * features] at places `unit` [A, 3] of the grid's own coordinates; differentiable in the table alone."""
+    return _Encode.apply(table, unit, config)  # type: ignore[return-value]
+
+
+def corners(unit: Tensor, cells: int, rows: int) -> tuple[Tensor, Tensor]:
+    """Table rows [A, 8] int64 and trilinear weights [A, 8] of the corners around places `unit` [A, 3] on a level of `cells` an axis."""
+    place = unit * cells
+    low = place.floor()
+    part = place - low
+    axis = torch.stack([low, low + 1], dim=2).long()  # [A, 3, 2]
+    share = torch.stack([1 - part, part], dim=2)
+    x, y, z = axis[:, 0, :, None, None], axis[:, 1, None, :, None], axis[:, 2, None, None, :]
+    if (cells + 1) ** 3 <= rows:
+        row = (x + (cells + 1) * (y + (cells + 1) * z)) % rows  # a corner's own; outside the cube it wraps around
+    else:
+        row = ((x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])) & (rows - 1)
+    weight = share[:, 0, :, None, None] * share[:, 1, None, :, None] * share[:, 2, None, None, :]
+    return row.reshape(-1, 8), weight.reshape(-1, 8)
+
+
+class _Encode(torch.autograd.Function):
+    """The blend, level by level; indices are found again in the backward pass, which keeps 3 numbers a place and not 256."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, unit: Tensor, config: HashGrid) -> Tensor:
+        unit = unit.contiguous()
+        ctx.save_for_backward(unit)
+        ctx.config, ctx.shape = config, table.shape
+        out, library = unit.new_empty(len(unit), config.levels, config.features), _library()
+        if library is None or not _fits(table, unit):
+            _forward(table, unit, config, out)
+        else:
+            sizes = torch.tensor([config.resolutions(), config.rows()])
+            columns = [native.pointer(t) for t in (table, unit, sizes[0], sizes[1])]
+            library.se_grid_forward(*columns, len(unit), config.levels, config.features, native.pointer(out), native.threads())
+        return out.view(len(unit), config.width)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, None, None]:
+        (unit,), config, library = ctx.saved_tensors, ctx.config, _library()
+        grad = grads[0].contiguous().view(len(unit), config.levels, config.features)
+        if library is None or not _fits(grad, unit):
+            return _backward(unit, grad, config), None, None
+        out, sizes = grad.new_zeros(ctx.shape), torch.tensor([config.resolutions(), config.rows()])
+        columns = [native.pointer(t) for t in (unit, grad, sizes[0], sizes[1])]
+        library.se_grid_backward(*columns, len(unit), config.levels, config.features, native.pointer(out), native.threads())
+        return out, None, None
+
+
+def _forward(table: Tensor, unit: Tensor, config: HashGrid, out: Tensor) -> None:
+    """Fills `out` [A, levels, features] in plain torch, for any device and dtype."""
+    columns, first = table.t().contiguous(), 0  # [features, rows]
+    for level, (cells, rows) in enumerate(zip(config.resolutions(), config.rows())):
+        row, weight = corners(unit, cells, rows)
+        for feature in range(config.features):
+            values = columns[feature, first : first + rows].index_select(0, row.view(-1)).view_as(weight)
+            out[:, level, feature] = (values * weight).sum(1)
+        first += rows
+
+
+def _backward(unit: Tensor, grad: Tensor, config: HashGrid) -> Tensor:
+    """The table's gradient in plain torch."""
+    out, first = grad.new_zeros(config.features, sum(config.rows())), 0
+    for level, (cells, rows) in enumerate(zip(config.resolutions(), config.rows())):
+        row, weight = corners(unit, cells, rows)
+        for feature in range(config.features):
+            out[feature, first : first + rows].scatter_add_(0, row.view(-1), (weight * grad[:, level, feature, None]).view(-1))
+        first += rows
+    return out.t().contiguous()
+
+
+def _fits(*tensors: Tensor) -> bool:
+    return all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in tensors)
+
+
+@functools.cache
+def _library() -> ctypes.CDLL | None:
+    P, L = ctypes.c_void_p, ctypes.c_int64
+    types = [P, P, P, P, L, L, L, P, ctypes.c_int32]
+    return native.bound({"se_grid_forward": types, "se_grid_backward": types})

@@ -1,0 +1,138 @@
+"""A graph over points, and what a point learns from its neighbours (Ververas et al., SAGS, ECCV 2024).
+
+Points do not move, so the graph changes only when rows come and go; a camera uses the part of it among the points it sees.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scene_experts.geometry.neighbours import nearest
+from scene_experts.native import library as native
+
+NEAREST = 1e-8  # points in one place count as so far apart
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Each point's neighbours, itself first: `index` [N, k] int64, `closeness` [N, k] float32, 1 / distance and 0 for itself."""
+
+    index: Tensor
+    closeness: Tensor
+
+    @classmethod
+    def of(cls, xyz: Tensor, k: int) -> Graph:
+        """The exact graph of points [N, 3] with their k - 1 nearest others; found from the places alone, so twice the same."""
+        d2, others = nearest(xyz, k - 1)
+        me = torch.arange(len(xyz), device=xyz.device)[:, None]
+        close = 1 / d2.sqrt().clamp_min(NEAREST)
+        return cls(torch.cat([me, others], dim=1), torch.cat([d2.new_zeros(len(xyz), 1), close], dim=1).to(xyz.dtype))
+
+    def among(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """The graph among `rows` [A]: neighbours [A, k] as places in `rows`, -1 where a neighbour is not one; weights [A, k].
+
+        Weights of a point's neighbours are their closeness over its sum, divided by how many neighbours it has, itself among them.
+        """
+        place = torch.full((len(self.index),), -1, dtype=torch.int64, device=rows.device)
+        place[rows] = torch.arange(len(rows), device=rows.device)
+        found = place[self.index.index_select(0, rows)]
+        there = found >= 0
+        close = self.closeness.index_select(0, rows) * there
+        total = close.sum(1, keepdim=True) * there.sum(1, keepdim=True)
+        return found, close / total.clamp_min(torch.finfo(close.dtype).tiny)
+
+
+def blended(feature: Tensor, found: Tensor, weight: Tensor, share: float = 0.5) -> Tensor:
+    """f_u + share * sum_v w_uv h_v, with h_v = max over the points u that have v as a neighbour of (f_v - f_u), element-wise; [A, F].
+
+    feature [A, F]; found [A, k] (-1: no neighbour) and weight [A, k] of `Graph.among`. Differentiable in the features; where several
+    points attain a maximum its gradient is shared evenly.
+    """
+    return _Blend.apply(feature, found, weight, share)  # type: ignore[return-value]
+
+
+class _Blend(torch.autograd.Function):
+    """By the compiled library where it fits, else in plain torch."""
+
+    @staticmethod
+    def forward(ctx: Any, feature: Tensor, found: Tensor, weight: Tensor, share: float) -> Tensor:
+        parts, library = (feature.contiguous(), found.contiguous(), weight.contiguous()), _library()
+        ctx.share = share
+        fits = all(t.device.type == "cpu" for t in parts) and feature.dtype == weight.dtype == torch.float32
+        if library is None or not fits or found.numel() >= 2**31:
+            least, out = _forward(*parts, share)
+            ctx.save_for_backward(*parts, least)
+            return out
+        (A, F), k, (feature, found, weight) = feature.shape, found.shape[1], parts
+        start, known = torch.empty(A + 1, dtype=torch.int32), torch.empty(A * k, dtype=torch.int32)
+        least, out = torch.empty_like(feature), torch.empty_like(feature)
+        library.se_graph_reverse(native.pointer(found), A, k, native.pointer(start), native.pointer(known))
+        columns = [native.pointer(t) for t in (feature, found, weight, start, known)]
+        library.se_graph_forward(*columns, A, k, F, share, native.pointer(least), native.pointer(out), native.threads())
+        ctx.save_for_backward(*parts, least, start, known)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, None, None, None]:
+        feature, found, weight, least, *reverse = ctx.saved_tensors
+        if not reverse:
+            return _backward(feature, found, weight, least, grads[0], ctx.share), None, None, None
+        library, (A, F), k = _library(), feature.shape, found.shape[1]
+        assert library is not None
+        h, shared, out, grad = *(torch.empty_like(feature) for _ in range(3)), grads[0].contiguous()
+        columns = [native.pointer(t) for t in (feature, least, grad, found, weight, *reverse)]
+        rooms = [native.pointer(t) for t in (h, shared, out)]
+        library.se_graph_backward(*columns, A, k, F, ctx.share, *rooms, native.threads())
+        return out, None, None, None
+
+
+def _forward(feature: Tensor, found: Tensor, weight: Tensor, share: float) -> tuple[Tensor, Tensor]:
+    """The minima over those who know a point and the blend, [A, F] each, neighbour by neighbour: nothing of size A k F is held."""
+    least = feature.clone()  # min over u of f_u; a point is a neighbour of itself
+    for me, other, _ in _columns(found, weight):
+        least.scatter_reduce_(0, other[:, None].expand(-1, feature.shape[1]), feature.index_select(0, me), "amin")
+    difference, out = feature - least, feature.clone()
+    for me, other, w in _columns(found, weight):
+        out.index_add_(0, me, difference.index_select(0, other).mul_(share * w[:, None]))
+    return least, out
+
+
+def _backward(feature: Tensor, found: Tensor, weight: Tensor, least: Tensor, grad: Tensor, share: float) -> Tensor:
+    """The gradient of the features."""
+    to, ties = torch.zeros_like(feature), torch.zeros_like(feature)  # gradients of h; how many attain each minimum
+    for me, other, w in _columns(found, weight):
+        where = other[:, None].expand(-1, grad.shape[1])
+        to.scatter_add_(0, where, grad.index_select(0, me).mul_(share * w[:, None]))
+        ties.scatter_add_(0, where, (feature.index_select(0, me) == least.index_select(0, other)).to(grad.dtype))
+    out, to = grad + to, to / ties.clamp_min(1)
+    for me, other, _ in _columns(found, weight):
+        hit = feature.index_select(0, me) == least.index_select(0, other)
+        out.index_add_(0, me, to.index_select(0, other).mul_(hit), alpha=-1)
+    return out
+
+
+def _columns(found: Tensor, weight: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """For the j-th neighbours: the points that have one, who that is, and its weight."""
+    out = []
+    for j in range(found.shape[1]):
+        me = (found[:, j] >= 0).nonzero().squeeze(1)
+        out.append((me, found[:, j].index_select(0, me), weight[:, j].index_select(0, me)))
+    return out
+
+
+@functools.cache
+def _library() -> ctypes.CDLL | None:
+    P, L, I, R = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32, ctypes.c_float
+    return native.bound(
+        {
+            "se_graph_reverse": [P, L, L, P, P],
+            "se_graph_forward": [*[P] * 5, L, L, L, R, P, P, I],
+            "se_graph_backward": [*[P] * 7, L, L, L, R, P, P, P, I],
+        }
+    )

@@ -1,0 +1,283 @@
+"""Points that learn from their neighbours in a graph (Ververas et al., SAGS: Structure-Aware 3D Gaussian Splatting, ECCV 2024).
+
+Each row is one Gaussian: a point that does not move, a feature and a log-scaling. Seen from a camera, the features of the visible points
+are blended along the graph among them and joined by their element-wise maximum and a hash grid's features of the place; four small
+networks without biases turn that into the Gaussian.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.schedule import Rate
+from scene_experts.core.table import Table
+from scene_experts.core.types import Camera, Decoded, Gaussians, Points, Routing
+from scene_experts.geometry.curvature import curvature, flatter, pairs_to_halve
+from scene_experts.geometry.neighbours import knn_d2
+from scene_experts.geometry.voxel import VoxelChoice, coarsen, to_lattice, unique_cells, voxel_size
+from scene_experts.scene import Cull
+from scene_experts.scene.anchors.mlp import CHANNELS
+from scene_experts.scene.anchors.scene import EPS
+from scene_experts.scene.anchors.select import visible_rows
+from scene_experts.scene.graph.hash_grid import HashGrid
+from scene_experts.scene.graph.network import Graph, blended
+
+PROBES = 1000  # points whose first opacity is looked at
+HALF = 2  # midpoints lie on a lattice of half the voxel
+
+
+@dataclass(frozen=True)
+class GraphPoints:
+    """What a scene of graph points is made of."""
+
+    F: int = 32
+    """Feature size."""
+    hidden: int = 32
+    """Width of the networks of opacity, colour and covariance (two hidden layers)."""
+    offset_hidden: int = 64
+    """Width of the network of offsets (one hidden layer, linear throughout)."""
+    neighbours: int = 10
+    """Points in a neighbourhood, the point itself among them: of the graph and of the curvature."""
+    blend: float = 0.5
+    """Share of what the neighbours say."""
+    low: int = 10
+    """Flat places are filled with midpoints to the so many nearest points, the point itself among them."""
+    high: int = 5
+    """All other places, to so many others (2 to 8 by scene in SAGS's scripts)."""
+    flat_sigmas: float = 1.0
+    """Flat: a curvature so many standard deviations below the mean."""
+    voxel_size: float = 0.0
+    """Edge of the finest lattice in trained world units; 0 takes `voxel_rule`."""
+    voxel_rule: VoxelChoice = "neighbours"
+    """neighbours: a quarter of the median neighbour distance; the others are Scaffold-GS's rule as coded and as documented."""
+    grid: HashGrid = HashGrid()
+
+    def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> GraphScene:
+        """The occupied voxels of the point cloud and the midpoints between them. Raises InputError when there are no points."""
+        if len(points.xyz) == 0:
+            raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
+        voxel = self.voxel_size or voxel_size(points.xyz, self.voxel_rule)
+        cells, _ = unique_cells(to_lattice(points.xyz, voxel))
+        flat = flatter(curvature(cells.double(), self.neighbours), self.flat_sigmas)
+        twice = cells[pairs_to_halve(cells.double(), flat, self.low, self.high)].sum(1)  # in half voxels
+        xyz = (twice.double() * (voxel / HALF)).float()
+        scale = knn_d2(xyz.double()).clamp_min(1e-7).sqrt().log().float()
+        params = {"feature": torch.zeros(len(xyz), self.F), "log_scaling": scale[:, None].repeat(1, 6)}
+        low, high = xyz.amin(0), xyz.amax(0)
+        edge = max(float((high - low).max()), voxel)
+        corner = tuple(float(v) for v in (low + high - edge) / 2)
+        scene = GraphScene(self, Table(params, {"cell": coarsen(twice, HALF), "xyz": xyz}), voxel, extent, corner, edge)
+        scene.face(cameras)
+        return scene
+
+    def load(self, table: Table, meta: dict[str, Any]) -> GraphScene:
+        """The scene of a checkpoint, its networks fresh."""
+        corner, edge = tuple(float(v) for v in meta["grid_low"]), float(meta["grid_edge"])
+        return GraphScene(self, table, float(meta["voxel"]), float(meta["extent"]), corner, edge)
+
+    def scaled(self, factor: float) -> GraphPoints:
+        """It has no schedule."""
+        return self
+
+    def check(self) -> None:
+        """Raises InputError for settings that no training can have."""
+        names = ("F", "hidden", "offset_hidden", "neighbours", "low")
+        expect_at_least([(f"--scene.{name.replace('_', '-')}", getattr(self, name), 1) for name in names])
+        expect_at_least([(f"--scene.{name.replace('_', '-')}", getattr(self, name), 0) for name in ("high", "voxel_size")])
+        self.grid.check()
+
+
+class Unbiased(nn.Module):
+    """Linear layers without biases, Glorot-uniform at first."""
+
+    def __init__(self, sizes: Sequence[int]) -> None:
+        super().__init__()
+        self.layers = nn.ParameterList(nn.init.xavier_uniform_(torch.empty(b, a)) for a, b in pairwise(sizes))
+
+    def product(self) -> Tensor:
+        """The one linear map that the layers are when nothing stands between them, [out, in]."""
+        out = self.layers[0]
+        for layer in list(self.layers)[1:]:
+            out = layer @ out
+        return out
+
+    def after_first(self, h: Tensor) -> Tensor:
+        """The outputs from what the first layer gave, with a ReLU before every other one."""
+        for layer in list(self.layers)[1:]:
+            h = functional.linear(functional.relu(h), layer)
+        return h
+
+
+class GraphScene(nn.Module):
+    """N points, one Gaussian each. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], log_scaling [N,6]."""
+
+    K = 1
+
+    @property
+    def file_values(self) -> int:
+        """Float32 values of a row in a file: position, normal, feature, opacity, scaling, rotation (SAGS's layout)."""
+        return 3 + 3 + self.config.F + 1 + 6 + 4
+
+    def __init__(self, config: GraphPoints, table: Table, voxel: float, extent: float, corner: tuple[float, ...], edge: float) -> None:
+        """voxel: edge of the finest lattice cell; extent: the scene's R; corner, edge: the hash grid's cube; in trained world units."""
+        super().__init__()
+        self.config, self.table, self.voxel, self.extent = config, table, voxel, extent
+        self.grid = config.grid.build(corner, edge)
+        width = 2 * config.F + config.grid.width
+        self.alpha, self.beta = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
+        inner = [width + 4, config.hidden, config.hidden]  # with direction and distance
+        heads = {name: Unbiased([*inner, size]) for name, size in CHANNELS.items()}
+        self.heads: Mapping[str, Unbiased] = nn.ModuleDict(heads)  # type: ignore[assignment]
+        self.offsets = Unbiased([width, config.offset_hidden, 3])
+        self._graph: tuple[Tensor, Graph] | None = None  # of the places it was made of
+
+    def meta(self) -> dict[str, Any]:
+        return {"voxel": self.voxel, "extent": self.extent, "grid_low": list(self.grid.low), "grid_edge": self.grid.edge}
+
+    def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
+        """Rows for points born at lattice cells [n, 3] with scaling `size` and features [n, F]."""
+        xyz = (cells.double() * self.voxel).to(feature.dtype)
+        return {"cell": cells, "xyz": xyz, "feature": feature, "log_scaling": feature.new_full((len(cells), 6), math.log(size))}
+
+    @torch.no_grad()
+    def face(self, cameras: Sequence[Camera]) -> None:
+        """Turn the opacity network's sign where its first opacities are negative on average, as most would be from every camera then.
+
+        Without biases or features it sees little but distances, and where all is hidden no gradient would ever show it.
+        """
+        rows = torch.arange(0, len(self.table), max(1, len(self.table) // PROBES))
+        own, strongest = self.encode(rows)
+        raw = [self.opacity(torch.cat([own, self.view(rows, camera)], dim=1), strongest).mean() for camera in cameras]
+        if raw and float(torch.stack(raw).mean()) < 0:
+            next(reversed(list(self.heads["opacity"].parameters()))).neg_()
+
+    def graph(self) -> Graph:
+        """The graph over all points, made anew when rows have come or gone."""
+        xyz = self.table.facts["xyz"]
+        if self._graph is None or self._graph[0] is not xyz:
+            self._graph = None  # before the next one needs its memory
+            self._graph = xyz, Graph.of(xyz, self.config.neighbours)
+        return self._graph[1]
+
+    def forward(self, camera: Camera, step: int, training: bool, cull: Cull) -> Decoded:
+        """The Gaussians that `camera` sees. `cull(means, scales, camera)` is the rasteriser's visibility test."""
+        table = self.table
+        rows = visible_rows(None, table.facts["xyz"], table.params["log_scaling"].detach()[:, :3].exp(), camera, cull)
+        return self.decode(rows, camera)
+
+    def encode(self, rows: Tensor, told: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """What the networks see of points [A], from the graph among them: each one's own [A, grid + F], and what all share [F].
+
+        With `told` [P], of rows[told] alone.
+        """
+        feature = self.table.params["feature"].index_select(0, rows)
+        near = blended(feature, *self.graph().among(rows), self.config.blend)
+        strongest = feature.amax(0) if len(rows) else feature.new_zeros(self.config.F)
+        if told is not None:
+            near, rows = near.index_select(0, told), rows.index_select(0, told)
+        return torch.cat([self.grid(self.table.facts["xyz"].index_select(0, rows)), near], dim=1), strongest
+
+    def folded(self, weight: Tensor, strongest: Tensor) -> tuple[Tensor, Tensor]:
+        """A first layer [H, 2 F + grid (+ 4)] for `encode`'s rows (and a view's 4): [H, grid + F (+ 4)] and the bias [H] of the rest.
+
+        weight ([own, strongest] alpha + beta) in other brackets: nothing of size A is scaled, and what all share is multiplied once.
+        """
+        width, own = len(self.alpha), len(self.alpha) - self.config.F
+        encoded = weight[:, :width] * self.alpha
+        bias = encoded[:, own:] @ strongest + weight[:, :width] @ self.beta
+        return torch.cat([encoded[:, :own], weight[:, width:]], dim=1), bias
+
+    def opacity(self, x: Tensor, strongest: Tensor) -> Tensor:
+        """Raw opacities [A, 1] of rows and view x [A, grid + F + 4]."""
+        head = self.heads["opacity"]
+        return head.after_first(functional.linear(x, *self.folded(head.layers[0], strongest))).tanh()
+
+    def offset(self, own: Tensor, strongest: Tensor) -> Tensor:
+        """Offsets [A, 3], in units of the scaling, of rows own [A, grid + F]."""
+        return functional.linear(own, *self.folded(self.offsets.product(), strongest))
+
+    def decode(self, rows: Tensor, camera: Camera) -> Decoded:
+        """Gaussians of the given points [A]: opacity first, the rest for those whose opacity is positive."""
+        own, strongest = self.encode(rows)
+        x = torch.cat([own, self.view(rows, camera)], dim=1)
+        raw = self.opacity(x, strongest)
+        keep = (raw > 0).view(-1).nonzero().squeeze(1)
+        x, source = x.index_select(0, keep), rows.index_select(0, keep)
+        cov, color = (self.heads[name] for name in ("cov", "color"))
+        first = functional.linear(x, *self.folded(torch.cat([cov.layers[0], color.layers[0]]), strongest))  # both in one product
+        shape, rgb = (head.after_first(h) for head, h in zip((cov, color), first.chunk(2, dim=1)))
+        scaling = self.table.params["log_scaling"].index_select(0, source).exp()
+        offset = self.offset(x[:, : own.shape[1]], strongest) * scaling[:, :3]
+        gaussians = Gaussians(
+            means=self.table.facts["xyz"].index_select(0, source) + offset,
+            quats=functional.normalize(shape[:, 3:], dim=1, eps=EPS),
+            scales=scaling[:, 3:] * shape[:, :3].sigmoid(),
+            opacities=raw.view(-1).index_select(0, keep),
+            colors=rgb.sigmoid(),
+            source=source,
+        )
+        return Decoded(gaussians, rows, raw, {})
+
+    def view(self, rows: Tensor, camera: Camera) -> Tensor:
+        """Unit direction camera -> point and distance, [A, 4]."""
+        v = self.table.facts["xyz"].index_select(0, rows) - camera.position.to(self.table.facts["xyz"])
+        distance = v.norm(dim=1, keepdim=True)
+        return torch.cat([v / distance.clamp_min(EPS), distance], dim=1)
+
+    @torch.no_grad()
+    def slot_points(self, rows: Tensor) -> Tensor:
+        """Where the Gaussians of `rows` [P] are, [P, 3] float64: from the whole graph, as no camera is asked."""
+        everyone = torch.arange(len(self.table), device=rows.device)
+        offset = self.offset(*self.encode(everyone, rows)) * self.table.params["log_scaling"].index_select(0, rows)[:, :3].exp()
+        return self.table.facts["xyz"].index_select(0, rows).double() + offset.double()
+
+    def scene_opacity(self, camera: Camera, step: int) -> Tensor:
+        """Raw opacities [N, 1] of every point from `camera`, whether it sees them or not."""
+        everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
+        own, strongest = self.encode(everyone)
+        return self.opacity(torch.cat([own, self.view(everyone, camera)], dim=1), strongest)
+
+    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
+        """There are no experts."""
+        return {}
+
+    def rate_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Every parameter, by the name of its learning rate."""
+        groups = {name: [self.table.params[name]] for name in ("feature", "log_scaling")}
+        groups |= {name: list(head.parameters()) for name, head in self.heads.items()}
+        return groups | {"offsets": list(self.offsets.parameters()), "grid": [self.grid.table], "affine": [self.alpha, self.beta]}
+
+    def network_tensors(self) -> dict[str, Tensor]:
+        """Every learned tensor that is no column, by name (`opacity.0`, `grid.table`, ...), for files."""
+        named = {**dict(self.heads.items()), "offsets": self.offsets}
+        layers = {f"{name}.{i}": layer for name, head in named.items() for i, layer in enumerate(head.parameters())}
+        return {**layers, "grid.table": self.grid.table, "affine.alpha": self.alpha, "affine.beta": self.beta}
+
+
+@dataclass(frozen=True)
+class GraphRates:
+    """Learning rates (SAGS's)."""
+
+    feature: Rate = Rate(0.0075, 0.0075)
+    log_scaling: Rate = Rate(0.007, 0.007)
+    opacity: Rate = Rate(0.002, 0.00002)
+    cov: Rate = Rate(0.004, 0.00004)
+    color: Rate = Rate(0.008, 0.00005)
+    offsets: Rate = Rate(0.005, 0.001)
+    """Of the network of offsets."""
+    grid: Rate = Rate(0.005, 0.001)
+    affine: Rate = Rate(0.005, 0.001)
+
+    def at(self, group: str, step: int, total: int, extent: float) -> float:
+        """The rate of a group of `rate_groups` at `step` of `total`."""
+        rate: Rate = getattr(self, group)
+        return rate.at(step, total)

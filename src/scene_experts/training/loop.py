@@ -1,0 +1,209 @@
+"""The training loop: yields events, saves, resumes; knows no method by name."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.transfer import upload
+from scene_experts.core.types import Decoded, Render, Routing
+from scene_experts.data.capture import Capture
+from scene_experts.render import Rasterizer
+from scene_experts.strategy import Edit, Strategy
+from scene_experts.training.config import RunConfig, Train
+from scene_experts.training.events import Adjusted, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
+from scene_experts.training.losses import hinge_is_on, load_dense, load_sparse, terms
+from scene_experts.training.memory import anchor_cap
+from scene_experts.training.state import Training, resume, save
+
+log = logging.getLogger(__name__)
+ROUTED = 16_384  # anchors whose routing a training's figures are of: their shares are within half a percent of all anchors'
+
+
+@dataclass(frozen=True)
+class Run:
+    """Where and how a training runs; nothing here changes its numbers but `stop_at`."""
+
+    config: RunConfig
+    out: Path | None = None  # the run folder; None keeps nothing
+    device: str = "cpu"
+    dtype: torch.dtype = torch.float32  # float64 with the reference rasteriser shows what rounding does; not for real trainings
+    resume: bool = False
+    save_every: int = 5000  # iterations between checkpoints; the last iteration is always saved
+    preview_every: int = 0  # iterations between pictures of one held-out view; 0: none
+    log_every: int = 10  # iterations between Stepped events
+    max_memory: float = 0.0  # GiB of memory (resident, or reserved on the GPU) at which growth stops; 0: no cap
+    keep: int = 2  # checkpoints kept
+    watch: Callable[[Training], None] = lambda training: None  # called between iterations, outside their time; a viewer draws here
+    stop: list[str] = field(default_factory=list)  # put a reason here (a signal handler does) to save and stop
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """What one iteration saw and did."""
+
+    decoded: Decoded
+    render: Render
+    terms: dict[str, Tensor]
+    target: Tensor  # [H, W, 3]
+    mask: Tensor | None  # [H, W]
+    edit: Edit | None
+
+
+def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iterator[Event]:
+    """Train `cfg` (as the user wrote it; windows are scaled here) on a capture, from scratch or from the run's newest whole checkpoint."""
+    cfg = cfg.scaled()
+    folder = run.out / "checkpoints" if run.out else None
+    training = resume(cfg, folder, run.device) if run.resume and folder else None
+    if training and training.capture not in ("", capture.fingerprint()):
+        raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
+    training = training or Training.start(cfg, capture, run.device, run.dtype)
+    training.capture = capture.fingerprint()
+    total = min(cfg.iterations, run.config.stop_at or cfg.iterations)
+    yield Started(training.step, total, len(training.scene.table), training.scene.meta().get("voxel", 0.0))
+    saved, parts = training.step, {}
+    while training.step < total and not run.stop:
+        began = time.perf_counter()
+        done = iterate(training, run, capture, rasterize)
+        training.seconds += time.perf_counter() - began
+        step, parts = training.step, done.terms
+        if done.edit is not None:
+            yield Adjusted(step, done.edit)
+        if step % run.log_every == 0 or step == total:
+            check_finite(step, parts)
+            yield stepped(training, done)
+        if run.preview_every and (step % run.preview_every == 0 or step == total):
+            yield preview(training, run, capture, rasterize)
+        if folder and (step % run.save_every == 0 or step == total):
+            check_finite(step, parts)
+            yield Saved(step, save(training, folder, run.keep))
+            saved = step
+        del done  # before the next frame needs its memory
+        run.watch(training)
+    if folder and saved != training.step:
+        check_finite(training.step, parts)
+        yield Saved(training.step, save(training, folder, run.keep))
+    if run.stop and training.step < total:
+        yield Stopped(training.step, run.stop[0])
+    else:
+        yield Finished(training.step, training.seconds)
+
+
+def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Iteration:
+    """One iteration, in the paper's order: rates, view, decode, draw, losses, gradients, density control, Adam."""
+    cfg, scene = training.cfg, training.scene
+    training.step += 1
+    training.set_rates()
+    index, following = training.next_view(capture.train)
+    camera = capture.views[index].camera.to(run.device, run.dtype)
+    frame = capture.frame(index)
+    capture.images.prefetch(following)
+    target = upload(frame.rgb, run.device, run.dtype).div_(255.0)
+    mask = None if frame.mask is None else upload(frame.mask, run.device, run.dtype)
+    background = torch.rand(3, generator=training.views) if cfg.random_background else torch.tensor(capture.background)
+    decoded = scene(camera, training.step, True, rasterize.visible)
+    if cfg.loss.opacity_scope == "all" and hinge_is_on(cfg.loss, training.step):
+        decoded = replace(decoded, scene_opacity=scene.scene_opacity(camera, training.step))
+    render = rasterize(decoded.gaussians, camera, upload(background, run.device, run.dtype))
+    parts = terms(decoded, render, target, cfg.loss, training.step, mask)
+    loss = torch.stack(list(parts.values())).sum()
+    if loss.requires_grad:
+        loss.backward()
+    decoded, render, parts = without_graph((decoded, render, parts))
+    del loss
+    training.largest.see(decoded, render)
+    cap = anchor_cap(scene, cfg.growth.max_anchors, run.max_memory, training.largest)
+    strategy: Strategy = cast(Strategy, replace(cfg.growth, max_anchors=cap))
+    strategy.observe(scene, decoded, render, training.step)
+    edit = strategy.update(scene, training.step, training.growth)
+    training.optimizer.step(rows=rows_to_move(cfg, decoded) if edit is None else None)
+    training.optimizer.zero_grad(set_to_none=True)
+    strategy.finish(scene, training.step, training.rates(), training.growth)
+    return Iteration(decoded, render, parts, target, mask, edit)
+
+
+def rows_to_move(cfg: Train, decoded: Decoded) -> Tensor | None:
+    """The rows of the table that Adam moves: those decoded, under `sparse_adam`; None for all, also where the objective reaches all."""
+    seen = len(decoded.rows)
+    everywhere = decoded.scene_opacity is not None or (decoded.population is not None and (cfg.loss.mean_opacity or cfg.loss.mean_size))
+    everywhere = everywhere or any(len(r.gates) != seen for r in decoded.routing.values())
+    return decoded.rows if cfg.sparse_adam and not everywhere else None
+
+
+def without_graph(value: Any) -> Any:
+    """The same value with every tensor in it cut from its graph, whose buffers go with the last reference to it."""
+    if isinstance(value, Tensor):
+        return value.detach()
+    if isinstance(value, (tuple, list)):
+        return type(value)(without_graph(item) for item in value)
+    if isinstance(value, dict):
+        return {name: without_graph(item) for name, item in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{f.name: without_graph(getattr(value, f.name)) for f in fields(value) if f.init})
+    return value
+
+
+def check_finite(step: int, parts: dict[str, Tensor]) -> None:
+    """Raises RunError when the losses are no longer numbers: nothing is saved over the last good checkpoint."""
+    bad = [name for name, value in parts.items() if not math.isfinite(value)]
+    if bad:
+        raise RunError(
+            f"expected finite losses, found {', '.join(bad)} = {float(parts[bad[0]])} at iteration {step}; "
+            "the last checkpoint is intact: look at the capture with `scene-experts info`, or lower the learning rates (--rates...)"
+        )
+
+
+@torch.no_grad()
+def stepped(training: Training, done: Iteration) -> Stepped:
+    """The figures of the iteration just made."""
+    decoded = done.decoded
+    error = done.render.image.clamp(0, 1).sub_(done.target).square_()
+    mse = float(error.mean() if done.mask is None else (error.mean(2) * done.mask).sum() / done.mask.sum().clamp_min(1e-12))
+    raw = decoded.raw_opacity
+    balance, entropy = {}, {}
+    for attribute, r in decoded.routing.items():
+        A, E = r.gates.shape
+        balance[attribute] = float(load_dense(r.gates) if r.chosen is None else load_sparse(r.gates, r.chosen) / r.chosen.shape[1])
+        entropy[attribute] = float(torch.special.entr(r.gates).sum()) / max(A, 1) / math.log(E)
+    scene = training.scene.routing(training.step, ROUTED) if decoded.routing else {}
+    return Stepped(
+        step=training.step,
+        terms={k: float(v) for k, v in done.terms.items()},
+        psnr=-10.0 * math.log10(max(mse, 1e-10)),
+        anchors=len(training.scene.table),
+        visible=len(decoded.rows),
+        gaussians=len(decoded.gaussians),
+        active=float((raw > 0).float().mean()) if raw is not None and raw.numel() else 0.0,
+        seconds=training.seconds,
+        routing={attribute: use(r) for attribute, r in decoded.routing.items()},
+        balance=balance,
+        entropy=entropy,
+        scene_routing={attribute: use(r) for attribute, r in scene.items()},
+        scene_gates={attribute: use(Routing(r.gates, None)) for attribute, r in scene.items()},
+    )
+
+
+def use(r: Routing) -> list[float]:
+    """Each expert's share of the assignments, or of the gates while dense."""
+    A, E = r.gates.shape
+    share = r.gates.sum(0) / max(A, 1) if r.chosen is None else torch.bincount(r.chosen.reshape(-1), minlength=E) / max(r.chosen.numel(), 1)
+    return [round(float(c), 4) for c in share]
+
+
+@torch.no_grad()
+def preview(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Previewed:
+    """A picture of one held-out view (a training view where none is held out)."""
+    index = (capture.test or capture.train)[0]
+    camera = capture.views[index].camera.to(run.device, run.dtype)
+    decoded = training.scene(camera, training.step, False, rasterize.visible)
+    picture = rasterize(decoded.gaussians, camera, torch.tensor(capture.background, device=run.device, dtype=run.dtype)).image
+    return Previewed(training.step, index, picture.clamp(0, 1).cpu())

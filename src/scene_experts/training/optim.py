@@ -1,0 +1,113 @@
+"""Adam, natively on the CPU: one call and one pass over memory for all parameters, bit for bit torch's own fused Adam (AVX2, AVX-512).
+
+State names are torch's (`exp_avg`, `exp_avg_sq`, `step`), so a checkpoint does not know which of them wrote it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scene_experts.native import library as native
+
+
+class _Tensor(ctypes.Structure):
+    """`AdamTensor` of csrc/adam.cpp."""
+
+    _fields_ = [
+        *[(name, ctypes.c_void_p) for name in ("value", "gradient", "first", "second", "rows")],
+        *[(name, ctypes.c_int64) for name in ("count", "width")],
+        *[(name, ctypes.c_double) for name in ("step_size", "root")],
+    ]
+
+
+class Adam(torch.optim.Adam):
+    """Adam (Kingma and Ba 2015) without weight decay; groups of one pair of betas and one eps.
+
+    A group with `by_row` true holds tables [N, ...] of which `step(rows=...)` moves some rows only.
+    """
+
+    def __init__(self, groups: Iterable[dict[str, Any]], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15) -> None:
+        """groups: {"params": tensors, "lr": float, "by_row": bool (False where absent), ...}."""
+        groups = [{"by_row": False, **group} for group in groups]
+        every = [p for group in groups for p in group["params"]]
+        self._native = all(p.device.type == "cpu" and p.dtype == torch.float32 for p in every) and _library() is not None
+        fused = all(p.device.type in ("cpu", "cuda") and p.dtype == torch.float32 for p in every)
+        super().__init__(groups, lr=0.0, betas=betas, eps=eps, fused=fused)
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None, *, rows: Tensor | None = None) -> Any:
+        """One step for every parameter that has a gradient.
+
+        rows [A] int64, each at most once: only these rows of the `by_row` groups move, values and moments both ("sparse" or "selective"
+        Adam); the bias correction counts every step. None: all rows.
+        """
+        if rows is None and not self._native:
+            return super().step(closure)
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        calls = [self._prepared(p, group, rows) for group in self.param_groups for p in group["params"] if p.grad is not None]
+        if self._native:
+            self._call(calls)
+        else:
+            for parameter, chosen, step_size, root, group in calls:
+                _by_torch(parameter, self.state[parameter], chosen, step_size, root, group)
+        return loss
+
+    def _prepared(self, parameter: Tensor, group: dict[str, Any], rows: Tensor | None) -> tuple[Tensor, Tensor | None, float, float, dict]:
+        """Counts the step: (parameter, its rows or None for all, step size, root of the second bias correction, group)."""
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
+            state["exp_avg"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+            state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+        state["step"] += 1
+        done, (beta1, beta2) = float(state["step"]), group["betas"]
+        chosen = rows if group["by_row"] else None
+        return parameter, chosen, float(group["lr"]) / (1 - beta1**done), (1 - beta2**done) ** 0.5, group
+
+    def _call(self, calls: list[tuple[Tensor, Tensor | None, float, float, dict]]) -> None:
+        library = _library()
+        assert library is not None
+        tensors, alive = (_Tensor * len(calls))(), []
+        for to, (parameter, rows, step_size, root, _) in zip(tensors, calls):
+            state, gradient = self.state[parameter], parameter.grad
+            assert gradient is not None
+            gradient = gradient.contiguous()
+            rows = None if rows is None else rows.contiguous()
+            alive += [gradient, rows]  # until the call is over
+            to.value, to.gradient, to.rows = (native.pointer(t).value for t in (parameter.detach(), gradient, rows))
+            to.first, to.second = native.pointer(state["exp_avg"]).value, native.pointer(state["exp_avg_sq"]).value
+            to.count, to.width = (parameter.numel(), 1) if rows is None else (len(rows), parameter[:1].numel())
+            to.step_size, to.root = step_size, root
+        group = self.param_groups[0]
+        library.se_adam_step(tensors, len(calls), *group["betas"], group["eps"], native.threads())
+
+
+def _by_torch(parameter: Tensor, state: dict[str, Tensor], rows: Tensor | None, step_size: float, root: float, group: dict) -> None:
+    """The same step in plain torch, for any device and dtype."""
+    beta1, beta2 = group["betas"]
+    gradient = parameter.grad
+    assert gradient is not None
+    if rows is None:
+        value, first, second = parameter, state["exp_avg"], state["exp_avg_sq"]
+    else:
+        value, gradient, first, second = (t.index_select(0, rows) for t in (parameter, gradient, state["exp_avg"], state["exp_avg_sq"]))
+    first.lerp_(gradient, 1 - beta1)
+    second.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+    value.addcdiv_(first, (second.sqrt() / root).add_(group["eps"]), value=-step_size)
+    if rows is not None:
+        for whole, part in ((parameter, value), (state["exp_avg"], first), (state["exp_avg_sq"], second)):
+            whole.index_copy_(0, rows, part)
+
+
+@functools.cache
+def _library() -> ctypes.CDLL | None:
+    return native.bound({"se_adam_step": [ctypes.POINTER(_Tensor), ctypes.c_int64, *[ctypes.c_double] * 3, ctypes.c_int32]})

@@ -1,0 +1,189 @@
+"""The state of a training: everything that a resumed run must find again, to and from checkpoints."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from scene_experts.core import checkpoint
+from scene_experts.core.errors import InputError
+from scene_experts.core.table import Table
+from scene_experts.data.capture import Capture
+from scene_experts.scene import Scene
+from scene_experts.training.config import Train, to_json
+from scene_experts.training.memory import Largest
+from scene_experts.training.optim import Adam
+
+log = logging.getLogger(__name__)
+
+
+class Training:
+    """Everything that a resumed run must find again: scene, optimiser, random streams, the queue of views, the clock."""
+
+    def __init__(self, cfg: Train, scene: Scene) -> None:
+        self.cfg, self.scene = cfg, scene
+        self.step = 0
+        self.largest = Largest()
+        self.seconds = 0.0
+        self.queue: list[int] = []
+        self.capture = ""  # its fingerprint
+        self.views = torch.Generator().manual_seed(cfg.seed)
+        self.growth = torch.Generator().manual_seed(cfg.seed + 1)
+        columns = scene.table.params
+        named = scene.rate_groups().items()
+        self.optimizer = Adam([{"params": params, "name": name, "lr": 0.0, "by_row": name in columns} for name, params in named])
+        scene.table.attach(self.optimizer)
+
+    @classmethod
+    def start(cls, cfg: Train, capture: Capture, device: str, dtype: torch.dtype = torch.float32) -> Training:
+        """A fresh training of `cfg` (already scaled) on a capture. Raises InputError when the capture has no points or no training view."""
+        if capture.points is None:
+            raise InputError("expected 3D points in the capture, found none; use --init random, or run structure from motion again")
+        if not capture.train:
+            raise InputError("expected at least one training view, found none; choose another --split")
+        torch.manual_seed(cfg.seed)
+        scene = cfg.scene.start(capture.points, capture.extent, [capture.views[i].camera for i in capture.train])
+        cap, n = cfg.max_anchors, len(scene.table)
+        if 0 < cap < n:
+            what, also = ("anchors", " or --scene.voxel-size") if "voxel" in scene.meta() else ("Gaussians", "")
+            raise InputError(f"expected at most {cap:,} {what} to start with, found {n:,}; raise --max-anchors{also}")
+        if 0 < cfg.growth.max_anchors < n:
+            log.warning("starts with %s rows, more than the recipe's %s: none will be added", f"{n:,}", f"{cfg.growth.max_anchors:,}")
+        return cls(cfg, to_device(scene, device, dtype))
+
+    def next_view(self, train: tuple[int, ...], ahead: int = 3) -> tuple[int, list[int]]:
+        """The next training view and the few after it: each view once per epoch, in random order."""
+        while len(self.queue) < ahead + 1:
+            self.queue += [train[i] for i in torch.randperm(len(train), generator=self.views).tolist()]
+        return self.queue.pop(0), self.queue[:ahead]
+
+    def set_rates(self) -> None:
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.cfg.rates.at(group["name"], self.step, self.cfg.iterations, self.scene.extent)
+
+    def rates(self) -> dict[str, float]:
+        """The learning rates in force, by group."""
+        return {group["name"]: group["lr"] for group in self.optimizer.param_groups}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The state as named tensors."""
+        table = self.scene.table
+        out = {f"params.{k}": v.detach() for k, v in table.params.items()}
+        out |= {f"facts.{k}": v for k, v in table.facts.items()} | {f"stats.{k}": v for k, v in table.stats.items()}
+        out |= {f"network.{k}": v.detach() for k, v in self.scene.network_tensors().items()}
+        for group in self.optimizer.param_groups:
+            for i, parameter in enumerate(group["params"]):
+                for key, value in self.optimizer.state.get(parameter, {}).items():
+                    out[f"adam.{group['name']}.{i}.{key}"] = value
+        out |= {"rng.torch": torch.get_rng_state(), "rng.views": self.views.get_state(), "rng.growth": self.growth.get_state()}
+        if table.device.type == "cuda":
+            out["rng.cuda"] = torch.cuda.get_rng_state(table.device)
+        out["queue"] = torch.tensor(self.queue, dtype=torch.int64)
+        return out
+
+    def meta(self) -> dict:
+        return {
+            "recipe": self.cfg.recipe,
+            "step": self.step,
+            "seconds": self.seconds,
+            **self.scene.meta(),
+            "config": config_hash(self.cfg),
+            "capture": self.capture,
+        }
+
+    @classmethod
+    def restore(cls, cfg: Train, tensors: dict[str, Tensor], meta: dict, device: str) -> Training:
+        """The training that `tensors` and `meta` were taken from. Raises InputError when they are of another configuration."""
+        if meta["config"] != config_hash(cfg):
+            raise InputError(
+                "expected a checkpoint of this configuration, found one trained with other settings; "
+                "resume with the run's own flags, or start in another --out folder"
+            )
+        training = cls(cfg, to_device(scene_from(cfg, tensors, meta), device))
+        table = training.scene.table
+        table.stats = {k.removeprefix("stats."): v.to(device) for k, v in tensors.items() if k.startswith("stats.")}
+        for group in training.optimizer.param_groups:
+            for i, parameter in enumerate(group["params"]):
+                prefix = f"adam.{group['name']}.{i}."
+                state = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+                if state:
+                    training.optimizer.state[parameter] = {k: v.to(device) for k, v in state.items()}
+        torch.set_rng_state(tensors["rng.torch"])
+        if "rng.cuda" in tensors and table.device.type == "cuda":
+            torch.cuda.set_rng_state(tensors["rng.cuda"], table.device)
+        training.views.set_state(tensors["rng.views"])
+        training.growth.set_state(tensors["rng.growth"])
+        training.queue = tensors["queue"].tolist()
+        training.step, training.seconds, training.capture = int(meta["step"]), float(meta["seconds"]), meta.get("capture", "")
+        return training
+
+
+def scene_from(cfg: Train, tensors: dict[str, Tensor], meta: dict) -> Scene:
+    """A scene from a checkpoint's tensors; `cfg` must be scaled."""
+    pick = lambda prefix: {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
+    scene = cfg.scene.load(Table(pick("params."), pick("facts.")), meta)
+    stored, wanted = pick("network."), scene.network_tensors()
+    if stored.keys() != wanted.keys() or any(stored[k].shape != wanted[k].shape for k in wanted):
+        raise InputError("expected the networks of this recipe in the checkpoint, found others; evaluate it with its own run folder")
+    with torch.no_grad():
+        for name, parameter in wanted.items():
+            parameter.copy_(stored[name])
+    return scene
+
+
+def to_device(scene: Scene, device: str, dtype: torch.dtype | None = None) -> Scene:
+    """The scene with all its tensors on `device`, and its real ones of `dtype` where one is given."""
+    scene = scene.to(device, dtype)
+    scene.table.facts = {k: v.to(device, dtype if v.is_floating_point() else None) for k, v in scene.table.facts.items()}
+    return scene
+
+
+LATER = {
+    "sparse_adam": False,
+    "schedule": 30_000,
+    "loss.mean_opacity": 0.0,
+    "loss.mean_size": 0.0,
+    "rates.appearance": {"type": "Rate", "first": 0.05, "last": 0.0005},
+    "rates.mix": {"type": "Rate", "first": 0.01, "last": 0.00001},
+    "scene.appearance": 0,
+    "scene.mix": {"type": "OwnFeature"},
+    "scene.select": {"type": "AllAnchors"},
+    "scene.test_appearance": "mean",
+}
+"""Settings that the first checkpoints do not know, with what those were trained with: there they do not count, so such a run resumes."""
+
+
+def config_hash(cfg: Train) -> str:
+    """A short hash of everything in the configuration."""
+    plain = to_json(cfg)
+    for path, value in LATER.items():
+        *above, name = path.split(".")
+        at = plain
+        for part in above:
+            at = at.get(part, {})
+        if name in at and at[name] == value:
+            del at[name]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def save(training: Training, folder: Path, keep: int) -> Path:
+    """Write a checkpoint, whole or not at all."""
+    tensors = {k: v.detach().cpu().contiguous() for k, v in training.tensors().items()}
+    return checkpoint.save(folder, training.step, tensors, training.meta(), keep=keep)
+
+
+def resume(cfg: Train, folder: Path, device: str) -> Training | None:
+    """The newest whole checkpoint of a run, or None where there is none yet. Raises InputError where all that there are are damaged."""
+    found = checkpoint.newest(folder)
+    if found is None and any(folder.glob("ckpt_*.safetensors")):
+        raise InputError(f"expected a whole checkpoint in {folder}, found only damaged ones; copy one back, or begin anew with --overwrite")
+    if found is None:
+        return None
+    tensors, meta = found
+    checkpoint.expect(meta, recipe=cfg.recipe)
+    return Training.restore(cfg, tensors, meta, device)

@@ -1,0 +1,122 @@
+"""What the documents name exists: files, functions, tests, switches, recipes; and every row of the tables names what it must."""
+
+import ast
+import functools
+import re
+from pathlib import Path
+
+import pytest
+
+from scene_experts.commands.evaluate import EvalCommand
+from scene_experts.commands.reproduce import ReproduceCommand
+from scene_experts.commands.train import TrainCommand
+from scene_experts.recipes import RECIPES
+from scene_experts.training.config import Data, Train
+from support.places import ROOT
+
+PLACES = (ROOT / "src" / "scene_experts", ROOT / "csrc", ROOT / "tests", ROOT)
+NAMED = re.compile(r"`([\w/]+\.(?:py|cpp|h))(?:: ([^`]+))?`")
+FLAG = re.compile(r"--([\w.-]+)")
+
+
+def read(name: str) -> str:
+    return (ROOT / "docs" / name).read_text()
+
+
+def rows(text: str) -> list[tuple[str, list[str]]]:
+    """The rows of every table, with the title of their section."""
+    out, title = [], ""
+    for line in text.splitlines():
+        if line.startswith("#"):
+            title = line.strip("# ")
+        elif line.startswith("|") and not set(line) <= set("|- "):
+            out.append((title, [cell.strip() for cell in line.strip("|").split("|")]))
+    return out
+
+
+def is_test(name: str) -> bool:
+    return Path(name).name.startswith("test_")
+
+
+def find(name: str) -> Path | None:
+    return next((place / name for place in PLACES if (place / name).is_file()), None)
+
+
+@functools.cache
+def names_in(path: Path) -> frozenset[str]:
+    """Functions, classes, their methods and the values of a Python file; of another, its words."""
+    if path.suffix != ".py":
+        return frozenset(re.findall(r"\w+", path.read_text()))
+    out: set[str] = set()
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            out.add(node.name)
+            inside = node.body if isinstance(node, ast.ClassDef) else []
+            out |= {f"{node.name}.{n.name}" for n in inside if isinstance(n, ast.FunctionDef)}
+        elif isinstance(node, (ast.Assign, ast.AnnAssign)):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            out |= {n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)}
+    return frozenset(out)
+
+
+@pytest.mark.parametrize("document", ["equations.md", "differences.md", "adding-a-method.md", "architecture.md", "conventions.md"])
+def test_files_and_functions_that_are_named_exist(document):
+    wrong = []
+    for name, inside in NAMED.findall(read(document)):
+        path = find(name)
+        wrong += [name] if path is None else [f"{name}: {n}" for n in re.split(r", ", inside) if inside and n not in names_in(path)]
+    assert not wrong
+
+
+def test_every_equation_names_its_code_and_its_test():
+    found = [(title, cells) for title, cells in rows(read("equations.md")) if cells[-1] != "test"]
+    assert len(found) > 50
+    for title, (rule, code, test) in found:
+        assert NAMED.search(code) and not any(is_test(name) for name, _ in NAMED.findall(code)), (title, rule)
+        assert NAMED.search(test) and all(is_test(name) for name, _ in NAMED.findall(test)), (title, rule)
+    numbered = [cells[0] for title, cells in found if title.startswith("MoE-GS")]
+    assert [rule[:3] for rule in numbered[:9]] == [f"({i})" for i in range(1, 10)]
+
+
+def flags(part: object, prefix: str = "") -> set[str]:
+    """Every flag of a recipe's or a command's value, with the negations of the switches."""
+    out: set[str] = set()
+    for name, value in vars(part).items():
+        flag = name.replace("_", "-")
+        if hasattr(value, "__dataclass_fields__"):  # a part has flags and is none
+            out |= flags(value, f"{prefix}{flag}.")
+        else:
+            out |= {prefix + flag} | ({f"{prefix}no-{flag}"} if isinstance(value, bool) else set())
+    return out
+
+
+@functools.cache
+def every_flag() -> frozenset[str]:
+    out = {
+        name.replace("_", "-") for kind in (TrainCommand, Data, Train, EvalCommand, ReproduceCommand) for name in kind.__dataclass_fields__
+    }
+    out |= {"only", "attribute"}  # of `render`
+    for _, recipe in RECIPES.values():
+        out |= flags(recipe)
+    return frozenset(out)
+
+
+def test_the_switches_of_the_differences_exist():
+    quoted = re.findall(r"`([^`]+)`", read("differences.md"))
+    wrong = [flag for text in quoted for flag in FLAG.findall(text) if flag not in every_flag() | {"help"}]
+    assert not wrong
+
+
+@pytest.mark.parametrize("document", ["differences.md", "adding-a-method.md", "equations.md"])
+def test_the_recipes_that_are_named_exist(document):
+    named = {name for text in re.findall(r"recipes? (`[^|.;)]+`)", read(document)) for name in re.findall(r"`([\w-]+)`", text)}
+    assert named <= set(RECIPES), named - set(RECIPES)
+
+
+def test_every_open_question_is_decided_and_every_departure_told():
+    questions = [cells for title, cells in rows(read("differences.md")) if title.startswith("Open questions")][1:]
+    numbers = [int(n) for cells in questions for n in re.findall(r"\d+", cells[0])]
+    assert sorted(numbers) == list(range(1, 40))
+    assert all(len(cells) == 4 and all(cells) for cells in questions)
+    departures = [cells for title, cells in rows(read("differences.md")) if title.startswith("From the reference")][1:]
+    assert len(departures) > 40 and all(len(cells) == 3 and all(cells) for cells in departures)

@@ -1,0 +1,97 @@
+"""The figures of README.md and docs/results.md are those of the records: whoever adds a record must say what it says."""
+
+import json
+import re
+import statistics
+
+import pytest
+
+from support.places import ROOT
+
+RECORDS = ROOT / "docs" / "results" / "records"
+CAPTURES = ("buddha", "fox", "kitchen", "bonsai", "fern", "colosseum", "brighton")
+SEEDED = ("scaffold-gs", "moe-gs", "moe-gs-dist")
+
+
+def lines(page: str) -> list[str]:
+    return (ROOT / page).read_text().splitlines()
+
+
+def recorded(capture: str, recipe: str, iterations: int) -> list[dict]:
+    """The results of a recipe on a capture at its shipped resolution, one a seed, in the order of the seeds."""
+    found = [json.loads(path.read_text()) for path in sorted((RECORDS / capture / recipe).glob("seed*.json"))]
+    return [r["results"] for r in found if r["results"]["iterations"] == iterations and r["config"]["data"]["resolution"] == "auto"]
+
+
+def psnr(runs: list[dict]) -> str:
+    values = [run["psnr"] for run in runs]
+    return f"{statistics.fmean(values):.2f}" + (f" ± {statistics.stdev(values):.2f}" if len(values) > 1 else "")
+
+
+def mean(runs: list[dict], *path: str, digits: int, factor: float = 1.0) -> str:
+    values = []
+    for run in runs:
+        for key in path:
+            run = run[key]
+        values.append(factor * run)  # type: ignore[operator]
+    return f"{statistics.fmean(values):,.{digits}f}"
+
+
+def scores(runs: list[dict]) -> list[str]:
+    """PSNR, SSIM, the two LPIPS, MB, anchors, active %."""
+    three = [mean(runs, name, digits=3) for name in ("ssim", "lpips", "lpips_3dgs")]
+    size, anchors = mean(runs, "size", "MB", digits=1), mean(runs, "anchors", digits=0)
+    return [psnr(runs), *three, size, anchors, mean(runs, "activation_ratio", digits=1, factor=100)]
+
+
+def row(*cells: object) -> str:
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+@pytest.mark.parametrize("capture", CAPTURES)
+@pytest.mark.parametrize("recipe", SEEDED)
+def test_means_over_seeds(capture, recipe):
+    runs = recorded(capture, recipe, 7000)
+    assert row(capture, recipe, len(runs), *scores(runs), mean(runs, "sharpness", "ratio", digits=2)) in lines("docs/results.md")
+
+
+@pytest.mark.parametrize("capture", CAPTURES)
+def test_differences_seed_by_seed_and_the_table_of_the_front_page(capture):
+    scaffold, moe = (recorded(capture, recipe, 7000) for recipe in SEEDED[:2])
+    gains = [theirs["psnr"] - ours["psnr"] for ours, theirs in zip(scaffold, moe, strict=True)]
+    assert row(capture, *(f"{gain:+.2f}" for gain in (*gains, statistics.fmean(gains)))) in lines("docs/results.md")
+    cells = [f for name, digits in (("lpips", 3), ("MB", 1)) for runs in (scaffold, moe) for f in [figure(runs, name, digits)]]
+    assert row(capture, psnr(scaffold), psnr(moe), *cells) in lines("README.md")
+
+
+def figure(runs: list[dict], name: str, digits: int) -> str:
+    return mean(runs, *(("size", "MB") if name == "MB" else (name,)), digits=digits)
+
+
+@pytest.mark.parametrize("capture", ["buddha", "fox", "bonsai"])
+def test_the_whole_schedule(capture):
+    runs = recorded(capture, "moe-gs", 30_000)
+    start = row(capture, *scores(runs), mean(runs, "sharpness", "ratio", digits=2))[:-2]
+    assert len(runs) == 1 and any(line.startswith(start) for line in lines("docs/results.md"))
+
+
+def test_the_whole_schedule_beside_the_others():
+    for recipe, name in (("scaffold-gs", "scaffold-gs"), ("scaffold-gs-opacity", 'scaffold-gs-opacity ("w/o MoE")'), ("moe-gs", "moe-gs")):
+        assert row(name, *scores(recorded("fox", recipe, 30_000))) in lines("docs/results.md")
+
+
+def test_the_claims_are_quoted_as_they_were_judged():
+    claims = {cells[1].strip(): cells[3] for line in lines("docs/results/seeds/README.md") if len(cells := line.split("|")) == 5}
+    front, page = ((ROOT / name).read_text() for name in ("README.md", "docs/results.md"))
+    number = r"([+-][\d.]+)"
+    for claim, digits in (("PSNR than Scaffold", 2), ("SSIM", 4), ("LPIPS (3DGS's variant)", 4)):
+        measured = next(text for name, text in claims.items() if name.startswith("MoE-GS") and claim in name)
+        gain, low, high = re.search(rf"{number}(?: dB)? \(95 % interval {number} to {number};", measured).groups()
+        assert len(gain.partition(".")[2]) == digits and re.search(rf"{re.escape(gain)}(?: dB)?\s+\({claimed(low, high)}", page), claim
+        assert digits > 2 or f"{gain[1:]} dB more (95 % interval {low} to {high})" in front
+    moe, scaffold = re.search(r"([\d.]+) MB against ([\d.]+) MB", claims["MoE-GS is at most as large as Scaffold-GS"]).groups()
+    assert all(f"at {moe} against {scaffold} MB" in text for text in (front, page))
+
+
+def claimed(low: str, high: str) -> str:
+    return rf"(?:95 % interval )?{re.escape(low)} to {re.escape(high)}\)"

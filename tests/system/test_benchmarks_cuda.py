@@ -1,0 +1,97 @@
+"""The CUDA benchmarks' plan, arguments and resuming, on the CPU; what they measure needs a GPU."""
+
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from scene_experts.core.types import Camera, Gaussians
+from scene_experts.render.reference import ReferenceRasterizer
+from support.places import ROOT
+from support.synthetic import make_capture
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+import decode_cuda
+import explicit_gsplat
+import train_cuda
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("capture"), views=8, size=(24, 16)).folder
+
+
+def draw(p, camera, degree, background):
+    """Stands for gsplat: the reference rasteriser, without harmonics."""
+    quats = torch.nn.functional.normalize(p["quats"], dim=1)
+    colors = (0.28209479 * p["dc"][:, 0] + 0.5).clamp_min(0)
+    g = Gaussians(p["means"], quats, p["scales"].exp(), p["opacities"].sigmoid(), colors, torch.arange(len(quats)))
+    return ReferenceRasterizer()(g, camera, background).image
+
+
+def test_the_plan_ends_with_the_peer():
+    recipes = ["scaffold-gs", "moe-gs"]
+    assert train_cuda.plan(recipes, {}) == [*recipes, train_cuda.PEER]
+    assert train_cuda.plan(recipes, {"scaffold-gs": {"done": True}, "moe-gs": {"step": 3}}) == ["moe-gs", train_cuda.PEER]
+
+
+def test_slices_until_the_table(folder, tmp_path, capsys):
+    line = ["--data", str(folder), "--out", str(tmp_path), "--device", "cpu", "--iterations", "6", "--recipes", "moe-gs", "--count", "50"]
+    train_cuda.main([*line, "--seconds", "0"], draw)
+    assert "to do: moe-gs, gsplat, explicit" in capsys.readouterr().out
+    train_cuda.main([*line, "--seconds", "120"], draw)
+    out = capsys.readouterr().out
+    assert "all done" in out and "moe-gs" in out
+    with pytest.raises(SystemExit, match="expected the settings"):
+        train_cuda.main([*line, "--iterations", "7"], draw)
+
+
+def test_the_peer_goes_on_where_it_stopped(folder, tmp_path):
+    from scene_experts.data.capture import load
+
+    capture = load(folder)
+    whole = explicit_gsplat.Training(capture, 60, 6, tmp_path / "whole", "cpu", draw)
+    assert whole.run(time.monotonic() + 100)
+    half = explicit_gsplat.Training(capture, 60, 6, tmp_path / "parts", "cpu", draw)
+    for _ in range(3):
+        half.iterate()
+    half.save()
+    again = explicit_gsplat.Training(capture, 60, 6, tmp_path / "parts", "cpu", draw)
+    assert again.step == 3 and not again.run(time.monotonic() - 1) and again.run(time.monotonic() + 100)
+    assert all(torch.equal(p, again.params[name]) for name, p in whole.params.items())
+    assert (whole.params["means"] != explicit_gsplat.begin(capture, 60)["means"]).any()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device")
+def test_without_a_gpu_they_say_so(folder, tmp_path, monkeypatch):
+    with pytest.raises(SystemExit, match="expected a CUDA device"):
+        train_cuda.main(["--data", str(folder), "--out", str(tmp_path)])
+    monkeypatch.setattr(sys, "argv", ["decode_cuda.py"])
+    with pytest.raises(SystemExit, match=r"CUDA|triton"):
+        decode_cuda.main()
+
+
+def test_the_least_traffic_is_counted_by_hand():
+    # one anchor of two seen, one Gaussian drawn, F = 1, K = 2, one network
+    forward = (8 + 12 + 4 + 24) + 12 + 2 * 4 + 64
+    backward = (8 + 12 + 4 + 24) + 12 + 2 * (2 * 4 + 56) + 2 * 4 * (1 + 6 + 6)
+    assert decode_cuda.least_bytes(2, 1, 1, 1, 2, 1) == (forward, backward)
+
+
+def test_every_decoder_is_run_and_reported(monkeypatch):
+    def timed(work):
+        work()
+        return 2.0
+
+    monkeypatch.setattr(decode_cuda, "timed", timed)
+    rows, cases = torch.arange(0, 60, 2), {}
+    camera = Camera(torch.eye(4), torch.eye(3), 80, 54)
+    for kind, config in decode_cuda.KINDS.items():
+        for form in ("composed", "auto"):
+            case = cases[kind, form] = decode_cuda.Case(decode_cuda.scene(config, 60, "cpu"), rows, camera, form)
+            for _ in range(decode_cuda.WARM_UP + 1):
+                case.run()
+    lines = decode_cuda.report(cases, 60, 30, 1e6)
+    assert len(lines) == 6 and all("1.00x as fast" in line for line in lines)

@@ -1,0 +1,213 @@
+"""The command line as a user meets it: help, one-sentence errors, exit codes."""
+
+import json
+import os
+import re
+import signal
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from scene_experts import cli
+from scene_experts.commands.train import parse_train
+from scene_experts.recipes import RECIPES
+from support.places import GOLDEN
+from support.synthetic import make_capture
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("cli"), views=9, size=(48, 32)).folder
+
+
+def run(capsys, *args: str) -> tuple[int, str, str]:
+    code = 0
+    try:
+        code = cli.main(list(args))
+    except SystemExit as stop:  # tyro's own usage errors
+        code = int(stop.code or 0)
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def fails(capsys, *args: str) -> str:
+    """Runs a command that must fail with exit code 2 and one sentence."""
+    code, _, err = run(capsys, *args)
+    lines = [line for line in err.strip().splitlines() if line.startswith("error:")]
+    assert code == 2 and len(lines) == 1 and "Traceback" not in err, (code, err)
+    return lines[0]
+
+
+def test_help_is_what_was_reviewed(capsys):
+    code, out, _ = run(capsys, "--help")
+    path = GOLDEN / "help.txt"
+    if os.environ.get("SCENE_EXPERTS_RECORD"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(out)
+    assert code == 0 and out == path.read_text()
+
+
+HELP = [
+    "info",
+    "train moe-gs",
+    "train scaffold-gs",
+    "train 3dgs",
+    "train 3dgs-mcmc",
+    "train moe-gs-balance",
+    "eval",
+    "compare",
+    "export",
+    "import",
+    "bench",
+    "catalog",
+    "download",
+    "doctor",
+]
+
+
+@pytest.mark.parametrize("command", HELP)
+def test_the_flags_of_every_command_are_what_was_reviewed(command, capsys, monkeypatch):
+    """Names alone, sorted: the layout of the help is tyro's and changes with it. Recorded with SCENE_EXPERTS_RECORD=1."""
+    monkeypatch.setenv("COLUMNS", "200")
+    code, out, _ = run(capsys, *command.split(), "--help")
+    found = sorted(set(re.findall(r"(?<![\w`-])--[a-zA-Z][\w.-]*", out)))
+    path = GOLDEN / "flags.json"
+    record = json.loads(path.read_text()) if path.exists() else {}
+    if os.environ.get("SCENE_EXPERTS_RECORD"):
+        path.write_text(json.dumps(record | {command: found}, indent=1) + "\n")
+        record[command] = found
+    assert code == 0 and found == record[command]
+
+
+def test_help_and_version_do_not_load_torch():
+    probe = "import sys, scene_experts.cli as c; c.main(['--help']); c.main(['--version']); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", probe], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("command", list(cli.COMMANDS))
+def test_every_command_has_help(command, capsys):
+    code, out, _ = run(capsys, command, "--help")
+    assert code == 0 and f"scene-experts {command}" in out
+
+
+def test_unknown_command_recipe_and_flag(capsys):
+    code, _, err = run(capsys, "trian")
+    assert code == 2 and "found 'trian'" in err
+    assert "expected a recipe, found 'moegs'; did you mean 'moe-gs'" in fails(capsys, "train", "moegs")
+    code, _, err = run(capsys, "train", "scaffold-gs", "--data", "x", "--out", "y", "--scene.decoder.top-k", "1")
+    assert code == 2 and "--scene.decoder.top-k" in err
+    assert run(capsys)[0] == 2
+
+
+def test_flags_reach_the_configuration():
+    made = parse_train(
+        ["moe-gs", "-s", "c", "-m", "r", "--scene.decoder.top-k", "1", "--iterations", "7000", "--loss.load", "0.5", "-r", "factor:2"]
+    )
+    assert made.cfg.scene.decoder.top_k == 1 and made.cfg.iterations == 7000 and made.cfg.loss.load == 0.5
+    assert made.data.path == Path("c") and made.out == Path("r") and made.data.resolution == "factor:2"
+    assert made.cfg.recipe == "moe-gs" and parse_train(["scaffold-gs", "-s", "c", "-m", "r"]).cfg == RECIPES["scaffold-gs"][1]
+
+
+def test_train_eval_compare_export_import(capsys, capture, tmp_path):
+    for recipe in ("scaffold-gs", "moe-gs"):
+        args = ("train", recipe, "--data", str(capture), "--out", str(tmp_path / recipe), "--iterations", "30")
+        assert run(capsys, *args, "--preview-every", "30")[0] == 0
+        assert run(capsys, "eval", str(tmp_path / recipe), "--no-lpips")[0] == 0
+    moe = tmp_path / "moe-gs"
+    results = json.loads((moe / "results.json").read_text())
+    assert results["psnr"] > 5 and (moe / "previews" / "000030.png").is_file() and (moe / "cameras.json").is_file()
+    assert (moe / "point_cloud" / "iteration_30" / "point_cloud.ply").is_file()
+    code, out, _ = run(capsys, "compare", str(tmp_path / "scaffold-gs"), str(moe), "--format", "markdown")
+    assert code == 0 and "moe-gs" in out and "scaffold-gs" in out
+    assert "add --resume" in fails(capsys, "train", "moe-gs", "--data", str(capture), "--out", str(moe), "--iterations", "30")
+    other = fails(capsys, "train", "scaffold-gs", "--data", str(capture), "--out", str(moe), "--iterations", "30", "--resume")
+    assert "found one of 'moe-gs'" in other
+    assert run(capsys, "export", str(moe), "--format", "compact")[0] == 0
+    compact = moe / "scene.compact"
+    for source in (compact, moe):
+        out_folder = tmp_path / f"from_{source.name}"
+        assert run(capsys, "import", str(source), "--data", str(capture), "--out", str(out_folder))[0] == 0
+        assert run(capsys, "eval", str(out_folder), "--no-lpips")[0] == 0
+        again = json.loads((out_folder / "results.json").read_text())
+        assert again["psnr"] == pytest.approx(results["psnr"], abs=0.02)
+
+
+def test_bad_runs(capsys, capture, tmp_path):
+    assert "config.json" in fails(capsys, "eval", str(tmp_path))
+    assert "config.json" in fails(capsys, "export", str(tmp_path / "absent"))
+    run_folder = tmp_path / "run"
+    assert run(capsys, "train", "moe-gs", "--data", str(capture), "--out", str(run_folder), "--iterations", "10")[0] == 0
+    newest = next((run_folder / "checkpoints").glob("*.safetensors"))
+    whole = newest.read_bytes()
+    newest.write_bytes(whole[: len(whole) // 2])
+    assert "checkpoint" in fails(capsys, "eval", str(run_folder))
+    newest.write_bytes(whole)
+    config = json.loads((run_folder / "config.json").read_text())
+    config["train"]["loss"]["load"] = "much"
+    (run_folder / "config.json").write_text(json.dumps(config))
+    assert "config.train.loss.load" in fails(capsys, "eval", str(run_folder))
+    assert (
+        run(capsys, "train", "moe-gs", "--data", str(capture), "--out", str(tmp_path / "none"), "--iterations", "10", "--split", "none")[0]
+        == 0
+    )
+    assert "--split" in fails(capsys, "eval", str(tmp_path / "none"))
+
+
+def test_bad_captures(capsys, capture, tmp_path):
+    assert "absent" in fails(capsys, "info", str(tmp_path / "absent"))
+    broken = tmp_path / "broken" / "sparse" / "0"
+    broken.mkdir(parents=True)
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        (broken / name).write_bytes(struct.pack("<Q", 5))
+    assert "cameras.bin" in fails(capsys, "train", "moe-gs", "--data", str(tmp_path / "broken"), "--out", str(tmp_path / "r"))
+    assert not (tmp_path / "r").exists()
+    assert "--iterations" in fails(capsys, "train", "moe-gs", "--data", str(capture), "--out", str(tmp_path / "r"), "--iterations", "0")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_ends_cleanly(number, capture, tmp_path):
+    args = [
+        sys.executable,
+        "-m",
+        "scene_experts",
+        "train",
+        "moe-gs",
+        "--data",
+        str(capture),
+        "--out",
+        str(tmp_path),
+        "--iterations",
+        "20000",
+    ]
+    process = subprocess.Popen(args, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    for _ in range(600):
+        if (tmp_path / "metrics.jsonl").exists() and (tmp_path / "metrics.jsonl").stat().st_size:
+            break
+        time.sleep(0.1)
+    process.send_signal(number)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 128 + number and "go on with --resume" in out and "Traceback" not in out, out
+    step = int(re.search(r"stopped at iteration ([\d,]+)", out)[1].replace(",", ""))
+    assert (tmp_path / "checkpoints" / f"ckpt_{step:06d}.safetensors").is_file()
+    again = [*args, "--resume", "--stop-at", str(step + 5)]
+    done = subprocess.run(again, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0 and f"resumed at iteration {step:,}" in done.stdout, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 1 byte\nmore")])
+def test_too_little_memory_is_one_sentence(error, capsys, monkeypatch):
+    from scene_experts import commands
+
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(commands, "run", fail)
+    code, _, err = run(capsys, "info", "x")
+    assert code == 1 and err.startswith("error: expected enough memory") and err.count("\n") == 1
+    monkeypatch.setattr(commands, "run", lambda *args: (_ for _ in ()).throw(RuntimeError("a fault of ours")))
+    with pytest.raises(RuntimeError, match="a fault of ours"):
+        cli.main(["info"])

@@ -1,0 +1,86 @@
+"""What happens to a run when its machine fails it: the disk fills up, the process is killed."""
+
+from __future__ import annotations
+
+import json
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from scene_experts import cli
+from scene_experts.core import checkpoint
+from support.synthetic import make_capture
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("capture"), views=9, size=(48, 32), points=300).folder
+
+
+def arguments(capture: Path, out: Path, *more: object) -> list[str]:
+    fixed = ["--iterations", "600", "--preview-every", "0", "--deterministic"]
+    return ["train", "moe-gs", "--data", str(capture), "--out", str(out), *fixed, *map(str, more)]
+
+
+def command(args: list[str]) -> list[str]:
+    return [sys.executable, "-m", "scene_experts", *args]
+
+
+def newest(out: Path) -> tuple[int, dict[str, torch.Tensor]]:
+    path = checkpoint.latest(out / "checkpoints")
+    assert path is not None
+    tensors, meta = checkpoint.load(path)
+    return meta["step"], tensors
+
+
+def test_a_disk_that_fills_up_while_saving(capture, tmp_path):
+    """Files may not grow beyond half a checkpoint: one sentence, exit code 1, the checkpoint before loads and the run goes on from it."""
+    assert cli.main(arguments(capture, tmp_path, "--stop-at", 10)) == 0
+    last = tmp_path / "checkpoints" / "ckpt_000010.safetensors"
+    whole = last.read_bytes()
+
+    def full() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) // 2, len(whole) // 2))
+
+    args = arguments(capture, tmp_path, "--resume", "--stop-at", 40, "--save-every", 5)
+    done = subprocess.run(command(args), preexec_fn=full, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    (sentence,) = [line for line in done.stderr.splitlines() if line.startswith("error:")]
+    assert "cannot write" in sentence and "ckpt_000015" in sentence and "free some space" in sentence
+    assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == [last.name] and last.read_bytes() == whole
+    assert cli.main(arguments(capture, tmp_path, "--resume", "--stop-at", 16)) == 0
+    assert newest(tmp_path)[0] == 16
+    steps = [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert steps == sorted(steps) and steps[-1] == 16
+
+
+def test_killed_while_it_saves_the_run_goes_on_as_if_nothing_had_happened(capture, tmp_path):
+    """SIGKILL, twice, in a training that saves after every iteration; the end is bit for bit that of a run left alone."""
+    out, reached = tmp_path / "killed", 0
+    for kill in range(2):
+        args = arguments(capture, out, "--save-every", 1, *(["--resume"] if kill else []))
+        process = subprocess.Popen(command(args), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline and process.poll() is None:
+            steps = [int(p.stem[5:]) for p in (out / "checkpoints").glob("ckpt_*.safetensors")]
+            if steps and max(steps) >= reached + 12:
+                break
+            time.sleep(0.003)
+        process.kill()
+        assert process.communicate()[1].count("error") == 0 and process.returncode == -9
+        step, _ = newest(out)
+        assert step >= reached + 11, "at most the iteration in hand is lost"
+        reached = step
+    end = reached + 5
+    assert cli.main(arguments(capture, out, "--resume", "--stop-at", end)) == 0
+    assert not list(out.rglob("*.part"))
+    assert cli.main(arguments(capture, tmp_path / "alone", "--stop-at", end)) == 0
+    torch.use_deterministic_algorithms(False)
+    (a, killed), (b, alone) = newest(out), newest(tmp_path / "alone")
+    assert a == b == end and killed.keys() == alone.keys()
+    assert all(torch.equal(killed[name], alone[name]) for name in alone)

@@ -1,0 +1,80 @@
+"""The viewer in a real browser (headless Chromium through playwright, where both are there): the scene is on the page, controls change it,
+clients that come and go leave nothing behind, and a socket that sends nonsense harms nobody."""
+
+import io
+import shutil
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from scene_experts.evaluate.pictures import to_8bit
+from scene_experts.view.paint import paint
+from unit.view.test_server import DRAW, capture, serving, viewer  # noqa: F401
+
+playwright = pytest.importorskip("playwright.sync_api")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+PART = np.s_[200:500, 330:610]  # between the notification and the panel
+
+
+@pytest.fixture
+def browser():
+    with playwright.sync_playwright() as p:
+        made = p.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield made
+        made.close()
+
+
+def settled(page, viewer, seconds=30.0) -> np.ndarray:  # noqa: F811
+    """A screenshot once the client has its full picture."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and not (viewer.clients and all(c.full for c in viewer.clients.values())):
+        page.wait_for_timeout(200)
+    page.wait_for_timeout(2500)
+    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
+
+
+def test_the_page_shows_our_own_render_and_follows_the_controls(serving, browser, capture):  # noqa: F811
+    page = browser.new_page(viewport={"width": 960, "height": 540})
+    page.goto(serving.url)
+    shot = settled(page, serving)
+    (client,) = serving.clients.values()
+    scene, step = serving.current()
+    camera = serving.camera(client)
+    picture = to_8bit(paint(scene, camera, step, DRAW, torch.tensor(serving.panel.background())))
+    picture = np.asarray(Image.fromarray(picture).resize((960, 540), Image.Resampling.BILINEAR))
+    error = ((shot[PART].astype(float) - picture[PART]) ** 2).mean()
+    assert picture[PART].std() > 5 and 10 * np.log10(255**2 / error) > 22
+    serving.panel.mode.value = "experts"
+    page.wait_for_timeout(500)
+    assert np.abs(settled(page, serving)[PART].astype(int) - shot[PART]).mean() > 3
+
+
+def test_clients_come_and_go_and_nonsense_harms_nobody(serving, browser):  # noqa: F811
+    websockets = pytest.importorskip("websockets.sync.client")
+    protocol = f"viser-v{pytest.importorskip('viser').__version__}"
+    before = threading.active_count()
+    for _ in range(10):
+        page = browser.new_page()
+        page.goto(serving.url)
+        page.wait_for_timeout(300)
+        page.close()
+    for message in (b"\xff\x00nonsense", b"", "text"):
+        try:
+            with websockets.connect(serving.url.replace("http", "ws"), subprotocols=[protocol], open_timeout=5) as socket:
+                socket.send(message)
+        except Exception:  # being refused is fine
+            pass
+    end = time.monotonic() + 20
+    while serving.clients and time.monotonic() < end:
+        time.sleep(0.2)
+    assert serving.clients == {} and threading.active_count() <= before + 4
+    page = browser.new_page()
+    page.goto(serving.url)
+    settled(page, serving)
+    assert len(serving.clients) == 1

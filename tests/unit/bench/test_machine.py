@@ -1,0 +1,31 @@
+"""What the machine is said to do at most."""
+
+import pytest
+
+from scene_experts.bench import machine
+from scene_experts.native import library as native
+
+
+def test_the_machine_describes_itself():
+    found = machine.describe(2)
+    assert found.processor and found.cores >= 1 and found.threads == 2 and set(found.levels) <= set(native.LEVELS)
+
+
+def test_rates_are_of_this_world():
+    assert 1e8 < machine.copied(0.0) < 1e13
+    if native.load() is None:
+        pytest.skip("no compiled library")
+    assert 1e8 < machine.multiply_adds(None, 1, 0.0) < 1e13
+    assert 1e8 < machine.clock_hz(native.load().level, 0.0) < 2e10
+
+
+def test_wider_vectors_multiply_more():
+    levels = [level for level in native.levels() if native.path(level)]
+    if not {"portable", "avx2"} <= set(levels):
+        pytest.skip("one instruction set alone")
+    assert machine.multiply_adds("avx2", 1, 0.05) > 1.3 * machine.multiply_adds("portable", 1, 0.05)
+
+
+def test_a_library_without_the_loop_gives_none(monkeypatch):
+    monkeypatch.setattr(native, "load", lambda level=None: object())
+    assert machine.multiply_adds(None, 1, 0.0) is None

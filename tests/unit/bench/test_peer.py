@@ -1,0 +1,33 @@
+"""The scalar peer draws the same picture as the reference, and its gradient."""
+
+import pytest
+import torch
+
+from scene_experts.bench import peer, raster
+from scene_experts.bench.measure import clock_for
+from scene_experts.core.types import Gaussians
+from scene_experts.native import library as native
+from scene_experts.render.reference import ReferenceRasterizer
+
+
+@pytest.mark.parametrize("level", native.LEVELS)
+def test_the_peer_is_a_rasteriser(level):
+    found = peer.load(level) if level in native.levels() else None
+    if found is None:
+        pytest.skip("not installed")
+    scene = raster.picture(300, 48, 32)
+    forward, backward, image, gradient = found.draw(scene.gaussians, scene.camera, scene.upstream, clock_for(1))
+    g = scene.gaussians
+    means = g.means.clone().requires_grad_()
+    leaves = Gaussians(means, g.quats, g.scales, g.opacities, g.colors, g.source)
+    expected = ReferenceRasterizer()(leaves, scene.camera, torch.zeros(3)).image
+    expected.backward(scene.upstream)
+    assert forward > 0 and backward > 0 and found.pairs > 0
+    assert (image - expected).abs().mean() < 1e-5
+    assert (gradient - means.grad).norm() < 1e-3 * means.grad.norm()
+
+
+def test_no_library_no_peer(monkeypatch):
+    assert peer.load(None) is None
+    monkeypatch.setattr(native, "path", lambda level: None)
+    assert peer.load("avx512") is None

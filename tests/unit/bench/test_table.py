@@ -1,0 +1,46 @@
+"""The groups together: JSON without NaN, and a machine without the compiled library."""
+
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from scene_experts.bench import table as run
+from scene_experts.bench.measure import Figure, Missing
+from scene_experts.native import library as native
+
+
+def test_sizes_shrink_with_the_budget():
+    assert run.size_for(60) == run.FULL == run.Size(100_000, 800, 544, 40_000)
+    assert run.size_for(10) == run.MEDIUM and run.size_for(1) == run.SMALL
+
+
+@pytest.fixture
+def no_library(monkeypatch):
+    monkeypatch.setattr(native, "path", lambda level: None)
+    native.load.cache_clear()
+    yield
+    native.load.cache_clear()
+
+
+def test_without_the_library_the_rest_is_measured_and_what_is_missing_is_said(no_library, tmp_path):
+    text, path = io.StringIO(), tmp_path / "b.json"
+    with pytest.warns(UserWarning, match="slow reference"):
+        assert run.run(0.5, 1, path, Console(file=text, width=200)) == 0
+    printed = text.getvalue()
+    assert "no compiled CPU library" in printed and "install a C++20 compiler" in printed and "pure-torch reference" in printed
+    found = json.loads(path.read_text())
+    assert found["machine"]["level"] is None and found["machine"]["multiply_adds"] is None
+    assert {m["name"] for m in found["missing"]} >= {"compiled rasteriser", "compiled decode", "fused loss", "gain of threads"}
+    assert {"one network in torch", "Top-2 of 5 in torch", "in torch", "whole step"} <= {f["name"] for f in found["figures"]}
+
+
+def test_the_table_names_the_peer_of_every_ratio():
+    text = io.StringIO()
+    machine = run.describe(1)
+    results = [Figure("parts", "fast", 2.0, "ms", "slow one", 12.5), Missing("parts", "other", "not here")]
+    run.show(machine, run.SMALL, results, Console(file=text, width=160))
+    assert "12.5 x slow one" in text.getvalue() and "not here" in text.getvalue()
+    plain = run.as_json(machine, run.SMALL, results, 1.0)
+    assert plain["figures"][0]["ratio"] == 12.5 and plain["missing"][0]["why"] == "not here" and json.dumps(plain, allow_nan=False)

@@ -1,0 +1,111 @@
+"""`download` and `catalog` from their flags, and a downloaded scene as a capture to train on."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from scene_experts import cli
+from scene_experts.commands import catalog as command
+from scene_experts.data.fetch import download, obtain
+from scene_experts.data.fetch.catalog import one
+from scene_experts.training import run_folder
+from scene_experts.training.config import Data
+from support.synthetic import make_capture
+from support.web import Server, serving
+from unit.data.fetch.test_archive import scene, tree, write_tar
+
+
+@pytest.fixture
+def captures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv(obtain.VARIABLE, str(tmp_path / "captures"))
+    monkeypatch.setattr(download, "PATIENCE", 0.0)
+    return tmp_path / "captures"
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    """Serves BungeeNeRF, whose rome is a small capture made in code."""
+    folder = make_capture(tmp_path / "made", views=9, size=(48, 32)).folder
+    with serving() as running:
+        archive = write_tar(tmp_path / "x.tar.gz", scene("bungeenerf/rome", tree(folder)))
+        running.files["/bungeenerf.tar.gz"] = archive.read_bytes()
+        yield running
+
+
+def test_a_scene_from_its_source_to_a_trained_run(
+    captures: Path, server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["download", "rome", "--mirror", server.url]) == 0
+    out = capsys.readouterr().out
+    assert "next: scene-experts train moe-gs --data catalog:rome --out RUN" in out and "rome: " in out
+    assert cli.main(["info", "catalog:rome"]) == 0
+    assert "9" in capsys.readouterr().out
+    flags = ["--iterations", "2", "--rasterizer", "reference", "--device", "cpu", "--preview-every", "0"]
+    assert cli.main(["train", "moe-gs", "--data", "catalog:bungeenerf/rome", "--out", str(tmp_path / "run"), *flags]) == 0
+    config = run_folder.read_config(tmp_path / "run")
+    data = config.data
+    assert data == Data(captures / "bungeenerf" / "rome", resolution="as-is", split="mod8", normalise="none")
+    assert (config.train.scene.voxel_rule, config.train.growth.init_factor) == ("squared_median", 128)
+    assert json.loads((data.path / "source.json").read_text())["data_set"] == "BungeeNeRF"
+
+
+def test_another_folder_is_named_in_the_next_step(
+    captures: Path, server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    to = tmp_path / "elsewhere"
+    assert cli.main(["download", "rome", "--to", str(to), "--mirror", server.url, "--no-keep-archives"]) == 0
+    said = capsys.readouterr().out
+    assert f"--data {to / 'bungeenerf' / 'rome'} --resolution as-is --split mod8 --normalise none --scene.voxel-rule squared_median" in said
+    assert not captures.exists() and [p.name for p in (to / "archives").iterdir()] == ["checksums.json"]
+
+
+def test_the_table_and_the_particulars(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("images", "sparse"):
+        (captures / "tandt" / "truck" / name).mkdir(parents=True)
+    assert cli.main(["catalog"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    rows = {line.split()[0]: line.split() for line in lines[1:18]}
+    assert len(rows) == 17 and rows["truck"][-3:] == ["as-is", "mod8", "yes"] and rows["bonsai"][-2:] == ["inria:2", "mod8"]
+    assert any("non-commercial" in line for line in lines) and lines[-1] == f"captures lie in {captures}"
+    assert cli.main(["catalog", "quebec", "truck"]) == 0
+    out = capsys.readouterr().out
+    assert f"put bungeenerf.tar.gz at {captures / 'archives' / 'bungeenerf.tar.gz'} and run `scene-experts download quebec`" in out
+    assert "(here)" in out and "816e62f2" in out and "first:31" in out
+    assert cli.main(["download", "--list", "db"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["scene", "drjohnson", "playroom"]
+
+
+def test_bad_words(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["download", "bonsay"]) == 2
+    assert "found 'bonsay'; did you mean 'bonsai'?" in capsys.readouterr().err
+    assert cli.main(["download"]) == 2
+    assert "expected scenes to download, found none" in capsys.readouterr().err
+    assert cli.main(["info", "catalog:bonsai"]) == 2
+    assert "fetch it with `scene-experts download bonsai`" in capsys.readouterr().err
+
+
+def test_progress_with_and_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "SAY_EVERY", -1.0)
+    plain = Console(file=io.StringIO(), width=120)
+    with command.Told(plain) as told:
+        told("360_v2.zip", 5_000_000, 0)
+        told("360_v2.zip", 5_000_000, 10_000_000)
+    assert plain.file.getvalue().splitlines() == ["360_v2.zip: 5 of ? MB", "360_v2.zip: 5 of 10 MB"]
+    screen = Console(file=io.StringIO(), force_terminal=True, width=120, highlight=False)
+    with command.Told(screen) as told:
+        told("unpacking truck", 5, 10)
+        told.say("a [word] as it is")
+    assert "unpacking truck" in screen.file.getvalue() and "a [word] as it is" in screen.file.getvalue()
+
+
+def test_flags_of_a_scene() -> None:
+    assert command.flags(one("garden"), None) == "--data catalog:garden"
+    said = command.flags(one("garden"), Path("d"))
+    assert said == "--data d/mipnerf360/garden --resolution inria:4 --split mod8 --normalise none --scene.voxel-size 0.001"
+    assert command.flags(one("garden"), Path("my d")).startswith("--data 'my d/mipnerf360/garden' ")

@@ -1,0 +1,92 @@
+"""The report of `scene-experts doctor`, on this machine and on broken ones."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+
+import pytest
+from rich.console import Console
+
+from scene_experts.commands import doctor
+from scene_experts.commands.doctor import Check
+from scene_experts.native import library as native
+
+NAMES = [
+    "Python",
+    "torch",
+    "CUDA",
+    "CPU library",
+    "gsplat",
+    "triton",
+    "cores",
+    "memory",
+    "LPIPS weights",
+    "viser",
+    "pycolmap",
+    "tensorboard",
+]
+
+
+def test_this_machine() -> None:
+    checks = doctor.diagnose()
+    assert [check.name for check in checks] == NAMES
+    assert doctor.exit_code(checks) == 0  # this suite runs on Python >= 3.11 and torch >= 2.7
+    for check in checks:
+        assert check.found and (check.ok or check.fix or check.name in ("gsplat", "triton")), check  # nothing to install without a GPU
+    console = Console(file=io.StringIO(), width=200)
+    assert doctor.run(console) == 0 and "Ready" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_pycolmap_is_not_imported() -> None:
+    code = "import sys; from scene_experts.commands import doctor; doctor.diagnose(); "
+    code += "sys.exit('pycolmap' in sys.modules or 'viser' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
+
+
+def test_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native, "why_not", lambda: "the compiled CPU library is not installed: install a compiler")
+    check = doctor.native_library()
+    assert not check.ok and "slow torch reference" in check.found and check.fix == "install a compiler"
+
+
+def test_old_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor.torch, "__version__", "2.6.1+cu124")
+    check = doctor.pytorch()
+    assert not check.ok and check.needed and "constraints.txt" in check.fix
+    monkeypatch.setattr(doctor.torch, "__version__", "2.13.0a0+git1")
+    assert doctor.pytorch().ok
+
+
+def test_absent_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
+    check = doctor.sfm()
+    assert not check.ok and "scene-experts[sfm]" in check.fix and "constraints.txt" in check.fix
+
+
+def test_a_check_that_breaks_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken() -> str | None:
+        raise OSError("damaged library")
+
+    monkeypatch.setattr(native, "why_not", broken)
+    check = next(c for c in doctor.diagnose() if "library" in c.name)
+    assert not check.ok and "damaged library" in check.found
+
+
+def test_verdicts() -> None:
+    good = [Check(name, True, "x", needed=name in ("Python", "torch")) for name in NAMES]
+    without = lambda *names: [Check(c.name, c.name not in names, "x", "do this", c.needed) for c in good]  # noqa: E731
+    assert "on CUDA" in doctor.render(good)
+    assert "compiled library" in doctor.render(without("gsplat"))
+    assert "slow" in doctor.render(without("CUDA", "CPU library"))
+    assert doctor.exit_code(without("CUDA", "CPU library")) == 0
+    report = doctor.render(without("torch"))
+    assert "MISSING torch" in report and "-> do this" in report and "cannot be trained" in report
+    assert doctor.exit_code(without("torch")) == 1
+
+
+def test_little_memory_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    for free, ok in ((2**30, False), (2**32, True), (None, True)):
+        monkeypatch.setattr(doctor, "available_bytes", lambda free=free: free)
+        assert doctor.memory().ok == ok

@@ -1,0 +1,100 @@
+"""`export` and `import` from their flags; the files themselves are tested in test_export_*.py."""
+
+import json
+import typing
+from dataclasses import replace
+
+import pytest
+
+from scene_experts.commands.files import ExportCommand, export, import_
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.files.export import write_layout
+from scene_experts.files.formats.standard import FORMATS, read_standard
+from scene_experts.recipes import RECIPES
+from scene_experts.render import choose
+from scene_experts.scene.anchors.mlp import MLP
+from scene_experts.training import loop as train
+from scene_experts.training import run_folder
+from scene_experts.training.config import Data, RunConfig
+from support.synthetic import make_capture
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path):
+    with pytest.raises(InputError, match="expected a run folder"):
+        export([str(tmp_path), "--no-measure"])
+
+
+def test_a_source_that_is_no_result_is_refused(tmp_path):
+    with pytest.raises(InputError):
+        import_([str(tmp_path / "nothing"), "--data", str(tmp_path), "--out", str(tmp_path / "run")])
+
+
+def test_every_standard_format_can_be_named():
+    assert set(typing.get_args(typing.get_type_hints(ExportCommand)["format"])) == {"anchors", "compact", *FORMATS}
+
+
+def test_flags_reach_the_bake(tmp_path, capsys):
+    folder = make_capture(tmp_path / "capture", views=9, size=(48, 32), points=250).folder
+    config = RunConfig(replace(RECIPES["scaffold-gs"][1], iterations=300), Data(folder), stop_at=10)
+    run_folder.prepare(tmp_path / "run", config, resume=False)
+    capture = run_folder.load_capture(config.data)
+    list(train.train(config.train, train.Run(config, tmp_path / "run"), capture, choose("auto", "cpu")))
+    capture.images.close()
+    flags = ["--sh-degree", "1", "--max-gaussians", "90", "--prune", "0.01", "--refine", "3", "--frame", "trained"]
+    assert export([str(tmp_path / "run"), "--format", "spz", *flags]) == 0
+    out, file = capsys.readouterr().out, tmp_path / "run" / "scene.spz"
+    assert f"wrote {file}" in out and "harmonics of degree 1, in the trained world" in out and "refined" in out
+    assert len(read_standard(file)) <= 90
+    about = json.loads((tmp_path / "run" / "scene.spz.json").read_text())
+    assert about["command"].startswith("scene-experts export ") and about["command"].endswith("--frame trained")
+    assert about["bake"]["prune"] == 0.01 and about["bake"]["refine"]["iterations"] == 3
+    with pytest.raises(InputError, match="expected --prune as a share"):
+        export([str(tmp_path / "run"), "--format", "ply", "--prune", "2"])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    root = tmp_path_factory.mktemp("run")
+    folder = make_capture(root / "capture", views=9, size=(48, 32), points=250).folder
+    config = RunConfig(replace(RECIPES["scaffold-gs"][1], iterations=300), Data(folder), stop_at=2)
+    run_folder.prepare(root / "run", config, resume=False)
+    capture = run_folder.load_capture(config.data)
+    list(train.train(config.train, train.Run(config, root / "run"), capture, choose("auto", "cpu")))
+    write_layout(run_folder.open_run(root / "run"), capture)
+    capture.images.close()
+    return root / "run"
+
+
+def test_settings_of_other_formats_are_not_dropped_in_silence(run):
+    for format in ("compact", "anchors"):
+        with pytest.raises(InputError, match=f"expected --sh-degree with a standard file .* found --format {format}"):
+            export([str(run), "--format", format, "--sh-degree", "1"])
+
+
+def test_a_name_of_another_format_and_a_place_that_takes_no_file_are_refused_before_the_work(run, tmp_path):
+    with pytest.raises(InputError, match=r"expected a name that ends in \.spz for --format spz, found x\.ply"):
+        export([str(run), "--format", "spz", "--out", str(tmp_path / "x.ply"), "--refine", "100000"])
+    (tmp_path / "file").touch()
+    with pytest.raises(RunError, match=r"cannot write .*; choose another folder"):
+        export([str(run), "--format", "ply", "--out", str(tmp_path / "file" / "x.ply"), "--refine", "100000"])
+
+
+def test_a_compact_file_is_whole_without_the_capture(run, tmp_path, capsys):
+    gone = run.parent / "capture"
+    gone.rename(run.parent / "elsewhere")
+    try:
+        assert export([str(run), "--out", str(tmp_path / "a.compact")]) == 0
+        assert "the cost in PSNR was not measured (--data says where it is)" in capsys.readouterr().out
+        assert export([str(run), "--out", str(tmp_path / "b.compact"), "--data", str(run.parent / "elsewhere")]) == 0
+        assert "held-out views" in capsys.readouterr().out
+    finally:
+        (run.parent / "elsewhere").rename(gone)
+
+
+def test_networks_that_the_layout_cannot_say_are_told(run, tmp_path, capsys, monkeypatch):
+    assert export([str(run), "--format", "anchors", "--out", str(tmp_path / "plain")]) == 0
+    assert "warning" not in capsys.readouterr().out
+    forward = MLP.forward
+    monkeypatch.setattr(MLP, "forward", lambda self, *given: (forward(self, *given)[0] * (0.9 if self.attribute == "color" else 1.0), None))
+    assert export([str(run), "--format", "anchors", "--out", str(tmp_path / "other")]) == 0
+    assert "warning: the color networks of 'scaffold-gs' are not Linear, ReLU, ..., Linear" in capsys.readouterr().out

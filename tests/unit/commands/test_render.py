@@ -1,0 +1,76 @@
+"""`scene-experts render` as a user runs it, on a run of a few iterations."""
+
+import json
+
+import pytest
+import torch
+
+from scene_experts import cli
+from scene_experts.commands.render import resized, size_of
+from scene_experts.core.errors import InputError
+from scene_experts.evaluate import pictures
+from support.synthetic import make_capture
+from unit.scene.test_init import CAMERA
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    root = tmp_path_factory.mktemp("render")
+    capture = make_capture(root / "box", views=9).folder
+    assert (
+        cli.main(["train", "moe-gs", "--data", str(capture), "--out", str(root / "run"), "--iterations", "60", "--preview-every", "0"]) == 0
+    )
+    return root / "run"
+
+
+def test_pictures_beside_each_other_and_the_path_as_a_file(run, tmp_path, capsys):
+    args = ["render", str(run), "--out", str(tmp_path / "frames"), "--size", "48x32", "--fps", "4", "--seconds", "1", "--path", "orbit"]
+    assert cli.main([*args, "--show", "picture", "experts", "--save-path", str(tmp_path / "p.json")]) == 0
+    assert "4 frames, 1.0 s" in capsys.readouterr().out
+    assert pictures.read(tmp_path / "frames" / "00003.png").shape == (32, 2 * 48 + 4, 3)
+    assert len(json.loads((tmp_path / "p.json").read_text())["keyframes"]) == 4
+    again = ["render", str(run), "--out", str(tmp_path / "again"), "--path", str(tmp_path / "p.json"), "--show", "picture"]
+    assert cli.main(again) == 0
+    first, second = (pictures.read(tmp_path / name / "00002.png")[:, :48].astype(int) for name in ("frames", "again"))
+    assert abs(first - second).mean() < 1
+
+
+def test_views_of_several_sizes_are_no_video(run, tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    args = ["render", str(run), "--path", "test", "--out"]
+    assert cli.main([*args, str(tmp_path / "frames")]) == 0
+    assert len({pictures.read(path).shape for path in (tmp_path / "frames").glob("*.png")}) == 2
+    assert cli.main([*args, str(tmp_path / "x.mp4")]) == 2 and not (tmp_path / "x.mp4").exists()
+    assert cli.main([*args, str(tmp_path / "x.mp4"), "--size", "48x32"]) == 0 and (tmp_path / "x.mp4").stat().st_size > 0
+
+
+def test_the_held_out_views_beside_another_run(run, tmp_path):
+    args = ["render", str(run), "--path", "test", "--beside", str(run), "--out", str(tmp_path / "t"), "--only", "1", "2"]
+    assert cli.main(args) == 0 and len(list((tmp_path / "t").glob("*.png"))) == 2
+
+
+def test_a_video_lands_in_the_run_folder(run, capsys):
+    pytest.importorskip("imageio_ffmpeg")
+    assert cli.main(["render", str(run), "--path", "spiral", "--size", "32x32", "--seconds", "0.5"]) == 0
+    assert (run / "renders" / "spiral.mp4").stat().st_size > 500
+
+
+def test_flags_that_no_video_can_have(run, tmp_path, capsys):
+    for wrong, word in (
+        (["--quality", "20"], "--quality"),
+        (["--fps", "0"], "--fps"),
+        (["--only", "9"], "experts 1 to 5"),
+        (["--out", str(tmp_path / "a.gif")], "ending in .mp4"),
+        (["--path", "bogus"], "test or a file"),
+    ):
+        assert cli.main(["render", str(run), *wrong]) == 2
+        assert word in capsys.readouterr().err
+
+
+def test_sizes():
+    assert size_of("640x360") == (640, 360) and size_of(None) is None
+    for wrong in ("640", "640x", "0x10", "1x99999", "-5x5"):
+        with pytest.raises(InputError, match="WIDTHxHEIGHT"):
+            size_of(wrong)
+    assert resized(CAMERA, (96, 32)).fx == pytest.approx(2 * CAMERA.fx) and resized(CAMERA, None) is CAMERA
+    assert torch.allclose(resized(CAMERA, (96, 64)).K[:2], CAMERA.K[:2] * 2)

@@ -1,0 +1,21 @@
+"""The choice of device and rasteriser; first words."""
+
+import pytest
+import torch
+
+from scene_experts.commands.shared import backend, positional
+from scene_experts.core.errors import InputError
+
+
+def test_the_device_and_rasteriser_that_were_asked_for(monkeypatch):
+    device, rasterize = backend("cpu", "reference", True, False)
+    assert device == "cpu" and rasterize.name == "reference" and rasterize.antialias  # type: ignore[attr-defined]
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert backend("auto", "reference", False, False)[0] == "cpu"
+    with pytest.raises(InputError, match="expected a CUDA device, found none"):
+        backend("cuda", "auto", False, False)
+
+
+def test_the_first_word_may_stand_for_its_flag():
+    assert positional(["folder", "--split", "none"], "--data") == ["--data", "folder", "--split", "none"]
+    assert positional(["--data", "folder"], "--data") == ["--data", "folder"] and positional([], "--data") == []

@@ -1,0 +1,102 @@
+"""From the flags of `train` to what the loop is given."""
+
+from pathlib import Path
+
+import pytest
+
+from scene_experts.commands.train import check_settings, parse_train, train
+from scene_experts.core.errors import InputError
+from scene_experts.recipes import RECIPES
+from scene_experts.training import run_folder
+from support.synthetic import make_capture
+
+PLACES = ["--data", "c", "--out", "r"]
+
+
+@pytest.mark.parametrize("recipe", list(RECIPES))
+def test_a_recipe_without_flags_is_the_recipe(recipe):
+    made = parse_train([recipe, *PLACES])
+    assert made.cfg == RECIPES[recipe][1] and (made.data.path, made.out) == (Path("c"), Path("r"))
+    check_settings(made)
+
+
+@pytest.mark.parametrize(
+    ("flag", "value"),
+    [
+        ("--stop-at", "0"),
+        ("--save-every", "0"),
+        ("--preview-every", "-1"),
+        ("--max-memory", "-1"),
+        ("--max-memory", "nan"),
+        ("--iterations", "0"),
+        ("--seed", "-1"),
+        ("--max-anchors", "-1"),
+        ("--scene.K", "0"),
+        ("--scene.voxel-size", "-0.1"),
+        ("--growth.adjust.interval", "0"),
+    ],
+)
+def test_numbers_no_training_can_have_name_their_flag(flag, value):
+    with pytest.raises(InputError, match=f"expected {flag} of at least"):
+        check_settings(parse_train(["moe-gs", *PLACES, flag, value]))
+
+
+def test_a_memory_cap_needs_a_system_that_tells(monkeypatch):
+    made = parse_train(["moe-gs", "--data", "capture", "--out", "run", "--max-memory", "4"])
+    check_settings(made)
+    monkeypatch.setattr("scene_experts.commands.train.used_bytes", lambda device: 0)
+    with pytest.raises(InputError, match="use --max-anchors"):
+        check_settings(made)
+
+
+def test_an_unknown_recipe_names_the_nearest():
+    with pytest.raises(InputError, match="did you mean 'moe-gs'"):
+        parse_train(["moegs", *PLACES])
+
+
+def test_a_scene_of_the_paper_brings_its_numbers_and_flags_have_the_last_word():
+    for data in (["--data", "catalog:truck"], ["--data=catalog:truck"], ["-s", "catalog:tandt/truck"]):
+        made = parse_train(["scaffold-gs", *data, "--out", "run"])
+        assert (made.data.normalise, made.cfg.scene.voxel_size) == ("none", 0.01)
+    made = parse_train(["scaffold-gs", "--data", "catalog:truck", "--out", "run", "--scene.voxel-size", "0", "--normalise", "extent"])
+    assert (made.data.normalise, made.cfg.scene.voxel_size) == ("extent", 0.0)
+    assert parse_train(["3dgs", "--data", "catalog:truck", "--out", "run"]).data.normalise == "none"
+    made = parse_train(["scaffold-gs", "--data", "truck", "--out", "run"])
+    assert (made.data.normalise, made.cfg.scene.voxel_size) == ("extent", 0.0)
+
+
+def test_flags_reach_the_parts_of_explicit_recipes():
+    made = parse_train(["3dgs", *PLACES, "--growth.grad-threshold", "0.001", "--rates.means.first", "0.01", "--scene.sh-degree", "1"])
+    assert (made.cfg.growth.grad_threshold, made.cfg.rates.means.first, made.cfg.scene.sh_degree) == (0.001, 0.01, 1)  # type: ignore[union-attr]
+    with pytest.raises(InputError, match="sh-degree"):
+        check_settings(parse_train(["3dgs-mcmc", *PLACES, "--scene.sh-degree", "4"]))
+
+
+def test_the_help_without_a_recipe_names_the_flags_that_all_take(capsys):
+    with pytest.raises(SystemExit):
+        parse_train(["--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    for flag in ("--data", "--out", "--iterations", "--resolution", "--resume", "--device", "--seed"):
+        assert f"{flag}," in said
+    assert "scene-experts train RECIPE --help" in said and "--schedule" not in said
+
+
+def test_a_finished_run_keeps_its_files_when_resumed(tmp_path, capsys):
+    capture = make_capture(tmp_path / "capture", views=9, size=(48, 32)).folder
+    args = ["scaffold-gs", "--data", str(capture), "--out", str(tmp_path / "run"), "--iterations", "3", "--preview-every", "0"]
+    assert train(args) == 0
+    layout = tmp_path / "run" / "point_cloud" / "iteration_3"
+    (layout / "point_cloud.ply").write_bytes(b"mine")
+    assert train([*args, "--resume"]) == 0 and "--resume" not in run_folder.read_config(tmp_path / "run").command
+    assert "nothing was left to train" in capsys.readouterr().out and (layout / "point_cloud.ply").read_bytes() == b"mine"
+    (layout / "point_cloud.ply").unlink()
+    assert train([*args, "--resume"]) == 0 and (layout / "point_cloud.ply").is_file()  # a run that was killed before it wrote them
+
+
+def test_two_trainings_into_one_folder(tmp_path):
+    capture = make_capture(tmp_path / "capture", views=9, size=(48, 32)).folder
+    args = ["scaffold-gs", "--data", str(capture), "--out", str(tmp_path / "run"), "--iterations", "3", "--preview-every", "0"]
+    with run_folder.held(tmp_path / "run"), pytest.raises(InputError, match="found a training at work"):
+        train(args)
+    assert [p.name for p in (tmp_path / "run").iterdir()] == [".lock"]
+    assert train(args) == 0

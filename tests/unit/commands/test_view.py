@@ -1,0 +1,25 @@
+"""`scene-experts view` from its flags."""
+
+import sys
+
+import pytest
+
+from scene_experts.commands import view as command
+from scene_experts.core.errors import InputError
+
+
+def test_without_viser_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(InputError, match="viewer"):
+        command.view(["run"])
+
+
+def test_a_port_that_is_none_is_refused(tmp_path):
+    with pytest.raises(InputError, match="--port"):
+        command.view([str(tmp_path), "--port", "99999"])
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path):
+    pytest.importorskip("viser")
+    with pytest.raises(InputError, match="expected a run folder"):
+        command.view([str(tmp_path)])

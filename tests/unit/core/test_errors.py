@@ -1,0 +1,48 @@
+"""Each way to end badly has its exit code and leaves one line on stderr."""
+
+import errno
+import os
+
+import pytest
+
+from scene_experts import cli, commands
+from scene_experts.core.errors import InputError, RunError, few, nearest
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (InputError("expected a, found b; do c"), 2, "error: expected a, found b; do c\n"),
+        (RunError("cannot write x: full; free some space"), 1, "error: cannot write x: full; free some space\n"),
+        (PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/x"), 1, "at /x, found: Permission denied; check it\n"),
+        (KeyboardInterrupt(), 130, "stopped\n"),
+    ],
+)
+def test_exit_codes(error, code, said, monkeypatch, capsys):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(commands, "run", fail)
+    assert cli.main(["info"]) == code
+    out, err = capsys.readouterr()
+    assert out == "" and err.endswith(said) and err.count("\n") == 1
+
+
+def test_neither_is_the_other_and_a_fault_of_ours_is_not_hidden(monkeypatch):
+    assert not issubclass(InputError, RunError) and not issubclass(RunError, InputError)
+
+    def fault(*_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(commands, "run", fault)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["info"])
+
+
+def test_a_word_like_a_known_one_is_hinted_at():
+    assert nearest("exprt", ["export", "eval"]) == "; did you mean 'export'?"
+    assert nearest("zzz", ["export", "eval"]) == ""
+
+
+def test_of_many_names_the_first_are_told():
+    assert few(["a", "b", "c"]) == "a, b, c" and few(["a", "b", "c", "d"]) == "a, b, c and 1 more" and few([], 8) == ""

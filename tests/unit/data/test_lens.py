@@ -1,0 +1,148 @@
+"""Lenses against pycolmap (in a process of its own) and against their own inverse."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from scene_experts.core.errors import InputError
+from scene_experts.data.images import Source, decode
+from scene_experts.data.lens import MODELS, Lens, pinhole_of, without_principal_point
+
+LENSES = [
+    Lens("SIMPLE_PINHOLE", 160, 120, (130.0, 83.0, 57.0)),
+    Lens("PINHOLE", 160, 120, (130.0, 133.0, 83.0, 57.0)),
+    Lens("SIMPLE_RADIAL", 160, 120, (130.0, 83.0, 57.0, -0.12)),
+    Lens("RADIAL", 160, 120, (130.0, 78.0, 61.0, 0.08, -0.03)),
+    Lens("OPENCV", 160, 120, (130.0, 133.0, 83.0, 57.0, -0.2, 0.05, 0.001, -0.002)),
+    Lens("OPENCV_FISHEYE", 160, 120, (110.0, 112.0, 82.0, 58.0, 0.03, -0.01, 0.004, -0.001)),
+    Lens("FULL_OPENCV", 160, 120, (130.0, 133.0, 83.0, 57.0, -0.1, 0.03, 0.002, -0.001, 0.01, 0.05, -0.01, 0.002)),
+    Lens("FOV", 160, 120, (130.0, 133.0, 83.0, 57.0, 0.7)),
+    Lens("SIMPLE_RADIAL_FISHEYE", 160, 120, (110.0, 83.0, 57.0, 0.02)),
+    Lens("RADIAL_FISHEYE", 160, 120, (110.0, 83.0, 57.0, 0.02, -0.01)),
+    Lens("THIN_PRISM_FISHEYE", 160, 120, (110.0, 112.0, 83.0, 57.0, 0.02, -0.01, 0.001, 0.002, 0.003, -0.001, 0.001, -0.002)),
+]
+IDS = [lens.model for lens in LENSES]
+
+# Runs without this project: it must not be imported beside pycolmap.
+ORACLE = """
+import json, sys
+import numpy as np
+import pycolmap
+folder, lenses = sys.argv[1], json.loads(sys.argv[2])
+options = pycolmap.UndistortCameraOptions()
+rays = np.load(folder + "/rays.npy")
+out = []
+for i, (model, width, height, params) in enumerate(lenses):
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
+    np.save(f"{folder}/pixels_{i}.npy", camera.img_from_cam(rays))
+    flat = pycolmap.undistort_camera(options, camera)
+    out.append([flat.width, flat.height, list(flat.params)])
+    bitmap, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.read(folder + "/photo.png", True), camera)
+    np.save(f"{folder}/flat_{i}.npy", bitmap.to_array())
+print(json.dumps(out))
+"""
+
+
+def photo() -> np.ndarray:
+    """A smooth, strongly coloured picture [120, 160, 3]."""
+    y, x = np.mgrid[:120, :160] / 20.0
+    return np.rint(127 + 120 * np.stack((np.sin(x + 0.3 * y), np.cos(y), np.sin(0.7 * x - y)), -1)).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def oracle(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, list]:
+    if importlib.util.find_spec("pycolmap") is None:
+        pytest.skip("pycolmap is not installed")
+    folder = tmp_path_factory.mktemp("oracle")
+    rng = np.random.default_rng(0)
+    rays = np.concatenate((rng.uniform(-0.5, 0.5, (200, 2)), np.ones((200, 1))), 1)
+    np.save(folder / "rays.npy", rays)
+    Image.fromarray(photo()).save(folder / "photo.png")
+    lenses = json.dumps([(lens.model, lens.width, lens.height, lens.params) for lens in LENSES])
+    done = subprocess.run([sys.executable, "-c", ORACLE, str(folder), lenses], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return folder, rays, json.loads(done.stdout.splitlines()[-1])
+
+
+def test_every_classic_model_is_there() -> None:
+    assert [lens.model for lens in LENSES] == list(MODELS)
+
+
+@pytest.mark.parametrize("index", range(len(LENSES)), ids=IDS)
+def test_projection_equals_pycolmap(oracle: tuple[Path, np.ndarray, list], index: int) -> None:
+    folder, rays, _ = oracle
+    lens = LENSES[index]
+    u, v = lens.distort(rays[:, 0], rays[:, 1])
+    ours = np.stack((u * lens.fx + lens.cx, v * lens.fy + lens.cy), 1)
+    np.testing.assert_allclose(ours, np.load(folder / f"pixels_{index}.npy"), atol=1e-6)
+
+
+@pytest.mark.parametrize("index", range(len(LENSES)), ids=IDS)
+def test_undistorted_camera_and_picture_equal_pycolmap(oracle: tuple[Path, np.ndarray, list], index: int) -> None:
+    folder, _, cameras = oracle
+    width, height, params = cameras[index]
+    flat = pinhole_of(LENSES[index])
+    assert (flat.width, flat.height) == (width, height)
+    theirs = params if len(params) == 4 else [params[0], *params]
+    np.testing.assert_allclose(flat.params, theirs, rtol=1e-9)
+    rgb, mask = decode(Source(folder / "photo.png", LENSES[index], (flat.width, flat.height)))
+    difference = np.abs(rgb.numpy().astype(int) - np.load(folder / f"flat_{index}.npy").astype(int))
+    inner = difference[2:-2, 2:-2]  # at the very edge pycolmap writes black where we continue the border
+    assert inner.max() <= 1
+    assert mask is None or float((mask[2:-2, 2:-2] > 0).float().mean()) > 0.999
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=IDS)
+def test_undistort_inverts_distort(lens: Lens) -> None:
+    rng = np.random.default_rng(1)
+    u, v = rng.uniform(-0.6, 0.6, (2, 500))
+    a, b = lens.undistort(*lens.distort(u, v))
+    np.testing.assert_allclose((a, b), (u, v), atol=1e-8)
+    zero = np.zeros(1)
+    np.testing.assert_allclose(lens.undistort(*lens.distort(zero, zero)), (zero, zero), atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=IDS)
+def test_resizing_scales_pixels_exactly(lens: Lens) -> None:
+    small = lens.resized(80, 45)
+    u, v = np.array([0.2, -0.3]), np.array([0.1, 0.25])
+    (a, b), (c, d) = lens.distort(u, v), small.distort(u, v)
+    np.testing.assert_allclose(c * small.fx + small.cx, (a * lens.fx + lens.cx) * 0.5, rtol=1e-12)
+    np.testing.assert_allclose(d * small.fy + small.cy, (b * lens.fy + lens.cy) * 0.375, rtol=1e-12)
+
+
+def test_distorted_only_with_a_coefficient() -> None:
+    assert not Lens("OPENCV", 8, 8, (5, 5, 4, 4, 0, 0, 0, 0)).distorted
+    assert Lens("OPENCV_FISHEYE", 8, 8, (5, 5, 4, 4, 0, 0, 0, 0)).distorted
+    assert pinhole_of(Lens("SIMPLE_RADIAL", 8, 6, (5, 4, 3, 0))) == Lens("PINHOLE", 8, 6, (5, 5, 4, 3))
+
+
+def test_wide_fisheye_gets_a_bounded_picture() -> None:
+    flat = pinhole_of(Lens("OPENCV_FISHEYE", 200, 200, (60, 60, 100, 100, 0, 0, 0, 0)))  # about 190 degrees across
+    assert 40 <= flat.width <= 400 and 40 <= flat.height <= 400
+
+
+def test_centred_principal_point() -> None:
+    assert without_principal_point(LENSES[1]).params == (130.0, 133.0, 80.0, 60.0)
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "word"),
+    [
+        ("EQUIRECTANGULAR", (1.0,), "camera model"),
+        ("PINHOLE", (1.0, 1.0, 1.0), "parameters"),
+        ("PINHOLE", (1.0, 1.0, float("nan"), 1.0), "finite"),
+        ("PINHOLE", (0.0, 1.0, 1.0, 1.0), "positive"),
+    ],
+)
+def test_bad_lenses(model: str, params: tuple[float, ...], word: str) -> None:
+    with pytest.raises(InputError, match=word):
+        Lens(model, 8, 8, params)

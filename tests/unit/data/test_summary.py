@@ -1,0 +1,28 @@
+"""Statistics of a capture against their plain definitions."""
+
+import json
+from dataclasses import replace
+
+import torch
+
+from scene_experts.data.capture import load
+from scene_experts.data.summary import neighbour_distance, summarise
+from support.synthetic import make_capture
+
+
+def test_counts_sizes_and_a_capture_without_points(tmp_path):
+    capture = load(make_capture(tmp_path, views=6, size=(48, 32), points=40).folder, split="first:2")
+    said = summarise(capture)
+    assert json.loads(json.dumps(said)) == said
+    assert (said["views"], said["train"], said["test"], said["split"]) == (6, 4, 2, "first:2")
+    assert said["sizes"] == {"48x32": 2, "40x36": 2, "32x48": 2} and said["undistorted"] == 0 and said["masks"] == 0
+    assert said["decoded_bytes"] == 3 * 2 * (48 * 32 + 40 * 36 + 32 * 48)
+    assert said["near"] == capture.views[0].camera.near and said["world"]["scale"] == capture.world.scale
+    bare = summarise(replace(capture, points=None))
+    assert bare["points"] == 0 and bare["median_neighbour_distance"] is None
+    capture.images.close()
+
+
+def test_the_neighbour_distance_is_the_median_of_the_nearest_even_far_from_the_origin():
+    grid = torch.cartesian_prod(*[torch.arange(6, dtype=torch.float64)] * 3) * 0.25 + 1e6
+    assert neighbour_distance(grid) == 0.25 and abs(neighbour_distance(grid, exact=10) - 0.25) < 1e-5

@@ -1,0 +1,53 @@
+"""`eval` opens what the run folder says and passes it on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from scene_experts.core.errors import InputError
+from scene_experts.evaluate import command
+from scene_experts.recipes import RECIPES
+from scene_experts.training.config import Data, RunConfig
+
+
+@dataclass(frozen=True)
+class Raster:
+    antialias: bool = False
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, antialias: bool) -> None:
+    cfg = replace(RECIPES["moe-gs"][1], iterations=300, seed=4, antialias=antialias)
+    config = RunConfig(cfg, Data(Path("old"), split="mod:4"), versions={"torch": "x"})
+    closed: list[bool] = []
+    seen: dict[str, Any] = {}
+    opened = SimpleNamespace(config=config, cfg=cfg.scaled(), scene="scene", step=250, seconds=9.0, capture="a", path=tmp_path)
+    capture = SimpleNamespace(root="new", fingerprint=lambda: "a", images=SimpleNamespace(close=lambda: closed.append(True)))
+
+    def load(data: Data, seed: int) -> Any:
+        seen["data"] = data
+        return capture
+
+    def evaluate(*args: Any, **options: Any) -> dict[str, Any]:
+        seen.update(args=args, **options)
+        options["progress"]("rendering and scoring", 1, 2)
+        return {"psnr": 1.0}
+
+    monkeypatch.setattr(command.run_folder, "open_run", lambda run, device, step: opened)
+    monkeypatch.setattr(command.run_folder, "load_capture", load)
+    monkeypatch.setattr(command, "evaluate", evaluate)
+    result = command.evaluate_run(tmp_path, "cpu", Raster(), data=Path("new"), views="train", lpips=False)  # type: ignore[arg-type]
+    assert result == {"psnr": 1.0} and closed == [True]
+    assert seen["data"] == Data(Path("new"), split="mod:4")
+    assert seen["args"] == ("scene", capture, Raster(antialias), tmp_path)
+    assert seen["step"] == 250 and seen["views"] == "train" and not seen["lpips"]
+    about = seen["about"]
+    assert (about.recipe, about.iterations, about.seed, about.train_seconds, about.versions) == ("moe-gs", 300, 4, 9.0, {"torch": "x"})
+    opened.capture = "b"
+    with pytest.raises(InputError, match="other views in new"):
+        command.evaluate_run(tmp_path, "cpu", Raster(), data=Path("new"), lpips=False)  # type: ignore[arg-type]

@@ -1,0 +1,122 @@
+"""Scores from their formulas, and what a mask does to them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from scene_experts.evaluate import metrics, weights
+from scene_experts.evaluate.lpips import Lpips
+from scene_experts.evaluate.metrics import Perceptual
+from scene_experts.training import losses
+from unit.evaluate.test_lpips import random_tensors
+
+
+def pair(height: int = 40, width: int = 50, seed: int = 0) -> tuple[Tensor, Tensor]:
+    gen = torch.Generator().manual_seed(seed)
+    target = torch.rand(height, width, 3, generator=gen)
+    return (target + 0.1 * torch.randn(height, width, 3, generator=gen)).clamp(0, 1), target
+
+
+def half(height: int = 40, width: int = 50) -> Tensor:
+    mask = torch.zeros(height, width)
+    mask[:, : width // 2] = 1
+    return mask
+
+
+def test_psnr() -> None:
+    target = torch.zeros(4, 5, 3)
+    assert metrics.psnr(target + 0.1, target) == pytest.approx(20.0)
+    one = target.clone()
+    one[0, 0, 0] = 0.5
+    assert metrics.psnr(one, target) == pytest.approx(20 * math.log10(1 / math.sqrt(0.25 / 60)))
+    assert metrics.psnr(target, target) == 100.0
+
+
+def test_psnr_counts_the_masked_pixels_alone() -> None:
+    image, target = pair()
+    assert metrics.psnr(image, target, half()) == pytest.approx(metrics.psnr(image[:, :25], target[:, :25]))
+    spoiled = image.clone()
+    spoiled[:, 25:] = 0
+    assert metrics.psnr(spoiled, target, half()) == metrics.psnr(image, target, half())
+
+
+def test_ssim_is_that_of_the_losses() -> None:
+    image, target = pair()
+    assert metrics.ssim(image, target) == pytest.approx(float(losses.ssim(image, target)))
+    assert metrics.ssim(target, target) == pytest.approx(1.0)
+
+
+def test_masked_ssim_is_that_of_the_counted_part() -> None:
+    """The same error everywhere must score the same with half of it masked, but for windows across the mask's edge."""
+    image, target = pair(80, 240)
+    whole, masked = metrics.ssim(image, target), metrics.ssim(image, target, half(80, 240))
+    assert abs(masked - whole) < 0.1 * (1 - whole)
+    spoiled = image.clone()
+    spoiled[:, 120:] = 0
+    assert metrics.ssim(spoiled, target, half(80, 240)) == pytest.approx(masked)
+    assert metrics.ssim(image, target, torch.ones(80, 240)) == pytest.approx(whole, abs=1e-6)
+
+
+def test_sharpness() -> None:
+    ramp = torch.linspace(0, 1, 11)[None, :, None].expand(7, 11, 3)
+    assert metrics.sharpness(ramp) == pytest.approx(0.1)
+    assert metrics.sharpness(ramp.transpose(0, 1)) == pytest.approx(0.1)
+    checks = ((torch.arange(40)[:, None] + torch.arange(50)) % 2).float()[..., None].expand(-1, -1, 3)
+    assert metrics.sharpness(checks) == pytest.approx(math.sqrt(2))
+    blurred = (checks[1:, 1:] + checks[:-1, 1:] + checks[1:, :-1] + checks[:-1, :-1]) / 4
+    assert metrics.sharpness(blurred) < 1e-6
+    both = torch.cat([checks, torch.zeros(40, 50, 3)], dim=1)
+    mask = torch.cat([torch.ones(40, 50), torch.zeros(40, 50)], dim=1)
+    assert metrics.sharpness(both, mask) == pytest.approx(math.sqrt(2))
+
+
+def test_each_variant_gets_its_own_input() -> None:
+    networks = {net: Lpips(net, random_tensors(net)) for net in ("vgg", "alex")}
+    image, target = pair()
+    found = Perceptual(networks)(image, target)
+    assert found["lpips"] == networks["vgg"](2 * image - 1, 2 * target - 1)
+    assert found["lpips_3dgs"] == networks["vgg"](image, target)
+    assert found["lpips_alex"] == networks["alex"](2 * image - 1, 2 * target - 1)
+    assert found.keys() == metrics.BACKBONE.keys() < metrics.VARIANTS.keys()
+
+
+def test_without_weights_the_reason_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(net: str, explicit: Path | None = None) -> tuple[dict[str, Tensor], str]:
+        if net == "vgg":
+            raise weights.Missing("no weights of LPIPS (vgg): run this")
+        return random_tensors(net), "somewhere"
+
+    monkeypatch.setattr(weights, "load", load)
+    found = Perceptual.find()
+    assert found.absent == dict.fromkeys(("lpips", "lpips_3dgs"), "no weights of LPIPS (vgg): run this")
+    assert found.sources == {"alex": "somewhere"} and set(found(*pair())) == {"lpips_alex"}
+    assert set(Perceptual.off().absent) == {"lpips", "lpips_3dgs", "lpips_alex"}
+
+
+def test_download_is_for_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    fetched: list[str] = []
+    monkeypatch.setattr(weights, "why_absent", lambda net, explicit=None: None if net == "vgg" or fetched else "absent")
+    monkeypatch.setattr(metrics.download, "lpips", lambda net, progress=None: fetched.append(net))
+    monkeypatch.setattr(weights, "load", lambda net, explicit=None: (random_tensors(net), "here"))
+    assert not Perceptual.find(fetch=True).absent and fetched == ["alex"]
+
+
+def test_pictures_too_small_for_a_network() -> None:
+    perceptual = Perceptual({net: Lpips(net, random_tensors(net)) for net in ("vgg", "alex")})
+    found = perceptual(*pair(20, 20))
+    assert set(found) == {"lpips", "lpips_3dgs"} and "at least 31 px" in perceptual.absent["lpips_alex"]
+
+
+@pytest.mark.gpu
+def test_scores_on_cuda_are_those_on_the_cpu() -> None:
+    networks = {net: Lpips(net, random_tensors(net)) for net in ("vgg", "alex")}
+    image, target = pair(64, 80)
+    here = metrics.score(image, target, None, Perceptual(networks))
+    there = metrics.score(image.cuda(), target.cuda(), None, Perceptual({net: network.to("cuda") for net, network in networks.items()}))
+    assert there == pytest.approx(here, rel=1e-4)
+    assert torch.backends.cudnn.allow_tf32  # as it was

@@ -1,0 +1,194 @@
+"""Tables: what is compared, what is refused, how it is written."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from scene_experts.core.errors import InputError
+from scene_experts.evaluate import tables
+
+
+def results(recipe: str, psnr: float, **other: Any) -> dict[str, Any]:
+    return {
+        "recipe": recipe,
+        "capture": "yard",
+        "resolution": "as-is",
+        "mean_pixels": 5000,
+        "split": "mod8",
+        "views": "test",
+        "view_count": 9,
+        "masked": False,
+        "psnr": psnr,
+        "ssim": 0.9,
+        "lpips": 0.2,
+        "lpips_3dgs": 0.19,
+        "lpips_alex": None,
+        "absent": {"lpips_alex": "no weights: run this"},
+        "size": {"MB": 1.25},
+        "anchors": 12345,
+        "activation_ratio": 0.365,
+        "sharpness": {"ratio": 0.93},
+        "fps": {"fps": 20.0, "decode_ms": 10.0, "raster_ms": 40.0, "device": "cpu"},
+        "train_seconds": 100.0,
+        "experts": {"color": {"share": [0.6, 0.4], "mean_gate": [0.5, 0.5], "entropy": 0.97}},
+        **other,
+    }
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> list[Path]:
+    out = []
+    for name, value in (("a", results("scaffold-gs", 27.123)), ("b", results("moe-gs", 27.456))):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "results.json").write_text(json.dumps(value))
+        out.append(tmp_path / name)
+    return out
+
+
+def printed(runs: list[Path], format: tables.Format = "table", mixed: bool = False, paper: str | None = None) -> str:
+    console = Console(file=io.StringIO(), width=200)
+    tables.compare_runs(runs, format, mixed, console, paper)
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_markdown(runs: list[Path]) -> None:
+    lines = printed(runs, "markdown").splitlines()
+    assert lines[0].startswith("| run | PSNR | SSIM | LPIPS | LPIPS (3DGS) | MB |")
+    assert lines[2].startswith("| scaffold-gs | 27.12 | **0.900** |") and lines[3].startswith("| moe-gs | **27.46** |")
+    assert "12,345" in lines[2] and "36.5" in lines[2] and lines[1].count("---") == lines[0].count("|") - 1
+    assert lines[-1] == "lpips_alex absent: no weights: run this"
+
+
+def test_csv_is_plain_numbers(runs: list[Path]) -> None:
+    rows = list(csv.DictReader(io.StringIO(printed(runs, "csv"))))
+    assert [r["run"] for r in rows] == ["scaffold-gs", "moe-gs"]
+    assert float(rows[0]["PSNR"]) == 27.12 and float(rows[0]["anchors"]) == 12345
+
+
+def test_terminal(runs: list[Path]) -> None:
+    text = printed(runs)
+    assert "yard: 9 test views (mod8), as-is" in text and "27.46" in text and "lpips_alex absent: no weights: run this" in text
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "option"),
+    [
+        ("capture", "garden", "--data"),
+        ("resolution", "cap1600", "--resolution"),
+        ("split", "first:31", "--split"),
+        ("view_count", 8, "--max-views"),
+        ("appearance", "half", "found rule in scaffold-gs and half in moe-gs.*--appearance"),
+    ],
+)
+def test_refuses_other_protocols(runs: list[Path], key: str, value: Any, option: str) -> None:
+    (runs[1] / "results.json").write_text(json.dumps(results("moe-gs", 28.0, **{key: value})))
+    with pytest.raises(InputError, match=f"{option}.*--mixed"):
+        printed(runs)
+    assert "moe-gs on" in printed(runs, mixed=True)
+
+
+def test_not_evaluated(tmp_path: Path, runs: list[Path]) -> None:
+    with pytest.raises(InputError, match="scene-experts eval"):
+        printed([*runs, tmp_path])
+    for wrong in ("[1]", '{"psnr": null}'):
+        (tmp_path / "results.json").write_text(wrong)
+        with pytest.raises(InputError, match="something else"):
+            printed([tmp_path])
+    with pytest.raises(InputError, match="at least one"):
+        printed([])
+
+
+def test_equal_recipes_are_told_apart_by_folder(runs: list[Path]) -> None:
+    (runs[1] / "results.json").write_text(json.dumps(results("scaffold-gs", 27.0)))
+    text = printed(runs, "markdown")
+    assert "| a (scaffold-gs) |" in text and "| b (scaffold-gs) |" in text
+    again = runs[0] / "deeper" / "a"
+    again.mkdir(parents=True)
+    (again / "results.json").write_text(json.dumps(results("scaffold-gs", 26.0)))
+    text = printed([runs[0], again], "markdown")
+    assert f"| {runs[0]} (scaffold-gs) |" in text and f"| {again} (scaffold-gs) |" in text
+
+
+def test_beside_the_paper(runs: list[Path]) -> None:
+    lines = printed(runs, "markdown", paper="DeepBlending").splitlines()
+    row = next(line for line in lines if line.startswith("| MoE-GS (paper)"))
+    assert [cell.strip(" *") for cell in row.split("|")][2:7] == ["30.64", "0.905", "-", "0.264", "55.4"]
+    with pytest.raises(InputError, match="BungeeNeRF"):
+        printed(runs, paper="nowhere")
+
+
+def test_paper_numbers() -> None:
+    assert tables.paper()["table2"]["BungeeNeRF"]["MoE-GS"] == [28.64, 0.925, 0.089, 161.6]
+    assert tables.paper()["table3"]["Scaffold-GS"]["DeepBlending"] == 41.0
+    for dataset in ("MipNeRF360", "DeepBlending", "TanksAndTemples", "BungeeNeRF"):
+        assert len(tables.paper_results(dataset)) == 5
+
+
+def test_print_results(tmp_path: Path) -> None:
+    console = Console(file=io.StringIO(), width=200)
+    tables.print_results(results("moe-gs", 27.5), console, tmp_path)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "27.50" in text and "experts, color: share 60% 40%, gate entropy 0.97" in text
+    assert "10.0 ms decode + 40.0 ms raster on cpu" in text and str(tmp_path / "results.json") in text
+    tables.print_results(results("moe-gs", 27.5, appearance="half"), console, tmp_path)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "right halves of 9 test views" in text and str(tmp_path / "results_half.json") in text and "test_half" in text
+
+
+def test_a_table_tells_a_shorter_training_from_one_cut_off() -> None:
+    short, cut = results("moe-gs", 27.0, step=7000, iterations=7000), results("moe-gs", 26.0, step=7000, iterations=30_000)
+    made = tables.table(["short", "cut"], [short, cut])
+    place = made.titles.index("iterations")
+    assert made.titles[place + 1] == "of schedule" and [row[place : place + 2] for row in made.rows] == [
+        ("7,000", "7,000"),
+        ("7,000", "30,000"),
+    ]
+
+
+@pytest.mark.parametrize("width", [10, 40, 80, 200])
+def test_no_cell_is_cut_in_a_narrow_terminal(runs: list[Path], width: int) -> None:
+    console = Console(file=io.StringIO(), width=width)
+    made = tables.compare_runs(runs, "table", False, console)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert all(cell in text for cell in made.titles + made.rows[0] + made.rows[1]) and "\u2026" not in text
+    lines = [line.rstrip() for line in text.splitlines()]
+    straight = any(line.startswith("run ") and "PSNR" in line for line in lines)
+    assert straight == (width == 200)
+    assert width < 40 or max(map(len, lines)) <= max(width, len(made.notes[0]))  # prose is wrapped by the terminal
+
+
+def test_a_file_that_knows_nothing_of_its_training_has_no_figures_of_it() -> None:
+    trained = results("moe-gs", 27.0, step=4000, iterations=7000)
+    imported = results("scaffold-gs", 26.0, step=0, iterations=0, train_seconds=0.0)
+    found = tables.table(["a", "b"], [trained, imported])
+    place = [found.titles.index(title) for title in ("iterations", "of schedule", "train s")]
+    assert [found.rows[0][j] for j in place] == ["4,000", "7,000", "100"] and [found.rows[1][j] for j in place] == ["-"] * 3
+    assert not {"iterations", "of schedule", "train s"} & set(tables.table(["b"], [imported]).titles)
+
+
+def test_what_was_trained_on_after_it_was_scored_is_said(tmp_path):
+    for step in (231, 400):
+        (tmp_path / "checkpoints").mkdir(exist_ok=True)
+        (tmp_path / "checkpoints" / f"ckpt_{step:06d}.safetensors").touch()
+    found = tables.outdated(["moe-gs", "other"], [tmp_path, tmp_path / "none"], [{"step": 231}, {"step": 5}])
+    assert found == [f"moe-gs was scored at iteration 231 and is at 400 now: run `scene-experts eval {tmp_path}` again"]
+    assert tables.outdated(["moe-gs"], [tmp_path], [{"step": 400}]) == tables.outdated(["moe-gs"], [tmp_path], [{}]) == []
+
+
+def test_an_absent_score_says_whose_it_is():
+    one, two = {"psnr": 1.0, "lpips": 0.2}, {"psnr": 2.0, "absent": {"lpips": "not asked for"}}
+    assert tables.table(["a", "b"], [one, two]).notes == ("lpips of b absent: not asked for",)
+    assert tables.table(["b"], [two]).notes == ("lpips absent: not asked for",)
+
+
+def test_rows_are_called_what_they_are() -> None:
+    anchors, explicit = results("moe-gs", 27.0), results("3dgs", 26.0, activation_ratio=None)
+    assert "anchors" in tables.table(["a"], [anchors]).titles and "Gaussians" in tables.table(["b"], [explicit]).titles
+    assert "anchors or Gaussians" in tables.table(["a", "b"], [anchors, explicit]).titles

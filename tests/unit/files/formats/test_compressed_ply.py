@@ -1,0 +1,60 @@
+"""Compressed PLY: within the quantum of each chunk's ranges, with its note, and damaged files in one sentence."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plyfile import PlyData
+
+from scene_experts.core.errors import InputError
+from scene_experts.files.formats.comments import read_note
+from scene_experts.files.formats.compressed_ply import read_compressed_ply, write_compressed_ply
+from scene_experts.files.formats.splats import Splats
+from support.splat_quanta import check, scene
+
+
+@given(st.sampled_from([0, 1, 255, 256, 257, 600]), st.integers(0, 3), st.integers(0, 99), st.sampled_from([1e-3, 1.0, 1e4]))
+@settings(max_examples=25, deadline=None)
+def test_round_trip_within_the_quantum(tmp_path_factory, n, degree, seed, size):
+    path = tmp_path_factory.mktemp("ply") / "a.ply"
+    s = scene(n, degree, seed, size)
+    write_compressed_ply(path, s, {})
+    check("compressed-ply", read_compressed_ply(path), s)
+
+
+def test_a_plain_ply_reader_sees_its_three_elements(tmp_path):
+    write_compressed_ply(tmp_path / "a.ply", scene(300, 2), {"recipe": "moe-gs"})
+    elements = PlyData.read(tmp_path / "a.ply")
+    assert [(e.name, e.count, len(e.properties)) for e in elements] == [("chunk", 2, 18), ("vertex", 300, 4), ("sh", 300, 24)]
+    assert read_note(tmp_path / "a.ply") == {"recipe": "moe-gs"}
+
+
+def test_equal_values_in_a_chunk(tmp_path):
+    s = scene(5, 1)
+    s = Splats(s.means[:1].expand(5, 3), s.log_scales[:1].expand(5, 3), s.quats, s.opacity_logit, s.sh[:1].expand(5, 4, 3))
+    write_compressed_ply(tmp_path / "a.ply", s, {})
+    found = read_compressed_ply(tmp_path / "a.ply")
+    torch.testing.assert_close(found.means, s.means)
+    torch.testing.assert_close(found.log_scales, s.log_scales)
+
+
+def test_damaged_files(tmp_path):
+    path = tmp_path / "a.ply"
+    write_compressed_ply(path, scene(300, 1), {})
+    good = path.read_bytes()
+    for data, words in (
+        (good[:-1], "asks for more"),
+        (good[:300], "no end of its header"),
+        (good.replace(b"element vertex 300", b"element vertex 999"), "another layout|asks for more"),
+        (good.replace(b"element vertex 300", b"element vertex -30"), "another layout"),
+        (good.replace(b"property uint packed_position", b"property float packed_position"), "another layout"),
+        (good.replace(b"property float min_x", b"property uint min_x"), "another layout"),
+        (good.replace(b"property uchar f_rest_0", b"property float f_rest_0"), "another layout"),
+        (good.replace(b"element chunk 2", b"element chunk 1"), "1 chunks for 300|asks for more"),
+        (good.replace(b"property float min_x", b"property float min_q"), "another layout"),
+        (good.replace(b"property uint packed_scale", b"property quad packed_scale"), "another layout"),
+        (good.replace(b"f_rest_8", b"f_rest_9"), "another layout"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=f"expected a whole compressed PLY file at .*({words})"):
+            read_compressed_ply(path)

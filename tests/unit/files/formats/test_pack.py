@@ -1,0 +1,55 @@
+"""What packed formats share, against the definitions of rotation, covariance and harmonics."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from scene_experts.core.errors import InputError
+from scene_experts.files.formats import pack
+from scene_experts.geometry.rotation import covariance
+from scene_experts.geometry.sh import sh_to_rgb
+from support.splat_quanta import scene
+
+
+@pytest.mark.parametrize(("axis", "signs"), [("x", (1.0, -1, -1)), ("z", (-1.0, -1, 1))])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_turned_frame_shows_the_same_scene(axis, signs, degree):
+    s = scene(40, degree)
+    t = pack.turned(s, axis)
+    turn, look = torch.diag(torch.tensor(signs)), torch.randn(40, 3)
+    torch.testing.assert_close(t.means, s.means @ turn)
+    unit = lambda x: torch.nn.functional.normalize(x.quats, dim=1)  # noqa: E731
+    ours = covariance(unit(s), s.log_scales.exp())
+    torch.testing.assert_close(covariance(unit(t), t.log_scales.exp()), turn @ ours @ turn, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(sh_to_rgb(t.sh, look @ turn, degree), sh_to_rgb(s.sh, look, degree), rtol=1e-4, atol=1e-5)
+    again = pack.turned(t, axis)
+    assert all(torch.equal(getattr(again, name), getattr(s, name)) for name in ("means", "quats", "sh"))
+
+
+def test_smallest_three_and_back():
+    q = pack.unit_quats(scene(500))
+    largest, rest = pack.smallest_three(q)
+    assert (np.abs(rest) <= np.sqrt(0.5) + 1e-12).all()
+    back = pack.from_smallest_three(largest, rest)
+    assert np.abs(np.abs((back * q).sum(1)) - 1).max() < 1e-12
+    zero = scene(2)
+    zero.quats[0] = 0
+    assert pack.unit_quats(zero)[0].tolist() == [1, 0, 0, 0]
+
+
+def test_bytes_of_opacities_are_finite_logits():
+    values = pack.byte_logits(np.arange(256))
+    assert np.isfinite(values).all() and (np.diff(values) > 0).all()
+    np.testing.assert_allclose(1 / (1 + np.exp(-values.astype(np.float64))), np.arange(256) / 255, atol=0.26 / 255)
+    assert pack.to_bytes(np.array([-1, 0, 0.5, 1, 2.0])).tolist() == [0, 0, 128, 255, 255]
+
+
+def test_sizes_that_cannot_be_honest():
+    pack.check_size(Path("a"), "SPZ", 10, 10_000, 10)
+    pack.check_size(Path("a"), "SPZ", 10, 1 << 30, 1 << 27)
+    with pytest.raises(InputError, match="above the limit"):
+        pack.check_size(Path("a"), "SPZ", 10**9, 1, 1)
+    with pytest.raises(InputError, match="100 bytes that unpack to"):
+        pack.check_size(Path("a"), "SPZ", 10, 1 << 30, 100)

@@ -1,0 +1,124 @@
+"""SPZ: every attribute within the format's quantum, in every version, and damaged files in one sentence."""
+
+import gzip
+import struct
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scene_experts.core.errors import InputError
+from scene_experts.files.formats import spz
+from scene_experts.files.formats.splats import Splats
+from support.splat_quanta import check, scene
+
+
+@given(st.integers(0, 300), st.integers(0, 3), st.integers(0, 99), st.sampled_from([1e-3, 1.0, 50.0, 1e5]))
+@settings(max_examples=25, deadline=None)
+def test_round_trip_within_the_quantum(tmp_path_factory, n, degree, seed, size):
+    path = tmp_path_factory.mktemp("spz") / "a.spz"
+    s = scene(n, degree, seed, size)
+    spz.write_spz(path, s, {})
+    check("spz", spz.read_spz(path), s)
+
+
+def test_the_layout_byte_by_byte(tmp_path):
+    """One Gaussian, from the format's description: 24-bit positions, bytes, the frame half turned about x."""
+    sh = torch.zeros(1, 4, 3)
+    sh[0, 0] = torch.tensor([1.0, 0.0, -1.0])
+    sh[0, 1:, 0] = torch.tensor([0.5, 0.25, -0.5])
+    s = Splats(torch.tensor([[1.0, -2.0, 3.0]]), torch.tensor([[-4.0, 0.0, 2.0]]), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1), sh)
+    head, body = spz.HEADER.unpack(gzip.decompress(spz.spz_bytes(s))[:16]), gzip.decompress(spz.spz_bytes(s))[16:]
+    assert head == (0x5053474E, 3, 1, 1, 20, 0, 0)
+    fixed = [int.from_bytes(body[3 * i : 3 * i + 3], "little", signed=True) for i in range(3)]
+    assert fixed == [1 << 20, 2 << 20, -3 << 20]  # y and z flip
+    assert list(body[9:13]) == [128, round((0.15 + 0.5) * 255), 128, round((-0.15 + 0.5) * 255)]
+    assert list(body[13:16]) == [96, 160, 192]
+    assert struct.unpack("<I", body[16:20])[0] == 3 << 30  # w is the largest, the others 0
+    assert [body[20 + 3 * i] for i in range(3)] == [128 - 64, 128 - 32, 128 - 64]  # y, z flip, x does not
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_old_versions(tmp_path, version):
+    s = scene(40, 1)
+    raw = gzip.decompress(spz.spz_bytes(s))
+    now = spz.decode_spz(spz.spz_bytes(s), tmp_path)
+    flipped = spz.turned(now, "x")
+    places = flipped.means.numpy().astype("<f2").tobytes() if version == 1 else raw[16 : 16 + 9 * 40]
+    q = torch.nn.functional.normalize(flipped.quats, dim=1)
+    q = q * torch.where(q[:, :1] < 0, -1.0, 1.0)
+    turns = np.clip(np.rint((q[:, 1:].numpy() + 1) * 127.5), 0, 255).astype(np.uint8).tobytes()
+    rest = raw[16 + 9 * 40 :]
+    data = spz.HEADER.pack(spz.MAGIC, version, 40, 1, raw[13], 0, 0) + places + rest[: 7 * 40] + turns + rest[11 * 40 :]
+    found = spz.decode_spz(gzip.compress(data), tmp_path)
+    torch.testing.assert_close(found.means, now.means, rtol=1e-3, atol=1e-4)
+    assert torch.equal(found.sh, now.sh) and torch.equal(found.log_scales, now.log_scales)
+    dots = (torch.nn.functional.normalize(found.quats, dim=1) * torch.nn.functional.normalize(now.quats, dim=1)).sum(1).abs()
+    assert dots.min() > 0.995
+
+
+def version_4(s, degree=None):
+    zstandard = pytest.importorskip("zstandard")
+    raw = gzip.decompress(spz.spz_bytes(s))
+    n, found, bits = len(s), raw[12], raw[13]
+    parts, at = [], 16
+    for width in (9, 1, 3, 3, 4, 3 * ((found + 1) ** 2 - 1)):
+        parts.append(raw[at : at + n * width])
+        at += n * width
+    parts = [p for p in parts if p]
+    packed = [zstandard.ZstdCompressor().compress(p) for p in parts]
+    table = b"".join(struct.pack("<QQ", len(p), len(r)) for p, r in zip(packed, parts))
+    return spz.V4_HEADER.pack(spz.MAGIC, 4, n, found if degree is None else degree, bits, 0, len(parts), 32) + table + b"".join(packed)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_version_4(tmp_path, degree):
+    s = scene(50, degree)
+    found, wanted = spz.decode_spz(version_4(s), tmp_path), spz.decode_spz(spz.spz_bytes(s), tmp_path)
+    for name in ("means", "log_scales", "quats", "opacity_logit", "sh"):
+        assert torch.equal(getattr(found, name), getattr(wanted, name))
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_the_flag_of_antialiasing(tmp_path, asked):
+    s = scene(50, 1)
+    spz.write_spz(tmp_path / "a.spz", s, {"antialias": asked})
+    assert gzip.decompress((tmp_path / "a.spz").read_bytes())[14] == int(asked) and spz.is_antialiased(tmp_path / "a.spz") is asked
+    data = bytearray(version_4(s))
+    data[14] = int(asked)
+    (tmp_path / "b.spz").write_bytes(data)
+    assert spz.is_antialiased(tmp_path / "b.spz") is asked
+    for broken in (b"", b"NGSP", b"\x1f\x8b rubbish"):
+        (tmp_path / "c.spz").write_bytes(broken)
+        assert spz.is_antialiased(tmp_path / "c.spz") is False
+
+
+def test_damaged_files(tmp_path):
+    good = spz.spz_bytes(scene(30, 2))
+    raw = gzip.decompress(good)
+    bomb = gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 40_000_000, 3, 12, 0, 0) + bytes(10_000_000))
+    cases = {
+        good[:-20]: "attributes where|does not unpack",
+        good[:8]: "no whole header|does not unpack",
+        b"\x1f\x8b rubbish": "does not unpack",
+        gzip.compress(raw[:-5]): "bytes of attributes where",
+        gzip.compress(raw + b"x"): "bytes of attributes where",
+        gzip.compress(b"XXXX" + raw[4:]): "another header",
+        gzip.compress(raw[:4] + struct.pack("<I", 9) + raw[8:]): "a header of version 9",
+        gzip.compress(raw[:12] + b"\x09" + raw[13:]): "harmonics of degree 9",
+        gzip.compress(raw[:8] + struct.pack("<I", 1 << 31) + raw[12:]): "above the limit",
+        bomb: "bytes that unpack to",
+        version_4(scene(30))[:-9]: "a stream",
+        version_4(scene(30))[:40]: "table",
+        version_4(scene(30), degree=1): "a stream",
+        version_4(scene(30))[:20]: "no whole header",
+    }
+    for i, (data, words) in enumerate(cases.items()):
+        path = tmp_path / f"{i}.spz"
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=f"expected a whole SPZ file at .*({words})"):
+            spz.read_spz(path)
+    with pytest.raises(InputError, match="expected positions within"):
+        spz.spz_bytes(scene(3, 0, 0, 1e8))

@@ -1,0 +1,120 @@
+"""The compiled library is found, refused when it is of another version, and its absence explained."""
+
+import ctypes
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+import scene_experts
+from scene_experts.native import library as native
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    """A package folder without libraries."""
+    native.load.cache_clear()
+    monkeypatch.setattr(scene_experts, "__path__", [str(tmp_path)])
+    yield tmp_path
+    native.load.cache_clear()
+
+
+def test_levels_end_with_the_one_that_runs_everywhere():
+    found = native.levels()
+    assert found[-1] == "portable" and found == native.LEVELS[-len(found) :]
+
+
+def test_a_loaded_library_is_one_of_this_processors():
+    if native.load() is None:
+        assert native.why_not()
+    else:
+        assert native.why_not() is None and native.load().level in native.levels() and native.path(native.load().level).is_file()
+    assert native.load("no such level") is None and native.path("no such level") is None
+
+
+def test_no_library_is_one_sentence_that_says_what_to_do(elsewhere):
+    assert native.load() is None and "not installed" in native.why_not() and "pip install ." in native.why_not()
+
+
+def test_a_library_of_another_version_is_not_used(elsewhere, monkeypatch):
+    (elsewhere / "_native").mkdir()
+    for name in native.LEVELS:
+        (elsewhere / "_native" / f"se_{name}{native._SUFFIX}").touch()
+    monkeypatch.setattr(ctypes, "CDLL", lambda where: SimpleNamespace(se_abi_version=lambda: native.ABI_VERSION + 1))
+    assert native.load() is None and "does not fit" in native.why_not() and "portable" in native.why_not()
+
+
+def test_a_damaged_library_is_not_used(elsewhere):
+    (elsewhere / "_native").mkdir()
+    for name in native.LEVELS:
+        (elsewhere / "_native" / f"se_{name}{native._SUFFIX}").write_bytes(b"cut short")
+    assert native.load() is None and "does not fit" in native.why_not()
+
+
+def test_pointers():
+    value = torch.arange(3.0)
+    assert native.pointer(value).value == value.data_ptr() and native.pointer(value[1:]).value == value.data_ptr() + 4
+    assert not native.pointer(None).value
+    with pytest.raises(AssertionError):
+        native.pointer(torch.zeros(4, 4).t()[1:])
+
+
+@pytest.mark.parametrize(
+    ("capability", "expected"),
+    [("AVX512", native.LEVELS), ("AVX2", ("avx2", "portable")), ("DEFAULT", ("portable",)), ("SVE256", ("portable",))],
+)
+def test_levels_follow_the_processor(monkeypatch, capability, expected):
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    assert native.levels() == expected
+
+
+SHORT = """
+import resource, torch
+from pathlib import Path
+from scene_experts.training import losses
+from scene_experts.core.errors import RunError
+from scene_experts.render import choose
+from scene_experts.core.types import Camera, Gaussians
+
+torch.set_num_threads(THREADS)
+x, y, n = torch.rand(22, 200_000, 3), torch.rand(22, 200_000, 3), 300_000
+means = torch.rand(n, 3) - 0.5 + torch.tensor([0, 0, 2.0])
+g = Gaussians(means, torch.rand(n, 4), torch.full((n, 3), 0.02), torch.rand(n), torch.rand(n, 3), torch.arange(n))
+camera, draw = Camera(torch.eye(4), torch.tensor([[300.0, 0, 160], [0, 300, 100], [0, 0, 1]]), 320, 200, id=0), choose("cpu", "cpu")
+work = {"loss": lambda: losses.photometric(x, y, 0.2), "picture": lambda: draw(g, camera, torch.zeros(3))}["WHAT"]
+pages = int(Path("/proc/self/statm").read_text().split()[0])
+limits = resource.getrlimit(resource.RLIMIT_AS)
+resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + (16 << 20), limits[1]))
+try:
+    work()
+    print("no shortage")
+except RunError as error:
+    print(error)
+resource.setrlimit(resource.RLIMIT_AS, limits)
+work()
+print("went on")
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux") or native.load() is None, reason="needs the compiled library and Linux's limits")
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(("what", "said"), [("loss", "the photometric loss"), ("picture", "drawing 300,000 Gaussians")])
+def test_out_of_memory_is_an_error_that_a_process_survives(what, said, threads):
+    code = SHORT.replace("WHAT", what).replace("THREADS", str(threads))
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[0].startswith(f"{said} ran out of memory: use fewer") and done.stdout.endswith("went on\n")
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not bind processes to cores")
+def test_cores_are_those_that_this_process_may_use():
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        assert native.cores() == 1
+    finally:
+        os.sched_setaffinity(0, before)
+    assert native.cores() == len(before)

@@ -1,0 +1,77 @@
+"""The choice of a rasteriser: what `auto` takes, and what cannot be had."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from scene_experts import render
+from scene_experts.core.errors import InputError
+from scene_experts.core.types import Camera, Gaussians
+from scene_experts.native import library as native
+from scene_experts.render import NAMES, as_trained, choose
+
+
+def test_auto_on_the_cpu_is_the_compiled_one_where_it_loads():
+    assert choose("auto", "cpu").name == ("cpu" if native.load() is not None else "reference")
+
+
+def test_auto_without_a_library_warns_once_and_takes_the_reference(monkeypatch):
+    monkeypatch.setattr(native, "load", lambda level=None: None)
+    render._warn.cache_clear()
+    with pytest.warns(UserWarning, match="slow reference rasteriser"):
+        assert choose("auto", "cpu").name == "reference"
+    render._warn.cache_clear()
+
+
+def test_auto_on_a_device_without_a_fast_one_takes_the_reference():
+    render._warn.cache_clear()
+    with pytest.warns(UserWarning, match="slow reference rasteriser"):
+        assert choose("auto", "meta").name == "reference"
+    render._warn.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("name", "device", "said"),
+    [
+        ("gsplat", "cpu", "choose `cpu` or `reference`"),
+        ("cpu", "cuda", "choose `gsplat` or `reference`"),
+        ("opengl", "cpu", ", ".join(NAMES)),
+    ],
+)
+def test_what_cannot_be_had_names_what_can(name, device, said):
+    with pytest.raises(InputError, match=said):
+        choose(name, device)
+
+
+@pytest.mark.parametrize("name", ["reference", "cpu"])
+def test_options_reach_the_rasteriser(name):
+    if name == "cpu" and native.load() is None:
+        pytest.skip(str(native.why_not()))
+    assert choose(name, "cpu", antialias=True).antialias and not choose(name, "cpu").antialias
+
+
+@pytest.mark.parametrize("name", ["reference", "cpu"])
+def test_channels_come_out_in_the_order_they_went_in(name):
+    if name == "cpu" and native.load() is None:
+        pytest.skip(str(native.why_not()))
+    camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 5], [0, 20, 11], [0, 0, 1]]), 24, 16)
+    place, turn, colour = torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[0.9, 0.5, 0.1]])
+    one = Gaussians(place, turn, torch.full((1, 3), 0.1), torch.ones(1), colour, torch.zeros(1, dtype=torch.int64))
+    picture = choose(name, "cpu")(one, camera, torch.tensor([0.0, 0.1, 0.2])).image
+    brightest = torch.nonzero(picture[..., 0] == picture[..., 0].max())[0]
+    assert brightest[0] in (10, 11) and brightest[1] in (4, 5), "row about cy, column about cx"
+    assert picture[10, 4, 0] > 0.7 and 0.4 < picture[10, 4, 1] < 0.5 and picture[10, 4, 2] < 0.15
+    torch.testing.assert_close(picture[0, -1], torch.tensor([0.0, 0.1, 0.2]))
+
+
+def test_a_rasteriser_is_as_the_run_was_trained():
+    draw = choose("reference", "cpu")
+    assert as_trained(draw, False) is draw and as_trained(draw, True) == replace(draw, antialias=True)  # type: ignore[type-var]
+    plain = object()  # one that has no compensation
+    assert as_trained(plain, True) is plain  # type: ignore[arg-type]
+
+
+def test_gsplat_says_that_it_is_not_deterministic():
+    with pytest.warns(UserWarning, match="--device cpu"):
+        assert choose("gsplat", "cuda", deterministic=True).name == "gsplat"

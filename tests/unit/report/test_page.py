@@ -1,0 +1,142 @@
+"""The page: whole, self-contained, of one run and of several."""
+
+import base64
+import io
+import json
+import re
+from dataclasses import replace
+
+import pytest
+from PIL import Image
+
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import write_json
+from scene_experts.report.page import NAME, write
+from scene_experts.training.config import to_json
+from support.records import record
+
+
+def run(folder, recipe="moe-gs", pictures=True):
+    made = record(recipe, views=3)
+    config = replace(made.config, command=f"scene-experts train {recipe} --data <here> --out run")
+    write_json(folder / "config.json", {"format": 1, **to_json(config)})
+    results = {**made.results, "capture": "fox", "views": "test", "view_count": 3, "split": "mod8", "resolution": "as-is", "step": 3000}
+    write_json(folder / "results.json", results)
+    write_json(folder / "per_view.json", {name: {"file": name, **facts} for name, facts in made.per_view.items()})
+    lines = [
+        {"step": s, "psnr": 20 + s / 10, "terms": {"l1": 0.1}, "anchors": 5, "active": 0.5, "gaussians": 9, "seconds": s} for s in range(9)
+    ]
+    lines += [{"step": 9, "grown": 3, "pruned": 1, "anchors": 7}]
+    lines += [{**lines[5], "step": 10 + s, "routing": {"cov": [0.6, 0.4]}, "entropy": {"cov": 0.9}} for s in range(3)]
+    (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)) + '\n{"torn')
+    if pictures:
+        for kind, colour in (("gt", "red"), ("renders", "blue"), ("errors", "black")):
+            (folder / "test" / kind).mkdir(parents=True)
+            for name in made.per_view:
+                Image.new("RGB", (1200, 600), colour).save(folder / "test" / kind / name)
+    return folder
+
+
+def test_one_run_is_one_file_that_needs_nothing_else(tmp_path):
+    path = write([run(tmp_path)])
+    text = path.read_text()
+    assert path == tmp_path / NAME
+    assert not re.findall(r'(?:src|href)="(?!data:)|https?://|@import', text)
+    for word in ("moe-gs on fox", "30.00", "Held-out views", "gate entropy", "share of cov", "--data &lt;here&gt;", "top_k"):
+        assert word in text, word
+    assert "$title" not in text and "$body" not in text
+    pictures = json.loads(re.search(r"const pictures = (.+);</script>", text)[1])  # type: ignore[index]
+    assert len(pictures) == 3 * 3
+    first = Image.open(io.BytesIO(base64.b64decode(pictures["0.0.0"].partition(",")[2])))
+    assert first.size == (960, 480) and first.getpixel((5, 5))[0] > 200  # type: ignore[index]
+
+
+def strips(text):
+    """The sizes of the strips of a page, by their attribute."""
+    found = re.findall(r"<img class='strip' alt='(\w+) experts' src='data:image/jpeg;base64,([^']+)'>", text)
+    return {attribute: Image.open(io.BytesIO(base64.b64decode(data))).size for attribute, data in found}
+
+
+def test_strips_of_each_experts_anchors(tmp_path):
+    folder = run(tmp_path)
+    assert not strips(write([folder]).read_text())
+    results = json.loads((folder / "results.json").read_text())
+    shares = {"share": [0.5, 0.3, 0.2], "k": 2}
+    write_json(folder / "results.json", {**results, "experts": dict.fromkeys(("opacity", "cov", "color"), shares)})
+    (folder / "test" / "experts").mkdir()
+    for attribute in ("opacity", "cov", "color"):
+        Image.new("RGB", (2900, 400), "red").save(folder / "test" / "experts" / f"{attribute}.png")
+    text = write([folder]).read_text()
+    assert strips(text) == dict.fromkeys(("color", "opacity", "cov"), (1600, 221)) and list(strips(text)) == ["color", "opacity", "cov"]
+    assert "0.png: <span class='soft'>the anchors routed to each expert, drawn alone; with Top-2 every anchor is in 2 pictures." in text
+    open_part = re.sub(r"<details>.*?</details>", "", text)
+    assert list(strips(open_part)) == ["color"]
+    (folder / "test" / "experts" / "color.png").unlink()
+    write_json(folder / "results.json", {**results, "experts": {"cov": {"mean_gate": [0.5, 0.3, 0.2], "k": None}}})
+    dense = write([folder]).read_text()
+    assert list(strips(dense)) == ["cov"] and "the mixture is dense" in dense and "Top-" not in dense.partition("To repeat")[0]
+
+
+def test_several_runs_stand_beside_each_other(tmp_path):
+    runs = [run(tmp_path / "a"), run(tmp_path / "b", "scaffold-gs")]
+    text = write(runs, tmp_path / "both.html").read_text()
+    assert "moe-gs, scaffold-gs on fox" in text and text.count("<option value='0.0.1'") == 2
+    same = write([tmp_path / "a", run(tmp_path / "c")], tmp_path / "same.html").read_text()
+    assert "a (moe-gs)" in same and "c (moe-gs)" in same
+    with pytest.raises(InputError, match="--out"):
+        write(runs)
+
+
+def test_runs_that_were_not_scored_alike_are_no_rivals(tmp_path):
+    runs = [run(tmp_path / "a"), run(tmp_path / "b", "scaffold-gs")]
+    alike = write(runs, tmp_path / "alike.html").read_text()
+    assert "class=best" in alike and "Do not compare" not in alike
+    results = json.loads((runs[1] / "results.json").read_text())
+    write_json(runs[1] / "results.json", {**results, "capture": "kitchen"})
+    text = write(runs, tmp_path / "other.html").read_text()
+    assert "moe-gs, scaffold-gs on fox, kitchen" in text and "class=best" not in text
+    assert "Do not compare these scores:</b> expected the same capture, found fox in moe-gs and kitchen in scaffold-gs." in text
+    assert "moe-gs: 3 test views (mod8), as-is, 3,000 iterations<br>scaffold-gs: 3 test" not in alike  # said once where all are alike
+    write_json(runs[1] / "results.json", {**results, "capture": "kitchen", "split": "files", "step": 231, "iterations": 3000})
+    write_json(runs[1] / "checkpoints" / "ckpt_000400.safetensors", {})
+    text = write(runs, tmp_path / "other.html").read_text()
+    assert "scaffold-gs: 3 test views (files), as-is, 231 of 3,000 iterations" in text
+    assert "scaffold-gs was scored at iteration 231 and is at 400 now: run `scene-experts eval" in text
+    assert "<h3>fox</h3>" in text and "<h3>kitchen</h3>" in text and "<h3>" not in alike
+    pictures = json.loads(re.search(r"const pictures = (.+);</script>", text)[1])  # type: ignore[index]
+    assert len(pictures) == 2 * 3 * 3  # of each its own photographs, renders and errors
+    per_view = json.loads((runs[1] / "per_view.json").read_text())
+    write_json(runs[1] / "per_view.json", {f"other-{name}": facts for name, facts in per_view.items()})
+    write_json(runs[1] / "results.json", results)
+    assert "no view that all of these runs held out" in write(runs, tmp_path / "apart.html").read_text()
+
+
+def test_a_run_without_pictures_or_results(tmp_path):
+    assert "no pictures" in write([run(tmp_path / "a", pictures=False)]).read_text()
+    (tmp_path / "a" / "results.json").unlink()
+    with pytest.raises(InputError, match="expected an evaluated run"):
+        write([tmp_path / "a"])
+    with pytest.raises(InputError, match="at least one"):
+        write([])
+
+
+def test_torn_and_foreign_files(tmp_path):
+    folder = run(tmp_path)
+    with (folder / "metrics.jsonl").open("ab") as stream:
+        stream.write(b"\xff\xfe\0\n")  # what a power cut leaves
+    assert "gate entropy" in write([folder]).read_text()
+    (folder / "test" / "gt" / "0.png").write_bytes(b"torn")
+    with pytest.raises(InputError, match=r"expected a picture at .* evaluate again"):
+        write([folder])
+    for wrong in ([1], {"a.png": 3}, {"a.png": {}}):
+        write_json(folder / "per_view.json", wrong)
+        with pytest.raises(InputError, match="expected scores by view in"):
+            write([folder])
+
+
+def test_an_imported_run_claims_no_training(tmp_path):
+    folder = run(tmp_path)
+    results = json.loads((folder / "results.json").read_text())
+    write_json(folder / "results.json", {**results, "step": 0, "iterations": 0, "train_seconds": 0.0})
+    text = write([folder]).read_text()
+    assert "0 iterations" not in text and "train s" not in text and "steps" not in text

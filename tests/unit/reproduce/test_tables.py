@@ -1,0 +1,80 @@
+"""Tables: ours beside the paper's, spreads, best cells, notes; LaTeX that escapes."""
+
+from scene_experts.reproduce.experiments import EXPERIMENTS
+from scene_experts.reproduce.tables import by_dataset, by_scene, escape, expert_shares, published, to_latex, write_all
+from support.records import record
+
+TABLE4, TABLE3 = EXPERIMENTS["table4"], EXPERIMENTS["table3"]
+
+
+def runs():
+    out = [record("moe-gs", "truck", seed, psnr=24 + seed, views=1, iterations=30_000) for seed in (0, 1)]
+    return [*out, record("scaffold-gs-opacity", "truck", 0, psnr=23.0, views=1, mb=8.0)]
+
+
+def test_ours_stand_beside_the_papers():
+    table = by_dataset(TABLE4, runs(), "TanksAndTemples", ["truck"])
+    assert table.titles[:5] == ("", "PSNR", "SSIM", "LPIPS", "MB") and table.titles[5] == "PSNR (paper)"
+    rows = {row[0]: row for row in table.rows}
+    assert rows["MoE-GS"][1] == "24.50 ± 0.71" and rows["MoE-GS"][5] == "24.61"
+    assert rows["w/o MoE"][1] == "23.00" and rows["w/o CL"][1] == "-" and rows["w/o CL"][5] == "24.42"
+    assert not table.best and "w/o MoE: no run on truck with seed 1" in table.notes  # means over other seeds are no rivals
+    table = by_dataset(TABLE4, [r for r in runs() if r.seed == 0], "TanksAndTemples", ["truck"])
+    assert (list(rows).index("MoE-GS"), 1) in table.best and (list(rows).index("w/o MoE"), 4) in table.best
+    table = by_dataset(TABLE4, runs(), "TanksAndTemples", ["truck"])
+    assert (
+        any(note.startswith("no run: w/o CL") for note in table.notes)
+        and "3,000 iterations (13 adjustments of density), 30,000 iterations (134 " in table.notes[0]
+    )
+
+
+def test_own_captures_have_no_published_numbers():
+    assert published(TABLE4, "captures") == {}
+    assert len(by_dataset(TABLE4, runs(), "captures", ["truck"]).titles) == 5
+
+
+def test_table_3_is_of_one_column():
+    assert published(TABLE3, "DeepBlending") == {"Scaffold-GS": [41.0], "Scaffold-GS+L_opacity": [70.5]}
+    table = by_dataset(TABLE3, [record("scaffold-gs", "playroom", active=0.4)], "DeepBlending", ["playroom"])
+    assert table.rows[0] == ("Scaffold-GS", "40.0", "41.0") and not table.best
+
+
+def test_scene_by_scene():
+    table = by_scene(TABLE4, runs(), ["truck", "train"])
+    assert table.titles == ("PSNR", "truck", "train") and dict(zip([r[0] for r in table.rows], table.rows))["MoE-GS"][2] == "-"
+    assert not table.best
+    alike = by_scene(TABLE4, [r for r in runs() if r.seed == 0], ["truck", "train"])
+    assert alike.best == {([r[0] for r in alike.rows].index("MoE-GS"), 1)}
+
+
+def test_the_three_files():
+    table = by_dataset(TABLE4, runs(), "TanksAndTemples", ["truck"])
+    files = write_all("Table 4", {"T&T": table})
+    assert files["md"].startswith("# Table 4") and "| MoE-GS |" in files["md"].replace("**", "")
+    assert files["csv"].splitlines()[0] == "table,row,column,value,spread"
+    assert "T&T,w/o MoE,PSNR,23.00," in files["csv"] and "T&T,MoE-GS,PSNR,24.50,0.71" in files["csv"] and "w/o CL,PSNR," not in files["csv"]
+    assert r"w/o L\_load" in to_latex(table, "T&T") and r"\caption{T\&T}" in to_latex(table, "T&T") and r"$\pm$" in files["tex"]
+    assert escape("50 %") == r"50 \%"
+
+
+def test_a_row_that_lacks_a_scene_is_no_rival():
+    table = by_dataset(
+        TABLE4, [*runs(), record("scaffold-gs-opacity", "train", 0, psnr=10.0, views=1)], "TanksAndTemples", ["truck", "train"]
+    )
+    assert (list(TABLE4.rows).index("MoE-GS"), 1) not in table.best and "MoE-GS: no run on train" in table.notes
+
+
+def test_notes_say_which_seeds_each_mean_is_of():
+    pair = [record("moe-gs", s, seed, psnr=24.0 + seed) for s in ("truck", "train") for seed in (0, 1)]
+    lacking = [record("scaffold-gs-opacity", s, seed) for s, seed in (("truck", 0), ("truck", 1), ("train", 0))]
+    found = by_dataset(TABLE4, [*pair, *lacking], "TanksAndTemples", ["truck", "train"]).notes
+    assert "w/o MoE: means of seeds 0, the others lack scenes" in found and not any("MoE-GS: means" in note for note in found)
+
+
+def test_shares_of_experts_at_the_end():
+    experts = {"cov": {"share": [0.5, 0.3, 0.2], "per_anchor": [1.0, 0.6, 0.4], "mean_gate": [0.4, 0.3, 0.3], "entropy": 0.5}}
+    table = expert_shares(EXPERIMENTS["fig3"], [record("moe-gs-e3-top2", seed=1), record("moe-gs-e3-top2", experts=experts)], "fox")
+    assert table is not None and table.rows == (("with L_load: cov", "50.0", "30.0", "20.0", "100.0", "60.0", "40.0", "0.50"),)
+    assert table.titles[3:5] == ("expert 3", "expert 1, of anchors")
+    dense = {"cov": {"share": None, "per_anchor": None, "mean_gate": [0.5, 0.5], "entropy": 1.0}}
+    assert expert_shares(EXPERIMENTS["fig3"], [record("moe-gs-e3-top2", experts=dense)], "fox") is None

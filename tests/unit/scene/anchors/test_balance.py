@@ -1,0 +1,108 @@
+"""Experts kept in use by biases: the rule of Wang et al. (2024) by hand, its state, and the promise that such a part takes two files."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import scene_experts
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import write_json
+from scene_experts.recipes import RECIPES
+from scene_experts.scene.anchors.balance import BalancedExperts, BalancedHead
+from scene_experts.scene.anchors.experts import Experts, MixtureHead
+from scene_experts.training.config import check, to_json
+from unit.scene.test_init import started
+
+SOURCE = Path(scene_experts.__file__).parent
+STEP = 2000  # after the dense warm-up
+
+
+def head(config: Experts, seed: int = 0) -> MixtureHead:
+    torch.manual_seed(seed)
+    made = config.build("color", 35, 16, 30, 32)
+    assert isinstance(made, MixtureHead)
+    return made
+
+
+def test_the_part_touches_its_own_file_and_the_recipes_alone():
+    own, names = (
+        SOURCE / "scene" / "anchors" / "balance.py",
+        ("BalancedExperts", "BalancedHead", "moe-gs-balance", "anchors.balance", "router_balance"),
+    )
+    naming = {p for p in SOURCE.rglob("*.py") if any(name in p.read_text() for name in names)}
+    assert naming == {own, SOURCE / "recipes.py"}
+    assert len(own.read_text().splitlines()) <= 60
+
+
+def test_without_speed_it_is_the_mixture_of_the_paper_bit_for_bit():
+    x, f = torch.randn(50, 35), torch.randn(50, 32)
+    for step in (1, STEP):
+        (a, ra), (b, rb) = (head(c)(x, f, step) for c in (Experts(), BalancedExperts(speed=0.0)))
+        assert torch.equal(a, b) and torch.equal(ra.gates, rb.gates) and (step == 1 or torch.equal(ra.chosen, rb.chosen))
+
+
+def test_biases_choose_and_gates_weigh():
+    made = head(BalancedExperts(speed=0.0))
+    f = torch.randn(40, 32)
+    with torch.no_grad():
+        made.router_balance.copy_(torch.tensor([0.0, 0.0, 2.0, 0.0, 1.5]))  # beyond any gate: everyone takes experts 2 and 4
+    routing, w = made.route(f, STEP, None)
+    assert (routing.chosen == torch.tensor([2, 4])).all()
+    gates = torch.softmax(made.logits(f, None), 1)
+    assert torch.equal(routing.gates, gates)
+    torch.testing.assert_close(w, gates[:, [2, 4]] / gates[:, [2, 4]].sum(1, keepdim=True))
+
+
+def test_the_biases_follow_the_count_of_a_training_view():
+    made = head(BalancedExperts(num=3, top_k=1, speed=0.01))
+    with torch.no_grad():
+        made.router_w.zero_()
+        made.router_b.copy_(torch.tensor([5.0, 0.0, 0.0]))
+    f = torch.randn(6, 32)
+    made.route(f, 1, None)
+    assert not made.router_balance.any()  # nothing is chosen while dense
+    with torch.no_grad():
+        made.route(f, STEP, None)
+    assert not made.router_balance.any()  # a preview teaches nothing
+    made.route(f, STEP, None)
+    assert made.router_balance.tolist() == pytest.approx([-0.01, 0.01, 0.01])  # counts 6, 0, 0; mean 2
+    made.routing(f, STEP)
+    assert made.router_balance.tolist() == pytest.approx([-0.01, 0.01, 0.01])  # a loss over the whole scene asks again at the same step
+    made.eval()
+    made.route(f, STEP + 1, None)
+    assert made.router_balance.tolist() == pytest.approx([-0.01, 0.01, 0.01])
+    assert not made.router_balance.requires_grad
+
+
+def test_a_collapsed_router_is_evened_out():
+    made, f = head(BalancedExperts(speed=0.002)), torch.randn(500, 32)
+    with torch.no_grad():
+        made.router_b[0] += 3.0
+    share = lambda: torch.bincount(made.route(f, STEP, None)[0].chosen.reshape(-1), minlength=5) / 1000  # noqa: E731
+    assert share()[0] > 0.45
+    for i in range(600):
+        made.route(f, STEP + 1 + i, None)
+    assert (share() - 0.2).abs().max() < 0.03
+
+
+def test_the_recipe_and_its_flags():
+    recipe = RECIPES["moe-gs-balance"][1]
+    check(recipe)
+    assert recipe.loss.load == 0 and recipe.loss.opacity == 0.01 and recipe.scene.decoder == BalancedExperts()
+    with pytest.raises(InputError, match=r"--scene\.decoder\.speed"):
+        BalancedExperts(speed=-1.0).check()
+    scene = started("moe-gs-balance")
+    assert all(isinstance(h, BalancedHead) for h in scene.heads.values()) and scene.native_weights(STEP) is None
+    assert {f"{a}.router_balance" for a in ("opacity", "cov", "color")} <= set(scene.network_tensors())
+
+
+def test_a_run_folder_is_read_where_nothing_else_named_the_part(tmp_path):
+    train = to_json(RECIPES["moe-gs-balance"][1])
+    write_json(tmp_path / "config.json", {"format": 1, "train": train, "data": {"path": "c"}, "type": "RunConfig"})
+    code = "from pathlib import Path; from scene_experts.training.run_folder import read_config; "
+    code += f"print(read_config(Path({str(tmp_path)!r})).train)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "BalancedExperts(" in done.stdout, done.stderr

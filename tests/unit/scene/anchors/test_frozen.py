@@ -1,0 +1,123 @@
+"""A frozen scene draws what the scene draws, bit for bit, for every recipe with anchors."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from scene_experts.core.types import Camera, Points
+from scene_experts.native import library as native
+from scene_experts.recipes import RECIPES
+from scene_experts.scene.anchors.experts import Experts, Router
+from scene_experts.scene.anchors.frozen import Frozen, freeze
+from scene_experts.scene.anchors.scene import Anchors, AnchorScene
+
+needs_native = pytest.mark.skipif(native.load() is None, reason="no compiled library")
+DONE = 1_000_000  # a step after every warm-up
+ANCHORED = [name for name, (_, cfg) in RECIPES.items() if isinstance(cfg.scene, Anchors)]
+
+
+def camera(index=0, x=0.3):
+    pose = torch.eye(4)
+    pose[:3, 3] = torch.tensor([x, -0.2, 4.0])
+    return Camera(pose, torch.tensor([[90.0, 0, 32], [0, 90, 24], [0, 0, 1]]), 64, 48, id=index)
+
+
+def trained(config: Anchors, n=600) -> AnchorScene:
+    """A scene whose columns look as after a training."""
+    g = torch.Generator().manual_seed(3)
+    xyz = torch.randn(n, 3, generator=g, dtype=torch.float64)
+    torch.manual_seed(3)
+    scene = config.start(Points(xyz, torch.zeros(n, 3, dtype=torch.uint8)), 5.0, [camera(i, 0.1 * i) for i in range(3)])
+    for name, scale in (("feature", 0.7), ("offsets", 0.3)):
+        scene.table.params[name].data.copy_(scale * torch.randn(scene.table.params[name].shape, generator=g))
+    return scene
+
+
+def halves(means, scales, camera):
+    """A visibility test that leaves gaps."""
+    return torch.arange(len(means)) % 3 != 1
+
+
+def same(found, expected):
+    assert torch.equal(found.rows, expected.rows) and torch.equal(found.raw_opacity, expected.raw_opacity)
+    for name, value in vars(expected.gaussians).items():
+        assert torch.equal(getattr(found.gaussians, name), value), name
+
+
+@pytest.mark.parametrize("recipe", ANCHORED)
+def test_every_recipe_draws_the_same_bits(recipe):
+    scene = trained(RECIPES[recipe][1].scene)
+    for fold in (True, False):
+        frozen = freeze(scene, DONE, fold)
+        if scene.native_weights(DONE) is None:
+            assert frozen is scene
+            continue
+        assert isinstance(frozen, Frozen) and frozen.folded == fold
+        for view in (camera(1), camera(7, -0.4)):
+            with torch.no_grad():
+                expected = scene(view, DONE, False, halves)
+            same(frozen(view, DONE, False, halves), expected)
+            assert len(expected.gaussians) and not frozen(view, DONE, False, halves).gaussians.means.requires_grad
+
+
+@needs_native
+@pytest.mark.parametrize(
+    "config",
+    [
+        Anchors(add_dist=("color",), decoder=Experts(num=7, top_k=3), hidden=24, F=20, K=3),
+        Anchors(decoder=Experts(num=4, top_k=1, attributes=("cov",))),
+        Anchors(decoder=Experts(num=16, top_k=5, router=Router(input_pos=True, bias=False))),
+        Anchors(appearance=6),
+        Anchors(appearance=6, decoder=Experts(top_k=None)),
+    ],
+    ids=["odd sizes", "top-1 of one attribute", "positions", "appearance", "appearance, dense"],
+)
+def test_other_heads_draw_the_same_bits(config):
+    scene = trained(config)
+    frozen = freeze(scene, DONE, fold_features=True)
+    assert isinstance(frozen, Frozen) and frozen.folded
+    for view in (camera(1), camera(7, -0.4)):
+        with torch.no_grad():
+            same(frozen(view, DONE, False, halves), scene(view, DONE, False, halves))
+    with torch.no_grad():
+        composed = replace(config, decode="composed")
+        scene.config = composed
+        exact = scene(camera(1), DONE, False, halves)
+    torch.testing.assert_close(frozen(camera(1), DONE, False, halves).raw_opacity, exact.raw_opacity, atol=1e-5, rtol=1e-4)
+
+
+@needs_native
+def test_while_dense_all_gates_are_kept_and_nothing_seen_draws_nothing():
+    scene = trained(RECIPES["moe-gs"][1].scene, n=50)
+    frozen = freeze(scene, 1)
+    assert isinstance(frozen, Frozen) and frozen.kept[0].chosen is None and frozen.kept[0].gates is not None
+    with torch.no_grad():
+        same(frozen(camera(), 1, False, halves), scene(camera(), 1, False, halves))
+    nothing = frozen(camera(), 1, False, lambda means, scales, camera: torch.zeros(len(means), dtype=torch.bool))
+    assert len(nothing.gaussians) == 0 and nothing.raw_opacity.shape == (0, scene.K)
+
+
+@needs_native
+def test_memory_is_what_it_says():
+    scene = trained(RECIPES["moe-gs"][1].scene, n=100)
+    N, frozen = len(scene.table), freeze(scene, DONE, fold_features=True)
+    assert isinstance(frozen, Frozen)
+    assert frozen.bytes == N * (3 * 2 * 32 * 4 + 3 * 2 * (8 + 4) + 12)  # first layers, routing, scales
+    lean = freeze(scene, DONE)
+    assert isinstance(lean, Frozen) and lean.bytes == N * (3 * 2 * (8 + 4) + 12)
+
+
+@needs_native
+def test_another_step_and_training_are_refused():
+    frozen = freeze(trained(Anchors(), n=20), 7)
+    with pytest.raises(ValueError, match="step 7"):
+        frozen(camera(), 8, False, halves)
+    with pytest.raises(ValueError, match="training"):
+        frozen(camera(), 7, True, halves)
+
+
+def test_what_the_native_decode_does_not_cover_stays_itself():
+    for config in (Anchors(decode="composed"), Anchors(quat_align=True), Anchors(decoder=Experts(mix="pre_activation"))):
+        scene = trained(config, n=20)
+        assert freeze(scene, 7) is scene

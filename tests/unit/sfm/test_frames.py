@@ -1,0 +1,45 @@
+"""Frames of a video: the sharpest of each stretch."""
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+
+from scene_experts.core.errors import InputError
+from scene_experts.sfm import frames
+
+
+def test_one_of_each_stretch_is_taken():
+    assert frames.sharpest([1, 3, 2, 9, 8, 7, 0, 0, 5], 3) == [1, 3, 8]
+    assert frames.sharpest([1.0, 2.0], 5) == [0, 1] and frames.sharpest([], 5) == []
+
+
+def test_blur_lowers_the_grade():
+    picture = Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8))
+    grades = [frames.sharpness(np.asarray(picture.filter(ImageFilter.GaussianBlur(r)))) for r in (0, 1, 2)]
+    assert grades[0] > grades[1] > grades[2]
+
+
+def test_the_sharp_frames_of_a_video_come_out_whole_and_in_order(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    generator = np.random.default_rng(0)
+    stream = ffmpeg.write_frames(str(tmp_path / "walk.mp4"), (96, 64), fps=10, macro_block_size=2, quality=9)
+    stream.send(None)
+    for shade in (40, 120, 200):  # of three frames each the middle one is sharp
+        noise = Image.fromarray((shade + generator.integers(-30, 30, (64, 96, 3))).astype(np.uint8))
+        for blur in (4, 0, 4):
+            stream.send(np.ascontiguousarray(noise.filter(ImageFilter.GaussianBlur(blur))))
+    stream.close()
+    said = []
+    names = frames.take(tmp_path / "walk.mp4", tmp_path / "out", 3, lambda *a: said.append(a))
+    assert names == ["frame_00001.jpg", "frame_00002.jpg", "frame_00003.jpg"] and said[-1] == ("frames", 3, 3)
+    pictures = [np.asarray(Image.open(tmp_path / "out" / name)).astype(float) for name in names]
+    assert [p.shape for p in pictures] == [(64, 96, 3)] * 3
+    assert np.allclose([p.mean() for p in pictures], [40, 120, 200], atol=6) and min(p.std() for p in pictures) > 8
+    assert ("looking for sharp frames", 9, 9) in said
+
+
+def test_a_file_that_is_no_video_is_told(tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    (tmp_path / "broken.mp4").write_bytes(b"nothing of the kind")
+    with pytest.raises(InputError, match="expected a video that ffmpeg reads"):
+        frames.take(tmp_path / "broken.mp4", tmp_path / "out", 3, lambda *_: None)

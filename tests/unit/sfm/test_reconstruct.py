@@ -1,0 +1,230 @@
+"""A capture made of photographs: the poses are those that are known, a stopped one goes on, and nothing is half there."""
+
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.data import load
+from scene_experts.sfm import reconstruct as run
+from scene_experts.sfm.reconstruct import LOG, NOTE, Options
+from scene_experts.sfm.work import NAME, PLACES
+from support.places import DEMO
+from unit.sfm.test_photos import photo
+
+BUDDHA = DEMO / "buddha"
+TOGETHER = ["008.jpg", "009.jpg", "017.jpg", "018.jpg", "025.jpg", "043.jpg", "053.jpg", "067.jpg"]  # they show much of each other
+
+
+def aligned(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """`a` [V, 3] moved, turned and scaled onto `b` (Umeyama 1991)."""
+    from_, to = a - a.mean(0), b - b.mean(0)
+    u, s, vh = torch.linalg.svd(to.T @ from_)
+    sign = torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vh).sign())], dtype=a.dtype))
+    scale = (s * sign.diagonal()).sum() / from_.square().sum()
+    return scale * from_ @ (u @ sign @ vh).T + b.mean(0)
+
+
+def centres(capture, names) -> torch.Tensor:
+    by_name = {view.name: view.camera.to(dtype=torch.float64).position for view in capture.views}
+    return torch.stack([by_name[name] for name in names])
+
+
+def test_poses_of_photographs_are_those_that_are_known(tmp_path):
+    if importlib.util.find_spec("pycolmap") is None:
+        pytest.skip("pycolmap is not installed")
+    source, out = tmp_path / "photos", tmp_path / "capture"
+    source.mkdir()
+    for name in TOGETHER:
+        shutil.copy(BUDDHA / "images" / name, source / name)
+    top = np.zeros((544, 800), np.uint8)
+    top[:400] = 255  # of two views the lower quarter does not count
+    for name in TOGETHER[:2]:
+        with Image.open(source / name) as picture:
+            Image.fromarray(top).resize(picture.size, Image.Resampling.NEAREST).save(source / f"{Path(name).stem}_mask.png")
+    steps = []
+    note = run.make(source, out, Options(max_side=640, threads=2), say=lambda _: None, progress=lambda *a: steps.append(a))
+    assert note == json.loads((out / NOTE).read_text()) and note["with_pose"] == 8 and note["error"] < 1.0
+    assert not (out / NAME).exists() and {s[0] for s in steps} >= {"features", "matches", "poses (incremental)"}
+    made, known = load(out, split="none", normalise="none"), load(BUDDHA, split="none", normalise="none")
+    theirs = centres(known, TOGETHER)
+    off = (aligned(centres(made, TOGETHER), theirs) - theirs).norm(dim=1)
+    assert off.max() < 0.03 * torch.cdist(theirs, theirs).max(), off
+    lowest = lowest_features(out)
+    assert max(lowest[name] for name in TOGETHER[:2]) < 0.75 and max(lowest.values()) > 0.9, lowest
+    with pytest.raises(InputError, match=r"expected no capture in .* yet, found one"):
+        run.make(source, out, Options())
+
+
+def lowest_features(capture: Path) -> dict[str, float]:
+    """By photograph, where its lowest feature lies: 0 at the top edge, 1 at the bottom. pycolmap is asked in a process of its own."""
+    code = (
+        "import json, sys, pycolmap; found = pycolmap.Reconstruction(sys.argv[1]).images.values(); "
+        "print(json.dumps({i.name: max(p.xy[1] for p in i.points2D) / i.camera.height for i in found}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(capture / "sparse" / "0")], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def black(folder: Path, count: int = 3) -> Path:
+    for i in range(count):
+        photo(folder / f"{i}.jpg", size=(64, 48))
+    return folder
+
+
+def answer(**said):
+    """A worker that says this."""
+
+    def reconstructed(request, log, say, progress):
+        reconstructed.requests.append(request)
+        model = Path(request["model"])
+        model.mkdir(parents=True)
+        (model / "cameras.bin").write_bytes(b"new")
+        return {"step": "done", "version": "0", "registered": [], **said}
+
+    reconstructed.requests = []
+    return reconstructed
+
+
+FOUND = {
+    "registered": ["0.jpg", "2.jpg"],
+    "mapper": "incremental",
+    "apart": [],
+    "points": 5,
+    "error": 0.5,
+    "observations": 3.0,
+    "cameras": [],
+}
+
+
+@pytest.fixture(autouse=True)
+def with_pycolmap(monkeypatch, request):
+    """Whether pycolmap is installed matters to the test of the poses alone."""
+    if "known" not in request.node.name:
+        monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: name)
+
+
+def make(source, out, options=Options(), **more):  # noqa: B008
+    return run.make(source, out, options, say=lambda _: None, **more)
+
+
+def test_photographs_that_fit_nowhere_leave_the_reason_and_nothing_else(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "reconstructed", answer())
+    with pytest.raises(InputError, match="found none that fit together"):
+        make(black(tmp_path / "photos"), tmp_path / "out")
+    assert [p.name for p in (tmp_path / "out").iterdir()] == [NAME]
+    with pytest.raises(InputError, match="found one that is not whole; give its `scene-experts capture PHOTOS"):
+        load(tmp_path / "out")
+
+
+def test_frames_of_a_video_are_taken_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "reconstructed", answer())
+    taken = []
+
+    def take(video, folder, count, progress):
+        taken.append(count)
+        black(folder, count)
+        return list(range(count))
+
+    monkeypatch.setattr(run.frames, "take", take)
+    video = tmp_path / "walk.mp4"
+    video.write_bytes(b"frames")
+    for count, message in [(5, "fit together"), (5, "fit together"), (4, "fit together"), (2, "a video of at least 3 frames")]:
+        with pytest.raises(InputError, match=message):
+            make(video, tmp_path / "out", Options(frames=count))
+    assert taken == [5, 4, 2]
+
+
+def test_the_same_request_finds_its_database_again_and_another_does_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "reconstructed", answer())
+    source, kept = black(tmp_path / "photos"), tmp_path / "out" / NAME / "database" / "colmap.db"
+
+    def ask(options=Options()):  # noqa: B008
+        with pytest.raises(InputError, match="fit together"):
+            make(source, tmp_path / "out", options)
+
+    ask()
+    kept.write_bytes(b"features")
+    ask(Options(matching="sequential"))
+    assert kept.exists()
+    ask(Options(max_side=800))
+    assert not kept.exists()
+    kept.write_bytes(b"features")
+    photo(source / "1.jpg", size=(64, 48), model="B")  # another photograph of the same name
+    ask(Options(max_side=800))
+    assert not kept.exists()
+
+
+def test_new_poses_take_the_place_of_old_ones_whole(tmp_path, monkeypatch):
+    worker = answer(**FOUND)
+    monkeypatch.setattr(run, "reconstructed", worker)
+    out = tmp_path / "out"
+    note = make(black(tmp_path / "photos"), out)
+    assert note["without_pose"] == ["1.jpg"] and note["with_pose"] == 2 and note["copied"] and note["all_compared"]
+    assert worker.requests[0]["pairs"] == [("0.jpg", "1.jpg"), ("0.jpg", "2.jpg"), ("1.jpg", "2.jpg")]
+    (out / PLACES["model"] / "frames.bin").write_bytes(b"old")
+    make(black(tmp_path / "others", 4), out, overwrite=True)
+    assert [p.name for p in (out / PLACES["model"]).iterdir()] == ["cameras.bin"]
+    assert sorted(p.name for p in out.iterdir()) == sorted(place.split("/")[0] for place in PLACES.values())
+    assert len(list((out / "images").iterdir())) == 4
+
+
+def test_a_capture_s_own_images_stay_as_they_are(tmp_path, monkeypatch):
+    worker = answer(**FOUND)
+    monkeypatch.setattr(run, "reconstructed", worker)
+    images = black(tmp_path / "images")
+    (images / "notes.txt").write_text("mine")
+    assert not make(images, tmp_path)["copied"] and worker.requests[0]["images"] == str(images)
+    assert (images / "notes.txt").exists()
+    with pytest.raises(InputError, match=r"expected no images at .*found others; choose another --out"):
+        make(black(tmp_path.parent / "elsewhere"), tmp_path, overwrite=True)
+
+
+def test_what_is_somebody_s_is_not_touched(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "reconstructed", answer(**FOUND))
+    out = tmp_path / "out"
+    for inside in (f"{NAME}/done", "sparse/photos", "images/more"):
+        with pytest.raises(InputError, match="expected photographs outside of"):
+            make(black(out / inside), out)
+        assert len(list((out / inside).iterdir())) == 3
+    with pytest.raises(InputError, match="expected a folder of its own for the capture"):
+        make(black(tmp_path / "photos"), tmp_path / "photos")
+    (tmp_path / "old" / "sparse").mkdir(parents=True)
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / "old" / "sparse" / f"{name}.bin").write_bytes(b"")
+    with pytest.raises(InputError, match=r"expected no capture in .* yet, found one"):
+        make(tmp_path / "photos", tmp_path / "old")
+
+
+def test_what_is_no_folder_and_no_video_is_told(tmp_path, monkeypatch):
+    with pytest.raises(InputError, match="found one photograph at"):
+        make(photo(tmp_path / "1.jpg"), tmp_path / "out")
+    with pytest.raises(InputError, match="found nothing; correct the path"):
+        make(tmp_path / "none", tmp_path / "out")
+    monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"found none; pip install 'scene-experts\[sfm\]'"):
+        make(black(tmp_path / "photos"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("code", "error", "message"),
+    [
+        ("print('{\"step\": \"missing\", \"why\": \"no module\"}')", InputError, r"expected pycolmap .*no module.*scene-experts\[sfm\]"),
+        ("import os; print('{\"step\": \"features\"}', flush=True); os.abort()", RunError, "code -6.*: it said nothing; all"),
+        ("import sys; sys.exit('E20261122 10:00 1 sqlite.h:9] disk is full')", RunError, "exit code 1.*: disk is full; all of its words"),
+    ],
+)  # fmt: skip
+def test_a_worker_that_fails_is_told(tmp_path, monkeypatch, code, error, message):
+    (tmp_path / "worker.py").write_text(code)
+    monkeypatch.setattr(run.worker, "__file__", str(tmp_path / "worker.py"))
+    with pytest.raises(error, match=message):
+        run.reconstructed({"threads": 1, "pairs": ["x" * 200] * 1000}, tmp_path / LOG, lambda _: None, lambda *_: None)

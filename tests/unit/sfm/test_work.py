@@ -1,0 +1,67 @@
+"""The hidden folder where a capture is made: published whole, from any moment on, and for one process."""
+
+from contextlib import suppress
+
+import pytest
+
+from scene_experts.core.errors import InputError
+from scene_experts.sfm import work
+
+
+def made(desk, text):
+    for name in work.PLACES:
+        path = desk / work.DONE / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if "." in name:
+            path.write_text(text)
+        else:
+            path.mkdir()
+            (path / "file").write_text(text)
+
+
+def there(out):
+    return [(out / place).read_text() if "." in name else (out / place / "file").read_text() for name, place in work.PLACES.items()]
+
+
+def test_what_is_done_takes_the_place_of_what_was_there(tmp_path):
+    for text in ("old", "new"):
+        with work.opened(tmp_path) as desk:
+            made(desk, text)
+            (desk / "database").mkdir()
+            work.publish(tmp_path)
+        assert there(tmp_path) == [text] * 3
+    assert [p.name for p in (tmp_path / work.NAME).iterdir()] in ([], [".lock"])
+
+
+@pytest.mark.parametrize("moves", range(7))
+def test_killed_between_any_two_moves_it_goes_on(tmp_path, monkeypatch, moves):
+    with work.opened(tmp_path) as desk:
+        made(desk, "old")
+        work.publish(tmp_path)
+        made(desk, "new")
+        rename, left = type(tmp_path).rename, [moves]
+
+        def some(self, target):
+            if left[0] == 0:
+                raise KeyboardInterrupt
+            left[0] -= 1
+            return rename(self, target)
+
+        monkeypatch.setattr(type(tmp_path), "rename", some)
+        with suppress(KeyboardInterrupt):
+            work.publish(tmp_path)
+        monkeypatch.undo()
+    with work.opened(tmp_path):
+        assert there(tmp_path) == ["new"] * 3
+
+
+def test_what_was_not_whole_is_not_published(tmp_path):
+    with work.opened(tmp_path) as desk:
+        made(desk, "half")
+    with work.opened(tmp_path):
+        assert not (tmp_path / "images").exists()
+
+
+def test_one_process_at_a_time(tmp_path):
+    with work.opened(tmp_path), pytest.raises(InputError, match="another process making one there; wait"), work.opened(tmp_path):
+        pass

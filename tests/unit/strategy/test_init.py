@@ -1,0 +1,32 @@
+"""Every recipe's strategy keeps the interface that the loop calls."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from scene_experts.core.errors import InputError
+from scene_experts.recipes import RECIPES
+from scene_experts.strategy import Edit
+from unit.scene.test_init import METHODS, started
+
+
+@pytest.mark.parametrize("recipe", METHODS)
+def test_nothing_is_due_at_the_first_iteration(recipe):
+    scene, strategy = started(recipe), RECIPES[recipe][1].scaled().growth
+    before = {k: v.clone() for k, v in scene.table.columns().items()}
+    assert strategy.update(scene, 1, torch.Generator()) is None
+    strategy.finish(scene, 1, dict.fromkeys(scene.rate_groups(), 0.0), torch.Generator())
+    assert all(torch.equal(before[k], v) for k, v in scene.table.columns().items())
+
+
+@pytest.mark.parametrize("recipe", METHODS)
+def test_impossible_numbers_are_refused(recipe):
+    strategy = RECIPES[recipe][1].growth
+    strategy.check()
+    with pytest.raises(InputError, match="max-anchors"):
+        replace(strategy, max_anchors=-1).check()
+
+
+def test_an_edit_says_what_it_did():
+    assert Edit(3, 1, 12) == Edit(grown=3, pruned=1, anchors=12, capped=False)

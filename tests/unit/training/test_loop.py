@@ -1,0 +1,289 @@
+"""Training end to end on a small coloured capture made in code: off-centre principal points, views of different sizes."""
+
+import json
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.data.capture import load
+from scene_experts.recipes import RECIPES
+from scene_experts.render import choose
+from scene_experts.scene.anchors.experts import Experts
+from scene_experts.scene.anchors.scene import Anchors
+from scene_experts.scene.gaussians import Explicit
+from scene_experts.scene.graph.scene import GraphPoints
+from scene_experts.strategy.split_clone import SplitClone
+from scene_experts.training.config import Data, RunConfig
+from scene_experts.training.events import Adjusted, Finished, Previewed, Saved, Started, Stepped, Stopped
+from scene_experts.training.loop import Run, iterate, rows_to_move, stepped, train, without_graph
+from scene_experts.training.state import Training
+from support.places import GOLDEN
+from support.synthetic import make_capture
+from unit.scene.test_init import METHODS
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("capture"), views=16).folder
+
+
+def config(recipe="moe-gs", **changes):
+    """A whole schedule in 600 iterations whose gates open early enough to grow."""
+    cfg = replace(RECIPES[recipe][1], **{"iterations": 600, **changes})
+    growth = replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=20))
+    return replace(cfg, growth=replace(growth, success_threshold=0.05) if hasattr(growth, "success_threshold") else growth)
+
+
+def events(cfg, folder, out=None, rasterizer="auto", world=None, **run):
+    capture = world or load(folder)
+    made = Run(RunConfig(cfg, Data(folder), stop_at=run.pop("stop_at", None)), out=out, **run)
+    try:
+        yield from train(cfg, made, capture, choose(rasterizer, "cpu", deterministic=True))
+    finally:
+        if world is None:
+            capture.images.close()
+
+
+def final(out: Path) -> dict[str, torch.Tensor]:
+    from scene_experts.core import checkpoint
+
+    return checkpoint.load(checkpoint.latest(out / "checkpoints"))[0]
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
+    assert a.keys() == b.keys()
+    for name in a:
+        assert torch.equal(a[name], b[name]), name
+
+
+@pytest.mark.parametrize("recipe", METHODS)
+def test_resumed_equals_uninterrupted_bit_for_bit_while_rows_come_and_go(recipe, folder, tmp_path):
+    cfg = config(recipe)
+    edits = [e for e in events(cfg, folder, tmp_path / "whole", stop_at=120) if isinstance(e, Adjusted)]
+    assert any(e.edit.grown for e in edits)
+    list(events(cfg, folder, tmp_path / "parts", stop_at=50))
+    kinds = [type(e) for e in events(cfg, folder, tmp_path / "parts", stop_at=90, resume=True)]
+    assert kinds[0] is Started
+    second = list(events(cfg, folder, tmp_path / "parts", stop_at=120, resume=True))
+    assert second[0].step == 90
+    same(final(tmp_path / "whole"), final(tmp_path / "parts"))
+
+
+def test_stopping_saves_and_goes_on(folder, tmp_path):
+    cfg, reasons = config(), []
+    seen = []
+    for event in events(cfg, folder, tmp_path, stop_at=60, stop=reasons, log_every=1):
+        seen.append(event)
+        if isinstance(event, Stepped) and event.step == 30:
+            reasons.append("SIGTERM")
+    assert isinstance(seen[-2], Saved) and seen[-1] == Stopped(30, "SIGTERM")
+    rest = list(events(cfg, folder, tmp_path, stop_at=60, resume=True))
+    assert rest[0].step == 30 and isinstance(rest[-1], Finished)
+
+
+def test_events_tell_what_happened(folder):
+    seen = list(events(config(), folder, stop_at=40, preview_every=20))
+    steps = [e for e in seen if isinstance(e, Stepped)]
+    assert [e.step for e in steps] == [10, 20, 30, 40]
+    assert set(steps[-1].terms) == {"l1", "dssim", "volume", "opacity", "load"}
+    assert set(steps[-1].routing) == {"opacity", "cov", "color"}
+    assert all(sum(s) == pytest.approx(1, abs=1e-3) for s in steps[-1].routing.values())
+    assert 0 < steps[-1].active < 1 and steps[-1].psnr > 5
+    assert [e.step for e in seen if isinstance(e, Previewed)] == [20, 40]
+
+
+def test_experts_without_loss_weights_and_one_expert_are_scaffold_gs_bit_for_bit(folder):
+    scaffold = config("scaffold-gs")
+    moe = config("moe-gs", loss=scaffold.loss)
+    one = replace(moe, scene=replace(moe.scene, decoder=replace(moe.scene.decoder, num=1, top_k=1)))
+    a, b = ([e.terms for e in events(c, folder, stop_at=30, log_every=5) if isinstance(e, Stepped)] for c in (scaffold, one))
+    assert a == b
+
+
+@pytest.mark.parametrize("scale", [100.0, 0.01])
+def test_the_unit_of_a_capture_does_not_matter(scale, folder, tmp_path):
+    scaled = make_capture(tmp_path, views=16, scale=scale).folder
+    a, b = ([e.terms for e in events(config(), f, stop_at=40, log_every=10) if isinstance(e, Stepped)] for f in (folder, scaled))
+    for x, y in zip(a, b):
+        assert x.keys() == y.keys() and all(y[k] == pytest.approx(x[k], rel=2e-3, abs=1e-6) for k in x)
+
+
+@pytest.mark.parametrize("recipe", METHODS)
+def test_losses_follow_the_golden_curve(recipe, tmp_path):
+    """The first 100 iterations at a fixed seed, Top-k from the 51st, in float64 by the reference parts, so that machines agree to 1e-3:
+    in float32 Adam turns the rounding of another instruction set into 1 % within these iterations. Recorded by this test with
+    SCENE_EXPERTS_RECORD=1."""
+    cfg = RECIPES[recipe][1]
+    if isinstance(cfg.scene, Explicit):  # through all degrees of the harmonics, four adjustments and a reset
+        cfg = config(recipe, iterations=1000, max_anchors=480)
+        cfg = replace(cfg, growth=replace(cfg.growth, reset_least=1)) if isinstance(cfg.growth, SplitClone) else cfg
+    elif isinstance(cfg.scene, Anchors) and isinstance(cfg.scene.decoder, Experts):
+        cfg = replace(cfg, scene=replace(cfg.scene, decoder=replace(cfg.scene.decoder, warmup=50)))
+    # Adam's first steps leave SAGS's features in near-ties; which of them its maxima take is soon a matter of the last bit.
+    until = 25 if isinstance(cfg.scene, GraphPoints) else 100
+    folder = make_capture(tmp_path, views=8, size=(48, 32), points=400).folder
+    seen = events(cfg, folder, rasterizer="reference", stop_at=until, log_every=5, dtype=torch.float64)
+    curve = [sum(e.terms.values()) for e in seen if isinstance(e, Stepped)]
+    path = GOLDEN / f"{recipe}.json"
+    if os.environ.get("SCENE_EXPERTS_RECORD"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps([round(c, 8) for c in curve], indent=1) + "\n")
+    assert curve == pytest.approx(json.loads(path.read_text()), rel=1e-3)
+
+
+def test_anchor_cap_holds(folder):
+    n = next(e for e in events(config(), folder, stop_at=1) if isinstance(e, Started)).anchors
+    capped = [e for e in events(config(max_anchors=n + 30), folder, stop_at=200) if isinstance(e, Adjusted)]
+    assert max(e.edit.anchors for e in capped) <= n + 30 and any(e.edit.capped for e in capped)
+
+
+def test_memory_cap_stops_growth(folder):
+    capped = [e for e in events(config(), folder, stop_at=100, max_memory=0.001) if isinstance(e, Adjusted)]
+    assert capped and not any(e.edit.grown for e in capped) and any(e.edit.capped for e in capped)
+
+
+def test_a_capture_without_points_or_training_views_is_refused(folder):
+    capture = load(folder)
+    cfg = config()
+    with pytest.raises(InputError, match="--init random"):
+        list(events(cfg, folder, world=replace(capture, points=None)))
+    with pytest.raises(InputError, match="--split"):
+        list(events(cfg, folder, world=replace(capture, train=())))
+    capture.images.close()
+
+
+def test_a_view_that_sees_nothing_trains_on(folder):
+    capture = load(folder)
+    away = []
+    for view in capture.views:
+        pose = view.camera.world_to_cam.clone()
+        pose[:3, 3] += torch.tensor([0.0, 0.0, -1000.0])
+        away.append(replace(view, camera=replace(view.camera, world_to_cam=pose)))
+    steps = [
+        e for e in events(config(), folder, world=replace(capture, views=tuple(away)), stop_at=5, log_every=1) if isinstance(e, Stepped)
+    ]
+    capture.images.close()
+    assert len(steps) == 5 and all(math.isfinite(v) for e in steps for v in e.terms.values()) and steps[-1].gaussians == 0
+
+
+def test_random_background_and_another_configuration_on_resume(folder, tmp_path):
+    list(events(config(random_background=True), folder, tmp_path, stop_at=5))
+    with pytest.raises(InputError, match="other settings"):
+        list(events(config(), folder, tmp_path, stop_at=6, resume=True))
+    with pytest.raises(InputError, match="scaffold-gs"):
+        list(events(config("scaffold-gs"), folder, tmp_path, stop_at=6, resume=True))
+
+
+def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count(folder):
+    capture = load(folder)
+    training = Training.start(config().scaled(), capture, "cpu")
+    run = Run(RunConfig(config(), Data(folder)))
+    done = iterate(training, run, capture, choose("auto", "cpu"))
+    capture.images.close()
+    half = torch.zeros_like(done.target[..., 0])
+    half[:, : half.shape[1] // 2] = 1
+    columns = half[0] > 0
+    mse = float((done.render.image.detach().clamp(0, 1) - done.target)[:, columns].square().mean())
+    assert stepped(training, replace(done, mask=half)).psnr == pytest.approx(-10 * math.log10(mse), rel=1e-5)
+    assert stepped(training, done).psnr != pytest.approx(-10 * math.log10(mse), rel=1e-5)
+
+
+def test_steps_tell_the_balance_of_the_experts(folder):
+    steps = [e for e in events(config(), folder, stop_at=60, log_every=1) if isinstance(e, Stepped)]  # dense to iteration 30
+    for e in steps:
+        assert set(e.balance) == set(e.entropy) == {"opacity", "cov", "color"}
+        assert all(1 - 1e-5 <= v <= 5 for v in e.balance.values()) or e.step > 30
+        assert all(0 <= v <= 1 + 1e-6 for v in e.entropy.values())
+    dense, sparse = steps[29], steps[30]
+    assert sum(dense.balance.values()) == pytest.approx(dense.terms["load"] / 0.01, rel=1e-4)
+    assert sum(sparse.balance.values()) == pytest.approx(sparse.terms["load"] / 0.01 / 2, rel=1e-4)
+
+
+def test_resuming_on_other_views_is_refused(folder, tmp_path):
+    list(events(config(), folder, tmp_path, stop_at=3))
+    capture = load(folder)
+    with pytest.raises(InputError, match="other views"):
+        list(events(config(), folder, tmp_path, world=replace(capture, train=capture.train[:2]), stop_at=6, resume=True))
+    capture.images.close()
+
+
+def test_losses_that_are_no_numbers_end_the_run_and_keep_its_checkpoint(folder, tmp_path, monkeypatch):
+    list(events(config(), folder, tmp_path, stop_at=5))
+    before = final(tmp_path)
+
+    def broken(decoded, render, target, weights, step, mask):
+        return {"l1": render.image.mean() * (math.nan if step > 8 else 1.0)}
+
+    monkeypatch.setattr("scene_experts.training.loop.terms", broken)
+    with pytest.raises(RunError, match="expected finite losses, found l1 = nan at iteration 9"):
+        list(events(config(), folder, tmp_path, stop_at=60, log_every=1, resume=True))
+    same(before, final(tmp_path))
+    with pytest.raises(RunError, match="at iteration 11"):  # not a moment to tell of it, but one to save
+        list(events(config(), folder, tmp_path, stop_at=60, log_every=20, save_every=11, resume=True))
+    same(before, final(tmp_path))
+    with pytest.raises(RunError, match="at iteration 10"):  # stopped
+        stop: list[str] = []
+        for event in events(config(), folder, tmp_path, stop_at=60, log_every=20, preview_every=10, stop=stop, resume=True):
+            stop += ["SIGTERM"] if isinstance(event, Previewed) else []
+    same(before, final(tmp_path))
+
+
+def test_more_anchors_than_the_cap_to_start_with_is_said(folder):
+    with pytest.raises(InputError, match="at most 100 anchors to start with"):
+        list(events(config(max_anchors=100), folder, stop_at=1))
+    with pytest.raises(InputError, match=r"at most 100 Gaussians to start with, found [0-9,]+; raise --max-anchors$"):
+        list(events(config("3dgs", max_anchors=100), folder, stop_at=1))
+
+
+def test_more_gaussians_than_the_recipes_own_cap_start_and_none_is_added(folder, caplog):
+    made = config("3dgs-mcmc")
+    made = replace(made, growth=replace(made.growth, max_anchors=100))
+    done = list(events(made, folder, stop_at=3))
+    assert isinstance(done[-1], Finished) and "more than the recipe's 100: none will be added" in caplog.text
+
+
+def test_the_routing_of_the_whole_scene_is_told_beside_the_views(folder, monkeypatch):
+    def stepped():
+        return [e for e in events(config(), folder, stop_at=20, log_every=10) if isinstance(e, Stepped)]
+
+    for event in stepped():
+        for shares in (event.scene_routing, event.scene_gates, event.routing):
+            assert shares.keys() == {"opacity", "cov", "color"} and all(sum(v) == pytest.approx(1, abs=1e-3) for v in shares.values())
+    monkeypatch.setattr("scene_experts.training.loop.ROUTED", 5)
+    few = stepped()
+    assert few[-1].scene_gates != event.scene_gates and few[-1].psnr == event.psnr  # a smaller sample, the same training
+
+
+def test_sparse_adam_moves_what_was_decoded(folder):
+    capture, rasterize = load(folder), choose("reference", "cpu")
+    cfg = replace(config(), sparse_adam=True)
+    moved = {}
+    for each in (cfg, replace(cfg, sparse_adam=False)):
+        training = Training.start(each.scaled(), capture, "cpu")
+        for _ in range(3):
+            before = training.scene.table.params["feature"].detach().clone()
+            done = iterate(training, Run(RunConfig(each, Data(folder))), capture, rasterize)
+        moved[each.sparse_adam] = (training.scene.table.params["feature"].detach() != before).any(1).nonzero().squeeze(1)
+        rows = rows_to_move(each, done.decoded)
+        assert (rows is None) == (not each.sparse_adam)
+        assert not each.sparse_adam or set(moved[True].tolist()) <= set(rows.tolist())
+    assert rows_to_move(cfg, replace(done.decoded, scene_opacity=torch.zeros(1, 1))) is None
+    capture.images.close()
+
+
+def test_what_an_iteration_leaves_holds_no_graph(folder):
+    capture = load(folder)
+    training = Training.start(config().scaled(), capture, "cpu")
+    done = iterate(training, Run(RunConfig(config(), Data(folder))), capture, choose("auto", "cpu"))
+    tensors = [done.render.image, done.decoded.gaussians.means, done.decoded.raw_opacity, *done.terms.values()]
+    assert not any(t.requires_grad for t in tensors)
+    assert training.largest.gaussians == len(done.decoded.gaussians) and training.largest.pixels == done.target[..., 0].numel()
+    x = torch.ones(1, requires_grad=True) * 2
+    kept = without_graph(({"a": x}, [x, 3], None))
+    assert not kept[0]["a"].requires_grad and not kept[1][0].requires_grad and kept[1][1:] == [3] and kept[2] is None
+    capture.images.close()

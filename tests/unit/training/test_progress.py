@@ -1,0 +1,61 @@
+import io
+from pathlib import Path
+
+from rich.console import Console
+
+from scene_experts.strategy import Edit
+from scene_experts.training.events import Adjusted, Finished, Saved, Started, Stepped, Stopped
+from scene_experts.training.progress import Bar, Progress, clock
+
+
+def test_a_log_file_gets_plain_lines():
+    out = io.StringIO()
+    with Progress(Console(file=out, width=200), every=0.0) as show:
+        show(Started(0, 200, 1234, 0.02))
+        show(Stepped(10, {"l1": 0.05, "dssim": 0.02}, 21.5, 1300, 800, 4000, 0.61, 1.0, {}))
+        show(Adjusted(100, Edit(10, 0, 1310, capped=True)))
+        show(Saved(200, Path("a/b")))
+        show(Finished(200, 75.0))
+        show(Stopped(100, "SIGINT"))
+    text = out.getvalue()
+    parts = (
+        "1,234 anchors on a lattice of 0.02",
+        "10/200",
+        "l1 0.0500",
+        "PSNR 21.50",
+        "anchors 1,300",
+        "active 61 %",
+        "it/s",
+        "left",
+        "cap on anchors",
+        "1:15",
+    )
+    for part in parts:
+        assert part in text, part
+    assert "--resume" in text and "\x1b" not in text
+
+
+def test_explicit_gaussians_are_called_so():
+    out = io.StringIO()
+    with Progress(Console(file=out, width=200), every=0.0) as show:
+        show(Started(0, 200, 1234))
+        show(Stepped(10, {"l1": 0.05}, 21.5, 1300, 800, 800, 0.0, 1.0, {}))
+        show(Adjusted(100, Edit(10, 0, 1310, capped=True)))
+    text = out.getvalue()
+    assert "1,234 Gaussians, 200" in text and "Gaussians 1,300" in text and "cap on Gaussians" in text
+    assert "anchors" not in text and "active" not in text and "lattice" not in text
+
+
+def test_clock():
+    assert [clock(s) for s in (0, 59.6, 61, 3661)] == ["0:00", "1:00", "1:01", "1:01:01"]
+
+
+def test_a_bar_speaks_in_lines_where_there_is_no_terminal():
+    console = Console(file=io.StringIO(), force_terminal=False)
+    with Bar(console, every=0.0) as tell:
+        tell("rendering", 3, 9)
+    assert console.file.getvalue() == "rendering: 3 of 9\n"  # type: ignore[attr-defined]
+    quiet = Console(file=io.StringIO(), force_terminal=False)
+    with Bar(quiet) as tell:
+        tell("rendering", 3, 9)
+    assert quiet.file.getvalue() == ""  # type: ignore[attr-defined]

@@ -1,0 +1,88 @@
+"""The state of a training: to named tensors and back, with nothing lost and nothing of another configuration let in."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from scene_experts.core.errors import InputError
+from scene_experts.data.capture import load
+from scene_experts.recipes import RECIPES
+from scene_experts.training.state import Training, config_hash, resume, save, scene_from
+from support.synthetic import make_capture
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    capture = load(make_capture(tmp_path_factory.mktemp("capture"), views=8).folder)
+    yield capture
+    capture.images.close()
+
+
+def started(capture, recipe="moe-gs") -> Training:
+    training = Training.start(RECIPES[recipe][1].scaled(), capture, "cpu")
+    for parameter in (p for group in training.optimizer.param_groups for p in group["params"]):
+        parameter.grad = torch.ones_like(parameter)
+    training.step = 7
+    training.set_rates()
+    training.optimizer.step()
+    training.next_view(capture.train)
+    return training
+
+
+@pytest.mark.parametrize("recipe", ["scaffold-gs", "moe-gs"])
+def test_restored_is_what_was_taken(recipe, capture):
+    before = started(capture, recipe)
+    tensors = {k: v.clone() for k, v in before.tensors().items()}
+    after = Training.restore(before.cfg, tensors, before.meta(), "cpu")
+    found = after.tensors()
+    assert found.keys() == tensors.keys()
+    assert all(torch.equal(found[k], tensors[k]) for k in tensors)
+    assert (after.step, after.queue, after.scene.meta()) == (7, before.queue, before.scene.meta())
+
+
+def test_rates_are_those_of_the_step(capture):
+    training = started(capture)
+    rates = training.rates()
+    assert rates["feature"] == pytest.approx(0.0075)
+    assert rates["offsets"] == pytest.approx(training.cfg.rates.at("offsets", 7, training.cfg.iterations, capture.extent))
+    assert rates.keys() == {group["name"] for group in training.optimizer.param_groups}
+
+
+def test_each_view_comes_once_an_epoch(capture):
+    training = Training.start(RECIPES["moe-gs"][1].scaled(), capture, "cpu")
+    seen = [training.next_view(capture.train)[0] for _ in range(2 * len(capture.train))]
+    half = len(capture.train)
+    assert sorted(seen[:half]) == sorted(seen[half:]) == sorted(capture.train)
+
+
+def test_another_configuration_is_refused(capture):
+    training = started(capture)
+    other = replace(training.cfg, seed=5)
+    assert config_hash(other) != config_hash(training.cfg)
+    with pytest.raises(InputError, match="other settings"):
+        Training.restore(other, training.tensors(), training.meta(), "cpu")
+
+
+def test_networks_of_another_recipe_are_refused(capture):
+    training = started(capture)
+    with pytest.raises(InputError, match="networks of this recipe"):
+        scene_from(RECIPES["scaffold-gs"][1].scaled(), training.tensors(), training.meta())
+
+
+def test_saved_is_found_again_and_none_is_none(capture, tmp_path):
+    training = started(capture)
+    assert resume(training.cfg, tmp_path, "cpu") is None
+    save(training, tmp_path, keep=2)
+    found = resume(training.cfg, tmp_path, "cpu")
+    assert found is not None and found.step == 7
+    (next(tmp_path.glob("ckpt_*"))).write_bytes(b"torn")
+    with pytest.raises(InputError, match="damaged"):
+        resume(training.cfg, tmp_path, "cpu")
+
+
+def test_the_first_checkpoints_still_fit():
+    """Hashes that the first release wrote; a new setting goes into LATER with the value that they were trained with."""
+    first = {"scaffold-gs": "f304f3c44732921f", "moe-gs": "536629188212acee"}
+    assert {name: config_hash(RECIPES[name][1].scaled()) for name in first} == first
+    assert config_hash(replace(RECIPES["moe-gs"][1], sparse_adam=True).scaled()) != first["moe-gs"]

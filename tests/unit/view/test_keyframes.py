@@ -1,0 +1,46 @@
+"""Keyframes: collected where a client stands, saved as a path that `render` reads, played back."""
+
+import json
+
+import numpy as np
+import pytest
+
+from scene_experts.view import path_files
+from unit.view.test_server import capture, joined, viewer  # noqa: F401
+
+pytest.importorskip("viser")
+
+
+def test_keyframes_become_a_path_that_render_reads(viewer, capture, tmp_path):  # noqa: F811
+    handle, keys = joined(viewer), viewer.panel.keyframes
+    keys.folder = tmp_path
+    keys.save(None)
+    assert "no keyframes" in keys.words.content and not list(tmp_path.iterdir())
+    for x in (0.0, 1.0, 2.0):
+        handle.camera.position = np.array([x, 0.0, 0.0])
+        keys.add(handle)
+    keys.save(None)
+    (path,) = tmp_path.iterdir()
+    assert json.loads(path.read_text())["fps"] == 24.0
+    made = path_files.read(path, capture.world, capture.views[0].camera)
+    assert len(made) == 97 and made.fps == 24.0  # two gaps of two seconds, both ends
+    assert np.allclose(made.cameras[48].position.numpy(), [1.0, 0, 0], atol=1e-4)
+    sent = []
+    handle.send_file_download = lambda name, data: sent.append((name, data))
+    keys.save(handle)
+    assert sent and json.loads(sent[0][1])["format"] == 1
+    keys.clear()
+    assert keys.keys == []
+
+
+def test_playing_moves_the_client(viewer):  # noqa: F811
+    handle, keys = joined(viewer), viewer.panel.keyframes
+    keys.play(handle)
+    assert "at least two" in keys.words.content
+    for x in (0.0, 1.0):
+        handle.camera.position = np.array([x, 0.0, 0.0])
+        keys.add(handle)
+    keys.seconds.value = 0.1
+    handle.camera.position = np.array([9.0, 9.0, 9.0])
+    keys.run(handle, fps=50.0)
+    assert np.allclose(handle.camera.position, [1.0, 0, 0], atol=1e-5)

@@ -1,0 +1,73 @@
+"""What a picture shows: each mode from its definition."""
+
+import pytest
+import torch
+
+from scene_experts.core.errors import InputError
+from scene_experts.render import choose
+from scene_experts.scene.anchors.frozen import freeze
+from scene_experts.view.paint import MODES, PALETTE, Look, paint, ramp, row_colours
+from unit.scene.test_init import CAMERA, started
+
+BLACK = torch.zeros(3)
+DRAW = choose("auto", "cpu")
+
+
+def decoded(recipe="moe-gs", step=2000):
+    with torch.no_grad():
+        return started(recipe)(CAMERA, step, False, DRAW.visible)
+
+
+def test_the_plain_picture_is_the_render():
+    scene = started("moe-gs")
+    with torch.no_grad():
+        image = DRAW(scene(CAMERA, 2000, False, DRAW.visible).gaussians, CAMERA, BLACK).image
+    assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK), image.clamp(0, 1))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_frozen_scene_gives_the_same_picture(mode):
+    scene = started("moe-gs")
+    draws = freeze(scene, 2000)
+    assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK, Look(mode), draws), paint(scene, CAMERA, 2000, DRAW, BLACK, Look(mode)))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_every_mode_gives_a_picture(mode):
+    picture = paint(started("moe-gs"), CAMERA, 2000, DRAW, BLACK, Look(mode))
+    assert picture.shape == (32, 48, 3) and picture.min() >= 0 and picture.max() <= 1 and torch.isfinite(picture).all()
+
+
+def test_expert_colours_are_the_weighted_palette():
+    made = decoded()
+    colours, routing = row_colours(made, Look("experts", "cov")), made.routing["cov"]
+    assert routing.chosen is not None
+    a, b = routing.chosen[0].tolist()
+    w = torch.softmax(routing.gates[0, [a, b]].log(), 0)
+    palette = torch.tensor(PALETTE)
+    assert torch.allclose(colours[0], w[0] * palette[a] + w[1] * palette[b], atol=1e-5)
+
+
+def test_entropy_of_even_gates_is_light_and_activation_counts_slots():
+    made = decoded()
+    assert torch.allclose(row_colours(made, Look("entropy"))[0], ramp(torch.tensor(1.0)), atol=0.02)  # a fresh router is nearly even
+    share = (made.raw_opacity[3] > 0).float().mean()
+    assert torch.allclose(row_colours(made, Look("activation"))[3], ramp(share))
+
+
+def test_one_expert_alone_draws_less_and_all_together_the_whole():
+    scene = started("moe-gs")
+    whole = paint(scene, CAMERA, 2000, DRAW, BLACK)
+    assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK, Look(only=(0, 1, 2, 3, 4))), whole)
+    assert paint(scene, CAMERA, 2000, DRAW, BLACK, Look("alpha", only=())).max() == 0
+
+
+def test_no_experts_no_expert_view():
+    with pytest.raises(InputError, match="expected a scene with experts"):
+        paint(started("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("experts"))
+    assert paint(started("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("activation")).shape == (32, 48, 3)
+
+
+def test_the_ramp_runs_dark_to_light():
+    light = ramp(torch.linspace(0, 1, 5)).sum(1)
+    assert (light.diff() > 0).all()

@@ -1,0 +1,58 @@
+"""What the controls offer for each kind of scene."""
+
+import numpy as np
+import pytest
+import torch
+
+from scene_experts.training.events import Finished, Stepped
+from unit.scene.test_init import started
+from unit.view.test_server import capture, viewer  # noqa: F401
+
+pytest.importorskip("viser")
+from scene_experts.view.panel import number_of_experts, positions
+
+
+def test_experts_are_counted():
+    assert number_of_experts(started("moe-gs")) == 5 and number_of_experts(started("scaffold-gs")) == 0
+    assert positions(started("moe-gs")).shape[1] == 3
+    balanced = started("moe-gs-balance")
+    balanced.train()
+    state, before = torch.random.get_rng_state(), [h.router_balance.clone() for h in balanced.heads.values()]
+    assert number_of_experts(balanced) == 5  # and changes nothing of a training
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert all(torch.equal(h.router_balance, b) for h, b in zip(balanced.heads.values(), before))
+
+
+def test_one_expert_alone(viewer):  # noqa: F811
+    for switch in viewer.panel.switches:
+        switch.value = False
+    viewer.panel.switches[2].value = True
+    assert viewer.panel.look().only == (2,)
+
+
+def test_cameras_and_anchors_come_and_go(viewer):  # noqa: F811
+    viewer.panel.show_frusta(True)
+    viewer.panel.show_anchors(True)
+    assert (
+        viewer.server.scene.get_handle_by_name("/anchors") is not None and viewer.server.scene.get_handle_by_name("/cameras/0") is not None
+    )
+    viewer.panel.show_frusta(False)
+    viewer.panel.show_anchors(False)
+    assert viewer.server.scene.get_handle_by_name("/anchors") is None and viewer.server.scene.get_handle_by_name("/cameras/0") is None
+
+
+def test_curves_follow_a_training(viewer):  # noqa: F811
+    viewer.panel.train()
+    for step in (10, 20):
+        viewer.panel.followed = 0.0
+        viewer.panel.drawn(0.1, viewer.capture.views[0].camera)  # somebody moves
+        viewer.panel.event(Stepped(step, {"l1": 0.1, "dssim": 0.2}, 20.0 + step, 100, 50, 400, 0.5, 1.0, {}))
+    assert viewer.panel.curves["psnr"] == [30.0, 40.0] and viewer.panel.curves["loss"] == [pytest.approx(0.3)] * 2
+    plots = dict(viewer.panel.charts)
+    assert np.array_equal(plots["psnr"].data[0], [10, 20]) and "iteration 20" in viewer.panel.status.content
+    viewer.panel.event(Finished(30, 9.0))
+    assert "ended at iteration 30" in viewer.panel.status.content and not viewer.panel.paused()
+
+
+def test_the_background_is_the_captures(viewer, capture):  # noqa: F811
+    assert torch.allclose(torch.tensor(viewer.panel.background()), torch.tensor(capture.background), atol=0.01)

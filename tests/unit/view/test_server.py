@@ -1,0 +1,177 @@
+"""The viewer without a browser: clients come, move, ask, go away, and send nonsense; in a browser it is driven in test_view_browser.py."""
+
+import threading
+import time
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from scene_experts.data.capture import load
+from scene_experts.evaluate.pictures import to_8bit
+from scene_experts.recipes import RECIPES
+from scene_experts.render import choose
+from scene_experts.view.paint import paint
+from scene_experts.view.paths import best_view
+from support.synthetic import make_capture
+
+pytest.importorskip("viser")
+from scene_experts.view.server import Client, Viewer
+
+DRAW = choose("auto", "cpu")
+
+
+class Handle:
+    """What the viewer uses of a viser client."""
+
+    def __init__(self, number=0):
+        self.client_id, self.pictures, self.update = number, [], None
+        self.camera = SimpleNamespace(
+            wxyz=np.array([1.0, 0, 0, 0]), position=np.zeros(3), fov=0.8, aspect=1.5, image_height=60, on_update=self.keep, look_at=None
+        )
+        self.scene = SimpleNamespace(set_background_image=lambda picture, **how: self.pictures.append((picture, how)))
+
+    def keep(self, function):
+        self.update = function
+
+    @contextmanager
+    def atomic(self):
+        yield
+
+    def move(self):
+        self.update(None)  # type: ignore[misc]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    capture = load(make_capture(tmp_path_factory.mktemp("capture"), views=9).folder)
+    yield capture
+    capture.images.close()
+
+
+@pytest.fixture
+def viewer(capture):
+    torch.manual_seed(0)
+    scene = RECIPES["moe-gs"][1].scene.start(capture.points, capture.extent)
+    made = Viewer(capture, lambda: (scene, 2000), DRAW, port=0)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def serving(viewer):
+    stop = threading.Event()
+    thread = threading.Thread(target=viewer.serve, args=(stop.is_set,), daemon=True)
+    thread.start()
+    yield viewer
+    stop.set()
+    thread.join(10)
+
+
+def joined(viewer, number=0) -> Handle:
+    handle = Handle(number)
+    viewer.connect(handle)
+    viewer.clients[number].moved = viewer.clients[number].arriving = 0.0
+    return handle
+
+
+def test_a_client_starts_at_the_best_held_out_view_and_gets_our_own_render(viewer, capture):
+    handle = joined(viewer)
+    viewer.draw()
+    (picture, how), camera = handle.pictures[-1], viewer.camera(viewer.clients[0])
+    assert how["format"] == "jpeg" and picture.shape == (60, 90, 3)
+    first = capture.views[best_view(capture)].camera
+    assert viewer.panel.chosen.value == viewer.panel.names[best_view(capture)]
+    assert torch.allclose(camera.world_to_cam, first.world_to_cam, atol=1e-5)
+    scene, step = viewer.current()
+    assert np.array_equal(picture, to_8bit(paint(scene, camera, step, DRAW, torch.tensor(capture.background))))
+    viewer.draw()
+    assert len(handle.pictures) == 1  # nothing changed
+
+
+def test_moving_gets_small_pictures_and_rest_the_full_one(viewer):
+    handle = joined(viewer)
+    viewer.draw()
+    viewer.clients[0].seconds_a_pixel = 1e-3
+    handle.move()
+    viewer.draw()
+    assert handle.pictures[-1][0].shape[0] < 60
+    viewer.clients[0].moved = time.monotonic() - 1
+    viewer.draw()
+    assert handle.pictures[-1][0].shape[0] == 60 and len(handle.pictures) == 3
+
+
+def test_controls_change_the_picture(viewer):
+    handle = joined(viewer)
+    viewer.draw()
+    for control, value in ((viewer.panel.mode, "experts"), (viewer.panel.switches[0], False), (viewer.panel.crop, True)):
+        control.value = value
+    viewer.panel.bounds[0].value = (viewer.panel.bounds[0].min, (viewer.panel.bounds[0].min + viewer.panel.bounds[0].max) / 2)
+    look = viewer.panel.look()
+    assert look.mode == "experts" and look.only == (1, 2, 3, 4) and look.box is not None and look.box[0][0] < look.box[1][0]
+    viewer.touch()
+    viewer.draw()
+    assert len(handle.pictures) == 2 and not np.array_equal(handle.pictures[0][0], handle.pictures[1][0])
+
+
+def test_the_photograph_is_wiped_over_the_render_at_its_view(viewer, capture):
+    handle = joined(viewer)
+    view = best_view(capture)
+    camera = capture.views[view].camera
+    handle.camera.aspect, handle.camera.image_height = camera.width / camera.height, camera.height
+    viewer.panel.wipe.value = 1.0
+    viewer.touch()
+    viewer.draw()
+    photo = capture.frame(view).rgb.float() / 255
+    assert torch.allclose(viewer.photograph(view, camera), photo, atol=2e-3)  # from its own camera it is itself
+    found = handle.pictures[-1][0]
+    assert np.array_equal(found, to_8bit(viewer.photograph(view, viewer.camera(viewer.clients[0]))))
+    viewer.clients[0].at_view = None
+    viewer.touch()
+    viewer.draw()
+    assert not np.array_equal(handle.pictures[-1][0], found)
+
+
+def test_nonsense_from_one_client_is_not_the_others_trouble(viewer):
+    bad, good = joined(viewer, 1), joined(viewer, 2)
+    for wrong in (np.full(4, np.nan), np.zeros(4), np.zeros(3), "x"):
+        bad.camera.wxyz = wrong
+        viewer.touch()
+        viewer.draw()
+    assert bad.pictures == [] and len(good.pictures) == 4
+    bad.camera.wxyz, bad.camera.fov = np.array([1.0, 0, 0, 0]), 99.0
+    viewer.touch()
+    viewer.draw()
+    assert bad.pictures == []
+
+
+def test_fifty_clients_that_go_leave_nothing(viewer):
+    for number in range(50):
+        handle = joined(viewer, number)
+        viewer.draw()
+        viewer.disconnect(handle)
+    assert viewer.clients == {} and viewer.due(time.monotonic()) == []
+
+
+def test_a_budget_leaves_clients_for_the_next_turn(viewer):
+    handles = [joined(viewer, n) for n in range(3)]
+    viewer.draw(budget=1e-9)
+    assert sum(len(h.pictures) for h in handles) <= 1
+    viewer.draw()
+    assert all(h.pictures for h in handles)
+
+
+def test_a_taken_port_is_told(viewer, capture):
+    taken = viewer.server.get_port()
+    other = Viewer(capture, viewer.current, DRAW, port=taken)
+    try:
+        assert other.moved and other.server.get_port() != taken and not viewer.moved
+    finally:
+        other.close()
+
+
+def test_clients_are_due_when_something_changed():
+    client = Client(Handle())
+    assert client.wanted and not client.full and not client.moving(time.monotonic())

@@ -1,0 +1,83 @@
+"""Frames to disk: pictures as they are, a video that reads back."""
+
+import numpy as np
+import pytest
+
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.evaluate import pictures
+from scene_experts.view import video
+
+
+def frames(count=6, size=(33, 47)):
+    y, x = np.mgrid[: size[0], : size[1]]
+    return [np.stack([x * 5, y * 7, np.full_like(x, 20 * i)], 2).astype(np.uint8) for i in range(count)]
+
+
+def test_pictures_are_the_frames_and_those_of_a_longer_path_go(tmp_path):
+    assert video.write_pictures(tmp_path, frames(5)) == 5
+    (tmp_path / "mine.png").write_bytes(b"kept")
+    assert video.write_pictures(tmp_path, frames(3)) == 3
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["00000.png", "00001.png", "00002.png", "frames.json", "mine.png"]
+    assert np.array_equal(pictures.read(tmp_path / "00002.png"), frames(3)[2])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="expected a folder"):
+        video.write_pictures(tmp_path / "file", frames(1))
+
+
+def test_numbered_pictures_of_somebody_else_are_not_touched(tmp_path):
+    (tmp_path / "00007.png").write_bytes(b"a photograph")
+    drawn = []
+    with pytest.raises(InputError, match=r"found 00007\.png; choose another --out"):
+        video.write_pictures(tmp_path, (drawn.append(f) or f for f in frames()))
+    assert not drawn and [p.name for p in tmp_path.iterdir()] == ["00007.png"]
+    (tmp_path / "00007.png").unlink()
+    video.write_pictures(tmp_path, frames(2))
+    (tmp_path / "00007.png").write_bytes(b"a photograph")
+    with pytest.raises(InputError, match="choose another --out"):
+        video.write_pictures(tmp_path, frames())
+    (tmp_path / "frames.json").write_text("{")
+    with pytest.raises(InputError, match=r"found 00000\.png"):
+        video.write_pictures(tmp_path, frames())
+
+
+def test_pictures_of_a_path_that_was_stopped_are_replaced(tmp_path):
+    def stopped():
+        yield from frames(3)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        video.write_pictures(tmp_path, stopped())
+    assert video.write_pictures(tmp_path, frames(2)) == 2
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["00000.png", "00001.png", "frames.json"]
+
+
+def test_a_video_that_was_cut_off_is_no_video(tmp_path, monkeypatch):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    whole = ffmpeg.count_frames_and_secs
+    monkeypatch.setattr(ffmpeg, "count_frames_and_secs", lambda path: (whole(path)[0] - 1, 1.0))
+    with pytest.raises(RunError, match="5 of 6 frames arrived"):
+        video.write_video(tmp_path / "v.mp4", frames(), 12.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_video_reads_back(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    assert video.write_video(tmp_path / "v.mp4", frames(), 12.0) == 6
+    reader = ffmpeg.read_frames(str(tmp_path / "v.mp4"))
+    meta = next(reader)
+    found = [np.frombuffer(f, np.uint8).reshape(34, 48, 3) for f in reader]
+    assert meta["size"] == (48, 34) and meta["fps"] == 12.0 and len(found) == 6  # odd sizes grow by a pixel
+    assert np.abs(found[0][:33, :47].astype(int) - frames()[0]).mean() < 12
+    assert [p.name for p in tmp_path.iterdir()] == ["v.mp4"]
+
+
+def test_without_an_encoder_the_error_says_what_to_install(monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(InputError, match="video"):
+        video.writer()
+
+
+def test_which_names_are_videos(tmp_path):
+    assert video.is_video(tmp_path / "a.MP4") and not video.is_video(tmp_path / "folder")
