@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from scene_experts.data.capture import Capture, load
+from scene_experts.data.summary import summarise
 from support.places import DEMO
 
 
@@ -15,7 +16,7 @@ def capture(request: pytest.FixtureRequest) -> Capture:
 
 
 def test_what_they_are(capture: Capture) -> None:
-    said = capture.summary()
+    said = summarise(capture)
     expected = {"buddha": (67, "684x385", 12505), "brighton": (18, "500x280", 7283)}[capture.name]
     assert (said["views"], *said["sizes"], said["points"]) == expected
     assert said["camera_models"] == {"PINHOLE": expected[0]} and said["extent"] == 5.0

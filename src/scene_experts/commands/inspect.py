@@ -9,7 +9,7 @@ from rich.console import Console
 
 from scene_experts.cli import COMMANDS, PROG
 from scene_experts.commands.shared import positional
-from scene_experts.data.report import show
+from scene_experts.data.summary import print_summary
 from scene_experts.training import run_folder
 from scene_experts.training.config import Data
 
@@ -21,7 +21,7 @@ def info(args: list[str]) -> int:
         args=positional(args, "--data"),
         description="Say what a capture holds; `info CAPTURE` does too.",
     )
-    show(run_folder.load_capture(run_folder.named(data), look=True), Console(highlight=False))
+    print_summary(run_folder.load_capture(run_folder.named(data), look=True), Console(highlight=False))
     return 0
 
 

@@ -106,9 +106,3 @@ class Capture:
         """A short hash of the views' names and sizes and of the split, by which a run knows its capture again wherever it lies."""
         seen = [[(v.name, v.camera.width, v.camera.height) for v in self.views], self.train, self.test]
         return hashlib.sha256(json.dumps(seen).encode()).hexdigest()[:16]
-
-    def summary(self) -> dict:
-        """What was detected, as plain values for printing and for results (see `data.summary`)."""
-        from scene_experts.data.summary import summarise
-
-        return summarise(self)

@@ -16,7 +16,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap import read_model, write_model
-from scene_experts.data.summary import neighbour_distance
+from scene_experts.data.summary import neighbour_distance, summarise
 from support.synthetic import Synthetic, make_capture, picture
 from unit.data.test_lens import LENSES
 
@@ -135,12 +135,12 @@ def test_masks_and_alpha(made: Synthetic, copy: Path) -> None:
     assert mask is not None and mask.dtype == torch.float32 and mask[:10].max() == 0 and mask[10:].min() == 1
     mask = capture.frame(1).mask
     assert mask is not None and torch.allclose(mask, torch.tensor(0.2))
-    assert capture.frame(2).mask is None and capture.summary()["masks"] == 1
+    assert capture.frame(2).mask is None and summarise(capture)["masks"] == 1
 
 
 def test_the_summary_is_json_and_true(made: Synthetic) -> None:
     capture = load(made.folder)
-    said = json.loads(json.dumps(capture.summary()))
+    said = json.loads(json.dumps(summarise(capture)))
     assert (said["views"], said["train"], said["test"], said["points"], said["kind"]) == (10, 8, 2, 300, "colmap")
     assert said["sizes"] == {"48x32": 4, "40x36": 3, "32x48": 3} and said["camera_models"] == {"PINHOLE": 10}
     assert capture.points is not None

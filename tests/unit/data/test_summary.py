@@ -1,12 +1,15 @@
-"""Statistics of a capture against their plain definitions."""
+"""The summary of a capture: its values against their plain definitions, and how it is printed."""
 
+import io
 import json
 from dataclasses import replace
 
+import pytest
 import torch
+from rich.console import Console
 
 from scene_experts.data.capture import load
-from scene_experts.data.summary import neighbour_distance, summarise
+from scene_experts.data.summary import format_value, neighbour_distance, print_summary, summarise
 from support.synthetic import make_capture
 
 
@@ -26,3 +29,31 @@ def test_counts_sizes_and_a_capture_without_points(tmp_path):
 def test_the_neighbour_distance_is_the_median_of_the_nearest_even_far_from_the_origin():
     grid = torch.cartesian_prod(*[torch.arange(6, dtype=torch.float64)] * 3) * 0.25 + 1e6
     assert neighbour_distance(grid) == 0.25 and abs(neighbour_distance(grid, exact=10) - 0.25) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (True, "yes"),
+        (False, "no"),
+        (1234567, "1,234,567"),
+        (0.1 + 0.2, "0.3"),
+        ({"48x32": 4, "40x36": 3}, "48x32 4, 40x36 3"),
+        ([0.0, 1.5], "0, 1.5"),
+        ("mod8", "mod8"),
+        (None, "None"),
+    ],
+)
+def test_values_are_formatted_for_a_reader(value, said):
+    assert format_value(value) == said
+
+
+def test_one_fact_a_row_then_the_warnings_on_one_line_each(tmp_path):
+    out = io.StringIO()
+    long = "a warning " * 30
+    capture = load(make_capture(tmp_path, views=6, size=(48, 32), points=40).folder)
+    print_summary(replace(capture, warnings=(long,)), Console(file=out, width=60))
+    rows = out.getvalue().splitlines()
+    assert ["views", "6"] in [row.split() for row in rows] and rows[-1] == f"warning: {long}"
+    assert not any(row.startswith("warnings") for row in rows)
+    capture.images.close()

@@ -13,6 +13,7 @@ from PIL import Image
 from scene_experts.core.errors import InputError
 from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
+from scene_experts.data.summary import summarise
 from support.synthetic import make_blender, make_capture, make_nerfstudio, picture
 from unit.data.test_lens import LENSES
 
@@ -48,7 +49,7 @@ def test_distorted_frames_are_undistorted(tmp_path: Path, index: int) -> None:
         truth = picture(flat, camera.world_to_cam.double().numpy(), 1.0, made.background)
         error = np.abs(capture.frame(camera.id).rgb.numpy() / 255 - truth)
         assert np.median(error) < 0.006 and error.mean() < 0.03
-    assert capture.summary()["undistorted"] == 3
+    assert summarise(capture)["undistorted"] == 3
 
 
 def test_frames_without_a_file_are_dropped_and_counted(tmp_path: Path) -> None:
