@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ from scene_experts.core.types import Camera, Points
 from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer, choose
 from scene_experts.render.cpu import CpuRasterizer
-from scene_experts.scene.anchors.scene import Anchors, AnchorScene
+from scene_experts.training.config import with_numbers
 from scene_experts.training.losses import terms
 from scene_experts.training.state import Training
 
@@ -88,13 +88,12 @@ def work(recipe: str, anchors: int, width: int, height: int, rasterize: Rasteriz
     side = (torch.rand(anchors, 2) - 0.5) * torch.tensor([1.0, height / width])
     xyz = torch.cat([side * depth[:, None].abs(), depth[:, None]], 1).double()
     K = torch.tensor([[width * 1.0, 0, width / 2], [0, width * 1.0, height / 2], [0, 0, 1.0]])
-    assert isinstance(cfg.scene, Anchors)
-    config = replace(cfg.scene, voxel_size=1e-4)
-    scene = AnchorScene.from_points(config, Points(xyz, torch.zeros(anchors, 3, dtype=torch.uint8)), 5.0)
+    cfg = with_numbers(cfg, [("scene.voxel_size", 1e-4)])
+    scene = cfg.scene.start(Points(xyz, torch.zeros(anchors, 3, dtype=torch.uint8)), 5.0)
     scene.table.params["feature"].data.normal_()
     scene.table.params["offsets"].data.normal_(0, 0.5)
     camera = Camera(torch.eye(4), K, width, height, 0.2)
-    return Work(Training(replace(cfg, scene=config), scene), camera, rasterize or choose("auto", "cpu"), torch.rand(height, width, 3))
+    return Work(Training(cfg, scene), camera, rasterize or choose("auto", "cpu"), torch.rand(height, width, 3))
 
 
 @torch.no_grad()

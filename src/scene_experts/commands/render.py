@@ -20,12 +20,10 @@ from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
 from scene_experts.evaluate.pictures import strip, to_8bit
 from scene_experts.render import as_trained
-from scene_experts.scene.anchors.frozen import freeze
 from scene_experts.training import run_folder
 from scene_experts.training.progress import Bar
 from scene_experts.view import path_files, paths, video
 from scene_experts.view.paint import Look, Mode, paint
-from scene_experts.view.panel import number_of_experts
 from scene_experts.view.paths import CameraPath
 
 
@@ -72,7 +70,7 @@ def render(args: list[str]) -> int:
     device, rasterize = backend(command.device, command.rasterizer, False, False)
     opened = [run_folder.open_run(run, device, command.step if run == command.run else None) for run in (command.run, *command.beside)]
     for run in opened:
-        count = number_of_experts(run.scene)
+        count = run.scene.traits.experts
         if command.only and max(command.only) > count:
             has = f"experts 1 to {count}" if count else "no experts"
             raise InputError(f"expected --only among the experts of {run.path}, which has {has}, found {max(command.only)}; correct it")
@@ -129,7 +127,7 @@ def drawn(
 ) -> Iterator[np.ndarray]:
     """The frames, each as 8-bit RGB: every run in every mode, side by side."""
     only = tuple(number - 1 for number in command.only) or None
-    frozen = [freeze(run.scene, run.step) for run in opened]
+    frozen = [run.scene.frozen(run.step) for run in opened]
     for i, camera in enumerate(cameras):
         camera = camera.to(background.device)
         tiles = []

@@ -12,7 +12,6 @@ import tyro
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import Device, Raster, backend
 from scene_experts.render import as_trained
-from scene_experts.scene.anchors.frozen import freeze
 from scene_experts.training import run_folder
 from scene_experts.view.server import Viewer, check_port, viser
 
@@ -51,7 +50,7 @@ def view(args: list[str]) -> int:
         command.port,
         label,
         paths=command.run / "paths",
-        draws=freeze(opened.scene, opened.step),
+        draws=opened.scene.frozen(opened.step),
     )
     if viewer.moved:
         print(f"warning: port {command.port} is taken, this scene is on another", file=sys.stderr)

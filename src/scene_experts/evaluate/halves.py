@@ -26,7 +26,7 @@ STEPS, RATE = 60, 0.1  # of Adam, from the mean of all codes; the rate falls lin
 
 def codes_of(scene: Scene) -> Codes:
     """The scene's appearance codes. Raises InputError where it has none."""
-    codes = getattr(scene, "codes", None)
+    codes = scene.codes
     if codes is None:
         raise InputError("expected a scene with appearance codes for --appearance half, found none; train with --scene.appearance 32")
     return codes

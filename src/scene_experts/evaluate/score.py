@@ -23,13 +23,12 @@ from scene_experts.core.types import Camera, Decoded, Render
 from scene_experts.evaluate import expert_pictures, halves, pictures, timing
 from scene_experts.evaluate.experts import expert_shares
 from scene_experts.evaluate.metrics import VARIANTS, Perceptual, score
-from scene_experts.scene.anchors.frozen import Draws, freeze
 from scene_experts.training import run_folder
 
 if TYPE_CHECKING:
     from scene_experts.data.capture import Capture
     from scene_experts.render import Rasterizer
-    from scene_experts.scene import Scene
+    from scene_experts.scene import Draws, Scene
 
 FORMAT = 1
 Progress = Callable[[str, int, int], None]  # what is being done, how far, of how many
@@ -82,7 +81,7 @@ def evaluate(
     folder = out / (f"{views}_half" if half else views)
     pictures.clear(folder)
     per_view: dict[str, dict[str, Any]] = {}
-    draws = freeze(scene, step)
+    draws = scene.frozen(step)
     for n, (index, camera) in enumerate(zip(chosen, cameras)):
         capture.images.prefetch(list(chosen[n + 1 : n + 3]))
         name = capture.views[index].name
@@ -240,7 +239,7 @@ def _scene_facts(scene: Scene, step: int) -> dict[str, Any]:
     return {
         "size": sizes(scene),
         "anchors": n,
-        **({"anchors_by_level": scene.table.facts["level"].bincount().tolist()} if "level" in scene.table.facts else {}),
+        **({"anchors_by_level": scene.rows_by_level()} if scene.traits.levels else {}),
         "gaussians": n * scene.K,
         "experts": {attribute: asdict(found) for attribute, found in expert_shares(scene, step).items()},
     }

@@ -1,6 +1,6 @@
 """How fast a trained scene draws: visibility filter + decode + rasterise, without reading or writing pictures.
 
-Two decodes are timed: that of the frozen scene (`scene/frozen.py`), which gives the frames a second, and the training's own.
+Two decodes are timed: that of the frozen scene (`Scene.frozen`), which gives the frames a second, and the training's own.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.types import Camera
-from scene_experts.scene.anchors.frozen import freeze
 
 if TYPE_CHECKING:
     from scene_experts.render import Rasterizer
@@ -47,7 +46,7 @@ def measure(scene: Scene, cameras: Sequence[Camera], step: int, rasterize: Raste
     """
     every = max(1, -(-len(cameras) // MOST_VIEWS))
     chosen = cameras[::every]
-    frozen = freeze(scene, step)
+    frozen = scene.frozen(step)
     decode, raster, ordinary = [], [], []
     start, frame, enough = time.perf_counter(), 0, WARM_UP + max(len(chosen), 10)
     while frame < WARM_UP + 3 or (frame < enough and time.perf_counter() - start < budget):

@@ -1,61 +1,123 @@
-"""Scenes: what a camera can look at, and what a training changes. The interface that the loop, evaluation and export see."""
+"""Scenes: what a camera looks at and what a training changes. The interface that training, evaluation and export use."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
 
-import torch
 from torch import Tensor, nn
 
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Points, Routing
 
+if TYPE_CHECKING:
+    from scene_experts.scene.anchors.appearance import Codes
+
 Cull = Callable[[Tensor, Tensor, Camera], Tensor]
 """The rasteriser's visibility test: means [n, 3], scales [n, 3], camera -> [n] bool."""
+Draws = Callable[[Camera, int, bool, Cull], Decoded]
+"""What a scene does when it is called: (camera, step, training, cull) -> Decoded."""
 
 
-class Scene(Protocol):
-    """Rows of a table that decode into Gaussians for a camera."""
+@dataclass(frozen=True)
+class Traits:
+    """What a scene is and can do. Other parts read these values and never ask for the scene's class."""
 
-    table: Table
-    extent: float  # the capture's R, trained world units
+    family: str
+    """Key of the scene's family: "anchors", "gaussians", "graph". `files` looks up readers and writers by it."""
+    rows: str
+    """What one row of the table is called, in the plural: "anchors", "Gaussians", "points"."""
+    voxel: float = 0.0
+    """Edge of the finest lattice cell that rows lie on, trained world units; 0: rows lie on no lattice."""
+    experts: int = 0
+    """Experts per attribute; 0: the scene has no mixture of experts."""
+    levels: int = 0
+    """Levels of detail; 0: the scene has none. `Scene.at_level` draws fewer of them."""
+    activation: bool = False
+    """A network decides each Gaussian's opacity, so a view has an activation ratio (share of Gaussians with positive opacity)."""
+    sh_degree: int | None = None
+    """Degree of the spherical harmonics where each row is a standard Gaussian; None where shape or opacity depend on the camera."""
+    appearance: int = 0
+    """Size of the appearance code of each training view; 0: the scene has no codes."""
 
     @property
+    def needs_bake(self) -> bool:
+        """Whether the rows must be baked before they are standard Gaussians."""
+        return self.sh_degree is None
+
+
+class Scene(nn.Module):
+    """Rows of a table that decode into Gaussians for a camera. A family subclasses it; the defaults suit a scene without extras."""
+
+    codes: Codes | None  # appearance codes; None where `traits.appearance` is 0
+
+    def __init__(self, table: Table, extent: float) -> None:
+        """extent: the capture's R, trained world units."""
+        super().__init__()
+        self.table, self.extent = table, extent
+        self.codes = None
+
+    @property
+    @abstractmethod
+    def traits(self) -> Traits:
+        """What this scene is and can do."""
+
+    @property
+    @abstractmethod
     def K(self) -> int:
         """Gaussians per row."""
-        ...
 
     @property
+    @abstractmethod
     def file_values(self) -> int:
-        """float32 values that a row takes in the file of the scene's family."""
-        ...
+        """float32 values of a row in the file of the scene's family."""
 
-    def __call__(self, camera: Camera, step: int, training: bool, cull: Cull) -> Decoded: ...
+    @property
+    @abstractmethod
+    def positions(self) -> Tensor:
+        """Where the rows are, [N, 3], trained world."""
 
-    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
-        """Routing of every row (of at most `most`, evenly spread), by attribute; empty without experts."""
-        ...
+    @abstractmethod
+    def forward(self, camera: Camera, step: int, training: bool, cull: Cull) -> Decoded:
+        """The Gaussians that `camera` sees at `step`."""
 
-    def scene_opacity(self, camera: Camera, step: int) -> Tensor | None:
-        """Raw opacities [N, K] of every row from `camera`, seen or not; None where opacity is no network's output."""
-        ...
-
+    @abstractmethod
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:
         """Every parameter, by the name of its learning rate."""
-        ...
+
+    @abstractmethod
+    def meta(self) -> dict[str, Any]:
+        """The plain values that a checkpoint keeps to build the scene again (`voxel`, `extent`, ...)."""
 
     def network_tensors(self) -> dict[str, Tensor]:
         """Every learned tensor that is not a column of the table, by name."""
-        ...
+        return {}
 
-    def meta(self) -> dict[str, Any]:
-        """The plain values that a checkpoint must keep to build the scene again (`voxel`, `extent`, ...)."""
-        ...
+    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
+        """Routing of every row (of at most `most` rows, evenly spread), by attribute; empty without experts."""
+        return {}
 
-    def eval(self) -> Any: ...
+    def scene_opacity(self, camera: Camera, step: int) -> Tensor | None:
+        """Raw opacities [N, K] of every row from `camera`, seen or not; None where no network decides opacities."""
+        return None
 
-    def to(self, device: Any = None, dtype: torch.dtype | None = None) -> Any: ...
+    def rows_by_level(self) -> list[int]:
+        """How many rows each level of detail holds, coarse to fine; empty without levels."""
+        return []
+
+    def at_level(self, level: int | None) -> AbstractContextManager[None]:
+        """Within the block the scene draws no finer level than `level` (0 is the coarsest; None: all).
+
+        A scene without levels draws as always.
+        """
+        return nullcontext()
+
+    def frozen(self, step: int) -> Draws:
+        """The scene prepared for drawing at `step` without gradients: the same pictures, faster. Do not train it meanwhile."""
+        return self
 
 
 class SceneConfig(Protocol):
@@ -74,5 +136,5 @@ class SceneConfig(Protocol):
         ...
 
     def check(self) -> None:
-        """Raises InputError, naming the flag, for settings that no training can have."""
+        """Raises InputError, naming the flag, for invalid settings."""
         ...

@@ -18,11 +18,11 @@ from torch.nn import functional
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Decoded, Gaussians, Points, Routing
+from scene_experts.core.types import Camera, Decoded, Gaussians, Points
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.sh import MAX_DEGREE, rgb_to_dc
 from scene_experts.geometry.sh_colors import sh_colors
-from scene_experts.scene import Cull
+from scene_experts.scene import Cull, Scene, Traits
 
 COLUMNS = ("means", "log_scales", "quats", "raw_opacity", "sh_dc", "sh_rest")
 FILE_VALUES = 3 + 3 + 1 + 3 + 4  # position, normal, opacity, scale and rotation of a row of the 3DGS file; the harmonics come on top
@@ -82,13 +82,17 @@ class Explicit:
             )
 
 
-class GaussianScene(nn.Module):
+class GaussianScene(Scene):
     """N Gaussians as rows of a table (see the module's text for its columns)."""
 
     def __init__(self, config: Explicit, table: Table, extent: float) -> None:
         """extent: the scene's R in trained world units."""
-        super().__init__()
-        self.config, self.table, self.extent = config, table, extent
+        super().__init__(table, extent)
+        self.config = config
+
+    @property
+    def traits(self) -> Traits:
+        return Traits("gaussians", "Gaussians", sh_degree=self.config.sh_degree)
 
     @property
     def K(self) -> int:
@@ -98,6 +102,10 @@ class GaussianScene(nn.Module):
     def file_values(self) -> int:
         """float32 values that a row takes in the 3DGS file: 62 at degree 3."""
         return FILE_VALUES + 3 * (self.config.sh_degree + 1) ** 2
+
+    @property
+    def positions(self) -> Tensor:
+        return self.table.params["means"].detach()
 
     def degree(self, step: int) -> int:
         """The degree of the harmonics in use at `step`: all of them at 0, where a training has none yet and a file that does not say
@@ -129,20 +137,9 @@ class GaussianScene(nn.Module):
         )
         return Decoded(gaussians, rows, None, {})
 
-    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
-        """Nothing: there are no experts."""
-        return {}
-
-    def scene_opacity(self, camera: Camera, step: int) -> None:
-        """None: opacity is no network's output."""
-
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by the name of their learning rate: one group per column."""
         return {name: [self.table.params[name]] for name in COLUMNS}
-
-    def network_tensors(self) -> dict[str, Tensor]:
-        """Nothing: everything learned is a column."""
-        return {}
 
     def meta(self) -> dict[str, Any]:
         return {"extent": self.extent}

@@ -12,8 +12,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Decoded, Gaussians, Render
 from scene_experts.evaluate.expert_pictures import chosen_by, keep
 from scene_experts.render import Rasterizer
-from scene_experts.scene import Scene
-from scene_experts.scene.anchors.frozen import Draws
+from scene_experts.scene import Draws, Scene
 
 Mode = Literal["picture", "depth", "alpha", "experts", "entropy", "activation"]
 MODES: tuple[Mode, ...] = ("picture", "depth", "alpha", "experts", "entropy", "activation")
@@ -48,7 +47,7 @@ def paint(
 ) -> Tensor:
     """A picture [H, W, 3] in [0, 1]. Raises InputError where the look needs experts and the scene has none.
 
-    draws: the same scene frozen (`scene.frozen.freeze`), which is faster; it does not say who decodes what, so expert views leave it aside.
+    draws: the same scene frozen (`Scene.frozen`), which is faster; it does not say who decodes what, so expert views leave it aside.
     """
     routed = look.only is not None or look.mode in ("experts", "entropy")
     decoded = (scene if draws is None or routed else draws)(camera, step, False, rasterize.visible)

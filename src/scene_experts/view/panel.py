@@ -14,8 +14,7 @@ from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
 from scene_experts.geometry.rotation import matrix_to_quat
 from scene_experts.scene import Scene
-from scene_experts.scene.anchors.scene import ATTRIBUTES, AnchorScene
-from scene_experts.scene.anchors.select import LevelSelector
+from scene_experts.scene.anchors.mlp import ATTRIBUTES
 from scene_experts.training.events import Event, Finished, Stepped, Stopped
 from scene_experts.view.keyframes import Keyframes
 from scene_experts.view.paint import MODES, Look
@@ -43,7 +42,7 @@ class Panel:
         self.said, self.followed, self.charts, self.pause = 0.0, 0.0, [], None
         self.status = server.gui.add_markdown("")
         scene, _ = current()
-        self.experts = number_of_experts(scene)
+        self.experts = scene.traits.experts
         with server.gui.add_folder("Show"):
             self.mode = self.on(server.gui.add_dropdown("what", options=self.modes(scene), initial_value="picture"))
             self.size = self.on(server.gui.add_slider("height, px", min=120, max=1080, step=20, initial_value=720))
@@ -51,8 +50,7 @@ class Panel:
             self.colour = self.on(server.gui.add_rgb("background", initial_value=colour))
         if self.experts:
             self.expert_controls()
-        if isinstance(scene, AnchorScene) and isinstance(scene.select, LevelSelector):
-            count = scene.select.lattices.count
+        if count := scene.traits.levels:
             self.level = self.on(server.gui.add_slider("finest level", min=0, max=count - 1, step=1, initial_value=count - 1))
         else:
             self.level = None
@@ -67,7 +65,7 @@ class Panel:
 
     def modes(self, scene: Scene) -> tuple[str, ...]:
         """What this scene can show."""
-        usable = {"experts": self.experts > 0, "entropy": self.experts > 0, "activation": isinstance(scene, AnchorScene)}
+        usable = {"experts": self.experts > 0, "entropy": self.experts > 0, "activation": scene.traits.activation}
         return tuple(mode for mode in MODES if usable.get(mode, True))
 
     def expert_controls(self) -> None:
@@ -91,14 +89,14 @@ class Panel:
             chosen.on_update(lambda _: self.go(names.index(chosen.value)))
             self.wipe = self.on(gui.add_slider("photograph", min=0.0, max=1.0, step=0.01, initial_value=0.0))
             frusta = gui.add_checkbox("cameras", initial_value=False)
-            anchors = gui.add_checkbox("anchors", initial_value=False)
+            anchors = gui.add_checkbox(self.current()[0].traits.rows, initial_value=False)
         frusta.on_update(lambda _: self.show_frusta(frusta.value))
         anchors.on_update(lambda _: self.show_anchors(anchors.value))
         self.chosen, self.names = chosen, names
 
     def crop_controls(self, scene: Scene) -> None:
         gui = self.server.gui
-        xyz = positions(scene)
+        xyz = scene.positions.cpu().float()
         low, high = (
             (torch.quantile(xyz[:: max(1, len(xyz) // 100_000)], q, dim=0) for q in (0.005, 0.995)) if len(xyz) else (xyz.new_zeros(3),) * 2
         )
@@ -171,7 +169,7 @@ class Panel:
         if not visible:
             self.server.scene.remove_by_name("/anchors")
             return
-        xyz = positions(self.current()[0])
+        xyz = self.current()[0].positions.cpu().float()
         xyz = xyz[:: max(1, -(-len(xyz) // MOST_POINTS))]
         self.server.scene.add_point_cloud("/anchors", xyz.numpy(), (230, 159, 0), point_size=0.002 * self.capture.extent)
 
@@ -214,22 +212,9 @@ class Panel:
 
     def redraw(self, event: Stepped) -> None:
         terms = " ".join(f"{name} {value:.4f}" for name, value in event.terms.items())
-        self.tell(f"iteration {event.step:,}, {event.anchors:,} anchors, {100 * event.active:.0f} % active\n\n{terms}")
+        self.tell(
+            f"iteration {event.step:,}, {event.anchors:,} {self.current()[0].traits.rows}, {100 * event.active:.0f} % active\n\n{terms}"
+        )
         step = max(1, len(self.curves["step"]) // 500)
         for key, plot in self.charts:
             plot.data = (np.array(self.curves["step"][::step]), np.array(self.curves[key][::step]))
-
-
-@torch.no_grad()  # with gradients, routing would be taken for a training's: noise would be drawn, biases moved
-def number_of_experts(scene: Scene) -> int:
-    """Experts per attribute; 0 for a scene without a mixture."""
-    if not isinstance(scene, AnchorScene):
-        return 0
-    return max((w.gates.shape[1] for w in scene.routing(1, 1).values()), default=0) if len(scene.table) else 0
-
-
-def positions(scene: Scene) -> torch.Tensor:
-    """Where the rows are [N, 3]."""
-    columns = scene.table.columns()
-    found = columns.get("xyz", columns.get("means"))
-    return torch.zeros(0, 3) if found is None else found.detach().cpu().float()

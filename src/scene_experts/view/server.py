@@ -24,9 +24,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.evaluate.pictures import to_8bit
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 from scene_experts.render import Rasterizer
-from scene_experts.scene import Scene
-from scene_experts.scene.anchors.frozen import Draws
-from scene_experts.scene.anchors.select import capped
+from scene_experts.scene import Draws, Scene
 from scene_experts.view.paint import paint
 from scene_experts.view.panel import Panel
 from scene_experts.view.paths import around, best_view, pose, with_fov
@@ -205,7 +203,7 @@ class Viewer:
     def picture(self, client: Client, scene: Scene, step: int, camera: Camera) -> torch.Tensor:
         """What the client is to see: the scene as the panel asks, the photograph over the left of it where it stands at a view."""
         look, background = self.panel.look(), torch.tensor(self.panel.background(), device=self.device)
-        with capped(scene, self.panel.finest()):  # meanwhile alone: a training's own scene must go on with all its levels
+        with scene.at_level(self.panel.finest()):  # meanwhile alone: a training's own scene must go on with all its levels
             picture = paint(scene, camera.to(self.device), step, self.rasterize, background, look, self.draws).cpu()
         part = self.panel.photograph()
         if part > 0 and client.at_view is not None:

@@ -11,14 +11,28 @@ import torch
 from scene_experts.evaluate import timing
 
 
+class Waits:
+    """A scene that is never frozen."""
+
+    def __init__(self, slow: Slow) -> None:
+        self.slow = slow
+
+    def frozen(self, step: int) -> Waits:
+        return self
+
+    def __call__(self, *args: Any) -> SimpleNamespace:
+        return self.slow.decoded(*args)
+
+
 class Slow:
     """A scene and a rasteriser that take known times on a clock of their own: a busy machine changes nothing."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, decode: float, raster: float) -> None:
         self.decode, self.raster, self.drawn, self.now = decode, raster, [], 0.0
         monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: self.now))
+        self.scene = Waits(self)
 
-    def scene(self, camera: int, step: int, training: bool, cull: Any) -> SimpleNamespace:
+    def decoded(self, camera: int, step: int, training: bool, cull: Any) -> SimpleNamespace:
         self.now += self.decode
         assert not training
         return SimpleNamespace(gaussians=None)

@@ -51,3 +51,43 @@ def test_every_recipe_is_made_of_frozen_parts_that_scale_and_are_possible(recipe
     for part in (cfg.scene, cfg.growth):
         assert is_dataclass(part) and type(part).__dataclass_params__.frozen and fields(part)  # type: ignore[attr-defined]
         assert part.scaled(1.0) == part
+
+
+TRAITS = {  # family, rows, lattice, experts, has levels, activation, needs a bake
+    "scaffold-gs": ("anchors", "anchors", True, 0, False, True, True),
+    "moe-gs": ("anchors", "anchors", True, 5, False, True, True),
+    "3dgs": ("gaussians", "Gaussians", False, 0, False, False, False),
+    "octree-gs": ("anchors", "anchors", True, 0, True, True, True),
+    "octree-moe-gs": ("anchors", "anchors", True, 5, True, True, True),
+    "sags": ("graph", "points", True, 0, False, True, True),
+}
+
+
+@pytest.mark.parametrize("recipe", TRAITS)
+def test_a_scene_says_what_it_is_and_can_do(recipe):
+    scene = started(recipe)
+    t = scene.traits
+    assert (t.family, t.rows, t.voxel > 0, t.experts, t.levels > 0, t.activation, t.needs_bake) == TRAITS[recipe]
+    assert scene.positions.shape == (len(scene.table), 3) and not scene.positions.requires_grad
+    assert t.sh_degree == (3 if recipe == "3dgs" else None) and t.appearance == 0 and scene.codes is None
+    assert sum(scene.rows_by_level()) == (len(scene.table) if t.levels else 0)
+
+
+def test_stating_traits_changes_nothing():
+    scene = started("moe-gs-balance")
+    state, before = torch.random.get_rng_state(), [h.router_balance.clone() for h in scene.heads.values()]
+    assert scene.traits.experts == 5
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert all(torch.equal(h.router_balance, b) for h, b in zip(scene.heads.values(), before))
+
+
+@pytest.mark.parametrize("recipe", ["octree-gs", "3dgs"])
+def test_at_level_draws_no_finer_level_within_its_block(recipe):
+    scene, draw = started(recipe), choose("auto", "cpu")
+    draws = lambda: len(scene(CAMERA, 2000, False, draw.visible).rows)  # noqa: E731
+    whole = draws()
+    with scene.at_level(0):
+        coarse = draws()
+    with scene.at_level(None):
+        assert draws() == whole
+    assert draws() == whole and (coarse < whole if recipe == "octree-gs" else coarse == whole)

@@ -13,7 +13,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.files.bake.sums import Tell
 from scene_experts.render import Rasterizer
-from scene_experts.scene.anchors.frozen import Draws
+from scene_experts.scene import Draws
 
 
 @dataclass(frozen=True)

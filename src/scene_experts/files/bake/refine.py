@@ -11,7 +11,7 @@ from scene_experts.core.schedule import Rate
 from scene_experts.files.bake.sums import Tell
 from scene_experts.files.bake.views import Views
 from scene_experts.render import Rasterizer
-from scene_experts.scene.anchors.frozen import Draws
+from scene_experts.scene import Draws
 from scene_experts.scene.gaussians import GaussianScene
 from scene_experts.training.losses import photometric
 from scene_experts.training.optim import Adam

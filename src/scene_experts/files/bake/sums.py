@@ -16,7 +16,7 @@ from torch.nn import functional
 from scene_experts.core.types import Camera, Gaussians
 from scene_experts.geometry.sh import C0, basis
 from scene_experts.render import Rasterizer
-from scene_experts.scene.anchors.frozen import Draws
+from scene_experts.scene import Draws
 
 Tell = Callable[[str, int, int], None]
 """Says how far a piece of work is: what, done, total."""

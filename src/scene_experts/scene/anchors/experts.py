@@ -102,7 +102,7 @@ class MixtureHead(nn.Module):
     def __init__(self, config: Experts, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> None:
         super().__init__()
         self.config, self.attribute = config, attribute
-        E = config.num
+        self.experts = E = config.num
         self.w1 = nn.Parameter(torch.cat([linear_init((1, hidden, inputs), inputs).data for _ in range(E)]))
         self.b1 = nn.Parameter(torch.cat([linear_init((1, hidden), inputs).data for _ in range(E)]))
         self.w2 = nn.Parameter(torch.cat([linear_init((1, outputs, hidden), hidden).data for _ in range(E)]))

@@ -8,24 +8,23 @@ first layer W1 (f, direction) + b1 of each chosen expert. The Gaussians are thos
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from scene_experts.core.types import Camera, Decoded, Gaussians
 from scene_experts.native import library as native
-from scene_experts.scene import Cull, Scene
+from scene_experts.scene import Cull, Draws, Scene
 from scene_experts.scene.anchors import native_decode
 from scene_experts.scene.anchors.appearance import fold
-from scene_experts.scene.anchors.mlp import HeadWeights
-from scene_experts.scene.anchors.scene import ATTRIBUTES, AnchorScene
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, HeadWeights
 from scene_experts.scene.anchors.select import faded, visible_rows
 
-Draws = Callable[[Camera, int, bool, Cull], Decoded]
-"""What a scene does when called: (camera, step, training, cull) -> Decoded."""
+if TYPE_CHECKING:
+    from scene_experts.scene.anchors.scene import AnchorScene
 
 
 @dataclass(frozen=True)
@@ -43,15 +42,13 @@ class Kept:
 
 
 def freeze(scene: Scene, step: int, fold_features: bool = False) -> Draws:
-    """`scene` for drawing at `step`: frozen where the native decode covers it, else the scene itself. It may not be trained meanwhile.
+    """`scene.frozen(step)`, with the first layers folded in where `fold_features` asks for it.
 
     fold_features: keep the first layers too, 384 bytes an anchor and expert at 32 hidden units. Reading them took longer than computing
     them again where it was measured (docs/performance.md).
     """
-    if not isinstance(scene, AnchorScene) or not len(scene.table) or scene.table.params["feature"].device.type != "cpu":
-        return scene
-    weights = scene.native_weights(step)
-    return scene if weights is None else Frozen(scene, weights, step, fold_features)
+    found = scene.frozen(step)
+    return Frozen(found.scene, found.weights, step, True) if fold_features and isinstance(found, Frozen) else found
 
 
 class Frozen:

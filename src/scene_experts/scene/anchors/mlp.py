@@ -40,6 +40,8 @@ class HeadWeights:
 class Head(Protocol):
     """What decodes one attribute; the form of the arithmetic hides behind it."""
 
+    experts: int  # number of experts; 0 without a mixture
+
     def __call__(self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None) -> tuple[Tensor, Routing | None]: ...
 
     def weights(self, step: int) -> HeadWeights | None:
@@ -80,6 +82,7 @@ class MLP(nn.Module):
 
     def __init__(self, attribute: str, inputs: int, hidden: int, outputs: int, depth: int = 2) -> None:
         super().__init__()
+        self.experts = 0
         if depth < 2:
             raise InputError(f"expected a depth of at least 2 linear layers, found {depth}; give a larger number")
         self.attribute = attribute

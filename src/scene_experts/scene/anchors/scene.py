@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -24,10 +25,12 @@ from scene_experts.core.types import Camera, Decoded, Gaussians, Points, Routing
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.voxel import VoxelChoice, voxel_size
 from scene_experts.native import library as native
+from scene_experts.scene import Draws, Scene, Traits
 from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors.appearance import Codes, TestRule, fold
 from scene_experts.scene.anchors.experts import Experts, MixtureHead
 from scene_experts.scene.anchors.features import FeatureBank, OwnFeature
+from scene_experts.scene.anchors.frozen import Frozen
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, HeadWeights, Plain
 from scene_experts.scene.anchors.select import AllAnchors, Octree, Selector, faded, visible_rows
 
@@ -90,15 +93,15 @@ class Anchors:
             raise InputError(f"expected attributes among {', '.join(ATTRIBUTES)}, found {', '.join(sorted(unknown))}; correct the flag")
 
 
-class AnchorScene(nn.Module):
+class AnchorScene(Scene):
     """N anchors and three decoder heads. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], offsets [N,K,3], log_scaling [N,6]."""
 
     def __init__(
         self, config: Anchors, table: Table, voxel: float, extent: float, select: Selector | None = None, views: Sequence[int] = ()
     ) -> None:
         """voxel: edge of the finest lattice cell; extent: the scene's R; both in trained world units. views: the training cameras' ids."""
-        super().__init__()
-        self.config, self.table, self.voxel, self.extent = config, table, voxel, extent
+        super().__init__(table, extent)
+        self.config, self.voxel = config, voxel
         self.select = select or AllAnchors()
         heads: dict[str, nn.Module] = {}
         for attribute in ATTRIBUTES:
@@ -109,8 +112,24 @@ class AnchorScene(nn.Module):
         self.codes = Codes(config.appearance, views, config.test_appearance) if config.appearance else None
 
     @property
+    def traits(self) -> Traits:
+        return Traits(
+            "anchors",
+            "anchors",
+            self.voxel,
+            experts=max(head.experts for head in self.heads.values()),
+            levels=self.select.count,
+            activation=True,
+            appearance=self.config.appearance,
+        )
+
+    @property
     def K(self) -> int:
         return self.config.K
+
+    @property
+    def positions(self) -> Tensor:
+        return self.table.facts["xyz"]
 
     @property
     def file_values(self) -> int:
@@ -251,6 +270,27 @@ class AnchorScene(nn.Module):
         feature, position = self.table.params["feature"][::every], self.table.facts["xyz"][::every] / self.extent
         found = {a: self.heads[a].routing(feature, step, position) for a in ATTRIBUTES}
         return {a: r for a, r in found.items() if r is not None}
+
+    def rows_by_level(self) -> list[int]:
+        """How many anchors each level of detail holds, coarse to fine; empty without levels."""
+        return self.table.facts["level"].bincount().tolist() if self.select.count else []
+
+    @contextmanager
+    def at_level(self, level: int | None) -> Iterator[None]:
+        """Within the block the scene draws no finer level than `level`; see `Scene.at_level`."""
+        whole = self.select
+        self.select = whole.capped(level)
+        try:
+            yield
+        finally:
+            self.select = whole
+
+    def frozen(self, step: int) -> Draws:
+        """The scene with its routing computed once, where the native decode covers it; else the scene itself."""
+        if not len(self.table) or self.table.device.type != "cpu":
+            return self
+        weights = self.native_weights(step)
+        return self if weights is None else Frozen(self, weights, step)
 
     def with_global_routing(self, decoded: Decoded, step: int) -> Decoded:
         """For `load_scope = all`: the routing of all anchors in place of the visible ones', so that L_load balances the whole scene."""

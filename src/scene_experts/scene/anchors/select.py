@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any, Protocol
@@ -21,7 +21,16 @@ from scene_experts.scene.anchors.levels import LevelRule, Levels, blended, whole
 
 
 class Selector(Protocol):
-    """Who is drawn, and where anchors may stand."""
+    """Which anchors are drawn, and where anchors may be."""
+
+    @property
+    def count(self) -> int:
+        """Levels of detail; 0 without levels."""
+        ...
+
+    def capped(self, level: int | None) -> Selector:
+        """The same with no finer level than `level`; None lifts the cap."""
+        ...
 
     def __call__(self, table: Table, camera: Camera, step: int, training: bool) -> Tensor | None:
         """Row indices [S] int64, ascending, that may be drawn, or None for all of them."""
@@ -43,6 +52,13 @@ class Selector(Protocol):
 @dataclass(frozen=True)
 class AllAnchors:
     """Every anchor, as in Scaffold-GS."""
+
+    @property
+    def count(self) -> int:
+        return 0
+
+    def capped(self, level: int | None) -> AllAnchors:
+        return self
 
     def __call__(self, table: Table, camera: Camera, step: int, training: bool) -> Tensor | None:
         return None
@@ -197,6 +213,10 @@ class LevelSelector:
             count = self.lattices.first + 1 + sum(turn < step for turn in self.config.turns(self.lattices))
         return min(count, self.lattices.count if self.cap is None else max(self.cap, 0) + 1)
 
+    @property
+    def count(self) -> int:
+        return self.lattices.count
+
     def capped(self, level: int | None) -> LevelSelector:
         """The same with no finer level than `level`; None lifts the cap."""
         return replace(self, cap=level)
@@ -215,18 +235,9 @@ class LevelSelector:
         return {"levels": self.lattices.meta()}
 
 
-@contextmanager
-def capped(scene: Any, level: int | None) -> Iterator[None]:
-    """`scene` (any) drawing no finer level than `level` meanwhile; as it is where `level` is None and where it has no levels."""
-    whole = getattr(scene, "select", None)
-    if level is None or not isinstance(whole, LevelSelector):
-        yield
-        return
-    scene.select = whole.capped(level)
-    try:
-        yield
-    finally:
-        scene.select = whole
+def capped(scene: Any, level: int | None) -> AbstractContextManager[None]:
+    """`scene.at_level(level)`."""
+    return scene.at_level(level)
 
 
 def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera: Camera, cull) -> Tensor:

@@ -20,11 +20,11 @@ from torch.nn import functional
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Decoded, Gaussians, Points, Routing
+from scene_experts.core.types import Camera, Decoded, Gaussians, Points
 from scene_experts.geometry.curvature import curvature, flatter, pairs_to_halve
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.voxel import VoxelChoice, coarsen, to_lattice, unique_cells, voxel_size
-from scene_experts.scene import Cull
+from scene_experts.scene import Cull, Scene, Traits
 from scene_experts.scene.anchors.mlp import CHANNELS
 from scene_experts.scene.anchors.scene import EPS
 from scene_experts.scene.anchors.select import visible_rows
@@ -117,10 +117,20 @@ class Unbiased(nn.Module):
         return h
 
 
-class GraphScene(nn.Module):
+class GraphScene(Scene):
     """N points, one Gaussian each. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], log_scaling [N,6]."""
 
-    K = 1
+    @property
+    def traits(self) -> Traits:
+        return Traits("graph", "points", self.voxel, activation=True)
+
+    @property
+    def K(self) -> int:
+        return 1
+
+    @property
+    def positions(self) -> Tensor:
+        return self.table.facts["xyz"]
 
     @property
     def file_values(self) -> int:
@@ -129,8 +139,8 @@ class GraphScene(nn.Module):
 
     def __init__(self, config: GraphPoints, table: Table, voxel: float, extent: float, corner: tuple[float, ...], edge: float) -> None:
         """voxel: edge of the finest lattice cell; extent: the scene's R; corner, edge: the hash grid's cube; in trained world units."""
-        super().__init__()
-        self.config, self.table, self.voxel, self.extent = config, table, voxel, extent
+        super().__init__(table, extent)
+        self.config, self.voxel = config, voxel
         self.grid = config.grid.build(corner, edge)
         width = 2 * config.F + config.grid.width
         self.alpha, self.beta = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
@@ -245,10 +255,6 @@ class GraphScene(nn.Module):
         everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
         own, strongest = self.encode(everyone)
         return self.opacity(torch.cat([own, self.view(everyone, camera)], dim=1), strongest)
-
-    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
-        """There are no experts."""
-        return {}
 
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:
         """Every parameter, by the name of its learning rate."""
