@@ -14,10 +14,12 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Render, Routing
 from scene_experts.evaluate import metrics, pictures, weights
 from scene_experts.evaluate import score as run
 from scene_experts.evaluate.score import About, evaluate
+from scene_experts.scene import Scene, Traits
 from unit.scene.test_init import started
 
 N, K, F, H, W = 6, 4, 8, 36, 48
@@ -54,18 +56,19 @@ class FakeCapture:
         return SimpleNamespace(rgb=photo(index), mask=self.mask)
 
 
-class FakeScene:
+class FakeScene(Scene):
     """Decodes 2 of 6 anchors; of their 8 Gaussians 3 have positive opacity."""
 
     K = K
     file_values = 9
+    traits = Traits("fake", "anchors", 0.1, activation=True)
 
     def __init__(self, routed: bool = True) -> None:
-        self.routed = routed
         params = {"feature": torch.zeros(N, F), "offsets": torch.zeros(N, K, 3), "log_scaling": torch.zeros(N, 6)}
-        self.table = FakeTable(params)
+        super().__init__(Table(params, {}), 5.0)
+        self.routed = routed
 
-    def __call__(self, camera: Camera, step: int, training: bool, cull: Any) -> Decoded:
+    def forward(self, camera: Camera, step: int, training: bool, cull: Any) -> Decoded:
         assert not training and not torch.is_grad_enabled() and step == 700
         m = 3
         gaussians = Gaussians(torch.zeros(m, 3), torch.zeros(m, 4), torch.ones(m, 3), torch.ones(m), torch.ones(m, 3), torch.arange(m))
@@ -80,14 +83,6 @@ class FakeScene:
 
     def network_tensors(self) -> dict[str, Tensor]:
         return {"color.w1": torch.zeros(10, 5)}
-
-
-class FakeTable:
-    def __init__(self, params: dict[str, Tensor]) -> None:
-        self.params, self.facts = params, {}
-
-    def __len__(self) -> int:
-        return N
 
 
 class FakeRasterizer:
