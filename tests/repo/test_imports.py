@@ -15,6 +15,7 @@ LAYERS = [
     {"strategy"},
     {"training", "recipes"},
     {"evaluate", "files", "report", "reproduce", "view", "bench", "sfm"},
+    {"api"},
     {"cli", "commands", "__main__"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -5,31 +5,28 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
-from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import tyro
 from rich.console import Console
 
+from scene_experts.api import recording
 from scene_experts.cli import PROG
 from scene_experts.commands.shared import Device, Raster, backend
-from scene_experts.core.errors import InputError, expect_at_least, nearest
+from scene_experts.core.errors import InputError, nearest
 from scene_experts.core.signals import handled
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.catalog import PREFIX, Numbers, one
 from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer
-from scene_experts.training import loop as training
 from scene_experts.training import run_folder
-from scene_experts.training.config import Data, RunConfig, Train, check, with_numbers
-from scene_experts.training.events import Started
+from scene_experts.training.config import Data, RunConfig, Train, with_numbers
+from scene_experts.training.events import Exported
 from scene_experts.training.loop import Run
-from scene_experts.training.memory import reuse_freed, used_bytes
+from scene_experts.training.memory import reuse_freed
 from scene_experts.training.progress import Progress
-from scene_experts.training.record import Recorder
 from scene_experts.view.live import Live
 from scene_experts.view.server import check_port, viser
 
@@ -70,30 +67,33 @@ def train(args: list[str]) -> int:
     command = parse_train(args)
     if command.viewer:
         check_port(command.port)
-        viser()  # says what is missing before anything is read
+        viser()  # reports a missing package before anything is read
     command = replace(command, data=run_folder.named(command.data))
-    check_settings(command)
+    line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # the command that makes the whole run
+    run = run_of(command, line)
+    recording.check_settings(run)
     reuse_freed()
     console = Console(highlight=False)
     device, rasterize = backend(command.device, command.rasterizer, command.cfg.antialias, command.deterministic)
-    line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # what makes the whole run
-    config = RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, run_folder.versions())
-    run_folder.check(command.out, config, command.resume, command.overwrite)
+    run_folder.check(command.out, run.config, command.resume, command.overwrite)
     capture = run_folder.load_capture(command.data, command.cfg.seed)
     for warning in capture.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    run = Run(
-        config=config,
+    what = f"{command.cfg.recipe} on {capture.name} ({len(capture.train)} views)"
+    console.print(f"{what}, {device}, rasteriser {rasterize.name}", soft_wrap=True)
+    return follow(command, replace(run, device=device), capture, rasterize, console)
+
+
+def run_of(command: TrainCommand, line: str) -> Run:
+    """What the loop needs to know of the command, on the CPU. line: the command line, for config.json."""
+    return Run(
+        config=RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, run_folder.versions()),
         out=command.out,
-        device=device,
         resume=command.resume,
         save_every=command.save_every,
         preview_every=command.preview_every,
         max_memory=command.max_memory,
     )
-    what = f"{config.train.recipe} on {capture.name} ({len(capture.train)} views)"
-    console.print(f"{what}, {device}, rasteriser {rasterize.name}", soft_wrap=True)
-    return follow(command, run, capture, rasterize, console)
 
 
 def parse_train(args: list[str]) -> TrainCommand:
@@ -140,55 +140,38 @@ def flags_of_all() -> str:
     )
 
 
-def check_settings(command: TrainCommand) -> None:
-    """Raises InputError for settings that no training can have."""
-    stop_at = 1 if command.stop_at is None else command.stop_at
-    numbers = [("--save-every", command.save_every, 1), ("--preview-every", command.preview_every, 0), ("--stop-at", stop_at, 1)]
-    expect_at_least([*numbers, ("--max-memory", command.max_memory, 0)])
-    if command.max_memory > 0 and not used_bytes(torch.device("cpu")):
-        raise InputError(f"expected a system that tells a process's memory for --max-memory, found {sys.platform}; use --max-anchors")
-    check(command.cfg)
-
-
 def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasterizer, console: Console) -> int:
-    """Train, show and record; Ctrl-C, SIGTERM and a closed terminal save and end the run."""
+    """Train and show the events; Ctrl-C, SIGTERM and a closed terminal save and end the run."""
 
     def stop(number: int, _: object) -> None:
         if run.stop:
             raise KeyboardInterrupt  # a second signal does not wait
         run.stop.append(signal.Signals(number).name)
 
-    live, finished = None, 0  # the iteration at which there was nothing left to train
+    live, exported = None, False
     if command.viewer:
         say = lambda url: console.print(f"viewer: {url}", soft_wrap=True)  # noqa: E731
         label = f"{command.cfg.recipe} on {capture.name}"
         live = Live(capture, rasterize, lambda: bool(run.stop), command.port, label, command.out / "paths", say)
         run = replace(run, watch=live)
-    with handled(stop):
+    with handled(stop), Progress(console) as progress:
         try:
-            with ExitStack() as folder, Recorder(command.out, command.tensorboard, capture) as record, Progress(console) as progress:
-                for event in training.train(command.cfg, run, capture, rasterize):
-                    if isinstance(event, Started):  # what can fail before the first iteration has not: now the folder may change
-                        finished = event.step if event.step == event.total else 0
-                        folder.enter_context(run_folder.held(command.out))
-                        run_folder.prepare(command.out, run.config, command.resume, command.overwrite)
-                    record(event)
-                    progress(event)
-                    if live:
-                        live.event(event)
+            for event in recording.train(run, capture, rasterize, overwrite=command.overwrite, tensorboard=command.tensorboard):
+                progress(event)
+                if isinstance(event, Exported):
+                    exported = True
+                    for warning in event.warnings:
+                        print(warning, file=sys.stderr)
+                if live:
+                    live.event(event)
         finally:
             if live:
                 live.close()
             capture.images.close()
-    if finished and (command.out / f"point_cloud/iteration_{finished}/point_cloud.ply").is_file():
-        console.print("nothing was left to train: the run's files stay as they are", soft_wrap=True)
-    elif not run.stop:
-        from scene_experts.files.export import warnings_of_layout, write_layout
-        from scene_experts.training.run_folder import open_run
-
-        done = open_run(command.out)
-        console.print(f"wrote {write_layout(done, capture)}", soft_wrap=True)
-        for warning in warnings_of_layout(done):
-            print(warning, file=sys.stderr)
+    if run.stop:
+        return 128 + signal.Signals[run.stop[0]]  # saved, but incomplete: `train && eval` must not go on
+    if exported:
         console.print(f"next: {shlex.join([PROG, 'eval', str(command.out)])}", soft_wrap=True)
-    return 128 + signal.Signals[run.stop[0]] if run.stop else 0  # saved, but not whole: `train && eval` must not go on
+    else:
+        console.print("nothing was left to train: the run's files stay as they are", soft_wrap=True)
+    return 0

@@ -61,9 +61,18 @@ class Stopped:
 
 
 @dataclass(frozen=True)
+class Exported:
+    """The scene was written to the run folder in the layout that other tools read."""
+
+    step: int
+    path: Path  # RUN/point_cloud/iteration_N
+    warnings: tuple[str, ...] = ()  # what other readers of the layout get wrong
+
+
+@dataclass(frozen=True)
 class Finished:
     step: int
     seconds: float
 
 
-Event = Started | Stepped | Adjusted | Previewed | Saved | Stopped | Finished
+Event = Started | Stepped | Adjusted | Previewed | Saved | Stopped | Exported | Finished

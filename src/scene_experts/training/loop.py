@@ -43,6 +43,7 @@ class Run:
     log_every: int = 10  # iterations between Stepped events
     max_memory: float = 0.0  # GiB of memory (resident, or reserved on the GPU) at which growth stops; 0: no cap
     keep: int = 2  # checkpoints kept
+    begin: Callable[[Training], None] = lambda training: None  # called once, before the first event
     watch: Callable[[Training], None] = lambda training: None  # called between iterations, outside their time; a viewer draws here
     stop: list[str] = field(default_factory=list)  # put a reason here (a signal handler does) to save and stop
 
@@ -69,6 +70,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     training = training or Training.start(cfg, capture, run.device, run.dtype)
     training.capture = capture.fingerprint()
     total = min(cfg.iterations, run.config.stop_at or cfg.iterations)
+    run.begin(training)
     yield Started(training.step, total, len(training.scene.table), training.scene.meta().get("voxel", 0.0))
     saved, parts = training.step, {}
     while training.step < total and not run.stop:

@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as TaskBar
 from rich.text import Text
 
-from scene_experts.training.events import Adjusted, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
+from scene_experts.training.events import Adjusted, Event, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
 
 
 class Progress:
@@ -52,6 +52,8 @@ class Progress:
                 self.say(f"saved {event.path}")
             case Stopped():
                 self.say(f"stopped at iteration {event.step:,} ({event.reason}); the run is saved, go on with --resume")
+            case Exported():
+                self.say(f"wrote {event.path}")
             case Finished():
                 self.say(f"finished {event.step:,} iterations in {clock(event.seconds)}")
             case Previewed():

@@ -4,13 +4,18 @@ from pathlib import Path
 
 import pytest
 
-from scene_experts.commands.train import check_settings, parse_train, train
+from scene_experts.api import recording
+from scene_experts.commands.train import TrainCommand, parse_train, run_of, train
 from scene_experts.core.errors import InputError
 from scene_experts.recipes import RECIPES
 from scene_experts.training import run_folder
 from support.synthetic import make_capture
 
 PLACES = ["--data", "c", "--out", "r"]
+
+
+def check_settings(command: TrainCommand) -> None:
+    recording.check_settings(run_of(command, ""))
 
 
 @pytest.mark.parametrize("recipe", list(RECIPES))
@@ -44,7 +49,7 @@ def test_numbers_no_training_can_have_name_their_flag(flag, value):
 def test_a_memory_cap_needs_a_system_that_tells(monkeypatch):
     made = parse_train(["moe-gs", "--data", "capture", "--out", "run", "--max-memory", "4"])
     check_settings(made)
-    monkeypatch.setattr("scene_experts.commands.train.used_bytes", lambda device: 0)
+    monkeypatch.setattr("scene_experts.api.recording.used_bytes", lambda device: 0)
     with pytest.raises(InputError, match="use --max-anchors"):
         check_settings(made)
 

@@ -1,0 +1,71 @@
+"""Trains into a run folder and writes everything that belongs there. `scene-experts train` and the Python API both call it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import torch
+
+from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.data.capture import Capture
+from scene_experts.files.export import warnings_of_layout, write_layout
+from scene_experts.render import Rasterizer
+from scene_experts.training import loop, run_folder
+from scene_experts.training.config import check
+from scene_experts.training.events import Event, Exported, Finished, Started
+from scene_experts.training.memory import used_bytes
+from scene_experts.training.record import Recorder
+
+
+def train(run: loop.Run, capture: Capture, rasterize: Rasterizer, *, overwrite: bool = False, tensorboard: bool = False) -> Iterator[Event]:
+    """Train the recipe of `run.config` on a capture; yields the events of the training.
+
+    With a folder `run.out`: hold it, write config.json, metrics.jsonl, previews, checkpoints and, once the training is complete,
+    the Scaffold-GS layout (or that of the recipe's family). Nothing is written before the first event. Without one, nothing is written.
+
+    overwrite: start again in a folder that holds an earlier run.  tensorboard: write `run.out`/tensorboard too.
+    Raises InputError for a folder that cannot hold the run, RunError where a file cannot be written.
+    """
+    if run.out is None:
+        yield from loop.train(run.config.train, run, capture, rasterize)
+        return
+    finished, complete = None, False
+    with ExitStack() as folder, Recorder(run.out, tensorboard, capture) as record:
+        for event in loop.train(run.config.train, run, capture, rasterize):
+            if isinstance(event, Started):  # the training can start: from here on the folder may change
+                complete = event.step == event.total and is_exported(run.out, event.step)
+                folder.enter_context(run_folder.held(run.out))
+                run_folder.prepare(run.out, run.config, run.resume, overwrite)
+            record(event)
+            if isinstance(event, Finished):
+                finished = event  # yielded last; the loop ends first and frees its memory
+            else:
+                yield event
+        if finished is not None:
+            if not complete:
+                yield export_layout(run.out, capture)
+            yield finished
+
+
+def is_exported(out: Path, step: int) -> bool:
+    """Whether the folder holds the layout of the iteration `step`."""
+    return (out / f"point_cloud/iteration_{step}/point_cloud.ply").is_file()
+
+
+def export_layout(out: Path, capture: Capture) -> Exported:
+    """Write the newest checkpoint of a run folder in the layout that other tools read."""
+    opened = run_folder.open_run(out)
+    return Exported(opened.step, write_layout(opened, capture), tuple(warnings_of_layout(opened)))
+
+
+def check_settings(run: loop.Run) -> None:
+    """Raises InputError, naming the flag, for invalid settings."""
+    stop_at = 1 if run.config.stop_at is None else run.config.stop_at
+    numbers = [("--save-every", run.save_every, 1), ("--preview-every", run.preview_every, 0), ("--stop-at", stop_at, 1)]
+    expect_at_least([*numbers, ("--max-memory", run.max_memory, 0)])
+    if run.max_memory > 0 and not used_bytes(torch.device("cpu")):
+        raise InputError(f"expected a system that reports a process's memory for --max-memory, found {sys.platform}; use --max-anchors")
+    check(run.config.train)

@@ -1,0 +1,71 @@
+"""A training into a folder writes everything that belongs there, and one without a folder writes nothing."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from scene_experts.api import recording
+from scene_experts.core.errors import InputError
+from scene_experts.data.capture import Capture, load
+from scene_experts.recipes import RECIPES
+from scene_experts.render import choose
+from scene_experts.training import run_folder
+from scene_experts.training.config import Data, RunConfig
+from scene_experts.training.events import Exported, Finished, Previewed, Saved, Started, Stopped
+from scene_experts.training.loop import Run
+from support.synthetic import make_capture
+
+CPU = choose("auto", "cpu")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Capture:
+    return load(make_capture(tmp_path_factory.mktemp("capture"), views=9, size=(32, 24), points=200).folder)
+
+
+def run_in(out: Path | None, capture: Capture, **settings) -> Run:
+    cfg = replace(RECIPES["scaffold-gs"][1], iterations=4)
+    return Run(RunConfig(cfg, Data(capture.root)), out, preview_every=2, **settings)
+
+
+def test_the_folder_is_complete_when_the_training_has_finished(tmp_path, capture):
+    kinds = []
+    for event in recording.train(run_in(tmp_path, capture), capture, CPU):
+        kinds.append(type(event))
+        if isinstance(event, Exported):
+            assert event.path == tmp_path / "point_cloud" / "iteration_4" and event.step == 4 and not event.warnings
+            with pytest.raises(InputError, match="training at work"), run_folder.held(tmp_path):
+                pass
+    assert kinds[0] is Started and kinds[-2:] == [Exported, Finished] and {Previewed, Saved} < set(kinds)
+    for name in ("config.json", "metrics.jsonl", "previews/000002.png", "point_cloud/iteration_4/point_cloud.ply", "cameras.json"):
+        assert (tmp_path / name).is_file(), name
+    with run_folder.held(tmp_path):
+        assert run_folder.open_run(tmp_path).step == 4
+
+
+def test_a_complete_run_keeps_its_layout(tmp_path, capture):
+    list(recording.train(run_in(tmp_path, capture), capture, CPU))
+    layout = tmp_path / "point_cloud" / "iteration_4" / "point_cloud.ply"
+    layout.write_bytes(b"mine")
+    events = list(recording.train(run_in(tmp_path, capture, resume=True), capture, CPU))
+    assert [type(event) for event in events] == [Started, Finished] and layout.read_bytes() == b"mine"
+    layout.unlink()
+    assert Exported in map(type, recording.train(run_in(tmp_path, capture, resume=True), capture, CPU)) and layout.is_file()
+
+
+def test_a_stopped_run_is_saved_and_has_no_layout_yet(tmp_path, capture):
+    run = run_in(tmp_path, capture)
+    events = []
+    for event in recording.train(run, capture, CPU):
+        events.append(event)
+        if isinstance(event, Previewed):
+            run.stop.append("enough")
+    assert isinstance(events[-1], Stopped) and run_folder.open_run(tmp_path).step == 2 and not (tmp_path / "point_cloud").exists()
+
+
+def test_nothing_is_written_without_a_folder_nor_before_the_first_event(tmp_path, capture, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    kinds = [type(event) for event in recording.train(run_in(None, capture), capture, CPU)]
+    recording.train(run_in(tmp_path / "run", capture), capture, CPU)
+    assert kinds[0] is Started and kinds[-1] is Finished and Saved not in kinds and not list(tmp_path.iterdir())
