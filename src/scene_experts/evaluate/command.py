@@ -37,7 +37,9 @@ def evaluate_run(
         recipe=opened.config.train.recipe,
         iterations=opened.cfg.iterations if opened.step else 0,  # an imported file that says nothing of its training
         seed=opened.cfg.seed,
-        train_seconds=opened.seconds,
+        train_seconds=opened.clock.seconds,
+        cpu_seconds=opened.clock.cpu_seconds,
+        load=opened.clock.load,
         versions=opened.config.versions,
     )
     try:

@@ -41,8 +41,10 @@ class About:
     recipe: str = ""
     iterations: int = 0
     seed: int = 0
-    train_seconds: float = 0.0  # of the training loop, without saving and previews
+    train_seconds: float = 0.0  # wall time of the training loop, without saving and previews
     versions: dict[str, str] = field(default_factory=dict)  # of the training; the evaluation's own are added
+    cpu_seconds: float | None = None  # CPU time of the training loop; None: unknown
+    load: dict[str, float | None] = field(default_factory=dict)  # of the machine during the training: `Clock.load`
 
 
 def evaluate(
@@ -252,6 +254,8 @@ def _about(about: About, step: int, rasterize: Rasterizer, perceptual: Perceptua
         "step": step,
         "seed": about.seed,
         "train_seconds": about.train_seconds,
+        "cpu_seconds": about.cpu_seconds,
+        "load": about.load,
         "rasterizer": getattr(rasterize, "name", type(rasterize).__name__),
         "lpips_weights": perceptual.sources,
         "versions": {

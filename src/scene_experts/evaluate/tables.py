@@ -68,6 +68,7 @@ COLUMNS = (
     Column("iterations", ("step",), counted=True),
     Column("of schedule", ("iterations",), counted=True),  # the schedule's length: with fewer steps a training was cut off, not short
     Column("train s", ("train_seconds",), counted=True),
+    Column("CPU s", ("cpu_seconds",), counted=True),
 )
 
 

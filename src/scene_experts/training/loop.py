@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -74,9 +73,8 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     yield Started(training.step, total, len(training.scene.table), training.scene.meta().get("voxel", 0.0))
     saved, parts = training.step, {}
     while training.step < total and not run.stop:
-        began = time.perf_counter()
-        done = iterate(training, run, capture, rasterize)
-        training.seconds += time.perf_counter() - began
+        with training.clock.running():
+            done = iterate(training, run, capture, rasterize)
         step, parts = training.step, done.terms
         if done.edit is not None:
             yield Adjusted(step, done.edit)
@@ -97,7 +95,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     if run.stop and training.step < total:
         yield Stopped(training.step, run.stop[0])
     else:
-        yield Finished(training.step, training.seconds)
+        yield Finished(training.step, training.clock.seconds)
 
 
 def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Iteration:
@@ -185,7 +183,7 @@ def stepped(training: Training, done: Iteration) -> Stepped:
         visible=len(decoded.rows),
         gaussians=len(decoded.gaussians),
         active=float((raw > 0).float().mean()) if raw is not None and raw.numel() else 0.0,
-        seconds=training.seconds,
+        seconds=training.clock.seconds,
         routing={attribute: use(r) for attribute, r in decoded.routing.items()},
         balance=balance,
         entropy=entropy,

@@ -33,6 +33,7 @@ from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
 from scene_experts.scene import Scene
+from scene_experts.training.clock import Clock
 from scene_experts.training.config import Data, RunConfig, Train, from_json, to_json
 from scene_experts.training.state import scene_from, to_device
 
@@ -50,7 +51,7 @@ class OpenRun:
     cfg: Train  # scaled
     scene: Scene
     step: int
-    seconds: float  # of training
+    clock: Clock  # of the training
     capture: str = ""  # fingerprint of the capture it was trained on; empty where nothing says it
 
 
@@ -222,7 +223,7 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     cfg = config.train.scaled()
     scene = to_device(scene_from(cfg, tensors, meta), device)
     scene.eval()
-    return OpenRun(run, config, cfg, scene, int(meta["step"]), float(meta["seconds"]), meta.get("capture", ""))
+    return OpenRun(run, config, cfg, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""))
 
 
 def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

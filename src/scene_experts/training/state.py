@@ -15,6 +15,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.data.capture import Capture
 from scene_experts.scene import Scene
+from scene_experts.training.clock import Clock
 from scene_experts.training.config import Train, to_json
 from scene_experts.training.memory import Largest
 from scene_experts.training.optim import Adam
@@ -29,7 +30,7 @@ class Training:
         self.cfg, self.scene = cfg, scene
         self.step = 0
         self.largest = Largest()
-        self.seconds = 0.0
+        self.clock = Clock()
         self.queue: list[int] = []
         self.capture = ""  # its fingerprint
         self.views = torch.Generator().manual_seed(cfg.seed)
@@ -90,7 +91,7 @@ class Training:
         return {
             "recipe": self.cfg.recipe,
             "step": self.step,
-            "seconds": self.seconds,
+            **self.clock.meta(),
             **self.scene.meta(),
             "config": config_hash(self.cfg),
             "capture": self.capture,
@@ -119,7 +120,7 @@ class Training:
         training.views.set_state(tensors["rng.views"])
         training.growth.set_state(tensors["rng.growth"])
         training.queue = tensors["queue"].tolist()
-        training.step, training.seconds, training.capture = int(meta["step"]), float(meta["seconds"]), meta.get("capture", "")
+        training.step, training.clock, training.capture = int(meta["step"]), Clock.of(meta), meta.get("capture", "")
         return training
 
 

@@ -12,6 +12,7 @@ import pytest
 from scene_experts.core.errors import InputError
 from scene_experts.evaluate import command
 from scene_experts.recipes import RECIPES
+from scene_experts.training.clock import Clock
 from scene_experts.training.config import Data, RunConfig
 
 
@@ -26,7 +27,9 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
     config = RunConfig(cfg, Data(Path("old"), split="mod:4"), versions={"torch": "x"})
     closed: list[bool] = []
     seen: dict[str, Any] = {}
-    opened = SimpleNamespace(config=config, cfg=cfg.scaled(), scene="scene", step=250, seconds=9.0, capture="a", path=tmp_path)
+    opened = SimpleNamespace(
+        config=config, cfg=cfg.scaled(), scene="scene", step=250, clock=Clock(9.0, 17.0, {"cores": 2}), capture="a", path=tmp_path
+    )
     capture = SimpleNamespace(root="new", fingerprint=lambda: "a", images=SimpleNamespace(close=lambda: closed.append(True)))
 
     def load(data: Data, seed: int) -> Any:
@@ -47,7 +50,8 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert seen["args"] == ("scene", capture, Raster(antialias), tmp_path)
     assert seen["step"] == 250 and seen["views"] == "train" and not seen["lpips"]
     about = seen["about"]
-    assert (about.recipe, about.iterations, about.seed, about.train_seconds, about.versions) == ("moe-gs", 300, 4, 9.0, {"torch": "x"})
+    assert (about.recipe, about.iterations, about.seed, about.versions) == ("moe-gs", 300, 4, {"torch": "x"})
+    assert (about.train_seconds, about.cpu_seconds, about.load) == (9.0, 17.0, {"cores": 2})
     opened.capture = "b"
     with pytest.raises(InputError, match="other views in new"):
         command.evaluate_run(tmp_path, "cpu", Raster(), data=Path("new"), lpips=False)  # type: ignore[arg-type]

@@ -86,3 +86,13 @@ def test_the_first_checkpoints_still_fit():
     first = {"scaffold-gs": "f304f3c44732921f", "moe-gs": "536629188212acee"}
     assert {name: config_hash(RECIPES[name][1].scaled()) for name in first} == first
     assert config_hash(replace(RECIPES["moe-gs"][1], sparse_adam=True).scaled()) != first["moe-gs"]
+
+
+def test_a_checkpoint_without_a_cpu_time_opens_and_it_stays_unknown(capture):
+    training = started(capture)
+    meta = {k: v for k, v in training.meta().items() if k not in ("cpu_seconds", "load")}
+    after = Training.restore(training.cfg, training.tensors(), meta, "cpu")
+    with after.clock.running():
+        pass
+    found = after.meta()
+    assert found["cpu_seconds"] is None and found["seconds"] > meta["seconds"] and "start" not in found["load"]

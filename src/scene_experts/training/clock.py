@@ -1,0 +1,45 @@
+"""What a training costs: wall time, CPU time, and how busy its machine is. Checkpoints keep all three."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+
+def load_average() -> float | None:
+    """Processes that run or wait to run on this machine, mean over the last minute; None where the system does not say (Windows)."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
+
+
+@dataclass
+class Clock:
+    """The time that iterations take, summed over resumes. Saving, previews and evaluation do not count."""
+
+    seconds: float = 0.0
+    """Wall time, s."""
+    cpu_seconds: float | None = 0.0
+    """User and system time of all threads of this process, s. None: an older checkpoint, which does not say."""
+    load: dict[str, float | None] = field(default_factory=lambda: {"cores": os.cpu_count(), "start": load_average()})
+    """`cores` of the machine, and its load averages at the `start` and the `end` of the training; empty for an older checkpoint."""
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Count the time of the block."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        self.seconds += time.perf_counter() - wall
+        if self.cpu_seconds is not None:
+            self.cpu_seconds += time.process_time() - cpu
+
+    def meta(self) -> dict[str, Any]:
+        """What a checkpoint keeps; its time of writing is the end of the training so far."""
+        return {"seconds": self.seconds, "cpu_seconds": self.cpu_seconds, "load": {**self.load, "end": load_average()}}
+
+    @classmethod
+    def of(cls, meta: dict[str, Any]) -> Clock:
+        """The clock of a checkpoint."""
+        return cls(float(meta["seconds"]), meta.get("cpu_seconds"), meta.get("load", {}))
