@@ -7,8 +7,12 @@ script runs on any version of the project.
     python tools/digests.py RUNS --record digests.json         today's code; RUNS keeps the run folders
     python tools/digests.py RUNS2 --check digests.json         another version, on the same machine: exit code 1 and the places that differ
     python tools/digests.py RUNS --reopen digests.json         opens the run folders that another version wrote and scores them again
+    python tools/digests.py RUNS2 --check digests.json --only moe-gs 3dgs         two recipes: training and pictures, no files
+    python tools/digests.py RUNS2 --check digests.json --only "files of moe-gs"   the files of one recipe, and runs imported from them
+    python tools/digests.py RUNS2 --check digests.json --only files --runs RUNS   the files of the runs in RUNS, without training
 
-Digests belong to one machine and one build of torch: they are compared on the machine that recorded them.
+Digests belong to one machine and one build of torch: they are compared on the machine that recorded them. A file that holds the command
+that wrote it is digested without the command, whose paths differ.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -76,6 +81,29 @@ def of_archive(path: Path) -> str:
         return sha(*(archive.read(n) for n in names))
 
 
+def of_file(path: Path) -> str:
+    """Digest of an exported file. The note that some formats keep counts without the command in it."""
+    import zipfile
+
+    if path.suffix == ".pt":
+        return of_archive(path)
+    if path.suffix == ".sog":
+        with zipfile.ZipFile(path) as archive:
+            return sha(*(_without_command(archive.read(name)) for name in sorted(archive.namelist())))
+    data = path.read_bytes()
+    if path.suffix == ".glb":  # 12 bytes of header, then chunks: length, kind, bytes
+        size = int.from_bytes(data[12:16], "little")
+        return sha(_without_command(data[20 : 20 + size]).rstrip(), data[20 + size :])
+    if path.suffix == ".ply":
+        end = data.find(b"end_header\n")
+        return sha(_without_command(data[:end]), data[end:])
+    return sha(data)
+
+
+def _without_command(data: bytes) -> bytes:
+    return re.sub(rb'"command": ?"[^"]*"', b'"command": ""', data)
+
+
 def of_scores(folder: Path) -> str:
     """Digest of the pictures that `eval` drew and of its scores."""
     scores = json.loads((folder / "results.json").read_text())
@@ -107,7 +135,7 @@ def exported(source: Path, out: Path) -> dict[str, str]:
             continue
         for path in sorted(p for p in place.rglob("*") if p.is_file() and p.suffix != ".json"):
             name = str(path.relative_to(out))
-            found[name] = of_archive(path) if path.suffix == ".pt" else sha(path.read_bytes())
+            found[name] = of_file(path)
     return found
 
 
@@ -132,26 +160,40 @@ def imported(files: Path, out: Path) -> dict[str, object]:
     return found
 
 
-def everything(runs: Path) -> dict[str, object]:
+def recipes() -> dict[str, tuple[str, ...]]:
+    """What is trained: the words after `train`, by name."""
     from scene_experts.recipes import RECIPES
 
+    found: dict[str, tuple[str, ...]] = {recipe: (recipe,) for recipe in RECIPES}
+    found["appearance"] = APPEARANCE
+    found["sparse-adam"] = ("moe-gs", "--sparse-adam")
+    found["random-background"] = ("scaffold-gs", "--random-background", "--antialias")
+    return found
+
+
+def everything(runs: Path, only: list[str], trained_in: Path | None = None) -> dict[str, object]:
+    """Digests of trainings and files. only: names of recipes, "files of RECIPE", or "files"; empty for everything.
+
+    trained_in: folder of runs that are there already, whose files are made; None trains them.
+    """
     found: dict[str, object] = {}
-    for recipe in RECIPES:
-        print(recipe, flush=True)
-        found[recipe] = trained(recipe, runs / recipe)
-    found["appearance"] = trained(APPEARANCE[0], runs / "appearance", *APPEARANCE[1:])
-    found["sparse-adam"] = trained("moe-gs", runs / "sparse-adam", "--sparse-adam")
-    found["random-background"] = trained("scaffold-gs", runs / "random-background", "--random-background", "--antialias")
-    for name in (*FAMILIES, "appearance"):
-        print("files of", name, flush=True)
-        files = runs / "files" / name
-        found[f"files of {name}"] = exported(runs / name, files)
-        found[f"imports of {name}"] = imported(files, runs / "imports" / name)
+    for name, (recipe, *flags) in recipes().items():
+        has_files = name in (*FAMILIES, "appearance")
+        wants_files = has_files and (not only or "files" in only or f"files of {name}" in only)
+        if trained_in is None and (not only or name in only or wants_files):
+            print(name, flush=True)
+            digests = trained(recipe, runs / name, *flags)
+            found |= {name: digests} if not only or name in only else {}
+        if wants_files:
+            print("files of", name, flush=True)
+            files = runs / "files" / name
+            found[f"files of {name}"] = exported((trained_in or runs) / name, files)
+            found[f"imports of {name}"] = imported(files, runs / "imports" / name)
     return found
 
 
 def reopened(runs: Path, recorded: dict) -> dict[str, object]:
-    """What `eval` makes of run folders that another version wrote; the record's other entries as they are."""
+    """What `eval` makes of run folders and `import` of files that another version wrote; the record's other entries as they are."""
     found = dict(recorded)
     for name, value in recorded.items():
         if (runs / name / "config.json").is_file():
@@ -171,18 +213,33 @@ def differences(old: object, new: object, where: str = "") -> list[str]:
     return [] if old == new else [f"{where}: recorded {old}, now {new}"]
 
 
+def chosen(recorded: dict, only: list[str], with_runs: bool = True) -> dict:
+    """The entries of a record that `everything` makes for `only`."""
+
+    def wanted(name: str) -> bool:
+        files = name.startswith(("files of ", "imports of "))
+        recipe = name.partition(" of ")[2]
+        if not only:
+            return files or with_runs
+        return "files" in only or f"files of {recipe}" in only if files else with_runs and name in only
+
+    return {name: value for name, value in recorded.items() if wanted(name)}
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, help="folder for the run folders")
     group = parser.add_mutually_exclusive_group(required=True)
     for name in ("record", "check", "reopen"):
         group.add_argument(f"--{name}", type=Path, metavar="FILE")
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="recipes, 'files of RECIPE', or 'files'")
+    parser.add_argument("--runs", type=Path, dest="trained_in", metavar="DIR", help="make the files of the runs in DIR instead of training")
     args = parser.parse_args()
     if args.record:
-        args.record.write_text(json.dumps(everything(args.runs), indent=1, sort_keys=True) + "\n")
+        args.record.write_text(json.dumps(everything(args.runs, args.only, args.trained_in), indent=1, sort_keys=True) + "\n")
         return 0
-    recorded = json.loads((args.check or args.reopen).read_text())
-    found = everything(args.runs) if args.check else reopened(args.runs, recorded)
+    recorded = chosen(json.loads((args.check or args.reopen).read_text()), args.only, args.trained_in is None)
+    found = everything(args.runs, args.only, args.trained_in) if args.check else reopened(args.runs, recorded)
     lines = differences(recorded, found)
     print("\n".join(lines) or "no digest differs")
     return 1 if lines else 0
