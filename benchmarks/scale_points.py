@@ -25,7 +25,7 @@ from scene_experts.core import checkpoint
 from scene_experts.core.types import Gaussians
 from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
-from scene_experts.data.readers.colmap import Model, Posed, write_model
+from scene_experts.data.readers.colmap_model import ColmapImage, Model, write_model
 from scene_experts.data.views import World
 from scene_experts.files.export import write_compact_run
 from scene_experts.render import choose
@@ -204,7 +204,7 @@ def write_views(folder: Path, count: int) -> None:
         if i >= 8:
             shutil.copyfile(folder / "images" / f"view_{i % 8:05d}.jpg", folder / "images" / name)
         half = np.pi * i / count
-        posed.append(Posed(i + 1, name, (float(np.cos(half)), 0.0, float(np.sin(half)), 0.0), (0.0, 0.0, 4.0), 1))
+        posed.append(ColmapImage(i + 1, name, (float(np.cos(half)), 0.0, float(np.sin(half)), 0.0), (0.0, 0.0, 4.0), 1))
     xyz = rng.normal(size=(20_000, 3)) * 0.6
     rgb = rng.integers(0, 255, xyz.shape, dtype=np.uint8)
     cameras = {1: Lens("PINHOLE", 640, 424, (600.0, 600.0, 320.0, 212.0))}

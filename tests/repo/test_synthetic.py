@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scene_experts.data.readers.colmap import Posed
+from scene_experts.data.readers.colmap_model import ColmapImage
 from support.synthetic import Synthetic, colours, hits, make_capture, quaternion, surface_points
 
 
@@ -64,4 +64,4 @@ def test_quaternions_are_rotations() -> None:
         R = np.linalg.qr(rng.standard_normal((3, 3)))[0]
         R *= np.sign(np.linalg.det(R))
         q = quaternion(R)
-        np.testing.assert_allclose(Posed(1, "a", q, (0.0, 0.0, 0.0), 1).world_to_cam()[:3, :3], R, atol=1e-12)
+        np.testing.assert_allclose(ColmapImage(1, "a", q, (0.0, 0.0, 0.0), 1).world_to_cam()[:3, :3], R, atol=1e-12)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from scene_experts.data.lens import Lens
-from scene_experts.data.readers.colmap import Model, Posed, write_model
+from scene_experts.data.readers.colmap_model import ColmapImage, Model, write_model
 
 Array = NDArray[np.floating]
 
@@ -165,7 +165,9 @@ def make_capture(
         pose = look_at(eye, np.array([0.05, -0.05, 0.2]), 0.15 * rng.standard_normal())
         pose[:3, 3] *= scale
         t = pose[:3, 3]
-        image = Posed(i + 1, f"view_{i:03d}.png", quaternion(pose[:3, :3]), (float(t[0]), float(t[1]), float(t[2])), i % len(kinds) + 1)
+        image = ColmapImage(
+            i + 1, f"view_{i:03d}.png", quaternion(pose[:3, :3]), (float(t[0]), float(t[1]), float(t[2])), i % len(kinds) + 1
+        )
         posed.append(image)
         images[image.name] = np.rint(picture(kinds[i % len(kinds)], pose, scale, background) * 255).astype(np.uint8)
     xyz = surface_points(points, rng)

@@ -18,7 +18,7 @@ import pytest
 
 from scene_experts import cli
 from scene_experts.core import checkpoint
-from scene_experts.data.readers.colmap import Model, read_model, write_model
+from scene_experts.data.readers.colmap_model import Model, read_model, write_model
 from support import places
 from support.synthetic import make_blender, make_capture
 

@@ -1,8 +1,8 @@
-"""One photograph from its file to the pixels that training sees: decode, turn, undistort, resize, composite, mask.
+"""Turns a photograph file into the pixels that training sees: decode, rotate, undistort, resize, composite, mask.
 
-EXIF orientation: structure-from-motion tools work on the stored pixels, so it is not applied, unless only the turned image has the size
-that the camera model states (then the tool had applied it). Masks are in [0, 1], 1 = counts; they come from alpha and from mask files, and
-black means "ignore" as in COLMAP.
+Structure-from-motion tools work on the stored pixels, so the EXIF orientation is not applied. The exception is a photograph that
+has the size of its camera model only after rotation: then the tool applied the orientation, too.
+Masks come from alpha channels and mask files. As in COLMAP, black pixels do not count.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ _ORIENTATION = 0x0112  # EXIF tag; 5 to 8 swap the axes
 
 @dataclass(frozen=True)
 class Source:
-    """Where one frame comes from and what is done to it."""
+    """The file of a frame and the steps that turn it into pixels."""
 
     path: Path
-    lens: Lens  # of the pixels after turning, at the file's resolution
-    size: Size  # the resolution training sees
+    lens: Lens  # of the rotated image, at the resolution of the file
+    size: Size  # the resolution that training sees
     mask: Path | None = None
     turn: bool = False  # apply the EXIF orientation
-    background: tuple[float, float, float] | None = None  # composite alpha over this; None: alpha is a mask
+    background: tuple[float, float, float] | None = None  # composite alpha over this RGB in [0, 1]; None: alpha is a mask
 
     @property
     def bytes(self) -> int:
-        """Bytes of the decoded frame with a mask."""
+        """Size in bytes of the decoded frame with a mask."""
         return self.size[0] * self.size[1] * 4
 
 
 def probe(path: Path) -> tuple[Size, Size]:
-    """Stored size of the image at `path` and its size with the EXIF orientation applied. Reads the header only."""
+    """Return the stored size of the image at `path`, and its size with the EXIF orientation applied. Reads only the header."""
     with _open(path) as image:
         size = image.size
         try:
             turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)
-        except (OSError, ValueError, SyntaxError) as error:  # PNG keeps EXIF behind the pixels: a file cut short fails here
+        except (OSError, ValueError, SyntaxError) as error:  # PNG stores EXIF after the pixels: a truncated file fails here
             raise _unreadable(path, error) from error
     return size, (size[1], size[0]) if turned else size
 
@@ -62,15 +62,15 @@ def _open(path: Path) -> Image.Image:
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:
-    return InputError(f"expected a readable image at {path}, found one that is not ({error}); replace it or remove it from the capture")
+    return InputError(f"cannot read the image {path}: {error}; replace it or remove it from the capture")
 
 
 def target_size(policy: str, size: Size) -> Size:
-    """Width and height that resolution `policy` makes of an image of `size`.
+    """Return the width and height in px of an image of `size` under the resolution policy `policy`.
 
-    "as-is" and "inria:N" (which reads the folder images_N) keep it; "cap1600" caps the width at 1600 px, sizes cut to whole pixels as
-    Scaffold-GS does; "factor:N" divides by N and rounds; "longest:N" caps the longer side at N px; "share:S" takes S of what "cap1600"
-    gives, 16 px of the longer side at least. Nothing is ever enlarged.
+    "as-is" and "inria:N" (which reads the folder images_N) keep the size. "cap1600" limits the width to 1600 px and truncates to
+    whole pixels, as Scaffold-GS does. "factor:N" divides by N and rounds. "longest:N" limits the longer side to N px. "share:S"
+    multiplies the result of "cap1600" by S, with a longer side of at least 16 px. No policy enlarges an image.
     """
     w, h = size
     kind, _, number = policy.partition(":")
@@ -90,7 +90,7 @@ def target_size(policy: str, size: Size) -> Size:
 
 
 def check_policy(policy: str) -> str:
-    """`policy` with "auto" resolved to "cap1600". Raises InputError for one that does not exist."""
+    """Return `policy`, with "auto" replaced by "cap1600". Raises InputError for an unknown policy."""
     if policy in ("auto", "cap1600", "as-is"):
         return "cap1600" if policy == "auto" else policy
     kind, _, number = policy.partition(":")
@@ -108,22 +108,23 @@ def check_policy(policy: str) -> str:
 
 
 def decode(source: Source) -> tuple[Tensor, Tensor | None]:
-    """The frame of `source`: rgb [H, W, 3] uint8 and its mask [H, W] uint8 (255 = counts) or None where every pixel counts.
+    """Return the frame of `source`: rgb [H, W, 3] uint8 and its mask [H, W] uint8 (255 = counts), or None if every pixel counts.
 
-    Order: undistort at the file's resolution, then resize (Pillow's antialiased bicubic, as the reference codes), then composite in float
-    and round. A pure function of the files. Raises InputError for a file that is unreadable or not of the expected size.
+    The photograph is undistorted at the resolution of its file, resized with Pillow's antialiased bicubic filter as in the
+    reference codes, then composited in float and rounded. The result depends on the files only.
+    Raises InputError if a file is unreadable or does not have the expected size.
     """
-    image = _pixels(source)
-    mask = _mask_file(source)
+    image = _load_pixels(source)
+    mask = _load_mask(source)
     rgb = image.convert("RGB") if image.mode == "L" else image
     outside = None
     if source.lens.distorted:
-        rgb = _remap(rgb, source.lens)
-        mask = None if mask is None else _remap(_sized(mask, (source.lens.width, source.lens.height)), source.lens)
-        outside = _outside(source.lens)
+        rgb = _undistort(rgb, source.lens)
+        mask = None if mask is None else _undistort(_resize_mask(mask, (source.lens.width, source.lens.height)), source.lens)
+        outside = _mask_outside(source.lens)
     if rgb.size != source.size:
         rgb = rgb.resize(source.size, Image.Resampling.BICUBIC)
-    weights = [np.asarray(_sized(m, source.size)) for m in (mask, outside) if m is not None]
+    weights = [np.asarray(_resize_mask(m, source.size)) for m in (mask, outside) if m is not None]
     pixels = np.asarray(rgb)
     if rgb.mode == "RGBA":
         alpha = pixels[..., 3]
@@ -134,10 +135,10 @@ def decode(source: Source) -> tuple[Tensor, Tensor | None]:
             a = alpha[..., None].astype(np.float32) / 255
             over = pixels[..., :3] * a + np.asarray(source.background, np.float32) * 255 * (1 - a)
             pixels = np.clip(np.rint(over), 0, 255).astype(np.uint8)
-    return torch.from_numpy(np.array(pixels, order="C")), _product(weights)
+    return torch.from_numpy(np.array(pixels, order="C")), _multiply(weights)
 
 
-def _product(weights: list[NDArray[np.uint8]]) -> Tensor | None:
+def _multiply(weights: list[NDArray[np.uint8]]) -> Tensor | None:
     weights = [w for w in weights if w.min() < 255]
     if not weights:
         return None
@@ -147,13 +148,13 @@ def _product(weights: list[NDArray[np.uint8]]) -> Tensor | None:
     return torch.from_numpy(np.rint(out).astype(np.uint8))
 
 
-def _sized(mask: Image.Image, size: Size) -> Image.Image:
-    """`mask` at `size`: the share of each new pixel that counts."""
+def _resize_mask(mask: Image.Image, size: Size) -> Image.Image:
+    """Resize `mask`: each new pixel is the fraction of its area that counts."""
     return mask if mask.size == size else mask.resize(size, Image.Resampling.BOX)
 
 
-def _pixels(source: Source) -> Image.Image:
-    """The stored picture as 8-bit L, RGB or RGBA, turned where asked."""
+def _load_pixels(source: Source) -> Image.Image:
+    """Load the photograph as 8-bit L, RGB or RGBA, rotated if `source.turn`."""
     with _open(source.path) as image:
         try:
             image.load()
@@ -162,13 +163,15 @@ def _pixels(source: Source) -> Image.Image:
             raise _unreadable(source.path, error) from error
     expected = (source.lens.width, source.lens.height)
     if out.size != expected:
-        raise InputError(f"expected {source.path} to be {expected[0]}x{expected[1]}, found {out.size[0]}x{out.size[1]}; load it again")
+        raise InputError(
+            f"expected {source.path} with {expected[0]}x{expected[1]} px, found {out.size[0]}x{out.size[1]}; load the capture again"
+        )
     return out
 
 
 def to_8_bit(image: Image.Image) -> Image.Image:
-    """A picture of any of Pillow's modes as L, RGB or RGBA."""
-    if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey: Pillow's own conversion would clip at 255
+    """Convert a Pillow image of any mode to L, RGB or RGBA."""
+    if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey: Pillow's own conversion clips at 255
         deep = np.asarray(image).astype(np.float64)
         return Image.fromarray(np.clip(np.rint(deep / 257), 0, 255).astype(np.uint8))
     if image.mode in ("L", "RGB", "RGBA"):
@@ -176,13 +179,16 @@ def to_8_bit(image: Image.Image) -> Image.Image:
     return image.convert("RGBA" if "transparency" in image.info or image.mode in ("LA", "PA", "La", "RGBa") else "RGB")
 
 
-def _mask_file(source: Source) -> Image.Image | None:
-    """The mask file as L, at its own size; lying where the photograph was turned, it is turned as its own EXIF or the photograph's says."""
+def _load_mask(source: Source) -> Image.Image | None:
+    """Load the mask file as L, at its own size.
+
+    If the photograph was rotated and the mask was not, the mask is rotated by its own EXIF orientation or by the photograph's.
+    """
     if source.mask is None:
         return None
     with _open(source.mask) as image:
         try:
-            out = mask_of(image)
+            out = to_mask(image)
         except (OSError, ValueError, SyntaxError) as error:
             raise _unreadable(source.mask, error) from error
     if not source.turn or (out.width > out.height) == (source.lens.width > source.lens.height):
@@ -194,14 +200,14 @@ def _mask_file(source: Source) -> Image.Image | None:
     return ImageOps.exif_transpose(out)
 
 
-def mask_of(image: Image.Image) -> Image.Image:
-    """What a mask file says, as L (255: counts): its alpha where all its colours are black, else its brightness."""
+def to_mask(image: Image.Image) -> Image.Image:
+    """Convert a mask file to L (255 = counts): its alpha if every colour is black, otherwise its brightness."""
     return image.getchannel("A") if image.mode == "RGBA" and image.convert("L").getextrema() == (0, 0) else image.convert("L")
 
 
-@functools.lru_cache(maxsize=2)  # neighbours in a capture share their camera
-def _grid(lens: Lens) -> Tensor:
-    """Where each pixel of the undistorted image looks in the photograph: [h, w, 2] float32 in grid_sample's [-1, 1]."""
+@functools.lru_cache(maxsize=2)  # neighbouring views share their camera
+def _undistortion_grid(lens: Lens) -> Tensor:
+    """Return where each pixel of the undistorted image lies in the photograph: [h, w, 2] float32 in [-1, 1], for grid_sample."""
     pinhole = pinhole_of(lens)
     out = np.empty((pinhole.height, pinhole.width, 2), np.float32)
     u = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
@@ -213,11 +219,11 @@ def _grid(lens: Lens) -> Tensor:
     return torch.from_numpy(out)
 
 
-def _remap(image: Image.Image, lens: Lens) -> Image.Image:
-    """Undistort `image` bilinearly; where the photograph ends its border is continued."""
+def _undistort(image: Image.Image, lens: Lens) -> Image.Image:
+    """Undistort `image` with bilinear interpolation. Its border is repeated outside."""
     pixels = np.array(image)
     planes = torch.from_numpy(pixels.reshape(*pixels.shape[:2], -1)).permute(2, 0, 1)[None].float()
-    grid = _grid(lens)
+    grid = _undistortion_grid(lens)
     strips = [
         torch.nn.functional.grid_sample(planes, grid[None, top : top + 256], padding_mode="border", align_corners=False)[0].round().byte()
         for top in range(0, grid.shape[0], 256)
@@ -225,7 +231,7 @@ def _remap(image: Image.Image, lens: Lens) -> Image.Image:
     return Image.fromarray(torch.cat(strips, 1).permute(1, 2, 0).squeeze(-1).numpy(), image.mode)
 
 
-def _outside(lens: Lens) -> Image.Image | None:
-    """Black where the undistorted image looks past the photograph's edge, or None where it nowhere does."""
-    inside = (_grid(lens).abs() <= 1).all(-1)
+def _mask_outside(lens: Lens) -> Image.Image | None:
+    """Return a mask that is black where the undistorted image exceeds the photograph, or None if it nowhere does."""
+    inside = (_undistortion_grid(lens).abs() <= 1).all(-1)
     return None if bool(inside.all()) else Image.fromarray(inside.numpy().astype(np.uint8) * 255)

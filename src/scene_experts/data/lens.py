@@ -1,6 +1,6 @@
-"""Camera lenses: the eleven classic COLMAP models, their distortion, and the pinhole each is undistorted to.
+"""Camera lenses: the eleven classic COLMAP camera models, their distortion, and the pinhole camera that each is undistorted to.
 
-Symbols: (u, v) are normalised pinhole coordinates x/z, y/z; pixels are COLMAP's, the centre of the first pixel at (0.5, 0.5).
+(u, v) are normalised pinhole coordinates x/z, y/z. Pixel coordinates are COLMAP's: the centre of the first pixel is (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scene_experts.core.errors import InputError
 
 Array = NDArray[np.floating]
 
-# Order is COLMAP's numbering. Names of parameters: "f" stands for fx = fy.
+# In the order of COLMAP's model ids. "f" stands for fx = fy.
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -30,15 +30,15 @@ MODELS: dict[str, tuple[str, ...]] = {
     "THIN_PRISM_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
 }
 FISHEYE = frozenset(name for name in MODELS if name.endswith("FISHEYE"))
-_LARGEST_ANGLE = math.radians(88.0)  # rays further from the axis than this have no useful place on a flat image
+_LARGEST_ANGLE = math.radians(88.0)  # rays further from the axis are not usable on a flat image
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera model of COLMAP with its size and parameters in pixels.
+    """A COLMAP camera model with its image size and parameters in pixels.
 
-    Raises InputError for an unknown model, a wrong number of parameters, values that are not finite, and a focal length or a size that is
-    not positive.
+    Raises InputError for an unknown model, a wrong number of parameters, values that are not finite, and a focal length or size
+    that is not positive.
     """
 
     model: str
@@ -60,7 +60,7 @@ class Lens:
             )
 
     def value(self, name: str) -> float:
-        """The parameter `name`, 0 where the model has none."""
+        """Return the parameter `name`, or 0 if the model does not have it."""
         names = MODELS[self.model]
         return self.params[names.index(name)] if name in names else 0.0
 
@@ -82,22 +82,22 @@ class Lens:
 
     @property
     def distorted(self) -> bool:
-        """Whether straight lines bend. A fisheye always does; the others only with a coefficient that is not 0."""
+        """Whether straight lines appear bent: always for a fisheye lens, otherwise if a distortion coefficient is not 0."""
         geometric = {"f", "fx", "fy", "cx", "cy"}
         return self.model in FISHEYE or any(p != 0 for n, p in zip(MODELS[self.model], self.params) if n not in geometric)
 
     def resized(self, width: int, height: int) -> Lens:
-        """The same lens before an image of another size; exact, each axis by its own ratio.
+        """Return the same lens for an image of another size. Each axis is scaled by its own ratio, exactly.
 
-        With pixel centres at +0.5 both the focal length and the principal point are multiplied by the ratio and nothing is added.
-        Raises InputError when the ratios differ so much that one shared focal length cannot hold both.
+        With pixel centres at +0.5, the focal length and the principal point are multiplied by the ratio, without an offset. A
+        model with one focal length becomes a model with two if the ratios differ.
         """
         sx, sy = width / self.width, height / self.height
         if sx == sy == 1.0:
             return self
         names, params = MODELS[self.model], list(self.params)
         model = self.model
-        if names[0] == "f" and sx != sy:  # one shared focal length cannot follow two ratios
+        if names[0] == "f" and sx != sy:  # one focal length cannot represent two ratios
             model = _TWO_FOCALS[self.model]
             params = [self.value(n) if n not in ("fx", "fy") else self.params[0] for n in MODELS[model]]
             names = MODELS[model]
@@ -105,28 +105,28 @@ class Lens:
         return Lens(model, width, height, tuple(p * factor.get(n, 1.0) for n, p in zip(names, params)))
 
     def distort(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Normalised pinhole coordinates to normalised distorted ones (the pixel is (fx u' + cx, fy v' + cy))."""
+        """Map normalised pinhole coordinates to normalised distorted ones (u', v'); the pixel is (fx u' + cx, fy v' + cy)."""
         if self.model == "FOV":
             return _fov(self.value("omega"), u, v)
-        if self.model in FISHEYE:  # first the equidistant image: |(u, v)| = angle from the axis
+        if self.model in FISHEYE:  # equidistant projection first: |(u, v)| = angle from the axis
             r = np.hypot(u, v)
             s = np.where(r > 1e-8, np.arctan(r) / np.maximum(r, 1e-8), 1.0)
             u, v = u * s, v * s
-        return self._bend(u, v)
+        return self._distort_polynomial(u, v)
 
     def undistort(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """The inverse of `distort`, by Newton's method. Rays beyond 88 degrees from the axis of a fisheye are clamped there."""
+        """Invert `distort` by Newton's method. Rays over 88 degrees from the axis of a fisheye lens are clamped to 88 degrees."""
         if self.model == "FOV":
             return _fov_inverse(self.value("omega"), u, v)
-        a, b = self._unbend(u, v)
+        a, b = self._undistort_polynomial(u, v)
         if self.model in FISHEYE:
             theta = np.hypot(a, b)
             s = np.where(theta > 1e-8, np.tan(np.minimum(theta, _LARGEST_ANGLE)) / np.maximum(theta, 1e-8), 1.0)
             a, b = a * s, b * s
         return a, b
 
-    def _bend(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Radial, tangential and thin-prism terms (the polynomial part of every model; OpenCV's and COLMAP's formulas)."""
+    def _distort_polynomial(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Apply the radial, tangential and thin-prism terms, the polynomial part of every model (formulas of OpenCV and COLMAP)."""
         k = [self.value(n) for n in ("k1", "k2", "k3", "k4", "k5", "k6")]
         p1, p2, sx, sy = (self.value(n) for n in ("p1", "p2", "sx1", "sy1"))
         r2 = u * u + v * v
@@ -140,13 +140,13 @@ class Lens:
             v * radial + 2 * p2 * uv + p1 * (r2 + 2 * v * v) + sy * r2,
         )
 
-    def _unbend(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Solve `_bend(a, b) = (u, v)` by Newton's method with central differences, starting from (u, v)."""
+    def _undistort_polynomial(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Solve `_distort_polynomial(a, b) = (u, v)` by Newton's method with central differences, starting at (u, v)."""
         a, b, h = u.copy(), v.copy(), 1e-6
         for _ in range(60):
-            fu, fv = self._bend(a, b)
-            (r, s), (t, w) = self._bend(a + h, b), self._bend(a - h, b)
-            (x, y), (m, n) = self._bend(a, b + h), self._bend(a, b - h)
+            fu, fv = self._distort_polynomial(a, b)
+            (r, s), (t, w) = self._distort_polynomial(a + h, b), self._distort_polynomial(a - h, b)
+            (x, y), (m, n) = self._distort_polynomial(a, b + h), self._distort_polynomial(a, b - h)
             j00, j10, j01, j11 = (r - t) / (2 * h), (s - w) / (2 * h), (x - m) / (2 * h), (y - n) / (2 * h)
             det = j00 * j11 - j01 * j10
             det = np.where(np.abs(det) < 1e-9, 1e-9, det)
@@ -158,7 +158,7 @@ class Lens:
         return a, b
 
 
-# The model with two focal lengths that holds each one-focal model exactly.
+# The model with two focal lengths that represents each model with one focal length exactly.
 _TWO_FOCALS = {
     "SIMPLE_PINHOLE": "PINHOLE",
     "SIMPLE_RADIAL": "OPENCV",
@@ -169,7 +169,7 @@ _TWO_FOCALS = {
 
 
 def _fov(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
-    """Devernay and Faugeras' field-of-view model: r' = atan(2 r tan(omega/2)) / omega."""
+    """Apply the field-of-view model of Devernay and Faugeras: r' = atan(2 r tan(omega/2)) / omega."""
     if abs(omega) < 1e-9:
         return u, v
     r = np.hypot(u, v)
@@ -188,10 +188,10 @@ def _fov_inverse(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
 
 
 def pinhole_of(lens: Lens) -> Lens:
-    """The pinhole that `lens` is undistorted to: same focal lengths, the largest size without empty pixels (COLMAP's rule).
+    """Return the pinhole camera that `lens` is undistorted to: the same focal lengths and the largest size without empty pixels.
 
-    The image border is undistorted; each axis is grown or cropped about the principal point until no output pixel looks outside the
-    photograph, within 0.2 to 2 times the original size. An undistorted lens is returned as a PINHOLE of its own size.
+    As in COLMAP, the image border is undistorted, and each axis is grown or cropped about the principal point until every output
+    pixel lies inside the photograph, within 0.2 to 2 times the original size. A lens without distortion keeps its size.
     """
     w, h = lens.width, lens.height
     if not lens.distorted:
@@ -206,14 +206,14 @@ def pinhole_of(lens: Lens) -> Lens:
     right = border(np.full(h, w - 0.5), rows)[0].min()
     top = border(cols, np.full(w, 0.5))[1].max()
     bottom = border(cols, np.full(w, h - 0.5))[1].min()
-    # The grown size keeps the principal point at the same fraction of the image, hence the larger (stricter) of the two ratios.
+    # The principal point keeps its fraction of the image, hence the larger (stricter) of the two ratios.
     scale_x = 1 / max(lens.cx / max(lens.cx - left, 1e-9), (w - 0.5 - lens.cx) / max(right - lens.cx, 1e-9))
     scale_y = 1 / max(lens.cy / max(lens.cy - top, 1e-9), (h - 0.5 - lens.cy) / max(bottom - lens.cy, 1e-9))
     width, height = (max(1, int(min(max(s, 0.2), 2.0) * n)) for s, n in ((scale_x, w), (scale_y, h)))
     return Lens("PINHOLE", width, height, (lens.fx, lens.fy, lens.cx * width / w, lens.cy * height / h))
 
 
-def without_principal_point(lens: Lens) -> Lens:
-    """`lens` with the principal point moved to the image centre (what code that ignores it believes)."""
+def centre_principal_point(lens: Lens) -> Lens:
+    """Move the principal point of `lens` to the image centre, as code that ignores it assumes."""
     centre = {"cx": lens.width / 2, "cy": lens.height / 2}
     return replace(lens, params=tuple(centre.get(n, p) for n, p in zip(MODELS[lens.model], lens.params)))

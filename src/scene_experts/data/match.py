@@ -1,4 +1,4 @@
-"""Finds the photographs and masks that a capture's files name. By name, never by position in a sorted list."""
+"""Finds the photographs and masks that the files of a capture name. Files are matched by name, never by sorted position."""
 
 from __future__ import annotations
 
@@ -14,27 +14,28 @@ EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 @dataclass(frozen=True)
 class Match:
-    """Files by name, the names without one, and what had to be assumed."""
+    """Files by name, the names without a file, and warnings about inexact matches."""
 
     found: dict[str, Path]
     absent: tuple[str, ...]
     warnings: tuple[str, ...]
 
 
-def plain_name(name: str) -> str:
-    """`name` as a path that stays below whatever folder it is put in: "/" between its parts, no root, drive, "." or "..".
+def to_relative_name(name: str) -> str:
+    """Turn `name` into a path that stays inside any folder: "/" between its parts, without root, drive, "." or "..".
 
-    Results are written under the names of views, and a capture may name "../photos/a.png" or a place on its maker's disk.
+    Results are written under the names of views, and a capture may name "../photos/a.png" or an absolute path of another machine.
     """
     parts = name.replace("\\", "/").split("/")
     return "/".join(part for part in parts if part not in ("", ".", "..") and not part.endswith(":"))
 
 
 def match_images(folder: Path, names: Sequence[str]) -> Match:
-    """For each of `names` (relative, "/" between folders) its file in `folder`.
+    """Find the file in `folder` for each of `names` (relative, "/" between folders).
 
-    The exact path first; else the only file with the same stem and another extension; else the only file of that base name in `folder`;
-    these two when no other name shares the stem or base name. Everything but an exact match is reported in `warnings`.
+    The exact path is tried first, then the only file with the same stem and another extension, then the only file anywhere in
+    `folder` with that base name. The last two require that no other name shares the stem or base name. `warnings` reports
+    every match that is not exact.
     """
     files = [path for path in folder.rglob("*") if path.suffix.lower() in EXTENSIONS] if folder.is_dir() else []
     by_stem, by_base = defaultdict(list), defaultdict(list)
@@ -61,23 +62,25 @@ def match_images(folder: Path, names: Sequence[str]) -> Match:
             absent.append(name)
     notes = []
     if other:
-        notes.append(f"{len(other)} images found under another extension (first: {other[0]})")
+        notes.append(f"{len(other)} images have another extension than named (first: {other[0]})")
     if moved:
-        notes.append(f"{len(moved)} images found in another folder (first: {moved[0]})")
+        notes.append(f"{len(moved)} images are in another folder than named (first: {moved[0]})")
     return Match(found, tuple(absent), tuple(notes))
 
 
 def absent_error(folder: Path, names: Sequence[str], absent: Sequence[str]) -> InputError:
-    """The error for images that are not there."""
+    """Return the error for images that are absent."""
     return InputError(
-        f"expected {len(names)} images in {folder}, found {len(absent)} of them absent (first: {absent[0]}); copy them there, name their "
-        f"folder with --images, or train without them with --missing drop"
+        f"expected {len(names)} images in {folder}, but {len(absent)} are absent (first: {absent[0]}); copy them there, name their folder "
+        f"with --images, or train without them with --missing drop"
     )
 
 
 def find_mask(root: Path, name: str, image: Path) -> Path | None:
-    """The mask file of view `name`, or None: masks/NAME, masks/NAME.png, masks/STEM.png under `root`, or STEM.mask.png, STEM_mask.png
-    beside the photograph."""
+    """Return the mask file of view `name`, or None.
+
+    A mask is masks/NAME, masks/NAME.png or masks/STEM.png in `root`, or STEM.mask.png or STEM_mask.png beside the photograph.
+    """
     stem = PurePosixPath(name).with_suffix("").as_posix()
     candidates = [root / "masks" / part for part in (name, f"{name}.png", f"{stem}.png")]
     candidates += [image.with_name(f"{image.stem}{ending}") for ending in (".mask.png", "_mask.png")]

@@ -1,6 +1,6 @@
-"""Pure functions from a capture to a capture: choose views, hold some out, change the resolution, move and scale the world, drop outliers.
+"""Functions from a capture to a capture: select views, split, resize, transform the world, drop outliers, add random points.
 
-`load` is built from them; each can also be called on a loaded capture. None reads a pixel and none changes its argument.
+`load` is built from them, and each can be applied to a loaded capture. They read no pixels and do not modify their argument.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from scene_experts.core.types import Camera, Points
 from scene_experts.data.images import check_policy, target_size
 from scene_experts.data.lens import pinhole_of
 from scene_experts.data.store import ImageStore
-from scene_experts.data.views import Capture, View, World
+from scene_experts.data.views import Capture, Vector, View, World
 
-RANDOM_POINTS = 10_000  # as 3DGS starts NeRF-synthetic scenes
-NORMAL_EXTENT = 5.0  # R of a capture trained in a normalised world
-_FAR_VIEW = 50.0  # a camera further from the median camera than this many median distances was mislocated
-_FAR_POINT = (50.0, 20.0)  # a point further than both 50 R and 20 median distances from the cameras is noise
+RANDOM_POINTS = 10_000  # as 3DGS for NeRF-synthetic scenes
+NORMAL_EXTENT = 5.0  # extent of a capture in a normalised world
+_FAR_VIEW = 50.0  # a camera further from the median camera than this many median distances is mislocated
+_FAR_POINT = (50.0, 20.0)  # a point further from the cameras than both 50 extents and 20 median distances is noise
 
 
-def centres(views: Sequence[View]) -> Tensor:
-    """Camera centres [V, 3] float64."""
+def camera_centres(views: Sequence[View]) -> Tensor:
+    """Return the camera centres [V, 3] float64."""
     return torch.stack([view.camera.to(dtype=torch.float64).position for view in views])
 
 
-def extent(capture: Capture) -> float:
-    """R: 1.1 x the largest distance of a training camera from the mean of the training cameras (3DGS's "cameras extent").
+def camera_extent(capture: Capture) -> float:
+    """Return 1.1 times the largest distance of a training camera from the mean training camera ("cameras extent" in 3DGS).
 
-    Where that is 0 (one camera, or all in one place) the median distance of the points from there, and 1 without points.
+    If all training cameras are at one place, return the median distance of the points from there, or 1 without points.
     """
-    xyz = centres([capture.views[i] for i in capture.train])
+    xyz = camera_centres([capture.views[i] for i in capture.train])
     middle = xyz.mean(0)
     radius = 1.1 * float((xyz - middle).norm(dim=1).max())
     if radius > 1e-9 * max(1.0, float(middle.norm())):
@@ -45,20 +45,23 @@ def extent(capture: Capture) -> float:
     return float(away.median()) or 1.0 if len(away) else 1.0
 
 
-def near_plane(radius: float) -> float:
-    """The near plane of a world of extent `radius`: 0.2 as in 3DGS, less in small worlds, so that no unit loses its geometry to it."""
-    return min(0.2, 0.02 * radius)
+def near_plane(extent: float) -> float:
+    """Return the near plane for a world of this extent: 0.2 as in 3DGS, or less in small worlds so that nothing is clipped."""
+    return min(0.2, 0.02 * extent)
 
 
-def measured(capture: Capture) -> Capture:
-    """`capture` with its extent and near planes taken from its training cameras anew."""
-    radius = extent(capture)
-    views = tuple(replace(v, camera=replace(v.camera, near=near_plane(radius))) for v in capture.views)
-    return replace(capture, views=views, extent=radius)
+def measure_extent(capture: Capture) -> Capture:
+    """Set the extent and the near planes from the training cameras."""
+    return _with_near(replace(capture, extent=camera_extent(capture)))
 
 
-def subset(capture: Capture, indices: Sequence[int]) -> Capture:
-    """Only the views `indices`, in order; the split is kept for those that remain."""
+def _with_near(capture: Capture) -> Capture:
+    near = near_plane(capture.extent)
+    return replace(capture, views=tuple(replace(v, camera=replace(v.camera, near=near)) for v in capture.views))
+
+
+def select_views(capture: Capture, indices: Sequence[int]) -> Capture:
+    """Keep only the views `indices`, in ascending order. Views keep their part of the split."""
     order = sorted(set(indices))
     new = {old: i for i, old in enumerate(order)}
     views = tuple(replace(capture.views[i], camera=replace(capture.views[i].camera, id=new[i])) for i in order)
@@ -67,27 +70,33 @@ def subset(capture: Capture, indices: Sequence[int]) -> Capture:
     return replace(capture, views=views, images=store, train=train, test=test)
 
 
-def at_most(capture: Capture, count: int) -> Capture:
-    """At most `count` views, spread evenly over the names in order."""
+def limit_views(capture: Capture, count: int) -> Capture:
+    """Keep at most `count` views, spread evenly over the sorted names. Raises InputError if `count` is below 1."""
     if count < 1:
-        raise InputError(f"expected --max-views of at least 1, found {count}; give a positive number or leave it out")
+        raise InputError(f"expected --max-views of at least 1, found {count}; give a positive number or omit the option")
     total = len(capture.views)
-    return capture if total <= count else subset(capture, [int(i * total / count) for i in range(count)])
+    return capture if total <= count else select_views(capture, [int(i * total / count) for i in range(count)])
 
 
 def hold_out(capture: Capture, split: str) -> Capture:
-    """Divide the views, sorted by their whole name, into training and test views.
+    """Divide the views, sorted by name, into training and test views.
 
-    "modN" or "mod:N": every Nth is a test view, starting with the first ("mod8" is the protocol of 3DGS and its kin); "first:N": the
-    first N are; "none": none is; "files": as the capture's files say. Raises InputError for another word or where no training view is left.
+    Args:
+        split: "modN" or "mod:N" holds out every Nth view, beginning with the first ("mod8" is the protocol of 3DGS);
+            "first:N" holds out the first N; "none" holds out none; "files" keeps the split that the files state.
+
+    Raises:
+        InputError: for another word, if the files state no split, or if no training view is left.
     """
     every, first = split.removeprefix("mod").removeprefix(":"), split.removeprefix("first:")
     indices = range(len(capture.views))
     if split == "files":
         test = capture.test
-        if not test and capture.kind != "blender":
-            found = "a COLMAP capture" if capture.kind == "colmap" else "no test views in transforms.json"
-            raise InputError(f"expected a capture whose files hold a split for --split files, found {found}; use --split mod8")
+        if not test and not capture.states_split:
+            raise InputError(
+                f"expected test views in the files of {capture.name} for --split files, found none in this {capture.kind} capture; "
+                f"use --split mod8"
+            )
     elif split == "none":
         test = ()
     elif split.startswith("mod") and every.isdecimal() and int(every) >= 2:
@@ -106,69 +115,68 @@ def hold_out(capture: Capture, split: str) -> Capture:
 
 
 def downscale(capture: Capture, policy: str) -> Capture:
-    """Views at the resolution that `policy` (see `images.target_size`) makes of each undistorted photograph; intrinsics scaled exactly."""
+    """Resize each undistorted photograph as `policy` says (see `images.target_size`), and scale its intrinsics exactly."""
     policy = check_policy(policy)
     views, sources = [], []
     for view, source in zip(capture.views, capture.images.sources):
         full = pinhole_of(source.lens)
         size = target_size(policy, (full.width, full.height))
         sources.append(replace(source, size=size))
-        views.append(replace(view, camera=_resized(view.camera, size)))
+        views.append(replace(view, camera=_resize_camera(view.camera, size)))
     return replace(capture, views=tuple(views), images=ImageStore(sources, capture.images.cache_bytes), resolution=policy)
 
 
-def _resized(camera: Camera, size: tuple[int, int]) -> Camera:
+def _resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:
     ratio = torch.tensor([[size[0] / camera.width], [size[1] / camera.height], [1.0]], dtype=torch.float64)
     return replace(camera, K=(camera.K.double() * ratio).to(camera.K.dtype), width=size[0], height=size[1])
 
 
-def moved(capture: Capture, shift: tuple[float, float, float], scale: float) -> Capture:
-    """The capture in the world (trained + shift) * scale: cameras, points, extent and near planes; `world` undoes it."""
+def transform(capture: Capture, shift: Vector, scale: float) -> Capture:
+    """Map cameras, points, extent and near planes by `(trained + shift) * scale`, and extend `world` by that step."""
     step = World(scale, shift)
     views = tuple(replace(v, camera=step.camera_from_input(v.camera)) for v in capture.views)
     points = capture.points and Points(step.from_input(capture.points.xyz), capture.points.rgb)
-    out = replace(capture, views=views, points=points, world=capture.world.then(shift, scale), extent=capture.extent * scale)
-    near = near_plane(out.extent)
-    return replace(out, views=tuple(replace(v, camera=replace(v.camera, near=near)) for v in out.views))
+    world = capture.world.then(shift, scale)
+    return _with_near(replace(capture, views=views, points=points, world=world, extent=capture.extent * scale))
 
 
-def scaled(capture: Capture, factor: float) -> Capture:
-    """The capture with every length multiplied by `factor`."""
-    return moved(capture, (0.0, 0.0, 0.0), factor)
+def scale(capture: Capture, factor: float) -> Capture:
+    """Multiply every length by `factor`."""
+    return transform(capture, (0.0, 0.0, 0.0), factor)
 
 
-def normalised(capture: Capture) -> Capture:
-    """The capture in a world whose origin is the mean training camera and whose extent is 5, whatever unit it came in."""
-    x, y, z = (-centres([capture.views[i] for i in capture.train]).mean(0)).tolist()
-    out = moved(capture, (x, y, z), NORMAL_EXTENT / capture.extent)
-    near = near_plane(NORMAL_EXTENT)  # set, not computed, so that captures of different units agree to the last bit here
-    return replace(out, extent=NORMAL_EXTENT, views=tuple(replace(v, camera=replace(v.camera, near=near)) for v in out.views))
+def normalise(capture: Capture) -> Capture:
+    """Move the origin to the mean training camera and scale the extent to 5, whatever the unit of the capture is."""
+    x, y, z = (-camera_centres([capture.views[i] for i in capture.train]).mean(0)).tolist()
+    out = transform(capture, (x, y, z), NORMAL_EXTENT / capture.extent)
+    return _with_near(replace(out, extent=NORMAL_EXTENT))  # exactly 5, so that captures in different units agree to the last bit
 
 
 def drop_outlier_views(capture: Capture) -> Capture:
-    """Without the views whose camera is more than 50 median distances from the median camera; such poses are errors and wreck the extent.
+    """Drop the views whose camera is more than 50 median distances from the median camera. Such poses are errors and distort the extent.
 
-    Captures of fewer than 8 views are left alone.
+    A capture of fewer than 8 views is not changed.
     """
-    xyz = centres(capture.views)
+    xyz = camera_centres(capture.views)
     distance = (xyz - xyz.median(0).values).norm(dim=1)
     bad = distance > _FAR_VIEW * distance.median()
     if len(xyz) < 8 or not bool(bad.any()) or float(distance.median()) == 0.0:
         return capture
     first = capture.views[int(bad.nonzero()[0])].name
-    note = f"{int(bad.sum())} views dropped whose camera is over {_FAR_VIEW:.0f} times further out than most (first: {first})"
-    return replace(subset(capture, (~bad).nonzero().flatten().tolist()), warnings=(*capture.warnings, note))
+    note = f"dropped {int(bad.sum())} views whose camera is over {_FAR_VIEW:.0f} times further away than most (first: {first})"
+    return replace(select_views(capture, (~bad).nonzero().flatten().tolist()), warnings=(*capture.warnings, note))
 
 
 def drop_outliers(capture: Capture) -> Capture:
-    """Without the points that are not finite or further from the mean training camera than both 50 R and 20 median distances.
+    """Drop the points that are not finite or are too far from the mean training camera.
 
-    Both limits together, because a short arc of cameras may rightly look at things hundreds of R away.
+    A point is too far beyond both 50 extents and 20 median distances. Both limits are needed because cameras on a short arc may
+    see things hundreds of extents away.
     """
     if capture.points is None:
         return capture
     xyz = capture.points.xyz
-    distance = (xyz - centres([capture.views[i] for i in capture.train]).mean(0)).norm(dim=1)
+    distance = (xyz - camera_centres([capture.views[i] for i in capture.train]).mean(0)).norm(dim=1)
     finite = torch.isfinite(distance)
     if not bool(finite.any()):
         return replace(capture, points=None)
@@ -177,22 +185,23 @@ def drop_outliers(capture: Capture) -> Capture:
     dropped = int((~keep).sum())
     if not dropped:
         return capture
-    note = f"{dropped} of {len(xyz)} points dropped: not finite, or over {limit / capture.extent:.0f} extents from the cameras"
+    note = f"dropped {dropped} of {len(xyz)} points that are not finite or over {limit / capture.extent:.0f} extents from the cameras"
     return replace(capture, points=Points(xyz[keep], capture.points.rgb[keep]), warnings=(*capture.warnings, note))
 
 
-def random_points(capture: Capture, count: int = RANDOM_POINTS, seed: int = 0) -> Capture:
-    """The capture with `count` near-grey points spread uniformly, in place of any it has.
+def add_random_points(capture: Capture, count: int = RANDOM_POINTS, seed: int = 0) -> Capture:
+    """Replace the points by `count` uniformly distributed, nearly grey points.
 
-    NeRF-synthetic scenes: the cube [-1.3, 1.3]^3 of their own frame, as 3DGS does. Others: the box of the training cameras and of what lies
-    one and a half extents in front of each, which holds the subject both of all-round and of forward-facing captures.
+    They fill `capture.bounds` if that is known, as 3DGS does for NeRF-synthetic scenes. Otherwise they fill the box of the
+    training cameras and of the places 1.5 extents in front of them, which holds the subject of inward-facing and of
+    forward-facing captures.
     """
     rng = np.random.default_rng(seed)
-    if capture.kind == "blender":
-        corners = capture.world.from_input(torch.tensor([[-1.3] * 3, [1.3] * 3], dtype=torch.float64))
+    if capture.bounds is not None:
+        corners = capture.world.from_input(torch.tensor(capture.bounds, dtype=torch.float64))
     else:
         views = [capture.views[i] for i in capture.train]
-        eyes = centres(views)
+        eyes = camera_centres(views)
         ahead = torch.stack([v.camera.world_to_cam[2, :3].double() for v in views])
         both = torch.cat((eyes, eyes + 1.5 * capture.extent * ahead))
         corners = torch.stack((both.amin(0), both.amax(0)))

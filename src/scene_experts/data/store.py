@@ -1,6 +1,6 @@
-"""Decoded frames kept in memory within a number of bytes, and decoded ahead by one thread.
+"""Caches decoded frames within a memory limit, and decodes frames ahead in one thread.
 
-What a frame holds never depends on the cache or on the thread's timing: decoding is a pure function of the files.
+Decoding depends on the files only, so the content of a frame never depends on the cache or on the timing of the thread.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ Decoded = tuple[Tensor, Tensor | None]  # rgb [H, W, 3] uint8, mask [H, W] uint8
 
 
 def available_bytes() -> int | None:
-    """Memory this process may still take: the least of what the machine and its control group leave. None where neither can be read.
+    """Return the memory in bytes that this process may still allocate, or None if the system does not tell.
 
-    What a control group holds of files is given back when it is asked for, so it counts as free, as it does in MemAvailable.
+    It is the smaller of what the machine and the control group leave free. File pages held by a control group count as free, as
+    they do in MemAvailable, because the kernel reclaims them on demand.
     """
     left = []
     with suppress(OSError, ValueError, KeyError):
-        left.append(1024 * _facts("/proc/meminfo")["MemAvailable:"])
+        left.append(1024 * _read_numbers("/proc/meminfo")["MemAvailable:"])
     group = Path("/sys/fs/cgroup")
     for limit, used, stat, files in (
         ("memory.max", "memory.current", "memory.stat", "inactive_file"),
@@ -36,7 +37,7 @@ def available_bytes() -> int | None:
         with suppress(OSError, ValueError):  # absent, or "max": no limit
             free = int(_read(group / limit)) - int(_read(group / used))
             with suppress(OSError, ValueError, KeyError):
-                free += _facts(group / stat)[files]
+                free += _read_numbers(group / stat)[files]
             left.append(max(0, free))
     if not left and hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
         left.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
@@ -47,19 +48,19 @@ def _read(path: Path | str) -> str:
     return Path(path).read_text()
 
 
-def _facts(path: Path | str) -> dict[str, int]:
-    """Numbers by name from lines such as "MemAvailable: 123 kB"."""
+def _read_numbers(path: Path | str) -> dict[str, int]:
+    """Read numbers by name from lines such as "MemAvailable: 123 kB"."""
     return {words[0]: int(words[1]) for line in _read(path).splitlines() if len(words := line.split()) > 1}
 
 
 class _Cache:
-    """State shared with the thread, apart from ImageStore so that the thread does not keep that alive."""
+    """The state that the thread shares. It is separate from ImageStore so that the thread does not keep the store alive."""
 
     def __init__(self, sources: tuple[Source, ...], budget: int) -> None:
         self.sources, self.budget, self.used = sources, budget, 0
         self.frames: OrderedDict[int, Decoded] = OrderedDict()  # least recently used first
         self.wanted: deque[int] = deque()
-        self.ahead: set[int] = set()  # of the last prefetch, decoded or not
+        self.ahead: set[int] = set()  # frames of the last prefetch, decoded or not
         self.busy: set[int] = set()
         self.changed = threading.Condition()
         self.stopped = False
@@ -82,29 +83,30 @@ class _Cache:
             raise
         with self.changed:
             self.busy.discard(index)
-            self._keep(index, frame)
+            self._insert(index, frame)
             self.changed.notify_all()
         return frame
 
-    def _keep(self, index: int, frame: Decoded) -> None:
-        size = _bytes(frame)
+    def _insert(self, index: int, frame: Decoded) -> None:
+        size = _count_bytes(frame)
         if size > self.budget:
             return
         self.frames[index] = frame
         self.used += size
         while self.used > self.budget:
-            self.used -= _bytes(self.frames.pop(self._spare(index)))
+            self.used -= _count_bytes(self.frames.pop(self._choose_victim(index)))
 
-    def _spare(self, new: int) -> int:
-        """The frame to drop: the last one used, for training sees every view once an epoch, so that one is needed last.
+    def _choose_victim(self, new: int) -> int:
+        """Choose the frame to drop: the most recently used one that is not prefetched.
 
-        (Dropping the least recently used would find 12 % of the frames of an epoch in a cache of half of them; this finds half.)
+        Training sees every view once per epoch, so this frame is needed last. With a cache for half of the frames, the hit rate is
+        50 %; dropping the least recently used frame gives 12 %.
         """
         free = (index for index in reversed(self.frames) if index != new and index not in self.ahead)
         return next(free, next(iter(self.frames)))
 
     def work(self) -> None:
-        """The thread: decode what is wanted, in order, until stopped. A bad file is left for `get` to report."""
+        """Decode the wanted frames in order until stopped; runs in the thread. `get` reports files that cannot be decoded."""
         while True:
             with self.changed:
                 while not self.wanted and not self.stopped:
@@ -120,7 +122,7 @@ class _Cache:
                 continue
 
 
-def _bytes(frame: Decoded) -> int:
+def _count_bytes(frame: Decoded) -> int:
     return sum(part.numel() for part in frame if part is not None)
 
 
@@ -134,11 +136,11 @@ def _stop(cache: _Cache, thread: threading.Thread | None) -> None:
 
 
 class ImageStore:
-    """Frames by index, decoded when first asked for and kept within `cache_bytes`.
+    """Frames by index, decoded on first use and cached within `cache_bytes`.
 
-    What was used last and is not prefetched for later is dropped first.
-
-    `cache_bytes` None: a third of `available_bytes`, or of 4 GiB where the system does not tell.
+    Args:
+        sources: One source per frame.
+        cache_bytes: Memory for decoded frames. None is a third of `available_bytes()`, or of 4 GiB if that is unknown.
     """
 
     def __init__(self, sources: Iterable[Source], cache_bytes: int | None = None) -> None:
@@ -155,20 +157,20 @@ class ImageStore:
 
     @property
     def used_bytes(self) -> int:
-        """Bytes of the frames kept now, never above `cache_bytes`."""
+        """Size in bytes of the cached frames, never above `cache_bytes`."""
         return self._cache.used
 
     def get(self, index: int) -> Decoded:
-        """rgb [H, W, 3] uint8 and mask [H, W] uint8 (255 = counts) or None. The tensors are shared: do not write to them.
+        """Return rgb [H, W, 3] uint8 and the mask [H, W] uint8 (255 = counts) or None. The tensors are shared: do not modify them.
 
-        Raises InputError for a file that is unreadable or changed its size.
+        Raises InputError if a file is unreadable or has changed its size.
         """
         return self._cache.get(index)
 
     def prefetch(self, indices: Iterable[int]) -> None:
-        """Decode these frames in the background, in this order, in place of what was asked for before.
+        """Decode these frames in the background, in this order. They replace the frames of the previous call.
 
-        As many as half the cache holds; with less than two frames' room nothing is done.
+        At most half of the cache is filled; nothing is done if it has room for fewer than two frames.
         """
         room, wanted = self.cache_bytes // 2, []
         for index in dict.fromkeys(indices):
@@ -188,6 +190,6 @@ class ImageStore:
             weakref.finalize(self, _stop, self._cache, self._thread)  # also runs at exit
 
     def close(self) -> None:
-        """Stop the thread; frames can still be read."""
+        """Stop the thread. Frames can still be read."""
         _stop(self._cache, self._thread)
         self._thread = None

@@ -1,4 +1,4 @@
-"""What a capture is, once loaded: views, points, split, and the world it is trained in."""
+"""A loaded capture: its views, points and split, and the world that it is trained in."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import hashlib
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -14,14 +13,17 @@ from torch import Tensor
 from scene_experts.core.types import Camera, Points
 from scene_experts.data.store import ImageStore
 
-Kind = Literal["colmap", "blender", "nerfstudio"]
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class View:
-    """One photograph: its name in the capture, its camera in the trained world at the trained resolution, and its file."""
+    """One photograph: its name in the capture, its camera and its file.
 
-    name: str  # relative, with extension, unique
+    The camera is in the trained world and at the trained resolution.
+    """
+
+    name: str  # relative path with extension, unique in the capture
     camera: Camera
     path: Path
 
@@ -31,48 +33,52 @@ class Frame:
     """The pixels of a view."""
 
     rgb: Tensor  # [H, W, 3] uint8
-    mask: Tensor | None  # [H, W] float32 in [0, 1], 1 = counts; None: all count
+    mask: Tensor | None  # [H, W] float32 in [0, 1]; 1 = the pixel counts; None = every pixel counts
 
 
 @dataclass(frozen=True)
 class World:
-    """The frame a capture is trained in: trained = (input + shift) * scale, lengths by `scale`, axes kept."""
+    """The coordinate frame that a capture is trained in.
+
+    A point is mapped by `trained = (input + shift) * scale`, where `input` is the capture's own frame. Axes are not rotated.
+    """
 
     scale: float = 1.0
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    shift: Vector = (0.0, 0.0, 0.0)
 
     @property
     def identity(self) -> bool:
+        """Whether the trained world is the capture's own frame."""
         return self.scale == 1.0 and self.shift == (0.0, 0.0, 0.0)
 
     def from_input(self, xyz: Tensor) -> Tensor:
-        """Input points [..., 3] in the trained world."""
+        """Map points [..., 3] from the capture's own frame to the trained world."""
         return (xyz + torch.tensor(self.shift, dtype=xyz.dtype, device=xyz.device)) * self.scale
 
     def to_input(self, xyz: Tensor) -> Tensor:
-        """Trained points [..., 3] in the capture's own frame and unit."""
+        """Map points [..., 3] from the trained world to the capture's own frame."""
         return xyz / self.scale - torch.tensor(self.shift, dtype=xyz.dtype, device=xyz.device)
 
     def camera_from_input(self, camera: Camera) -> Camera:
-        """The same view in the trained world; the near plane is a length and is scaled too."""
+        """Map a camera from the capture's own frame to the trained world. The near plane is a length and is scaled too."""
         pose = camera.world_to_cam.double()
         shift = torch.tensor(self.shift, dtype=torch.float64, device=pose.device)
-        t = (pose[:3, 3] - pose[:3, :3] @ shift) * self.scale  # x_cam = R (X / scale - shift) + t, and lengths times scale
-        return _moved(camera, t, self.scale)
+        t = (pose[:3, 3] - pose[:3, :3] @ shift) * self.scale  # x_cam = R (X / scale - shift) + t, then lengths times scale
+        return _with_translation(camera, t, self.scale)
 
     def camera_to_input(self, camera: Camera) -> Camera:
-        """The inverse of `camera_from_input`."""
+        """Map a camera from the trained world to the capture's own frame, the inverse of `camera_from_input`."""
         pose = camera.world_to_cam.double()
         shift = torch.tensor(self.shift, dtype=torch.float64, device=pose.device)
-        return _moved(camera, pose[:3, 3] / self.scale + pose[:3, :3] @ shift, 1 / self.scale)
+        return _with_translation(camera, pose[:3, 3] / self.scale + pose[:3, :3] @ shift, 1 / self.scale)
 
-    def then(self, shift: tuple[float, float, float], scale: float) -> World:
-        """This world followed by another: (trained + shift) * scale."""
+    def then(self, shift: Vector, scale: float) -> World:
+        """Return this world followed by another transform, `(trained + shift) * scale`."""
         x, y, z = (a + b / self.scale for a, b in zip(self.shift, shift))
         return World(self.scale * scale, (x, y, z))
 
 
-def _moved(camera: Camera, t: Tensor, scale: float) -> Camera:
+def _with_translation(camera: Camera, t: Tensor, scale: float) -> Camera:
     pose = camera.world_to_cam.double().clone()
     pose[:3, 3] = t
     return replace(camera, world_to_cam=pose.to(camera.world_to_cam.dtype), near=camera.near * scale)
@@ -80,29 +86,34 @@ def _moved(camera: Camera, t: Tensor, scale: float) -> Camera:
 
 @dataclass(frozen=True)
 class Capture:
-    """Posed photographs ready to train on, with what was decided on the way so that results can state it."""
+    """Photographs with camera poses, ready for training, and the choices that were made while loading them."""
 
     name: str
     root: Path
-    kind: Kind
-    views: tuple[View, ...]  # sorted by name; view i has camera.id == i
+    kind: str  # name of the reader that read it, e.g. "colmap"
+    views: tuple[View, ...]  # sorted by name; views[i].camera.id == i
     points: Points | None
-    train: tuple[int, ...]
-    test: tuple[int, ...]
+    train: tuple[int, ...]  # indices of the training views
+    test: tuple[int, ...]  # indices of the held-out views
     images: ImageStore  # frame i belongs to view i
     world: World
-    extent: float  # R = 1.1 x the largest distance of a training camera from their mean (3DGS), in trained units
+    extent: float  # R = 1.1 times the largest distance of a training camera from their mean (as 3DGS), trained units
     resolution: str  # "as-is", "cap1600", "factor:2", "longest:800", "inria:4"
     split: str  # "mod8", "first:31", "none", "files"
-    background: tuple[float, float, float]  # what the scene is rendered over
+    background: Vector  # RGB in [0, 1] behind the scene
     warnings: tuple[str, ...] = field(default=())
+    states_split: bool = False  # the files divide the views into training and test views, even if no test view is left
+    bounds: tuple[Vector, Vector] | None = None  # lower and upper corner of the scene in the capture's own frame; None: unknown
 
     def frame(self, index: int) -> Frame:
-        """The pixels of view `index`. Raises InputError where the file cannot be read."""
+        """Return the pixels of view `index`. Raises InputError if its file cannot be read."""
         rgb, mask = self.images.get(index)
         return Frame(rgb, None if mask is None else mask.float() / 255)
 
     def fingerprint(self) -> str:
-        """A short hash of the views' names and sizes and of the split, by which a run knows its capture again wherever it lies."""
-        seen = [[(v.name, v.camera.width, v.camera.height) for v in self.views], self.train, self.test]
-        return hashlib.sha256(json.dumps(seen).encode()).hexdigest()[:16]
+        """Return a short hash of the names and sizes of the views and of the split.
+
+        A run compares it to recognise its capture, wherever the capture's folder is.
+        """
+        content = [[(v.name, v.camera.width, v.camera.height) for v in self.views], self.train, self.test]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]

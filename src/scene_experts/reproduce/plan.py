@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import is_capture, no_capture
 from scene_experts.data.fetch import catalog
 from scene_experts.data.fetch.obtain import present
 from scene_experts.data.images import check_policy
+from scene_experts.data.readers import is_capture, unrecognised_error
 from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.training.config import Data, Train, flags_of, to_json, with_numbers
@@ -138,7 +138,7 @@ def expect_captures(scenes: Sequence[Scene]) -> None:
     """Raises InputError for a scene whose folder is no capture: all of its runs would fail."""
     for scene in scenes:
         if not is_capture(scene.path):
-            raise no_capture(scene.path)
+            raise unrecognised_error(scene.path)
 
 
 def paper_scenes(root: Path) -> list[Scene]:

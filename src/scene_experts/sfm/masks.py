@@ -9,7 +9,7 @@ from pathlib import Path
 from PIL import Image, ImageOps
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.images import mask_of
+from scene_experts.data.images import to_mask
 from scene_experts.data.match import find_mask
 from scene_experts.sfm.photos import Photo
 from scene_experts.sfm.work import remove
@@ -51,7 +51,7 @@ def read(path: Path, photo: Photo) -> Image.Image:
     """The mask file of `photo`, at its size, lying as the photograph is stored, also where EXIF turns this one and the mask is upright."""
     try:
         with Image.open(path) as image:
-            mask = mask_of(image)
+            mask = to_mask(image)
     except (OSError, ValueError, SyntaxError) as error:
         raise InputError(f"expected a whole mask at {path}, found one that is not ({error}); replace it or take it away") from error
     width, height = photo.size

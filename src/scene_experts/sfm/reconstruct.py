@@ -18,8 +18,8 @@ from typing import Any, Literal
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.io import read_json, write_json
-from scene_experts.data.capture import is_capture
 from scene_experts.data.match import EXTENSIONS
+from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
 from scene_experts.sfm import frames, masks, photos, work, worker
 from scene_experts.sfm.pairs import Matching, pairs

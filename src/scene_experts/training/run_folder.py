@@ -190,7 +190,7 @@ def load_capture(data: Data, seed: int = 0, look: bool = False) -> Capture:
         ignore_principal_point=data.ignore_principal_point,
         background=data.background,
         seed=seed,
-        look=look,
+        allow_no_points=look,
     )
     if data.near is None:
         return capture

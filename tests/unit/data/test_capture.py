@@ -15,7 +15,7 @@ from PIL import Image
 from scene_experts.core.errors import InputError
 from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
-from scene_experts.data.readers.colmap import read_model, write_model
+from scene_experts.data.readers.colmap_model import read_model, write_model
 from scene_experts.data.summary import neighbour_distance, summarise
 from support.synthetic import Synthetic, make_capture, picture
 from unit.data.test_lens import LENSES
@@ -159,30 +159,9 @@ def test_fewer_views(made: Synthetic) -> None:
     assert [v.name for v in capture.views] == [f"view_{i:03d}.png" for i in (0, 2, 5, 7)] and capture.test == (0,)
 
 
-def test_text_models_load_alike(made: Synthetic, copy: Path) -> None:
-    model = read_model(copy / "sparse/0")
-    shutil.rmtree(copy / "sparse/0")
-    write_model(copy / "sparse/0", model, text=True)
-    a, b = load(made.folder), load(copy)
-    assert all(torch.equal(v.camera.world_to_cam, w.camera.world_to_cam) for v, w in zip(a.views, b.views))
-    assert a.points is not None and b.points is not None and torch.equal(a.points.xyz, b.points.xyz)
-
-
-def test_absent_images(copy: Path) -> None:
-    for i in (3, 5):
-        (copy / f"images/view_{i:03d}.png").unlink()
-    with pytest.raises(InputError, match=r"expected 10 images in .*, found 2 of them absent \(first: view_003\.png\).*--missing drop"):
-        load(copy)
-    capture = load(copy, missing="drop")
-    assert len(capture.views) == 8 and any("2 of 10 views dropped" in w for w in capture.warnings)
-    shutil.rmtree(copy / "images")
-    with pytest.raises(InputError, match="found 10 of them absent"):
-        load(copy, missing="drop")
-
-
 def test_images_of_another_shape(copy: Path) -> None:
     Image.new("RGB", (48, 48)).save(copy / "images/view_000.png")
-    with pytest.raises(InputError, match="in the shape of its camera"):
+    with pytest.raises(InputError, match=r"view_000\.png.*48x32"):
         load(copy)
 
 
@@ -194,8 +173,8 @@ def test_no_points(copy: Path) -> None:
     (copy / "sparse/0/points3D.bin").unlink()
     with pytest.raises(InputError, match=r"points3D\.bin.*--init random"):
         load(copy)
-    looked = load(copy, look=True)
-    assert looked.points is None and "no 3D points to start from: train with --init random" in looked.warnings
+    looked = load(copy, allow_no_points=True)
+    assert looked.points is None and any("--init random" in w for w in looked.warnings)
     capture = load(copy, init="random")
     assert capture.points is not None and len(capture.points.xyz) > 1000
 
@@ -207,40 +186,20 @@ def test_only_useless_points(copy: Path) -> None:
         load(copy)
 
 
-def test_the_same_image_twice(copy: Path) -> None:
-    model = read_model(copy / "sparse/0")
-    write_model(copy / "sparse/0", replace(model, images=(*model.images, replace(model.images[0], id=99))))
-    with pytest.raises(InputError, match="twice"):
-        load(copy)
-
-
-def test_several_reconstructions(copy: Path) -> None:
-    shutil.copytree(copy / "sparse/0", copy / "sparse/1")
-    assert any("2 reconstructions" in w for w in load(copy).warnings)
-
-
-@pytest.mark.parametrize("part", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_truncated_models(copy: Path, part: str) -> None:
-    path = copy / "sparse/0" / part
-    path.write_bytes(path.read_bytes()[:-5])
-    with pytest.raises(InputError, match=part):
-        load(copy)
-
-
 def test_paths_that_are_no_captures(made: Synthetic, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="found nothing"):
         load(tmp_path / "none")
     with pytest.raises(InputError, match="found a file"):
         load(made.folder / "images/view_000.png")
-    with pytest.raises(InputError, match="expected a capture in"):
+    with pytest.raises(InputError, match=f"{tmp_path}.*sparse/0.*transforms_train.json.*transforms.json"):
         load(tmp_path)
     shutil.copytree(made.folder / "images", tmp_path / "images")
-    with pytest.raises(InputError, match="found 10 photographs without camera poses; run `scene-experts capture "):
+    with pytest.raises(InputError, match=r"10 photographs .*scene-experts capture "):
         load(tmp_path)
-    with pytest.raises(InputError, match=r"found 10 photographs without camera poses; run .*images --out CAPTURE`"):
+    with pytest.raises(InputError, match=r"10 photographs .*images --out CAPTURE`"):
         load(tmp_path / "images")
-    with pytest.raises(InputError, match=f"found its reconstruction alone; give the folder that holds it: {made.folder}$"):
+    with pytest.raises(InputError, match=f"reconstruction.*: {made.folder}$"):
         load(made.folder / "sparse/0")
     for part in ("images", "sparse"):
-        with pytest.raises(InputError, match=f"found a part of one; give the folder that holds it: {made.folder}$"):
+        with pytest.raises(InputError, match=f"a part of one.*: {made.folder}$"):
             load(made.folder / part)

@@ -147,21 +147,21 @@ def test_bad_policies(policy: str) -> None:
 
 
 def test_bad_files(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match=r"none\.png"):
         probe(tmp_path / "none.png")
     (tmp_path / "text.png").write_text("hello")
-    with pytest.raises(InputError, match="readable image"):
+    with pytest.raises(InputError, match=r"text\.png"):
         probe(tmp_path / "text.png")
     (tmp_path / "empty.jpg").write_bytes(b"")
-    with pytest.raises(InputError, match="readable image"):
+    with pytest.raises(InputError, match=r"empty\.jpg"):
         probe(tmp_path / "empty.jpg")
     for ending in ("png", "jpg"):
         made = source(tmp_path / f"cut.{ending}", noise(64, 64))
         whole = made.path.read_bytes()
         made.path.write_bytes(whole[: len(whole) // 2])
-        with pytest.raises(InputError, match="readable image"):
+        with pytest.raises(InputError, match=f"cut.{ending}"):
             decode(made)
     made = source(tmp_path / "grown.png", noise(8, 8))
     Image.fromarray(noise(8, 9)).save(made.path)
-    with pytest.raises(InputError, match=r"expected .* to be 8x8, found 9x8"):
+    with pytest.raises(InputError, match="8x8 px, found 9x8"):
         decode(made)

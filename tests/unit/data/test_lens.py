@@ -14,7 +14,7 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.images import Source, decode
-from scene_experts.data.lens import MODELS, Lens, pinhole_of, without_principal_point
+from scene_experts.data.lens import MODELS, Lens, centre_principal_point, pinhole_of
 
 LENSES = [
     Lens("SIMPLE_PINHOLE", 160, 120, (130.0, 83.0, 57.0)),
@@ -131,7 +131,7 @@ def test_wide_fisheye_gets_a_bounded_picture() -> None:
 
 
 def test_centred_principal_point() -> None:
-    assert without_principal_point(LENSES[1]).params == (130.0, 133.0, 80.0, 60.0)
+    assert centre_principal_point(LENSES[1]).params == (130.0, 133.0, 80.0, 60.0)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,78 @@
+"""The readers of captures. A new kind is one file in this folder and one line in READERS.
+
+A reader outside this package is added with `register`, or by an entry point of the group "scene_experts.readers".
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from importlib.metadata import entry_points
+from pathlib import Path
+
+from scene_experts.core.errors import InputError
+from scene_experts.data.match import EXTENSIONS
+from scene_experts.data.readers.reader import PosedImage, RawCapture, Reader, ReadOptions
+
+__all__ = ["READERS", "PosedImage", "RawCapture", "ReadOptions", "Reader", "find_reader", "is_capture", "register", "unrecognised_error"]
+
+GROUP = "scene_experts.readers"
+READERS = (  # module:object, imported on first use; the first reader that recognises a folder reads it
+    "scene_experts.data.readers.colmap:READER",
+    "scene_experts.data.readers.blender:READER",
+    "scene_experts.data.readers.nerfstudio:READER",
+)
+_registered: list[Reader] = []
+
+
+def register(reader: Reader) -> None:
+    """Add a reader. It is asked before the built-in readers, and before readers registered earlier."""
+    _registered.insert(0, reader)
+
+
+@functools.cache
+def _built_in() -> tuple[Reader, ...]:
+    places = (place.partition(":") for place in READERS)
+    return tuple(getattr(importlib.import_module(module), name) for module, _, name in places)
+
+
+@functools.cache
+def _installed() -> tuple[Reader, ...]:
+    """Load the readers that installed packages offer. Raises InputError if one cannot be imported."""
+    found = []
+    for entry in entry_points(group=GROUP):
+        try:
+            found.append(entry.load())
+        except Exception as error:
+            raise InputError(f"cannot import the capture reader {entry.name} ({entry.value}): {error}; fix or uninstall it") from error
+    return tuple(found)
+
+
+def find_reader(folder: Path) -> Reader | None:
+    """Return the reader that recognises `folder`, or None."""
+    for readers in (_registered, _built_in(), _installed()):
+        for reader in readers:
+            if reader.recognise(folder):
+                return reader
+    return None
+
+
+def is_capture(folder: Path) -> bool:
+    """Return whether a reader recognises `folder`."""
+    return find_reader(folder) is not None
+
+
+def unrecognised_error(folder: Path) -> InputError:
+    """Return the error for a folder that no reader recognises. It says what to do, e.g. with photographs without camera poses."""
+    kinds = ", ".join(reader.files for reader in (*_built_in(), *_installed(), *_registered))
+    expected = f"expected a capture in {folder} ({kinds}), found"
+    if is_capture(folder.absolute().parent):
+        return InputError(f"{expected} a part of one; give the folder that contains it: {folder.absolute().parent}")
+    for place in (folder, folder / "images"):
+        photos = sum(p.suffix.lower() in EXTENSIONS for p in place.iterdir()) if place.is_dir() else 0
+        if photos:
+            out = "CAPTURE" if place == folder else str(folder)
+            return InputError(f"{expected} {photos} photographs without camera poses; run `scene-experts capture {place} --out {out}`")
+    if (folder / ".capture").is_dir():
+        return InputError(f"{expected} an unfinished one; run its `scene-experts capture PHOTOS --out {folder}` again")
+    return InputError(f"{expected} none of these; give the folder that contains them")

@@ -1,293 +1,76 @@
-"""COLMAP reconstructions, binary and text, read with numpy alone; a writer without 2D tracks.
-
-Binary layouts are little endian. cameras: u64 count, then i32 id, i32 model, u64 width, u64 height, f64 parameters. images: u64 count, then
-i32 id, f64 quaternion (wxyz), f64 translation (world to camera), i32 camera, zero-terminated name, u64 n, n x (f64 x, f64 y, i64 point).
-points3D: u64 count, then u64 id, f64 xyz, u8 rgb, f64 error, u64 n, n x (i32 image, i32 index).
-"""
+"""Reads COLMAP captures: a reconstruction (sparse/0) beside the folder of its photographs (images)."""
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from itertools import pairwise
+from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
+import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.io import write_bytes
-from scene_experts.data.lens import MODELS, Lens
-
-_NAMES = tuple(MODELS)
-_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])  # 51 bytes, packed
-_OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+from scene_experts.core.types import Points
+from scene_experts.data.match import absent_error, find_mask, match_images
+from scene_experts.data.readers.colmap_model import find_model, read_model
+from scene_experts.data.readers.reader import PosedImage, RawCapture, ReadOptions
 
 
-@dataclass(frozen=True)
-class Posed:
-    """A registered image: world-to-camera quaternion (w, x, y, z) and translation, and the camera that took it."""
+class ColmapReader:
+    """Reads the first reconstruction of a COLMAP workspace, in binary or text form."""
 
-    id: int
-    name: str
-    quaternion: tuple[float, float, float, float]
-    translation: tuple[float, float, float]
-    camera_id: int
+    name = "colmap"
+    files = "sparse/0 beside images (COLMAP)"
 
-    def world_to_cam(self) -> NDArray[np.float64]:
-        """[4, 4] float64."""
-        w, x, y, z = np.asarray(self.quaternion) / np.linalg.norm(self.quaternion)
-        out = np.eye(4)
-        out[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        out[:3, 3] = self.translation
-        return out
+    def recognise(self, folder: Path) -> bool:
+        return find_model(folder) is not None
 
+    def read(self, folder: Path, options: ReadOptions) -> RawCapture:
+        """Read poses, points and masks.
 
-@dataclass(frozen=True)
-class Model:
-    """A reconstruction: lenses by camera id, registered images, and the points (P may be 0)."""
-
-    cameras: dict[int, Lens]
-    images: tuple[Posed, ...]
-    ids: NDArray[np.int64]  # [P]
-    xyz: NDArray[np.float64]  # [P, 3]
-    rgb: NDArray[np.uint8]  # [P, 3]
-    error: NDArray[np.float64]  # [P] px, mean reprojection error as stored
-    observations: dict[int, tuple[NDArray[np.float64], NDArray[np.int64]]] = field(
-        default_factory=dict
-    )  # image id: xy [n, 2], point id [n]
-
-
-def find_model(root: Path) -> Path | None:
-    """The folder of the reconstruction in `root` (sparse/0, sparse, colmap/sparse/0, colmap/sparse or itself), or None."""
-    for name in ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "."):
-        folder = root / name
-        if any((folder / f"{part}.{kind}").is_file() for part in ("cameras", "images", "points3D") for kind in ("bin", "txt")):
-            return folder
-    return None
+        Raises InputError if a file of the reconstruction is damaged, an image is listed twice, or photographs are absent
+        (with `options.missing == "drop"`: if all are).
+        """
+        place = find_model(folder)
+        assert place is not None
+        model = read_model(place)
+        names = sorted(image.name for image in model.images)
+        twice = next((a for a, b in pairwise(names) if a == b), None)
+        if twice is not None:
+            raise InputError(f"expected every image once in {place}, found {twice} twice; remove one of its poses")
+        photographs = folder / (options.images or "images")
+        _check_whole(folder, place, options.images or "images")
+        match = match_images(photographs, names)
+        warnings = list(match.warnings)
+        if match.absent and (options.missing == "error" or not match.found):
+            raise absent_error(photographs, names, match.absent)
+        if match.absent:
+            warnings.append(f"dropped {len(match.absent)} of {len(names)} views because their image is absent (first: {match.absent[0]})")
+        warnings += _other_reconstructions(place)
+        images = []
+        for image in sorted(model.images, key=lambda i: i.name):
+            if image.name in match.found:
+                path = match.found[image.name]
+                mask = find_mask(folder, image.name, path)
+                images.append(PosedImage(image.name, path, model.cameras[image.camera_id], image.world_to_cam(), mask))
+        points = Points(torch.from_numpy(model.xyz), torch.from_numpy(model.rgb)) if len(model.xyz) else None
+        return RawCapture(images, points, warnings, points_source="points3D.bin or points3D.txt")
 
 
-def read_model(folder: Path, observations: bool = False) -> Model:
-    """Read the reconstruction in `folder`; binary files before text files. A missing points3D gives a model without points.
-
-    `observations` also reads the 2D tracks. Raises InputError for files that are missing, truncated or not what they say, for unknown
-    camera models, for no cameras or images, for poses that are not finite and for images of unknown cameras.
-    """
-    cameras_file, images_file, points_file = (_pick(folder, name) for name in ("cameras", "images", "points3D"))
-    for name, found in (("cameras", cameras_file), ("images", images_file)):
-        if found is None:
-            raise InputError(f"expected {name}.bin or {name}.txt in {folder}, found neither; copy the whole reconstruction there")
-    assert cameras_file is not None and images_file is not None
-    cameras = dict(_cameras_bin(cameras_file) if cameras_file.suffix == ".bin" else _cameras_txt(cameras_file))
-    if not cameras:
-        raise InputError(f"expected at least one camera in {cameras_file}, found none; reconstruct the capture again")
-    rows = list(_images_bin(images_file, observations) if images_file.suffix == ".bin" else _images_txt(images_file, observations))
-    images = tuple(image for image, _ in rows)
-    _check_images(images, cameras, images_file)
-    points = np.empty(0, _POINT)
-    if points_file is not None:
-        points = _points_bin(points_file) if points_file.suffix == ".bin" else _points_txt(points_file)
-    return Model(
-        cameras,
-        images,
-        points["id"].astype(np.int64),
-        np.array(points["xyz"], dtype=np.float64),  # copies: one row of a packed record counts as contiguous, with strides torch refuses
-        np.array(points["rgb"]),
-        np.array(points["error"], dtype=np.float64),
-        {image.id: (seen["xy"].copy(), seen["point"].copy()) for image, seen in rows if seen is not None},
-    )
+def _check_whole(folder: Path, place: Path, images: str) -> None:
+    """Raise InputError if `folder` is the reconstruction itself, not the folder that contains it and the photographs."""
+    above = next((p for p in (folder.absolute().parent, folder.absolute().parent.parent) if (p / images).is_dir()), None)
+    if not (folder / images).is_dir() and above is not None and place.samefile(folder):
+        raise InputError(
+            f"expected the folder of a capture, found only its reconstruction {folder}; give the folder that contains it: {above}"
+        )
 
 
-def _pick(folder: Path, name: str) -> Path | None:
-    return next((path for kind in ("bin", "txt") if (path := folder / f"{name}.{kind}").is_file()), None)
+def _other_reconstructions(place: Path) -> list[str]:
+    """Return a warning if COLMAP split the photographs into several reconstructions."""
+    if place.name != "0":
+        return []
+    others = [p for p in place.parent.iterdir() if p.is_dir() and p.name.isdigit() and p.name != "0"]
+    note = f"{place.parent.name}/ holds {len(others) + 1} reconstructions that COLMAP could not join; only 0 is used"
+    return [note] if others else []
 
 
-def _check_images(images: tuple[Posed, ...], cameras: dict[int, Lens], path: Path) -> None:
-    if not images:
-        raise InputError(f"expected at least one registered image in {path}, found none; reconstruct the capture again")
-    for image in images:
-        if not PurePosixPath(image.name).name:
-            raise InputError(f"expected a name for every image, found {image.name!r} for image {image.id} in {path}; restore the file")
-        if not np.isfinite((*image.quaternion, *image.translation)).all() or not any(image.quaternion):
-            raise InputError(f"expected a finite pose for every image, found {image.name} without one in {path}; remove that image from it")
-        if image.camera_id not in cameras:
-            raise InputError(
-                f"expected the camera of {image.name} among those of {path.parent}, found no camera {image.camera_id}; restore it"
-            )
-
-
-class _Bytes:
-    """A cursor over the bytes of one file; reading past the end is an InputError that names the file."""
-
-    def __init__(self, path: Path, smallest: int) -> None:
-        self.path, self.data, self.at = path, path.read_bytes(), 0
-        (self.count,) = self.take("<Q")
-        if self.count * smallest > len(self.data):
-            raise self.short()
-
-    def short(self) -> InputError:
-        return InputError(f"expected a whole COLMAP file at {self.path}, found it cut short after {len(self.data)} bytes; copy it again")
-
-    def take(self, layout: str) -> tuple:
-        start, self.at = self.at, self.at + struct.calcsize(layout)
-        if self.at > len(self.data):
-            raise self.short()
-        return struct.unpack_from(layout, self.data, start)
-
-    def text(self) -> str:
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
-            raise self.short()
-        start, self.at = self.at, end + 1
-        return self.data[start:end].decode("utf-8", "surrogateescape")
-
-    def skip(self, size: int) -> int:
-        start, self.at = self.at, self.at + size
-        if self.at > len(self.data):
-            raise self.short()
-        return start
-
-
-def _cameras_bin(path: Path) -> Iterator[tuple[int, Lens]]:
-    file = _Bytes(path, 24)
-    for _ in range(file.count):
-        key, model, width, height = file.take("<iiQQ")
-        if not 0 <= model < len(_NAMES):
-            raise InputError(
-                f"expected a camera model between 0 and {len(_NAMES) - 1} ({', '.join(_NAMES)}), found {model} for camera {key} in {path}; "
-                f"convert the reconstruction to one of those"
-            )
-        name = _NAMES[model]
-        yield key, _lens(path, key, name, width, height, file.take(f"<{len(MODELS[name])}d"))
-
-
-def _lens(path: Path, key: int, model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
-    try:
-        return Lens(model, width, height, params)
-    except InputError as error:
-        raise InputError(f"camera {key} of {path}: {error}") from None
-
-
-def _images_bin(path: Path, observations: bool) -> Iterator[tuple[Posed, NDArray | None]]:
-    file = _Bytes(path, 73)
-    for _ in range(file.count):
-        key, qw, qx, qy, qz, tx, ty, tz, camera = file.take("<i7di")
-        name = file.text()
-        (n,) = file.take("<Q")
-        start = file.skip(n * _OBSERVATION.itemsize)
-        seen = np.frombuffer(file.data, _OBSERVATION, n, start) if observations else None
-        yield Posed(key, name, (qw, qx, qy, qz), (tx, ty, tz), camera), seen
-
-
-def _points_bin(path: Path) -> NDArray:
-    file = _Bytes(path, _POINT.itemsize)
-    data, at, size, length = file.data, file.at, _POINT.itemsize, struct.Struct("<Q").unpack_from
-    heads: list[bytes] = []
-    try:
-        for _ in range(file.count):  # records differ in length, so one small step per point; the tracks are jumped over
-            heads.append(data[at : at + size])
-            at += size + 8 * length(data, at + size - 8)[0]
-    except struct.error:
-        raise file.short() from None
-    if at > len(data):
-        raise file.short()
-    return np.frombuffer(b"".join(heads), _POINT)
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return [line for line in path.read_text("utf-8", "surrogateescape").split("\n") if not line.startswith("#")]
-    except OSError as error:
-        raise InputError(f"expected a readable file at {path}, found {error.strerror}; check its permissions") from error
-
-
-def _bad_line(path: Path, line: str) -> InputError:
-    return InputError(f"expected a line of a COLMAP {path.name}, found {line[:60]!r} in {path}; restore the file")
-
-
-def _cameras_txt(path: Path) -> Iterator[tuple[int, Lens]]:
-    for line in filter(str.strip, _lines(path)):
-        parts = line.split()
-        try:
-            key, model, width, height = int(parts[0]), parts[1], int(parts[2]), int(parts[3])
-            params = tuple(float(p) for p in parts[4:])
-        except (ValueError, IndexError):
-            raise _bad_line(path, line) from None
-        yield key, _lens(path, key, model, width, height, params)
-
-
-def _images_txt(path: Path, observations: bool) -> Iterator[tuple[Posed, NDArray | None]]:
-    lines = _lines(path)
-    while lines and not lines[-1].strip():
-        lines.pop()
-    for i in range(0, len(lines), 2):  # a pair of lines an image; the second, its observations, may be empty
-        parts = lines[i].split(maxsplit=9)
-        try:
-            q, t = [float(p) for p in parts[1:5]], [float(p) for p in parts[5:8]]
-            image = Posed(int(parts[0]), parts[9].strip(), (q[0], q[1], q[2], q[3]), (t[0], t[1], t[2]), int(parts[8]))
-            seen = _seen(lines[i + 1] if i + 1 < len(lines) else "") if observations else None
-        except (ValueError, IndexError):
-            raise _bad_line(path, lines[i]) from None
-        yield image, seen
-
-
-def _seen(line: str) -> NDArray:
-    numbers = np.array(line.split(), dtype=np.float64).reshape(-1, 3)
-    out = np.empty(len(numbers), _OBSERVATION)
-    out["xy"], out["point"] = numbers[:, :2], numbers[:, 2]
-    return out
-
-
-def _points_txt(path: Path) -> NDArray:
-    rows = [line.split(maxsplit=8)[:8] for line in _lines(path) if line.strip()]
-    try:
-        numbers = np.array([[float(x) for x in row] for row in rows], dtype=np.float64).reshape(len(rows), 8)
-    except ValueError:
-        raise _bad_line(path, next((" ".join(row) for row in rows if len(row) < 8), " ".join(rows[0]))) from None
-    out = np.empty(len(rows), _POINT)
-    out["id"], out["xyz"], out["rgb"], out["error"], out["length"] = numbers[:, 0], numbers[:, 1:4], numbers[:, 4:7], numbers[:, 7], 0
-    return out
-
-
-def write_model(folder: Path, model: Model, text: bool = False) -> None:
-    """Write `model` to `folder` as COLMAP does, without its 2D tracks. Loses nothing that training reads."""
-    kind, make = (".txt", _as_text) if text else (".bin", _as_binary)
-    for name, data in make(model).items():
-        write_bytes(folder / f"{name}{kind}", data)
-
-
-def _encoded(name: str) -> bytes:
-    return name.encode("utf-8", "surrogateescape")
-
-
-def _as_binary(model: Model) -> dict[str, bytes]:
-    cameras = struct.pack("<Q", len(model.cameras)) + b"".join(
-        struct.pack(f"<iiQQ{len(c.params)}d", key, _NAMES.index(c.model), c.width, c.height, *c.params) for key, c in model.cameras.items()
-    )
-    images = struct.pack("<Q", len(model.images)) + b"".join(
-        struct.pack("<i7di", i.id, *i.quaternion, *i.translation, i.camera_id)
-        + i.name.encode("utf-8", "surrogateescape")
-        + b"\0"
-        + bytes(8)
-        for i in model.images
-    )
-    points = np.zeros(len(model.xyz), _POINT)
-    points["id"], points["xyz"], points["rgb"], points["error"] = model.ids, model.xyz, model.rgb, model.error
-    return {"cameras": cameras, "images": images, "points3D": struct.pack("<Q", len(points)) + points.tobytes()}
-
-
-def _as_text(model: Model) -> dict[str, bytes]:
-    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    cameras += [f"{key} {c.model} {c.width} {c.height} " + " ".join(map(repr, c.params)) for key, c in model.cameras.items()]
-    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
-    for i in model.images:
-        images += [" ".join([str(i.id), *map(repr, (*i.quaternion, *i.translation)), str(i.camera_id), i.name]), ""]
-    points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
-    for key, xyz, rgb, error in zip(model.ids.tolist(), model.xyz.tolist(), model.rgb.tolist(), model.error.tolist()):
-        points.append(" ".join([str(key), *map(repr, xyz), *map(str, rgb), repr(error)]))
-    parts = {"cameras": cameras, "images": images, "points3D": points}
-    return {name: _encoded("\n".join(lines) + "\n") for name, lines in parts.items()}
+READER = ColmapReader()

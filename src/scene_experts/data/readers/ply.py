@@ -1,4 +1,4 @@
-"""Point clouds in PLY files: positions and colours, the three encodings, nothing else."""
+"""Reads point clouds from PLY files: positions and colours, in the three encodings of the format."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _TYPES = {
 
 
 def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """xyz [P, 3] float64 and rgb [P, 3] uint8 (grey 128 without colours) of the vertices in `path`.
+    """Return xyz [P, 3] float64 and rgb [P, 3] uint8 of the vertices in `path`. Without colours, rgb is 128 (grey).
 
-    Raises InputError for anything but a PLY whose first element is its vertices, without lists, and for one cut short.
+    Raises InputError if the file is not a PLY file whose first element is `vertex` without list properties, or is truncated.
     """
     data = path.read_bytes()
     end = data.find(b"end_header")
@@ -45,7 +45,7 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
             columns = {name: table[name] for name, _ in fields}
         xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
     except (StopIteration, ValueError, KeyError, IndexError):
-        raise InputError(f"expected a whole PLY file of points at {path}, found a damaged one; copy it again") from None
+        raise InputError(f"expected a complete PLY file of points at {path}, found a damaged one; copy it again") from None
     if not all(name in columns for name in ("red", "green", "blue")):
         return xyz, np.full((count, 3), 128, np.uint8)
     rgb = np.stack([columns[name] for name in ("red", "green", "blue")], 1)

@@ -1,212 +1,74 @@
-"""The COLMAP reader: both formats, 2D tracks, and every way a file can be bad."""
+"""COLMAP captures: the reconstruction and the photographs that belong to it."""
 
 from __future__ import annotations
 
-import struct
-import time
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.readers.colmap import Model, Posed, find_model, read_model, write_model
-from unit.data.test_lens import LENSES
+from scene_experts.data.capture import load
+from scene_experts.data.readers.colmap import READER
+from scene_experts.data.readers.colmap_model import read_model, write_model
+from scene_experts.data.readers.reader import ReadOptions
+from support.synthetic import Synthetic, make_capture
 
 
-def model() -> Model:
-    cameras = {i + 3: lens for i, lens in enumerate(LENSES)}
-    rng = np.random.default_rng(0)
-    images = []
-    for i in range(14):
-        q, t = rng.standard_normal(4), rng.standard_normal(3)
-        q /= np.linalg.norm(q)
-        images.append(Posed(i + 1, f"left cam/é {i}.b.jpg", tuple(map(float, q)), tuple(map(float, t)), 3 + i % len(LENSES)))  # type: ignore[arg-type]
-    count = 50
-    return Model(
-        cameras,
-        tuple(images),
-        np.arange(10, 10 + count),
-        rng.standard_normal((count, 3)) * 1e5,
-        rng.integers(0, 256, (count, 3)).astype(np.uint8),
-        rng.random(count),
-    )
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Synthetic:
+    return make_capture(tmp_path_factory.mktemp("made"), views=10, size=(48, 32), points=300)
 
 
-def assert_same(a: Model, b: Model) -> None:
-    assert a.cameras == b.cameras and a.images == b.images
-    for name in ("ids", "xyz", "rgb", "error"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+@pytest.fixture
+def copy(made: Synthetic, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made.folder, tmp_path / "copy"))
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_written_models_read_back_exactly(tmp_path: Path, text: bool) -> None:
-    made = model()
-    write_model(tmp_path, made, text=text)
-    assert_same(read_model(tmp_path), made)
+def test_a_reconstruction_states_neither_split_nor_bounds(made: Synthetic) -> None:
+    raw = READER.read(made.folder, ReadOptions())
+    assert [image.name for image in raw.images] == sorted(made.images) and not any(image.test for image in raw.images)
+    assert raw.alpha_over is None and raw.bounds is None and not raw.states_split and "points3D" in raw.points_source
 
 
-def with_tracks(folder: Path) -> None:
-    """A binary model written by hand: 1 camera, 2 images with 2 and 1 observations, 2 points with tracks of 3 and 0."""
-    (folder / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 7, 1, 640, 480, 500.0, 501.0, 320.5, 240.25))
-    first = struct.pack("<i7di", 1, 1, 0, 0, 0, 0.5, 0, 0, 7) + b"a.png\0" + struct.pack("<Qddqddq", 2, 10.5, 11.5, 42, 3, 4, -1)
-    second = struct.pack("<i7di", 2, 0, 1, 0, 0, 0, 0, 1, 7) + b"sub/b.png\0" + struct.pack("<Qddq", 1, 1, 2, 43)
-    (folder / "images.bin").write_bytes(struct.pack("<Q", 2) + first + second)
-    one = struct.pack("<Q3d3Bd", 42, 1, 2, 3, 10, 20, 30, 0.25) + struct.pack("<Q6i", 3, 1, 0, 2, 0, 2, 1)
-    two = struct.pack("<Q3d3Bd", 43, 4, 5, 6, 40, 50, 60, 0.5) + struct.pack("<Q", 0)
-    (folder / "points3D.bin").write_bytes(struct.pack("<Q", 2) + one + two)
+def test_text_models_load_alike(made: Synthetic, copy: Path) -> None:
+    model = read_model(copy / "sparse/0")
+    shutil.rmtree(copy / "sparse/0")
+    write_model(copy / "sparse/0", model, text=True)
+    a, b = load(made.folder), load(copy)
+    assert all(torch.equal(v.camera.world_to_cam, w.camera.world_to_cam) for v, w in zip(a.views, b.views))
+    assert a.points is not None and b.points is not None and torch.equal(a.points.xyz, b.points.xyz)
 
 
-def test_tracks_are_read_or_jumped_over(tmp_path: Path) -> None:
-    with_tracks(tmp_path)
-    got = read_model(tmp_path, observations=True)
-    assert got.cameras[7].params == (500.0, 501.0, 320.5, 240.25)
-    assert [i.name for i in got.images] == ["a.png", "sub/b.png"]
-    np.testing.assert_array_equal(got.xyz, [[1, 2, 3], [4, 5, 6]])
-    np.testing.assert_array_equal(got.rgb, [[10, 20, 30], [40, 50, 60]])
-    np.testing.assert_array_equal(got.observations[1][0], [[10.5, 11.5], [3, 4]])
-    np.testing.assert_array_equal(got.observations[1][1], [42, -1])
-    np.testing.assert_allclose(got.images[0].world_to_cam(), [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    np.testing.assert_allclose(got.images[1].world_to_cam()[:3, :3], np.diag([1, -1, -1]), atol=1e-12)
-    assert read_model(tmp_path).observations == {}
+def test_absent_images(copy: Path) -> None:
+    for i in (3, 5):
+        (copy / f"images/view_{i:03d}.png").unlink()
+    with pytest.raises(InputError, match=r"10 images in .*2 are absent.*view_003\.png.*--missing drop"):
+        load(copy)
+    capture = load(copy, missing="drop")
+    assert len(capture.views) == 8 and any("2 of 10 views" in w for w in capture.warnings)
+    shutil.rmtree(copy / "images")
+    with pytest.raises(InputError, match="10 are absent"):
+        load(copy, missing="drop")
 
 
-def test_text_with_observations_and_blank_lines(tmp_path: Path) -> None:
-    (tmp_path / "cameras.txt").write_text("# comment\n1 SIMPLE_RADIAL 64 48 50 32 24 0.1\n")
-    (tmp_path / "images.txt").write_text("# c\n1 1 0 0 0 0 0 1 1 a b.png\n1.5 2.5 9 3 4 -1\n2 1 0 0 0 0 0 2 1 c.png\n\n")
-    (tmp_path / "points3D.txt").write_text("9 1 2 3 255 0 7 0.5 1 0 2 0\n")
-    got = read_model(tmp_path, observations=True)
-    assert [i.name for i in got.images] == ["a b.png", "c.png"]
-    np.testing.assert_array_equal(got.observations[1][0], [[1.5, 2.5], [3, 4]])
-    assert len(got.observations[2][0]) == 0
-    np.testing.assert_array_equal(got.rgb, [[255, 0, 7]])
+def test_the_same_image_twice(copy: Path) -> None:
+    model = read_model(copy / "sparse/0")
+    write_model(copy / "sparse/0", replace(model, images=(*model.images, replace(model.images[0], id=99))))
+    with pytest.raises(InputError, match="twice"):
+        load(copy)
 
 
-def test_75_thousand_points_in_well_under_a_second_or_two(tmp_path: Path) -> None:
-    made, count = model(), 75_000
-    rng = np.random.default_rng(0)
-    made = replace(
-        made,
-        ids=np.arange(count),
-        xyz=rng.random((count, 3)),
-        rgb=np.zeros((count, 3), np.uint8),
-        error=np.zeros(count),
-        images=made.images,
-    )
-    write_model(tmp_path, made)
-    start = time.process_time()
-    assert len(read_model(tmp_path).xyz) == count
-    assert time.process_time() - start < 1.5
+def test_several_reconstructions(copy: Path) -> None:
+    shutil.copytree(copy / "sparse/0", copy / "sparse/1")
+    assert any("2 reconstructions" in w for w in load(copy).warnings)
 
 
-@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
-def test_models_are_found(tmp_path: Path, place: str) -> None:
-    write_model(tmp_path / place, model())
-    assert find_model(tmp_path) == tmp_path / place
-
-
-def test_no_model(tmp_path: Path) -> None:
-    assert find_model(tmp_path) is None
-
-
-@pytest.mark.parametrize("name", ["cameras", "images"])
-def test_missing_files_are_named(tmp_path: Path, name: str) -> None:
-    write_model(tmp_path, model())
-    (tmp_path / f"{name}.bin").unlink()
-    with pytest.raises(InputError, match=f"{name}.bin or {name}.txt"):
-        read_model(tmp_path)
-
-
-def test_missing_points_mean_none(tmp_path: Path) -> None:
-    write_model(tmp_path, model())
-    (tmp_path / "points3D.bin").unlink()
-    assert len(read_model(tmp_path).xyz) == 0
-
-
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_truncation_anywhere_is_an_input_error(tmp_path: Path, name: str) -> None:
-    with_tracks(tmp_path)
-    whole = (tmp_path / f"{name}.bin").read_bytes()
-    for size in range(len(whole)):
-        (tmp_path / f"{name}.bin").write_bytes(whole[:size])
-        with pytest.raises(InputError, match=f"{name}.bin"):
-            read_model(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_an_absurd_count_is_an_input_error_at_once(tmp_path: Path, name: str) -> None:
-    with_tracks(tmp_path)
-    whole = (tmp_path / f"{name}.bin").read_bytes()
-    (tmp_path / f"{name}.bin").write_bytes(struct.pack("<Q", 1 << 60) + whole[8:])
-    with pytest.raises(InputError, match="cut short"):
-        read_model(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_damaged_text(tmp_path: Path, name: str) -> None:
-    write_model(tmp_path, model(), text=True)
-    path = tmp_path / f"{name}.txt"
-    path.write_text(path.read_text()[: path.read_text().rstrip().rfind("\n") + 5])
-    with pytest.raises(InputError, match=name):
-        read_model(tmp_path)
-
-
-def test_unknown_model_number(tmp_path: Path) -> None:
-    with_tracks(tmp_path)
-    (tmp_path / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 7, 99, 640, 480, 500.0, 501.0, 320.5, 240.25))
-    with pytest.raises(InputError, match="found 99"):
-        read_model(tmp_path)
-
-
-def test_unknown_model_name(tmp_path: Path) -> None:
-    write_model(tmp_path, model(), text=True)
-    (tmp_path / "cameras.txt").write_text("3 WIBBLE 64 48 50 32 24\n")
-    with pytest.raises(InputError, match="WIBBLE"):
-        read_model(tmp_path)
-
-
-def test_no_cameras_and_no_images(tmp_path: Path) -> None:
-    write_model(tmp_path, replace(model(), cameras={}))
-    with pytest.raises(InputError, match="at least one camera"):
-        read_model(tmp_path)
-    write_model(tmp_path, replace(model(), images=()))
-    with pytest.raises(InputError, match="at least one registered image"):
-        read_model(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "bad", [{"quaternion": (float("nan"), 0.0, 0.0, 1.0)}, {"translation": (0.0, float("inf"), 0.0)}, {"quaternion": (0.0,) * 4}]
-)
-def test_poses_that_are_not_finite(tmp_path: Path, bad: dict) -> None:
-    made = model()
-    write_model(tmp_path, replace(made, images=(replace(made.images[0], **bad), *made.images[1:])))
-    with pytest.raises(InputError, match="finite pose"):
-        read_model(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["", "."])
-def test_images_without_a_name(tmp_path: Path, name: str) -> None:
-    made = model()
-    write_model(tmp_path, replace(made, images=(replace(made.images[0], name=name), *made.images[1:])))
-    with pytest.raises(InputError, match=r"a name for every image, found '\.?' for image 1"):
-        read_model(tmp_path)
-
-
-@pytest.mark.parametrize("text", [False, True])
-def test_one_point(tmp_path: Path, text: bool) -> None:
-    made = model()
-    made = replace(made, ids=made.ids[:1], xyz=made.xyz[:1], rgb=made.rgb[:1], error=made.error[:1])
-    write_model(tmp_path, made, text=text)
-    got = read_model(tmp_path)
-    assert_same(got, made)
-    for array in (got.xyz, got.rgb, got.error):
-        assert torch.from_numpy(array).shape == array.shape
-
-
-def test_image_of_an_unknown_camera(tmp_path: Path) -> None:
-    made = model()
-    write_model(tmp_path, replace(made, images=(replace(made.images[0], camera_id=999),)))
-    with pytest.raises(InputError, match="no camera 999"):
-        read_model(tmp_path)
+@pytest.mark.parametrize("part", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_truncated_models(copy: Path, part: str) -> None:
+    path = copy / "sparse/0" / part
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(InputError, match=part):
+        load(copy)
