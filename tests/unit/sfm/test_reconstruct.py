@@ -121,7 +121,7 @@ def test_photographs_that_fit_nowhere_leave_the_reason_and_nothing_else(tmp_path
     with pytest.raises(InputError, match="found none that fit together"):
         make(black(tmp_path / "photos"), tmp_path / "out")
     assert [p.name for p in (tmp_path / "out").iterdir()] == [NAME]
-    with pytest.raises(InputError, match="found one that is not whole; give its `scene-experts capture PHOTOS"):
+    with pytest.raises(InputError, match=r"unfinished.*scene-experts capture PHOTOS"):
         load(tmp_path / "out")
 
 
