@@ -17,6 +17,7 @@ import torch
 
 from scene_experts.bench.measure import Clock, Subject, clock_for, least
 from scene_experts.bench.step import AT, work
+from scene_experts.core.types import Mode
 from scene_experts.evaluate import timing
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
@@ -41,7 +42,7 @@ def frames(recipe: str, anchors: int) -> tuple[Subject, int]:
         times, decoded = [], None
         for form in forms:
             began = clock()
-            decoded = form(camera, AT, False, rasterize.visible)
+            decoded = form(camera, AT, Mode.DRAW, rasterize.visible)
             times.append(clock() - began)
         assert decoded is not None
         began = clock()

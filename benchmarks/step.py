@@ -14,7 +14,7 @@ import torch
 
 from scene_experts.bench import peer, raster
 from scene_experts.bench.step import BASELINE, MIXTURE, PARTS, Work, alike, work
-from scene_experts.core.types import Gaussians
+from scene_experts.core.types import Gaussians, Mode
 from scene_experts.native import library as native
 
 
@@ -28,7 +28,7 @@ def target_of(pixels: torch.Tensor, step: Work) -> float:
 @torch.no_grad()
 def drawn(step: Work) -> Gaussians:
     """The Gaussians that one step draws."""
-    g = step.training.scene(step.camera, 2000, False, step.rasterize.visible).gaussians
+    g = step.training.scene(step.camera, 2000, Mode.DRAW, step.rasterize.visible).gaussians
     return Gaussians(*(t.detach() for t in (g.means, g.quats, g.scales, g.opacities, g.colors)), g.source)
 
 

@@ -25,6 +25,7 @@ import torch
 import explicit_gsplat
 from scene_experts.core.io import write_atomic
 from scene_experts.core.transfer import upload
+from scene_experts.core.types import Mode
 from scene_experts.data.capture import Capture, load
 from scene_experts.evaluate import timing
 from scene_experts.recipes import RECIPES
@@ -135,11 +136,10 @@ def recipe(name: str, capture: Capture, rasterize: Rasterizer, args: argparse.Na
 def scored(done: Training, capture: Capture, rasterize: Rasterizer, device: str) -> dict[str, Any]:
     """PSNR over held-out views, frames a second, and the number of Gaussians with positive opacity."""
     scene, active, psnr = done.scene, [], []
-    scene.eval()
     background = upload(torch.tensor(capture.background), device)
     for index in capture.test or capture.train:
         camera = capture.views[index].camera.to(device)
-        decoded = scene(camera, done.step, False, rasterize.visible)
+        decoded = scene(camera, done.step, Mode.DRAW, rasterize.visible)
         if decoded.raw_opacity is not None:
             active.append(float((decoded.raw_opacity > 0).float().mean()))
         psnr.append(quality(rasterize(decoded.gaussians, camera, background).image, capture, index))

@@ -11,6 +11,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.recipes import RECIPES
@@ -52,7 +53,7 @@ def held_out(capture, recipe: str, seed: int = 0, grow: bool = True, monkeypatch
         scores = []
         for i in getattr(capture, views):
             camera, frame = capture.views[i].camera, capture.frame(i)
-            decoded = last["scene"](camera, steps, False, rasterize.visible)
+            decoded = last["scene"](camera, steps, Mode.DRAW, rasterize.visible)
             image = rasterize(decoded.gaussians, camera, torch.tensor(capture.background)).image
             scores.append(psnr(image.clamp(0, 1), frame.rgb.float() / 255, frame.mask))
     return statistics.mean(scores)

@@ -14,7 +14,7 @@ from torch import Tensor
 from scene_experts.bench import raster
 from scene_experts.bench.machine import Machine, multiply_adds
 from scene_experts.bench.measure import Clock, Figure, Missing, Result, Subject, clock_for, least
-from scene_experts.core.types import Camera, Points
+from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer, choose
 from scene_experts.render.cpu import CpuRasterizer
@@ -44,7 +44,7 @@ class Work:
         times = [clock()]
         training.step = AT
         training.set_rates()
-        decoded = scene(self.camera, AT, True, self.rasterize.visible)
+        decoded = scene(self.camera, AT, Mode.TRAIN, self.rasterize.visible)
         times.append(clock())
         render = self.rasterize(decoded.gaussians, self.camera, torch.zeros(3))
         times.append(clock())
@@ -73,7 +73,7 @@ class Work:
     @torch.no_grad()
     def drawn(self) -> int:
         """Gaussians that the view shows."""
-        return len(self.training.scene(self.camera, AT, False, self.rasterize.visible).gaussians)
+        return len(self.training.scene(self.camera, AT, Mode.DRAW, self.rasterize.visible).gaussians)
 
 
 def work(recipe: str, anchors: int, width: int, height: int, rasterize: Rasterizer | None = None, seen: float = 0.5) -> Work:

@@ -23,7 +23,7 @@ from scene_experts.render import as_trained
 from scene_experts.training import run_folder
 from scene_experts.training.progress import Bar
 from scene_experts.view import path_files, paths, video
-from scene_experts.view.paint import Look, Mode, paint
+from scene_experts.view.paint import Look, Show, paint
 from scene_experts.view.paths import CameraPath
 
 
@@ -44,7 +44,7 @@ class RenderCommand:
     """Frames a second; 24, or what the file says."""
     size: str | None = None
     """WIDTHxHEIGHT in px; the training views' by default."""
-    show: tuple[Mode, ...] = ("picture",)
+    show: tuple[Show, ...] = ("picture",)
     """What to show, several beside each other: picture, depth, alpha, experts, entropy, activation."""
     attribute: Literal["opacity", "cov", "color"] = "color"
     """Whose experts are shown."""

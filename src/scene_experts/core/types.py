@@ -15,6 +15,7 @@ Frames and units
 
 from __future__ import annotations
 
+import enum
 import functools
 import math
 from dataclasses import dataclass, replace
@@ -23,6 +24,18 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.transfer import upload
+
+
+class Mode(enum.Enum):
+    """What a scene is used for. Everything in a scene that is random or adapts obeys this value, and nothing else.
+
+    `nn.Module.train()` and `eval()` have no effect on a scene, and neither has whether gradients are enabled.
+    """
+
+    TRAIN = "train"
+    """Routers draw noise, biases of the router move, and a coarse-to-fine training uses the levels that it has reached."""
+    DRAW = "draw"
+    """Nothing is random and nothing changes: for pictures, evaluation and measurements, with or without gradients."""
 
 
 @dataclass(frozen=True)

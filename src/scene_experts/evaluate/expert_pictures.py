@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_experts.core.types import Camera, Decoded, Gaussians
+from scene_experts.core.types import Camera, Decoded, Gaussians, Mode
 from scene_experts.evaluate import pictures
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def alone(
 
     With Top-2 every anchor is in two pictures. Raises KeyError where the attribute has no experts.
     """
-    decoded = scene(camera, step, False, rasterize.visible)
+    decoded = scene(camera, step, Mode.DRAW, rasterize.visible)
     mine = chosen_by(decoded, attribute, scene.K)
     draw = lambda gaussians: rasterize(gaussians, camera, background).image.clamp(0, 1)  # noqa: E731
     return draw(decoded.gaussians), [draw(keep(decoded.gaussians, mine[:, e])) for e in range(mine.shape[1])]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.types import Camera
+from scene_experts.core.types import Camera, Mode
 from scene_experts.scene.anchors.appearance import Codes
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def fitted(
     area = 3 * counts.sum().clamp_min(1e-12)
     for i in range(STEPS):
         codes.fitted[camera.id] = code
-        image = rasterize(scene(camera, step, False, rasterize.visible).gaussians, camera, background).image
+        image = rasterize(scene(camera, step, Mode.DRAW, rasterize.visible).gaussians, camera, background).image
         loss = ((image.clamp(0, 1) - photo).abs() * counts[..., None]).sum() / area
         if loss.item() < least:
             best, least = code.detach().clone(), loss.item()

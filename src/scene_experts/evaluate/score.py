@@ -19,7 +19,7 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
-from scene_experts.core.types import Camera, Decoded, Render
+from scene_experts.core.types import Camera, Decoded, Mode, Render
 from scene_experts.evaluate import expert_pictures, halves, pictures, timing
 from scene_experts.evaluate.experts import expert_shares
 from scene_experts.evaluate.metrics import VARIANTS, Perceptual, score
@@ -153,7 +153,7 @@ def _draw(
 ) -> dict[str, Any]:
     """Draw one view and write it beside its photograph; what was counted on the way. half: only the right half counts."""
     frame = capture.frame(index)
-    decoded = draws(camera, step, False, rasterize.visible)
+    decoded = draws(camera, step, Mode.DRAW, rasterize.visible)
     render = rasterize(decoded.gaussians, camera, background)
     photo, drawn = frame.rgb.cpu().numpy(), pictures.to_8bit(render.image)
     if photo.shape != drawn.shape:

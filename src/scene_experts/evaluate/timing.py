@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from scene_experts.core.types import Camera
+from scene_experts.core.types import Camera, Mode
 
 if TYPE_CHECKING:
     from scene_experts.render import Rasterizer
@@ -52,12 +52,12 @@ def measure(scene: Scene, cameras: Sequence[Camera], step: int, rasterize: Raste
     while frame < WARM_UP + 3 or (frame < enough and time.perf_counter() - start < budget):
         camera = chosen[frame % len(chosen)]
         began = _now(background)
-        decoded = frozen(camera, step, False, rasterize.visible)
+        decoded = frozen(camera, step, Mode.DRAW, rasterize.visible)
         between = _now(background)
         rasterize(decoded.gaussians, camera, background)
         ended = _now(background)
         if frozen is not scene:
-            scene(camera, step, False, rasterize.visible)
+            scene(camera, step, Mode.DRAW, rasterize.visible)
         if frame >= WARM_UP:
             decode.append(between - began)
             raster.append(ended - between)

@@ -122,7 +122,7 @@ def scene_of_compact(run: OpenRun, file: Compact, world: World) -> AnchorScene:
     """The scene that a compact file holds, in the world and with the configuration of the run it was written from."""
     old = anchors_of(run)
     tensors = run_tensors(compact_anchors(file), file.cells, file.networks, old.config.add_dist, old.voxel, world)
-    return scene_from(run.cfg, tensors, old.meta()).eval()
+    return scene_from(run.cfg, tensors, old.meta())
 
 
 def write_compact_run(run: OpenRun, world: World, path: Path) -> Sizes:

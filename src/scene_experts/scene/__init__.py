@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 from torch import Tensor, nn
 
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Decoded, Points, Routing
+from scene_experts.core.types import Camera, Decoded, Mode, Points, Routing
 
 if TYPE_CHECKING:
     from scene_experts.scene.anchors.appearance import Codes
 
 Cull = Callable[[Tensor, Tensor, Camera], Tensor]
 """The rasteriser's visibility test: means [n, 3], scales [n, 3], camera -> [n] bool."""
-Draws = Callable[[Camera, int, bool, Cull], Decoded]
-"""What a scene does when it is called: (camera, step, training, cull) -> Decoded."""
+Draws = Callable[[Camera, int, Mode, Cull], Decoded]
+"""What a scene does when it is called: (camera, step, mode, cull) -> Decoded."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ class Scene(nn.Module):
         """Where the rows are, [N, 3], trained world."""
 
     @abstractmethod
-    def forward(self, camera: Camera, step: int, training: bool, cull: Cull) -> Decoded:
-        """The Gaussians that `camera` sees at `step`."""
+    def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
+        """The Gaussians that `camera` sees at `step`. `cull(means, scales, camera)` is the rasteriser's visibility test."""
 
     @abstractmethod
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -96,11 +96,11 @@ class Scene(nn.Module):
         """Every learned tensor that is not a column of the table, by name."""
         return {}
 
-    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
+    def routing(self, step: int, most: int | None = None, mode: Mode = Mode.DRAW) -> dict[str, Routing]:
         """Routing of every row (of at most `most` rows, evenly spread), by attribute; empty without experts."""
         return {}
 
-    def scene_opacity(self, camera: Camera, step: int) -> Tensor | None:
+    def scene_opacity(self, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Tensor | None:
         """Raw opacities [N, K] of every row from `camera`, seen or not; None where no network decides opacities."""
         return None
 

@@ -18,7 +18,7 @@ from torch.nn import functional
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Decoded, Gaussians, Points
+from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.sh import MAX_DEGREE, rgb_to_dc
 from scene_experts.geometry.sh_colors import sh_colors
@@ -112,7 +112,7 @@ class GaussianScene(Scene):
         how long it was trained has what it has."""
         return min(self.config.sh_degree, step // self.config.sh_ramp) if step else self.config.sh_degree
 
-    def forward(self, camera: Camera, step: int, training: bool, cull: Cull) -> Decoded:
+    def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
         """The Gaussians that may touch the picture of `camera`; `cull` is the rasteriser's visibility test.
 
         Each is looked for as a ball of its largest axis, which holds the Gaussian: what is left out would not have been drawn.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.transfer import upload
-from scene_experts.core.types import Decoded, Render, Routing
+from scene_experts.core.types import Decoded, Mode, Render, Routing
 from scene_experts.data.capture import Capture
 from scene_experts.render import Rasterizer
 from scene_experts.strategy import Edit, Strategy
@@ -110,9 +110,9 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     target = upload(frame.rgb, run.device, run.dtype).div_(255.0)
     mask = None if frame.mask is None else upload(frame.mask, run.device, run.dtype)
     background = torch.rand(3, generator=training.views) if cfg.random_background else torch.tensor(capture.background)
-    decoded = scene(camera, training.step, True, rasterize.visible)
+    decoded = scene(camera, training.step, Mode.TRAIN, rasterize.visible)
     if cfg.loss.opacity_scope == "all" and hinge_is_on(cfg.loss, training.step):
-        decoded = replace(decoded, scene_opacity=scene.scene_opacity(camera, training.step))
+        decoded = replace(decoded, scene_opacity=scene.scene_opacity(camera, training.step, Mode.TRAIN))
     render = rasterize(decoded.gaussians, camera, upload(background, run.device, run.dtype))
     parts = terms(decoded, render, target, cfg.loss, training.step, mask)
     loss = torch.stack(list(parts.values())).sum()
@@ -204,6 +204,6 @@ def preview(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     """A picture of one held-out view (a training view where none is held out)."""
     index = (capture.test or capture.train)[0]
     camera = capture.views[index].camera.to(run.device, run.dtype)
-    decoded = training.scene(camera, training.step, False, rasterize.visible)
+    decoded = training.scene(camera, training.step, Mode.DRAW, rasterize.visible)
     picture = rasterize(decoded.gaussians, camera, torch.tensor(capture.background, device=run.device, dtype=run.dtype)).image
     return Previewed(training.step, index, picture.clamp(0, 1).cpu())

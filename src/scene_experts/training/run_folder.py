@@ -222,7 +222,6 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     checkpoint.expect(meta, recipe=config.train.recipe)
     cfg = config.train.scaled()
     scene = to_device(scene_from(cfg, tensors, meta), device)
-    scene.eval()
     return OpenRun(run, config, cfg, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""))
 
 

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.types import Camera, Decoded, Gaussians, Render
+from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Render
 from scene_experts.evaluate.expert_pictures import chosen_by, keep
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Draws, Scene
 
-Mode = Literal["picture", "depth", "alpha", "experts", "entropy", "activation"]
-MODES: tuple[Mode, ...] = ("picture", "depth", "alpha", "experts", "entropy", "activation")
+Show = Literal["picture", "depth", "alpha", "experts", "entropy", "activation"]
+MODES: tuple[Show, ...] = ("picture", "depth", "alpha", "experts", "entropy", "activation")
 PALETTE = (  # told apart by colour-blind readers (Okabe and Ito), then darker forms of the same
     (0.00, 0.45, 0.70), (0.84, 0.37, 0.00), (0.00, 0.62, 0.45), (0.80, 0.47, 0.65), (0.90, 0.62, 0.00), (0.34, 0.71, 0.91),
     (0.94, 0.89, 0.26), (0.50, 0.50, 0.50), (0.00, 0.27, 0.42), (0.50, 0.22, 0.00), (0.00, 0.37, 0.27), (0.48, 0.28, 0.39),
@@ -29,7 +29,7 @@ class Look:
     """What to show. `attribute`: of which routers; `only`: the experts whose anchors are drawn (None: all); `box`: the corners of a
     crop, trained world."""
 
-    mode: Mode = "picture"
+    mode: Show = "picture"
     attribute: str = "color"
     only: tuple[int, ...] | None = None
     box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
@@ -50,7 +50,7 @@ def paint(
     draws: the same scene frozen (`Scene.frozen`), which is faster; it does not say who decodes what, so expert views leave it aside.
     """
     routed = look.only is not None or look.mode in ("experts", "entropy")
-    decoded = (scene if draws is None or routed else draws)(camera, step, False, rasterize.visible)
+    decoded = (scene if draws is None or routed else draws)(camera, step, Mode.DRAW, rasterize.visible)
     gaussians = decoded.gaussians
     if look.only is not None:
         mine = chosen_by(needed(decoded, look.attribute), look.attribute, scene.K)
@@ -67,7 +67,7 @@ def paint(
     return shown(rasterize(gaussians, camera, background), gaussians, look.mode)
 
 
-def shown(render: Render, gaussians: Gaussians, mode: Mode) -> Tensor:
+def shown(render: Render, gaussians: Gaussians, mode: Show) -> Tensor:
     if mode == "alpha":
         return render.alpha[..., None].expand(-1, -1, 3).clamp(0, 1)
     if mode == "depth":

@@ -6,6 +6,7 @@ import torch
 
 from scene_experts.bench import machine, raster, step
 from scene_experts.bench.measure import Missing, clock_for
+from scene_experts.core.types import Mode
 
 
 def test_half_of_the_anchors_are_seen_and_a_step_leaves_the_networks_as_they_were():
@@ -23,7 +24,7 @@ def test_a_mixture_alike_draws_the_same_gaussians():
     step.alike(mixture, base)
     for made in (mixture, base):
         made(clock_for(2))  # and a step changes nothing of it
-    a, b = (w.training.scene(w.camera, step.AT, False, w.rasterize.visible) for w in (mixture, base))
+    a, b = (w.training.scene(w.camera, step.AT, Mode.DRAW, w.rasterize.visible) for w in (mixture, base))
     assert torch.allclose(a.raw_opacity, b.raw_opacity, atol=1e-5) and abs(mixture.drawn() - base.drawn()) <= 2
     sure = (b.raw_opacity.abs() > 1e-4).all() and len(a.gaussians) == len(b.gaussians)
     assert not sure or torch.allclose(a.gaussians.colors, b.gaussians.colors, atol=1e-4)

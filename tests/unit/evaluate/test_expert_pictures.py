@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from scene_experts.core.types import Mode
 from scene_experts.evaluate import pictures
 from scene_experts.evaluate.expert_pictures import WIDEST, alone, chosen_by, keep, strip, write
 from scene_experts.render import choose
@@ -14,7 +15,7 @@ from unit.scene.test_init import CAMERA, started
 
 def test_top_2_puts_every_gaussian_into_two_pictures():
     scene, draw = started("moe-gs"), choose("auto", "cpu")
-    decoded = scene(CAMERA, 2000, False, draw.visible)
+    decoded = scene(CAMERA, 2000, Mode.DRAW, draw.visible)
     mine = chosen_by(decoded, "color", scene.K)
     assert mine.shape == (len(decoded.gaussians), 5) and (mine.sum(1) == 2).all()
     routing = decoded.routing["color"].chosen
@@ -27,7 +28,7 @@ def test_top_2_puts_every_gaussian_into_two_pictures():
 
 def test_while_dense_each_gaussian_is_in_the_picture_of_its_largest_gate():
     scene, draw = started("moe-gs"), choose("auto", "cpu")
-    decoded = scene(CAMERA, 1, False, draw.visible)
+    decoded = scene(CAMERA, 1, Mode.DRAW, draw.visible)
     assert (chosen_by(decoded, "cov", scene.K).sum(1) == 1).all()
 
 

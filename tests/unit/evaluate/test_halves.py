@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
 from scene_experts.evaluate import halves
 from scene_experts.evaluate.score import evaluate
@@ -29,7 +30,7 @@ def started(capture, appearance=8):
     config = replace(RECIPES["scaffold-gs"][1].scene, appearance=appearance)
     scene = config.start(capture.points, capture.extent, [capture.views[i].camera for i in capture.train])
     scene.table.params["feature"].data.normal_()
-    return scene.eval()
+    return scene
 
 
 def test_halves_share_no_pixel():
@@ -47,7 +48,7 @@ def test_the_code_is_found_on_the_left_half_alone(capture):
     code = scene.codes.table[2].detach() * 1.5
     scene.codes.fitted[camera.id] = code
     with torch.no_grad():
-        photo = draw(scene(camera, STEP, False, draw.visible).gaussians, camera, black).image.clamp(0, 1)
+        photo = draw(scene(camera, STEP, Mode.DRAW, draw.visible).gaussians, camera, black).image.clamp(0, 1)
     left = halves.left(camera.height, camera.width)
     misled = photo.clone()
     misled[:, camera.width // 2 :] = torch.rand_like(misled[:, camera.width // 2 :])  # what is not counted does not matter
@@ -57,7 +58,7 @@ def test_the_code_is_found_on_the_left_half_alone(capture):
     for name, value in (("mean", scene.codes.table.detach().mean(0)), ("found", found)):
         scene.codes.fitted[camera.id] = value
         with torch.no_grad():
-            image = draw(scene(camera, STEP, False, draw.visible).gaussians, camera, black).image.clamp(0, 1)
+            image = draw(scene(camera, STEP, Mode.DRAW, draw.visible).gaussians, camera, black).image.clamp(0, 1)
         errors[name] = float((image - photo).abs()[:, camera.width // 2 :].mean())  # on the other half
     assert errors["found"] < 0.35 * errors["mean"], errors
     assert all(torch.equal(before[name], p) and p.grad is None for name, p in scene.named_parameters())

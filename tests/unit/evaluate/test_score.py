@@ -15,7 +15,7 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Decoded, Gaussians, Render, Routing
+from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Render, Routing
 from scene_experts.evaluate import metrics, pictures, weights
 from scene_experts.evaluate import score as run
 from scene_experts.evaluate.score import About, evaluate
@@ -68,8 +68,8 @@ class FakeScene(Scene):
         super().__init__(Table(params, {}), 5.0)
         self.routed = routed
 
-    def forward(self, camera: Camera, step: int, training: bool, cull: Any) -> Decoded:
-        assert not training and not torch.is_grad_enabled() and step == 700
+    def forward(self, camera: Camera, step: int, mode: Mode, cull: Any) -> Decoded:
+        assert mode is Mode.DRAW and not torch.is_grad_enabled() and step == 700
         m = 3
         gaussians = Gaussians(torch.zeros(m, 3), torch.zeros(m, 4), torch.ones(m, 3), torch.ones(m), torch.ones(m, 3), torch.arange(m))
         raw = torch.full((2, K), -0.5)

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 
+from scene_experts.core.types import Mode
 from scene_experts.evaluate import timing
 
 
@@ -32,9 +33,9 @@ class Slow:
         monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: self.now))
         self.scene = Waits(self)
 
-    def decoded(self, camera: int, step: int, training: bool, cull: Any) -> SimpleNamespace:
+    def decoded(self, camera: int, step: int, mode: Mode, cull: Any) -> SimpleNamespace:
         self.now += self.decode
-        assert not training
+        assert mode is Mode.DRAW
         return SimpleNamespace(gaussians=None)
 
     def __call__(self, gaussians: Any, camera: int, background: torch.Tensor) -> None:

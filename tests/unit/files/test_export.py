@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.types import Mode
 from scene_experts.files.anchors.compact import read_compact
 from scene_experts.files.anchors.layout import read_scaffold_folder
 from scene_experts.files.export import export_run, import_result, psnr_cost, world_of, write_compact_run, write_layout
@@ -59,7 +60,7 @@ def picture(run, capture):
     scene, rasterize = run.scene, choose("auto", "cpu")
     camera = capture.views[capture.test[0]].camera
     with torch.no_grad():
-        decoded = scene(camera, run.step, False, rasterize.visible)
+        decoded = scene(camera, run.step, Mode.DRAW, rasterize.visible)
         return rasterize(decoded.gaussians, camera, torch.tensor(capture.background)).image
 
 

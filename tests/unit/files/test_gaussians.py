@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
 from scene_experts.files import gaussians as explicit
 from scene_experts.files.bake.export import Options, export_standard
@@ -46,7 +47,7 @@ def drawn(run, index=0):
     draw, camera = choose("auto", "cpu"), capture.views[capture.test[index]].camera
     capture.images.close()
     with torch.no_grad():
-        return draw(opened.scene(camera, opened.step, False, draw.visible).gaussians, camera, torch.zeros(3)).image
+        return draw(opened.scene(camera, opened.step, Mode.DRAW, draw.visible).gaussians, camera, torch.zeros(3)).image
 
 
 def test_the_file_has_the_layout_of_3dgs_in_the_frame_of_the_capture(made, tmp_path):

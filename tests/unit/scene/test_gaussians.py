@@ -8,7 +8,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Points
+from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.geometry.sh import sh_to_rgb
 from scene_experts.render import choose
 from scene_experts.scene.gaussians import COLUMNS, Explicit, ExplicitRates, GaussianScene
@@ -80,7 +80,7 @@ def test_decoded_gaussians_are_the_activated_columns():
 def test_what_is_left_out_would_not_have_been_drawn(seed):
     scene, draw = make(2000, seed), choose("auto", "cpu")
     with torch.no_grad():
-        some, every = scene(CAMERA, 3000, False, draw.visible), scene(CAMERA, 3000, False, everything)
+        some, every = scene(CAMERA, 3000, Mode.DRAW, draw.visible), scene(CAMERA, 3000, Mode.DRAW, everything)
         a, b = (draw(d.gaussians, CAMERA, torch.zeros(3)) for d in (some, every))
     assert len(some.rows) < len(every.rows)
     assert set(every.rows[b.radii > 0].tolist()) <= set(some.rows.tolist())

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Points
+from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene import Scene
@@ -29,7 +29,7 @@ def test_a_scene_is_built_again_from_its_table_and_plain_values(recipe):
     with torch.no_grad():
         for name, tensor in again.network_tensors().items():
             tensor.copy_(scene.network_tensors()[name])
-        first, second = (s(CAMERA, 2000, False, draw.visible) for s in (scene, again))
+        first, second = (s(CAMERA, 2000, Mode.DRAW, draw.visible) for s in (scene, again))
     assert torch.equal(first.gaussians.source, second.gaussians.source)
     assert torch.equal(first.gaussians.colors, second.gaussians.colors)
 
@@ -84,10 +84,32 @@ def test_stating_traits_changes_nothing():
 @pytest.mark.parametrize("recipe", ["octree-gs", "3dgs"])
 def test_at_level_draws_no_finer_level_within_its_block(recipe):
     scene, draw = started(recipe), choose("auto", "cpu")
-    draws = lambda: len(scene(CAMERA, 2000, False, draw.visible).rows)  # noqa: E731
+    draws = lambda: len(scene(CAMERA, 2000, Mode.DRAW, draw.visible).rows)  # noqa: E731
     whole = draws()
     with scene.at_level(0):
         coarse = draws()
     with scene.at_level(None):
         assert draws() == whole
     assert draws() == whole and (coarse < whole if recipe == "octree-gs" else coarse == whole)
+
+
+@pytest.mark.parametrize("recipe", METHODS)
+@pytest.mark.parametrize("flag", [True, False])
+def test_a_drawing_with_gradients_changes_nothing_and_torchs_own_mode_has_no_effect(recipe, flag):
+    scene, draw = started(recipe), choose("auto", "cpu")
+    scene.train(flag)
+    before = {k: v.detach().clone() for k, v in {**scene.table.columns(), **scene.network_tensors()}.items()}
+    random = torch.random.get_rng_state()
+    decoded = scene(CAMERA, 2000, Mode.DRAW, draw.visible)
+    assert decoded.gaussians.means.requires_grad or decoded.gaussians.colors.requires_grad
+    scene.routing(2000)
+    scene.scene_opacity(CAMERA, 2000)
+    assert torch.equal(torch.random.get_rng_state(), random)
+    assert all(torch.equal(v, before[k]) for k, v in {**scene.table.columns(), **scene.network_tensors()}.items())
+
+
+def test_training_moves_the_biases_of_the_router_even_without_gradients():
+    scene, draw = started("moe-gs-balance"), choose("auto", "cpu")
+    with torch.no_grad():
+        scene(CAMERA, 2000, Mode.TRAIN, draw.visible)
+    assert all(head.router_balance.any() for head in scene.heads.values())

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from scene_experts.core.types import Camera
+from scene_experts.core.types import Camera, Mode
 from scene_experts.recipes import RECIPES
 
 pytest.importorskip("viser")
@@ -50,6 +50,6 @@ def test_a_coarser_level_in_the_browser_leaves_the_training_all_its_levels(captu
         whole, coarse = (picture for picture, _ in handle.pictures[-2:])
         assert (whole != coarse).any()  # it is drawn coarser there
         camera: Camera = capture.views[0].camera
-        assert scene.table.facts["level"][scene(camera, 20_000, True, DRAW.visible).rows].unique().numel() > 1
+        assert scene.table.facts["level"][scene(camera, 20_000, Mode.TRAIN, DRAW.visible).rows].unique().numel() > 1
     finally:
         live.close()

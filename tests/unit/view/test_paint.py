@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.types import Mode
 from scene_experts.render import choose
 from scene_experts.scene.anchors.frozen import freeze
 from scene_experts.view.paint import MODES, PALETTE, Look, paint, ramp, row_colours
@@ -15,13 +16,13 @@ DRAW = choose("auto", "cpu")
 
 def decoded(recipe="moe-gs", step=2000):
     with torch.no_grad():
-        return started(recipe)(CAMERA, step, False, DRAW.visible)
+        return started(recipe)(CAMERA, step, Mode.DRAW, DRAW.visible)
 
 
 def test_the_plain_picture_is_the_render():
     scene = started("moe-gs")
     with torch.no_grad():
-        image = DRAW(scene(CAMERA, 2000, False, DRAW.visible).gaussians, CAMERA, BLACK).image
+        image = DRAW(scene(CAMERA, 2000, Mode.DRAW, DRAW.visible).gaussians, CAMERA, BLACK).image
     assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK), image.clamp(0, 1))
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from scene_experts.core.types import Camera
+from scene_experts.core.types import Camera, Mode
 from scene_experts.data.capture import Capture
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.files.bake.sums import Tell
@@ -55,5 +55,5 @@ def scores(
 
 def picture(draws: Draws, step: int, camera: Camera, background: Tensor, rasterize: Rasterizer) -> Tensor:
     """The picture [H, W, 3] as an 8-bit file would hold it, in [0, 1]."""
-    image = rasterize(draws(camera, step, False, rasterize.visible).gaussians, camera, background).image
+    image = rasterize(draws(camera, step, Mode.DRAW, rasterize.visible).gaussians, camera, background).image
     return (image.clamp(0, 1) * 255 + 0.5).floor() / 255

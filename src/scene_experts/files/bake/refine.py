@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.schedule import Rate
+from scene_experts.core.types import Mode
 from scene_experts.files.bake.sums import Tell
 from scene_experts.files.bake.views import Views
 from scene_experts.render import Rasterizer
@@ -59,11 +60,11 @@ def refine(
             queue = torch.randperm(len(views), generator=generator).tolist()
         camera = views.free(generator) if is_free else views.cameras[queue.pop()]
         with torch.no_grad():
-            target = rasterize(draws(camera, step, False, rasterize.visible).gaussians, camera, background).image.clamp_(0, 1)
+            target = rasterize(draws(camera, step, Mode.DRAW, rasterize.visible).gaussians, camera, background).image.clamp_(0, 1)
         for group in optimizer.param_groups:
             rate: Rate = getattr(how, group["name"])
             group["lr"] = rate.at(i + 1, how.iterations) * (scene.extent if group["name"] == "means" else 1.0)
-        image = rasterize(scene(camera, DRAWN_AT, True, rasterize.visible).gaussians, camera, background).image
+        image = rasterize(scene(camera, DRAWN_AT, Mode.TRAIN, rasterize.visible).gaussians, camera, background).image
         loss = sum(photometric(image, target, how.dssim))
         assert isinstance(loss, Tensor)
         if loss.requires_grad:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from scene_experts.core.types import Camera, Gaussians
+from scene_experts.core.types import Camera, Gaussians, Mode
 from scene_experts.geometry.sh import C0, basis
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Draws
@@ -55,7 +55,7 @@ def add_up(draws: Draws, step: int, slots: int, cameras: Sequence[Camera], raste
     """Sums over the pictures of `cameras`. slots: rows of the scene's table times Gaussians a row."""
     total, of_views = torch.zeros(slots, 12), []  # weight, potential, means, log-scales, quaternions
     for i, camera in enumerate(cameras):
-        g = draws(camera, step, False, rasterize.visible).gaussians
+        g = draws(camera, step, Mode.DRAW, rasterize.visible).gaussians
         of_views.append(contributions(g, camera, rasterize))
         w, before = of_views[-1][:, None], total.index_select(0, g.source)
         sign = torch.where((before[:, 8:] * g.quats).sum(1, keepdim=True) < 0, -1.0, 1.0)
@@ -86,7 +86,7 @@ def hidden(
     drawn, on, off = torch.zeros(total, dtype=torch.bool), torch.zeros(len(slots)), torch.zeros(len(slots))
     for i, camera in enumerate(cameras):
         drawn.zero_()
-        drawn[draws(camera, step, False, rasterize.visible).gaussians.source] = True
+        drawn[draws(camera, step, Mode.DRAW, rasterize.visible).gaussians.source] = True
         is_drawn = drawn.index_select(0, slots)
         area = 1 / (means - camera.position).square().sum(1).clamp_min(camera.near**2)
         on += area * is_drawn
@@ -121,7 +121,7 @@ def fit_harmonics(
         place[part] = torch.arange(len(part))
         weight, colour = torch.zeros(V, len(part)), torch.zeros(V, len(part), 3)
         for v, camera in enumerate(cameras):
-            g = draws(camera, step, False, rasterize.visible).gaussians
+            g = draws(camera, step, Mode.DRAW, rasterize.visible).gaussians
             at = place.index_select(0, g.source)
             chosen = (at >= 0).nonzero().squeeze(1)
             at = at.index_select(0, chosen)

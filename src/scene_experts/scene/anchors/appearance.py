@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from scene_experts.core.types import Camera
+from scene_experts.core.types import Camera, Mode
 from scene_experts.scene.anchors.mlp import HeadWeights
 
 TestRule = Literal["mean", "index"]
@@ -34,9 +34,9 @@ class Codes(nn.Module):
         self.table = nn.Parameter(torch.randn(len(self.views), dim))
         self.fitted: dict[int, Tensor] = {}
 
-    def forward(self, camera: Camera) -> Tensor:
-        """The code [dim] of a camera."""
-        if camera.id in self.fitted:
+    def forward(self, camera: Camera, mode: Mode = Mode.DRAW) -> Tensor:
+        """The code [dim] of a camera. Fitted codes are for drawing only."""
+        if mode is Mode.DRAW and camera.id in self.fitted:
             return self.fitted[camera.id]
         row = self.row.get(camera.id)
         if row is None and self.rule == "index" and camera.id >= 0:  # below 0: a free camera, at no view's place

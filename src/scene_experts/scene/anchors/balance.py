@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from scene_experts.core.errors import expect_at_least
-from scene_experts.core.types import Routing
+from scene_experts.core.types import Mode, Routing
 from scene_experts.scene.anchors.experts import Experts, MixtureHead, top_k
 
 
@@ -47,10 +47,10 @@ class BalancedHead(MixtureHead):
         """Indices [A, k] of the largest biased gates, largest first."""
         return top_k(logits.softmax(dim=1) + self.router_balance, k)
 
-    def route(self, feature: Tensor, step: int, position: Tensor | None) -> tuple[Routing, Tensor]:
-        """As a mixture; in training the biases then move, once at each step."""
-        routing, w = super().route(feature, step, position)
-        if self.training and torch.is_grad_enabled() and routing.chosen is not None and step != self.moved_at:
+    def route(self, feature: Tensor, step: int, position: Tensor | None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor]:
+        """As a mixture; in training the biases then move, once per step."""
+        routing, w = super().route(feature, step, position, mode)
+        if mode is Mode.TRAIN and routing.chosen is not None and step != self.moved_at:
             count = torch.bincount(routing.chosen.reshape(-1), minlength=self.config.num).to(w.dtype)
             self.router_balance += self.config.speed * (count.mean() - count).sign()
             self.moved_at = step  # losses over the whole scene ask again

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from scene_experts.core.errors import InputError, expect_at_least
-from scene_experts.core.types import Routing
+from scene_experts.core.types import Mode, Routing
 from scene_experts.scene.anchors.mlp import ACTIVATIONS, ATTRIBUTES, MLP, HeadWeights, linear_init
 
 log = logging.getLogger(__name__)
@@ -122,7 +122,8 @@ class MixtureHead(nn.Module):
         """Experts per anchor at `step`; None while dense. The first `warmup` iterations (1 .. warmup) are dense."""
         return None if self.config.top_k is None or step <= self.config.warmup else self.config.top_k
 
-    def logits(self, feature: Tensor, position: Tensor | None) -> Tensor:
+    def logits(self, feature: Tensor, position: Tensor | None, mode: Mode = Mode.DRAW) -> Tensor:
+        """The router's outputs [A, E], with noise in training."""
         router = self.config.router
         x = feature.detach() if router.detach_feature else feature
         if router.input_pos:
@@ -130,13 +131,13 @@ class MixtureHead(nn.Module):
                 raise ValueError("expected anchor positions for a router with input_pos, found none")
             x = torch.cat([x, position], dim=1)
         y = functional.linear(x, self.router_w, self.router_b)
-        if router.noise_std > 0 and self.training and torch.is_grad_enabled():
+        if router.noise_std > 0 and mode is Mode.TRAIN:
             y = y + router.noise_std * torch.randn_like(y)
         return y
 
-    def route(self, feature: Tensor, step: int, position: Tensor | None) -> tuple[Routing, Tensor]:
+    def route(self, feature: Tensor, step: int, position: Tensor | None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor]:
         """Routing, and the mixture's weights: [A, E] while dense, [A, k] after."""
-        logits = self.logits(feature, position)
+        logits = self.logits(feature, position, mode)
         gates = logits.softmax(dim=1)  # eq. 3
         k = self.k(step)
         if k is None:
@@ -149,12 +150,14 @@ class MixtureHead(nn.Module):
         """Indices [A, k] of the experts that decode each anchor, from logits [A, E]."""
         return top_k(logits, k)
 
-    def routing(self, feature: Tensor, step: int, position: Tensor | None = None) -> Routing:
-        return self.route(feature, step, position)[0]
+    def routing(self, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW) -> Routing:
+        return self.route(feature, step, position, mode)[0]
 
-    def forward(self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None) -> tuple[Tensor, Routing | None]:
+    def forward(
+        self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW
+    ) -> tuple[Tensor, Routing | None]:
         """x [A, D], feature [A, F] -> activated mixture [A, out], routing."""
-        routing, w = self.route(feature, step, position)
+        routing, w = self.route(feature, step, position, mode)
         if routing.chosen is None:
             y = self.all_experts(x, w)
         elif self.config.form == "masked":
@@ -184,9 +187,11 @@ class MixtureHead(nn.Module):
         y = torch.cat(parts) * w.reshape(-1, 1).index_select(0, order)
         return torch.zeros(A, y.shape[1], dtype=y.dtype, device=y.device).index_add(0, rows, y)
 
-    def aligned(self, x: Tensor, feature: Tensor, step: int, position: Tensor | None, K: int) -> tuple[Tensor, Routing]:
+    def aligned(
+        self, x: Tensor, feature: Tensor, step: int, position: Tensor | None, K: int, mode: Mode = Mode.DRAW
+    ) -> tuple[Tensor, Routing]:
         """Covariance outputs [A, K * 7] mixed after flipping quaternions into the hemisphere of each anchor's first expert."""
-        routing, w = self.route(feature, step, position)
+        routing, w = self.route(feature, step, position, mode)
         if routing.chosen is not None:
             w = torch.zeros_like(routing.gates).scatter(1, routing.chosen, w)
         y = torch.stack([self.expert(i, x) for i in range(self.config.num)], dim=1).reshape(len(x), self.config.num, K, 7)

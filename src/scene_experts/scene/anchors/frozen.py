@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from scene_experts.core.types import Camera, Decoded, Gaussians
+from scene_experts.core.types import Camera, Decoded, Gaussians, Mode
 from scene_experts.native import library as native
 from scene_experts.scene import Cull, Draws, Scene
 from scene_experts.scene.anchors import native_decode
@@ -76,16 +76,14 @@ class Frozen:
         return self.kept[0].base is not None
 
     @torch.no_grad()
-    def __call__(self, camera: Camera, step: int, training: bool, cull: Cull) -> Decoded:
+    def __call__(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
         """As `AnchorScene.forward`. Raises ValueError for another step, and for training."""
-        if training or step != self.step:
-            raise ValueError(
-                f"expected to draw step {self.step}, found {'training' if training else f'step {step}'}; freeze the scene again"
-            )
+        if mode is not Mode.DRAW or step != self.step:
+            raise ValueError(f"expected to draw step {self.step}, found {mode} at step {step}; freeze the scene again")
         scene = self.scene
-        rows = visible_rows(scene.select(scene.table, camera, step, False), self.xyz, self.scales, camera, cull)
+        rows = visible_rows(scene.select(scene.table, camera, step, mode), self.xyz, self.scales, camera, cull)
         decoded = self.decode(rows, camera)
-        return faded(decoded, scene.select.fade(scene.table, rows, camera, step, False), len(scene.table), scene.K)
+        return faded(decoded, scene.select.fade(scene.table, rows, camera, step, mode), len(scene.table), scene.K)
 
     @torch.no_grad()
     def decode(self, rows: Tensor, camera: Camera) -> Decoded:
@@ -101,7 +99,9 @@ class Frozen:
     def _at(self, camera: Camera) -> dict[str, HeadWeights]:
         """The heads that `camera` sees: its appearance, where there are any, is a part of the colour's first bias."""
         codes = self.scene.codes
-        return self.weights if codes is None else {**self.weights, "color": _detached(fold(self.weights["color"], codes(camera)))}
+        return (
+            self.weights if codes is None else {**self.weights, "color": _detached(fold(self.weights["color"], codes(camera, Mode.DRAW)))}
+        )
 
     def _call(self, rows: Tensor, position: Tensor, heads: dict[str, HeadWeights]) -> tuple:
         """The library's arguments, and the tensors that they point to."""

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from scene_experts.core.errors import InputError, expect_at_least
-from scene_experts.core.types import Routing
+from scene_experts.core.types import Mode, Routing
 
 ATTRIBUTES = ("opacity", "cov", "color")  # what is decoded, in the compiled library's order
 ACTIVATIONS = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid}  # the last layer of each attribute
@@ -42,13 +42,17 @@ class Head(Protocol):
 
     experts: int  # number of experts; 0 without a mixture
 
-    def __call__(self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None) -> tuple[Tensor, Routing | None]: ...
+    def __call__(
+        self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW
+    ) -> tuple[Tensor, Routing | None]:
+        """x [A, inputs], feature [A, F], position [A, 3] over the scene's extent -> activated outputs [A, out], routing."""
+        ...
 
     def weights(self, step: int) -> HeadWeights | None:
         """The tensors in use at `step`, or None where they do not say all (unusual switches)."""
         ...
 
-    def routing(self, feature: Tensor, step: int, position: Tensor | None = None) -> Routing | None:
+    def routing(self, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW) -> Routing | None:
         """Who decodes what; None without experts. It depends on the anchor's feature alone, never on the view."""
         ...
 
@@ -92,7 +96,9 @@ class MLP(nn.Module):
         self.w2 = linear_init((1, outputs, hidden), hidden)
         self.b2 = linear_init((1, outputs), hidden)
 
-    def forward(self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None) -> tuple[Tensor, Routing | None]:
+    def forward(
+        self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW
+    ) -> tuple[Tensor, Routing | None]:
         """x [A, D] -> activated outputs [A, out]; no routing."""
         h = functional.relu(functional.linear(x, self.w1[0], self.b1[0]))
         for layer in self.middle:
@@ -106,5 +112,5 @@ class MLP(nn.Module):
         middle_b = torch.stack([layer.bias for layer in self.middle])[None]  # type: ignore[misc]
         return HeadWeights(None, None, self.w1, self.b1, self.w2, self.b2, None, middle_w, middle_b)
 
-    def routing(self, feature: Tensor, step: int, position: Tensor | None = None) -> Routing | None:
+    def routing(self, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW) -> Routing | None:
         return None

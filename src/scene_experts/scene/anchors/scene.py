@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -21,11 +21,11 @@ from torch.nn import functional
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Decoded, Gaussians, Points, Routing
+from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points, Routing
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.voxel import VoxelChoice, voxel_size
 from scene_experts.native import library as native
-from scene_experts.scene import Draws, Scene, Traits
+from scene_experts.scene import Cull, Draws, Scene, Traits
 from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors.appearance import Codes, TestRule, fold
 from scene_experts.scene.anchors.experts import Experts, MixtureHead
@@ -171,22 +171,22 @@ class AnchorScene(Scene):
             "log_scaling": feature.new_full((n, 6), math.log(size)),
         }
 
-    def forward(self, camera: Camera, step: int, training: bool, cull: Callable[[Tensor, Tensor, Camera], Tensor]) -> Decoded:
+    def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
         """The Gaussians that `camera` sees at `step`. `cull(means, scales, camera)` is the rasteriser's visibility test."""
         table = self.table
         scales = table.params["log_scaling"].detach()[:, :3].contiguous().exp()  # with gaps between its rows exp takes 7 times as long
-        rows = visible_rows(self.select(table, camera, step, training), table.facts["xyz"], scales, camera, cull)
-        decoded = self.decode(rows, camera, step)
-        decoded = faded(decoded, self.select.fade(table, rows, camera, step, training), len(table), self.K)
-        return self.with_global_routing(decoded, step) if training else decoded
+        rows = visible_rows(self.select(table, camera, step, mode), table.facts["xyz"], scales, camera, cull)
+        decoded = self.decode(rows, camera, step, mode)
+        decoded = faded(decoded, self.select.fade(table, rows, camera, step, mode), len(table), self.K)
+        return self.with_global_routing(decoded, step) if mode is Mode.TRAIN else decoded
 
-    def decode(self, rows: Tensor, camera: Camera, step: int) -> Decoded:
+    def decode(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:
         """Gaussians of the given anchors [A], by the device's fused kernels where they cover the scene, else in plain torch."""
         weights = self.native_weights(step)
         if weights is None:
-            return self.decode_composed(rows, camera, step)
+            return self.decode_composed(rows, camera, step, mode)
         if self.codes is not None:
-            weights["color"] = fold(weights["color"], self.codes(camera))
+            weights["color"] = fold(weights["color"], self.codes(camera, mode))
         p = self.table.params
         with_dist = {a: a in self.config.add_dist for a in ATTRIBUTES}
         xyz, columns = self.table.facts["xyz"], (p["feature"], p["log_scaling"], p["offsets"])
@@ -219,7 +219,7 @@ class AnchorScene(Scene):
         distance = v.norm(dim=1, keepdim=True)
         return self.table.params["feature"].index_select(0, rows), v / distance.clamp_min(EPS), distance
 
-    def decode_composed(self, rows: Tensor, camera: Camera, step: int) -> Decoded:
+    def decode_composed(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:
         """The definition, in plain torch: one head call per attribute, then mask, activate and place."""
         p, K = self.table.params, self.K
         feature, direction, distance = self.inputs(rows, camera)
@@ -231,11 +231,11 @@ class AnchorScene(Scene):
             head = self.heads[attribute]
             x = torch.cat([seen, direction] + ([distance] if attribute in self.config.add_dist else []), dim=1)
             if attribute == "color" and self.codes is not None:
-                x = torch.cat([x, self.codes(camera).expand(len(x), -1)], dim=1)
+                x = torch.cat([x, self.codes(camera, mode).expand(len(x), -1)], dim=1)
             if attribute == "cov" and self.config.quat_align and isinstance(head, MixtureHead):
-                out[attribute], found = head.aligned(x, feature, step, position, K)
+                out[attribute], found = head.aligned(x, feature, step, position, K, mode)
             else:
-                out[attribute], found = head(x, feature, step, position)
+                out[attribute], found = head(x, feature, step, position, mode)
             if found is not None:
                 routing[attribute] = found
         raw = out["opacity"]  # [A, K]
@@ -256,19 +256,19 @@ class AnchorScene(Scene):
         )
         return Decoded(gaussians, rows, raw, routing)
 
-    def scene_opacity(self, camera: Camera, step: int) -> Tensor:
+    def scene_opacity(self, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Tensor:
         """Raw opacities [N, K] of every anchor from `camera`, whether it sees them or not."""
         everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
         feature, direction, distance = self.inputs(everyone, camera)
         seen = feature if self.mix is None else self.mix(self.table, everyone, direction, distance)
         x = torch.cat([seen, direction] + ([distance] if "opacity" in self.config.add_dist else []), dim=1)
-        return self.heads["opacity"](x, feature, step, self.table.facts["xyz"] / self.extent)[0]
+        return self.heads["opacity"](x, feature, step, self.table.facts["xyz"] / self.extent, mode)[0]
 
-    def routing(self, step: int, most: int | None = None) -> dict[str, Routing]:
+    def routing(self, step: int, most: int | None = None, mode: Mode = Mode.DRAW) -> dict[str, Routing]:
         """Routing of every anchor (of at most `most`, evenly spread), by attribute: it does not depend on the camera."""
         every = max(1, -(-len(self.table) // most)) if most else 1
         feature, position = self.table.params["feature"][::every], self.table.facts["xyz"][::every] / self.extent
-        found = {a: self.heads[a].routing(feature, step, position) for a in ATTRIBUTES}
+        found = {a: self.heads[a].routing(feature, step, position, mode) for a in ATTRIBUTES}
         return {a: r for a, r in found.items() if r is not None}
 
     def rows_by_level(self) -> list[int]:
@@ -296,7 +296,7 @@ class AnchorScene(Scene):
         """For `load_scope = all`: the routing of all anchors in place of the visible ones', so that L_load balances the whole scene."""
         decoder = self.config.decoder
         if isinstance(decoder, Experts) and decoder.load_scope == "all" and decoded.routing:
-            return replace(decoded, routing=self.routing(step))
+            return replace(decoded, routing=self.routing(step, mode=Mode.TRAIN))
         return decoded
 
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Decoded
+from scene_experts.core.types import Camera, Decoded, Mode
 from scene_experts.geometry.voxel import to_lattice, unique_cells
 from scene_experts.scene.anchors import levels as lattices
 from scene_experts.scene.anchors.levels import LevelRule, Levels, blended, whole
@@ -32,11 +32,11 @@ class Selector(Protocol):
         """The same with no finer level than `level`; None lifts the cap."""
         ...
 
-    def __call__(self, table: Table, camera: Camera, step: int, training: bool) -> Tensor | None:
+    def __call__(self, table: Table, camera: Camera, step: int, mode: Mode) -> Tensor | None:
         """Row indices [S] int64, ascending, that may be drawn, or None for all of them."""
         ...
 
-    def fade(self, table: Table, rows: Tensor, camera: Camera, step: int, training: bool) -> Tensor | None:
+    def fade(self, table: Table, rows: Tensor, camera: Camera, step: int, mode: Mode) -> Tensor | None:
         """Factors [A] in [0, 1] on the opacities of `rows`, or None for 1 throughout."""
         ...
 
@@ -60,10 +60,10 @@ class AllAnchors:
     def capped(self, level: int | None) -> AllAnchors:
         return self
 
-    def __call__(self, table: Table, camera: Camera, step: int, training: bool) -> Tensor | None:
+    def __call__(self, table: Table, camera: Camera, step: int, mode: Mode) -> Tensor | None:
         return None
 
-    def fade(self, table: Table, rows: Tensor, camera: Camera, step: int, training: bool) -> Tensor | None:
+    def fade(self, table: Table, rows: Tensor, camera: Camera, step: int, mode: Mode) -> Tensor | None:
         return None
 
     def places(self, cells: Tensor, voxel: float, level: int) -> dict[str, Tensor]:
@@ -191,25 +191,25 @@ class LevelSelector:
     cap: int | None = None
     """No finer level than this, whatever the distance (a viewer's level of detail)."""
 
-    def __call__(self, table: Table, camera: Camera, step: int, training: bool) -> Tensor:
+    def __call__(self, table: Table, camera: Camera, step: int, mode: Mode) -> Tensor:
         asked = self.asked(table.facts["xyz"], table.facts["level"], table.facts["extra_level"], camera)
-        return (table.facts["level"] <= whole(asked, self.lattices.rule, self.top(step, training))).nonzero().squeeze(1)
+        return (table.facts["level"] <= whole(asked, self.lattices.rule, self.top(step, mode))).nonzero().squeeze(1)
 
-    def fade(self, table: Table, rows: Tensor, camera: Camera, step: int, training: bool) -> Tensor | None:
+    def fade(self, table: Table, rows: Tensor, camera: Camera, step: int, mode: Mode) -> Tensor | None:
         if self.lattices.rule != "blend":
             return None
         xyz, level, extra = (table.facts[name].index_select(0, rows) for name in ("xyz", "level", "extra_level"))
-        asked = blended(self.asked(xyz, level, extra, camera), self.top(step, training))
+        asked = blended(self.asked(xyz, level, extra, camera), self.top(step, mode))
         return torch.where(level == asked.floor().long(), asked.frac(), torch.ones_like(asked))
 
     def asked(self, xyz: Tensor, level: Tensor, extra: Tensor, camera: Camera) -> Tensor:
         """Real-valued levels [n] with each anchor's own addition."""
         return self.lattices.asked(xyz, level, camera.position) + extra
 
-    def top(self, step: int, training: bool) -> int:
+    def top(self, step: int, mode: Mode) -> int:
         """Levels in use: all of them, or while a coarse-to-fine training lasts, those let in before `step`."""
         count = self.lattices.count
-        if training and self.config.coarse_to_fine:
+        if mode is Mode.TRAIN and self.config.coarse_to_fine:
             count = self.lattices.first + 1 + sum(turn < step for turn in self.config.turns(self.lattices))
         return min(count, self.lattices.count if self.cap is None else max(self.cap, 0) + 1)
 

@@ -20,7 +20,7 @@ from torch.nn import functional
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Decoded, Gaussians, Points
+from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.geometry.curvature import curvature, flatter, pairs_to_halve
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.voxel import VoxelChoice, coarsen, to_lattice, unique_cells, voxel_size
@@ -178,7 +178,7 @@ class GraphScene(Scene):
             self._graph = xyz, Graph.of(xyz, self.config.neighbours)
         return self._graph[1]
 
-    def forward(self, camera: Camera, step: int, training: bool, cull: Cull) -> Decoded:
+    def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
         """The Gaussians that `camera` sees. `cull(means, scales, camera)` is the rasteriser's visibility test."""
         table = self.table
         rows = visible_rows(None, table.facts["xyz"], table.params["log_scaling"].detach()[:, :3].exp(), camera, cull)
@@ -250,7 +250,7 @@ class GraphScene(Scene):
         offset = self.offset(*self.encode(everyone, rows)) * self.table.params["log_scaling"].index_select(0, rows)[:, :3].exp()
         return self.table.facts["xyz"].index_select(0, rows).double() + offset.double()
 
-    def scene_opacity(self, camera: Camera, step: int) -> Tensor:
+    def scene_opacity(self, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Tensor:
         """Raw opacities [N, 1] of every point from `camera`, whether it sees them or not."""
         everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
         own, strongest = self.encode(everyone)

@@ -10,6 +10,7 @@ import torch
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
+from scene_experts.core.types import Mode
 from scene_experts.files.anchors.frame import cell_positions
 from scene_experts.files.anchors.networks import write_torchscript
 from scene_experts.files.export import export_run, import_result
@@ -54,7 +55,7 @@ def picture(scene, capture, step):
     rasterize = choose("auto", "cpu")
     camera = capture.views[0].camera
     with torch.no_grad():
-        decoded = scene(camera, step, False, rasterize.visible)
+        decoded = scene(camera, step, Mode.DRAW, rasterize.visible)
         return rasterize(decoded.gaussians, camera, torch.tensor(capture.background)).image
 
 
@@ -145,7 +146,7 @@ def test_a_published_feature_bank_and_codes_are_drawn(tmp_path, folder):
     for index in (capture.train[1], capture.test[0]):
         camera, draw = capture.views[index].camera, choose("auto", "cpu")
         with torch.no_grad():
-            a, b = (s(camera, 1, False, draw.visible).gaussians for s in (scene, opened.scene))
+            a, b = (s(camera, 1, Mode.DRAW, draw.visible).gaussians for s in (scene, opened.scene))
         torch.testing.assert_close(a.colors, b.colors, rtol=0, atol=1e-5)
         torch.testing.assert_close(a.opacities, b.opacities, rtol=0, atol=1e-5)
     capture.images.close()

@@ -61,7 +61,7 @@ def test_explicit_gaussians_keep_everything_but_cut_harmonics(capture):
 def test_a_trained_anchor_scene_comes_near_and_refinement_nearer(capture):
     cfg = RECIPES["moe-gs"][1]
     torch.manual_seed(0)
-    scene = cfg.scene.start(capture.points, capture.extent).eval()
+    scene = cfg.scene.start(capture.points, capture.extent)
     with torch.no_grad():  # as if it had learned something that depends on the view
         for name, size in (("feature", 2.0), ("offsets", 2.0)):
             scene.table.params[name].normal_().mul_(size)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import torch
 
+from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
 from scene_experts.files.bake.bake import explicit
 from scene_experts.files.bake.refine import DRAWN_AT, Refine, refine
@@ -28,7 +29,7 @@ def test_disturbed_gaussians_draw_the_same_picture_again(tmp_path):
     def error(scene) -> float:
         camera = capture.views[capture.test[0]].camera
         with torch.no_grad():
-            a, b = (draw(s(camera, DRAWN_AT, False, draw.visible).gaussians, camera, background).image for s in (true, scene))
+            a, b = (draw(s(camera, DRAWN_AT, Mode.DRAW, draw.visible).gaussians, camera, background).image for s in (true, scene))
         return float((a - b).square().mean())
 
     found = []

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from scene_experts.core.types import Camera, Decoded, Gaussians
+from scene_experts.core.types import Camera, Decoded, Gaussians, Mode
 from scene_experts.files.bake import sums as bake_sums
 from scene_experts.files.bake.bake import explicit
 from scene_experts.files.bake.sums import add_up, contributions, fit_harmonics, hidden, solved
@@ -57,7 +57,7 @@ def test_contributions_are_blending_weights():
     assert float(contributions(one, camera, draw)) == pytest.approx(float(draw(one, camera, torch.zeros(3)).alpha.sum()), rel=1e-5)
     scene = explicit(columns(60), 5.0)
     with torch.no_grad():
-        many = scene(camera, STEP, False, draw.visible).gaussians
+        many = scene(camera, STEP, Mode.DRAW, draw.visible).gaussians
         total = float(draw(many, camera, torch.zeros(3)).alpha.sum())
     assert float(contributions(many, camera, draw).sum()) == pytest.approx(total, rel=1e-4)
 

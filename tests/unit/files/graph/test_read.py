@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.types import Mode
 from scene_experts.files.export import import_result
 from scene_experts.files.graph import read as graph_points_in
 from scene_experts.files.ply import read_vertices, write_vertices
@@ -27,7 +28,9 @@ def test_a_run_comes_back_from_its_files(made, tmp_path):  # noqa: F811
     assert old.keys() == new.keys() and all(new[k] == pytest.approx(old[k], rel=1e-6) for k in old)
     camera = capture.views[capture.test[0]].camera
     with torch.no_grad():
-        pictures = [draw(s(camera, 60, False, draw.visible).gaussians, camera, torch.zeros(3)).image for s in (first.scene, again.scene)]
+        pictures = [
+            draw(s(camera, 60, Mode.DRAW, draw.visible).gaussians, camera, torch.zeros(3)).image for s in (first.scene, again.scene)
+        ]
     torch.testing.assert_close(pictures[0], pictures[1], atol=2e-4, rtol=0)
     assert (tmp_path / "again" / "point_cloud" / "iteration_60" / "networks.safetensors").is_file()
 

@@ -9,6 +9,7 @@ import torch
 from scene_experts.core.checkpoint import read_tensors
 from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
+from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
 from scene_experts.evaluate.score import sizes
 from scene_experts.files.export import export_run, write_layout
@@ -65,7 +66,10 @@ def test_the_files_alone_give_the_same_picture_in_the_capture_s_own_frame(made):
         for name, value in scene.network_tensors().items():
             value.copy_(tensors[name])
         camera = capture.views[capture.test[0]].camera
-        ours, theirs = opened.scene(camera, 60, False, draw.visible), scene(capture.world.camera_to_input(camera), 60, False, draw.visible)
+        ours, theirs = (
+            opened.scene(camera, 60, Mode.DRAW, draw.visible),
+            scene(capture.world.camera_to_input(camera), 60, Mode.DRAW, draw.visible),
+        )
     assert torch.equal(ours.gaussians.source, theirs.gaussians.source) and len(ours.gaussians) > 50
     torch.testing.assert_close(theirs.gaussians.colors, ours.gaussians.colors, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(theirs.gaussians.scales * capture.world.scale, ours.gaussians.scales, rtol=1e-3, atol=1e-5)

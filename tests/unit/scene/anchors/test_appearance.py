@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from scene_experts.core.types import Camera, Points
+from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.appearance import Codes, fold
@@ -52,7 +52,7 @@ def test_colours_alone_depend_on_the_code_and_the_colour_network_has_the_counted
     made = scene(decode="composed")
     assert sum(p.numel() for p in made.heads["color"].parameters()) == 3166  # type: ignore[attr-defined]
     assert made.rate_groups()["appearance"][0].shape == (4, 32)
-    own, other = (made(replace(CAMERA, id=i), 1, True, EVERYTHING) for i in (3, 5))
+    own, other = (made(replace(CAMERA, id=i), 1, Mode.TRAIN, EVERYTHING) for i in (3, 5))
     assert torch.equal(own.raw_opacity, other.raw_opacity) and not torch.allclose(own.gaussians.colors, other.gaussians.colors)
     rates = RECIPES["scaffold-gs"][1].rates
     assert rates.at("appearance", 30_000, 30_000, 5.0) == pytest.approx(5e-4) and rates.appearance.first == 0.05
@@ -64,7 +64,7 @@ def test_native_and_composed_decode_agree_with_codes(recipe):
     found = []
     for decode in ("native", "composed"):
         made = scene(recipe, decode=decode)
-        d = made(CAMERA, 2000, True, EVERYTHING)
+        d = made(CAMERA, 2000, Mode.TRAIN, EVERYTHING)
         torch.manual_seed(1)
         (d.gaussians.colors * torch.randn_like(d.gaussians.colors)).sum().backward()
         grads = [made.codes.table.grad, made.table.params["feature"].grad, made.heads["color"].w1.grad]

@@ -10,6 +10,7 @@ import torch
 import scene_experts
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
+from scene_experts.core.types import Mode
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.balance import BalancedExperts, BalancedHead
 from scene_experts.scene.anchors.experts import Experts, MixtureHead
@@ -62,16 +63,15 @@ def test_the_biases_follow_the_count_of_a_training_view():
         made.router_w.zero_()
         made.router_b.copy_(torch.tensor([5.0, 0.0, 0.0]))
     f = torch.randn(6, 32)
-    made.route(f, 1, None)
+    made.route(f, 1, None, Mode.TRAIN)
     assert not made.router_balance.any()  # nothing is chosen while dense
-    with torch.no_grad():
-        made.route(f, STEP, None)
-    assert not made.router_balance.any()  # a preview teaches nothing
-    made.route(f, STEP, None)
+    made.route(f, STEP, None, Mode.DRAW)
+    assert not made.router_balance.any()  # drawing moves nothing, with gradients or without
+    made.route(f, STEP, None, Mode.TRAIN)
     assert made.router_balance.tolist() == pytest.approx([-0.01, 0.01, 0.01])  # counts 6, 0, 0; mean 2
-    made.routing(f, STEP)
+    made.routing(f, STEP, mode=Mode.TRAIN)
     assert made.router_balance.tolist() == pytest.approx([-0.01, 0.01, 0.01])  # a loss over the whole scene asks again at the same step
-    made.eval()
+    made.train()
     made.route(f, STEP + 1, None)
     assert made.router_balance.tolist() == pytest.approx([-0.01, 0.01, 0.01])
     assert not made.router_balance.requires_grad
@@ -84,7 +84,7 @@ def test_a_collapsed_router_is_evened_out():
     share = lambda: torch.bincount(made.route(f, STEP, None)[0].chosen.reshape(-1), minlength=5) / 1000  # noqa: E731
     assert share()[0] > 0.45
     for i in range(600):
-        made.route(f, STEP + 1 + i, None)
+        made.route(f, STEP + 1 + i, None, Mode.TRAIN)
     assert (share() - 0.2).abs().max() < 0.03
 
 

@@ -5,6 +5,7 @@ import torch
 from torch.nn import functional
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.types import Mode
 from scene_experts.scene.anchors.experts import Experts, MixtureHead, Router, top_k
 from scene_experts.scene.anchors.mlp import MLP, Plain
 
@@ -141,9 +142,8 @@ def test_switches():
     with pytest.raises(ValueError, match="positions"):
         positioned(x, f, SPARSE)
     positioned(x, f, SPARSE, torch.zeros(A, 3, dtype=torch.float64))
-    noisy = head(router=Router(noise_std=1.0)).train()
-    assert not torch.equal(noisy(x, f, SPARSE)[0], noisy(x, f, SPARSE)[0])
-    noisy.eval()
+    noisy = head(router=Router(noise_std=1.0))
+    assert not torch.equal(noisy(x, f, SPARSE, mode=Mode.TRAIN)[0], noisy(x, f, SPARSE, mode=Mode.TRAIN)[0])
     assert torch.equal(noisy(x, f, SPARSE)[0], noisy(x, f, SPARSE)[0])
 
 

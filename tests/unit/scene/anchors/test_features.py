@@ -7,7 +7,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Points
+from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.features import Bank, FeatureBank, OwnFeature
 
@@ -63,13 +63,13 @@ def test_parameters_and_rates():
 
 def test_decoders_see_the_blend_and_routers_the_raw_feature():
     made = scene("moe-gs", mix=FeatureBank())
-    decoded = made(CAMERA, 2000, True, EVERYTHING)
+    decoded = made(CAMERA, 2000, Mode.TRAIN, EVERYTHING)
     again = made.routing(2000)["color"].chosen
     assert torch.equal(decoded.routing["color"].chosen, again[decoded.rows])
     before = decoded.raw_opacity
     with torch.no_grad():
         made.mix.b2 += torch.tensor([[3.0, 0.0, 0.0]])
-    after = made(CAMERA, 2000, True, EVERYTHING)
+    after = made(CAMERA, 2000, Mode.TRAIN, EVERYTHING)
     assert not torch.allclose(before, after.raw_opacity) and torch.equal(after.routing["color"].chosen, decoded.routing["color"].chosen)
     assert torch.equal(made.scene_opacity(CAMERA, 2000)[after.rows], after.raw_opacity)
 

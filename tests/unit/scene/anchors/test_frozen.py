@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from scene_experts.core.types import Camera, Points
+from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.experts import Experts, Router
@@ -56,9 +56,9 @@ def test_every_recipe_draws_the_same_bits(recipe):
         assert isinstance(frozen, Frozen) and frozen.folded == fold
         for view in (camera(1), camera(7, -0.4)):
             with torch.no_grad():
-                expected = scene(view, DONE, False, halves)
-            same(frozen(view, DONE, False, halves), expected)
-            assert len(expected.gaussians) and not frozen(view, DONE, False, halves).gaussians.means.requires_grad
+                expected = scene(view, DONE, Mode.DRAW, halves)
+            same(frozen(view, DONE, Mode.DRAW, halves), expected)
+            assert len(expected.gaussians) and not frozen(view, DONE, Mode.DRAW, halves).gaussians.means.requires_grad
 
 
 @needs_native
@@ -79,12 +79,12 @@ def test_other_heads_draw_the_same_bits(config):
     assert isinstance(frozen, Frozen) and frozen.folded
     for view in (camera(1), camera(7, -0.4)):
         with torch.no_grad():
-            same(frozen(view, DONE, False, halves), scene(view, DONE, False, halves))
+            same(frozen(view, DONE, Mode.DRAW, halves), scene(view, DONE, Mode.DRAW, halves))
     with torch.no_grad():
         composed = replace(config, decode="composed")
         scene.config = composed
-        exact = scene(camera(1), DONE, False, halves)
-    torch.testing.assert_close(frozen(camera(1), DONE, False, halves).raw_opacity, exact.raw_opacity, atol=1e-5, rtol=1e-4)
+        exact = scene(camera(1), DONE, Mode.DRAW, halves)
+    torch.testing.assert_close(frozen(camera(1), DONE, Mode.DRAW, halves).raw_opacity, exact.raw_opacity, atol=1e-5, rtol=1e-4)
 
 
 @needs_native
@@ -93,8 +93,8 @@ def test_while_dense_all_gates_are_kept_and_nothing_seen_draws_nothing():
     frozen = freeze(scene, 1)
     assert isinstance(frozen, Frozen) and frozen.kept[0].chosen is None and frozen.kept[0].gates is not None
     with torch.no_grad():
-        same(frozen(camera(), 1, False, halves), scene(camera(), 1, False, halves))
-    nothing = frozen(camera(), 1, False, lambda means, scales, camera: torch.zeros(len(means), dtype=torch.bool))
+        same(frozen(camera(), 1, Mode.DRAW, halves), scene(camera(), 1, Mode.DRAW, halves))
+    nothing = frozen(camera(), 1, Mode.DRAW, lambda means, scales, camera: torch.zeros(len(means), dtype=torch.bool))
     assert len(nothing.gaussians) == 0 and nothing.raw_opacity.shape == (0, scene.K)
 
 
@@ -112,9 +112,9 @@ def test_memory_is_what_it_says():
 def test_another_step_and_training_are_refused():
     frozen = freeze(trained(Anchors(), n=20), 7)
     with pytest.raises(ValueError, match="step 7"):
-        frozen(camera(), 8, False, halves)
-    with pytest.raises(ValueError, match="training"):
-        frozen(camera(), 7, True, halves)
+        frozen(camera(), 8, Mode.DRAW, halves)
+    with pytest.raises(ValueError, match="TRAIN"):
+        frozen(camera(), 7, Mode.TRAIN, halves)
 
 
 def test_what_the_native_decode_does_not_cover_stays_itself():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.types import Camera, Points
+from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.experts import Experts, Router
@@ -55,7 +55,7 @@ def test_a_chosen_voxel_that_keeps_nearly_every_point_is_said(caplog):
 @pytest.mark.parametrize("add_dist", [(), ATTRIBUTES])
 def test_every_gaussian_follows_the_formula(add_dist):
     made, cam = scene(Anchors(add_dist=add_dist, decode="composed"), n=20), camera()
-    decoded = made(cam, 1, True, EVERYTHING)
+    decoded = made(cam, 1, Mode.TRAIN, EVERYTHING)
     g, p = decoded.gaussians, made.table.params
     centre = -cam.world_to_cam[:3, :3].T @ cam.world_to_cam[:3, 3]
     order = []
@@ -93,7 +93,7 @@ def test_native_and_composed_decode_agree_in_value_and_gradient(name, step):
     found = []
     for decode in ("auto", "composed"):
         made = scene(replace(RECIPES[name][1].scene, decode=decode))
-        d = made(camera(), step, True, EVERYTHING)
+        d = made(camera(), step, Mode.TRAIN, EVERYTHING)
         g = d.gaussians
         values = [g.means, g.quats, g.scales, g.opacities, g.colors, d.raw_opacity, *(r.gates for r in d.routing.values())]
         torch.manual_seed(3)
@@ -115,9 +115,9 @@ def test_native_and_composed_decode_agree_in_value_and_gradient(name, step):
 def test_load_scope_all_balances_every_anchor():
     made = scene(Anchors(decoder=Experts(load_scope="all"), decode="composed"))
     half = lambda means, scales, cam: torch.arange(len(means)) % 2 == 0  # noqa: E731
-    decoded = made(camera(), 1, True, half)
+    decoded = made(camera(), 1, Mode.TRAIN, half)
     assert len(decoded.rows) == 100 and all(len(r.gates) == 200 for r in decoded.routing.values())
-    assert all(len(r.gates) == 100 for r in made(camera(), 1, False, half).routing.values())
+    assert all(len(r.gates) == 100 for r in made(camera(), 1, Mode.DRAW, half).routing.values())
 
 
 def test_nothing_in_view_and_nothing_positive():
@@ -127,7 +127,7 @@ def test_nothing_in_view_and_nothing_positive():
     with torch.no_grad():
         made.heads["opacity"].w2.zero_()
         made.heads["opacity"].b2.fill_(-1.0)
-    faint = made(camera(), 1, True, EVERYTHING)
+    faint = made(camera(), 1, Mode.TRAIN, EVERYTHING)
     assert len(faint.gaussians) == 0 and faint.raw_opacity.shape == (200, 10)
 
 
@@ -135,7 +135,7 @@ def test_a_camera_on_an_anchor_stays_finite():
     made = scene(Anchors(decode="composed"), n=3)
     pose = torch.eye(4)
     pose[:3, 3] = -made.table.facts["xyz"][0]
-    decoded = made(replace(camera(), world_to_cam=pose), 1, True, EVERYTHING)
+    decoded = made(replace(camera(), world_to_cam=pose), 1, Mode.TRAIN, EVERYTHING)
     decoded.raw_opacity.sum().backward()
     assert torch.isfinite(decoded.raw_opacity).all() and torch.isfinite(made.table.params["feature"].grad).all()
 
@@ -177,4 +177,4 @@ def test_the_native_decode_refuses_heads_it_has_no_code_for():
         pytest.skip("no compiled library")
     wanted = Anchors(decode="native", decoder=Experts(mix="pre_activation"))
     with pytest.raises(InputError, match=r"--scene\.decode auto"):
-        scene(wanted)(camera(), 1, True, EVERYTHING)
+        scene(wanted)(camera(), 1, Mode.TRAIN, EVERYTHING)

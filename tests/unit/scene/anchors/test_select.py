@@ -6,7 +6,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Decoded, Gaussians, Points
+from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.select import AllAnchors, LevelSelector, Octree, faded, visible_rows
@@ -41,15 +41,15 @@ def test_a_selection_is_filtered_and_keeps_row_numbers():
 def test_anchors_of_a_level_are_used_where_their_distance_asks_for_it(step):
     rows, at = table(), (0.5, 0.2, -1.0)
     select = LevelSelector(Octree(), LEVELS)
-    for training in (True, False):
-        top = 4 if not training else {1: 2, 7001: 3, 10_001: 4}[step]
+    for mode in Mode:
+        top = 4 if mode is Mode.DRAW else {1: 2, 7001: 3, 10_001: 4}[step]
         expected = []
         for i in range(60):
             real = slow_level(rows.facts["xyz"][i].tolist(), int(rows.facts["level"][i]), at) + float(rows.facts["extra_level"][i])
             if int(rows.facts["level"][i]) <= min(max(round(real), 0), top - 1):
                 expected.append(i)
-        assert select(rows, camera(*at), step, training).tolist() == expected
-        assert select.top(step, training) == top
+        assert select(rows, camera(*at), step, mode).tolist() == expected
+        assert select.top(step, mode) == top
 
 
 def test_levels_are_let_in_one_by_one():
@@ -61,24 +61,24 @@ def test_levels_are_let_in_one_by_one():
     select = LevelSelector(Octree(), LEVELS)
     assert select.coarse(10_000) and not select.coarse(10_001)
     assert not LevelSelector(Octree(coarse_to_fine=False), LEVELS).coarse(1)
-    assert LevelSelector(Octree(coarse_to_fine=False), LEVELS).top(1, True) == 4
+    assert LevelSelector(Octree(coarse_to_fine=False), LEVELS).top(1, Mode.TRAIN) == 4
     assert Octree().scaled(0.1).coarse_until == 1000
 
 
 def test_a_viewer_may_hold_the_level():
     rows, select = table(), LevelSelector(Octree(), LEVELS)
     near = camera(2.0, 2.0, 2.0)
-    capped = select.capped(1)(rows, near, 20_000, False)
+    capped = select.capped(1)(rows, near, 20_000, Mode.DRAW)
     assert (rows.facts["level"][capped] <= 1).all() and len(capped) == int((rows.facts["level"] <= 1).sum())
-    assert torch.equal(select.capped(1).capped(None)(rows, near, 20_000, False), select(rows, near, 20_000, False))
-    assert len(select.capped(0)(rows, near, 20_000, False)) == int((rows.facts["level"] == 0).sum())
+    assert torch.equal(select.capped(1).capped(None)(rows, near, 20_000, Mode.DRAW), select(rows, near, 20_000, Mode.DRAW))
+    assert len(select.capped(0)(rows, near, 20_000, Mode.DRAW)) == int((rows.facts["level"] == 0).sum())
 
 
 def test_blending_fades_the_finest_level_in():
     rows, at = table(), (0.5, 0.2, -1.0)
     select = LevelSelector(Octree(rule="blend"), replace(LEVELS, rule="blend"))
-    chosen = select(rows, camera(*at), 20_000, False)
-    fade = select.fade(rows, chosen, camera(*at), 20_000, False)
+    chosen = select(rows, camera(*at), 20_000, Mode.DRAW)
+    fade = select.fade(rows, chosen, camera(*at), 20_000, Mode.DRAW)
     for i, row in enumerate(chosen.tolist()):
         level = int(rows.facts["level"][row])
         real = slow_level(rows.facts["xyz"][row].tolist(), level, at) + float(rows.facts["extra_level"][row]) + 1
@@ -86,7 +86,7 @@ def test_blending_fades_the_finest_level_in():
         assert level <= int(real)
         assert float(fade[i]) == pytest.approx(real - int(real) if level == int(real) else 1.0, abs=1e-4)
     assert ((fade > 0) & (fade < 1)).any() and (fade == 1).any()
-    assert LevelSelector(Octree(), LEVELS).fade(rows, chosen, camera(*at), 20_000, False) is None
+    assert LevelSelector(Octree(), LEVELS).fade(rows, chosen, camera(*at), 20_000, Mode.DRAW) is None
 
 
 def test_fading_scales_raw_and_drawn_opacities():

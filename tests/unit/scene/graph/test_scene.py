@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.types import Camera, Points
+from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.geometry.curvature import curvature, flatter
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.recipes import RECIPES
@@ -79,7 +79,7 @@ def test_no_points_and_points_of_one_voxel():
     with pytest.raises(InputError, match="--init random"):
         GraphPoints().start(Points(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.uint8)), 5.0)
     one = GraphPoints(voxel_size=100.0).start(cloud(5), 5.0, [CAMERA])
-    assert len(one.table) == 1 and torch.isfinite(one(CAMERA, 1, True, everyone).gaussians.means).all()
+    assert len(one.table) == 1 and torch.isfinite(one(CAMERA, 1, Mode.TRAIN, everyone).gaussians.means).all()
 
 
 def slow(scene: GraphScene, rows: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -170,7 +170,7 @@ def test_the_graph_is_made_again_when_rows_change_and_only_then():
 def test_whatever_the_seed_something_is_drawn_at_first(seed):
     torch.manual_seed(seed)
     scene = RECIPES["sags"][1].scene.start(cloud(), 5.0, [CAMERA])
-    raw = scene(CAMERA, 1, True, everyone).raw_opacity
+    raw = scene(CAMERA, 1, Mode.TRAIN, everyone).raw_opacity
     assert raw is not None and float(raw.detach().mean()) > 0
     turned = copy.deepcopy(scene)
     turned.heads["opacity"].layers[-1].data.neg_()
