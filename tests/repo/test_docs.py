@@ -34,6 +34,27 @@ def rows(text: str) -> list[tuple[str, list[str]]]:
     return out
 
 
+def slug(title: str) -> str:
+    """The anchor of a heading, as GitHub makes it."""
+    return re.sub(r"[^\w -]", "", title.strip("# ").lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize(
+    "page", sorted(p for place in (".", "docs", "results", "results/*", "results/*/*") for p in ROOT.glob(f"{place}/*.md"))
+)
+def test_links_lead_somewhere(page):
+    broken = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        name, _, anchor = target.partition("#")
+        if name.startswith(("http:", "https:")):
+            continue
+        file = page.parent / name if name else page
+        anchors = {slug(line) for line in file.read_text().splitlines() if line.startswith("#")} if file.exists() and anchor else set()
+        if not file.exists() or (anchor and anchor not in anchors):
+            broken.append(target)
+    assert not broken
+
+
 def is_test(name: str) -> bool:
     return Path(name).name.startswith("test_")
 

@@ -8,7 +8,8 @@ import pytest
 
 from support.places import ROOT
 
-RECORDS = ROOT / "docs" / "results" / "records"
+RECORDS = ROOT / "results" / "records"
+pytestmark = pytest.mark.skipif(not RECORDS.is_dir(), reason="a source distribution leaves results/ out")
 CAPTURES = ("buddha", "fox", "kitchen", "bonsai", "fern", "colosseum", "brighton")
 SEEDED = ("scaffold-gs", "moe-gs", "moe-gs-dist")
 
@@ -81,7 +82,7 @@ def test_the_whole_schedule_beside_the_others():
 
 
 def test_the_claims_are_quoted_as_they_were_judged():
-    claims = {cells[1].strip(): cells[3] for line in lines("docs/results/seeds/README.md") if len(cells := line.split("|")) == 5}
+    claims = {cells[1].strip(): cells[3] for line in lines("results/seeds/README.md") if len(cells := line.split("|")) == 5}
     front, page = ((ROOT / name).read_text() for name in ("README.md", "docs/results.md"))
     number = r"([+-][\d.]+)"
     for claim, digits in (("PSNR than Scaffold", 2), ("SSIM", 4), ("LPIPS (3DGS's variant)", 4)):

@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from scene_experts.core.errors import InputError, few
-from scene_experts.core.io import read_json, write_json
+from scene_experts.core.io import read_json, write_bytes
 from scene_experts.evaluate.tables import load_results
+from scene_experts.reproduce.columns import columns, length, rows, text
 from scene_experts.reproduce.plan import Spec, identity
 from scene_experts.training.config import RunConfig, from_json, to_json
 from scene_experts.training.run_folder import load_capture, read_config
 
-FORMAT = 1
+FORMAT = 2
 POINTS = 60  # samples of a curve over training
 CURVES = ("step", "seconds", "psnr", "anchors", "active", "routing", "entropy", "scene_routing", "scene_gates")
 PER_VIEW = ("psnr", "ssim", "lpips", "lpips_3dgs", "activation_ratio", "gaussians_rendered")
@@ -121,21 +122,40 @@ def write(store: Path, record: Record) -> Path:
         "curves": record.curves,
     }
     path = path_of(store, record)
-    write_json(path, value)
+    write_bytes(path, packed(value).encode())
     return path
+
+
+def packed(value: dict[str, Any]) -> str:
+    """The text of a record: scores by view and curves as columns, an entry a line."""
+    views, curve = value["per_view"], value["curves"]
+    scores = {"names": list(views), "scores": columns(list(views.values()))}
+    return text({**value, "format": FORMAT, "per_view": scores, "curves": columns(curve)}) + "\n"
+
+
+def unpacked(value: dict[str, Any]) -> dict[str, Any]:
+    """The same with a row for each view and each point of a curve, as format 1 has it."""
+    if value["format"] == 1:
+        return value
+    views, curve = value["per_view"], value["curves"]
+    scores = dict(zip(views["names"], rows(views["scores"], len(views["names"])), strict=True))
+    return {**value, "per_view": scores, "curves": rows(curve, length(curve))}
 
 
 def read(path: Path) -> Record:
     """A record file. Raises InputError where it is none, or was changed by hand."""
     value = read_json(path, "record of a run")
     parts = {"scene", "config", "results", "per_view", "curves", "config_sha256", "results_sha256"}
-    if not isinstance(value, dict) or value.get("format") != FORMAT or not parts <= value.keys():
+    if not isinstance(value, dict) or value.get("format") not in (1, FORMAT) or not parts <= value.keys():
         raise InputError(f"expected a record of a run (format {FORMAT}) in {path}, found something else; remove it and reproduce again")
     for part in ("config", "results"):
         if digest(value[part]) != value[f"{part}_sha256"]:
             raise InputError(f"expected {part} as they were written in {path}, found them changed; remove it and reproduce again")
-    config = from_json(RunConfig, value["config"])
-    return Record(value["scene"], config, value["results"], value["per_view"], value["curves"])
+    try:
+        value = unpacked(value)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"expected columns of equal length in {path}, found others ({error}); remove it and reproduce again") from error
+    return Record(value["scene"], from_json(RunConfig, value["config"]), value["results"], value["per_view"], value["curves"])
 
 
 def load(store: Path) -> list[Record]:

@@ -9,7 +9,7 @@ import pytest
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
 from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec, distinct
-from scene_experts.reproduce.store import POINTS, curves, expect_of_captures, find, load, of_run, of_specs, read, write
+from scene_experts.reproduce.store import POINTS, curves, expect_of_captures, find, load, of_run, of_specs, read, unpacked, write
 from scene_experts.training.config import to_json
 from scene_experts.training.run_folder import load_capture
 from support.records import record
@@ -24,6 +24,15 @@ def test_a_record_comes_back_as_it_was_without_the_place_of_the_capture(tmp_path
     back = read(path)
     assert (back.key, back.results, back.per_view, back.curves) == (made.key, made.results, made.per_view, made.curves)
     assert [r.key for r in load(tmp_path)] == [made.key]
+
+
+def test_a_record_of_the_first_format_opens(tmp_path):
+    made = record()
+    path = write(tmp_path, made)
+    value = unpacked(json.loads(path.read_text()))
+    assert value["curves"] == made.curves and value["per_view"] == made.per_view
+    path.write_text(json.dumps({**value, "format": 1}, indent=2))
+    assert read(path) == made
 
 
 def test_a_run_is_found_by_its_spec(tmp_path):
@@ -50,6 +59,12 @@ def test_changed_figures_are_refused(tmp_path):
     value["results"]["psnr"] = 99.0
     path.write_text(json.dumps(value))
     with pytest.raises(InputError, match="expected results as they were written"):
+        read(path)
+    path = write(tmp_path, record())
+    value = json.loads(path.read_text())
+    del value["per_view"]["scores"]["psnr"][1:]
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match="columns of equal length"):
         read(path)
     for other in ("{}", '{"format": 1}'):
         path.write_text(other)
