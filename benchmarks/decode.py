@@ -77,9 +77,9 @@ def main() -> None:
     parser.add_argument("--level", choices=native.LEVELS, help="which build of the library; the best of this processor by default")
     args = parser.parse_args()
     if args.level:
-        native.levels = lambda: (args.level,)
+        native.list_levels = lambda: (args.level,)
     if native.load() is None:
-        raise SystemExit(native.why_not())
+        raise SystemExit(native.explain_missing())
     pose = torch.eye(4)
     pose[2, 3] = 6.0
     camera = Camera(pose, torch.eye(3), 800, 544)

@@ -21,7 +21,6 @@ from scene_experts.core.types import Mode
 from scene_experts.evaluate import timing
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
-from scene_experts.scene.anchors.frozen import freeze
 from scene_experts.training.run_folder import load_capture, open_run
 
 KINDS = (
@@ -32,10 +31,10 @@ KINDS = (
 
 
 def frames(recipe: str, anchors: int) -> tuple[Subject, int]:
-    """Draws the recipe's made scene once and times (own decode, frozen, folded, raster); and how many Gaussians are drawn."""
+    """Draws the recipe's made scene once and times (own decode, frozen, raster); and how many Gaussians are drawn."""
     made = work(recipe, anchors, 800, 544)
     scene, camera, rasterize = made.training.scene, made.camera, made.rasterize
-    forms = (scene, freeze(scene, AT), freeze(scene, AT, fold_features=True))
+    forms = (scene, scene.frozen(AT))
 
     @torch.no_grad()
     def frame(clock: Clock) -> tuple[float, ...]:
@@ -59,9 +58,9 @@ def made_scenes(anchors: int, only: str, seconds: float) -> None:
             subjects[name], drawn[name] = frames(name, anchors)
     clock = clock_for(torch.get_num_threads())
     print(f"{anchors} anchors, half of them seen, 800x544, {torch.get_num_threads()} thread(s); ms")
-    print("| recipe | Gaussians | own decode | frozen | folded | raster | FPS, frozen |\n|---|---|---|---|---|---|---|")
-    for name, (own, frozen, folded, raster) in least(subjects, seconds * len(subjects), clock).items():
-        parts = " | ".join(f"{1e3 * t:.1f}" for t in (own, frozen, folded, raster))
+    print("| recipe | Gaussians | own decode | frozen | raster | FPS, frozen |\n|---|---|---|---|---|---|")
+    for name, (own, frozen, raster) in least(subjects, seconds * len(subjects), clock).items():
+        parts = " | ".join(f"{1e3 * t:.1f}" for t in (own, frozen, raster))
         print(f"| {name} | {drawn[name]:,} | {parts} | {1 / (frozen + raster):.0f} |")
 
 

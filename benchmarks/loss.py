@@ -42,9 +42,9 @@ def main() -> None:
     parser.add_argument("--level", choices=native.LEVELS, help="which build of the library; the best of this processor by default")
     args = parser.parse_args()
     if args.level:
-        native.levels = lambda: (args.level,)
+        native.list_levels = lambda: (args.level,)
     if native.load() is None:
-        raise SystemExit(native.why_not())
+        raise SystemExit(native.explain_missing())
     torch.manual_seed(0)
     target = torch.rand(args.height // 8, args.width // 8, 3).repeat_interleave(8, 0).repeat_interleave(8, 1)
     image = (target + 0.05 * torch.randn_like(target)).clamp(0, 1)

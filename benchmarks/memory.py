@@ -47,7 +47,7 @@ class Watched:
         state = getattr(render.image.grad_fn, "state", None)
         if state is not None:
             counts, seconds = (ctypes.c_int64 * 3)(), (ctypes.c_double * 5)()
-            state.library.se_raster_counts(ctypes.c_void_p(state.address), counts, seconds)
+            state.library.se_raster_count(ctypes.c_void_p(state.address), counts, seconds)
             pairs, pixels = counts[1] / max(1, len(gaussians)), camera.width * camera.height
             size = memory.frame_bytes(len(gaussians), pixels, pairs)
             if size > self.largest:

@@ -37,9 +37,8 @@ def compile_peer(folder: Path) -> ctypes.CDLL:
     """The peer's shared library, built in `folder`."""
     target = folder / "peer.so"
     source = [str(PEER / "raster_peer.cpp"), str(PEER / "clock.cpp")]
-    subprocess.run(
-        ["c++", "-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", "-o", str(target), *source], check=True
-    )
+    flags = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", f"-I{PEER.parents[1] / 'csrc'}"]
+    subprocess.run(["c++", *flags, "-o", str(target), *source], check=True)
     library = ctypes.CDLL(str(target))
     library.peer_new.restype = ctypes.c_void_p
     library.peer_composited.restype = ctypes.c_int64
@@ -66,7 +65,7 @@ class Fast:
         render.image.backward(weights)
         end = clock()
         counts, seconds = (ctypes.c_int64 * 3)(), (ctypes.c_double * 5)()
-        kept.library.se_raster_counts(ctypes.c_void_p(kept.address), counts, seconds)
+        kept.library.se_raster_count(ctypes.c_void_p(kept.address), counts, seconds)
         self.counts = list(counts)
         self.stages = [min(a, b) for a, b in zip(self.stages, seconds, strict=True)]
         return middle - start, end - middle, render.image.detach(), leaves[0].grad  # type: ignore[return-value]
@@ -82,7 +81,7 @@ class Peer:
 
     def __call__(self, g: Gaussians, camera: Camera, weights: Tensor, clock: Callable[[], float]) -> tuple[float, float, Tensor, Tensor]:
         """As Fast's."""
-        args = cpu._camera(camera)
+        args = cpu.convert_camera(camera)
         inputs = [g.means, g.quats, g.scales, g.opacities, g.colors]
         image, background = torch.empty((camera.height, camera.width, 3)), torch.zeros(3)
         outputs = [torch.empty_like(t) for t in inputs]
@@ -162,7 +161,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cloud", type=Path, help="npz of a point cloud (default: one made in code)")
     parser.add_argument("--cases", nargs="+", default=["100000,800,544", "500000,800,544"], help="Gaussians,width,height")
-    parser.add_argument("--levels", nargs="+", default=[name for name in native.levels() if native.path(name)])
+    parser.add_argument("--levels", nargs="+", default=[name for name in native.list_levels() if native.find(name)])
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeat", type=int, default=15)
     parser.add_argument("--reference", action="store_true", help="also time the pure-torch reference (a minute or more)")

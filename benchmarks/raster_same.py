@@ -41,7 +41,7 @@ def hashes(case: tuple[int, int, int], level: str, antialias: bool, threads: int
 
 def everything() -> dict[str, dict[str, str]]:
     """Hashes of all cases."""
-    levels = [name for name in native.levels() if native.path(name)]
+    levels = [name for name in native.list_levels() if native.find(name)]
     return {
         f"{case[0]} {level} antialias={antialias}": hashes(case, level, antialias, threads=1 + antialias)
         for case in CASES

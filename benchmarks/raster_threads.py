@@ -10,7 +10,6 @@ endless loops as there are cores run beside it; mean wall time of a frame on 1 t
 from __future__ import annotations
 
 import argparse
-import ctypes
 import multiprocessing
 import os
 import time
@@ -29,11 +28,8 @@ CHUNKS = 4096  # of multiply-adds: about as long as a frame
 
 def arithmetic(threads: int) -> Callable[[], None]:
     """A loop that has nothing to wait for."""
-    library = native.load()
-    if library is None:
-        raise SystemExit(native.why_not())
-    library.se_arithmetic.restype, library.se_arithmetic.argtypes = ctypes.c_double, [ctypes.c_int64, ctypes.c_int32]
-    return lambda: library.se_arithmetic(CHUNKS, threads)
+    library = native.require()
+    return lambda: library.se_benchmark_multiply_adds(CHUNKS, threads)
 
 
 def raster(g: Gaussians, camera: Camera, threads: int) -> Callable[[], None]:

@@ -27,7 +27,6 @@ import torch
 from scene_experts.data.capture import Capture
 from scene_experts.geometry.rotation import matrix_to_quat
 from scene_experts.render import Rasterizer, choose
-from scene_experts.scene.anchors.frozen import freeze
 from scene_experts.training import loop as train
 from scene_experts.training import run_folder
 from scene_experts.training.run_folder import OpenRun
@@ -103,7 +102,7 @@ def start_client(url: str, seconds: float, size: tuple[int, int], along: list[Po
 
 
 def served(run: OpenRun, capture: Capture, rasterize: Rasterizer, seconds: float, size: tuple[int, int]) -> None:
-    viewer = Viewer(capture, lambda: (run.scene, run.step), rasterize, port=0, draws=freeze(run.scene, run.step))
+    viewer = Viewer(capture, lambda: (run.scene, run.step), rasterize, port=0, draws=run.scene.frozen(run.step))
     along, smallest = poses(capture), server.SMALLEST
     print(f"{len(run.scene.table):,} rows, {torch.get_num_threads()} thread(s), {size[0]}x{size[1]}")
     try:

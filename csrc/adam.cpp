@@ -9,24 +9,15 @@
 #include <cmath>
 #include <cstdint>
 
-#include "export.h"
 #include "lanes.h"
 #include "pool.h"
+#include "se_api.h"
 
 namespace se {
 namespace {
 
 constexpr int64_t kGrain = 32768;  // elements a worker takes at a time: 900 kB of traffic, long beside the claim of a chunk
 constexpr int64_t kAhead = 8;      // rows that are on their way from memory while one is worked on
-
-struct AdamTensor {
-  float* value;
-  const float* gradient;
-  float *first, *second;  // moments
-  const int64_t* rows;    // null: all
-  int64_t count, width;   // how many of `rows` and the elements of one; without `rows` all elements, and 1
-  double step_size, root;
-};
 
 struct Constants {
   float rate1, beta2, rate2, eps, step_size, root;  // rates: 1 - beta
@@ -53,7 +44,7 @@ inline void store_some(float* p, V a, int64_t n) {
 #endif
 }
 
-void span(const Constants& c, const AdamTensor& t, int64_t begin, int64_t end) {
+void span(const Constants& c, const SeAdamTensor& t, int64_t begin, int64_t end) {
   const V rate1 = all(c.rate1), beta2 = all(c.beta2), rate2 = all(c.rate2), eps = all(c.eps), step = all(-c.step_size), root = all(c.root);
   int64_t i = begin;
   for (; i + LANES <= end; i += LANES) {
@@ -84,7 +75,7 @@ void span(const Constants& c, const AdamTensor& t, int64_t begin, int64_t end) {
   }
 }
 
-inline void fetch(const AdamTensor& t, int64_t row) {
+inline void fetch(const SeAdamTensor& t, int64_t row) {
   for (int64_t i = row * t.width; i < (row + 1) * t.width; i += 16) {
     __builtin_prefetch(t.gradient + i, 0);
     __builtin_prefetch(t.first + i, 1);
@@ -94,7 +85,7 @@ inline void fetch(const AdamTensor& t, int64_t row) {
 }
 
 // Neighbouring rows are one span, so that short rows do not end in a rest each.
-void spans(const Constants& c, const AdamTensor& t, int64_t begin, int64_t end) {
+void spans(const Constants& c, const SeAdamTensor& t, int64_t begin, int64_t end) {
   while (begin < end) {
     int64_t last = begin + 1;
     while (last < end && t.rows[last] == t.rows[last - 1] + 1) ++last;
@@ -104,20 +95,20 @@ void spans(const Constants& c, const AdamTensor& t, int64_t begin, int64_t end) 
   }
 }
 
-int64_t grain(const AdamTensor& t) { return std::max<int64_t>(1, kGrain / std::max<int64_t>(1, t.width)); }
+int64_t grain(const SeAdamTensor& t) { return std::max<int64_t>(1, kGrain / std::max<int64_t>(1, t.width)); }
 
-int64_t chunks(const AdamTensor& t) { return (t.count + grain(t) - 1) / grain(t); }
+int64_t chunks(const SeAdamTensor& t) { return (t.count + grain(t) - 1) / grain(t); }
 
 }  // namespace
 }  // namespace se
 
 // tensors [n]; where `rows` is given, each row at most once and inside of the tensor.
-SE_EXPORT void se_adam_step(const se::AdamTensor* tensors, int64_t n, double beta1, double beta2, double eps, int32_t threads) {
+SE_EXPORT void se_adam_step(const SeAdamTensor* tensors, int64_t count, double beta1, double beta2, double eps, int32_t threads) {
   int64_t total = 0;
-  for (int64_t i = 0; i < n; ++i) total += se::chunks(tensors[i]);
+  for (int64_t i = 0; i < count; ++i) total += se::chunks(tensors[i]);
   const auto single = [](double x) { return static_cast<float>(x); };
   se::parallel_for(total, 1, threads, [&](int64_t chunk, int64_t, int) {
-    const se::AdamTensor* t = tensors;
+    const SeAdamTensor* t = tensors;
     for (; chunk >= se::chunks(*t); ++t) chunk -= se::chunks(*t);
     const se::Constants c{single(1 - beta1), single(beta2), single(1 - beta2), single(eps), single(t->step_size), single(t->root)};
     const int64_t from = chunk * se::grain(*t), to = std::min(t->count, from + se::grain(*t));

@@ -2,9 +2,9 @@
 #include <algorithm>
 #include <atomic>
 
-#include "export.h"
 #include "lanes.h"
 #include "pool.h"
+#include "se_api.h"
 
 namespace se {
 namespace {
@@ -28,7 +28,7 @@ float chunk_of_sums(float start) {
 }  // namespace se
 
 // Runs `chunks` chunks of multiply-adds on at most `threads` workers. Returns how many multiply-adds of single floats that were.
-SE_EXPORT double se_arithmetic(int64_t chunks, int32_t threads) {
+SE_EXPORT double se_benchmark_multiply_adds(int64_t chunks, int32_t threads) {
   std::atomic<int> strange{0};
   se::parallel_for(chunks, 1, threads, [&](int64_t begin, int64_t end, int) {
     for (int64_t c = begin; c < end; ++c)

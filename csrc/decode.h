@@ -14,6 +14,7 @@
 
 #include "lanes.h"
 #include "pool.h"
+#include "se_api.h"
 
 namespace se {
 
@@ -22,38 +23,15 @@ constexpr int BLOCK = 48;    // anchors of one expert at a time
 constexpr int BUFFERS = 16;  // partial sums of weight gradients
 constexpr int COV = 7;       // 3 scale, 4 rotation
 
-// Plain C structures, mirrored by scene/anchors/native_decode.py: pointers first, then 64-bit integers.
-struct Head {
-  const float *router_w, *router_b, *w1, *b1, *wm, *bm, *w2, *b2;  // [E,F or F+3] or null, [E] or null, [E,H,D], [E,H], [E,L,H,H],
-                                                                   // [E,L,H], [E,out,H], [E,out]
-  float* gates;                                                    // [A,E], with a router
-  int64_t* chosen;                                                 // [A,k], with a router and k > 0
-  float* mix;                                                      // [A,k], the weights of the chosen
-  float* base;                                                     // frozen: [N,shares,Hp] or null, the features' part of layer 1
-  float *d_router_w, *d_router_b, *d_w1, *d_b1, *d_wm, *d_bm, *d_w2, *d_b2;
-  const float* d_gates;                                  // [A,E] or null
-  int64_t E, k, H, L, out, distance, position;           // k = 0: dense; L: middle layers; distance, position: 1 if an input
-  bool single() const { return E == 1 || k == 1; }       // one expert of weight 1 per anchor
-  bool every() const { return !router_w || k == 0; }     // all experts see all anchors
-  int shares() const { return static_cast<int>(k ? k : E); }
-};
+using Head = SeDecodeHead;
+using Decode = SeDecode;
 
-struct Decode {
-  const int64_t* rows;                                              // [A]
-  const float *xyz, *feature, *log_scaling, *offsets, *camera;      // [N,3], [N,F], [N,6], [N,K,3], [3]
-  float* raw;                                                       // [A,K]
-  int64_t* starts;                                                  // [chunks + 1]: first Gaussian of each chunk
-  float *means, *quats, *scales, *opacities, *colors, *per_length;  // [M,...]; per_length = 1 / length of the mixed quaternion
-  int64_t* source;                                                  // [M]
-  const float *d_means, *d_quats, *d_scales, *d_opacities, *d_colors, *d_raw;  // any may be null
-  float *d_feature, *d_log_scaling, *d_offsets;                     // [N,...]
-  int64_t A, N, K, F, threads, ascending;                           // ascending: rows are; then the gaps between them are zeroed here
-  int64_t frozen;                                                   // gates, chosen and mix are given, for all N rows of the table
-  double extent;                                                    // positions are divided by it
-  Head heads[3];                                                    // opacity, covariance, colour
-  int64_t chunks() const { return (A + CHUNK - 1) / CHUNK; }
-  int64_t routed(int64_t anchor) const { return frozen ? rows[anchor] : anchor; }  // where an anchor's gates, chosen and mix are
-};
+inline bool has_one_expert(const Head& h) { return h.E == 1 || h.k == 1; }       // one expert of weight 1 per anchor
+inline bool uses_all_experts(const Head& h) { return !h.router_w || h.k == 0; }  // all experts see all anchors
+inline int experts_per_anchor(const Head& h) { return static_cast<int>(h.k ? h.k : h.E); }
+inline int64_t count_chunks(const Decode& d) { return (d.A + CHUNK - 1) / CHUNK; }
+// The row of gates, chosen and chosen_weight that belongs to `anchor`.
+inline int64_t routing_row(const Decode& d, int64_t anchor) { return d.frozen ? d.rows[anchor] : anchor; }
 
 // Sizes of padded blocks.
 struct Sizes {
@@ -153,10 +131,6 @@ void groups(const Decode& d, const Head& head, const Chunk& chunk, bool live_onl
 void block_inputs(const Work& w, const Sizes& s, const Group& g, int from, int n);
 // Hidden layers of w.block; the last of them.
 float* hidden(const Packed::Expert& e, const Sizes& s, int head, int middle, int n, Work& w);
-// The same from the features' part of the first layer, to the last bit.
-float* hidden_from_base(const Decode& d, const Packed::Expert& e, const Sizes& s, const Chunk& chunk, int head, const int* anchor,
-                        const int* place, int n, Work& w);
-float* middle_layers(const Packed::Expert& e, const Sizes& s, int head, int middle, int n, Work& w);
 void outputs(const Packed::Expert& e, const Sizes& s, int head, int n, const float* h, float* y);
 void activate(int head, float* y, int n);
 inline int block_size(int n) {  // equal parts of at most BLOCK

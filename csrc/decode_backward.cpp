@@ -3,9 +3,10 @@
 #include <memory>
 
 #include "decode.h"
-#include "export.h"
 #include "pool.h"
 #include "products.h"
+#include "se_api.h"
+#include "status.h"
 
 namespace {
 
@@ -69,7 +70,7 @@ class Backward {
   void head(const Chunk& chunk, int i) {
     const Head& head = d_.heads[i];
     groups(d_, head, chunk, i > 0 || !d_.d_raw, w_, found_);
-    if (!head.single()) std::fill_n(w_.weights, int64_t(chunk.n) * head.shares(), 0.f);
+    if (!has_one_expert(head)) std::fill_n(w_.weights, int64_t(chunk.n) * experts_per_anchor(head), 0.f);
     for (const Group& g : found_) {
       const int step = block_size(g.n);
       for (int from = 0; from < g.n; from += step) block(i, g, from, std::min(step, g.n - from));
@@ -88,13 +89,13 @@ class Backward {
     const int *anchor = w_.anchor + g.first + from, *place = w_.place + g.first + from;
     block_inputs(w_, s_, g, from, n);
     float *h = hidden(expert, s_, i, L, n, w_), *dh = h + layer, *other = dh + layer, *y = w_.out, *dy = y + int64_t(BLOCK + SLACK) * Op;
-    if (!head.single() && i != 1) {
+    if (!has_one_expert(head) && i != 1) {
       outputs(expert, s_, i, n, h, y);
       activate(i, y, n * Op);
     }
     output_gradients(i, n, anchor, place, weight, expert.b2.data(), y, dy);
     product(n, Hp, s_.out[i], dy, Op, expert.w2.data(), Hp, nullptr, Store{dh, Hp});
-    if (i == 1 && !head.single())
+    if (i == 1 && !has_one_expert(head))
       weigh(n, Hp, Op, place, weight, h, dh, dy, sums_ + at.b2);
     else {
       mask(n * Hp, h, dh);
@@ -121,7 +122,7 @@ class Backward {
   void output_gradients(int i, int n, const int* anchor, const int* place, const float* weight, const float* bias, const float* y,
                         float* dy) {
     const int Op = s_.Op[i];
-    const bool single = d_.heads[i].single();
+    const bool single = has_one_expert(d_.heads[i]);
     for (int t = 0; t < n; ++t, y += Op, dy += Op) {
       const float* given = w_.mixed[i] + int64_t(anchor[t]) * Op;
       const V share = all(weight[t]);
@@ -195,7 +196,7 @@ void write_expert(const Decode& d, const Sizes& s, const Layout::Expert& at, con
     b1[j] = sums[at.w1t + int64_t(s.F + 3) * Hp + j];
   }
   for (int64_t l = 0; l < head.L; ++l) {
-    float *wm = head.d_wm + (e * head.L + l) * H * H, *bm = head.d_bm + (e * head.L + l) * H;
+    float *wm = head.d_middle_w + (e * head.L + l) * H * H, *bm = head.d_middle_b + (e * head.L + l) * H;
     for (int j = 0; j < H; ++j) std::copy_n(sums + at.wm + (l * Hp + j) * Hp, H, wm + j * H);
     std::copy_n(sums + at.bm + l * Hp, H, bm);
   }
@@ -232,13 +233,13 @@ float* partial_sums(int64_t floats) {
 }  // namespace
 
 // Gradients of the table's rows and of all weights.
-SE_EXPORT int se_decode_backward(const Decode* decode) {
-  return guarded([&] {
+SE_EXPORT int32_t se_decode_backward(const Decode* decode) {
+  return run_guarded([&] {
     const Decode& d = *decode;
     const Sizes s(d);
     const Packed packed(d, s, true);
     const Layout layout(d, s);
-    const int64_t grain = std::max<int64_t>(1, (d.chunks() + BUFFERS - 1) / BUFFERS) * CHUNK;
+    const int64_t grain = std::max<int64_t>(1, (count_chunks(d) + BUFFERS - 1) / BUFFERS) * CHUNK;
     const int64_t buffers = std::max<int64_t>(1, (d.A + grain - 1) / grain);
     float* sums = partial_sums(buffers * layout.total);
     if (!d.A) std::fill_n(sums, layout.total, 0.f);

@@ -69,7 +69,7 @@ void emit_backward(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w)
     for (int slot = 0; slot < s.Op[0]; slot += LANES) {
       const int n = std::max(0, std::min(LANES, K - slot));
       const V sigma = load_part(raw + slot, n), g = d_raw ? load_part(d_raw + slot, n) : all(0.f);
-      store(opacity + slot, d.heads[0].single() ? g * (all(1.f) - sigma * sigma) : g);
+      store(opacity + slot, has_one_expert(d.heads[0]) ? g * (all(1.f) - sigma * sigma) : g);
     }
     Quad to_reach = four(0.f), to_size = four(0.f);
     if (w.live[a]) {
@@ -81,7 +81,7 @@ void emit_backward(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w)
       for_drawn(w, K, a, [&](int slot) {
         if (d.d_opacities) {  // not added to what was just stored: a load behind a wider masked store waits long
           const float g = d.d_opacities[at] + (d_raw ? d_raw[slot] : 0.f);
-          opacity[slot] = d.heads[0].single() ? g * (1.f - raw[slot] * raw[slot]) : g;
+          opacity[slot] = has_one_expert(d.heads[0]) ? g * (1.f - raw[slot] * raw[slot]) : g;
         }
         if (d.d_means) {
           const Quad g = load3(d.d_means + 3 * at) * reach;
@@ -102,7 +102,7 @@ void emit_backward(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w)
         }
         if (d.d_colors) {
           const Quad g = load3(d.d_colors + 3 * at), c = load3(d.colors + 3 * at);
-          store3(color + 3 * slot, d.heads[2].single() ? g * (c - c * c) : g);
+          store3(color + 3 * slot, has_one_expert(d.heads[2]) ? g * (c - c * c) : g);
         }
         ++at;
       });

@@ -17,7 +17,7 @@ Sizes::Sizes(const Decode& d) : K(static_cast<int>(d.K)), F(static_cast<int>(d.F
     inputs[i] = F + 4 + static_cast<int>(h.distance);
     first[i] = R;
     if (h.router_w) R += static_cast<int>(h.E), position |= h.position != 0;
-    shares = std::max(shares, h.shares()), L = std::max(L, static_cast<int>(h.L)), Hp_most = std::max(Hp_most, Hp[i]);
+    shares = std::max(shares, experts_per_anchor(h)), L = std::max(L, static_cast<int>(h.L)), Hp_most = std::max(Hp_most, Hp[i]);
   }
   Rp = round_up(R, 16);
   router = position ? F + 8 : F, routerp = round_up(router, 16);
@@ -40,7 +40,7 @@ Packed::Expert::Expert(const Decode& d, const Sizes& s, int i, int e, bool backw
   wmt.assign(int64_t(L) * H * Hp, 0.f), bm.assign(int64_t(L) * Hp, 0.f);
   if (backward) w1.assign(int64_t(H) * s.Fp, 0.f), wm.assign(int64_t(L) * H * Hp, 0.f), w2.assign(int64_t(out) * Hp, 0.f);
   for (int l = 0; l < L; ++l) {
-    const float *from_wm = head.wm + (int64_t(e) * L + l) * H * H, *from_bm = head.bm + (int64_t(e) * L + l) * H;
+    const float *from_wm = head.middle_w + (int64_t(e) * L + l) * H * H, *from_bm = head.middle_b + (int64_t(e) * L + l) * H;
     std::copy_n(from_bm, H, &bm[int64_t(l) * Hp]);
     for (int j = 0; j < H; ++j)
       for (int c = 0; c < H; ++c) {
@@ -110,13 +110,12 @@ void gather(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w) {
   const Quad camera = load3(d.camera);
   const float extent = static_cast<float>(d.extent);
   constexpr int AHEAD = 12;
-  const bool folded = d.heads[0].base && d.heads[1].base && d.heads[2].base;
   for (int a = 0; a < chunk.n; ++a) {
     const int64_t row = d.rows[chunk.begin + a], next = d.rows[chunk.begin + std::min(a + AHEAD, chunk.n - 1)];
-    for (int c = 0; !folded && c < s.F; c += 16) __builtin_prefetch(d.feature + next * s.F + c);
+    for (int c = 0; c < s.F; c += 16) __builtin_prefetch(d.feature + next * s.F + c);
     __builtin_prefetch(d.xyz + next * 3);
     float* z = w.z + int64_t(a) * s.Z;
-    if (!folded) copy_row(d.feature + row * s.F, s.F, z);
+    copy_row(d.feature + row * s.F, s.F, z);
     const Quad x = load3(d.xyz + row * 3), v = x - camera;
     const float distance = std::sqrt(dot(v, v));
     Quad direction = v * four(1.f / std::max(distance, 1e-12f));
@@ -154,7 +153,7 @@ void scaling(const Decode& d, const Chunk& chunk, Work& w) {
 void groups(const Decode& d, const Head& head, const Chunk& chunk, bool live_only, Work& w, std::vector<Group>& found) {
   found.clear();
   const int n = chunk.n, E = static_cast<int>(head.E), k = static_cast<int>(head.k);
-  if (head.every()) {
+  if (uses_all_experts(head)) {
     int live = 0;
     for (int a = 0; a < n; ++a) {
       w.anchor[live] = a;
@@ -166,7 +165,7 @@ void groups(const Decode& d, const Head& head, const Chunk& chunk, bool live_onl
       if (e) std::copy_n(w.anchor, live, anchor);
       for (int i = 0; i < live; ++i) {
         place[i] = anchor[i] * E + e;
-        weight[i] = head.router_w ? head.gates[d.routed(chunk.begin + anchor[i]) * E + e] : 1.f;
+        weight[i] = head.router_w ? head.gates[routing_row(d, chunk.begin + anchor[i]) * E + e] : 1.f;
       }
       if (live) found.push_back({e, e * live, live});
     }
@@ -177,7 +176,7 @@ void groups(const Decode& d, const Head& head, const Chunk& chunk, bool live_onl
   std::vector<int> many(E > FEW ? E : 0, 0);
   int* next = E > FEW ? many.data() : few;
   for (int a = 0; a < n; ++a) {
-    const int64_t* chosen = head.chosen + d.routed(chunk.begin + a) * k;
+    const int64_t* chosen = head.chosen + routing_row(d, chunk.begin + a) * k;
     if (!live_only || w.live[a])
       for (int r = 0; r < k; ++r) ++next[chosen[r]];
   }
@@ -188,11 +187,11 @@ void groups(const Decode& d, const Head& head, const Chunk& chunk, bool live_onl
     total += count;
   }
   for (int a = 0; a < n; ++a) {
-    const int64_t at = d.routed(chunk.begin + a) * k;
+    const int64_t at = routing_row(d, chunk.begin + a) * k;
     if (!live_only || w.live[a])
       for (int r = 0; r < k; ++r) {
         const int to = next[head.chosen[at + r]]++;
-        w.anchor[to] = a, w.place[to] = a * k + r, w.weight[to] = head.mix[at + r];
+        w.anchor[to] = a, w.place[to] = a * k + r, w.weight[to] = head.chosen_weight[at + r];
       }
   }
 }
@@ -207,33 +206,8 @@ void block_inputs(const Work& w, const Sizes& s, const Group& g, int from, int n
 }
 
 float* hidden(const Packed::Expert& e, const Sizes& s, int head, int middle, int n, Work& w) {
-  product(n, s.Hp[head], s.inputs[head], w.block, s.Z, e.w1t.data(), s.Hp[head], nullptr, StoreRelu{w.hidden, s.Hp[head]});
-  return middle_layers(e, s, head, middle, n, w);
-}
-
-float* hidden_from_base(const Decode& d, const Packed::Expert& e, const Sizes& s, const Chunk& chunk, int i, const int* anchor,
-                        const int* place, int n, Work& w) {
-  const Head& head = d.heads[i];
-  const int Hp = s.Hp[i], shares = head.shares();
-  for (int j = 0; j < Hp; j += LANES) {
-    const float* more = e.w1t.data() + int64_t(s.F) * Hp + j;
-    const V x = load(more), y = load(more + Hp), z = load(more + 2 * Hp), bias = load(more + 3 * Hp);
-    const V distance = head.distance ? load(more + 4 * Hp) : all(0.f);
-    for (int t = 0; t < n; ++t) {  // the order of hidden's sums
-      const float* seen = w.z + int64_t(anchor[t]) * s.Z + s.F;
-      const int64_t row = d.rows[chunk.begin + anchor[t]] * shares + place[t] - anchor[t] * shares;
-      V h = fma(all(seen[0]), x, load(head.base + row * Hp + j));
-      h = fma(all(seen[1]), y, h);
-      h = fma(all(seen[2]), z, h) + bias;
-      if (head.distance) h = fma(all(seen[4]), distance, h);
-      store(w.hidden + int64_t(t) * Hp + j, max(all(0.f), h));
-    }
-  }
-  return middle_layers(e, s, i, static_cast<int>(head.L), n, w);
-}
-
-float* middle_layers(const Packed::Expert& e, const Sizes& s, int head, int middle, int n, Work& w) {
   const int Hp = s.Hp[head], H = s.H[head];
+  product(n, Hp, s.inputs[head], w.block, s.Z, e.w1t.data(), Hp, nullptr, StoreRelu{w.hidden, Hp});
   const int64_t layer = int64_t(BLOCK + SLACK) * Hp;
   float* h = w.hidden;
   for (int l = 0; l < middle; ++l, h += layer)

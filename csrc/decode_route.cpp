@@ -67,7 +67,7 @@ void route(const Decode& d, const Sizes& s, const Packed& packed, const Chunk& c
     choose(copy, E, k, n, values, places);
     softmax(values, k, n);
     int64_t* chosen = head.chosen + chunk.begin * k;
-    float* mix = head.mix + chunk.begin * k;
+    float* mix = head.chosen_weight + chunk.begin * k;
     for (int a = 0; a < n; ++a)
       for (int r = 0; r < k; ++r) {
         chosen[a * k + r] = static_cast<int64_t>(places[r * CHUNK + a]);
@@ -78,7 +78,7 @@ void route(const Decode& d, const Sizes& s, const Packed& packed, const Chunk& c
 
 void route_backward(const Decode& d, const Sizes& s, const Chunk& chunk, int i, Work& w) {
   const Head& head = d.heads[i];
-  const int E = static_cast<int>(head.E), k = static_cast<int>(head.k), shares = head.shares();
+  const int E = static_cast<int>(head.E), k = static_cast<int>(head.k), shares = experts_per_anchor(head);
   const bool dense = k == 0 && E > 1;
   for (int a = 0; a < chunk.n; ++a) {
     const int64_t anchor = chunk.begin + a;
@@ -93,7 +93,7 @@ void route_backward(const Decode& d, const Sizes& s, const Chunk& chunk, int i, 
       for (int e = 0; e < E; ++e) to[e] = 0.f;
     }
     if (k <= 1) continue;
-    const float* mix = head.mix + anchor * k;
+    const float* mix = head.chosen_weight + anchor * k;
     const int64_t* chosen = head.chosen + anchor * k;
     mean = 0;
     for (int r = 0; r < k; ++r) mean += mix[r] * own[r];

@@ -5,8 +5,8 @@
 #include <cmath>
 #include <cstdint>
 
-#include "export.h"
 #include "pool.h"
+#include "se_api.h"
 
 namespace {
 constexpr int64_t kRows = 256, kPlaces = 512;  // what a worker takes at a time

@@ -3,9 +3,9 @@
 // Gaussians along the lanes, CHUNK at a time; strategy/mcmc.py has the same in torch.
 #include <cstdint>
 
-#include "export.h"
 #include "lanes.h"
 #include "pool.h"
+#include "se_api.h"
 
 namespace se {
 namespace {
@@ -56,7 +56,7 @@ void disturb(const Noise& a, int64_t begin, int64_t end) {
 }  // namespace se
 
 // means [N, 3] changed in place; quats [N, 4] of any length, log_scales [N, 3], raw_opacity [N] (logits), eta [N, 3] of unit variance.
-SE_EXPORT void se_noise(float* means, const float* quats, const float* log_scales, const float* raw_opacity, const float* eta, int64_t count,
+SE_EXPORT void se_mcmc_add_noise(float* means, const float* quats, const float* log_scales, const float* raw_opacity, const float* eta, int64_t count,
                         float size, float sharpness, float faint, int32_t threads) {
   const se::Noise noise{means, quats, log_scales, raw_opacity, eta, size, sharpness, faint};
   se::parallel_for(count, se::CHUNK, threads, [&](int64_t begin, int64_t end, int) { se::disturb(noise, begin, end); });

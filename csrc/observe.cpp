@@ -3,8 +3,8 @@
 #include <cmath>
 #include <cstdint>
 
-#include "export.h"
 #include "pool.h"
+#include "se_api.h"
 
 namespace {
 constexpr int64_t kRows = 1024, kDrawn = 8192;  // what a worker takes at a time

@@ -9,7 +9,6 @@
 #include <thread>
 #include <vector>
 
-#include "export.h"
 
 namespace se {
 namespace {
@@ -163,5 +162,3 @@ void parallel_chunks(int64_t n, int64_t grain, int threads, void (*body)(void*, 
 }
 
 }  // namespace se
-
-SE_EXPORT int se_abi_version() { return 5; }

@@ -9,9 +9,10 @@
 #include <time.h>
 #else
 #include <chrono>
+
+#include "se_api.h"
 #endif
 
-#include "export.h"
 
 namespace se::raster {
 namespace {
@@ -75,26 +76,17 @@ class Stages {
 
 using namespace se::raster;
 
-struct SeRasterForward {
-  CameraArgs camera;
-  int32_t antialias, threads;
-  int64_t m;
-  Inputs in;
-  const float* background;  // [3]
-  Outputs out;
-  int32_t* radii;  // [m]
-};
+namespace {
 
-struct SeRasterBackward {
-  int32_t deterministic, threads;
-  Inputs in;
-  const float* background;
-  Upstream up;
-  Gradients out;
-};
+template <class Call>
+Inputs inputs_of(const Call& a) {
+  return {a.means, a.quats, a.scales, a.opacities, a.colors};
+}
+
+}  // namespace
 
 // `state` null: nothing is kept for backward; else *state must be given to se_raster_release once.
-SE_EXPORT int se_raster_forward(const SeRasterForward* a, void** state) {
+SE_EXPORT int32_t se_raster_forward(const SeRasterForward* a, void** state) {
   try {
     std::unique_ptr<State> s = spare().take();
     s->camera = a->camera;
@@ -103,11 +95,11 @@ SE_EXPORT int se_raster_forward(const SeRasterForward* a, void** state) {
     s->tiles_x = (a->camera.width + kTile - 1) / kTile;
     s->tiles_y = (a->camera.height + kTile - 1) / kTile;
     Stages stages(s->seconds);
-    project(*s, a->in, a->radii, a->threads);
+    project(*s, inputs_of(*a), a->radii, a->threads);
     stages.done();
     bin(*s, a->threads);
     stages.done();
-    blend(*s, a->background, a->out, a->threads);
+    blend(*s, a->background, {a->image, a->alpha, a->depth}, a->threads);
     stages.done();
     if (state)
       *state = s.release();
@@ -120,16 +112,16 @@ SE_EXPORT int se_raster_forward(const SeRasterForward* a, void** state) {
   }
 }
 
-SE_EXPORT int se_raster_backward(void* state, const SeRasterBackward* a) {
+SE_EXPORT int32_t se_raster_backward(void* state, const SeRasterBackward* a) {
   try {
     State& s = *static_cast<State*>(state);
     // With many workers one row of sums per worker and Gaussian would take more memory than one per pair.
     const bool slots = a->deterministic || (a->threads > 4 && a->threads * s.visible > s.pairs);
     const int rows = slots ? 0 : std::max(1, a->threads);
     Stages stages(s.seconds + 3);
-    blend_backward(s, a->background, a->up, a->out.background, rows, a->threads);
+    blend_backward(s, a->background, {a->g_image, a->g_alpha, a->g_depth}, a->d_background, rows, a->threads);
     stages.done();
-    project_backward(s, a->in, a->out, rows, a->threads);
+    project_backward(s, inputs_of(*a), {a->d_means, a->d_quats, a->d_scales, a->d_opacities, a->d_colors, a->d_mean2d}, rows, a->threads);
     stages.done();
     return 0;
   } catch (const std::exception&) {
@@ -142,13 +134,13 @@ SE_EXPORT void se_raster_release(void* state) {
   if (state) spare().give(std::unique_ptr<State>(static_cast<State*>(state)));
 }
 
-SE_EXPORT void se_raster_visible(const CameraArgs* camera, const float* means, const float* scales, int64_t m, uint8_t* visible,
+SE_EXPORT void se_raster_find_visible(const SeCamera* camera, const float* means, const float* scales, int64_t m, uint8_t* visible,
                                  int32_t threads) {
   project_visible(*camera, means, scales, m, visible, threads);
 }
 
 // For benchmarks: [visible Gaussians, (Gaussian, tile) pairs, (Gaussian, block) pairs drawn] and the stages' seconds.
-SE_EXPORT void se_raster_counts(const void* state, int64_t* counts, double* seconds) {
+SE_EXPORT void se_raster_count(const void* state, int64_t* counts, double* seconds) {
   const State& s = *static_cast<const State*>(state);
   int64_t blocks = 0;
   for (int t = 0; t < s.tiles(); ++t)

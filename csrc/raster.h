@@ -22,6 +22,8 @@
 #include <malloc.h>
 #endif
 
+#include "se_api.h"
+
 namespace se::raster {
 
 constexpr int kTile = 16;     // pixels
@@ -34,12 +36,6 @@ constexpr int kBeyond = kAhead + 16;  // entries after the last list, so that lo
 constexpr float kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
 constexpr float kMinAlphaLog2 = -7.994353437f;  // log2(1 / 255)
 constexpr float kWhiten = 0.84932180f;          // sqrt(log2(e) / 2)
-
-struct CameraArgs {
-  float view[12];  // rows of [R | t]
-  float fx, fy, cx, cy, near_plane;
-  int32_t width, height;
-};
 
 // A Gaussian that reaches the picture; colours and ellipse first, as blending reads them.
 struct alignas(64) Record {
@@ -119,7 +115,7 @@ class Buffer {
 
 // Everything of one picture that backward needs, and the scratch memory of the stages; reused from picture to picture.
 struct State {
-  CameraArgs camera{};
+  SeCamera camera{};
   int64_t m = 0, visible = 0, pairs = 0;
   int tiles_x = 0, tiles_y = 0;
   bool antialias = false;
@@ -169,13 +165,13 @@ struct Upstream {
 };
 
 struct Gradients {
-  float *means, *quats, *scales, *opacities, *colors, *mean2d, *background;
+  float *means, *quats, *scales, *opacities, *colors, *mean2d;
 };
 
 // Projects all; fills records, items and groups per chunk, and radii [m].
 void project(State& s, const Inputs& in, int32_t* radii, int threads);
 // Radii alone, of unrotated Gaussians.
-void project_visible(const CameraArgs& camera, const float* means, const float* scales, int64_t m, uint8_t* visible, int threads);
+void project_visible(const SeCamera& camera, const float* means, const float* scales, int64_t m, uint8_t* visible, int threads);
 // Sorts by depth and fills the tiles' lists.
 void bin(State& s, int threads);
 void blend(State& s, const float* background, const Outputs& out, int threads);

@@ -59,7 +59,7 @@ uint32_t whole_sum(F16 a) {
 }
 
 void project_chunk(State& s, const Inputs& in, int32_t* radii, int64_t begin, int64_t end) {
-  const CameraArgs& camera = s.camera;
+  const SeCamera& camera = s.camera;
   uint32_t at = static_cast<uint32_t>(begin);
   F16 entries = bcast(0.0f);
   for (int64_t i = begin; i < end; i += 16) {
@@ -123,7 +123,7 @@ void project(State& s, const Inputs& in, int32_t* radii, int threads) {
   parallel_for(s.m, kChunk, threads, [&](int64_t begin, int64_t end, int) { project_chunk(s, in, radii, begin, end); });
 }
 
-void project_visible(const CameraArgs& camera, const float* means, const float* scales, int64_t m, uint8_t* visible, int threads) {
+void project_visible(const SeCamera& camera, const float* means, const float* scales, int64_t m, uint8_t* visible, int threads) {
   const int tiles_x = (camera.width + kTile - 1) / kTile, tiles_y = (camera.height + kTile - 1) / kTile;
   parallel_for(m, kChunk, threads, [&](int64_t begin, int64_t end, int) {
     for (int64_t i = begin; i < end; i += 16) {

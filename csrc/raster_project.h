@@ -74,7 +74,7 @@ struct Projection {
   F16 cxx, cyy, det;           // with blur
   M16 front;
 
-  void centre(const CameraArgs& c, const F16 (&mean)[3]) {
+  void centre(const SeCamera& c, const F16 (&mean)[3]) {
     const auto row = [&](int k) {
       return fma(bcast(c.view[4 * k]), mean[0],
                  fma(bcast(c.view[4 * k + 1]), mean[1], fma(bcast(c.view[4 * k + 2]), mean[2], bcast(c.view[4 * k + 3]))));

@@ -55,7 +55,7 @@ struct Chain {  // one Gaussian per lane
   }
 
   Chain(const State& s, const Projection& p, const F16 (&q)[4], const F16 (&size)[3], const F16 (&sum)[16]) {
-    const CameraArgs& cam = s.camera;
+    const SeCamera& cam = s.camera;
     const F16 two = bcast(2.0f), zero = bcast(0.0f), inv = bcast(1.0f) / p.det;
     const F16 gu = (p.xy * sum[kSy] - p.cyy * sum[kSx]) * inv, gv = (p.xy * sum[kSx] - p.cxx * sum[kSy]) * inv;
     mean2d[0] = gu * bcast(0.5f * static_cast<float>(cam.width)), mean2d[1] = gv * bcast(0.5f * static_cast<float>(cam.height));

@@ -182,7 +182,7 @@ inline void join_rgb(float* p, const float* r, const float* g, const float* b) {
 // Calls whole(offset in the picture, place in block order) for four neighbours at a time where the tile lies inside the picture,
 // else one(...) for single pixels.
 template <class Whole, class One>
-inline void each_pixel(const CameraArgs& c, const Tile& tile, Whole&& whole, One&& one) {
+inline void each_pixel(const SeCamera& c, const Tile& tile, Whole&& whole, One&& one) {
   const int width = std::min(kTile, c.width - tile.x * kTile), height = std::min(kTile, c.height - tile.y * kTile);
   for (int j = 0; j < height; ++j) {
     const int64_t row = static_cast<int64_t>(tile.y * kTile + j) * c.width + tile.x * kTile;
@@ -194,14 +194,14 @@ inline void each_pixel(const CameraArgs& c, const Tile& tile, Whole&& whole, One
 }
 
 // [channels][16 blocks, 16 lanes] of a tile from a picture [H, W, channels]; 0 outside.
-inline void load_tile(const float* picture, const CameraArgs& c, const Tile& tile, float (&plane)[256]) {
+inline void load_tile(const float* picture, const SeCamera& c, const Tile& tile, float (&plane)[256]) {
   if (!tile.whole) std::memset(plane, 0, sizeof plane);
   each_pixel(
       c, tile, [&](int64_t from, int to) { std::memcpy(plane + to, picture + from, 16); },
       [&](int64_t from, int to) { plane[to] = picture[from]; });
 }
 
-inline void load_tile(const float* picture, const CameraArgs& c, const Tile& tile, float (&planes)[3][256]) {
+inline void load_tile(const float* picture, const SeCamera& c, const Tile& tile, float (&planes)[3][256]) {
   if (!tile.whole) std::memset(planes, 0, sizeof planes);
   each_pixel(
       c, tile, [&](int64_t from, int to) { split_rgb(picture + 3 * from, planes[0] + to, planes[1] + to, planes[2] + to); },
@@ -210,13 +210,13 @@ inline void load_tile(const float* picture, const CameraArgs& c, const Tile& til
       });
 }
 
-inline void store_tile(float* picture, const CameraArgs& c, const Tile& tile, const float (&plane)[256]) {
+inline void store_tile(float* picture, const SeCamera& c, const Tile& tile, const float (&plane)[256]) {
   each_pixel(
       c, tile, [&](int64_t to, int from) { std::memcpy(picture + to, plane + from, 16); },
       [&](int64_t to, int from) { picture[to] = plane[from]; });
 }
 
-inline void store_tile(float* picture, const CameraArgs& c, const Tile& tile, const float (&planes)[3][256]) {
+inline void store_tile(float* picture, const SeCamera& c, const Tile& tile, const float (&planes)[3][256]) {
   each_pixel(
       c, tile, [&](int64_t to, int from) { join_rgb(picture + 3 * to, planes[0] + from, planes[1] + from, planes[2] + from); },
       [&](int64_t to, int from) {
@@ -260,7 +260,7 @@ inline Tile tile_at(const State& s, int number) {
 }
 
 // 1 for pixels inside the picture, 0 for the rest of a tile at the edge.
-inline void inside(const CameraArgs& c, const Tile& tile, float (&one)[256]) {
+inline void inside(const SeCamera& c, const Tile& tile, float (&one)[256]) {
   if (tile.whole) {
     std::fill(one, one + 256, 1.0f);
     return;

@@ -4,9 +4,9 @@
 #include <cmath>
 #include <cstdint>
 
-#include "export.h"
 #include "lanes.h"
 #include "pool.h"
+#include "se_api.h"
 
 namespace se {
 namespace {

@@ -12,9 +12,10 @@
 #include <cstdint>
 #include <vector>
 
-#include "export.h"
 #include "lanes.h"
 #include "pool.h"
+#include "se_api.h"
+#include "status.h"
 
 namespace {
 
@@ -230,9 +231,9 @@ class Band {
 
 // out[0] = mean |x - y|, out[1] = 1 - mean SSIM; gradient (may be null) = d (weight_l1 out[0] + weight_ssim out[1]) / dx.
 // Returns 1 where memory ran out.
-SE_EXPORT int se_photometric(const float* x, const float* y, int64_t H, int64_t W, float weight_l1, float weight_ssim, int threads,
+SE_EXPORT int32_t se_photometric_loss(const float* x, const float* y, int64_t H, int64_t W, float weight_l1, float weight_ssim, int threads,
                              float* gradient, double* out) {
-  return guarded([&] {
+  return run_guarded([&] {
     const Picture picture{x, y, H, 3 * W, weight_l1, weight_ssim, gradient};
     const int64_t bands = (H + BAND - 1) / BAND;
     std::vector<double> sums(2 * bands, 0.0);

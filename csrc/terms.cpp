@@ -3,8 +3,8 @@
 #include <algorithm>
 #include <cstdint>
 
-#include "export.h"
 #include "pool.h"
+#include "se_api.h"
 
 namespace {
 constexpr int64_t kGrain = 8192;
@@ -15,10 +15,10 @@ inline double total(const double* lanes) {
 }  // namespace
 
 // How many partial sums a sum over `count` has; the caller adds them up in order, which is the same for every number of threads.
-SE_EXPORT int64_t se_term_chunks(int64_t count) { return (count + kGrain - 1) / kGrain; }
+SE_EXPORT int64_t se_sum_chunks(int64_t count) { return (count + kGrain - 1) / kGrain; }
 
 // sx sy sz of scales [M, 3].
-SE_EXPORT void se_volume(const float* scales, int64_t count, double* partial, int32_t threads) {
+SE_EXPORT void se_volume_forward(const float* scales, int64_t count, double* partial, int32_t threads) {
   se::parallel_for(count, kGrain, threads, [&](int64_t begin, int64_t end, int) {
     double lanes[8] = {};
     for (int64_t i = begin; i < end; ++i) lanes[i % 8] += scales[3 * i] * scales[3 * i + 1] * scales[3 * i + 2];
@@ -39,7 +39,7 @@ SE_EXPORT void se_volume_backward(const float* scales, int64_t count, float upst
 }
 
 // max(0, tau - raw) over `count` values.
-SE_EXPORT void se_hinge(const float* raw, int64_t count, float tau, double* partial, int32_t threads) {
+SE_EXPORT void se_hinge_forward(const float* raw, int64_t count, float tau, double* partial, int32_t threads) {
   se::parallel_for(count, kGrain, threads, [&](int64_t begin, int64_t end, int) {
     double lanes[8] = {};
     int64_t i = begin;

@@ -8,16 +8,15 @@
 #include <cstring>
 #include <vector>
 
+#include "se_api.h"
+
 namespace {
 
 constexpr int kTile = 16;
 // exp of less is below 1/255 whatever the opacity; the published kernel does not skip here, but it saves the peer half its time.
 constexpr float kFaint = -5.55f;
 
-struct Camera {
-  float view[12], fx, fy, cx, cy, near_plane;
-  int32_t width, height;
-};
+using Camera = SeCamera;
 
 struct Splat {
   float u, v, a, b, c, opacity, color[3], z, cov[3];

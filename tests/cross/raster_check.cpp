@@ -1,35 +1,11 @@
-// Draws a made scene with the library it is linked to and prints sums of the picture and of every gradient, so that builds for different
-// processors can be compared where no Python runs (tests/test_cross.py). Then the time of a frame.
+// Render a synthetic scene with the library that this program is linked to. Print the sum and the norm of the image and of every gradient,
+// so that tests/system/test_cross.py can compare builds for different processors without Python. Print the time of the frame to stderr.
 #include <chrono>
 #include <cmath>
 #include <cstdio>
 #include <vector>
 
-#include "../../csrc/raster.h"
-
-using namespace se::raster;
-
-struct SeRasterForward {
-  CameraArgs camera;
-  int32_t antialias, threads;
-  int64_t m;
-  Inputs in;
-  const float* background;
-  Outputs out;
-  int32_t* radii;
-};
-struct SeRasterBackward {
-  int32_t deterministic, threads;
-  Inputs in;
-  const float* background;
-  Upstream up;
-  Gradients out;
-};
-extern "C" {
-int se_raster_forward(const SeRasterForward* a, void** state);
-int se_raster_backward(void* state, const SeRasterBackward* a);
-void se_raster_release(void* state);
-}
+#include "se_api.h"
 
 namespace {
 
@@ -66,13 +42,21 @@ int main() {
   std::vector<float> image(3 * pixels), alpha(pixels), depth(pixels), up(3 * pixels);
   for (float& v : up) v = random(-1, 1);
   std::vector<int32_t> radii(m);
-  const CameraArgs camera{{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1}, 120, 125, 80, 48, 0.01f, width, height};
-  const Inputs in{means.data(), quats.data(), scales.data(), opacities.data(), colors.data()};
-  SeRasterForward forward{camera, 0, 2, m, in, background, {image.data(), alpha.data(), depth.data()}, radii.data()};
+  const SeCamera camera{{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1}, 120, 125, 80, 48, 0.01f, width, height};
+  SeRasterForward forward{};
+  forward.camera = camera, forward.threads = 2, forward.m = m;
+  forward.means = means.data(), forward.quats = quats.data(), forward.scales = scales.data();
+  forward.opacities = opacities.data(), forward.colors = colors.data(), forward.background = background;
+  forward.image = image.data(), forward.alpha = alpha.data(), forward.depth = depth.data(), forward.radii = radii.data();
   std::vector<float> d_means(3 * m), d_quats(4 * m), d_scales(3 * m), d_opacities(m), d_colors(3 * m), d_mean2d(2 * m), d_background(3);
-  SeRasterBackward backward{1, 2, in, background, {up.data(), nullptr, nullptr},
-                            {d_means.data(), d_quats.data(), d_scales.data(), d_opacities.data(), d_colors.data(), d_mean2d.data(),
-                             d_background.data()}};
+  SeRasterBackward backward{};
+  backward.deterministic = 1, backward.threads = 2;
+  backward.means = means.data(), backward.quats = quats.data(), backward.scales = scales.data();
+  backward.opacities = opacities.data(), backward.colors = colors.data();
+  backward.background = background, backward.g_image = up.data();
+  backward.d_means = d_means.data(), backward.d_quats = d_quats.data(), backward.d_scales = d_scales.data();
+  backward.d_opacities = d_opacities.data(), backward.d_colors = d_colors.data();
+  backward.d_mean2d = d_mean2d.data(), backward.d_background = d_background.data();
   const auto start = std::chrono::steady_clock::now();
   void* state = nullptr;
   if (se_raster_forward(&forward, &state) || se_raster_backward(state, &backward)) return 1;

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import platform
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,9 +32,9 @@ class Machine:
 
 def describe(threads: int) -> Machine:
     """The machine without its rates."""
-    cores = native.cores()
+    cores = native.count_cores()
     library = native.load()
-    installed = tuple(level for level in native.levels() if native.path(level))
+    installed = tuple(level for level in native.list_levels() if native.find(level))
     return Machine(processor(), cores, threads, getattr(library, "level", None), installed, torch.__version__)
 
 
@@ -55,16 +54,14 @@ def multiply_adds(level: str | None, threads: int, seconds: float, clock: Clock 
     clock: processor time for one thread and wall time for more, unless given.
     """
     library = native.load(level)
-    if library is None or not hasattr(library, "se_arithmetic"):
+    if library is None:
         return None
-    run = library.se_arithmetic
-    run.restype, run.argtypes = ctypes.c_double, [ctypes.c_int64, ctypes.c_int32]
     done = 0.0
 
     def loop(clock: Clock) -> tuple[float]:
         nonlocal done
         began = clock()
-        done = run(CHUNKS * threads, threads)
+        done = library.se_benchmark_multiply_adds(CHUNKS * threads, threads)
         return (clock() - began,)
 
     best = least({"loop": loop}, seconds, clock or clock_for(threads))["loop"][0]

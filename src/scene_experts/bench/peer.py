@@ -11,15 +11,15 @@ from torch import Tensor
 from scene_experts.bench.measure import Clock
 from scene_experts.core.types import Camera, Gaussians
 from scene_experts.native import library as native
-from scene_experts.render import cpu
+from scene_experts.render.cpu import convert_camera
 
 NAME = "scalar C++ peer"
-WHY_NOT = "the scalar C++ peer is not installed: install a C++20 compiler (g++ or clang++) and run `pip install .` again"
+WHY_NOT = "the scalar C++ peer is not part of a normal install: run `pip install -e .` in a checkout to build it"
 
 
 def path(level: str) -> Path | None:
     """Where the peer with the flags of the library for `level` is installed, or None."""
-    beside = native.path(level)
+    beside = native.find(level)
     candidate = beside.with_name(beside.name.replace("se_", "peer_", 1)) if beside else None
     return candidate if candidate is not None and candidate.is_file() else None
 
@@ -57,7 +57,7 @@ class Peer:
 
         upstream: gradient of the loss in the picture, [H, W, 3].
         """
-        args = cpu._camera(camera)
+        args = convert_camera(camera)
         inputs = [g.means, g.quats, g.scales, g.opacities, g.colors]
         image, background = torch.empty((camera.height, camera.width, 3)), torch.zeros(3)
         outputs = [torch.empty_like(t) for t in inputs]

@@ -79,7 +79,7 @@ def run(seconds: float, threads: int | None, json: Path | None, console: Console
         machine, size, results = measure(seconds, threads or torch.get_num_threads(), lambda what: status.update(f"measuring {what}"))
     took = time.perf_counter() - began
     show(machine, size, results, console)
-    reason = native.why_not()
+    reason = native.explain_missing()
     if reason is not None:
         console.print(f"missing: {reason}", markup=False, soft_wrap=True)
     console.print(f"{took:.0f} s; times are the least of interleaved runs, of one thread its processor time", soft_wrap=True)

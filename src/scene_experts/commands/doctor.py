@@ -95,9 +95,9 @@ def cuda() -> Check:
 
 
 def native_library() -> Check:
-    reason = native.why_not()
+    reason = native.explain_missing()
     if reason is None:
-        return Check("CPU library", True, f"{native.load().level}, up to {native.threads()} threads")  # type: ignore[union-attr]
+        return Check("CPU library", True, f"{native.load().level}, up to {native.count_threads()} threads")  # type: ignore[union-attr]
     why, _, fix = reason.partition(": ")
     return Check("CPU library", False, f"{why}; the slow torch reference is used instead", fix)
 
@@ -132,7 +132,7 @@ def triton() -> Check:
 
 
 def machine() -> Check:
-    usable = native.cores()
+    usable = native.count_cores()
     threads = torch.get_num_threads()
     fix = f"set OMP_NUM_THREADS to {usable} at most: more threads than cores slow training down"
     return Check("cores", threads <= usable, f"{usable} usable of {os.cpu_count()}, torch uses {threads} threads", fix)

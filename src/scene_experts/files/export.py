@@ -26,7 +26,6 @@ from scene_experts.files.graph import read as graph_points_in
 from scene_experts.files.graph import write as graph_points
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.scene.anchors.experts import MixtureHead
-from scene_experts.scene.anchors.frozen import freeze
 from scene_experts.scene.anchors.scene import ATTRIBUTES, AnchorScene
 from scene_experts.scene.anchors.select import LevelSelector
 from scene_experts.scene.gaussians import GaussianScene
@@ -113,7 +112,7 @@ def _cost_line(run: OpenRun, path: Path, rasterize: Rasterizer) -> str:
 def psnr_cost(run: OpenRun, capture: Capture, path: Path, rasterize: Rasterizer) -> tuple[float, float]:
     """Mean PSNR (dB, 8-bit pictures) of the held-out views drawn from the run and from its compact file."""
     again = scene_of_compact(run, read_compact(path), capture.world)
-    scenes = {"run": (freeze(run.scene, run.step), run.step), "file": (freeze(again, run.step), run.step)}
+    scenes = {"run": (run.scene.frozen(run.step), run.step), "file": (again.frozen(run.step), run.step)}
     found = scores(scenes, capture, counted(capture), as_trained(rasterize, run.cfg.antialias))
     return found["run"].photographs, found["file"].photographs
 

@@ -5,8 +5,6 @@ Gradients reach the harmonics and, through the viewing direction, the positions 
 
 from __future__ import annotations
 
-import ctypes
-import functools
 from typing import Any
 
 import torch
@@ -25,7 +23,7 @@ def sh_colors(means: Tensor, dc: Tensor, rest: Tensor, rows: Tensor | None, posi
     if not 0 <= degree <= MAX_DEGREE or rest.shape[1] < (degree + 1) ** 2 - 1:
         raise ValueError(f"expected a degree of 0 to {MAX_DEGREE} that {rest.shape[1] + 1} coefficients hold, found {degree}")
     fits = all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in (means, dc, rest))
-    if fits and not position.requires_grad and _library() is not None:
+    if fits and not position.requires_grad and native.load() is not None:
         return _Colors.apply(means, dc, rest, rows, position, degree)  # type: ignore[return-value]
     return by_torch(means, dc, rest, rows, position, degree)
 
@@ -39,13 +37,12 @@ def by_torch(means: Tensor, dc: Tensor, rest: Tensor, rows: Tensor | None, posit
 class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, dc: Tensor, rest: Tensor, rows: Tensor | None, position: Tensor, degree: int) -> Tensor:
-        library = _library()
-        assert library is not None
+        library = native.require()
         rows = None if rows is None else rows.contiguous()
         position = position.detach().to("cpu", torch.float32).contiguous()
         out = torch.empty(len(means), 3)
-        inputs = [native.pointer(t) for t in (means.detach(), dc.detach(), rest.detach(), rows)]
-        library.se_sh_forward(*inputs, len(means), rest.shape[1], degree, native.pointer(position), native.pointer(out), native.threads())
+        *inputs, at, to = (native.pointer(t) for t in (means.detach(), dc.detach(), rest.detach(), rows, position, out))
+        library.se_sh_forward(*inputs, len(means), rest.shape[1], degree, at, to, native.count_threads())
         ctx.save_for_backward(means, dc, rest, rows, position, out)
         ctx.degree = degree
         return out
@@ -54,16 +51,9 @@ class _Colors(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, upstream: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         means, dc, rest, rows, position, out = ctx.saved_tensors
-        library = _library()
-        assert library is not None
+        library = native.require()
         d_means, d_dc, d_rest = torch.empty_like(means), torch.zeros_like(dc), torch.zeros_like(rest)
         tensors = [means, dc, rest, rows, position, out, upstream.contiguous(), d_means, d_dc, d_rest]
         where = [native.pointer(None if t is None else t.detach()) for t in tensors]
-        library.se_sh_backward(*where, len(means), rest.shape[1], ctx.degree, native.threads())
+        library.se_sh_backward(*where, len(means), rest.shape[1], ctx.degree, native.count_threads())
         return d_means, d_dc, d_rest, None, None, None
-
-
-@functools.cache
-def _library(level: str | None = None) -> ctypes.CDLL | None:
-    P, L, I = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32
-    return native.bound({"se_sh_forward": [P, P, P, P, L, L, I, P, P, I], "se_sh_backward": [P] * 10 + [L, L, I, I]}, level)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-from functools import cache
 from typing import Any
 
 import torch
@@ -14,7 +12,7 @@ from scene_experts.native import library as native
 
 def covers(values: Tensor) -> bool:
     """Whether the compiled library can sum over `values`: float32 on the CPU."""
-    return values.device.type == "cpu" and values.dtype == torch.float32 and _library() is not None
+    return values.device.type == "cpu" and values.dtype == torch.float32 and native.load() is not None
 
 
 def volume_sum(scales: Tensor) -> Tensor:
@@ -33,7 +31,7 @@ class _Volume(torch.autograd.Function):
         scales = scales.detach().contiguous()
         ctx.save_for_backward(scales)
         partial = _partial(len(scales))
-        _loaded().se_volume(native.pointer(scales), len(scales), native.pointer(partial), native.threads())
+        native.require().se_volume_forward(native.pointer(scales), len(scales), native.pointer(partial), native.count_threads())
         return partial.sum().float()
 
     @staticmethod
@@ -42,7 +40,7 @@ class _Volume(torch.autograd.Function):
         (scales,) = ctx.saved_tensors
         gradient = torch.empty_like(scales)
         up = float(upstream[0])
-        _loaded().se_volume_backward(native.pointer(scales), len(scales), up, native.pointer(gradient), native.threads())
+        native.require().se_volume_backward(native.pointer(scales), len(scales), up, native.pointer(gradient), native.count_threads())
         return gradient
 
 
@@ -52,7 +50,7 @@ class _Hinge(torch.autograd.Function):
         raw, ctx.tau = raw.detach().contiguous(), tau
         ctx.save_for_backward(raw)
         partial = _partial(raw.numel())
-        _loaded().se_hinge(native.pointer(raw), raw.numel(), tau, native.pointer(partial), native.threads())
+        native.require().se_hinge_forward(native.pointer(raw), raw.numel(), tau, native.pointer(partial), native.count_threads())
         return partial.sum().float()
 
     @staticmethod
@@ -61,32 +59,10 @@ class _Hinge(torch.autograd.Function):
         (raw,) = ctx.saved_tensors
         gradient = torch.empty_like(raw)
         up = float(upstream[0])
-        _loaded().se_hinge_backward(native.pointer(raw), raw.numel(), ctx.tau, up, native.pointer(gradient), native.threads())
+        native.require().se_hinge_backward(native.pointer(raw), raw.numel(), ctx.tau, up, native.pointer(gradient), native.count_threads())
         return gradient, None
 
 
 def _partial(count: int) -> Tensor:
     """Room for the partial sums over `count` values."""
-    return torch.empty(_loaded().se_term_chunks(count), dtype=torch.float64)
-
-
-def _loaded() -> ctypes.CDLL:
-    library = _library()
-    assert library is not None
-    return library
-
-
-@cache
-def _library() -> ctypes.CDLL | None:
-    address, count, real, threads = ctypes.c_void_p, ctypes.c_int64, ctypes.c_float, ctypes.c_int32
-    library = native.bound(
-        {
-            "se_volume": [address, count, address, threads],
-            "se_volume_backward": [address, count, real, address, threads],
-            "se_hinge": [address, count, real, address, threads],
-            "se_hinge_backward": [address, count, real, real, address, threads],
-        }
-    )
-    if library is not None:
-        library.se_term_chunks.argtypes, library.se_term_chunks.restype = [count], count
-    return library
+    return torch.empty(native.require().se_sum_chunks(count), dtype=torch.float64)

@@ -88,7 +88,7 @@ def _best(device: torch.device) -> str:
     elif native.load() is not None:
         return "cpu"
     else:
-        _warn(native.why_not() or "the compiled CPU library cannot be used")
+        _warn(native.explain_missing() or "the compiled CPU library cannot be used")
     return "reference"
 
 

@@ -8,8 +8,6 @@ rounding of its stop; compare means and quantiles.
 from __future__ import annotations
 
 import ctypes
-import functools
-from ctypes import POINTER, Structure, c_float, c_int32, c_int64, c_void_p
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,43 +17,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.native import library as native
-
-
-class _Camera(Structure):
-    _fields_ = [
-        ("view", c_float * 12),
-        ("fx", c_float),
-        ("fy", c_float),
-        ("cx", c_float),
-        ("cy", c_float),
-        ("near", c_float),
-        ("width", c_int32),
-        ("height", c_int32),
-    ]
-
-
-_INPUTS = [(name, c_void_p) for name in ("means", "quats", "scales", "opacities", "colors")]
-
-
-class _Forward(Structure):
-    _fields_ = [
-        ("camera", _Camera),
-        ("antialias", c_int32),
-        ("threads", c_int32),
-        ("m", c_int64),
-        *_INPUTS,
-        *[(name, c_void_p) for name in ("background", "image", "alpha", "depth", "radii")],
-    ]
-
-
-class _Backward(Structure):
-    _fields_ = [
-        ("deterministic", c_int32),
-        ("threads", c_int32),
-        *_INPUTS,
-        *[(name, c_void_p) for name in ("background", "g_image", "g_alpha", "g_depth")],
-        *[(f"d_{name}", c_void_p) for name in ("means", "quats", "scales", "opacities", "colors", "mean2d", "background")],
-    ]
+from scene_experts.native.api import SeCamera, SeRasterBackward, SeRasterForward
 
 
 @dataclass(frozen=True)
@@ -74,7 +36,9 @@ class CpuRasterizer:
     name: str = "cpu"
 
     def __post_init__(self) -> None:
-        _library(self.level)
+        if native.load(self.level) is None:
+            why = native.explain_missing() if self.level is None else f"no compiled CPU library for {self.level} is installed"
+            raise InputError(f"{why}; or choose the slow rasteriser `reference`")
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
         """Draws M Gaussians over `background` [3]; see `types.Render`. A later backward pass overwrites `mean2d_grad`."""
@@ -90,11 +54,12 @@ class CpuRasterizer:
         means, scales = _plain(means), _plain(scales)
         out = torch.empty(len(means), dtype=torch.bool)
         where = [native.pointer(t) for t in (means, scales, out)]
-        _library(self.level).se_raster_visible(ctypes.byref(_camera(camera)), where[0], where[1], len(means), where[2], self._threads())
+        library = native.require(self.level)
+        library.se_raster_find_visible(ctypes.byref(convert_camera(camera)), *where[:2], len(means), where[2], self._threads())
         return out
 
     def _threads(self) -> int:
-        return max(1, self.threads if self.threads is not None else native.threads())
+        return max(1, self.threads if self.threads is not None else native.count_threads())
 
 
 class _Kept:
@@ -104,7 +69,7 @@ class _Kept:
         self.library, self.address = library, address
 
     def __del__(self) -> None:
-        self.library.se_raster_release(c_void_p(self.address))
+        self.library.se_raster_release(ctypes.c_void_p(self.address))
 
 
 class _Draw(torch.autograd.Function):
@@ -114,13 +79,13 @@ class _Draw(torch.autograd.Function):
         size = (camera.height, camera.width)
         image, alpha, depth = torch.empty((*size, 3)), torch.empty(size), torch.empty(size)
         radii = torch.empty(len(means), dtype=torch.int32)
-        library = _library(how.level)
+        library = native.require(how.level)
         where = [t.data_ptr() for t in (*plain, image, alpha, depth, radii)]
-        args = _Forward(_camera(camera), how.antialias, how._threads(), len(means), *where)
-        state = c_void_p()
+        args = SeRasterForward(convert_camera(camera), how.antialias, how._threads(), len(means), *where)
+        state = ctypes.c_void_p()
         keep = any(ctx.needs_input_grad)
         code = library.se_raster_forward(ctypes.byref(args), ctypes.byref(state) if keep else None)
-        native.done(code, f"drawing {len(means):,} Gaussians")
+        native.check(code, f"drawing {len(means):,} Gaussians")
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
         if keep:
@@ -137,31 +102,17 @@ class _Draw(torch.autograd.Function):
         outputs = [torch.empty_like(t) for t in plain[:5]] + [ctx.mean2d_grad, torch.empty(3)]
         how: CpuRasterizer = ctx.how
         where = [None if t is None else t.data_ptr() for t in (*plain, *up, *outputs)]
-        args = _Backward(how.deterministic, how._threads(), *where)
-        code = ctx.state.library.se_raster_backward(c_void_p(ctx.state.address), ctypes.byref(args))
-        native.done(code, "the backward pass of the picture")
+        args = SeRasterBackward(how.deterministic, how._threads(), *where)
+        code = ctx.state.library.se_raster_backward(ctypes.c_void_p(ctx.state.address), ctypes.byref(args))
+        native.check(code, "the backward pass of the picture")
         return *outputs[:5], outputs[6], None, None, None
 
 
-@functools.cache
-def _library(level: str | None) -> ctypes.CDLL:
-    library = native.load(level)
-    if library is None:
-        why = native.why_not() if level is None else f"no compiled CPU library for the instruction set {level!r} is installed"
-        raise InputError(f"{why}; or choose the slow rasteriser `reference`")
-    library.se_raster_forward.argtypes = [POINTER(_Forward), POINTER(c_void_p)]
-    library.se_raster_backward.argtypes = [c_void_p, POINTER(_Backward)]
-    library.se_raster_release.argtypes = [c_void_p]
-    library.se_raster_release.restype = None
-    library.se_raster_visible.argtypes = [POINTER(_Camera), c_void_p, c_void_p, c_int64, c_void_p, c_int32]
-    library.se_raster_visible.restype = None
-    return library
-
-
-def _camera(camera: Camera) -> _Camera:
+def convert_camera(camera: Camera) -> SeCamera:
+    """`camera` as the library takes it."""
     rows = [value for row in camera.world_to_cam.tolist()[:3] for value in row]
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
-    return _Camera((c_float * 12)(*rows), fx, fy, cx, cy, camera.near, camera.width, camera.height)
+    return SeCamera((ctypes.c_float * 12)(*rows), fx, fy, cx, cy, camera.near, camera.width, camera.height)
 
 
 def _check(inputs: tuple[Tensor, ...]) -> None:

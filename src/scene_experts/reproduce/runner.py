@@ -118,7 +118,7 @@ class Runner:
         """Run `scene-experts ARGS` with the worker's share of the machine, its words going to the log; returns the exit code."""
         environment = {**os.environ, PARENT: str(os.getpid())}
         if self.workers > 1:
-            environment["OMP_NUM_THREADS"] = str(max(1, native.cores() // self.workers))
+            environment["OMP_NUM_THREADS"] = str(max(1, native.count_cores() // self.workers))
         if self.devices:
             environment["CUDA_VISIBLE_DEVICES"] = self.devices[slot % len(self.devices)]
         with log.open("a") as stream:

@@ -81,7 +81,7 @@ def make(
             "model": str(desk / work.DONE / "model"),
             "groups": groups,
             "pairs": [(names[i], names[j]) for i, j in matched],
-            "threads": options.threads or native.cores(),
+            "threads": options.threads or native.count_cores(),
             "max_side": options.max_side,
             "camera_model": options.camera_model,
             "mapper": options.mapper,

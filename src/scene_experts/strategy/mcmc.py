@@ -5,7 +5,6 @@ The two regularisers that belong to it are loss weights: `Weights.mean_opacity` 
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import math
 from dataclasses import dataclass, replace
@@ -115,10 +114,10 @@ class MCMC:
         p = scene.table.params
         columns = [p[name].detach() for name in ("means", "quats", "log_scales", "raw_opacity")]
         eta = torch.randn(p["means"].shape, generator=generator).to(p["means"])
-        library = _library()
+        library = native.load()
         if library is not None and all(c.device.type == "cpu" and c.dtype == torch.float32 and c.is_contiguous() for c in columns):
             where = [native.pointer(t) for t in (*columns, eta)]
-            library.se_noise(*where, len(eta), size, _SHARP, self.min_opacity, native.threads())
+            library.se_mcmc_add_noise(*where, len(eta), size, _SHARP, self.min_opacity, native.count_threads())
         else:
             means, quats, log_scales, raw_opacity = columns
             disturb(means, quats, log_scales, raw_opacity, eta, size, self.min_opacity)
@@ -157,9 +156,3 @@ def _signed_binomials() -> Tensor:
     """binom(n, j) (-1)^(j-1) / sqrt(j) for n = 0 .. MOST (rows) and j = 1 .. MOST (columns), float64."""
     rows = [[math.comb(n, j) * (-1) ** (j - 1) / math.sqrt(j) for j in range(1, MOST + 1)] for n in range(MOST + 1)]
     return torch.tensor(rows, dtype=torch.float64)
-
-
-@functools.cache
-def _library(level: str | None = None) -> ctypes.CDLL | None:
-    P, F = ctypes.c_void_p, ctypes.c_float
-    return native.bound({"se_noise": [P, P, P, P, P, ctypes.c_int64, F, F, F, ctypes.c_int32]}, level)

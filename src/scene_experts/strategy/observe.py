@@ -6,9 +6,6 @@ Statistics of a table ([N] or [N, K]): `visits` views that saw the anchor; `opac
 
 from __future__ import annotations
 
-import ctypes
-import functools
-
 import torch
 from torch import Tensor
 
@@ -39,27 +36,27 @@ def observe(table: Table, decoded: Decoded, render: Render) -> None:
     Rows and slots of a view are each at most once, so the compiled library adds them in parallel; the bits are the same without it.
     """
     assert decoded.raw_opacity is not None
-    raw, library = decoded.raw_opacity.detach(), _library()
+    raw, library = decoded.raw_opacity.detach(), native.load()
     columns = [table.stats[name] for name in STATS]
     parts = [*columns, raw, render.mean2d_grad]
     if library is None or not all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in parts):
         return _by_torch(table.stats, decoded, render)
     visits, opacity = native.pointer(table.stats["visits"]), native.pointer(table.stats["opacity"])
     rows = decoded.rows.contiguous()
-    library.se_observe_rows(native.pointer(rows), native.pointer(raw), len(rows), raw.shape[1], visits, opacity, native.threads())
+    library.se_observe_rows(native.pointer(rows), native.pointer(raw), len(rows), raw.shape[1], visits, opacity, native.count_threads())
     observe_drawn(table.stats, decoded, render)
 
 
 @torch.no_grad()
 def observe_drawn(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:
     """Add to `grad` and `count` (one value a slot) alone what one view drew: all that explicit Gaussians need."""
-    columns, library = [stats["grad"], stats["count"]], _library()
+    columns, library = [stats["grad"], stats["count"]], native.load()
     parts = [*columns, render.mean2d_grad]
     if library is None or not all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in parts):
         return _drawn_by_torch(stats, decoded, render)
     radii, source = render.radii.int().contiguous(), decoded.gaussians.source.contiguous()
     drawn = [native.pointer(t) for t in (radii, render.mean2d_grad, source)]
-    library.se_observe_drawn(*drawn, len(source), *[native.pointer(t) for t in columns], native.threads())
+    library.se_observe_drawn(*drawn, len(source), *[native.pointer(t) for t in columns], native.count_threads())
 
 
 def _by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:
@@ -77,9 +74,3 @@ def _drawn_by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) 
     # Zeros for what was not drawn, instead of picking out the others: on a GPU the host would wait for their number.
     stats["grad"].view(-1).index_add_(0, source, torch.where(drawn, norms, 0.0))
     stats["count"].view(-1).index_add_(0, source, drawn.to(norms.dtype))
-
-
-@functools.cache
-def _library() -> ctypes.CDLL | None:
-    P, L, I = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32
-    return native.bound({"se_observe_rows": [P, P, L, L, P, P, I], "se_observe_drawn": [P, P, P, L, P, P, I]})

@@ -6,7 +6,6 @@ Equation numbers are those of "Scene Experts" (MoE-GS, AAAI 2026); the photometr
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
@@ -159,20 +158,12 @@ class _Photometric(torch.autograd.Function):
         x, y = image.detach().contiguous(), target.detach().contiguous()
         gradient = torch.empty_like(x) if ctx.needs_input_grad[0] else None
         found = torch.empty(2, dtype=torch.float64)
-        library = native.load()
-        assert library is not None
-        code = library.se_photometric(
-            native.pointer(x),
-            native.pointer(y),
-            ctypes.c_int64(x.shape[0]),
-            ctypes.c_int64(x.shape[1]),
-            ctypes.c_float(1 - lambda_dssim),
-            ctypes.c_float(lambda_dssim),
-            ctypes.c_int(native.threads()),
-            native.pointer(gradient),
-            native.pointer(found),
+        H, W, _ = x.shape
+        tensors = [native.pointer(t) for t in (x, y, gradient, found)]
+        code = native.require().se_photometric_loss(
+            *tensors[:2], H, W, 1 - lambda_dssim, lambda_dssim, native.count_threads(), *tensors[2:]
         )
-        native.done(code, "the photometric loss")
+        native.check(code, "the photometric loss")
         ctx.l1_weight = 1 - lambda_dssim
         if gradient is not None:
             ctx.save_for_backward(x, y, gradient)

@@ -39,7 +39,7 @@ def gaussian_bytes(pairs: float = _TILES) -> float:
     68 as decoded (14 floats, its length, its slot), 76 of gradients, radius and 2D gradient; in the rasteriser 64 of its record, 16 of its
     rectangle and key, 64 of sums per thread, and 8 a pair (its place in a list, the masks and checkpoints of its batch).
     """
-    sums = 64 * min(native.threads(), 4)
+    sums = 64 * min(native.count_threads(), 4)
     return 68 + 76 + _SPARE * (64 + 16 + sums + 8 * pairs)
 
 

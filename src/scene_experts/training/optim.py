@@ -5,8 +5,6 @@ State names are torch's (`exp_avg`, `exp_avg_sq`, `step`), so a checkpoint does 
 
 from __future__ import annotations
 
-import ctypes
-import functools
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -14,16 +12,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.native import library as native
-
-
-class _Tensor(ctypes.Structure):
-    """`AdamTensor` of csrc/adam.cpp."""
-
-    _fields_ = [
-        *[(name, ctypes.c_void_p) for name in ("value", "gradient", "first", "second", "rows")],
-        *[(name, ctypes.c_int64) for name in ("count", "width")],
-        *[(name, ctypes.c_double) for name in ("step_size", "root")],
-    ]
+from scene_experts.native.api import SeAdamTensor
 
 
 class Adam(torch.optim.Adam):
@@ -36,7 +25,7 @@ class Adam(torch.optim.Adam):
         """groups: {"params": tensors, "lr": float, "by_row": bool (False where absent), ...}."""
         groups = [{"by_row": False, **group} for group in groups]
         every = [p for group in groups for p in group["params"]]
-        self._native = all(p.device.type == "cpu" and p.dtype == torch.float32 for p in every) and _library() is not None
+        self._native = all(p.device.type == "cpu" and p.dtype == torch.float32 for p in every) and native.load() is not None
         fused = all(p.device.type in ("cpu", "cuda") and p.dtype == torch.float32 for p in every)
         super().__init__(groups, lr=0.0, betas=betas, eps=eps, fused=fused)
 
@@ -74,9 +63,7 @@ class Adam(torch.optim.Adam):
         return parameter, chosen, float(group["lr"]) / (1 - beta1**done), (1 - beta2**done) ** 0.5, group
 
     def _call(self, calls: list[tuple[Tensor, Tensor | None, float, float, dict]]) -> None:
-        library = _library()
-        assert library is not None
-        tensors, alive = (_Tensor * len(calls))(), []
+        tensors, alive = (SeAdamTensor * len(calls))(), []
         for to, (parameter, rows, step_size, root, _) in zip(tensors, calls):
             state, gradient = self.state[parameter], parameter.grad
             assert gradient is not None
@@ -88,7 +75,7 @@ class Adam(torch.optim.Adam):
             to.count, to.width = (parameter.numel(), 1) if rows is None else (len(rows), parameter[:1].numel())
             to.step_size, to.root = step_size, root
         group = self.param_groups[0]
-        library.se_adam_step(tensors, len(calls), *group["betas"], group["eps"], native.threads())
+        native.require().se_adam_step(tensors, len(calls), *group["betas"], group["eps"], native.count_threads())
 
 
 def _by_torch(parameter: Tensor, state: dict[str, Tensor], rows: Tensor | None, step_size: float, root: float, group: dict) -> None:
@@ -106,8 +93,3 @@ def _by_torch(parameter: Tensor, state: dict[str, Tensor], rows: Tensor | None, 
     if rows is not None:
         for whole, part in ((parameter, value), (state["exp_avg"], first), (state["exp_avg_sq"], second)):
             whole.index_copy_(0, rows, part)
-
-
-@functools.cache
-def _library() -> ctypes.CDLL | None:
-    return native.bound({"se_adam_step": [ctypes.POINTER(_Tensor), ctypes.c_int64, *[ctypes.c_double] * 3, ctypes.c_int32]})

@@ -20,12 +20,7 @@ def test_rates_are_of_this_world():
 
 
 def test_wider_vectors_multiply_more():
-    levels = [level for level in native.levels() if native.path(level)]
+    levels = [level for level in native.list_levels() if native.find(level)]
     if not {"portable", "avx2"} <= set(levels):
         pytest.skip("one instruction set alone")
     assert machine.multiply_adds("avx2", 1, 0.05) > 1.3 * machine.multiply_adds("portable", 1, 0.05)
-
-
-def test_a_library_without_the_loop_gives_none(monkeypatch):
-    monkeypatch.setattr(native, "load", lambda level=None: object())
-    assert machine.multiply_adds(None, 1, 0.0) is None

@@ -12,7 +12,7 @@ from scene_experts.render.reference import ReferenceRasterizer
 
 @pytest.mark.parametrize("level", native.LEVELS)
 def test_the_peer_is_a_rasteriser(level):
-    found = peer.load(level) if level in native.levels() else None
+    found = peer.load(level) if level in native.list_levels() else None
     if found is None:
         pytest.skip("not installed")
     scene = raster.picture(300, 48, 32)
@@ -29,5 +29,5 @@ def test_the_peer_is_a_rasteriser(level):
 
 def test_no_library_no_peer(monkeypatch):
     assert peer.load(None) is None
-    monkeypatch.setattr(native, "path", lambda level: None)
+    monkeypatch.setattr(native, "find", lambda level: None)
     assert peer.load("avx512") is None

@@ -18,7 +18,7 @@ def test_sizes_shrink_with_the_budget():
 
 @pytest.fixture
 def no_library(monkeypatch):
-    monkeypatch.setattr(native, "path", lambda level: None)
+    monkeypatch.setattr(native, "find", lambda level: None)
     native.load.cache_clear()
     yield
     native.load.cache_clear()

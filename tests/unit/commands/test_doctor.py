@@ -46,7 +46,7 @@ def test_pycolmap_is_not_imported() -> None:
 
 
 def test_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(native, "why_not", lambda: "the compiled CPU library is not installed: install a compiler")
+    monkeypatch.setattr(native, "explain_missing", lambda: "the compiled CPU library is not installed: install a compiler")
     check = doctor.native_library()
     assert not check.ok and "slow torch reference" in check.found and check.fix == "install a compiler"
 
@@ -69,7 +69,7 @@ def test_a_check_that_breaks_is_reported(monkeypatch: pytest.MonkeyPatch) -> Non
     def broken() -> str | None:
         raise OSError("damaged library")
 
-    monkeypatch.setattr(native, "why_not", broken)
+    monkeypatch.setattr(native, "explain_missing", broken)
     check = next(c for c in doctor.diagnose() if "library" in c.name)
     assert not check.ok and "damaged library" in check.found
 

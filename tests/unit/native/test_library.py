@@ -1,6 +1,5 @@
 """The compiled library is found, refused when it is of another version, and its absence explained."""
 
-import ctypes
 import os
 import subprocess
 import sys
@@ -10,6 +9,8 @@ import pytest
 import torch
 
 import scene_experts
+from scene_experts.core.errors import InputError
+from scene_experts.native import api
 from scene_experts.native import library as native
 
 
@@ -23,35 +24,50 @@ def elsewhere(tmp_path, monkeypatch):
 
 
 def test_levels_end_with_the_one_that_runs_everywhere():
-    found = native.levels()
+    found = native.list_levels()
     assert found[-1] == "portable" and found == native.LEVELS[-len(found) :]
 
 
 def test_a_loaded_library_is_one_of_this_processors():
     if native.load() is None:
-        assert native.why_not()
+        assert native.explain_missing()
     else:
-        assert native.why_not() is None and native.load().level in native.levels() and native.path(native.load().level).is_file()
-    assert native.load("no such level") is None and native.path("no such level") is None
+        level = native.load().level
+        assert native.explain_missing() is None and level in native.list_levels() and native.find(level).is_file()
+    assert native.load("no such level") is None and native.find("no such level") is None
 
 
 def test_no_library_is_one_sentence_that_says_what_to_do(elsewhere):
-    assert native.load() is None and "not installed" in native.why_not() and "pip install ." in native.why_not()
+    assert native.load() is None and "not installed" in native.explain_missing() and "pip install ." in native.explain_missing()
 
 
 def test_a_library_of_another_version_is_not_used(elsewhere, monkeypatch):
     (elsewhere / "_native").mkdir()
     for name in native.LEVELS:
         (elsewhere / "_native" / f"se_{name}{native._SUFFIX}").touch()
-    monkeypatch.setattr(ctypes, "CDLL", lambda where: SimpleNamespace(se_abi_version=lambda: native.ABI_VERSION + 1))
-    assert native.load() is None and "does not fit" in native.why_not() and "portable" in native.why_not()
+    monkeypatch.setattr(native, "Library", lambda path: SimpleNamespace(se_abi_version=lambda: api.ABI_VERSION + 1))
+    assert native.load() is None and "does not fit" in native.explain_missing() and "portable" in native.explain_missing()
+
+
+def test_a_library_that_lacks_a_function_is_not_used(elsewhere, monkeypatch):
+    (elsewhere / "_native").mkdir()
+    (elsewhere / "_native" / f"se_portable{native._SUFFIX}").touch()
+    monkeypatch.setattr(native, "Library", lambda path: SimpleNamespace(se_abi_version=lambda: api.ABI_VERSION))
+    assert native.load("portable") is None
+
+
+def test_require_says_what_is_missing(elsewhere):
+    with pytest.raises(InputError, match="not installed"):
+        native.require()
+    with pytest.raises(InputError, match="not installed"):
+        native.require("avx2")
 
 
 def test_a_damaged_library_is_not_used(elsewhere):
     (elsewhere / "_native").mkdir()
     for name in native.LEVELS:
         (elsewhere / "_native" / f"se_{name}{native._SUFFIX}").write_bytes(b"cut short")
-    assert native.load() is None and "does not fit" in native.why_not()
+    assert native.load() is None and "does not fit" in native.explain_missing()
 
 
 def test_pointers():
@@ -68,7 +84,7 @@ def test_pointers():
 )
 def test_levels_follow_the_processor(monkeypatch, capability, expected):
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
-    assert native.levels() == expected
+    assert native.list_levels() == expected
 
 
 SHORT = """
@@ -114,7 +130,7 @@ def test_cores_are_those_that_this_process_may_use():
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(before)})
     try:
-        assert native.cores() == 1
+        assert native.count_cores() == 1
     finally:
         os.sched_setaffinity(0, before)
-    assert native.cores() == len(before)
+    assert native.count_cores() == len(before)

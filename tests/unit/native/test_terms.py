@@ -4,9 +4,10 @@ import pytest
 import torch
 from torch.nn import functional
 
+from scene_experts.native import library as native
 from scene_experts.native import terms as native_terms
 
-pytestmark = pytest.mark.skipif(native_terms._library() is None, reason="no compiled library")
+pytestmark = pytest.mark.skipif(native.load() is None, reason="no compiled library")
 
 
 @pytest.mark.parametrize("count", [0, 1, 20_003])

@@ -15,8 +15,8 @@ from scene_experts.render import Rasterizer
 from scene_experts.render.cpu import CpuRasterizer
 from scene_experts.render.reference import ReferenceRasterizer
 
-pytestmark = pytest.mark.skipif(native.load() is None, reason=str(native.why_not()))
-LEVELS = [name for name in native.levels() if native.path(name)]
+pytestmark = pytest.mark.skipif(native.load() is None, reason=str(native.explain_missing()))
+LEVELS = [name for name in native.list_levels() if native.find(name)]
 NAMES = ("means", "quats", "scales", "opacities", "colors", "background", "mean2d")
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 

@@ -47,14 +47,14 @@ def test_what_cannot_be_had_names_what_can(name, device, said):
 @pytest.mark.parametrize("name", ["reference", "cpu"])
 def test_options_reach_the_rasteriser(name):
     if name == "cpu" and native.load() is None:
-        pytest.skip(str(native.why_not()))
+        pytest.skip(str(native.explain_missing()))
     assert choose(name, "cpu", antialias=True).antialias and not choose(name, "cpu").antialias
 
 
 @pytest.mark.parametrize("name", ["reference", "cpu"])
 def test_channels_come_out_in_the_order_they_went_in(name):
     if name == "cpu" and native.load() is None:
-        pytest.skip(str(native.why_not()))
+        pytest.skip(str(native.explain_missing()))
     camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 5], [0, 20, 11], [0, 0, 1]]), 24, 16)
     place, turn, colour = torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[0.9, 0.5, 0.1]])
     one = Gaussians(place, turn, torch.full((1, 3), 0.1), torch.ones(1), colour, torch.zeros(1, dtype=torch.int64))

@@ -5,6 +5,7 @@ import torch
 
 from scene_experts.core.table import Table
 from scene_experts.core.types import Decoded, Gaussians, Render
+from scene_experts.native import library as native
 from scene_experts.strategy import observe
 
 K = 3
@@ -47,7 +48,7 @@ def test_a_training_in_float64_counts_in_float64():
 
 @pytest.mark.parametrize("K", [1, 4, 10, 33])
 def test_the_compiled_form_gives_the_bits_of_the_plain_one(K):
-    if observe._library() is None:
+    if native.load() is None:
         pytest.skip("no compiled library")
     generator = torch.Generator().manual_seed(K)
     n, rows = 3000, torch.arange(1, 3000, 2)

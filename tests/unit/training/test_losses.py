@@ -73,21 +73,21 @@ def test_the_compiled_form_equals_torch_in_value_and_gradient(size):
         assert float((fast.grad - expected).norm() / expected.norm()) < 2e-6
 
 
-@pytest.mark.parametrize("level", native.levels())
+@pytest.mark.parametrize("level", native.list_levels())
 @pytest.mark.parametrize("threads", [1, 2])
 def test_every_build_gives_the_same_and_threads_change_nothing(level, threads, monkeypatch):
     library = native.load(level)
     if library is None:
         pytest.skip(f"no {level} build")
-    monkeypatch.setattr(native, "load", lambda: library)
-    monkeypatch.setattr(native, "threads", lambda: threads)
+    monkeypatch.setattr(native, "load", lambda level=None: library)
+    monkeypatch.setattr(native, "count_threads", lambda: threads)
     x, y = pictures(150, 67, dtype=torch.float32)
     fast, exact = x.clone().requires_grad_(), x.double().requires_grad_()
     found = photometric(fast, y, 0.2)
     sum(found).backward()
     (0.8 * losses.l1(exact, y.double()) + 0.2 * (1 - ssim(exact, y.double()))).backward()
     torch.testing.assert_close(fast.grad.double(), exact.grad, rtol=1e-4, atol=1e-10)
-    monkeypatch.setattr(native, "threads", lambda: 1)
+    monkeypatch.setattr(native, "count_threads", lambda: 1)
     again = x.clone().requires_grad_()
     sum(photometric(again, y, 0.2)).backward()
     assert torch.equal(again.grad, fast.grad)

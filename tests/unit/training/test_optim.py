@@ -5,7 +5,8 @@ import copy
 import pytest
 import torch
 
-from scene_experts.training.optim import Adam, _by_torch, _library
+from scene_experts.native import library as native
+from scene_experts.training.optim import Adam, _by_torch
 
 SHAPES = [(300, 32), (300, 10, 3), (300, 6), (64, 35), (7,), (1,), (0, 4)]
 
@@ -34,7 +35,7 @@ def trained(optimizer, tensors, steps, **kwargs):
     return optimizer
 
 
-@pytest.mark.skipif(_library() is None, reason="no compiled library")
+@pytest.mark.skipif(native.load() is None, reason="no compiled library")
 @pytest.mark.parametrize("threads", [1, 2])
 def test_it_is_torchs_fused_adam_bit_for_bit(threads):
     ours, theirs, before = parameters(), parameters(), torch.get_num_threads()

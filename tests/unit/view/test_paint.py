@@ -6,7 +6,6 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
 from scene_experts.render import choose
-from scene_experts.scene.anchors.frozen import freeze
 from scene_experts.view.paint import MODES, PALETTE, Look, paint, ramp, row_colours
 from unit.scene.test_init import CAMERA, started
 
@@ -29,7 +28,7 @@ def test_the_plain_picture_is_the_render():
 @pytest.mark.parametrize("mode", MODES)
 def test_a_frozen_scene_gives_the_same_picture(mode):
     scene = started("moe-gs")
-    draws = freeze(scene, 2000)
+    draws = scene.frozen(2000)
     assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK, Look(mode), draws), paint(scene, CAMERA, 2000, DRAW, BLACK, Look(mode)))
 
 

@@ -22,7 +22,6 @@ from scene_experts.files.bake.views import Views
 from scene_experts.geometry.sh import MAX_DEGREE
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Scene
-from scene_experts.scene.anchors.frozen import freeze
 from scene_experts.scene.gaussians import Explicit, GaussianScene
 
 FREE_LOOKS = 150  # free views, beside the others, from which is seen what the scene leaves out
@@ -67,7 +66,7 @@ def bake(scene: Scene, step: int, capture: Capture, rasterize: Rasterizer, how: 
     """
     how.check()
     generator = torch.Generator().manual_seed(how.seed)
-    views, draws = Views.of(capture), freeze(scene, step)
+    views, draws = Views.of(capture), scene.frozen(step)
     cameras, slots = views.for_sums(generator), len(scene.table) * scene.K
     sums = add_up(draws, step, slots, cameras, rasterize, tell)
     rows = (sums.weight > 0).nonzero().squeeze(1)

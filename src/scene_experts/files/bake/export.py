@@ -22,7 +22,6 @@ from scene_experts.files.formats.html_page import capture_notes
 from scene_experts.files.formats.splats import Splats, from_scene, to_columns
 from scene_experts.files.formats.standard import FORMATS, read_standard, write_standard
 from scene_experts.render import Rasterizer, as_trained
-from scene_experts.scene.anchors.frozen import freeze
 from scene_experts.scene.anchors.scene import AnchorScene
 from scene_experts.scene.anchors.select import LevelSelector, capped
 from scene_experts.scene.gaussians import GaussianScene
@@ -190,7 +189,7 @@ def measure(
     tell: Tell,
 ) -> tuple[dict[str, Any], str]:
     """PSNR of the held-out `views` from the run, the closed form, the bake and the file as it is read again; and the line that says it."""
-    scenes: dict[str, Any] = {"run": (freeze(run.scene, run.step), run.step)}
+    scenes: dict[str, Any] = {"run": (run.scene.frozen(run.step), run.step)}
     if made.closed_form is not None:
         scenes |= {"closed_form": (made.closed_form, DRAWN_AT)} if refined else {}
         scenes["bake"] = (scene_of(made.splats, world, run.scene.extent), DRAWN_AT)

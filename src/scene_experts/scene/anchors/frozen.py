@@ -1,14 +1,11 @@
 """A trained anchor scene made ready for drawing: what no camera changes is computed once.
 
-Routing depends on the anchor alone, so each anchor's experts and their weights are kept; if asked for, also the part W1[:, :F] f of the
-first layer W1 (f, direction) + b1 of each chosen expert. The Gaussians are those of the native decode, bit for bit. Symbols as in
-`types.py`; S experts an anchor (k, or E while dense, or 1).
+Routing depends on the anchor alone, so each anchor's experts and their weights are kept. The Gaussians are those of the native decode,
+bit for bit. Symbols as in `types.py`; S experts an anchor (k, or E while dense, or 1).
 """
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +13,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode
-from scene_experts.native import library as native
-from scene_experts.scene import Cull, Draws, Scene
+from scene_experts.scene import Cull
 from scene_experts.scene.anchors import native_decode
 from scene_experts.scene.anchors.appearance import fold
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, HeadWeights
@@ -34,28 +30,17 @@ class Kept:
     gates: Tensor | None  # [N, E], while dense
     chosen: Tensor | None  # [N, k] int64
     mix: Tensor | None  # [N, k]
-    base: Tensor | None  # [N, S, Hp]: W1[:, :F] f, Hp hidden units rounded up to 16
 
     @property
     def bytes(self) -> int:
-        return sum(t.numel() * t.element_size() for t in (self.gates, self.chosen, self.mix, self.base) if t is not None)
-
-
-def freeze(scene: Scene, step: int, fold_features: bool = False) -> Draws:
-    """`scene.frozen(step)`, with the first layers folded in where `fold_features` asks for it.
-
-    fold_features: keep the first layers too, 384 bytes an anchor and expert at 32 hidden units. Reading them took longer than computing
-    them again where it was measured (docs/performance.md).
-    """
-    found = scene.frozen(step)
-    return Frozen(found.scene, found.weights, step, True) if fold_features and isinstance(found, Frozen) else found
+        return sum(t.numel() * t.element_size() for t in (self.gates, self.chosen, self.mix) if t is not None)
 
 
 class Frozen:
     """Draws one scene at one step without gradients; routing is left out of what it returns (`AnchorScene.routing` has it)."""
 
     @torch.no_grad()
-    def __init__(self, scene: AnchorScene, weights: dict[str, HeadWeights], step: int, fold_features: bool = False) -> None:
+    def __init__(self, scene: AnchorScene, weights: dict[str, HeadWeights], step: int) -> None:
         self.scene, self.step = scene, step
         p = scene.table.params
         self.columns = [p[name].detach().contiguous() for name in ("feature", "log_scaling", "offsets")]
@@ -63,17 +48,12 @@ class Frozen:
         self.scales = self.columns[1][:, :3].contiguous().exp()
         self.with_dist = {a: a in scene.config.add_dist for a in ATTRIBUTES}
         self.weights = {a: _detached(w) for a, w in weights.items()}
-        self.kept = self._keep(fold_features)
+        self.kept = self._keep()
 
     @property
     def bytes(self) -> int:
         """Memory beyond the scene's own."""
         return sum(kept.bytes for kept in self.kept) + self.scales.numel() * 4
-
-    @property
-    def folded(self) -> bool:
-        """Whether first layers are kept."""
-        return self.kept[0].base is not None
 
     @torch.no_grad()
     def __call__(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
@@ -91,7 +71,7 @@ class Frozen:
         call, alive = self._call(rows, camera.position, self._at(camera))
         call.frozen = 1
         for head, kept in zip(call.heads, self.kept):
-            native_decode.set_pointers(head, gates=kept.gates, chosen=kept.chosen, mix=kept.mix, base=kept.base)
+            native_decode.set_pointers(head, gates=kept.gates, chosen=kept.chosen, chosen_weight=kept.mix)
         made, raw, _, _ = native_decode.run(call)
         del alive
         return Decoded(Gaussians(*made), rows, raw, {})
@@ -109,29 +89,19 @@ class Frozen:
         weights = [getattr(heads[a], name) for a in ATTRIBUTES for name in native_decode.TENSORS]
         return native_decode.prepared(plan, self.columns, weights), (plan, weights)
 
-    def _keep(self, fold_features: bool) -> tuple[Kept, ...]:
+    def _keep(self) -> tuple[Kept, ...]:
         heads, N, nowhere = self.weights, len(self.xyz), torch.zeros(3)
         if self.scene.codes is not None:  # which code does not matter: it touches neither routing nor the feature's part
             heads = {**heads, "color": _detached(fold(heads["color"], self.scene.codes.table[0]))}
         call, alive = self._call(torch.arange(N), nowhere, heads)
-        routed, width = [h.router_w is not None for h in heads.values()], [-(-head.H // 16) * 16 for head in call.heads]
+        routed = [h.router_w is not None for h in heads.values()]
         gates = [torch.empty(N, head.E) if r else None for r, head in zip(routed, call.heads)]
         chosen = [torch.empty(N, head.k, dtype=torch.int64) if r and head.k else None for r, head in zip(routed, call.heads)]
         mix = [torch.empty(N, head.k) if r and head.k else None for r, head in zip(routed, call.heads)]
         native_decode.set_routing(call, gates, chosen, mix)
         native_decode.route(call)
-        bases: Sequence[Tensor | None] = (None, None, None)
-        shares = [int(head.k or head.E) for head in call.heads]
-        if fold_features:
-            call.frozen = 1
-            bases = [torch.empty(N, s, w) for s, w in zip(shares, width)]
-            for head, base in zip(call.heads, bases):
-                native_decode.set_pointers(head, base=base)
-            library = native.load()
-            assert library is not None
-            native.done(library.se_decode_fold(ctypes.byref(call)), native_decode.WHAT)
         del alive
-        return tuple(Kept(None if c is not None else g, c, m, b) for g, c, m, b in zip(gates, chosen, mix, bases))
+        return tuple(Kept(None if c is not None else g, c, m) for g, c, m in zip(gates, chosen, mix))
 
 
 def _detached(w: HeadWeights) -> HeadWeights:

@@ -15,36 +15,14 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.types import Gaussians, Routing
+from scene_experts.native import api
 from scene_experts.native import library as native
+from scene_experts.native.api import SeDecode
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, HeadWeights
 
 WHAT = "the decode"
-CHUNK = 256  # anchors per unit of work (csrc/decode.h)
-TENSORS = ("router_w", "router_b", "w1", "b1", "middle_w", "middle_b", "w2", "b2")
+TENSORS = api.HEAD_TENSORS
 T = len(TENSORS)
-
-
-class _Head(ctypes.Structure):
-    """`Head` of csrc/decode.h."""
-
-    _fields_ = [
-        *[(name, ctypes.c_void_p) for name in (*TENSORS, "gates", "chosen", "mix", "base", *(f"d_{t}" for t in TENSORS), "d_gates")],
-        *[(name, ctypes.c_int64) for name in ("E", "k", "H", "L", "out", "distance", "position")],
-    ]
-
-
-class _Decode(ctypes.Structure):
-    """`Decode` of csrc/decode.h."""
-
-    _fields_ = [
-        *[(name, ctypes.c_void_p) for name in ("rows", "xyz", "feature", "log_scaling", "offsets", "camera", "raw", "starts")],
-        *[(name, ctypes.c_void_p) for name in ("means", "quats", "scales", "opacities", "colors", "per_length", "source")],
-        *[(name, ctypes.c_void_p) for name in ("d_means", "d_quats", "d_scales", "d_opacities", "d_colors", "d_raw")],
-        *[(name, ctypes.c_void_p) for name in ("d_feature", "d_log_scaling", "d_offsets")],
-        *[(name, ctypes.c_int64) for name in ("A", "N", "K", "F", "threads", "ascending", "frozen")],
-        ("extent", ctypes.c_double),
-        ("heads", _Head * 3),
-    ]
 
 
 @dataclass(frozen=True)
@@ -133,26 +111,23 @@ def _check(xyz: Tensor, feature: Tensor, log_scaling: Tensor, offsets: Tensor, h
             )
 
 
-def route(call: _Decode) -> None:
+def route(call: SeDecode) -> None:
     """Fills in the gates, chosen experts and weights that `set_routing` points to, and nothing else."""
-    library = native.load()
-    assert library is not None
-    native.done(library.se_decode_route(ctypes.byref(call)), WHAT)
+    native.check(native.require().se_decode_route(ctypes.byref(call)), WHAT)
 
 
-def run(call: _Decode) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor]:
+def run(call: SeDecode) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor]:
     """Decodes what `prepared` and `set_routing` put together: the fields of Gaussians, raw opacities [A, K], and for the backward pass the
     first Gaussian of each chunk and the inverse lengths of the quaternions before their normalisation [M]."""
-    library = native.load()
-    assert library is not None
-    raw, starts = torch.empty(call.A, call.K), torch.zeros(-(-call.A // CHUNK) + 1, dtype=torch.int64)
+    library = native.require()
+    raw, starts = torch.empty(call.A, call.K), torch.zeros(library.se_decode_chunks(call.A) + 1, dtype=torch.int64)
     set_pointers(call, raw=raw, starts=starts)
-    native.done(library.se_decode_begin(ctypes.byref(call)), WHAT)
+    native.check(library.se_decode_begin(ctypes.byref(call)), WHAT)
     M = int(starts[-1])
     means, quats, scales, colors = torch.empty(M, 3), torch.empty(M, 4), torch.empty(M, 3), torch.empty(M, 3)
     opacities, per_length, source = torch.empty(M), torch.empty(M), torch.empty(M, dtype=torch.int64)
     set_pointers(call, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, per_length=per_length, source=source)
-    native.done(library.se_decode_emit(ctypes.byref(call)), WHAT)
+    native.check(library.se_decode_emit(ctypes.byref(call)), WHAT)
     return (means, quats, scales, opacities, colors, source), raw, starts, per_length
 
 
@@ -197,18 +172,16 @@ class _DecodeFunction(torch.autograd.Function):
         set_pointers(call, d_feature=d_columns[0], d_log_scaling=d_columns[1], d_offsets=d_columns[2])
         for i, head in enumerate(call.heads):
             set_pointers(head, d_gates=given[7 + i], **{f"d_{name}": d_weights[T * i + j] for j, name in enumerate(TENSORS)})
-        library = native.load()
-        assert library is not None
-        native.done(library.se_decode_backward(ctypes.byref(call)), "the backward pass of the decode")
+        native.check(native.require().se_decode_backward(ctypes.byref(call)), "the backward pass of the decode")
         wanted = ctx.needs_input_grad[1:]
         return None, *(g if want else None for g, want in zip([*d_columns, *d_weights], wanted))
 
 
-def prepared(plan: Plan, columns: Any, weights: Any) -> _Decode:
+def prepared(plan: Plan, columns: Any, weights: Any) -> SeDecode:
     """The structure with all inputs in it. The tensors must outlive the call."""
     feature, log_scaling, offsets = columns
-    call = _Decode(
-        A=len(plan.rows), N=len(plan.xyz), K=offsets.shape[1], F=feature.shape[1], threads=native.threads(), ascending=plan.ascending
+    call = SeDecode(
+        A=len(plan.rows), N=len(plan.xyz), K=offsets.shape[1], F=feature.shape[1], threads=native.count_threads(), ascending=plan.ascending
     )
     call.extent = plan.extent
     set_pointers(call, rows=plan.rows, xyz=plan.xyz, feature=feature, log_scaling=log_scaling, offsets=offsets, camera=plan.camera)
@@ -226,6 +199,6 @@ def set_pointers(structure: ctypes.Structure, **tensors: Tensor | None) -> None:
         setattr(structure, name, native.pointer(tensor))
 
 
-def set_routing(call: _Decode, gates: Any, chosen: Any, mix: Any) -> None:
+def set_routing(call: SeDecode, gates: Any, chosen: Any, mix: Any) -> None:
     for head, g, c, m in zip(call.heads, gates, chosen, mix):
-        set_pointers(head, gates=g, chosen=c, mix=m)
+        set_pointers(head, gates=g, chosen=c, chosen_weight=m)

@@ -325,7 +325,7 @@ def no_kernels(device: torch.device) -> str | None:
     """None where `device` has fused kernels; else why not."""
     if device.type == "cuda":
         return triton_decode.available()
-    return native.why_not() if device.type == "cpu" else f"no kernels for {device.type}"
+    return native.explain_missing() if device.type == "cpu" else f"no kernels for {device.type}"
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,6 @@ A level with more corners than the table has rows shares rows among them by a ha
 
 from __future__ import annotations
 
-import ctypes
-import functools
 import math
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -111,24 +109,24 @@ class _Encode(torch.autograd.Function):
         unit = unit.contiguous()
         ctx.save_for_backward(unit)
         ctx.config, ctx.shape = config, table.shape
-        out, library = unit.new_empty(len(unit), config.levels, config.features), _library()
+        out, library = unit.new_empty(len(unit), config.levels, config.features), native.load()
         if library is None or not _fits(table, unit):
             _forward(table, unit, config, out)
         else:
             sizes = torch.tensor([config.resolutions(), config.rows()])
             columns = [native.pointer(t) for t in (table, unit, sizes[0], sizes[1])]
-            library.se_grid_forward(*columns, len(unit), config.levels, config.features, native.pointer(out), native.threads())
+            library.se_grid_forward(*columns, len(unit), config.levels, config.features, native.pointer(out), native.count_threads())
         return out.view(len(unit), config.width)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, None, None]:
-        (unit,), config, library = ctx.saved_tensors, ctx.config, _library()
+        (unit,), config, library = ctx.saved_tensors, ctx.config, native.load()
         grad = grads[0].contiguous().view(len(unit), config.levels, config.features)
         if library is None or not _fits(grad, unit):
             return _backward(unit, grad, config), None, None
         out, sizes = grad.new_zeros(ctx.shape), torch.tensor([config.resolutions(), config.rows()])
         columns = [native.pointer(t) for t in (unit, grad, sizes[0], sizes[1])]
-        library.se_grid_backward(*columns, len(unit), config.levels, config.features, native.pointer(out), native.threads())
+        library.se_grid_backward(*columns, len(unit), config.levels, config.features, native.pointer(out), native.count_threads())
         return out, None, None
 
 
@@ -156,10 +154,3 @@ def _backward(unit: Tensor, grad: Tensor, config: HashGrid) -> Tensor:
 
 def _fits(*tensors: Tensor) -> bool:
     return all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in tensors)
-
-
-@functools.cache
-def _library() -> ctypes.CDLL | None:
-    P, L = ctypes.c_void_p, ctypes.c_int64
-    types = [P, P, P, P, L, L, L, P, ctypes.c_int32]
-    return native.bound({"se_grid_forward": types, "se_grid_backward": types})

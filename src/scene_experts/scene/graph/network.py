@@ -5,8 +5,6 @@ Points do not move, so the graph changes only when rows come and go; a camera us
 
 from __future__ import annotations
 
-import ctypes
-import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,7 +60,7 @@ class _Blend(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, feature: Tensor, found: Tensor, weight: Tensor, share: float) -> Tensor:
-        parts, library = (feature.contiguous(), found.contiguous(), weight.contiguous()), _library()
+        parts, library = (feature.contiguous(), found.contiguous(), weight.contiguous()), native.load()
         ctx.share = share
         fits = all(t.device.type == "cpu" for t in parts) and feature.dtype == weight.dtype == torch.float32
         if library is None or not fits or found.numel() >= 2**31:
@@ -74,7 +72,7 @@ class _Blend(torch.autograd.Function):
         least, out = torch.empty_like(feature), torch.empty_like(feature)
         library.se_graph_reverse(native.pointer(found), A, k, native.pointer(start), native.pointer(known))
         columns = [native.pointer(t) for t in (feature, found, weight, start, known)]
-        library.se_graph_forward(*columns, A, k, F, share, native.pointer(least), native.pointer(out), native.threads())
+        library.se_graph_forward(*columns, A, k, F, share, native.pointer(least), native.pointer(out), native.count_threads())
         ctx.save_for_backward(*parts, least, start, known)
         return out
 
@@ -83,12 +81,11 @@ class _Blend(torch.autograd.Function):
         feature, found, weight, least, *reverse = ctx.saved_tensors
         if not reverse:
             return _backward(feature, found, weight, least, grads[0], ctx.share), None, None, None
-        library, (A, F), k = _library(), feature.shape, found.shape[1]
-        assert library is not None
+        library, (A, F), k = native.require(), feature.shape, found.shape[1]
         h, shared, out, grad = *(torch.empty_like(feature) for _ in range(3)), grads[0].contiguous()
         columns = [native.pointer(t) for t in (feature, least, grad, found, weight, *reverse)]
         rooms = [native.pointer(t) for t in (h, shared, out)]
-        library.se_graph_backward(*columns, A, k, F, ctx.share, *rooms, native.threads())
+        library.se_graph_backward(*columns, A, k, F, ctx.share, *rooms, native.count_threads())
         return out, None, None, None
 
 
@@ -124,15 +121,3 @@ def _columns(found: Tensor, weight: Tensor) -> list[tuple[Tensor, Tensor, Tensor
         me = (found[:, j] >= 0).nonzero().squeeze(1)
         out.append((me, found[:, j].index_select(0, me), weight[:, j].index_select(0, me)))
     return out
-
-
-@functools.cache
-def _library() -> ctypes.CDLL | None:
-    P, L, I, R = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32, ctypes.c_float
-    return native.bound(
-        {
-            "se_graph_reverse": [P, L, L, P, P],
-            "se_graph_forward": [*[P] * 5, L, L, L, R, P, P, I],
-            "se_graph_backward": [*[P] * 7, L, L, L, R, P, P, P, I],
-        }
-    )

@@ -9,7 +9,7 @@ from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.experts import Experts, Router
-from scene_experts.scene.anchors.frozen import Frozen, freeze
+from scene_experts.scene.anchors.frozen import Frozen
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 
 needs_native = pytest.mark.skipif(native.load() is None, reason="no compiled library")
@@ -48,17 +48,16 @@ def same(found, expected):
 @pytest.mark.parametrize("recipe", ANCHORED)
 def test_every_recipe_draws_the_same_bits(recipe):
     scene = trained(RECIPES[recipe][1].scene)
-    for fold in (True, False):
-        frozen = freeze(scene, DONE, fold)
-        if scene.native_weights(DONE) is None:
-            assert frozen is scene
-            continue
-        assert isinstance(frozen, Frozen) and frozen.folded == fold
-        for view in (camera(1), camera(7, -0.4)):
-            with torch.no_grad():
-                expected = scene(view, DONE, Mode.DRAW, halves)
-            same(frozen(view, DONE, Mode.DRAW, halves), expected)
-            assert len(expected.gaussians) and not frozen(view, DONE, Mode.DRAW, halves).gaussians.means.requires_grad
+    frozen = scene.frozen(DONE)
+    if scene.native_weights(DONE) is None:
+        assert frozen is scene
+        return
+    assert isinstance(frozen, Frozen)
+    for view in (camera(1), camera(7, -0.4)):
+        with torch.no_grad():
+            expected = scene(view, DONE, Mode.DRAW, halves)
+        same(frozen(view, DONE, Mode.DRAW, halves), expected)
+        assert len(expected.gaussians) and not frozen(view, DONE, Mode.DRAW, halves).gaussians.means.requires_grad
 
 
 @needs_native
@@ -75,8 +74,8 @@ def test_every_recipe_draws_the_same_bits(recipe):
 )
 def test_other_heads_draw_the_same_bits(config):
     scene = trained(config)
-    frozen = freeze(scene, DONE, fold_features=True)
-    assert isinstance(frozen, Frozen) and frozen.folded
+    frozen = scene.frozen(DONE)
+    assert isinstance(frozen, Frozen)
     for view in (camera(1), camera(7, -0.4)):
         with torch.no_grad():
             same(frozen(view, DONE, Mode.DRAW, halves), scene(view, DONE, Mode.DRAW, halves))
@@ -90,7 +89,7 @@ def test_other_heads_draw_the_same_bits(config):
 @needs_native
 def test_while_dense_all_gates_are_kept_and_nothing_seen_draws_nothing():
     scene = trained(RECIPES["moe-gs"][1].scene, n=50)
-    frozen = freeze(scene, 1)
+    frozen = scene.frozen(1)
     assert isinstance(frozen, Frozen) and frozen.kept[0].chosen is None and frozen.kept[0].gates is not None
     with torch.no_grad():
         same(frozen(camera(), 1, Mode.DRAW, halves), scene(camera(), 1, Mode.DRAW, halves))
@@ -101,16 +100,13 @@ def test_while_dense_all_gates_are_kept_and_nothing_seen_draws_nothing():
 @needs_native
 def test_memory_is_what_it_says():
     scene = trained(RECIPES["moe-gs"][1].scene, n=100)
-    N, frozen = len(scene.table), freeze(scene, DONE, fold_features=True)
-    assert isinstance(frozen, Frozen)
-    assert frozen.bytes == N * (3 * 2 * 32 * 4 + 3 * 2 * (8 + 4) + 12)  # first layers, routing, scales
-    lean = freeze(scene, DONE)
-    assert isinstance(lean, Frozen) and lean.bytes == N * (3 * 2 * (8 + 4) + 12)
+    frozen = scene.frozen(DONE)
+    assert isinstance(frozen, Frozen) and frozen.bytes == len(scene.table) * (3 * 2 * (8 + 4) + 12)  # routing, scales
 
 
 @needs_native
 def test_another_step_and_training_are_refused():
-    frozen = freeze(trained(Anchors(), n=20), 7)
+    frozen = trained(Anchors(), n=20).frozen(7)
     with pytest.raises(ValueError, match="step 7"):
         frozen(camera(), 8, Mode.DRAW, halves)
     with pytest.raises(ValueError, match="TRAIN"):
@@ -120,4 +116,4 @@ def test_another_step_and_training_are_refused():
 def test_what_the_native_decode_does_not_cover_stays_itself():
     for config in (Anchors(decode="composed"), Anchors(quat_align=True), Anchors(decoder=Experts(mix="pre_activation"))):
         scene = trained(config, n=20)
-        assert freeze(scene, 7) is scene
+        assert scene.frozen(7) is scene

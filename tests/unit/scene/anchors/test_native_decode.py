@@ -13,7 +13,7 @@ from scene_experts.scene.anchors.mlp import CHANNELS, HeadWeights
 pytestmark = pytest.mark.skipif(native.load() is None, reason="no compiled library")
 ATTRIBUTES = ("opacity", "cov", "color")
 ACTIVATIONS = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid}
-LEVELS = [level for level in native.levels() if native.path(level)]
+LEVELS = [level for level in native.list_levels() if native.find(level)]
 
 
 def problem(A=70, N=100, K=4, F=8, H=16, E=3, k=2, distance=(), bias=True, seed=0, shuffled=False, depth=2, position=()):
@@ -194,10 +194,10 @@ def test_builds_agree_and_threads_change_nothing(level, case, monkeypatch):
     data = problem(**CASES[case])
     best = run_native(*data)
     library = native.load(level)
-    monkeypatch.setattr(native, "load", lambda: library)
+    monkeypatch.setattr(native, "load", lambda level=None: library)
     found = []
     for threads in (1, 3):
-        monkeypatch.setattr(native, "threads", lambda n=threads: n)
+        monkeypatch.setattr(native, "count_threads", lambda n=threads: n)
         found.append(run_native(*data))
     compare(found[0][0].colors, best[0].colors.double(), name="colors")
     for name, gradient in found[0][3].items():
@@ -251,7 +251,7 @@ def test_tiny_opacities_keep_their_sign():
 @pytest.mark.parametrize("level", LEVELS)
 def test_broken_features_break_values_not_memory(level, monkeypatch):
     library = native.load(level)
-    monkeypatch.setattr(native, "load", lambda: library)
+    monkeypatch.setattr(native, "load", lambda level=None: library)
     rows, columns, camera, heads, with_dist = problem()
     columns["feature"][::3] = float("nan")
     columns["feature"][1::3] = float("inf")

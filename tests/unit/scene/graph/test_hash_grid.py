@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.scene.graph import hash_grid
+from scene_experts.native import library as native
 from scene_experts.scene.graph.hash_grid import PRIMES, Grid, HashGrid, encode
 
 SMALL = HashGrid(levels=5, features=3, log2_table=7, base=2, growth=1.6)
@@ -94,7 +94,7 @@ def test_no_places_and_sizes_that_cannot_be():
             HashGrid(**wrong).check()
 
 
-@pytest.mark.skipif(hash_grid._library() is None, reason="needs the compiled library")
+@pytest.mark.skipif(native.load() is None, reason="needs the compiled library")
 @pytest.mark.parametrize("config", [HashGrid(), SMALL, HashGrid(levels=3, features=1, coordinates="world")])
 def test_the_compiled_form_is_the_plain_one(config, monkeypatch):
     grid = built(config, torch.float32)
@@ -109,6 +109,6 @@ def test_the_compiled_form_is_the_plain_one(config, monkeypatch):
         compiled = both()
         assert all(torch.equal(a, b) for a, b in zip(compiled, both()))
         with monkeypatch.context() as without:
-            without.setattr(hash_grid, "_library", lambda: None)
+            without.setattr(native, "load", lambda level=None: None)
             for a, b in zip(compiled, both()):
                 torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)

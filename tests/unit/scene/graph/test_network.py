@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from scene_experts.scene.graph import network as graph
+from scene_experts.native import library as native
 from scene_experts.scene.graph.network import Graph, blended
 
 
@@ -83,7 +83,7 @@ def test_points_in_one_place_stay_finite():
     assert torch.isfinite(blended(features(4).float(), found, weight)).all()
 
 
-@pytest.mark.skipif(graph._library() is None, reason="needs the compiled library")
+@pytest.mark.skipif(native.load() is None, reason="needs the compiled library")
 @pytest.mark.parametrize(("n", "seen", "F"), [(3000, 1700, 32), (600, 600, 5), (50, 3, 32), (20, 0, 8), (1, 1, 1)])
 def test_the_compiled_form_is_the_plain_one(n, seen, F, monkeypatch):
     found, weight = Graph.of(points(n, torch.float32), 10).among(torch.randperm(n)[:seen])
@@ -96,6 +96,6 @@ def test_the_compiled_form_is_the_plain_one(n, seen, F, monkeypatch):
 
     compiled = both()
     assert all(torch.equal(a, b) for a, b in zip(compiled, both()))
-    monkeypatch.setattr(graph, "_library", lambda: None)
+    monkeypatch.setattr(native, "load", lambda level=None: None)
     for a, b in zip(compiled, both()):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)

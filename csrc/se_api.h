@@ -1,0 +1,191 @@
+// The C interface of the native library: every exported function and every structure that crosses it.
+//
+// src/scene_experts/native/api.py declares the same for Python, and tests/unit/native/test_api.py holds the two equal. After a change
+// here, change api.py and raise its ABI_VERSION. The build compiles that number into se_abi_version(), and Python refuses a library
+// whose number differs.
+//
+// Arrays are contiguous and row-major. `float` is 32 bits. A pointer may be null only where its comment says so. Functions that return
+// int32_t return 0 on success and 1 when memory runs out. `threads` is the largest number of threads used, including the caller.
+//
+// Symbols: A anchors in view, N rows of a table, K Gaussians per anchor, F feature channels, E experts, k experts per anchor (0: dense),
+// H hidden units, L middle layers, D inputs of the first layer, M Gaussians.
+#ifndef SE_API_H
+#define SE_API_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+#define SE_EXTERN_C extern "C"
+#else
+#define SE_EXTERN_C
+#endif
+#if defined(_WIN32)
+#define SE_EXPORT SE_EXTERN_C __declspec(dllexport)
+#else
+#define SE_EXPORT SE_EXTERN_C __attribute__((visibility("default")))
+#endif
+
+// ---- Library --------------------------------------------------------------------------------------------------------------------
+
+// Return the number of this interface, ABI_VERSION of api.py.
+SE_EXPORT int32_t se_abi_version(void);
+
+// Run `chunks` chunks of independent multiply-adds and return how many single multiply-adds that was. For benchmarks.
+SE_EXPORT double se_benchmark_multiply_adds(int64_t chunks, int32_t threads);
+
+// ---- Rasteriser -----------------------------------------------------------------------------------------------------------------
+
+typedef struct {
+  float view[12];  // the rows of [R | t], world to camera
+  float fx, fy, cx, cy, near_plane;
+  int32_t width, height;  // pixels
+} SeCamera;
+
+typedef struct {
+  SeCamera camera;
+  int32_t antialias, threads;
+  int64_t m;                                                 // M
+  const float *means, *quats, *scales, *opacities, *colors;  // [M, 3] [M, 4] [M, 3] [M] [M, 3]
+  const float* background;                                   // [3]
+  float *image, *alpha, *depth;                              // output: [height, width, 3] [height, width] [height, width]
+  int32_t* radii;                                            // output: [M], pixels; 0 outside of the image
+} SeRasterForward;
+
+typedef struct {
+  int32_t deterministic, threads;
+  const float *means, *quats, *scales, *opacities, *colors;  // those of the forward pass
+  const float* background;
+  const float *g_image, *g_alpha, *g_depth;  // gradients of the outputs; null: zero
+  float *d_means, *d_quats, *d_scales, *d_opacities, *d_colors, *d_mean2d, *d_background;  // output; d_mean2d [M, 2], in NDC units
+} SeRasterBackward;
+
+// Render. With `state`, *state holds what the backward pass needs; pass it to se_raster_release once. Null: keep nothing.
+SE_EXPORT int32_t se_raster_forward(const SeRasterForward* call, void** state);
+SE_EXPORT int32_t se_raster_backward(void* state, const SeRasterBackward* call);
+SE_EXPORT void se_raster_release(void* state);
+// visible [m]: 1 where an unrotated Gaussian at means [m, 3] with scales [m, 3] would be drawn, else 0.
+SE_EXPORT void se_raster_find_visible(const SeCamera* camera, const float* means, const float* scales, int64_t m, uint8_t* visible,
+                                      int32_t threads);
+// For benchmarks. counts [3]: visible Gaussians, (Gaussian, tile) pairs, (Gaussian, block) pairs drawn. seconds [5]: time of each stage.
+SE_EXPORT void se_raster_count(const void* state, int64_t* counts, double* seconds);
+
+// ---- Decode of anchors ----------------------------------------------------------------------------------------------------------
+
+typedef struct {
+  const float *router_w, *router_b;  // [E, F] or [E, F + 3], [E]; null without a router, router_b also without a bias
+  const float *w1, *b1;              // [E, H, D] [E, H]
+  const float *middle_w, *middle_b;  // [E, L, H, H] [E, L, H]; null if L = 0
+  const float *w2, *b2;              // [E, out, H] [E, out]
+  float* gates;                      // [A, E], softmax over all logits; null without a router
+  int64_t* chosen;                   // [A, k]; null without a router or if k = 0
+  float* chosen_weight;              // [A, k], mixture weights of the chosen experts; null like `chosen`
+  float *d_router_w, *d_router_b, *d_w1, *d_b1, *d_middle_w, *d_middle_b, *d_w2, *d_b2;  // gradients; null like the tensors
+  const float* d_gates;        // [A, E]; null: zero
+  int64_t E, k, H, L, out;     // out: outputs of an expert
+  int64_t distance, position;  // 1 if the first layer sees the distance; 1 if the router sees the position
+} SeDecodeHead;
+
+typedef struct {
+  const int64_t* rows;                                                         // [A], rows of the table
+  const float *xyz, *feature, *log_scaling, *offsets, *camera;                 // [N, 3] [N, F] [N, 6] [N, K, 3] [3]
+  float* raw;                                                                  // [A, K], raw opacities
+  int64_t* starts;                                                             // [se_decode_chunks(A) + 1], a chunk's first Gaussian
+  float *means, *quats, *scales, *opacities, *colors;                          // [M, 3] [M, 4] [M, 3] [M] [M, 3]
+  float* per_length;                                                           // [M], 1 / length of the mixed quaternion
+  int64_t* source;                                                             // [M], row * K + slot
+  const float *d_means, *d_quats, *d_scales, *d_opacities, *d_colors, *d_raw;  // null: zero
+  float *d_feature, *d_log_scaling, *d_offsets;                                // [N, ...]
+  int64_t A, N, K, F, threads;
+  int64_t ascending;      // 1 if `rows` ascend: the backward pass then writes zeros to all other rows of the table
+  int64_t frozen;         // 1 if gates, chosen and chosen_weight are given, for all N rows
+  double extent;          // the router sees xyz / extent
+  SeDecodeHead heads[3];  // opacity, covariance, colour
+} SeDecode;
+
+// Return the number of chunks that A anchors make.
+SE_EXPORT int64_t se_decode_chunks(int64_t anchors);
+// Fill gates, chosen and chosen_weight.
+SE_EXPORT int32_t se_decode_route(const SeDecode* call);
+// Route (unless frozen) and fill raw and starts; the last entry of starts is M, the number of positive opacities.
+SE_EXPORT int32_t se_decode_begin(const SeDecode* call);
+// Fill the M Gaussians in the order of (anchor, slot).
+SE_EXPORT int32_t se_decode_emit(const SeDecode* call);
+// Fill all gradients.
+SE_EXPORT int32_t se_decode_backward(const SeDecode* call);
+
+// ---- Losses ---------------------------------------------------------------------------------------------------------------------
+
+// out[0] = mean |x - y| and out[1] = 1 - mean SSIM of two images [H, W, 3]; gradient [H, W, 3] (or null) =
+// d (weight_l1 out[0] + weight_ssim out[1]) / dx.
+SE_EXPORT int32_t se_photometric_loss(const float* x, const float* y, int64_t H, int64_t W, float weight_l1, float weight_ssim,
+                                      int32_t threads, float* gradient, double* out);
+// Return the number of partial sums of a sum over `count` values. The caller adds them in order, which gives the same bits for every
+// number of threads.
+SE_EXPORT int64_t se_sum_chunks(int64_t count);
+// partial [se_sum_chunks(count)]: sums of sx sy sz over scales [count, 3].
+SE_EXPORT void se_volume_forward(const float* scales, int64_t count, double* partial, int32_t threads);
+// gradient [count, 3] = upstream times the gradient of the sum.
+SE_EXPORT void se_volume_backward(const float* scales, int64_t count, float upstream, float* gradient, int32_t threads);
+// partial [se_sum_chunks(count)]: sums of max(0, tau - raw) over raw [count].
+SE_EXPORT void se_hinge_forward(const float* raw, int64_t count, float tau, double* partial, int32_t threads);
+SE_EXPORT void se_hinge_backward(const float* raw, int64_t count, float tau, float upstream, float* gradient, int32_t threads);
+
+// ---- Adam -----------------------------------------------------------------------------------------------------------------------
+
+typedef struct {
+  float* value;
+  const float* gradient;
+  float *first, *second;   // moments
+  const int64_t* rows;     // [count], the rows to update; null: all
+  int64_t count, width;    // with rows: their number and the elements of one row; else all elements and 1
+  double step_size, root;  // learning rate / (1 - beta1^t), sqrt(1 - beta2^t)
+} SeAdamTensor;
+
+// Update `count` tensors by one step of Adam.
+SE_EXPORT void se_adam_step(const SeAdamTensor* tensors, int64_t count, double beta1, double beta2, double eps, int32_t threads);
+
+// ---- Spherical harmonics --------------------------------------------------------------------------------------------------------
+
+// out [count, 3]: colours of Gaussians at means [count, 3] seen from position [3]. dc [N, 3] and rest [N, width, 3] are a table, of which
+// rows [count] (null: all, count = N) belong to the means.
+SE_EXPORT void se_sh_forward(const float* means, const float* dc, const float* rest, const int64_t* rows, int64_t count, int64_t width,
+                             int32_t degree, const float* position, float* out, int32_t threads);
+// Gradients of the means, and, at `rows` only, of dc and rest, from the colours [count, 3] and their gradient.
+SE_EXPORT void se_sh_backward(const float* means, const float* dc, const float* rest, const int64_t* rows, const float* position,
+                              const float* colors, const float* upstream, float* d_means, float* d_dc, float* d_rest, int64_t count,
+                              int64_t width, int32_t degree, int32_t threads);
+
+// ---- Graph of anchors and hash grid ---------------------------------------------------------------------------------------------
+
+// Invert the graph of neighbours found [A, k] (-1: none). The edges a * k + j that lead to point v are known[start[v]] up to, but not
+// including, known[start[v + 1]]. start [A + 1], known [A k].
+SE_EXPORT void se_graph_reverse(const int64_t* found, int64_t A, int64_t k, int32_t* start, int32_t* known);
+// out [A, F] = feature + share * sum over neighbours of weight (feature - least) of the neighbour; least [A, F], the minima over the points
+// that know a point.
+SE_EXPORT void se_graph_forward(const float* feature, const int64_t* found, const float* weight, const int32_t* start,
+                                const int32_t* known, int64_t A, int64_t k, int64_t F, float share, float* least, float* out,
+                                int32_t threads);
+// out [A, F]: the gradient of the features; h and shared [A, F] are scratch memory.
+SE_EXPORT void se_graph_backward(const float* feature, const float* least, const float* grad, const int64_t* found, const float* weight,
+                                 const int32_t* start, const int32_t* known, int64_t A, int64_t k, int64_t F, float share, float* h,
+                                 float* shared, float* out, int32_t threads);
+// out [A, levels, features]: features of points unit [A, 3] in the unit cube; cells and rows [levels]: cells along an axis, table rows.
+SE_EXPORT void se_grid_forward(const float* table, const float* unit, const int64_t* cells, const int64_t* rows, int64_t A, int64_t levels,
+                               int64_t features, float* out, int32_t threads);
+// Add the gradient of the table to out [sum of rows, features].
+SE_EXPORT void se_grid_backward(const float* unit, const float* grad, const int64_t* cells, const int64_t* rows, int64_t A, int64_t levels,
+                                int64_t features, float* out, int32_t threads);
+
+// ---- Density control ------------------------------------------------------------------------------------------------------------
+
+// Add one view to visits [N] and opacity [N]: rows [count], raw opacities [count, K].
+SE_EXPORT void se_observe_rows(const int64_t* rows, const float* raw, int64_t count, int64_t K, float* visits, float* opacity,
+                               int32_t threads);
+// Add the norms of gradient [count, 2] and 1 to grad and counted at source [count], where radii [count] is positive.
+SE_EXPORT void se_observe_drawn(const int32_t* radii, const float* gradient, const int64_t* source, int64_t count, float* grad,
+                                float* counted, int32_t threads);
+// means [count, 3] += Sigma eta size sigmoid(-sharpness (opacity - faint)), with eta [count, 3].
+SE_EXPORT void se_mcmc_add_noise(float* means, const float* quats, const float* log_scales, const float* raw_opacity, const float* eta,
+                                 int64_t count, float size, float sharpness, float faint, int32_t threads);
+
+#endif
