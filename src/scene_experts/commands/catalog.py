@@ -16,7 +16,7 @@ from rich.table import Table
 from scene_experts.cli import PROG
 from scene_experts.core.errors import InputError
 from scene_experts.data.fetch.catalog import COLLECTIONS, SCENES, Scene, select
-from scene_experts.data.fetch.obtain import captures_dir, obtain, present
+from scene_experts.data.fetch.obtain import captures_dir, is_present, obtain
 from scene_experts.training.config import Train, flag, flags_of
 
 SAY_EVERY = 15.0  # seconds between lines where there is no terminal
@@ -95,7 +95,7 @@ def table(scenes: tuple[Scene, ...] | list[Scene], root: Path) -> Table:
         out.add_column(name, no_wrap=True)
     for s in scenes:
         views = "" if s.views is None else str(s.views)
-        here = "yes" if present(root, s) else ""
+        here = "yes" if is_present(root, s) else ""
         out.add_row(s.name, s.collection.title, s.collection.archive.name, views, s.resolution, s.split, here)
     return out
 
@@ -114,9 +114,9 @@ def described(scene: Scene, root: Path) -> list[str]:
         f"  protocol    --resolution {scene.resolution} --split {scene.split}" + (f"; others use {scene.also}" if scene.also else ""),
         f"              --normalise none and, in recipes that have them, {numbers}",
         f"  views       {scene.views or 'not known here'}",
-        f"  place       {root / scene.path}" + (" (here)" if present(root, scene) else " (not here)"),
+        f"  place       {root / scene.path}" + (" (here)" if is_present(root, scene) else " (not here)"),
     ]
-    if not present(root, scene):
+    if not is_present(root, scene):
         lines.append(f"  by hand     put {a.name} at {root / 'archives' / a.name} and run `{PROG} download {scene.name}`,")
         lines.append(f"              or put the scene's images and sparse/0 into {root / scene.path}")
     return lines

@@ -11,7 +11,7 @@ from typing import Any
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.fetch import catalog
-from scene_experts.data.fetch.obtain import present
+from scene_experts.data.fetch.obtain import is_present
 from scene_experts.data.images import check_policy
 from scene_experts.data.readers import is_capture, unrecognised_error
 from scene_experts.recipes import RECIPES
@@ -145,7 +145,7 @@ def paper_scenes(root: Path) -> list[Scene]:
     """The paper's scenes that lie below `root`, each with the paper's protocol; trained in their own units, as the paper's code does."""
     found = []
     for scene in catalog.SCENES:
-        if present(root, scene):
+        if is_present(root, scene):
             options = {"resolution": scene.resolution, "split": scene.split, "normalise": "none"}
             found.append(Scene(scene.name, COLLECTIONS[scene.collection.key], root / scene.path, options, scene.collection.numbers))
     return found

@@ -87,7 +87,7 @@ def test_bad_words(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["download"]) == 2
     assert "expected scenes to download, found none" in capsys.readouterr().err
     assert cli.main(["info", "catalog:bonsai"]) == 2
-    assert "fetch it with `scene-experts download bonsai`" in capsys.readouterr().err
+    assert "`scene-experts download bonsai`" in capsys.readouterr().err
 
 
 def test_progress_with_and_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""One scene out of a zip or tar archive of many: only plain files below the wanted folder, within bounds, whole or not at all."""
+"""Extracts one scene from a zip or tar archive: only plain files of the wanted folder, within size limits, all of them or none."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scene_experts.core.errors import RunError
 from scene_experts.core.io import new_file_mode
 from scene_experts.data.fetch.download import Progress
 
-MOST_BYTES = 64 << 30  # of one scene; the largest of the catalog has about 3 GB
+MOST_BYTES = 64 << 30  # per scene; the largest in the catalog has about 3 GB
 MOST_FILES = 100_000
 SPARE = 64 << 20  # bytes of disk left free
 _DAMAGE = (zipfile.BadZipFile, tarfile.TarError, gzip.BadGzipFile, zlib.error, lzma.LZMAError)
@@ -29,7 +29,7 @@ _CLUTTER = ("__MACOSX", ".DS_Store")
 
 @dataclass(frozen=True)
 class Member:
-    """An entry of an archive. Names are as the archive states them: not to be trusted."""
+    """An entry of an archive. Its name comes from the archive and is not trusted."""
 
     name: str
     bytes: int
@@ -39,7 +39,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Extracted:
-    """What came out: the folder inside the archive, and how much."""
+    """The folder inside the archive that was extracted, and its size."""
 
     inside: str
     files: int
@@ -47,8 +47,8 @@ class Extracted:
 
 
 @contextmanager
-def members(archive: Path) -> Iterator[list[Member]]:
-    """The entries of a zip or tar archive (of any compression), readable while the context lasts. Raises RunError for another file."""
+def open_archive(archive: Path) -> Iterator[list[Member]]:
+    """Open a zip or tar archive of any compression and yield its entries. Raises RunError if the file is damaged or something else."""
     try:
         if zipfile.is_zipfile(archive):
             with zipfile.ZipFile(archive) as opened:
@@ -59,7 +59,7 @@ def members(archive: Path) -> Iterator[list[Member]]:
     except (*_DAMAGE, EOFError, NotImplementedError) as error:
         reason = str(error).partition("\n")[0].rstrip(":")
         raise RunError(
-            f"expected a whole zip or tar archive at {archive}, found a damaged one ({reason}); remove it and run the command again"
+            f"expected a complete zip or tar archive at {archive}, found a damaged one ({reason}); remove it and run the command again"
         ) from error
 
 
@@ -79,15 +79,19 @@ def _from_tar(opened: tarfile.TarFile, info: tarfile.TarInfo) -> Member:
 
 
 def extract(archive: Path, scene: str, into: Path, inside: Sequence[str] = (), progress: Progress | None = None) -> Extracted:
-    """Write the files of `scene` to the folder `into`, which appears whole or not at all.
+    """Write the files of `scene` to the folder `into`. The folder appears when it is complete.
 
-    inside: where in the archive it is expected, e.g. "tandt/truck"; else the one folder of that name which holds `images`.
-    progress: told bytes so far and in all. Raises RunError for damage, a link or a name that leads outside, more than MOST_BYTES or
-    MOST_FILES, too small a disk, or an archive without the scene.
+    Args:
+        inside: Expected folders in the archive, e.g. "tandt/truck". Otherwise the only folder of that name that contains `images` is used.
+        progress: Called with the bytes so far and in total.
+
+    Raises:
+        RunError: if the archive is damaged, does not contain the scene, contains a link or a name that leads outside the folder,
+            exceeds MOST_BYTES or MOST_FILES, or does not fit on the disk.
     """
-    with members(archive) as entries:
-        prefix = find(entries, scene, inside, archive)
-        wanted = [(parts, m) for m in entries if (parts := _below(m.name, prefix)) and m.kind != "folder" and not _clutter(parts)]
+    with open_archive(archive) as entries:
+        prefix = find_scene(entries, scene, inside, archive)
+        wanted = [(parts, m) for m in entries if (parts := _parts_after(m.name, prefix)) and m.kind != "folder" and not _is_clutter(parts)]
         total = _check(wanted, archive)
         _expect_room(into, total)
         temporary = Path(tempfile.mkdtemp(dir=into.parent, prefix=f".{into.name}.", suffix=".part"))
@@ -111,12 +115,12 @@ def extract(archive: Path, scene: str, into: Path, inside: Sequence[str] = (), p
 
 
 def _copy(source: IO[bytes], stream: IO[bytes], member: Member, done: int, total: int, progress: Progress | None) -> int:
-    """Copy one entry, never more than it says it holds; a zip's checksums are verified on the way."""
+    """Copy one entry, at most as many bytes as it declares. Reading a zip entry verifies its checksum."""
     left = member.bytes
     while block := source.read(min(1 << 20, left + 1)):
         left -= len(block)
         if left < 0:
-            raise EOFError(f"{member.name} is longer than it says")
+            raise EOFError(f"{member.name} is longer than declared")
         stream.write(block)
         done += len(block)
         if progress:
@@ -126,41 +130,46 @@ def _copy(source: IO[bytes], stream: IO[bytes], member: Member, done: int, total
     return done
 
 
-def find(entries: Sequence[Member], scene: str, inside: Sequence[str], archive: Path) -> tuple[str, ...]:
-    """The folder of `scene` as parts of its path: one of `inside` if it is there, else the only folder of that name that holds images."""
-    folders = {parts[: parts.index("images")] for m in entries if "images" in (parts := _parts(m.name))}
+def find_scene(entries: Sequence[Member], scene: str, inside: Sequence[str], archive: Path) -> tuple[str, ...]:
+    """Return the folder of `scene` as path parts.
+
+    It is one of `inside` if present, otherwise the only folder of that name with images.
+    """
+    folders = {parts[: parts.index("images")] for m in entries if "images" in (parts := _split_name(m.name))}
     for place in inside:
-        if _parts(place) in folders:
-            return _parts(place)
+        if _split_name(place) in folders:
+            return _split_name(place)
     found = sorted(f for f in folders if f and f[-1].lower() == scene.lower())
     if len(found) == 1:
         return found[0]
-    names = ", ".join(sorted({f[-1] for f in folders if f})[:20]) or "no folder that holds images"
+    names = ", ".join(sorted({f[-1] for f in folders if f})[:20]) or "no folder with images"
     raise RunError(
-        f"expected one folder {scene} that holds images in {archive.name}, found {len(found) or names}; "
-        f"the archive has changed: extract the scene by hand (see `scene-experts catalog {scene}`)"
+        f"expected one folder {scene} with images in {archive.name}, found {len(found) or names}; "
+        f"the archive has changed, so extract the scene by hand (see `scene-experts catalog {scene}`)"
     )
 
 
 def _check(wanted: Sequence[tuple[tuple[str, ...], Member]], archive: Path) -> int:
-    """Bytes of the entries `wanted`. Raises RunError for one that cannot be trusted."""
+    """Return the total size in bytes of the entries `wanted`. Raises RunError if one of them is not trustworthy."""
 
     def refuse(found: str) -> RunError:
-        return RunError(f"expected plain files of a scene in {archive.name}, found {found}; do not trust this archive: remove it")
+        return RunError(f"expected plain files of a scene in {archive.name}, found {found}; remove this archive, it is not trustworthy")
 
     seen: set[str] = set()
     for parts, member in wanted:
         if member.kind == "other":
             raise refuse(f"a link, a device or an encrypted file ({member.name})")
         if any(part in ("..", ".") or "\\" in part or ":" in part or "\0" in part for part in parts):
-            raise refuse(f"a name that leads elsewhere ({member.name})")
+            raise refuse(f"a name that leads outside the folder ({member.name})")
         name = "/".join(parts)
         if name in seen:
-            raise refuse(f"two files of one name ({member.name})")
+            raise refuse(f"two files with the same name ({member.name})")
         seen.add(name)
     total = sum(member.bytes for _, member in wanted)
     if total > MOST_BYTES or len(wanted) > MOST_FILES:
-        raise refuse(f"{len(wanted):,} files of {total / 1e9:,.0f} GB, where {MOST_FILES:,} and {MOST_BYTES / 1e9:.0f} GB are the most")
+        raise refuse(
+            f"{len(wanted):,} files of {total / 1e9:,.0f} GB (at most {MOST_FILES:,} files of {MOST_BYTES / 1e9:.0f} GB are allowed)"
+        )
     return total
 
 
@@ -174,17 +183,17 @@ def _expect_room(into: Path, total: int) -> None:
         )
 
 
-def _parts(name: str) -> tuple[str, ...]:
-    """The parts of a name; a leading "./" and doubled slashes do not count."""
+def _split_name(name: str) -> tuple[str, ...]:
+    """Split a name into its parts, without a leading "./" and empty parts."""
     parts = tuple(part for part in name.split("/") if part)
     return parts[1:] if parts[:1] == (".",) else parts
 
 
-def _below(name: str, prefix: tuple[str, ...]) -> tuple[str, ...]:
-    """The rest of `name` below the folder `prefix`, or nothing where it is not below."""
-    parts = _parts(name)
+def _parts_after(name: str, prefix: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the parts of `name` after the folder `prefix`, or an empty tuple if it is not inside that folder."""
+    parts = _split_name(name)
     return parts[len(prefix) :] if parts[: len(prefix)] == prefix else ()
 
 
-def _clutter(parts: tuple[str, ...]) -> bool:
+def _is_clutter(parts: tuple[str, ...]) -> bool:
     return any(part in _CLUTTER or part.startswith("._") for part in parts)

@@ -1,7 +1,7 @@
-"""The 17 scenes of the paper: where their owners publish them, under which terms, and how the paper reads them.
+"""The 17 scenes of the paper: where their owners publish them, under which terms, and in which protocol the paper evaluates them.
 
-Facts as published by the owners of the data; a checksum stands here only where many independent users report the same one. Nothing here
-touches the network or the disk; `data.obtain` does.
+The facts are those that the owners of the data publish. A checksum is listed only if many independent users report the same one.
+This module uses neither the network nor the disk; `data.fetch.obtain` does.
 """
 
 from __future__ import annotations
@@ -17,45 +17,45 @@ Numbers = tuple[tuple[str, float | int | str], ...]
 
 @dataclass(frozen=True)
 class Archive:
-    """A file that holds several scenes."""
+    """A file that contains several scenes."""
 
     name: str
-    urls: tuple[str, ...]  # tried in order; the owners' own address first
-    page: str  # where people find it
-    size: str  # for people
-    bytes: int | None = None  # exact; None: not known here
-    sha256: str | None = None  # None: not published; the first download's is kept and later ones are compared with it
+    urls: tuple[str, ...]  # tried in order; the owner's address comes first
+    page: str  # web page of the data set
+    size: str  # as shown to users
+    bytes: int | None = None  # exact; None: unknown
+    sha256: str | None = None  # None: not published; later downloads are compared with the first
     notes: str = ""
 
 
 @dataclass(frozen=True)
 class Collection:
-    """A data set: scenes of one owner, in one archive."""
+    """A data set: the scenes of one owner, in one archive."""
 
     key: str
     title: str
     archive: Archive
-    licence: str  # as its owner states it
-    source: str  # who made it
+    licence: str  # as the owner states it
+    source: str  # publication of its authors
     numbers: Numbers = ()
-    """What the scripts of Scaffold-GS and Octree-GS set for its scenes, by where a training keeps it; in the captures' own units."""
+    """Settings of the scripts of Scaffold-GS and Octree-GS for these scenes, by the field of `Train`; in the captures' own units."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene and the protocol of the paper, which evaluates as 3DGS does (Kerbl et al. 2023): its image sizes, every 8th view held out."""
+    """A scene and its protocol in the paper: image sizes and held-out views as in 3DGS (Kerbl et al. 2023)."""
 
     name: str
     collection: Collection
-    inside: tuple[str, ...]  # places in the archive where it may lie
+    inside: tuple[str, ...]  # possible folders in the archive
     resolution: str  # policy of `--resolution`
     split: str = "mod8"
-    views: int | None = None  # photographs; None: not known here
+    views: int | None = None  # number of photographs; None: unknown
     also: str = ""  # other protocols in use
 
     @property
     def path(self) -> str:
-        """Its folder below the captures' folder, and its full name."""
+        """Its folder inside the folder of captures, which is also its full name."""
         return f"{self.collection.key}/{self.name}"
 
 
@@ -141,9 +141,10 @@ COLLECTIONS = (MIPNERF360, TANDT, DEEP_BLENDING, BUNGEENERF)
 
 
 def select(words: Sequence[str]) -> list[Scene]:
-    """The scenes that `words` name: a scene ("bonsai", "mipnerf360/bonsai"), a data set ("tandt") or "all"; each once, in catalog order.
+    """Return the scenes that `words` name, each once and in catalog order.
 
-    Raises InputError for a word that is none of them, with the nearest names.
+    A word names a scene ("bonsai", "mipnerf360/bonsai"), a data set ("tandt") or everything ("all").
+    Raises InputError for any other word and suggests the nearest names.
     """
     chosen: list[Scene] = []
     for word in words:
@@ -159,10 +160,10 @@ def select(words: Sequence[str]) -> list[Scene]:
 
 
 def one(word: str) -> Scene:
-    """The scene that `word` names. Raises InputError for none and for several."""
+    """Return the scene that `word` names. Raises InputError if it names none or several."""
     found = select([word])
     if len(found) != 1:
-        raise InputError(f"expected one scene of the catalog, found '{word}', which is {len(found)}; name one of {_names(found)}")
+        raise InputError(f"expected one scene of the catalog, found '{word}', which names {len(found)}; choose one of {_names(found)}")
     return found[0]
 
 

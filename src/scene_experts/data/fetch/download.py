@@ -1,4 +1,4 @@
-"""Files over HTTP: continued where a download stopped, tried at several addresses, checked, and put in place whole or not at all."""
+"""Downloads files over HTTP: resumes interrupted downloads, tries several addresses, verifies checksums and writes atomically."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from scene_experts.core.errors import InputError, RunError
 
 Progress = Callable[[int, int], None]  # bytes so far, bytes in all (0: unknown)
 Say = Callable[[str], None]
-TRIES = 4  # attempts at one address that bring nothing new, before the next address
-PATIENCE = 1.0  # seconds before the second attempt; doubled each time
+TRIES = 4  # attempts without progress at one address before the next address is tried
+PATIENCE = 1.0  # seconds before the second attempt; doubles with each attempt
 SPARE = 64 << 20  # bytes of disk left free
 
 
 @dataclass(frozen=True)
 class Fetched:
-    """What was fetched, and from where."""
+    """A downloaded file."""
 
     url: str
     bytes: int
@@ -37,28 +37,28 @@ class Fetched:
 
 
 @dataclass(frozen=True)
-class _Begun:
-    """What is known of the file that a part is the beginning of; kept beside it."""
+class _Partial:
+    """Facts about the file that a partial download belongs to. They are stored beside it."""
 
     url: str = ""
-    version: str = ""  # the server's ETag or date of change, so that a changed file is not continued
-    md5: str = ""  # as the server states it
+    version: str = ""  # the server's ETag or modification date, so that a changed file is not resumed
+    md5: str = ""  # stated by the server
 
 
 class _Refused(Exception):
-    """This address does not serve the file; trying again would not help."""
+    """The address does not serve the file, and trying again would not help."""
 
 
 def sha256(path: Path) -> str:
-    """Hexadecimal SHA-256 of a file."""
+    """Return the SHA-256 of a file in hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def web_address(text: str) -> str:
-    """`text` if it is an http or https address; raises InputError otherwise."""
+def check_web_address(text: str) -> str:
+    """Return `text`. Raises InputError unless it is an http or https address."""
     if not re.match(r"https?://[^/\s]+", text):
-        raise InputError(f"expected an address that begins with http:// or https://, found '{text}'; correct it")
+        raise InputError(f"expected an address that begins with http:// or https://, found '{text}'; correct the address")
     return text
 
 
@@ -72,12 +72,19 @@ def fetch(
     say: Say | None = None,
     advice: str = "",
 ) -> Fetched:
-    """Download the file that is at any of `urls`, tried in order, to `path`.
+    """Download a file to `path` from the first of `urls` that serves it.
 
-    digest: the SHA-256 it must have; without one, what the server itself states (an MD5, the length) is all that can be checked.
-    size: its exact bytes, where known.  say: told why an address was given up.  advice: ends the error, what else the user can do.
-    What an interrupted download left in `<name>.part` is continued where the server allows it. Content with another checksum is removed.
-    Raises RunError when no address serves the right content, or the disk is too small.
+    An interrupted download leaves `<name>.part`, which is resumed if the server allows it. Content with a wrong checksum is removed.
+
+    Args:
+        digest: Expected SHA-256. Without it, only the length and the MD5 that the server states are verified.
+        size: Expected size in bytes, if known.
+        progress: Called with the bytes so far and in total (0: unknown).
+        say: Called with the reason when an address is given up.
+        advice: Ends the error message with what else the user can do.
+
+    Raises:
+        RunError: if no address serves the expected content or the disk is too small.
     """
     if digest and path.is_file() and sha256(path) == digest:
         return Fetched("", path.stat().st_size, digest)
@@ -85,29 +92,29 @@ def fetch(
     reasons: list[str] = []
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _alone(part):
+        with _lock(part):
             if digest and part.is_file() and sha256(part) == digest:
-                return _placed(part, path, "", digest)
+                return _move_into_place(part, path, "", digest)
             for number, url in enumerate(urls, 1):
                 try:
-                    return _placed(part, path, url, _from(url, part, digest, size, progress))
+                    return _move_into_place(part, path, url, _download(url, part, digest, size, progress))
                 except _Refused as error:
                     reasons.append(f"{url}: {error}")
                     if say and number < len(urls):
                         say(f"{reasons[-1]}; trying the next address")
     except OSError as error:
         raise RunError(f"cannot download to {path}: {error.strerror or error}; free some space or choose another folder") from error
-    raise RunError(f"cannot download {'; '.join(reasons)}; run the command again to continue it{advice and ', or '}{advice}")
+    raise RunError(f"cannot download {'; '.join(reasons)}; run the command again to resume{advice and ', or '}{advice}")
 
 
-def _placed(part: Path, path: Path, url: str, found: str) -> Fetched:
+def _move_into_place(part: Path, path: Path, url: str, found: str) -> Fetched:
     part.replace(path)
-    _note(part).unlink(missing_ok=True)
+    _note_path(part).unlink(missing_ok=True)
     return Fetched(url, path.stat().st_size, found)
 
 
-def _from(url: str, part: Path, digest: str | None, size: int | None, progress: Progress | None) -> str:
-    """Complete `part` from one address and return its SHA-256. Raises _Refused when that fails."""
+def _download(url: str, part: Path, digest: str | None, size: int | None, progress: Progress | None) -> str:
+    """Complete `part` from one address and return its SHA-256. Raises _Refused if that fails."""
     tries = 0
     while True:
         before = part.stat().st_size if part.is_file() else 0
@@ -125,14 +132,14 @@ def _from(url: str, part: Path, digest: str | None, size: int | None, progress: 
             raise _Refused(reason)
         time.sleep(PATIENCE * 2 ** (tries - 1))
     try:
-        return _checked(part, begun, digest, size)
+        return _verify(part, begun, digest, size)
     except _Refused:
-        _forget(part)
+        _remove_part(part)
         raise
 
 
-def _checked(part: Path, begun: _Begun, digest: str | None, size: int | None) -> str:
-    """The SHA-256 of a complete download whose length and checksums are as they should be."""
+def _verify(part: Path, begun: _Partial, digest: str | None, size: int | None) -> str:
+    """Return the SHA-256 of a complete download. Raises _Refused if its length or a checksum is wrong."""
     if size is not None and part.stat().st_size != size:
         raise _Refused(f"expected {size:,} bytes, found {part.stat().st_size:,}")
     if digest is None and begun.md5:
@@ -146,10 +153,10 @@ def _checked(part: Path, begun: _Begun, digest: str | None, size: int | None) ->
     return found
 
 
-def _continue(url: str, part: Path, known: bool, size: int | None, progress: Progress | None) -> _Begun:
-    """Append what is missing of `url` to `part`, or start over where the server sends the whole file.
+def _continue(url: str, part: Path, known: bool, size: int | None, progress: Progress | None) -> _Partial:
+    """Append the missing bytes of `url` to `part`, or start over if the server sends the whole file.
 
-    known: the checksum is, so a part from another address may be continued too; a wrong one is found out at the end.
+    known: Whether the checksum is known. Then a part from another address is resumed, too, because the checksum is verified at the end.
     """
     have, begun = _resumable(url, part, known)
     headers = {"User-Agent": "scene-experts", "Accept-Encoding": "identity"}
@@ -158,25 +165,25 @@ def _continue(url: str, part: Path, known: bool, size: int | None, progress: Pro
         if begun.url == url and begun.version:
             headers["If-Range"] = begun.version
     try:
-        answer = urllib.request.urlopen(urllib.request.Request(web_address(url), headers=headers), timeout=60)
+        answer = urllib.request.urlopen(urllib.request.Request(check_web_address(url), headers=headers), timeout=60)
     except urllib.error.HTTPError as error:
-        if error.code != 416 or not have:  # 416: there is nothing after what we have
+        if error.code != 416 or not have:  # 416: no bytes follow those we have
             raise
         if error.headers.get("Content-Range") == f"bytes */{have}" or have == size:
-            return begun  # it was whole
-        _forget(part)
+            return begun  # the part is complete
+        _remove_part(part)
         return _continue(url, part, known, size, progress)
     with answer:
         resumed = answer.status == 206 and (answer.headers.get("Content-Range") or f"bytes {have}-").startswith(f"bytes {have}-")
         if answer.status == 206 and not resumed:
-            raise _Refused("the server sent another range than was asked for")
+            raise _Refused("the server sent another byte range than requested")
         have = have if resumed else 0
         total = have + int(answer.headers.get("Content-Length") or 0)
         _expect_file(answer.headers.get("Content-Type") or "", total if total > have else 0, size)
         _expect_room(part, total - have)
         if not resumed:
-            begun = _Begun(url, _version(answer.headers), _stated_md5(answer.headers))
-            _note(part).write_text(json.dumps(asdict(begun)))
+            begun = _Partial(url, _read_version(answer.headers), _read_md5(answer.headers))
+            _note_path(part).write_text(json.dumps(asdict(begun)))
         have = _append(answer, part, have, total if total > have else 0, progress)
     if have < total:
         raise ConnectionError(f"the connection ended after {have} of {total} bytes")
@@ -193,26 +200,26 @@ def _append(answer: http.client.HTTPResponse, part: Path, have: int, total: int,
     return have
 
 
-def _resumable(url: str, part: Path, known: bool) -> tuple[int, _Begun]:
-    """Bytes of `part` that `url` may continue, and what is known of their file; (0, ...) to begin anew."""
+def _resumable(url: str, part: Path, known: bool) -> tuple[int, _Partial]:
+    """Return the number of bytes of `part` that `url` can continue (0: start over), and the facts about their file."""
     have = part.stat().st_size if part.is_file() else 0
-    begun = _Begun()
+    begun = _Partial()
     with suppress(OSError, ValueError, TypeError):
-        begun = _Begun(**json.loads(_note(part).read_text()))
+        begun = _Partial(**json.loads(_note_path(part).read_text()))
     same = begun.url == url and begun.version != ""
     return (have, begun) if have and (known or same) else (0, begun)
 
 
 def _expect_file(kind: str, total: int, size: int | None) -> None:
-    """Raises _Refused for an answer that cannot be the file: a web page (moved, a quota used up), another length."""
+    """Raise _Refused for an answer that is not the file: a web page (file moved, quota used up) or another length."""
     if kind.partition(";")[0].strip().lower() in ("text/html", "application/xhtml+xml"):
-        raise _Refused("the server sent a web page instead of the file (it moved, or its quota of downloads is used up)")
+        raise _Refused("the server sent a web page instead of the file (the file moved, or its download quota is used up)")
     if size is not None and total and total != size:
         raise _Refused(f"expected {size:,} bytes, found {total:,}")
 
 
 def _expect_room(part: Path, missing: int) -> None:
-    """Raises RunError where the disk cannot take `missing` more bytes."""
+    """Raise RunError if the disk has no room for `missing` more bytes."""
     free = shutil.disk_usage(part.parent).free
     if missing + SPARE > free:
         raise RunError(
@@ -221,45 +228,45 @@ def _expect_room(part: Path, missing: int) -> None:
         )
 
 
-def _version(headers: http.client.HTTPMessage) -> str:
-    """A strong ETag, else the date of the last change, else nothing."""
+def _read_version(headers: http.client.HTTPMessage) -> str:
+    """Return a strong ETag, otherwise the modification date, otherwise an empty string."""
     tag = headers.get("ETag") or ""
     return tag if tag.startswith('"') else headers.get("Last-Modified") or ""
 
 
-def _stated_md5(headers: http.client.HTTPMessage) -> str:
-    """The MD5 of the whole file that a server states (Google Cloud Storage: x-goog-hash), in hexadecimal, or nothing."""
+def _read_md5(headers: http.client.HTTPMessage) -> str:
+    """Return the MD5 of the whole file in hexadecimal if the server states it (x-goog-hash), otherwise an empty string."""
     for value in headers.get_all("x-goog-hash") or []:
         if found := re.search(r"md5=([A-Za-z0-9+/]{22}==)", value):
             return base64.b64decode(found[1]).hex()
     return ""
 
 
-def _note(part: Path) -> Path:
+def _note_path(part: Path) -> Path:
     return part.with_name(part.name + ".json")
 
 
-def _forget(part: Path) -> None:
+def _remove_part(part: Path) -> None:
     part.unlink(missing_ok=True)
-    _note(part).unlink(missing_ok=True)
+    _note_path(part).unlink(missing_ok=True)
 
 
 @contextmanager
-def _alone(part: Path) -> Iterator[None]:
-    """Raises RunError while another process of this machine fetches the same file: two would interleave their blocks."""
+def _lock(part: Path) -> Iterator[None]:
+    """Hold a lock on `part`. Raises RunError while another process on this machine downloads the same file."""
     try:
         import fcntl
-    except ImportError:  # Windows: an open file cannot be replaced there, which is guard enough
+    except ImportError:  # Windows does not replace open files, which is protection enough
         yield
         return
     lock = part.with_name(part.name + ".lock")
     with lock.open("w") as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.fstat(stream.fileno()).st_ino != lock.stat().st_ino:  # the holder has just removed it, and another made it anew
+            if os.fstat(stream.fileno()).st_ino != lock.stat().st_ino:  # removed by its holder and created again by another process
                 raise FileNotFoundError(lock)
         except OSError as error:
-            raise RunError(f"another process is fetching {part.with_suffix('')} now; wait for it, then run the command again") from error
+            raise RunError(f"another process is downloading {part.with_suffix('')}; wait for it, then run the command again") from error
         try:
             yield
         finally:

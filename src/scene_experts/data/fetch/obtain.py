@@ -1,8 +1,8 @@
-"""Scenes of the catalog on this machine: fetched, checked and unpacked below one folder, and found there again.
+"""Downloads scenes of the catalog, verifies and unpacks them into one folder, and finds them there.
 
-ROOT/archives/360_v2.zip             as published; shared by its scenes, fetched once
-ROOT/archives/checksums.json         what the first download of each was, for comparison
-ROOT/mipnerf360/bonsai/              a scene: images/, sparse/0/, and source.json, which says where it came from
+ROOT/archives/360_v2.zip             an archive as published, downloaded once for all its scenes
+ROOT/archives/checksums.json         checksums of the first downloads, for comparison with later ones
+ROOT/mipnerf360/bonsai/              a scene: images/, sparse/0/, and source.json, which states its origin
 """
 
 from __future__ import annotations
@@ -16,34 +16,35 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.io import cache_dir, read_json, write_json
 from scene_experts.data.fetch.archive import extract
 from scene_experts.data.fetch.catalog import PREFIX, Archive, Scene, one
-from scene_experts.data.fetch.download import Say, fetch, sha256, web_address
+from scene_experts.data.fetch.download import Say, check_web_address, fetch, sha256
 
 VARIABLE = "SCENE_EXPERTS_CAPTURES"
-Progress = Callable[[str, int, int], None]  # what, bytes so far, bytes in all (0: unknown)
+Progress = Callable[[str, int, int], None]  # name of the work, bytes so far, bytes in total (0: unknown)
 
 
 def captures_dir() -> Path:
-    """The folder of downloaded scenes: $SCENE_EXPERTS_CAPTURES, else `captures` in this user's cache folder."""
+    """Return the folder of downloaded scenes: $SCENE_EXPERTS_CAPTURES, or `captures` in the user's cache folder."""
     return Path(os.environ.get(VARIABLE) or cache_dir() / "captures")
 
 
-def present(root: Path, scene: Scene) -> bool:
-    """Whether the scene lies below `root`, downloaded or put there by hand."""
+def is_present(root: Path, scene: Scene) -> bool:
+    """Return whether the scene is in `root`, downloaded or copied there by hand."""
     return all((root / scene.path / name).is_dir() for name in ("images", "sparse"))
 
 
 def resolve(path: Path, resolution: str, split: str) -> tuple[Path, str, str]:
-    """Folder, resolution and split of a capture named `catalog:SCENE`: the paper's protocol where those are "auto". Others as they are.
+    """Return the folder, resolution and split of a capture. A path `catalog:SCENE` is looked up, any other path is returned as it is.
 
-    Raises InputError for an unknown scene and for one that is not on this machine.
+    For a scene of the catalog, "auto" is replaced by the paper's protocol.
+    Raises InputError for an unknown scene and for a scene that is not on this machine.
     """
     if not str(path).startswith(PREFIX):
         return path, resolution, split
     scene, root = one(str(path)), captures_dir()
-    if not present(root, scene):
+    if not is_present(root, scene):
         raise InputError(
-            f"expected the scene {scene.name} at {root / scene.path}, found none; fetch it with `scene-experts download {scene.name}`, "
-            f"or set {VARIABLE} to the folder you gave as --to"
+            f"expected the scene {scene.name} at {root / scene.path}, found none; download it with `scene-experts download {scene.name}`, "
+            f"or set {VARIABLE} to the folder that was given as --to"
         )
     return root / scene.path, scene.resolution if resolution == "auto" else resolution, scene.split if split == "auto" else split
 
@@ -57,23 +58,30 @@ def obtain(
     say: Say = print,
     progress: Progress | None = None,
 ) -> None:
-    """Put `scenes` below `root`; those already there are left alone, and an archive that several share is fetched once.
+    """Download and unpack `scenes` into `root`. Scenes that are already there are not touched; shared archives are downloaded once.
 
-    mirrors: addresses of folders (or of the archive itself) to try before the owners'.  keep: leave the archives for other scenes.
-    Raises InputError for a mirror that is no web address, RunError when a source fails; what was got until then stays.
+    Args:
+        mirrors: Addresses of folders (or of the archive itself) that are tried before the owner's address.
+        keep: Keep the archives for other scenes.
+        say: Called with each message.
+        progress: Called with the name of the work, the bytes so far and in total.
+
+    Raises:
+        InputError: if a mirror is not a web address.
+        RunError: if a download or an archive fails. What was completed before stays.
     """
     for mirror in mirrors:
-        web_address(mirror)
-    missing = [scene for scene in scenes if not present(root, scene)]
+        check_web_address(mirror)
+    missing = [scene for scene in scenes if not is_present(root, scene)]
     for scene in scenes:
         if scene not in missing:
             say(f"{scene.name} is at {root / scene.path}")
     for archive in dict.fromkeys(scene.collection.archive for scene in missing):
-        path, digest, url = _archive(archive, root, mirrors, say, progress)
+        path, digest, url = _fetch_archive(archive, root, mirrors, say, progress)
         for scene in missing:
             if scene.collection.archive == archive:
                 _unpack(scene, path, digest, root, say, progress)
-                _record(root, archive, digest, url)  # not before it has shown to be whole: later ones are compared with it
+                _write_record(root, archive, digest, url)  # only once it proved complete: later downloads are compared with it
         if not keep:
             path.unlink()
 
@@ -102,29 +110,29 @@ def _unpack(scene: Scene, archive: Path, digest: str, root: Path, say: Say, prog
     )
     photographs = sum(p.is_file() for p in (into / "images").iterdir())
     if scene.views is not None and photographs != scene.views:
-        say(f"warning: expected {scene.views} photographs of {scene.name}, found {photographs}: the owner may have changed the archive")
+        say(f"warning: expected {scene.views} photographs of {scene.name}, found {photographs}; the owner may have changed the archive")
     say(f"{scene.name}: {out.files} files, {out.bytes / 1e6:,.0f} MB at {into}")
 
 
-def _archive(archive: Archive, root: Path, mirrors: Sequence[str], say: Say, progress: Progress | None) -> tuple[Path, str, str]:
-    """The archive's file, its SHA-256 and where it was fetched from; nothing where it is there already."""
+def _fetch_archive(archive: Archive, root: Path, mirrors: Sequence[str], say: Say, progress: Progress | None) -> tuple[Path, str, str]:
+    """Return the archive's file, its SHA-256 and the address that it was downloaded from. Downloads it unless it is there."""
     path = root / "archives" / archive.name
-    known = _recorded(root).get(archive.name, {})
+    known = _read_record(root).get(archive.name, {})
     digest = archive.sha256 or known.get("sha256")
     if path.is_file():
-        return path, _verified(archive, path, known, root, say), known.get("from", "")
+        return path, _verify(archive, path, known, root, say), known.get("from", "")
     urls = [m if m.endswith(archive.name) else f"{m.rstrip('/')}/{archive.name}" for m in mirrors]
     told = (lambda done, total: progress(archive.name, done, total)) if progress else None
     got = fetch(
-        [*urls, *archive.urls], path, digest, size=archive.bytes, progress=told, say=say, advice=_by_hand(archive, path, root, known)
+        [*urls, *archive.urls], path, digest, size=archive.bytes, progress=told, say=say, advice=_manual_advice(archive, path, root, known)
     )
     if not digest:
-        say(f"{archive.name}: SHA-256 {got.sha256} (none is published; later downloads are compared with this one)")
+        say(f"{archive.name}: SHA-256 {got.sha256} (none is published, so later downloads are compared with this one)")
     return path, got.sha256, got.url
 
 
-def _verified(archive: Archive, path: Path, known: dict, root: Path, say: Say) -> str:
-    """The SHA-256 of an archive that is there, from this tool or put there by hand; only a new or changed file is read for it."""
+def _verify(archive: Archive, path: Path, known: dict, root: Path, say: Say) -> str:
+    """Return the SHA-256 of an existing archive. Only a new or changed file is read; otherwise the recorded value is used."""
     about = path.stat()
     if known and known.get("bytes") == about.st_size and known.get("changed") == about.st_mtime_ns:
         return str(known["sha256"])
@@ -139,9 +147,9 @@ def _verified(archive: Archive, path: Path, known: dict, root: Path, say: Say) -
     return found
 
 
-def _by_hand(archive: Archive, path: Path, root: Path, known: dict) -> str:
-    """What is left to do when no address works."""
-    text = f"get {archive.name} ({archive.size}) by hand from {archive.page} and put it at {path}"
+def _manual_advice(archive: Archive, path: Path, root: Path, known: dict) -> str:
+    """Return what a user can do if no address works."""
+    text = f"download {archive.name} ({archive.size}) by hand from {archive.page} to {path}"
     if known and not archive.sha256:
         text += f"; if its owner published a new version, remove its entry in {_record_file(root)}"
     return text
@@ -151,7 +159,7 @@ def _record_file(root: Path) -> Path:
     return root / "archives" / "checksums.json"
 
 
-def _recorded(root: Path) -> dict[str, dict]:
+def _read_record(root: Path) -> dict[str, dict]:
     file = _record_file(root)
     found = read_json(file, "record of checksums") if file.is_file() else {}
     if not isinstance(found, dict) or not all(isinstance(v, dict) and isinstance(v.get("sha256"), str) for v in found.values()):
@@ -159,8 +167,8 @@ def _recorded(root: Path) -> dict[str, dict]:
     return found
 
 
-def _record(root: Path, archive: Archive, digest: str, url: str) -> None:
-    about, known = (root / "archives" / archive.name).stat(), _recorded(root)
+def _write_record(root: Path, archive: Archive, digest: str, url: str) -> None:
+    about, known = (root / "archives" / archive.name).stat(), _read_record(root)
     entry = {"sha256": digest, "bytes": about.st_size, "changed": about.st_mtime_ns, "from": url}
     if {k: known.get(archive.name, {}).get(k) for k in entry} != entry:
         when = datetime.now(UTC).isoformat(timespec="seconds")

@@ -64,16 +64,16 @@ def test_the_stated_place_wins_and_two_others_are_refused(tmp_path: Path) -> Non
     source = write_zip(tmp_path / "a.zip", {**scene("x/truck", {"images/x": b"x"}), **scene("y/truck", {"images/y": b"y"})})
     archive.extract(source, "truck", tmp_path / "one", ["y/truck"])
     assert tree(tmp_path / "one") == {"images/y": b"y"}
-    with pytest.raises(RunError, match="found 2; the archive has changed"):
+    with pytest.raises(RunError, match="found 2"):
         archive.extract(source, "truck", tmp_path / "two", ["z/truck"])
-    with pytest.raises(RunError, match=r"expected one folder train that holds images in a\.zip, found truck"):
+    with pytest.raises(RunError, match=r"train.*a\.zip, found truck"):
         archive.extract(source, "train", tmp_path / "two")
 
 
 @pytest.mark.parametrize("name", ["../evil", "images/../../evil", "images/..\\..\\evil", "C:evil", "images/./x"])
 def test_names_that_lead_elsewhere(tmp_path: Path, name: str) -> None:
     source = write_zip(tmp_path / "a.zip", {**scene("truck"), f"truck/{name}": b"evil"})
-    with pytest.raises(RunError, match=r"found a name that leads elsewhere .*; do not trust this archive"):
+    with pytest.raises(RunError, match="a name that leads outside"):
         archive.extract(source, "truck", tmp_path / "in" / "truck")
     assert not list(tmp_path.rglob("*evil*")) and not (tmp_path / "in").exists()
 
@@ -112,7 +112,7 @@ def test_two_files_of_one_name(tmp_path: Path) -> None:
     source = write_zip(tmp_path / "a.zip", scene("truck"))
     with zipfile.ZipFile(source, "a") as out, pytest.warns(UserWarning, match="Duplicate"):
         out.writestr("truck/poses.npy", b"other")
-    with pytest.raises(RunError, match="two files of one name"):
+    with pytest.raises(RunError, match="two files"):
         archive.extract(source, "truck", tmp_path / "truck")
 
 
@@ -132,14 +132,14 @@ def test_damage_leaves_nothing(tmp_path: Path) -> None:
     short.write_bytes(short.read_bytes()[:-20_000])
     flipped = damaged_bytes(write_zip(tmp_path / "flipped.zip", scene("truck"), zipfile.ZIP_STORED))
     for source in (tmp_path / "text.zip", cut, short, flipped):
-        with pytest.raises(RunError, match=r"found a damaged one \([^\n]+\); remove it"):
+        with pytest.raises(RunError, match=r"damaged one \([^\n]+\)"):
             archive.extract(source, "truck", tmp_path / "out" / "truck")
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
 
 
 def test_an_entry_longer_than_it_says_is_cut_off() -> None:
     member = archive.Member("x", 4, "file", lambda: io.BytesIO(b"12345"))
-    with pytest.raises(EOFError, match="longer than it says"):
+    with pytest.raises(EOFError, match="longer"):
         archive._copy(member.open(), io.BytesIO(), member, 0, 4, None)
     with pytest.raises(EOFError, match="ends early"):
         archive._copy(io.BytesIO(b"123"), io.BytesIO(), member, 0, 4, None)

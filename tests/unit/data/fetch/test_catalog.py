@@ -39,11 +39,11 @@ def test_words() -> None:
     assert [s.name for s in select(["truck", "mipnerf360/bonsai", "tandt", "catalog:bonsai"])] == ["bonsai", "truck", "train"]
     assert len(select(["all"])) == 17 and select([]) == []
     assert one("Quebec").path == "bungeenerf/quebec"
-    with pytest.raises(InputError, match="found 'tandt', which is 2; name one of truck, train"):
+    with pytest.raises(InputError, match=r"'tandt'.*truck, train"):
         one("tandt")
 
 
 @pytest.mark.parametrize(("word", "hint"), [("bonzai", "'bonsai'"), ("mipnerf/garden", "'mipnerf360/garden'"), ("tant", "'tandt'")])
 def test_unknown_words_are_answered_with_the_nearest(word: str, hint: str) -> None:
-    with pytest.raises(InputError, match=f"expected a scene or data set of the catalog, found '{word}'; did you mean .*{hint}"):
+    with pytest.raises(InputError, match=f"'{word}'; did you mean .*{hint}"):
         select([word])

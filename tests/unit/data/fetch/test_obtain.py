@@ -52,7 +52,7 @@ def test_an_archive_is_fetched_once(server: Server, tmp_path: Path) -> None:
     assert {told[0] for told in seen} == {"both.zip", "unpacking truck"}
     assert any("none is published" in line and digest in line for line in said)
     assert get(both, tmp_path)[0] == f"truck is at {folder}" and server.asked == [None]
-    assert all(obtain.present(tmp_path, s) for s in both)
+    assert all(obtain.is_present(tmp_path, s) for s in both)
     assert get(both, tmp_path) == [f"{s.name} is at {tmp_path / s.path}" for s in both]
 
 
@@ -98,7 +98,7 @@ def test_mirrors_come_first_and_the_owner_last(server: Server, tmp_path: Path) -
 def test_when_the_source_is_gone_the_archive_is_put_there_by_hand(server: Server, tmp_path: Path) -> None:
     data = server.files.pop("/both.zip")
     place = tmp_path / "archives" / "both.zip"
-    with pytest.raises(RunError, match=f"answered 404; run the command again.* by hand from https://owner/page and put it at {place}"):
+    with pytest.raises(RunError, match=f"answered 404.* by hand from https://owner/page.*{place}"):
         get(scenes(server), tmp_path)
     place.write_bytes(data)
     assert f"using {place}" in get(scenes(server)[:1], tmp_path)
@@ -134,7 +134,7 @@ def test_names_become_folders_with_the_papers_protocol(tmp_path: Path, monkeypat
     monkeypatch.setenv(obtain.VARIABLE, str(tmp_path))
     assert obtain.captures_dir() == tmp_path
     assert obtain.resolve(Path("some/folder"), "auto", "auto") == (Path("some/folder"), "auto", "auto")
-    with pytest.raises(InputError, match=r"expected the scene bonsai at .*mipnerf360/bonsai, found none; fetch it with .*download bonsai"):
+    with pytest.raises(InputError, match=r"mipnerf360/bonsai.*download bonsai"):
         obtain.resolve(Path("catalog:bonsai"), "auto", "auto")
     for name in ("images", "sparse"):
         (tmp_path / "mipnerf360" / "bonsai" / name).mkdir(parents=True)
