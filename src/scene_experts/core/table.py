@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Self
+
 import torch
 from torch import Tensor, nn
 
@@ -25,6 +28,13 @@ class Table(nn.Module):
 
     def __len__(self) -> int:
         return next(iter(self.columns().values())).shape[0]
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """What `.to(...)` and the like do: move parameters, facts and statistics alike. Integer columns keep their dtype."""
+        super()._apply(fn, recurse)
+        self.facts = {name: fn(value) for name, value in self.facts.items()}
+        self.stats = {name: fn(value) for name, value in self.stats.items()}
+        return self
 
     def columns(self) -> dict[str, Tensor]:
         """Parameters and facts by name (not the statistics): what a new row must have."""

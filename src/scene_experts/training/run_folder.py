@@ -35,7 +35,7 @@ from scene_experts.data.fetch.obtain import resolve
 from scene_experts.scene import Scene
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import Data, RunConfig, Train, from_json, to_json
-from scene_experts.training.state import scene_from, to_device
+from scene_experts.training.state import scene_from
 
 FORMAT = 1
 EXPORTED = re.compile(r"scene(_level\d+)?\.(compact|((compressed\.)?ply|splat|spz|sog|glb|html)(\.json)?)")  # what `export` calls its files
@@ -221,7 +221,7 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     tensors, meta = newest(folder) if step is None else at_step(folder, step)
     checkpoint.expect(meta, recipe=config.train.recipe)
     cfg = config.train.scaled()
-    scene = to_device(scene_from(cfg, tensors, meta), device)
+    scene = scene_from(cfg, tensors, meta).to(device)
     return OpenRun(run, config, cfg, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""))
 
 

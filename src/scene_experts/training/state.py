@@ -55,7 +55,7 @@ class Training:
             raise InputError(f"expected at most {cap:,} {what} to start with, found {n:,}; raise --max-anchors{also}")
         if 0 < cfg.growth.max_anchors < n:
             log.warning("starts with %s rows, more than the recipe's %s: none will be added", f"{n:,}", f"{cfg.growth.max_anchors:,}")
-        return cls(cfg, to_device(scene, device, dtype))
+        return cls(cfg, scene.to(device, dtype))
 
     def next_view(self, train: tuple[int, ...], ahead: int = 3) -> tuple[int, list[int]]:
         """The next training view and the few after it: each view once per epoch, in random order."""
@@ -105,9 +105,10 @@ class Training:
                 "expected a checkpoint of this configuration, found one trained with other settings; "
                 "resume with the run's own flags, or start in another --out folder"
             )
-        training = cls(cfg, to_device(scene_from(cfg, tensors, meta), device))
+        scene = scene_from(cfg, tensors, meta)
+        scene.table.stats = {k.removeprefix("stats."): v for k, v in tensors.items() if k.startswith("stats.")}
+        training = cls(cfg, scene.to(device))
         table = training.scene.table
-        table.stats = {k.removeprefix("stats."): v.to(device) for k, v in tensors.items() if k.startswith("stats.")}
         for group in training.optimizer.param_groups:
             for i, parameter in enumerate(group["params"]):
                 prefix = f"adam.{group['name']}.{i}."
@@ -134,13 +135,6 @@ def scene_from(cfg: Train, tensors: dict[str, Tensor], meta: dict) -> Scene:
     with torch.no_grad():
         for name, parameter in wanted.items():
             parameter.copy_(stored[name])
-    return scene
-
-
-def to_device(scene: Scene, device: str, dtype: torch.dtype | None = None) -> Scene:
-    """The scene with all its tensors on `device`, and its real ones of `dtype` where one is given."""
-    scene = scene.to(device, dtype)
-    scene.table.facts = {k: v.to(device, dtype if v.is_floating_point() else None) for k, v in scene.table.facts.items()}
     return scene
 
 

@@ -23,6 +23,19 @@ def step(table, optimizer):
     optimizer.step()
 
 
+def test_to_moves_facts_and_statistics_too_and_keeps_integers():
+    table = make().to("meta", torch.float64)
+    columns = {**table.columns(), **table.stats}
+    assert {v.device.type for v in columns.values()} == {"meta"}
+    assert {k: v.dtype for k, v in columns.items()} == {
+        "a": torch.float64,
+        "b": torch.float64,
+        "cell": torch.int64,
+        "seen": torch.float64,
+    }
+    assert all(isinstance(p, torch.nn.Parameter) for p in table.params.values())
+
+
 def test_append_adds_rows_with_zero_moments_and_statistics():
     table = make()
     optimizer = adam(table)

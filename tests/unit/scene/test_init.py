@@ -10,6 +10,7 @@ from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene import Scene
+from scene_experts.scene.anchors.appearance import Codes
 
 METHODS = ("scaffold-gs", "moe-gs", "3dgs", "3dgs-mcmc", "octree-gs", "octree-moe-gs", "scaffold-gs-bank", "sags", "moe-gs-balance")
 CAMERA = Camera(torch.eye(4), torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), 48, 32, 0.2)
@@ -113,3 +114,39 @@ def test_training_moves_the_biases_of_the_router_even_without_gradients():
     with torch.no_grad():
         scene(CAMERA, 2000, Mode.TRAIN, draw.visible)
     assert all(head.router_balance.any() for head in scene.heads.values())
+
+
+def tensors_of(value, path="scene", found=None, visited=None) -> dict[str, torch.Tensor]:
+    """Every tensor that can be reached from a value's attributes, by path."""
+    found, visited = ({} if found is None else found), (set() if visited is None else visited)
+    if id(value) in visited:
+        return found
+    visited.add(id(value))
+    if isinstance(value, torch.Tensor):
+        found[path] = value
+    elif isinstance(value, dict):
+        for name, item in value.items():
+            tensors_of(item, f"{path}.{name}", found, visited)
+    elif isinstance(value, (list, tuple)):
+        for i, item in enumerate(value):
+            tensors_of(item, f"{path}[{i}]", found, visited)
+    elif hasattr(value, "__dict__") and not isinstance(value, type):
+        tensors_of(vars(value), path, found, visited)
+    return found
+
+
+@pytest.mark.parametrize("recipe", METHODS)
+def test_to_moves_every_tensor_that_a_scene_owns(recipe):
+    scene, draw = started(recipe), choose("auto", "cpu")
+    scene(CAMERA, 2000, Mode.DRAW, draw.visible)  # makes what a scene keeps between drawings
+    scene.table.stats["visits"] = torch.zeros(len(scene.table))
+    before = {path: tensor.dtype for path, tensor in tensors_of(scene).items()}
+    wide = {path: tensor.dtype for path, tensor in tensors_of(scene.to(dtype=torch.float64)).items()}
+    assert all(dtype == (torch.float64 if before[path].is_floating_point else before[path]) for path, dtype in wide.items())
+    assert {path for path, tensor in tensors_of(scene.to("meta")).items() if tensor.device.type != "meta"} == set()
+
+
+def test_to_moves_fitted_appearance_codes():
+    codes = Codes(4, [0, 1])
+    codes.fitted[7] = torch.zeros(4)
+    assert codes.to("meta").fitted[7].device.type == "meta"

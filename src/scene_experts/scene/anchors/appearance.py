@@ -6,9 +6,9 @@ and kernels that know nothing of codes decode such scenes too.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -33,6 +33,11 @@ class Codes(nn.Module):
         self.row = {view: i for i, view in enumerate(self.views)}
         self.table = nn.Parameter(torch.randn(len(self.views), dim))
         self.fitted: dict[int, Tensor] = {}
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        super()._apply(fn, recurse)
+        self.fitted = {view: fn(code) for view, code in self.fitted.items()}
+        return self
 
     def forward(self, camera: Camera, mode: Mode = Mode.DRAW) -> Tensor:
         """The code [dim] of a camera. Fitted codes are for drawing only."""

@@ -8,10 +8,10 @@ networks without biases turn that into the Gaussian.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -149,6 +149,11 @@ class GraphScene(Scene):
         self.heads: Mapping[str, Unbiased] = nn.ModuleDict(heads)  # type: ignore[assignment]
         self.offsets = Unbiased([width, config.offset_hidden, 3])
         self._graph: tuple[Tensor, Graph] | None = None  # of the places it was made of
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """What `.to(...)` does; the graph is made again when it is next needed."""
+        self._graph = None
+        return super()._apply(fn, recurse)
 
     def meta(self) -> dict[str, Any]:
         return {"voxel": self.voxel, "extent": self.extent, "grid_low": list(self.grid.low), "grid_edge": self.grid.edge}

@@ -149,7 +149,7 @@ def test_gaussians_stand_where_the_whole_graph_puts_them():
 
 def test_a_view_that_sees_nothing():
     scene = started()
-    decoded = scene(CAMERA, 1, True, lambda means, scales, camera: torch.zeros(len(means), dtype=torch.bool))
+    decoded = scene(CAMERA, 1, Mode.TRAIN, lambda means, scales, camera: torch.zeros(len(means), dtype=torch.bool))
     assert len(decoded.gaussians) == len(decoded.rows) == 0 and decoded.raw_opacity.shape == (0, 1)
 
 
