@@ -1,9 +1,13 @@
+"""What every test shares: one thread, and GPU tests only where there is a CUDA device."""
+
 import os
 
 import pytest
 import torch
 
-# One thread, here and in the commands that tests start: small tensors gain nothing from more, and on a busy machine lose much.
+pytest.register_assert_rewrite("support")  # asserts in support modules show their values too
+
+# One thread, here and in the commands that tests start: more threads slow small tensors down on a busy machine.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 torch.set_num_threads(1)
 

@@ -7,15 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from scene_experts.core.types import Camera, Gaussians
-from scene_experts.render.reference import ReferenceRasterizer
-from support.places import ROOT
-from support.synthetic import make_capture
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
 import decode_cuda
 import explicit_gsplat
 import train_cuda
+from scene_experts.core.types import Camera, Gaussians
+from scene_experts.render.reference import ReferenceRasterizer
+from support.synthetic import make_capture
 
 
 @pytest.fixture(scope="module")

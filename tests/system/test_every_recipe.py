@@ -17,7 +17,7 @@ from scene_experts.training.config import Train
 from scene_experts.training.events import Adjusted, Finished, Started
 from scene_experts.training.state import scene_from
 from support.places import DEMO
-from unit.training.test_loop import events, final, same
+from support.trainings import assert_same, events, last_tensors
 
 BUDDHA = DEMO / "buddha"
 LAST, STOP = 40, 14  # rows are adjusted on both sides of the stop and statistics half gathered at it; Top-k and all levels are in use
@@ -54,7 +54,7 @@ def test_it_trains_grows_resumes_to_the_bit_and_is_scored(recipe, buddha, tmp_pa
     assert (first, second) == ([0, STOP], [STOP, LAST])
     assert before[-1] > before[0] and after[-1] > after[0], "rows come on both sides of the stop"
     assert before + after[1:] == counts and after[0] == before[-1]
-    same(final(whole), final(parts))
+    assert_same(last_tensors(whole), last_tensors(parts))
 
     tensors, meta = checkpoint.load(checkpoint.latest(parts / "checkpoints"))
     scene = scene_from(cfg.scaled(), tensors, meta)

@@ -19,6 +19,7 @@ from scene_experts.files.formats.pack import turned
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.formats.standard import FORMATS, read_standard, write_standard
 from scene_experts.files.ply import read_gaussian_ply
+from support.gltf import column, parsed
 from support.splat_quanta import check, differences, quanta, scene
 
 PYTHON = os.environ.get("SCENE_EXPERTS_FOREIGN_PYTHON", sys.executable)
@@ -122,8 +123,6 @@ def test_we_read_what_splat_transform_writes(tmp_path, format):
 
 def test_our_gltf_has_the_accessors_of_splat_transform_s(tmp_path):
     """It writes glTF and reads none: the same scene, attribute by attribute."""
-    from unit.files.formats.test_gltf import column, parsed
-
     s = scene(300, 3)
     write_standard(tmp_path / "a.ply", s, "ply", {})
     theirs = by_splat_transform(tmp_path / "a.ply", tmp_path, "b.glb")

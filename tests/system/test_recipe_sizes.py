@@ -8,7 +8,7 @@ import pytest
 
 from scene_experts.evaluate.score import sizes
 from scene_experts.recipes import RECIPES
-from unit.scene.test_init import started
+from support.scenes import start_scene
 
 PLAIN, LAYER, EXPERT = 7086, 3 * (32 * 32 + 32), 7185
 GRID = 2 * (17**3 + 24**3 + 14 * 2**15)  # levels of 16, 23, 33, ... cells; from the third on hashed into 2^15 rows
@@ -41,7 +41,7 @@ def test_every_recipe_is_counted():
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_parameters_and_bytes(recipe):
-    scene = started(recipe)
+    scene = start_scene(recipe)
     assert sum(tensor.numel() for tensor in scene.network_tensors().values()) == (PARAMETERS | EXTRA)[recipe]
     found = sizes(scene)
     assert found["network_bytes"] == 4 * (PARAMETERS | EXTRA)[recipe]
@@ -52,7 +52,7 @@ def test_parameters_and_bytes(recipe):
 def test_with_and_without_the_distance_by_attribute():
     counts = {}
     for recipe in ("scaffold-gs", "moe-gs-dist"):
-        tensors = started(recipe).network_tensors()
+        tensors = start_scene(recipe).network_tensors()
         counts[recipe] = {
             a: sum(t.numel() for n, t in tensors.items() if n.startswith(f"{a}.") and "router" not in n)
             for a in ("opacity", "cov", "color")

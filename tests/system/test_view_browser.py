@@ -13,7 +13,7 @@ from PIL import Image
 
 from scene_experts.evaluate.pictures import to_8bit
 from scene_experts.view.paint import paint
-from unit.view.test_server import DRAW, capture, serving, viewer  # noqa: F401
+from support.viewers import DRAW
 
 playwright = pytest.importorskip("playwright.sync_api")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -30,7 +30,7 @@ def browser():
         made.close()
 
 
-def settled(page, viewer, seconds=30.0) -> np.ndarray:  # noqa: F811
+def settled(page, viewer, seconds=30.0) -> np.ndarray:
     """A screenshot once the client has its full picture."""
     end = time.monotonic() + seconds
     while time.monotonic() < end and not (viewer.clients and all(c.full for c in viewer.clients.values())):
@@ -39,7 +39,7 @@ def settled(page, viewer, seconds=30.0) -> np.ndarray:  # noqa: F811
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
 
 
-def test_the_page_shows_our_own_render_and_follows_the_controls(serving, browser, capture):  # noqa: F811
+def test_the_page_shows_our_own_render_and_follows_the_controls(serving, browser, capture):
     page = browser.new_page(viewport={"width": 960, "height": 540})
     page.goto(serving.url)
     shot = settled(page, serving)
@@ -55,7 +55,7 @@ def test_the_page_shows_our_own_render_and_follows_the_controls(serving, browser
     assert np.abs(settled(page, serving)[PART].astype(int) - shot[PART]).mean() > 3
 
 
-def test_clients_come_and_go_and_nonsense_harms_nobody(serving, browser):  # noqa: F811
+def test_clients_come_and_go_and_nonsense_harms_nobody(serving, browser):
     websockets = pytest.importorskip("websockets.sync.client")
     protocol = f"viser-v{pytest.importorskip('viser').__version__}"
     before = threading.active_count()

@@ -16,9 +16,9 @@ from scene_experts.data.fetch import download, obtain
 from scene_experts.data.fetch.catalog import one
 from scene_experts.training import run_folder
 from scene_experts.training.config import Data
+from support.archives import in_folder, read_tree, write_tar
 from support.synthetic import make_capture
 from support.web import Server, serving
-from unit.data.fetch.test_archive import scene, tree, write_tar
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
     """Serves BungeeNeRF, whose rome is a small capture made in code."""
     folder = make_capture(tmp_path / "made", views=9, size=(48, 32)).folder
     with serving() as running:
-        archive = write_tar(tmp_path / "x.tar.gz", scene("bungeenerf/rome", tree(folder)))
+        archive = write_tar(tmp_path / "x.tar.gz", in_folder("bungeenerf/rome", read_tree(folder)))
         running.files["/bungeenerf.tar.gz"] = archive.read_bytes()
         yield running
 

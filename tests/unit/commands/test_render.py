@@ -9,8 +9,8 @@ from scene_experts import cli
 from scene_experts.commands.render import resized, size_of
 from scene_experts.core.errors import InputError
 from scene_experts.evaluate import pictures
+from support.scenes import CAMERA
 from support.synthetic import make_capture
-from unit.scene.test_init import CAMERA
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,8 @@ from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap_model import read_model, write_model
 from scene_experts.data.summary import neighbour_distance, summarise
+from support.lenses import LENSES
 from support.synthetic import Synthetic, make_capture, picture
-from unit.data.test_lens import LENSES
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,11 @@ from scene_experts.core.types import Mode
 from scene_experts.evaluate import pictures
 from scene_experts.evaluate.expert_pictures import WIDEST, alone, chosen_by, keep, strip, write
 from scene_experts.render import choose
-from unit.scene.test_init import CAMERA, started
+from support.scenes import CAMERA, start_scene
 
 
 def test_top_2_puts_every_gaussian_into_two_pictures():
-    scene, draw = started("moe-gs"), choose("auto", "cpu")
+    scene, draw = start_scene("moe-gs"), choose("auto", "cpu")
     decoded = scene(CAMERA, 2000, Mode.DRAW, draw.visible)
     mine = chosen_by(decoded, "color", scene.K)
     assert mine.shape == (len(decoded.gaussians), 5) and (mine.sum(1) == 2).all()
@@ -27,20 +27,20 @@ def test_top_2_puts_every_gaussian_into_two_pictures():
 
 
 def test_while_dense_each_gaussian_is_in_the_picture_of_its_largest_gate():
-    scene, draw = started("moe-gs"), choose("auto", "cpu")
+    scene, draw = start_scene("moe-gs"), choose("auto", "cpu")
     decoded = scene(CAMERA, 1, Mode.DRAW, draw.visible)
     assert (chosen_by(decoded, "cov", scene.K).sum(1) == 1).all()
 
 
 def test_the_pictures():
-    scene, draw = started("moe-gs"), choose("auto", "cpu")
+    scene, draw = start_scene("moe-gs"), choose("auto", "cpu")
     whole, each = alone(scene, CAMERA, 2000, draw, torch.zeros(3))
     assert whole.shape == (32, 48, 3) and len(each) == 5 and each[0].shape == whole.shape
     assert whole.max() > 0.01 and any(not torch.equal(e, whole) for e in each)
 
 
 def test_a_strip_holds_the_pictures_in_order():
-    scene, draw = started("moe-gs"), choose("auto", "cpu")
+    scene, draw = start_scene("moe-gs"), choose("auto", "cpu")
     whole, each = alone(scene, CAMERA, 2000, draw, torch.zeros(3), "opacity")
     sheet = strip(scene, CAMERA, 2000, draw, torch.zeros(3), "opacity")
     panel = 48 + pictures.GAP
@@ -59,7 +59,7 @@ def test_a_strip_holds_the_pictures_in_order():
 )
 def test_a_file_for_each_attribute_with_experts(recipe, names, tmp_path):
     large = replace(CAMERA, K=CAMERA.K * torch.tensor([[20.0], [20], [1]]), width=960, height=640)
-    write(tmp_path, started(recipe), large, 2000, choose("auto", "cpu"), torch.zeros(3))
+    write(tmp_path, start_scene(recipe), large, 2000, choose("auto", "cpu"), torch.zeros(3))
     found = list((tmp_path / "experts").glob("*"))
     assert {path.name for path in found} == names
     for sheet in map(pictures.read, found):

@@ -9,17 +9,8 @@ from torch.nn import functional
 
 from scene_experts.core.errors import InputError
 from scene_experts.evaluate import lpips, weights
-from scene_experts.evaluate.lpips import BACKBONES, SCALE, SHIFT, Lpips, shapes
-
-
-def random_tensors(net: str, seed: int = 0) -> dict[str, Tensor]:
-    """Weights of the right shapes that keep activations of the order of 1."""
-    gen = torch.Generator().manual_seed(seed)
-    out = {}
-    for name, shape in shapes(net).items():
-        value = torch.randn(shape, generator=gen)
-        out[name] = value * (2 / value[0].numel()) ** 0.5 if name.endswith("weight") else value.abs() if name[:3] == "lin" else 0.1 * value
-    return out
+from scene_experts.evaluate.lpips import BACKBONES, SCALE, SHIFT, Lpips
+from support.lpips import random_tensors
 
 
 def definition(net: str, tensors: dict[str, Tensor], x: Tensor, y: Tensor) -> float:

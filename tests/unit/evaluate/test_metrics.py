@@ -13,7 +13,7 @@ from scene_experts.evaluate import metrics, weights
 from scene_experts.evaluate.lpips import Lpips
 from scene_experts.evaluate.metrics import Perceptual
 from scene_experts.training import losses
-from unit.evaluate.test_lpips import random_tensors
+from support.lpips import random_tensors
 
 
 def pair(height: int = 40, width: int = 50, seed: int = 0) -> tuple[Tensor, Tensor]:

@@ -20,7 +20,8 @@ from scene_experts.evaluate import metrics, pictures, weights
 from scene_experts.evaluate import score as run
 from scene_experts.evaluate.score import About, evaluate
 from scene_experts.scene import Scene, Traits
-from unit.scene.test_init import started
+from support.lpips import random_tensors
+from support.scenes import start_scene
 
 N, K, F, H, W = 6, 4, 8, 36, 48
 
@@ -150,7 +151,7 @@ def test_scores_are_those_of_the_8_bit_files(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("recipe", "row"), [("scaffold-gs", 316), ("3dgs", 248)])
 def test_sizes_are_those_of_the_published_layouts(recipe: str, row: int) -> None:
-    scene = started(recipe)
+    scene = start_scene(recipe)
     size, networks = run.sizes(scene), sum(4 * t.numel() for t in scene.network_tensors().values())
     assert size["ply_bytes"] == row * len(scene.table) and size["network_bytes"] == networks
     assert size["total_bytes"] == row * len(scene.table) + networks
@@ -219,8 +220,6 @@ def test_photograph_of_another_size(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_lpips_where_there_are_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from unit.evaluate.test_lpips import random_tensors
-
     monkeypatch.setattr(weights, "load", lambda net, explicit=None: (random_tensors(net), f"{net} from here"))
     results = evaluated(tmp_path)
     assert results["lpips"] > 0 and results["lpips_3dgs"] > 0 and results["lpips_alex"] > 0 and not results["absent"]

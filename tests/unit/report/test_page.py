@@ -4,7 +4,6 @@ import base64
 import io
 import json
 import re
-from dataclasses import replace
 
 import pytest
 from PIL import Image
@@ -12,33 +11,11 @@ from PIL import Image
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
 from scene_experts.report.page import NAME, write
-from scene_experts.training.config import to_json
-from support.records import record
-
-
-def run(folder, recipe="moe-gs", pictures=True):
-    made = record(recipe, views=3)
-    config = replace(made.config, command=f"scene-experts train {recipe} --data <here> --out run")
-    write_json(folder / "config.json", {"format": 1, **to_json(config)})
-    results = {**made.results, "capture": "fox", "views": "test", "view_count": 3, "split": "mod8", "resolution": "as-is", "step": 3000}
-    write_json(folder / "results.json", results)
-    write_json(folder / "per_view.json", {name: {"file": name, **facts} for name, facts in made.per_view.items()})
-    lines = [
-        {"step": s, "psnr": 20 + s / 10, "terms": {"l1": 0.1}, "anchors": 5, "active": 0.5, "gaussians": 9, "seconds": s} for s in range(9)
-    ]
-    lines += [{"step": 9, "grown": 3, "pruned": 1, "anchors": 7}]
-    lines += [{**lines[5], "step": 10 + s, "routing": {"cov": [0.6, 0.4]}, "entropy": {"cov": 0.9}} for s in range(3)]
-    (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)) + '\n{"torn')
-    if pictures:
-        for kind, colour in (("gt", "red"), ("renders", "blue"), ("errors", "black")):
-            (folder / "test" / kind).mkdir(parents=True)
-            for name in made.per_view:
-                Image.new("RGB", (1200, 600), colour).save(folder / "test" / kind / name)
-    return folder
+from support.evaluated import make_run
 
 
 def test_one_run_is_one_file_that_needs_nothing_else(tmp_path):
-    path = write([run(tmp_path)])
+    path = write([make_run(tmp_path)])
     text = path.read_text()
     assert path == tmp_path / NAME
     assert not re.findall(r'(?:src|href)="(?!data:)|https?://|@import', text)
@@ -58,7 +35,7 @@ def strips(text):
 
 
 def test_strips_of_each_experts_anchors(tmp_path):
-    folder = run(tmp_path)
+    folder = make_run(tmp_path)
     assert not strips(write([folder]).read_text())
     results = json.loads((folder / "results.json").read_text())
     shares = {"share": [0.5, 0.3, 0.2], "k": 2}
@@ -78,17 +55,17 @@ def test_strips_of_each_experts_anchors(tmp_path):
 
 
 def test_several_runs_stand_beside_each_other(tmp_path):
-    runs = [run(tmp_path / "a"), run(tmp_path / "b", "scaffold-gs")]
+    runs = [make_run(tmp_path / "a"), make_run(tmp_path / "b", "scaffold-gs")]
     text = write(runs, tmp_path / "both.html").read_text()
     assert "moe-gs, scaffold-gs on fox" in text and text.count("<option value='0.0.1'") == 2
-    same = write([tmp_path / "a", run(tmp_path / "c")], tmp_path / "same.html").read_text()
+    same = write([tmp_path / "a", make_run(tmp_path / "c")], tmp_path / "same.html").read_text()
     assert "a (moe-gs)" in same and "c (moe-gs)" in same
     with pytest.raises(InputError, match="--out"):
         write(runs)
 
 
 def test_runs_that_were_not_scored_alike_are_no_rivals(tmp_path):
-    runs = [run(tmp_path / "a"), run(tmp_path / "b", "scaffold-gs")]
+    runs = [make_run(tmp_path / "a"), make_run(tmp_path / "b", "scaffold-gs")]
     alike = write(runs, tmp_path / "alike.html").read_text()
     assert "class=best" in alike and "Do not compare" not in alike
     results = json.loads((runs[1] / "results.json").read_text())
@@ -112,7 +89,7 @@ def test_runs_that_were_not_scored_alike_are_no_rivals(tmp_path):
 
 
 def test_a_run_without_pictures_or_results(tmp_path):
-    assert "no pictures" in write([run(tmp_path / "a", pictures=False)]).read_text()
+    assert "no pictures" in write([make_run(tmp_path / "a", pictures=False)]).read_text()
     (tmp_path / "a" / "results.json").unlink()
     with pytest.raises(InputError, match="expected an evaluated run"):
         write([tmp_path / "a"])
@@ -121,7 +98,7 @@ def test_a_run_without_pictures_or_results(tmp_path):
 
 
 def test_torn_and_foreign_files(tmp_path):
-    folder = run(tmp_path)
+    folder = make_run(tmp_path)
     with (folder / "metrics.jsonl").open("ab") as stream:
         stream.write(b"\xff\xfe\0\n")  # what a power cut leaves
     assert "gate entropy" in write([folder]).read_text()
@@ -135,7 +112,7 @@ def test_torn_and_foreign_files(tmp_path):
 
 
 def test_an_imported_run_claims_no_training(tmp_path):
-    folder = run(tmp_path)
+    folder = make_run(tmp_path)
     results = json.loads((folder / "results.json").read_text())
     write_json(folder / "results.json", {**results, "step": 0, "iterations": 0, "train_seconds": 0.0})
     text = write([folder]).read_text()

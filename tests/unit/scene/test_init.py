@@ -6,25 +6,16 @@ import pytest
 import torch
 
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Mode, Points
+from scene_experts.core.types import Mode
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
-from scene_experts.scene import Scene
 from scene_experts.scene.anchors.appearance import Codes
-
-METHODS = ("scaffold-gs", "moe-gs", "3dgs", "3dgs-mcmc", "octree-gs", "octree-moe-gs", "scaffold-gs-bank", "sags", "moe-gs-balance")
-CAMERA = Camera(torch.eye(4), torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), 48, 32, 0.2)
-
-
-def started(recipe: str) -> Scene:
-    torch.manual_seed(0)
-    points = Points(torch.randn(200, 3, dtype=torch.float64) + torch.tensor([0.0, 0, 4]), torch.full((200, 3), 128, dtype=torch.uint8))
-    return RECIPES[recipe][1].scene.start(points, 5.0, [CAMERA])
+from support.scenes import CAMERA, METHODS, start_scene
 
 
 @pytest.mark.parametrize("recipe", METHODS)
 def test_a_scene_is_built_again_from_its_table_and_plain_values(recipe):
-    scene, draw = started(recipe), choose("auto", "cpu")
+    scene, draw = start_scene(recipe), choose("auto", "cpu")
     params = {k: v.detach().clone() for k, v in scene.table.params.items()}
     again = RECIPES[recipe][1].scene.load(Table(params, dict(scene.table.facts)), scene.meta())
     with torch.no_grad():
@@ -37,7 +28,7 @@ def test_a_scene_is_built_again_from_its_table_and_plain_values(recipe):
 
 @pytest.mark.parametrize("recipe", METHODS)
 def test_every_learned_tensor_has_a_rate(recipe):
-    scene, cfg = started(recipe), RECIPES[recipe][1]
+    scene, cfg = start_scene(recipe), RECIPES[recipe][1]
     groups = scene.rate_groups()
     held = {id(p) for group in groups.values() for p in group}
     assert {id(p) for p in scene.table.params.values()} <= held
@@ -66,7 +57,7 @@ TRAITS = {  # family, rows, lattice, experts, has levels, activation, needs a ba
 
 @pytest.mark.parametrize("recipe", TRAITS)
 def test_a_scene_says_what_it_is_and_can_do(recipe):
-    scene = started(recipe)
+    scene = start_scene(recipe)
     t = scene.traits
     assert (t.family, t.rows, t.voxel > 0, t.experts, t.levels > 0, t.activation, t.needs_bake) == TRAITS[recipe]
     assert scene.positions.shape == (len(scene.table), 3) and not scene.positions.requires_grad
@@ -75,7 +66,7 @@ def test_a_scene_says_what_it_is_and_can_do(recipe):
 
 
 def test_stating_traits_changes_nothing():
-    scene = started("moe-gs-balance")
+    scene = start_scene("moe-gs-balance")
     state, before = torch.random.get_rng_state(), [h.router_balance.clone() for h in scene.heads.values()]
     assert scene.traits.experts == 5
     assert torch.equal(torch.random.get_rng_state(), state)
@@ -84,7 +75,7 @@ def test_stating_traits_changes_nothing():
 
 @pytest.mark.parametrize("recipe", ["octree-gs", "3dgs"])
 def test_at_level_draws_no_finer_level_within_its_block(recipe):
-    scene, draw = started(recipe), choose("auto", "cpu")
+    scene, draw = start_scene(recipe), choose("auto", "cpu")
     draws = lambda: len(scene(CAMERA, 2000, Mode.DRAW, draw.visible).rows)  # noqa: E731
     whole = draws()
     with scene.at_level(0):
@@ -97,7 +88,7 @@ def test_at_level_draws_no_finer_level_within_its_block(recipe):
 @pytest.mark.parametrize("recipe", METHODS)
 @pytest.mark.parametrize("flag", [True, False])
 def test_a_drawing_with_gradients_changes_nothing_and_torchs_own_mode_has_no_effect(recipe, flag):
-    scene, draw = started(recipe), choose("auto", "cpu")
+    scene, draw = start_scene(recipe), choose("auto", "cpu")
     scene.train(flag)
     before = {k: v.detach().clone() for k, v in {**scene.table.columns(), **scene.network_tensors()}.items()}
     random = torch.random.get_rng_state()
@@ -110,7 +101,7 @@ def test_a_drawing_with_gradients_changes_nothing_and_torchs_own_mode_has_no_eff
 
 
 def test_training_moves_the_biases_of_the_router_even_without_gradients():
-    scene, draw = started("moe-gs-balance"), choose("auto", "cpu")
+    scene, draw = start_scene("moe-gs-balance"), choose("auto", "cpu")
     with torch.no_grad():
         scene(CAMERA, 2000, Mode.TRAIN, draw.visible)
     assert all(head.router_balance.any() for head in scene.heads.values())
@@ -137,7 +128,7 @@ def tensors_of(value, path="scene", found=None, visited=None) -> dict[str, torch
 
 @pytest.mark.parametrize("recipe", METHODS)
 def test_to_moves_every_tensor_that_a_scene_owns(recipe):
-    scene, draw = started(recipe), choose("auto", "cpu")
+    scene, draw = start_scene(recipe), choose("auto", "cpu")
     scene(CAMERA, 2000, Mode.DRAW, draw.visible)  # makes what a scene keeps between drawings
     scene.table.stats["visits"] = torch.zeros(len(scene.table))
     before = {path: tensor.dtype for path, tensor in tensors_of(scene).items()}

@@ -7,7 +7,7 @@ from PIL import Image
 from scene_experts.core.errors import InputError
 from scene_experts.sfm.masks import write
 from scene_experts.sfm.photos import copy, find, in_place
-from unit.sfm.test_photos import photo, turned
+from support.photos import write_photo, write_turned
 
 
 def half(size=(40, 30), value=255):
@@ -20,7 +20,7 @@ def half(size=(40, 30), value=255):
 def test_the_mask_is_found_where_training_finds_it(tmp_path):
     images = tmp_path / "images"
     for name in ("a.jpg", "b.jpg", "c.jpg", "sub/d.jpg"):
-        photo(images / name)
+        write_photo(images / name)
     half().save(images / "a_mask.png")
     (tmp_path / "masks" / "sub").mkdir(parents=True)
     half((20, 15), value=200).save(tmp_path / "masks" / "b.jpg.png")  # of another size, and not quite white
@@ -47,7 +47,7 @@ def test_the_mask_is_found_where_training_finds_it(tmp_path):
 def test_alpha_is_a_mask(tmp_path):
     images = tmp_path / "images"
     for i in range(3):
-        photo(images / f"{i}.png")
+        write_photo(images / f"{i}.png")
     picture = Image.new("RGBA", (40, 30), (9, 9, 9, 255))
     picture.putalpha(half())
     picture.save(images / "1.png")
@@ -62,7 +62,7 @@ def test_a_mask_lies_as_its_photograph_is_stored(tmp_path, orientation):
     source, images = tmp_path / "photos", tmp_path / "images"
     for folder in (source, images):
         for name in ("a", "b", "c"):
-            turned(folder / f"{name}.jpg", orientation)
+            write_turned(folder / f"{name}.jpg", orientation)
         half().save(folder / "a_mask.png")
     with Image.open(copy_of(source / "a_mask.png", orientation)) as upright:
         upright.save(images / "b_mask.png")
@@ -85,5 +85,5 @@ def copy_of(path, orientation):
 
 def test_without_masks_none_are_written(tmp_path):
     for i in range(3):
-        photo(tmp_path / "images" / f"{i}.jpg")
+        write_photo(tmp_path / "images" / f"{i}.jpg")
     assert write(find(tmp_path / "images"), tmp_path / "images", tmp_path / "out") == [] and not (tmp_path / "out").exists()

@@ -8,61 +8,43 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.sfm.photos import by_camera, copy, find, in_place
-
-
-def photo(path, size=(40, 30), model="", focal=0.0):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    exif = Image.Exif()
-    if model:
-        exif[0x0110] = model
-        exif.get_ifd(0x8769)[0x920A] = focal
-    Image.fromarray(np.zeros((size[1], size[0], 3), np.uint8)).save(path, exif=exif)
-    return path
+from support.photos import write_photo, write_turned
 
 
 def test_names_are_in_the_order_of_their_numbers_and_hidden_files_are_none(tmp_path):
     for name in ("10.jpg", "2.jpg", "b/1.png", ".thumbs/1.jpg", "1.JPG"):
-        photo(tmp_path / name)
+        write_photo(tmp_path / name)
     (tmp_path / "notes.txt").write_text("no photograph")
     assert [p.name for p in find(tmp_path)] == ["1.JPG", "2.jpg", "10.jpg", "b/1.png"]
 
 
 def test_too_few_or_unreadable_photographs_are_told(tmp_path):
-    photo(tmp_path / "1.jpg")
+    write_photo(tmp_path / "1.jpg")
     for i in range(4):
         (tmp_path / f"{i}.HEIC").write_bytes(b"")
     with pytest.raises(InputError, match=r"found 1; save the \.heic files as JPEG"):
         find(tmp_path)
     for i in range(3):
-        photo(tmp_path / f"{i}.jpg")
-    whole = photo(tmp_path / "2.jpg", size=(400, 300)).read_bytes()
+        write_photo(tmp_path / f"{i}.jpg")
+    whole = write_photo(tmp_path / "2.jpg", size=(400, 300)).read_bytes()
     (tmp_path / "2.jpg").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"expected a whole photograph at .*2\.jpg"):
         find(tmp_path)
 
 
 def test_a_camera_is_one_size_maker_and_focal_length(tmp_path):
-    photo(tmp_path / "1.jpg", model="A", focal=4.0)
-    photo(tmp_path / "2.jpg", model="A", focal=9.0)
-    photo(tmp_path / "3.jpg", model="A", focal=4.0)
-    photo(tmp_path / "4.jpg", size=(30, 40), model="A", focal=4.0)
-    photo(tmp_path / "5.jpg")
+    write_photo(tmp_path / "1.jpg", model="A", focal=4.0)
+    write_photo(tmp_path / "2.jpg", model="A", focal=9.0)
+    write_photo(tmp_path / "3.jpg", model="A", focal=4.0)
+    write_photo(tmp_path / "4.jpg", size=(30, 40), model="A", focal=4.0)
+    write_photo(tmp_path / "5.jpg")
     assert by_camera(find(tmp_path)) == [["1.jpg", "3.jpg"], ["2.jpg"], ["4.jpg"], ["5.jpg"]]
-
-
-def turned(path, orientation=6, form="JPEG"):
-    """Red at the top as it is stored, which belongs to the right once it is turned."""
-    picture, exif = Image.new("RGB", (40, 30)), Image.Exif()
-    picture.paste((255, 0, 0), (0, 0, 40, 10))
-    exif[0x0112], exif[0x0110] = orientation, "A"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    picture.save(path, form, exif=exif, quality=95)
 
 
 def test_photographs_that_are_shown_turned_are_written_upright_and_their_masks_too(tmp_path):
     source, target = tmp_path / "photos", tmp_path / "work" / "images"
     for i, orientation in enumerate((6, 1, 6)):
-        turned(source / f"{i}.jpg", orientation)
+        write_turned(source / f"{i}.jpg", orientation)
         mask = np.zeros((30, 40), np.uint8)
         mask[:10] = 255
         Image.fromarray(mask).save(source / f"{i}_mask.png")
@@ -80,11 +62,11 @@ def test_photographs_that_are_shown_turned_are_written_upright_and_their_masks_t
 
 def test_names_and_kinds_are_those_that_colmap_takes_and_copies_are_made_once(tmp_path):
     source, target = tmp_path / "my photos", tmp_path / "work" / "images"
-    photo(source / "#a b" / "IMG (0).jpg").chmod(0o444)
-    photo(source / "c.webp")
-    turned(source / "d.JPG", form="MPO" if "MPO" in Image.SAVE else "JPEG")
+    write_photo(source / "#a b" / "IMG (0).jpg").chmod(0o444)
+    write_photo(source / "c.webp")
+    write_turned(source / "d.JPG", form="MPO" if "MPO" in Image.SAVE else "JPEG")
     (tmp_path / "linked").mkdir()
-    photo(tmp_path / "linked" / "e.png")
+    write_photo(tmp_path / "linked" / "e.png")
     (source / "link").symlink_to(tmp_path / "linked", target_is_directory=True)
     (source / "self").symlink_to(source, target_is_directory=True)
     found = find(source)
@@ -94,25 +76,25 @@ def test_names_and_kinds_are_those_that_colmap_takes_and_copies_are_made_once(tm
     before = {p: p.stat().st_mtime_ns for p in target.rglob("*.*")}
     assert copy(find(source), source, target) == there and before == {p: p.stat().st_mtime_ns for p in target.rglob("*.*")}
     (source / "c.webp").unlink()
-    photo(source / "link" / "e.png", size=(50, 30))
+    write_photo(source / "link" / "e.png", size=(50, 30))
     assert copy(find(source), source, target)[-1].size == (50, 30) and not (target / "c.jpg").exists()
     with pytest.raises(InputError, match="expected photographs as COLMAP takes them"):
         in_place(found, source)
-    photo(source / "_a b" / "IMG (0).jpg")
+    write_photo(source / "_a b" / "IMG (0).jpg")
     with pytest.raises(InputError, match="rename one"):
         find(source)
 
 
 def test_the_capture_inside_the_photographs_is_left_out(tmp_path):
     for i in range(3):
-        photo(tmp_path / f"{i}.jpg")
-    photo(tmp_path / "out" / "images" / "0.jpg")
+        write_photo(tmp_path / f"{i}.jpg")
+    write_photo(tmp_path / "out" / "images" / "0.jpg")
     assert len(find(tmp_path, but=tmp_path / "out")) == 3 and len(find(tmp_path)) == 4
 
 
 def test_names_that_are_no_text_are_told(tmp_path):
     for i in range(3):
-        photo(tmp_path / f"{i}.jpg")
+        write_photo(tmp_path / f"{i}.jpg")
     try:
         (tmp_path / os.fsdecode(b"\xe9.jpg")).write_bytes((tmp_path / "0.jpg").read_bytes())
     except OSError:
@@ -140,7 +122,7 @@ def test_grey_of_sixteen_bits_is_written_with_eight(tmp_path):
 def test_a_changed_mask_is_copied_again(tmp_path):
     source, target = tmp_path / "photos", tmp_path / "work" / "images"
     for i in range(3):
-        photo(source / f"{i}.jpg")
+        write_photo(source / f"{i}.jpg")
     for value in (255, 0):
         Image.new("L", (40, 30), value).save(source / "0_mask.png")
         os.utime(source / "0_mask.png", (1, 1 + value))

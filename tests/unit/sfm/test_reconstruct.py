@@ -17,8 +17,8 @@ from scene_experts.data import load
 from scene_experts.sfm import reconstruct as run
 from scene_experts.sfm.reconstruct import LOG, NOTE, Options
 from scene_experts.sfm.work import NAME, PLACES
+from support.photos import fake_worker, write_black, write_photo
 from support.places import DEMO
-from unit.sfm.test_photos import photo
 
 BUDDHA = DEMO / "buddha"
 TOGETHER = ["008.jpg", "009.jpg", "017.jpg", "018.jpg", "025.jpg", "043.jpg", "053.jpg", "067.jpg"]  # they show much of each other
@@ -74,26 +74,6 @@ def lowest_features(capture: Path) -> dict[str, float]:
     return json.loads(done.stdout)
 
 
-def black(folder: Path, count: int = 3) -> Path:
-    for i in range(count):
-        photo(folder / f"{i}.jpg", size=(64, 48))
-    return folder
-
-
-def answer(**said):
-    """A worker that says this."""
-
-    def reconstructed(request, log, say, progress):
-        reconstructed.requests.append(request)
-        model = Path(request["model"])
-        model.mkdir(parents=True)
-        (model / "cameras.bin").write_bytes(b"new")
-        return {"step": "done", "version": "0", "registered": [], **said}
-
-    reconstructed.requests = []
-    return reconstructed
-
-
 FOUND = {
     "registered": ["0.jpg", "2.jpg"],
     "mapper": "incremental",
@@ -117,21 +97,21 @@ def make(source, out, options=Options(), **more):  # noqa: B008
 
 
 def test_photographs_that_fit_nowhere_leave_the_reason_and_nothing_else(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "reconstructed", answer())
+    monkeypatch.setattr(run, "reconstructed", fake_worker())
     with pytest.raises(InputError, match="found none that fit together"):
-        make(black(tmp_path / "photos"), tmp_path / "out")
+        make(write_black(tmp_path / "photos"), tmp_path / "out")
     assert [p.name for p in (tmp_path / "out").iterdir()] == [NAME]
     with pytest.raises(InputError, match=r"unfinished.*scene-experts capture PHOTOS"):
         load(tmp_path / "out")
 
 
 def test_frames_of_a_video_are_taken_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "reconstructed", answer())
+    monkeypatch.setattr(run, "reconstructed", fake_worker())
     taken = []
 
     def take(video, folder, count, progress):
         taken.append(count)
-        black(folder, count)
+        write_black(folder, count)
         return list(range(count))
 
     monkeypatch.setattr(run.frames, "take", take)
@@ -144,8 +124,8 @@ def test_frames_of_a_video_are_taken_once(tmp_path, monkeypatch):
 
 
 def test_the_same_request_finds_its_database_again_and_another_does_not(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "reconstructed", answer())
-    source, kept = black(tmp_path / "photos"), tmp_path / "out" / NAME / "database" / "colmap.db"
+    monkeypatch.setattr(run, "reconstructed", fake_worker())
+    source, kept = write_black(tmp_path / "photos"), tmp_path / "out" / NAME / "database" / "colmap.db"
 
     def ask(options=Options()):  # noqa: B008
         with pytest.raises(InputError, match="fit together"):
@@ -158,45 +138,45 @@ def test_the_same_request_finds_its_database_again_and_another_does_not(tmp_path
     ask(Options(max_side=800))
     assert not kept.exists()
     kept.write_bytes(b"features")
-    photo(source / "1.jpg", size=(64, 48), model="B")  # another photograph of the same name
+    write_photo(source / "1.jpg", size=(64, 48), model="B")  # another photograph of the same name
     ask(Options(max_side=800))
     assert not kept.exists()
 
 
 def test_new_poses_take_the_place_of_old_ones_whole(tmp_path, monkeypatch):
-    worker = answer(**FOUND)
+    worker = fake_worker(**FOUND)
     monkeypatch.setattr(run, "reconstructed", worker)
     out = tmp_path / "out"
-    note = make(black(tmp_path / "photos"), out)
+    note = make(write_black(tmp_path / "photos"), out)
     assert note["without_pose"] == ["1.jpg"] and note["with_pose"] == 2 and note["copied"] and note["all_compared"]
     assert worker.requests[0]["pairs"] == [("0.jpg", "1.jpg"), ("0.jpg", "2.jpg"), ("1.jpg", "2.jpg")]
     (out / PLACES["model"] / "frames.bin").write_bytes(b"old")
-    make(black(tmp_path / "others", 4), out, overwrite=True)
+    make(write_black(tmp_path / "others", 4), out, overwrite=True)
     assert [p.name for p in (out / PLACES["model"]).iterdir()] == ["cameras.bin"]
     assert sorted(p.name for p in out.iterdir()) == sorted(place.split("/")[0] for place in PLACES.values())
     assert len(list((out / "images").iterdir())) == 4
 
 
 def test_a_capture_s_own_images_stay_as_they_are(tmp_path, monkeypatch):
-    worker = answer(**FOUND)
+    worker = fake_worker(**FOUND)
     monkeypatch.setattr(run, "reconstructed", worker)
-    images = black(tmp_path / "images")
+    images = write_black(tmp_path / "images")
     (images / "notes.txt").write_text("mine")
     assert not make(images, tmp_path)["copied"] and worker.requests[0]["images"] == str(images)
     assert (images / "notes.txt").exists()
     with pytest.raises(InputError, match=r"expected no images at .*found others; choose another --out"):
-        make(black(tmp_path.parent / "elsewhere"), tmp_path, overwrite=True)
+        make(write_black(tmp_path.parent / "elsewhere"), tmp_path, overwrite=True)
 
 
 def test_what_is_somebody_s_is_not_touched(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "reconstructed", answer(**FOUND))
+    monkeypatch.setattr(run, "reconstructed", fake_worker(**FOUND))
     out = tmp_path / "out"
     for inside in (f"{NAME}/done", "sparse/photos", "images/more"):
         with pytest.raises(InputError, match="expected photographs outside of"):
-            make(black(out / inside), out)
+            make(write_black(out / inside), out)
         assert len(list((out / inside).iterdir())) == 3
     with pytest.raises(InputError, match="expected a folder of its own for the capture"):
-        make(black(tmp_path / "photos"), tmp_path / "photos")
+        make(write_black(tmp_path / "photos"), tmp_path / "photos")
     (tmp_path / "old" / "sparse").mkdir(parents=True)
     for name in ("cameras", "images", "points3D"):
         (tmp_path / "old" / "sparse" / f"{name}.bin").write_bytes(b"")
@@ -206,12 +186,12 @@ def test_what_is_somebody_s_is_not_touched(tmp_path, monkeypatch):
 
 def test_what_is_no_folder_and_no_video_is_told(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="found one photograph at"):
-        make(photo(tmp_path / "1.jpg"), tmp_path / "out")
+        make(write_photo(tmp_path / "1.jpg"), tmp_path / "out")
     with pytest.raises(InputError, match="found nothing; correct the path"):
         make(tmp_path / "none", tmp_path / "out")
     monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"found none; pip install 'scene-experts\[sfm\]'"):
-        make(black(tmp_path / "photos"), tmp_path / "out")
+        make(write_black(tmp_path / "photos"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

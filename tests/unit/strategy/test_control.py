@@ -10,7 +10,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.schedule import Every
 from scene_experts.strategy import observe
 from scene_experts.strategy.control import AnchorControl
-from unit.scene.test_init import started
+from support.scenes import start_scene
 
 
 class Still(AnchorControl):
@@ -22,7 +22,7 @@ class Still(AnchorControl):
 
 @pytest.mark.parametrize("recipe", ["scaffold-gs", "octree-gs"])
 def test_faint_anchors_that_were_seen_often_go(recipe):
-    scene, rule = started(recipe), AnchorControl()
+    scene, rule = start_scene(recipe), AnchorControl()
     n = len(scene.table)
     observe.start(scene.table, scene.K)
     stats = scene.table.stats
@@ -38,7 +38,7 @@ def test_faint_anchors_that_were_seen_often_go(recipe):
 
 def test_sizes_are_clamped_in_the_unit_asked_for():
     for clamp, bound in (("log0.05", 0.05), ("linear0.05", math.log(0.05)), ("off", 2.0)):
-        scene = started("scaffold-gs")
+        scene = start_scene("scaffold-gs")
         observe.start(scene.table, scene.K)
         scene.table.params["log_scaling"].data.fill_(2.0)
         AnchorControl(scale_clamp=clamp).prune(scene)  # type: ignore[arg-type]
@@ -47,7 +47,7 @@ def test_sizes_are_clamped_in_the_unit_asked_for():
 
 
 def test_adjustments_are_due_inside_the_window_and_spare_the_anchors_one_step():
-    scene, rule = started("scaffold-gs"), Still(adjust=Every(1500, 15_000, 100))
+    scene, rule = start_scene("scaffold-gs"), Still(adjust=Every(1500, 15_000, 100))
     assert rule.update(scene, 1600, torch.Generator()) is None  # nothing counted yet
     observe.start(scene.table, scene.K)
     for parameter in scene.table.params.values():

@@ -15,7 +15,7 @@ from scene_experts.scene.anchors.select import LevelSelector, Octree
 from scene_experts.strategy import observe
 from scene_experts.strategy.grow_octree import GrowOctree
 from scene_experts.training.config import check
-from unit.scene.anchors.test_levels import slow_level
+from support.octree import slow_level
 
 K, EDGE, COUNT = 4, 0.8, 4
 CAMERAS = ((0.0, 0.0, -1.0), (2.0, 0.0, 4.0), (0.0, 5.0, 0.0))

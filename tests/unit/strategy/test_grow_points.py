@@ -12,7 +12,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.strategy.grow import GrowAnchors
 from scene_experts.strategy.grow_points import GrowPoints
 from scene_experts.training.config import check
-from unit.scene.graph.test_scene import started
+from support.graph_scenes import start_graph
 
 
 def view(rows: list[int], opacity: list[float], radii: list[int]) -> tuple[Decoded, Render]:
@@ -29,7 +29,7 @@ def view(rows: list[int], opacity: list[float], radii: list[int]) -> tuple[Decod
 
 @pytest.mark.parametrize(("visits", "seen"), [("drawn", [0, 0, 2, 0, 0]), ("seen", [2, 0, 2, 2, 0])])
 def test_only_drawn_points_count_as_visited(visits, seen):
-    scene = started(torch.float32)
+    scene = start_graph(torch.float32)
     growth = GrowPoints(start_stat=0, adjust=Every(1, 100, 10), visits=visits)
     for step in (1, 2):  # row 0 is hidden, row 2 drawn, row 3 misses the picture
         growth.observe(scene, *view([0, 2, 3], [-0.5, 0.25, 0.5], [4, 0]), step)
@@ -40,7 +40,7 @@ def test_only_drawn_points_count_as_visited(visits, seen):
 
 
 def test_points_found_new_ones_where_their_gaussians_are():
-    scene = started(torch.float32)
+    scene = start_graph(torch.float32)
     growth = GrowPoints(start_stat=0, adjust=Every(1, 100, 10), elimination=False)
     scene.table.params["log_scaling"].data[:, :3] = 2.0  # offsets reach far
     growth.observe(scene, *view([5], [0.5], [4]), 1)

@@ -8,12 +8,12 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.recipes import RECIPES
 from scene_experts.strategy import Edit
-from unit.scene.test_init import METHODS, started
+from support.scenes import METHODS, start_scene
 
 
 @pytest.mark.parametrize("recipe", METHODS)
 def test_nothing_is_due_at_the_first_iteration(recipe):
-    scene, strategy = started(recipe), RECIPES[recipe][1].scaled().growth
+    scene, strategy = start_scene(recipe), RECIPES[recipe][1].scaled().growth
     before = {k: v.clone() for k, v in scene.table.columns().items()}
     assert strategy.update(scene, 1, torch.Generator()) is None
     strategy.finish(scene, 1, dict.fromkeys(scene.rate_groups(), 0.0), torch.Generator())

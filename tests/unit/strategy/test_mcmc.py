@@ -11,7 +11,7 @@ from scene_experts.geometry.rotation import covariance
 from scene_experts.native import library as native
 from scene_experts.strategy import mcmc
 from scene_experts.strategy.mcmc import MCMC, MOST, draw, shared
-from unit.strategy.test_split_clone import make, moments
+from support.explicit import make_gaussians, moments
 
 
 def as_written(o: float, n: int) -> tuple[float, float]:
@@ -52,7 +52,7 @@ def test_draws_follow_the_weights():
 
 
 def test_the_dead_become_shares_of_the_living():
-    scene, rule = make(), MCMC()
+    scene, rule = make_gaussians(), MCMC()
     before = {name: value.detach().clone() for name, value in scene.table.params.items()}
     dead = before["raw_opacity"].sigmoid() <= 0.005
     moved = rule.relocate(scene, torch.Generator().manual_seed(0))
@@ -76,7 +76,7 @@ def test_the_dead_become_shares_of_the_living():
 
 
 def test_gaussians_are_added_up_to_the_cap():
-    scene = make()
+    scene = make_gaussians()
     assert MCMC().add(scene, torch.Generator()) == (10, False) and len(scene.table) == 210
     assert not moments(scene, "means")[200:].any()
     assert MCMC(max_anchors=213).add(scene, torch.Generator()) == (3, True)
@@ -86,19 +86,19 @@ def test_gaussians_are_added_up_to_the_cap():
 def test_when_things_happen():
     rule = MCMC()
     for step, adjusts in ((500, False), (600, True), (650, False), (24_900, True), (25_000, False)):
-        scene = make(60)
+        scene = make_gaussians(60)
         assert (rule.update(scene, step, torch.Generator()) is not None) == adjusts
         assert (scene.table.params["means"].grad is None) == adjusts
-    empty = make(60)
+    empty = make_gaussians(60)
     empty.table.keep(torch.zeros(60, dtype=torch.bool))
     assert rule.update(empty, 600, torch.Generator()) is None
-    everyone = make(60)
+    everyone = make_gaussians(60)
     everyone.table.assign("raw_opacity", torch.full((60,), -9.0))
     assert rule.relocate(everyone, torch.Generator()) == 0  # nobody lives to be shared
 
 
 def test_noise_has_the_shape_of_the_gaussian_and_spares_the_opaque():
-    scene, rule = make(1), MCMC()
+    scene, rule = make_gaussians(1), MCMC()
     p = scene.table.params
     with torch.no_grad():
         p["raw_opacity"].fill_(math.log(0.005 / 0.995))  # where the gate is a half
@@ -131,7 +131,7 @@ def test_noise_has_the_shape_of_the_gaussian_and_spares_the_opaque():
 def test_native_noise_is_that_of_torch(level, n, monkeypatch):
     library = native.load(level)
     monkeypatch.setattr(native, "load", lambda level=None: library)
-    scene = make(n)
+    scene = make_gaussians(n)
     with torch.no_grad():
         scene.table.params["means"].zero_()
     columns = [scene.table.params[name].detach().clone().double() for name in ("means", "quats", "log_scales", "raw_opacity")]

@@ -8,45 +8,14 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.schedule import Every
-from scene_experts.core.table import Table
 from scene_experts.core.types import Decoded, Gaussians, Render
 from scene_experts.geometry.rotation import covariance
-from scene_experts.scene.gaussians import Explicit, GaussianScene
 from scene_experts.strategy.split_clone import SplitClone, split_rows
-from scene_experts.training.optim import Adam
-
-EXTENT = 5.0
-
-
-def make(n=200, seed=0) -> GaussianScene:
-    torch.manual_seed(seed)
-    params = {
-        "means": torch.randn(n, 3),
-        "log_scales": torch.randn(n, 3) * 0.5 + math.log(0.04),  # about the clone size of 0.05
-        "quats": torch.randn(n, 4),
-        "raw_opacity": torch.randn(n) - 4,
-        "sh_dc": torch.randn(n, 3),
-        "sh_rest": torch.randn(n, 15, 3),
-    }
-    scene = GaussianScene(Explicit(), Table(params, {}), EXTENT)
-    groups = scene.rate_groups().items()
-    optimizer = Adam([{"params": p, "name": name, "lr": 0.0, "by_row": True} for name, p in groups])
-    scene.table.attach(optimizer)
-    for parameter in scene.table.params.values():
-        parameter.grad = torch.randn_like(parameter)
-    optimizer.step()
-    scene.table.stats = {"count": torch.randint(0, 4, (n,)).float()}
-    scene.table.stats["grad"] = scene.table.stats["count"] * torch.rand(n) * 4e-4
-    return scene
-
-
-def moments(scene: GaussianScene, name: str) -> torch.Tensor:
-    assert scene.table._optimizer is not None
-    return scene.table._optimizer.state[scene.table.params[name]]["exp_avg"]
+from support.explicit import EXTENT, make_gaussians, moments
 
 
 def test_small_gaussians_are_cloned_and_large_ones_split():
-    scene, rule = make(), SplitClone()
+    scene, rule = make_gaussians(), SplitClone()
     old = {name: value.detach().clone() for name, value in scene.table.params.items()}
     first = moments(scene, "sh_dc").clone()
     count, grad = scene.table.stats["count"], scene.table.stats["grad"]
@@ -71,7 +40,7 @@ def test_small_gaussians_are_cloned_and_large_ones_split():
 
 
 def test_halves_are_drawn_from_the_gaussian():
-    scene = make(2)
+    scene = make_gaussians(2)
     rows = torch.zeros(40_000, dtype=torch.int64)
     halves = split_rows(scene.table.params, rows, torch.Generator().manual_seed(0))
     away = (halves["means"] - scene.table.params["means"][0]).detach().double()
@@ -84,7 +53,7 @@ def test_halves_are_drawn_from_the_gaussian():
 
 def test_faint_gaussians_go_and_huge_ones_after_the_first_reset():
     for step, huge in ((3000, False), (3100, True)):
-        scene, rule = make(), SplitClone(min_opacity=0.02, max_size=0.03)
+        scene, rule = make_gaussians(), SplitClone(min_opacity=0.02, max_size=0.03)
         opacity, size = scene.table.params["raw_opacity"].detach().sigmoid(), scene.table.params["log_scales"].detach().amax(1).exp()
         gone = [i for i in range(len(opacity)) if opacity[i] < 0.02 or (huge and size[i] > 0.03 * EXTENT)]
         keep = [i for i in range(len(opacity)) if i not in gone]
@@ -94,7 +63,7 @@ def test_faint_gaussians_go_and_huge_ones_after_the_first_reset():
 
 
 def test_opacities_are_pressed_and_their_moments_cleared():
-    scene = make()
+    scene = make_gaussians()
     before = scene.table.params["raw_opacity"].detach().sigmoid()
     others = moments(scene, "means").clone()
     SplitClone().press_opacities(scene)
@@ -107,21 +76,21 @@ def test_when_things_happen():
     """Adjustments after 500 at multiples of 100 below 15,000; resets at multiples of 3000 below 15,000; statistics begin anew."""
     rule = SplitClone(grad_threshold=math.inf, min_opacity=0.0, max_size=math.inf)
     for step, adjusts, resets in ((500, 0, 0), (600, 1, 0), (650, 0, 0), (3000, 1, 1), (14_900, 1, 0), (15_000, 0, 0)):
-        scene = make(20)
+        scene = make_gaussians(20)
         edit = rule.update(scene, step, torch.Generator())
         assert (edit is not None) == bool(adjusts), step
         assert (float(scene.table.params["raw_opacity"].detach().sigmoid().max()) <= 0.0101) == bool(resets), step
         assert adjusts == 0 or not scene.table.stats["count"].any()
         assert (scene.table.params["means"].grad is None) == bool(adjusts)
         assert bool(scene.table.stats) == (step < 15_000)
-    scene = make(20)
+    scene = make_gaussians(20)
     replace(rule, reset_at_start=True).update(scene, 500, torch.Generator())
     assert float(scene.table.params["raw_opacity"].detach().sigmoid().max()) <= 0.0101
-    assert replace(rule, enabled=False).update(make(20), 600, torch.Generator()) is None
+    assert replace(rule, enabled=False).update(make_gaussians(20), 600, torch.Generator()) is None
 
 
 def test_statistics_count_what_was_drawn():
-    scene, rule = make(6), SplitClone()
+    scene, rule = make_gaussians(6), SplitClone()
     scene.table.stats = {}
     rows = torch.tensor([4, 0, 2])
     zeros = torch.zeros(3, 3)
@@ -135,7 +104,7 @@ def test_statistics_count_what_was_drawn():
 
 
 def test_the_cap_lets_the_largest_gradients_through():
-    scene = make()
+    scene = make_gaussians()
     g = scene.table.stats["grad"] / scene.table.stats["count"].clamp_min(1)
     best = g.argsort(descending=True)[:7]
     small = (scene.table.params["log_scales"].amax(1).exp() <= 0.05)[best]
@@ -144,7 +113,7 @@ def test_the_cap_lets_the_largest_gradients_through():
     assert len(scene.table) == 207
     copies = scene.table.params["means"].detach()[200 - int((~small).sum()) :][: int(small.sum())]
     assert torch.equal(copies, means[best[small].sort().values])
-    full = make()
+    full = make_gaussians()
     assert SplitClone(max_anchors=150).grow(full, torch.Generator()) == (0, True) and len(full.table) == 200
 
 

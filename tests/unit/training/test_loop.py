@@ -20,45 +20,17 @@ from scene_experts.scene.graph.scene import GraphPoints
 from scene_experts.strategy.split_clone import SplitClone
 from scene_experts.training.config import Data, RunConfig
 from scene_experts.training.events import Adjusted, Finished, Previewed, Saved, Started, Stepped, Stopped
-from scene_experts.training.loop import Run, iterate, rows_to_move, stepped, train, without_graph
+from scene_experts.training.loop import Run, iterate, rows_to_move, stepped, without_graph
 from scene_experts.training.state import Training
 from support.places import GOLDEN
+from support.scenes import METHODS
 from support.synthetic import make_capture
-from unit.scene.test_init import METHODS
+from support.trainings import assert_same, config, events, last_tensors
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     return make_capture(tmp_path_factory.mktemp("capture"), views=16).folder
-
-
-def config(recipe="moe-gs", **changes):
-    """A whole schedule in 600 iterations whose gates open early enough to grow."""
-    cfg = replace(RECIPES[recipe][1], **{"iterations": 600, **changes})
-    growth = replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=20))
-    return replace(cfg, growth=replace(growth, success_threshold=0.05) if hasattr(growth, "success_threshold") else growth)
-
-
-def events(cfg, folder, out=None, rasterizer="auto", world=None, **run):
-    capture = world or load(folder)
-    made = Run(RunConfig(cfg, Data(folder), stop_at=run.pop("stop_at", None)), out=out, **run)
-    try:
-        yield from train(cfg, made, capture, choose(rasterizer, "cpu", deterministic=True))
-    finally:
-        if world is None:
-            capture.images.close()
-
-
-def final(out: Path) -> dict[str, torch.Tensor]:
-    from scene_experts.core import checkpoint
-
-    return checkpoint.load(checkpoint.latest(out / "checkpoints"))[0]
-
-
-def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
-    assert a.keys() == b.keys()
-    for name in a:
-        assert torch.equal(a[name], b[name]), name
 
 
 @pytest.mark.parametrize("recipe", METHODS)
@@ -71,7 +43,7 @@ def test_resumed_equals_uninterrupted_bit_for_bit_while_rows_come_and_go(recipe,
     assert kinds[0] is Started
     second = list(events(cfg, folder, tmp_path / "parts", stop_at=120, resume=True))
     assert second[0].step == 90
-    same(final(tmp_path / "whole"), final(tmp_path / "parts"))
+    assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "parts"))
 
 
 def test_stopping_saves_and_goes_on(folder, tmp_path):
@@ -214,7 +186,7 @@ def test_resuming_on_other_views_is_refused(folder, tmp_path):
 
 def test_losses_that_are_no_numbers_end_the_run_and_keep_its_checkpoint(folder, tmp_path, monkeypatch):
     list(events(config(), folder, tmp_path, stop_at=5))
-    before = final(tmp_path)
+    before = last_tensors(tmp_path)
 
     def broken(decoded, render, target, weights, step, mask):
         return {"l1": render.image.mean() * (math.nan if step > 8 else 1.0)}
@@ -222,15 +194,15 @@ def test_losses_that_are_no_numbers_end_the_run_and_keep_its_checkpoint(folder, 
     monkeypatch.setattr("scene_experts.training.loop.terms", broken)
     with pytest.raises(RunError, match="expected finite losses, found l1 = nan at iteration 9"):
         list(events(config(), folder, tmp_path, stop_at=60, log_every=1, resume=True))
-    same(before, final(tmp_path))
+    assert_same(before, last_tensors(tmp_path))
     with pytest.raises(RunError, match="at iteration 11"):  # not a moment to tell of it, but one to save
         list(events(config(), folder, tmp_path, stop_at=60, log_every=20, save_every=11, resume=True))
-    same(before, final(tmp_path))
+    assert_same(before, last_tensors(tmp_path))
     with pytest.raises(RunError, match="at iteration 10"):  # stopped
         stop: list[str] = []
         for event in events(config(), folder, tmp_path, stop_at=60, log_every=20, preview_every=10, stop=stop, resume=True):
             stop += ["SIGTERM"] if isinstance(event, Previewed) else []
-    same(before, final(tmp_path))
+    assert_same(before, last_tensors(tmp_path))
 
 
 def test_more_anchors_than_the_cap_to_start_with_is_said(folder):

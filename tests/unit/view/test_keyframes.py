@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from scene_experts.view import path_files
-from unit.view.test_server import capture, joined, viewer  # noqa: F401
+from support.viewers import joined
 
 pytest.importorskip("viser")
 
 
-def test_keyframes_become_a_path_that_render_reads(viewer, capture, tmp_path):  # noqa: F811
+def test_keyframes_become_a_path_that_render_reads(viewer, capture, tmp_path):
     handle, keys = joined(viewer), viewer.panel.keyframes
     keys.folder = tmp_path
     keys.save(None)
@@ -33,7 +33,7 @@ def test_keyframes_become_a_path_that_render_reads(viewer, capture, tmp_path):  
     assert keys.keys == []
 
 
-def test_playing_moves_the_client(viewer):  # noqa: F811
+def test_playing_moves_the_client(viewer):
     handle, keys = joined(viewer), viewer.panel.keyframes
     keys.play(handle)
     assert "at least two" in keys.words.content

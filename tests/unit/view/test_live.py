@@ -11,10 +11,10 @@ from scene_experts.recipes import RECIPES
 
 pytest.importorskip("viser")
 from scene_experts.view.live import Live
-from unit.view.test_server import DRAW, capture, joined, viewer  # noqa: F401
+from support.viewers import DRAW, joined
 
 
-def test_a_training_is_shown_within_its_share_and_held_while_paused(viewer, capture):  # noqa: F811
+def test_a_training_is_shown_within_its_share_and_held_while_paused(viewer, capture):
     scene, _ = viewer.current()
     training = SimpleNamespace(scene=scene, step=5)
     stop: list[str] = []
@@ -36,7 +36,7 @@ def test_a_training_is_shown_within_its_share_and_held_while_paused(viewer, capt
         live.close()
 
 
-def test_a_coarser_level_in_the_browser_leaves_the_training_all_its_levels(capture):  # noqa: F811
+def test_a_coarser_level_in_the_browser_leaves_the_training_all_its_levels(capture):
     torch.manual_seed(0)
     scene = RECIPES["octree-gs"][1].scene.start(capture.points, capture.extent, [v.camera for v in capture.views])
     live = Live(capture, DRAW, lambda: False, port=0, ready=lambda url: None)

@@ -7,7 +7,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
 from scene_experts.render import choose
 from scene_experts.view.paint import MODES, PALETTE, Look, paint, ramp, row_colours
-from unit.scene.test_init import CAMERA, started
+from support.scenes import CAMERA, start_scene
 
 BLACK = torch.zeros(3)
 DRAW = choose("auto", "cpu")
@@ -15,11 +15,11 @@ DRAW = choose("auto", "cpu")
 
 def decoded(recipe="moe-gs", step=2000):
     with torch.no_grad():
-        return started(recipe)(CAMERA, step, Mode.DRAW, DRAW.visible)
+        return start_scene(recipe)(CAMERA, step, Mode.DRAW, DRAW.visible)
 
 
 def test_the_plain_picture_is_the_render():
-    scene = started("moe-gs")
+    scene = start_scene("moe-gs")
     with torch.no_grad():
         image = DRAW(scene(CAMERA, 2000, Mode.DRAW, DRAW.visible).gaussians, CAMERA, BLACK).image
     assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK), image.clamp(0, 1))
@@ -27,14 +27,14 @@ def test_the_plain_picture_is_the_render():
 
 @pytest.mark.parametrize("mode", MODES)
 def test_a_frozen_scene_gives_the_same_picture(mode):
-    scene = started("moe-gs")
+    scene = start_scene("moe-gs")
     draws = scene.frozen(2000)
     assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK, Look(mode), draws), paint(scene, CAMERA, 2000, DRAW, BLACK, Look(mode)))
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_every_mode_gives_a_picture(mode):
-    picture = paint(started("moe-gs"), CAMERA, 2000, DRAW, BLACK, Look(mode))
+    picture = paint(start_scene("moe-gs"), CAMERA, 2000, DRAW, BLACK, Look(mode))
     assert picture.shape == (32, 48, 3) and picture.min() >= 0 and picture.max() <= 1 and torch.isfinite(picture).all()
 
 
@@ -56,7 +56,7 @@ def test_entropy_of_even_gates_is_light_and_activation_counts_slots():
 
 
 def test_one_expert_alone_draws_less_and_all_together_the_whole():
-    scene = started("moe-gs")
+    scene = start_scene("moe-gs")
     whole = paint(scene, CAMERA, 2000, DRAW, BLACK)
     assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK, Look(only=(0, 1, 2, 3, 4))), whole)
     assert paint(scene, CAMERA, 2000, DRAW, BLACK, Look("alpha", only=())).max() == 0
@@ -64,8 +64,8 @@ def test_one_expert_alone_draws_less_and_all_together_the_whole():
 
 def test_no_experts_no_expert_view():
     with pytest.raises(InputError, match="expected a scene with experts"):
-        paint(started("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("experts"))
-    assert paint(started("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("activation")).shape == (32, 48, 3)
+        paint(start_scene("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("experts"))
+    assert paint(start_scene("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("activation")).shape == (32, 48, 3)
 
 
 def test_the_ramp_runs_dark_to_light():

@@ -5,19 +5,18 @@ import pytest
 import torch
 
 from scene_experts.training.events import Finished, Stepped
-from unit.view.test_server import capture, viewer  # noqa: F401
 
 pytest.importorskip("viser")
 
 
-def test_one_expert_alone(viewer):  # noqa: F811
+def test_one_expert_alone(viewer):
     for switch in viewer.panel.switches:
         switch.value = False
     viewer.panel.switches[2].value = True
     assert viewer.panel.look().only == (2,)
 
 
-def test_cameras_and_anchors_come_and_go(viewer):  # noqa: F811
+def test_cameras_and_anchors_come_and_go(viewer):
     viewer.panel.show_frusta(True)
     viewer.panel.show_anchors(True)
     assert (
@@ -28,7 +27,7 @@ def test_cameras_and_anchors_come_and_go(viewer):  # noqa: F811
     assert viewer.server.scene.get_handle_by_name("/anchors") is None and viewer.server.scene.get_handle_by_name("/cameras/0") is None
 
 
-def test_curves_follow_a_training(viewer):  # noqa: F811
+def test_curves_follow_a_training(viewer):
     viewer.panel.train()
     for step in (10, 20):
         viewer.panel.followed = 0.0
@@ -41,5 +40,5 @@ def test_curves_follow_a_training(viewer):  # noqa: F811
     assert "ended at iteration 30" in viewer.panel.status.content and not viewer.panel.paused()
 
 
-def test_the_background_is_the_captures(viewer, capture):  # noqa: F811
+def test_the_background_is_the_captures(viewer, capture):
     assert torch.allclose(torch.tensor(viewer.panel.background()), torch.tensor(capture.background), atol=0.01)

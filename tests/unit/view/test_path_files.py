@@ -10,7 +10,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.data.views import World
 from scene_experts.view import path_files
 from scene_experts.view.paths import CameraPath, look_at, with_fov
-from unit.scene.test_init import CAMERA
+from support.scenes import CAMERA
 
 WORLD = World(2.5, (1.0, -2.0, 0.5))
 

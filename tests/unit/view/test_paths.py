@@ -13,8 +13,8 @@ from scene_experts.geometry.rotation import quat_to_matrix
 from scene_experts.view import paths
 from scene_experts.view.paths import Around, best_view, catmull_rom, interpolate, look_at, make, orbit, pose, slerp, spiral, with_fov
 from support.places import DEMO
+from support.scenes import CAMERA
 from support.synthetic import make_capture
-from unit.scene.test_init import CAMERA
 
 
 @pytest.fixture(scope="module")

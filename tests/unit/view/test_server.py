@@ -1,80 +1,18 @@
 """The viewer without a browser: clients come, move, ask, go away, and send nonsense; in a browser it is driven in test_view_browser.py."""
 
-import threading
 import time
-from contextlib import contextmanager
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from scene_experts.data.capture import load
 from scene_experts.evaluate.pictures import to_8bit
-from scene_experts.recipes import RECIPES
-from scene_experts.render import choose
 from scene_experts.view.paint import paint
 from scene_experts.view.paths import best_view
-from support.synthetic import make_capture
 
 pytest.importorskip("viser")
 from scene_experts.view.server import Client, Viewer
-
-DRAW = choose("auto", "cpu")
-
-
-class Handle:
-    """What the viewer uses of a viser client."""
-
-    def __init__(self, number=0):
-        self.client_id, self.pictures, self.update = number, [], None
-        self.camera = SimpleNamespace(
-            wxyz=np.array([1.0, 0, 0, 0]), position=np.zeros(3), fov=0.8, aspect=1.5, image_height=60, on_update=self.keep, look_at=None
-        )
-        self.scene = SimpleNamespace(set_background_image=lambda picture, **how: self.pictures.append((picture, how)))
-
-    def keep(self, function):
-        self.update = function
-
-    @contextmanager
-    def atomic(self):
-        yield
-
-    def move(self):
-        self.update(None)  # type: ignore[misc]
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    capture = load(make_capture(tmp_path_factory.mktemp("capture"), views=9).folder)
-    yield capture
-    capture.images.close()
-
-
-@pytest.fixture
-def viewer(capture):
-    torch.manual_seed(0)
-    scene = RECIPES["moe-gs"][1].scene.start(capture.points, capture.extent)
-    made = Viewer(capture, lambda: (scene, 2000), DRAW, port=0)
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def serving(viewer):
-    stop = threading.Event()
-    thread = threading.Thread(target=viewer.serve, args=(stop.is_set,), daemon=True)
-    thread.start()
-    yield viewer
-    stop.set()
-    thread.join(10)
-
-
-def joined(viewer, number=0) -> Handle:
-    handle = Handle(number)
-    viewer.connect(handle)
-    viewer.clients[number].moved = viewer.clients[number].arriving = 0.0
-    return handle
+from support.viewers import DRAW, Handle, joined
 
 
 def test_a_client_starts_at_the_best_held_out_view_and_gets_our_own_render(viewer, capture):

@@ -13,11 +13,9 @@ import viser
 from viser._messages import ViewerCameraMessage
 from websockets.sync.client import connect
 
-from unit.view.test_server import capture, serving, viewer  # noqa: F401
-
 
 @contextmanager
-def socket(viewer, camera=True):  # noqa: F811
+def socket(viewer, camera=True):
     url, protocol = viewer.url.replace("http", "ws"), f"viser-v{viser.__version__}"
     with connect(url, subprotocols=[protocol], max_size=None, open_timeout=10) as made:  # type: ignore[list-item]
         if camera:
@@ -38,13 +36,13 @@ def picture(made, seconds=20.0) -> bool:
     return False
 
 
-def settled(viewer, seconds=20.0):  # noqa: F811
+def settled(viewer, seconds=20.0):
     end = time.monotonic() + seconds
     while viewer.clients and time.monotonic() < end:
         time.sleep(0.02)
 
 
-def test_fifty_reconnects_leak_nothing(serving):  # noqa: F811
+def test_fifty_reconnects_leak_nothing(serving):
     with socket(serving) as made:
         assert picture(made)
     settled(serving)
@@ -64,7 +62,7 @@ def test_fifty_reconnects_leak_nothing(serving):  # noqa: F811
     assert serving.server.get_clients() == {}
 
 
-def test_malformed_messages_end_their_own_client_alone(serving):  # noqa: F811
+def test_malformed_messages_end_their_own_client_alone(serving):
     camera = {"type": "ViewerCameraMessage"}
     nonsense = [
         b"",

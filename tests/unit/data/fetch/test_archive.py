@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import stat
-import tarfile
 import zipfile
 from pathlib import Path
 
@@ -13,36 +12,7 @@ import pytest
 
 from scene_experts.core.errors import RunError
 from scene_experts.data.fetch import archive
-
-FILES = {"images/b.jpg": b"b" * 1000, "images/a.jpg": b"a" * 10, "sparse/0/cameras.bin": b"c", "poses.npy": b""}
-
-
-def write_zip(path: Path, files: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
-    with zipfile.ZipFile(path, "w", method) as out:
-        for name, data in files.items():
-            out.writestr(name, data)
-    return path
-
-
-def write_tar(path: Path, files: dict[str, bytes], links: dict[str, str] | None = None) -> Path:
-    with tarfile.open(path, "w:gz") as out:
-        for name, data in files.items():
-            info = tarfile.TarInfo(name)
-            info.size = len(data)
-            out.addfile(info, io.BytesIO(data))
-        for name, target in (links or {}).items():
-            info = tarfile.TarInfo(name)
-            info.type, info.linkname = tarfile.SYMTYPE, target
-            out.addfile(info)
-    return path
-
-
-def scene(prefix: str, files: dict[str, bytes] = FILES) -> dict[str, bytes]:
-    return {f"{prefix}/{name}": data for name, data in files.items()}
-
-
-def tree(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+from support.archives import FILES, in_folder, read_tree, write_tar, write_zip
 
 
 @pytest.mark.parametrize("write", [write_zip, write_tar])
@@ -50,20 +20,20 @@ def tree(folder: Path) -> dict[str, bytes]:
 def test_one_scene_of_many(tmp_path: Path, write, prefix: str) -> None:
     source = write(
         tmp_path / "a",
-        {**scene("tandt/train"), **scene(prefix), "truck.txt": b"x", f"{prefix}/.DS_Store": b"", f"{prefix}/images/._a.jpg": b""},
+        {**in_folder("tandt/train"), **in_folder(prefix), "truck.txt": b"x", f"{prefix}/.DS_Store": b"", f"{prefix}/images/._a.jpg": b""},
     )
     seen: list[tuple[int, int]] = []
     out = archive.extract(source, "truck", tmp_path / "deep" / "truck", ["tandt/truck"], lambda *n: seen.append(n))
-    assert tree(tmp_path / "deep" / "truck") == FILES and seen[-1] == (1011, 1011)
+    assert read_tree(tmp_path / "deep" / "truck") == FILES and seen[-1] == (1011, 1011)
     assert out == archive.Extracted(prefix.removeprefix("./"), 4, 1011)
     assert os.listdir(tmp_path / "deep") == ["truck"]
     assert stat.S_IMODE((tmp_path / "deep" / "truck").stat().st_mode) == stat.S_IMODE((tmp_path / "deep").stat().st_mode)
 
 
 def test_the_stated_place_wins_and_two_others_are_refused(tmp_path: Path) -> None:
-    source = write_zip(tmp_path / "a.zip", {**scene("x/truck", {"images/x": b"x"}), **scene("y/truck", {"images/y": b"y"})})
+    source = write_zip(tmp_path / "a.zip", {**in_folder("x/truck", {"images/x": b"x"}), **in_folder("y/truck", {"images/y": b"y"})})
     archive.extract(source, "truck", tmp_path / "one", ["y/truck"])
-    assert tree(tmp_path / "one") == {"images/y": b"y"}
+    assert read_tree(tmp_path / "one") == {"images/y": b"y"}
     with pytest.raises(RunError, match="found 2"):
         archive.extract(source, "truck", tmp_path / "two", ["z/truck"])
     with pytest.raises(RunError, match=r"train.*a\.zip, found truck"):
@@ -72,28 +42,28 @@ def test_the_stated_place_wins_and_two_others_are_refused(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("name", ["../evil", "images/../../evil", "images/..\\..\\evil", "C:evil", "images/./x"])
 def test_names_that_lead_elsewhere(tmp_path: Path, name: str) -> None:
-    source = write_zip(tmp_path / "a.zip", {**scene("truck"), f"truck/{name}": b"evil"})
+    source = write_zip(tmp_path / "a.zip", {**in_folder("truck"), f"truck/{name}": b"evil"})
     with pytest.raises(RunError, match="a name that leads outside"):
         archive.extract(source, "truck", tmp_path / "in" / "truck")
     assert not list(tmp_path.rglob("*evil*")) and not (tmp_path / "in").exists()
 
 
 def test_links_are_refused(tmp_path: Path) -> None:
-    tar = write_tar(tmp_path / "a.tar.gz", scene("truck"), {"truck/images/link.jpg": "/etc/passwd"})
+    tar = write_tar(tmp_path / "a.tar.gz", in_folder("truck"), {"truck/images/link.jpg": "/etc/passwd"})
     with pytest.raises(RunError, match="found a link"):
         archive.extract(tar, "truck", tmp_path / "truck")
     link = zipfile.ZipInfo("truck/images/link.jpg")
     link.external_attr = (stat.S_IFLNK | 0o777) << 16
-    zipped = write_zip(tmp_path / "a.zip", scene("truck"))
+    zipped = write_zip(tmp_path / "a.zip", in_folder("truck"))
     with zipfile.ZipFile(zipped, "a") as out:
         out.writestr(link, "/etc/passwd")
     with pytest.raises(RunError, match="found a link"):
         archive.extract(zipped, "truck", tmp_path / "truck")
-    archive.extract(write_tar(tmp_path / "b", scene("truck"), {"train/link": "/etc"}), "truck", tmp_path / "truck")  # not in the scene
+    archive.extract(write_tar(tmp_path / "b", in_folder("truck"), {"train/link": "/etc"}), "truck", tmp_path / "truck")  # not in the scene
 
 
 def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = write_zip(tmp_path / "a.zip", scene("truck"))
+    source = write_zip(tmp_path / "a.zip", in_folder("truck"))
     with monkeypatch.context() as patch:
         patch.setattr(archive, "MOST_BYTES", 1010)
         with pytest.raises(RunError, match="found 4 files of 0 GB"):
@@ -109,7 +79,7 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_two_files_of_one_name(tmp_path: Path) -> None:
-    source = write_zip(tmp_path / "a.zip", scene("truck"))
+    source = write_zip(tmp_path / "a.zip", in_folder("truck"))
     with zipfile.ZipFile(source, "a") as out, pytest.warns(UserWarning, match="Duplicate"):
         out.writestr("truck/poses.npy", b"other")
     with pytest.raises(RunError, match="two files"):
@@ -126,11 +96,11 @@ def damaged_bytes(path: Path) -> Path:
 
 def test_damage_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "text.zip").write_text("<html>")
-    cut = write_zip(tmp_path / "cut.zip", scene("truck"))
+    cut = write_zip(tmp_path / "cut.zip", in_folder("truck"))
     cut.write_bytes(cut.read_bytes()[:-30])
-    short = write_tar(tmp_path / "short.tar.gz", {**scene("truck"), "truck/images/noise": os.urandom(50_000)})
+    short = write_tar(tmp_path / "short.tar.gz", {**in_folder("truck"), "truck/images/noise": os.urandom(50_000)})
     short.write_bytes(short.read_bytes()[:-20_000])
-    flipped = damaged_bytes(write_zip(tmp_path / "flipped.zip", scene("truck"), zipfile.ZIP_STORED))
+    flipped = damaged_bytes(write_zip(tmp_path / "flipped.zip", in_folder("truck"), zipfile.ZIP_STORED))
     for source in (tmp_path / "text.zip", cut, short, flipped):
         with pytest.raises(RunError, match=r"damaged one \([^\n]+\)"):
             archive.extract(source, "truck", tmp_path / "out" / "truck")

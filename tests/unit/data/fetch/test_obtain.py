@@ -13,8 +13,8 @@ import pytest
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.data.fetch import download, obtain
 from scene_experts.data.fetch.catalog import Archive, Collection, Scene
+from support.archives import in_folder, read_tree, write_zip
 from support.web import Server, serving
-from unit.data.fetch.test_archive import scene, tree, write_zip
 
 FILES = {"images/a.jpg": b"a", "images/b.jpg": b"b", "sparse/0/cameras.bin": b"c"}
 
@@ -22,7 +22,7 @@ FILES = {"images/a.jpg": b"a", "images/b.jpg": b"b", "sparse/0/cameras.bin": b"c
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
     monkeypatch.setattr(download, "PATIENCE", 0.0)
-    source = write_zip(tmp_path / "both.zip", {**scene("both/truck", FILES), **scene("both/train", FILES)})
+    source = write_zip(tmp_path / "both.zip", {**in_folder("both/truck", FILES), **in_folder("both/train", FILES)})
     with serving() as running:
         running.files["/both.zip"] = source.read_bytes()
         source.unlink()
@@ -48,7 +48,7 @@ def test_an_archive_is_fetched_once(server: Server, tmp_path: Path) -> None:
     source = json.loads((folder / "source.json").read_text())
     digest = hashlib.sha256(server.files["/both.zip"]).hexdigest()
     assert source["archive_sha256"] == digest and source["licence"] == "not stated" and source["inside"] == "both/truck"
-    assert tree(folder).keys() == {*FILES, "source.json"} and not (tmp_path / "pair" / "train").exists()
+    assert read_tree(folder).keys() == {*FILES, "source.json"} and not (tmp_path / "pair" / "train").exists()
     assert {told[0] for told in seen} == {"both.zip", "unpacking truck"}
     assert any("none is published" in line and digest in line for line in said)
     assert get(both, tmp_path)[0] == f"truck is at {folder}" and server.asked == [None]

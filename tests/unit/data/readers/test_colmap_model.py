@@ -13,7 +13,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.readers.colmap_model import ColmapImage, Model, find_model, read_model, write_model
-from unit.data.test_lens import LENSES
+from support.lenses import LENSES
 
 
 def model() -> Model:

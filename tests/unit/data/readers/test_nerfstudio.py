@@ -14,8 +14,8 @@ from scene_experts.core.errors import InputError
 from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
 from scene_experts.data.summary import summarise
+from support.lenses import LENSES
 from support.synthetic import make_capture, make_nerfstudio, picture
-from unit.data.test_lens import LENSES
 
 
 def edit(path: Path, change) -> None:

@@ -13,11 +13,11 @@ from scene_experts.files.anchors.extras import (
     rescaled,
     trained_names,
 )
-from unit.scene.test_init import started
+from support.scenes import start_scene
 
 
 def test_the_distance_of_a_feature_bank_changes_its_unit_and_back():
-    scene = started("scaffold-gs-bank")
+    scene = start_scene("scaffold-gs-bank")
     files = extra_networks(scene, 4.0)
     assert files.keys() == {"feature_bank"}
     x = torch.randn(5, 4)
@@ -27,16 +27,16 @@ def test_the_distance_of_a_feature_bank_changes_its_unit_and_back():
     back = trained_names({**files, "color": {}}, 4.0)
     assert back.keys() == {"mix", "color"}
     torch.testing.assert_close(back["mix"]["w1"], scene.mix.w1.detach())
-    assert extra_networks(started("scaffold-gs"), 4.0) == {} == trained_names({}, 4.0)
+    assert extra_networks(start_scene("scaffold-gs"), 4.0) == {} == trained_names({}, 4.0)
     assert torch.equal(rescaled(files["feature_bank"], 1.0)["w1"], files["feature_bank"]["w1"])
 
 
 def test_levels_to_columns_and_back():
-    scene = started("octree-gs")
+    scene = start_scene("octree-gs")
     levels, facts = scene.select.lattices, scene.table.facts
     columns = level_columns(scene, 2.0)
     assert columns["info"][:2].tolist() == pytest.approx([levels.edge / 2, levels.standard / 2])
-    assert level_columns(started("scaffold-gs"), 2.0) == {}
+    assert level_columns(start_scene("scaffold-gs"), 2.0) == {}
     again = level_facts(levels_in(scene.meta()), {"xyz": facts["xyz"] + 1e-6, **columns}, exact=True)
     assert all(torch.equal(again[name], facts[name]) for name in ("cell", "xyz", "level", "extra_level"))
     assert not torch.equal(level_facts(levels, {"xyz": facts["xyz"] + 1e-6, **columns}, exact=False)["xyz"], facts["xyz"])

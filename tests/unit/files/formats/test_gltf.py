@@ -13,6 +13,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.files.formats import gltf
 from scene_experts.geometry.rotation import covariance
 from scene_experts.geometry.sh import sh_to_rgb
+from support.gltf import column, parsed
 from support.splat_quanta import check, scene
 
 
@@ -23,20 +24,6 @@ def test_round_trip_is_exact(tmp_path_factory, n, degree, seed):
     s = scene(n, degree if n else 0, seed)
     gltf.write_glb(path, s, {})
     check("glb", gltf.read_glb(path), s)
-
-
-def parsed(path):
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    return json.loads(data[20 : 20 + size]), data[20 + size + 8 :]
-
-
-def column(doc, body, name):
-    accessor = doc["accessors"][doc["meshes"][0]["primitives"][0]["attributes"][name]]
-    view = doc["bufferViews"][accessor["bufferView"]]
-    kind = np.uint8 if accessor["componentType"] == 5121 else np.float32
-    flat = np.frombuffer(body[view["byteOffset"] : view["byteOffset"] + view["byteLength"]], kind)
-    return flat.reshape(accessor["count"], -1)
 
 
 def test_what_a_gltf_viewer_sees_is_the_scene_half_turned(tmp_path):

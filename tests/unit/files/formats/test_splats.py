@@ -9,14 +9,9 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Points
 from scene_experts.data.views import World
-from scene_experts.files.formats.splats import Splats, from_scene, to_columns
+from scene_experts.files.formats.splats import from_scene, to_columns
 from scene_experts.scene.gaussians import COLUMNS, Explicit
-
-
-def splats(n=5, degree=3, seed=0):
-    g = torch.Generator().manual_seed(seed)
-    new = lambda *shape: torch.randn(*shape, generator=g)  # noqa: E731
-    return Splats(new(n, 3), new(n, 3), new(n, 4), new(n), new(n, (degree + 1) ** 2, 3))
+from support.splats import splats
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

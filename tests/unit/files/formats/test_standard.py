@@ -11,7 +11,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.files.formats.comments import read_note
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.formats.standard import FORMATS, format_of, read_standard, write_standard
-from unit.files.formats.test_splats import splats
+from support.splats import splats
 
 NOTE = {"recipe": "moe-gs", "psnr": 21.88}
 

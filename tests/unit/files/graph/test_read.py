@@ -13,10 +13,9 @@ from scene_experts.files.ply import read_vertices, write_vertices
 from scene_experts.render import choose
 from scene_experts.training import run_folder
 from scene_experts.training.config import Data
-from unit.files.graph.test_write import made  # noqa: F401  (a fixture)
 
 
-def test_a_run_comes_back_from_its_files(made, tmp_path):  # noqa: F811
+def test_a_run_comes_back_from_its_files(made, tmp_path):
     run, _, capture = made
     again = run_folder.open_run(import_result(run, Data(capture.root), tmp_path / "again"))
     first, draw = run_folder.open_run(run), choose("auto", "cpu", deterministic=True)
@@ -35,7 +34,7 @@ def test_a_run_comes_back_from_its_files(made, tmp_path):  # noqa: F811
     assert (tmp_path / "again" / "point_cloud" / "iteration_60" / "networks.safetensors").is_file()
 
 
-def test_what_does_not_fit_is_told(made, tmp_path):  # noqa: F811
+def test_what_does_not_fit_is_told(made, tmp_path):
     run, folder, capture = made
     with pytest.raises(InputError, match="world of the scene"):
         import_result(run, Data(capture.root, normalise="none"), tmp_path / "other")

@@ -1,7 +1,5 @@
 """Graph points as files: SAGS's row layout, and a picture from the files alone in the capture's own frame; other formats refuse."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -10,33 +8,13 @@ from scene_experts.core.checkpoint import read_tensors
 from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.core.types import Mode
-from scene_experts.data.capture import load
 from scene_experts.evaluate.score import sizes
-from scene_experts.files.export import export_run, write_layout
+from scene_experts.files.export import export_run
 from scene_experts.files.graph import write as graph_points
 from scene_experts.files.ply import read_vertices
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.graph.scene import GraphScene
-from scene_experts.training import loop as train
 from scene_experts.training import run_folder
-from scene_experts.training.config import Data, RunConfig
-from support.synthetic import make_capture
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A short training of a capture whose unit is not ours, and its folder."""
-    root = tmp_path_factory.mktemp("graph")
-    folder = make_capture(root / "capture", views=9, size=(48, 32), points=150, scale=3.0).folder
-    cfg = replace(RECIPES["sags"][1], iterations=60)
-    config = RunConfig(cfg, Data(folder))
-    run_folder.prepare(root / "run", config, resume=False)
-    capture = load(folder)
-    list(train.train(cfg, train.Run(config, root / "run"), capture, choose("auto", "cpu")))
-    written = write_layout(run_folder.open_run(root / "run"), capture)
-    capture.images.close()
-    return root / "run", written, capture
 
 
 def test_a_row_takes_196_bytes_in_the_layout_of_sags(made):

@@ -15,7 +15,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.balance import BalancedExperts, BalancedHead
 from scene_experts.scene.anchors.experts import Experts, MixtureHead
 from scene_experts.training.config import check, to_json
-from unit.scene.test_init import started
+from support.scenes import start_scene
 
 SOURCE = Path(scene_experts.__file__).parent
 STEP = 2000  # after the dense warm-up
@@ -94,7 +94,7 @@ def test_the_recipe_and_its_flags():
     assert recipe.loss.load == 0 and recipe.loss.opacity == 0.01 and recipe.scene.decoder == BalancedExperts()
     with pytest.raises(InputError, match=r"--scene\.decoder\.speed"):
         BalancedExperts(speed=-1.0).check()
-    scene = started("moe-gs-balance")
+    scene = start_scene("moe-gs-balance")
     assert all(isinstance(h, BalancedHead) for h in scene.heads.values()) and scene.native_weights(STEP) is None
     assert {f"{a}.router_balance" for a in ("opacity", "cov", "color")} <= set(scene.network_tensors())
 

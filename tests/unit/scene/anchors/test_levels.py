@@ -1,26 +1,14 @@
 """Lattices of several levels against the formulas of Octree-GS, point by point."""
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from scene_experts.core.types import Camera
 from scene_experts.scene.anchors.levels import Levels, blended, cube, distances, level_count, occupied, whole, within_reach
+from support.octree import camera_at, slow_level
 
 LEVELS = Levels(4, 2, 2, 0.8, (-1.0, -1.0, -1.0), 8.0, "round", 0.5, ((0.0, 0.0, -1.0), (0.0, 0.0, -9.0), (3.0, 0.0, 0.5)))
-
-
-def camera(x: float, y: float, z: float) -> Camera:
-    pose = torch.eye(4)
-    pose[:3, 3] = -torch.tensor([x, y, z])
-    return Camera(pose, torch.eye(3), 4, 4)
-
-
-def slow_level(x: list[float], level: int, position: tuple[float, ...]) -> float:
-    r = math.dist([c + 0.8 / (2 * 2**level) for c in x], position)
-    return math.log2(8.0 / r)
 
 
 def test_the_level_that_a_distance_asks_for():
@@ -54,10 +42,10 @@ def test_shares_and_weeding_by_counting():
 
 def test_how_many_levels():
     points = torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 2], [0, 0, 4]], dtype=torch.float64)  # one twice
-    far, near = distances(points, [camera(0, 0, 0), camera(0, 0, -4)], 1.0)
+    far, near = distances(points, [camera_at(0, 0, 0), camera_at(0, 0, -4)], 1.0)
     assert (far, near) == (8.0, 1.0) and level_count(far, near, 2) == 4
     assert level_count(8.0, 1.0, 8) == 2 and level_count(1.0, 1.0, 2) == 1 and level_count(1.0, 0.0, 2) == 1
-    inner, outer = distances(points, [camera(0, 0, 0)], 0.75)  # distances 1, 2, 4: quantiles 3 and 1.5, and again of those two
+    inner, outer = distances(points, [camera_at(0, 0, 0)], 0.75)  # distances 1, 2, 4: quantiles 3 and 1.5, and again of those two
     assert (inner, outer) == pytest.approx((1.5 + 0.75 * 1.5, 1.5 + 0.25 * 1.5))
 
 

@@ -10,7 +10,7 @@ from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.select import AllAnchors, LevelSelector, Octree, faded, visible_rows
-from unit.scene.anchors.test_levels import camera, slow_level
+from support.octree import camera_at, slow_level
 
 CAMERA = Camera(torch.eye(4), torch.eye(3), 4, 4)
 LEVELS = Levels(4, 1, 2, 0.8, (-1.0, -1.0, -1.0), 8.0, "round", 0.0, ((0.0, 0.0, 0.0),))
@@ -48,7 +48,7 @@ def test_anchors_of_a_level_are_used_where_their_distance_asks_for_it(step):
             real = slow_level(rows.facts["xyz"][i].tolist(), int(rows.facts["level"][i]), at) + float(rows.facts["extra_level"][i])
             if int(rows.facts["level"][i]) <= min(max(round(real), 0), top - 1):
                 expected.append(i)
-        assert select(rows, camera(*at), step, mode).tolist() == expected
+        assert select(rows, camera_at(*at), step, mode).tolist() == expected
         assert select.top(step, mode) == top
 
 
@@ -67,7 +67,7 @@ def test_levels_are_let_in_one_by_one():
 
 def test_a_viewer_may_hold_the_level():
     rows, select = table(), LevelSelector(Octree(), LEVELS)
-    near = camera(2.0, 2.0, 2.0)
+    near = camera_at(2.0, 2.0, 2.0)
     capped = select.capped(1)(rows, near, 20_000, Mode.DRAW)
     assert (rows.facts["level"][capped] <= 1).all() and len(capped) == int((rows.facts["level"] <= 1).sum())
     assert torch.equal(select.capped(1).capped(None)(rows, near, 20_000, Mode.DRAW), select(rows, near, 20_000, Mode.DRAW))
@@ -77,8 +77,8 @@ def test_a_viewer_may_hold_the_level():
 def test_blending_fades_the_finest_level_in():
     rows, at = table(), (0.5, 0.2, -1.0)
     select = LevelSelector(Octree(rule="blend"), replace(LEVELS, rule="blend"))
-    chosen = select(rows, camera(*at), 20_000, Mode.DRAW)
-    fade = select.fade(rows, chosen, camera(*at), 20_000, Mode.DRAW)
+    chosen = select(rows, camera_at(*at), 20_000, Mode.DRAW)
+    fade = select.fade(rows, chosen, camera_at(*at), 20_000, Mode.DRAW)
     for i, row in enumerate(chosen.tolist()):
         level = int(rows.facts["level"][row])
         real = slow_level(rows.facts["xyz"][row].tolist(), level, at) + float(rows.facts["extra_level"][row]) + 1
@@ -86,7 +86,7 @@ def test_blending_fades_the_finest_level_in():
         assert level <= int(real)
         assert float(fade[i]) == pytest.approx(real - int(real) if level == int(real) else 1.0, abs=1e-4)
     assert ((fade > 0) & (fade < 1)).any() and (fade == 1).any()
-    assert LevelSelector(Octree(), LEVELS).fade(rows, chosen, camera(*at), 20_000, Mode.DRAW) is None
+    assert LevelSelector(Octree(), LEVELS).fade(rows, chosen, camera_at(*at), 20_000, Mode.DRAW) is None
 
 
 def test_fading_scales_raw_and_drawn_opacities():
@@ -99,7 +99,7 @@ def test_fading_scales_raw_and_drawn_opacities():
 
 
 XYZ = torch.rand(300, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * torch.tensor([2.0, 2, 8])
-CAMERAS = [camera(1.0, 1.0, z) for z in (-2.0, -1.0, 0.0, 2.0, 3.0, 6.0)]
+CAMERAS = [camera_at(1.0, 1.0, z) for z in (-2.0, -1.0, 0.0, 2.0, 3.0, 6.0)]
 
 
 def start(**changes):

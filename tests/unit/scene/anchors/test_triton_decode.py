@@ -12,8 +12,8 @@ from scene_experts.scene.anchors import scene as anchors
 from scene_experts.scene.anchors.experts import Experts, Router
 from scene_experts.scene.anchors.mlp import HeadWeights, Plain
 from scene_experts.scene.anchors.scene import ATTRIBUTES, Anchors, AnchorScene
+from support.decoding import CASES, EXTENT, compare, leaves, objective, oracle, problem, single_precision
 from support.interpret import DEVICE, kernels
-from unit.scene.anchors.test_native_decode import CASES, EXTENT, compare, leaves, objective, oracle, problem, single_precision
 
 SMALL = {
     "paper's sizes, several chunks": {"A": 70, "N": 80},

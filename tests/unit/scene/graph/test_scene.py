@@ -6,40 +6,18 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.types import Camera, Mode, Points
+from scene_experts.core.types import Mode, Points
 from scene_experts.geometry.curvature import curvature, flatter
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.graph.hash_grid import HashGrid
 from scene_experts.scene.graph.network import Graph, blended
 from scene_experts.scene.graph.scene import GraphPoints, GraphRates, GraphScene
-
-CAMERA = Camera(torch.eye(4), torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), 48, 32, 0.2)
-
-
-def cloud(n: int = 80) -> Points:
-    xyz = torch.randn(n, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(4)) * torch.tensor([2.0, 1.5, 0.5])
-    return Points(xyz + torch.tensor([0.0, 0, 5]), torch.full((n, 3), 128, dtype=torch.uint8))
-
-
-def started(dtype: torch.dtype = torch.float64, **changes) -> GraphScene:
-    """A scene whose features and offsets are no longer what they start as."""
-    torch.manual_seed(0)
-    scene = GraphPoints(**{"voxel_size": 0.05, **changes}).start(cloud(), 5.0, [CAMERA])
-    for p in (scene.table.params["feature"], scene.beta, scene.grid.table):
-        p.data.normal_(0, 0.1 if p is scene.beta else 1.5)
-    scene.heads["opacity"].layers[0].data[:, scene.grid.config.width + scene.config.F :] /= 20  # what all share would show all or nothing
-    scene = scene.to(dtype)
-    scene.table.facts["xyz"] = scene.table.facts["xyz"].to(dtype)
-    return scene
-
-
-def everyone(means: torch.Tensor, scales: torch.Tensor, camera: Camera) -> torch.Tensor:
-    return torch.ones(len(means), dtype=torch.bool)
+from support.graph_scenes import CAMERA, cloud, everyone, start_graph
 
 
 def test_networks_have_the_sizes_of_sags():
-    scene = started()
+    scene = start_graph()
     sizes = {name: sum(p.numel() for p in group) for name, group in scene.rate_groups().items()}
     assert {k: sizes[k] for k in ("opacity", "color", "cov", "offsets")} == {"opacity": 4256, "color": 4320, "cov": 4448, "offsets": 6336}
     assert sizes["affine"] == 2 * 96 and sizes["grid"] == 2 * sum(HashGrid().rows())
@@ -111,7 +89,7 @@ def slow(scene: GraphScene, rows: torch.Tensor) -> dict[str, torch.Tensor]:
 
 
 def test_the_decode_is_that_of_the_text():
-    scene = started()
+    scene = start_graph()
     rows = torch.arange(0, len(scene.table), 2)
     decoded, wanted = scene.decode(rows, CAMERA), slow(scene, rows)
     torch.testing.assert_close(decoded.raw_opacity.detach(), wanted["raw"])
@@ -124,7 +102,7 @@ def test_the_decode_is_that_of_the_text():
 
 
 def test_gradients_by_finite_differences():
-    scene = started(F=3, hidden=4, offset_hidden=4, grid=HashGrid(levels=2, features=1, log2_table=6, base=2))
+    scene = start_graph(F=3, hidden=4, offset_hidden=4, grid=HashGrid(levels=2, features=1, log2_table=6, base=2))
     rows = torch.arange(0, len(scene.table), 12)
     leaves = [scene.table.params["feature"], scene.table.params["log_scaling"], *scene.network_tensors().values()]
 
@@ -136,7 +114,7 @@ def test_gradients_by_finite_differences():
 
 
 def test_gaussians_stand_where_the_whole_graph_puts_them():
-    scene = started()
+    scene = start_graph()
     everybody = torch.arange(len(scene.table))
     with torch.no_grad():
         own, strongest = scene.encode(everybody)
@@ -148,13 +126,13 @@ def test_gaussians_stand_where_the_whole_graph_puts_them():
 
 
 def test_a_view_that_sees_nothing():
-    scene = started()
+    scene = start_graph()
     decoded = scene(CAMERA, 1, Mode.TRAIN, lambda means, scales, camera: torch.zeros(len(means), dtype=torch.bool))
     assert len(decoded.gaussians) == len(decoded.rows) == 0 and decoded.raw_opacity.shape == (0, 1)
 
 
 def test_the_graph_is_made_again_when_rows_change_and_only_then():
-    scene = started(torch.float32)
+    scene = start_graph(torch.float32)
     first = scene.graph()
     scene.table.params["feature"].data.add_(1)
     assert scene.graph() is first

@@ -1,0 +1,19 @@
+"""Untrained scenes of every recipe, and a camera that sees them."""
+
+import torch
+
+from scene_experts.core.types import Camera, Points
+from scene_experts.recipes import RECIPES
+from scene_experts.scene import Scene
+
+# one recipe of every scene family and of every way to mix
+METHODS = ("scaffold-gs", "moe-gs", "3dgs", "3dgs-mcmc", "octree-gs", "octree-moe-gs", "scaffold-gs-bank", "sags", "moe-gs-balance")
+
+CAMERA = Camera(torch.eye(4), torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), 48, 32, 0.2)
+
+
+def start_scene(recipe: str) -> Scene:
+    """The untrained scene of a recipe, from 200 points."""
+    torch.manual_seed(0)
+    points = Points(torch.randn(200, 3, dtype=torch.float64) + torch.tensor([0.0, 0, 4]), torch.full((200, 3), 128, dtype=torch.uint8))
+    return RECIPES[recipe][1].scene.start(points, 5.0, [CAMERA])

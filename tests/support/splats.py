@@ -1,0 +1,12 @@
+"""Random Gaussians as the standard formats hold them."""
+
+import torch
+
+from scene_experts.files.formats.splats import Splats
+
+
+def splats(n=5, degree=3, seed=0) -> Splats:
+    """n Gaussians whose every value is drawn from a normal distribution."""
+    g = torch.Generator().manual_seed(seed)
+    new = lambda *shape: torch.randn(*shape, generator=g)  # noqa: E731
+    return Splats(new(n, 3), new(n, 3), new(n, 4), new(n), new(n, (degree + 1) ** 2, 3))
