@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
-import tyro
+from scene_experts.arguments import parse as arguments
 
 PACKAGE = "scene_experts"
 
@@ -55,20 +55,20 @@ class Walk:
 
 
 def followed(command: Callable[[], int]) -> tuple[int, Walk]:
-    """Run a command; its exit code and the walk since `tyro` parsed its words."""
-    walk, parse = Walk(), tyro.cli
+    """Run a command; its exit code and the walk since its options were parsed."""
+    walk, make = Walk(), arguments.make
 
-    def parse_and_follow(*args: Any, **options: Any) -> Any:
-        parsed = parse(*args, **options)
+    def make_and_follow(*args: Any) -> Any:
+        made = make(*args)
         sys.setprofile(walk)
-        return parsed
+        return made
 
-    tyro.cli = parse_and_follow  # type: ignore[assignment]
+    arguments.make = make_and_follow
     try:
         return command(), walk
     finally:
         sys.setprofile(None)
-        tyro.cli = parse
+        arguments.make = make
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""The command line: `scene-experts COMMAND ...`: finds the command and turns errors into exit codes."""
+"""The command line: `scene-experts COMMAND ...`. Finds the command and turns errors into a sentence and an exit code."""
 
 from __future__ import annotations
 
@@ -7,33 +7,17 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
+from scene_experts import commands
+from scene_experts.arguments.parse import HelpAsked
+from scene_experts.commands import COMMANDS, PROG
 from scene_experts.core.errors import InputError, RunError, nearest
-
-PROG = "scene-experts"
-COMMANDS = {
-    "capture": "poses and points of photographs or of a video: a capture to train on",
-    "info": "what a capture holds: views, sizes, cameras, points, split, warnings",
-    "train": "train a scene on a capture",
-    "eval": "render and score the held-out views of a run",
-    "compare": "one table of several runs",
-    "render": "a camera path through a run, as video or pictures",
-    "view": "a run in a browser, drawn here: experts, cameras, photographs beside",
-    "report": "one page of runs: curves, views with a slider, experts, commands",
-    "export": "write a trained scene to files that viewers and later runs open",
-    "import": "make a run folder of a published result or of a file that export writes",
-    "reproduce": "the paper's tables and figures, from runs made or reused",
-    "bench": "how fast this machine is, in a minute: each part beside a named peer",
-    "catalog": "the paper's 17 scenes: sources, sizes, licences, what is on this machine",
-    "download": "fetch scenes of the catalog: continued, checked, unpacked",
-    "doctor": "which backends work here, why not, what to install",
-}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code: 0 done, 1 failed, 2 unusable input."""
+    """Run a command. Returns the exit code: 0 for success, 1 for a failure, 2 for invalid input."""
     try:
         return dispatch(list(sys.argv[1:] if argv is None else argv))
-    except BrokenPipeError:  # the reader (`| head`) has seen enough
+    except BrokenPipeError:  # the reader (`| head`) has closed the pipe
         with suppress(OSError, ValueError):
             sys.stdout.close()
         return 0
@@ -41,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def dispatch(args: list[str]) -> int:
     """Run a command and turn its errors into a sentence and an exit code."""
-    if not args or args[0] in ("-h", "--help", "help"):
+    if not args or args[0] in ("-h", "--help", "--help-all", "help"):
         print(usage())
         return 0 if args else 2
     if args[0] in ("-V", "--version", "version"):
@@ -51,17 +35,15 @@ def dispatch(args: list[str]) -> int:
         return 0
     command, rest = args[0], args[1:]
     if command not in COMMANDS:
-        print(
-            f"error: expected one of {', '.join(COMMANDS)}, found '{command}'{nearest(command, COMMANDS)}; see {PROG} --help",
-            file=sys.stderr,
-        )
+        hint = nearest(command, COMMANDS) or f"; see {PROG} --help"
+        print(f"error: expected one of {', '.join(COMMANDS)}, found '{command}'{hint}", file=sys.stderr)
         return 2
     logging.basicConfig(level=logging.WARNING, format="warning: %(message)s")
     try:
-        from scene_experts import commands
-
-        expect_no_empty(rest)
         return commands.run(command, rest)
+    except HelpAsked as help_:
+        print(help_)
+        return 0
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -70,15 +52,15 @@ def dispatch(args: list[str]) -> int:
         return 1
     except BrokenPipeError:
         raise
-    except OSError as error:  # what no part foresaw: a file without permission, a drive that went away
-        place = f" at {error.filename}" if error.filename else ""
-        print(f"error: expected a file or folder that can be used{place}, found: {error.strerror or error}; check it", file=sys.stderr)
+    except OSError as error:  # one that no part of the program expects, for example a missing permission
+        place = f" {error.filename}" if error.filename else " a file"
+        print(f"error: cannot use{place}: {(error.strerror or str(error)).lower()}", file=sys.stderr)
         return 1
     except (MemoryError, RuntimeError) as error:
         if not out_of_memory(error):
             raise
         why = str(error).partition("\n")[0] or "no memory left"
-        advice = "lower --max-anchors or --resolution (a saved training goes on with --resume)"
+        advice = "lower --max-anchors or --resolution (--resume continues a saved training)"
         print(f"error: expected enough memory, found too little ({why}); {advice}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -86,16 +68,8 @@ def dispatch(args: list[str]) -> int:
         return 130
 
 
-def expect_no_empty(args: Sequence[str]) -> None:
-    """Raises InputError for an empty value: of a path it would be the current folder, as where a shell's variable is not set."""
-    for place, arg in enumerate(args):
-        if not arg or (arg.startswith("--") and arg.endswith("=")):
-            before = arg or (args[place - 1] if place else "the command")
-            raise InputError(f"expected a value after {before}, found an empty one; give one, or leave it out")
-
-
 def out_of_memory(error: Exception) -> bool:
-    """Whether an error is torch's or Python's way to say that an allocation failed. torch has a type of its own for the GPU alone."""
+    """Whether an error means that an allocation failed. torch has an exception type for this only on the GPU."""
     text = str(error).lower()
     return isinstance(error, MemoryError) or "out of memory" in text or "allocate memory" in text
 
@@ -108,16 +82,16 @@ def entry() -> None:
 def usage() -> str:
     """The text of `scene-experts --help`."""
     width = max(len(name) for name in COMMANDS)
-    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
+    lines = [f"  {name:<{width}}  {text}" for name, (_, text) in COMMANDS.items()]
     return "\n".join(
         [
             f"usage: {PROG} COMMAND [options]",
             "",
-            "Photographs to compact, sharp 3D scenes.",
+            "Turn photographs into compact, sharp 3D scenes.",
             "",
             *lines,
             "",
-            f"{PROG} COMMAND --help says more.",
+            f"`{PROG} COMMAND --help` shows the options of a command.",
         ]
     )
 

@@ -10,6 +10,7 @@ import scene_experts
 SOURCE = Path(scene_experts.__file__).parent
 LAYERS = [
     {"core", "native", "__init__"},
+    {"arguments"},
     {"geometry"},
     {"data", "render", "scene"},
     {"strategy"},

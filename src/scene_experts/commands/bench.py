@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
 from rich.console import Console
 
+from scene_experts.arguments.parse import Command, parse
 from scene_experts.bench.table import run
-from scene_experts.cli import PROG
+from scene_experts.commands import PROG
 
 
 @dataclass(frozen=True)
@@ -25,5 +25,5 @@ class BenchCommand:
 
 
 def bench(args: list[str]) -> int:
-    command = tyro.cli(BenchCommand, prog=f"{PROG} bench", args=args)
+    command = parse(BenchCommand, Command(f"{PROG} bench"), args)
     return run(command.seconds, command.threads, command.json, Console(highlight=False))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import tyro
 from rich.console import Console
 
-from scene_experts.cli import PROG
-from scene_experts.commands.shared import positional
+from scene_experts.arguments.option import Option
+from scene_experts.arguments.parse import Command, parse
+from scene_experts.commands import PROG
 from scene_experts.core.errors import InputError, expect_at_least, few
 from scene_experts.core.signals import handled
 from scene_experts.sfm import reconstruct as run
@@ -30,9 +30,9 @@ class CaptureCommand:
     upright. The same command goes on where it was stopped.
     """
 
-    photos: Path
+    photos: Annotated[Path, Option(value="PHOTOS")]
     """Folder of photographs (JPEG, PNG, ...; subfolders too), or a video. CAPTURE/images itself stays as it is."""
-    out: Path
+    out: Annotated[Path, Option(value="CAPTURE")]
     """Folder of the capture: OUT/images, OUT/sparse/0, OUT/capture.json."""
     frames: int = run.Options.frames
     """Of a video: how many frames to take, the sharpest of as many stretches."""
@@ -53,7 +53,7 @@ class CaptureCommand:
 
 
 def capture(args: list[str]) -> int:
-    command = tyro.cli(CaptureCommand, prog=f"{PROG} capture", args=positional(args, "--photos"))
+    command = parse(CaptureCommand, Command(f"{PROG} capture", ("--photos",)), args)
     least = {"frames": 3, "max_side": 64, "threads": 0, "seed": 0}
     expect_at_least([(f"--{name.replace('_', '-')}", getattr(command, name), low) for name, low in least.items()])
     if command.frames > MOST:

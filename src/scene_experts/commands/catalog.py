@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import shlex
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 from rich.table import Table
 
-from scene_experts.cli import PROG
+from scene_experts.arguments.option import Option
+from scene_experts.arguments.parse import Command, parse
+from scene_experts.commands import PROG
 from scene_experts.core.errors import InputError
 from scene_experts.data.fetch.catalog import COLLECTIONS, SCENES, Scene, select
 from scene_experts.data.fetch.obtain import captures_dir, is_present, obtain
@@ -26,11 +27,11 @@ SAY_EVERY = 15.0  # seconds between lines where there is no terminal
 class DownloadCommand:
     """Fetch scenes of the paper from their owners: continued where it stopped, checked, unpacked."""
 
-    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    scenes: Annotated[tuple[str, ...], Option(value="SCENE")] = ()
     """Scenes (bonsai), data sets (mipnerf360, tandt, db, bungeenerf) or all. A data set's archive is fetched whole, once."""
     to: Path | None = None
     """Folder to put them in; by default $SCENE_EXPERTS_CAPTURES, else this user's cache folder."""
-    mirror: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default=())
+    mirror: Annotated[tuple[str, ...], Option(value="URL", repeat=True)] = ()
     """Address of a folder that holds the archives, tried before the owners' own. May be given several times."""
     keep_archives: bool = True
     """Leave the archives in place for their other scenes."""
@@ -39,7 +40,7 @@ class DownloadCommand:
 
 
 def download(args: list[str]) -> int:
-    command = tyro.cli(DownloadCommand, prog=f"{PROG} download", args=args)
+    command = parse(DownloadCommand, Command(f"{PROG} download", ("--scenes",)), args)
     root = command.to or captures_dir()
     console = Console(highlight=False, soft_wrap=True)
     scenes = select(command.scenes)
@@ -67,14 +68,14 @@ def flags(scene: Scene, to: Path | None) -> str:
 class CatalogCommand:
     """What the catalog knows of the paper's scenes: sources, sizes, licences, protocol, what is on this machine."""
 
-    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    scenes: Annotated[tuple[str, ...], Option(value="SCENE")] = ()
     """Scenes or data sets to say everything about; none: one table of all."""
     to: Path | None = None
     """Folder of the captures, as for `download`."""
 
 
 def catalog(args: list[str]) -> int:
-    command = tyro.cli(CatalogCommand, prog=f"{PROG} catalog", args=args)
+    command = parse(CatalogCommand, Command(f"{PROG} catalog", ("--scenes",)), args)
     root, console = command.to or captures_dir(), Console(highlight=False, soft_wrap=True)
     scenes = select(command.scenes)
     if not scenes:

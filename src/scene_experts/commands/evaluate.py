@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from rich.console import Console
 
-from scene_experts.cli import PROG
+from scene_experts.arguments.option import Option
+from scene_experts.arguments.parse import Command, parse
+from scene_experts.commands import PROG
 from scene_experts.commands.shared import Device, Raster, backend
 
 
@@ -17,9 +18,9 @@ from scene_experts.commands.shared import Device, Raster, backend
 class EvalCommand:
     """Render the held-out views of a run to disk and score the 8-bit files."""
 
-    run: Annotated[Path, tyro.conf.Positional]
+    run: Annotated[Path, Option(value="RUN")]
     """Run folder."""
-    data: Annotated[Path | None, tyro.conf.arg(aliases=["-s"])] = None
+    data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
     """Where the capture is now, if it moved."""
     views: Literal["test", "train"] = "test"
     appearance: Literal["rule", "half"] = "rule"
@@ -42,7 +43,7 @@ def evaluate(args: list[str]) -> int:
     from scene_experts.evaluate.tables import print_results
     from scene_experts.report import page
 
-    command = tyro.cli(EvalCommand, prog=f"{PROG} eval", args=args)
+    command = parse(EvalCommand, Command(f"{PROG} eval", ("--run",)), args)
     device, rasterize = backend(command.device, command.rasterizer, False, False)
     results = evaluate_run(
         command.run,
@@ -66,7 +67,7 @@ def evaluate(args: list[str]) -> int:
 class CompareCommand:
     """One table of several evaluated runs."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    runs: Annotated[tuple[Path, ...], Option(value="RUN")]
     """Run folders."""
     format: Literal["table", "markdown", "csv"] = "table"
     mixed: bool = False
@@ -76,6 +77,6 @@ class CompareCommand:
 def compare(args: list[str]) -> int:
     from scene_experts.evaluate.tables import compare_runs
 
-    command = tyro.cli(CompareCommand, prog=f"{PROG} compare", args=args)
+    command = parse(CompareCommand, Command(f"{PROG} compare", ("--runs",)), args)
     compare_runs(command.runs, command.format, command.mixed, Console(highlight=False))
     return 0

@@ -7,10 +7,11 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from rich.console import Console
 
-from scene_experts.cli import PROG
+from scene_experts.arguments.option import Option
+from scene_experts.arguments.parse import Command, parse
+from scene_experts.commands import PROG
 from scene_experts.commands.shared import backend
 from scene_experts.core.errors import InputError
 from scene_experts.render import Rasterizer
@@ -27,7 +28,7 @@ class ExportCommand:
     Standard files (ply and what follows it) hold Gaussians that no network changes: scenes of anchors are baked for them, in minutes.
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
+    run: Annotated[Path, Option(value="RUN")]
     """Run folder."""
     format: Literal["anchors", "compact", "ply", "compressed-ply", "splat", "spz", "sog", "glb", "html"] = "compact"
     """anchors: the Scaffold-GS folder layout; compact: one small file of ours; the others are standard files that viewers open."""
@@ -36,7 +37,7 @@ class ExportCommand:
     step: int | None = None
     measure: bool = True
     """Render the held-out views before and after, and say what the file costs in PSNR."""
-    data: Annotated[Path | None, tyro.conf.arg(aliases=["-s"])] = None
+    data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
     """Where the capture is now, if it moved. Standard files need it; for a compact file, what it costs in PSNR does."""
     sh_degree: int = 3
     """Standard files: degree of the harmonics, 0 (smallest) to 3 (best)."""
@@ -55,7 +56,7 @@ class ExportCommand:
 def export(args: list[str]) -> int:
     from scene_experts.files.export import export_run
 
-    command = tyro.cli(ExportCommand, prog=f"{PROG} export", args=args)
+    command = parse(ExportCommand, Command(f"{PROG} export", ("--run",)), args)
     rasterize = backend("cpu", "auto", False, False)[1]
     reuse_freed()
     if command.format in ("anchors", "compact"):
@@ -92,10 +93,10 @@ def _standard(command: ExportCommand, args: list[str], rasterize: Rasterizer) ->
 class ImportCommand:
     """Make a run folder of a published Scaffold-GS, Octree-GS or 3DGS result or of a file that `export` writes, to score and convert it."""
 
-    source: Annotated[Path, tyro.conf.Positional]
+    source: Annotated[Path, Option(value="RESULT")]
     """Result folder (with point_cloud/iteration_N), compact file, or Gaussians as ply, compressed-ply, splat, spz, sog, glb or html."""
-    data: Annotated[Data, tyro.conf.arg(name="")]
-    out: Annotated[Path, tyro.conf.arg(aliases=["-m"])]
+    data: Annotated[Data, Option(name="")]
+    out: Annotated[Path, Option(short="-m", value="RUN")]
     """Run folder to write."""
     iteration: int | None = None
 
@@ -103,7 +104,7 @@ class ImportCommand:
 def import_(args: list[str]) -> int:
     from scene_experts.files.export import import_result
 
-    command = tyro.cli(ImportCommand, prog=f"{PROG} import", args=args)
+    command = parse(ImportCommand, Command(f"{PROG} import", ("--source",)), args)
     print(f"wrote {import_result(command.source, named(command.data), command.out, command.iteration)}")
     print(f"next: {shlex.join([PROG, 'eval', str(command.out)])}")
     return 0

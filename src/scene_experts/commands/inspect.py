@@ -2,31 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from dataclasses import dataclass
 
-import tyro
 from rich.console import Console
 
-from scene_experts.cli import COMMANDS, PROG
-from scene_experts.commands.shared import positional
+from scene_experts.arguments.parse import Command, parse
+from scene_experts.commands import PROG
 from scene_experts.data.summary import print_summary
 from scene_experts.training import run_folder
 from scene_experts.training.config import Data
 
 
 def info(args: list[str]) -> int:
-    data = tyro.cli(
-        Annotated[Data, tyro.conf.arg(name="")],
-        prog=f"{PROG} info",
-        args=positional(args, "--data"),
-        description="Say what a capture holds; `info CAPTURE` does too.",
-    )
+    about = "Show what a capture contains: views, picture sizes, cameras, points, split and warnings."
+    data = parse(Data, Command(f"{PROG} info", ("--data",), about=about), args)
     print_summary(run_folder.load_capture(run_folder.named(data), look=True), Console(highlight=False))
     return 0
+
+
+@dataclass(frozen=True)
+class DoctorCommand:
+    """Check which backends work on this machine, why the others do not, and what to install."""
 
 
 def doctor(args: list[str]) -> int:
     from scene_experts.commands import doctor as checks
 
-    tyro.cli(lambda: None, prog=f"{PROG} doctor", args=args, description=COMMANDS["doctor"])
+    parse(DoctorCommand, Command(f"{PROG} doctor"), args)
     return checks.run(Console(highlight=False))

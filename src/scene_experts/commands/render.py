@@ -10,10 +10,11 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-import tyro
 from rich.console import Console
 
-from scene_experts.cli import PROG
+from scene_experts.arguments.option import Option
+from scene_experts.arguments.parse import Command, parse
+from scene_experts.commands import PROG
 from scene_experts.commands.shared import Device, Raster, backend
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.types import Camera
@@ -31,7 +32,7 @@ from scene_experts.view.paths import CameraPath
 class RenderCommand:
     """Render a camera path through a run to a video, or to a folder of PNG files."""
 
-    run: Annotated[Path, tyro.conf.Positional]
+    run: Annotated[Path, Option(value="RUN")]
     """Run folder."""
     out: Path | None = None
     """FILE.mp4 (.mov, .mkv, .webm) or a folder for PNG files; RUN/renders/<path>.mp4 by default."""
@@ -56,7 +57,7 @@ class RenderCommand:
     """Write the path as JSON too (nerfstudio's form if the name ends in .nerfstudio.json)."""
     quality: int = 8
     """Of the video, 1 to 10."""
-    data: Annotated[Path | None, tyro.conf.arg(aliases=["-s"])] = None
+    data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
     """Where the capture is now, if it moved."""
     step: int | None = None
     """Checkpoint to draw; the newest by default."""
@@ -65,7 +66,7 @@ class RenderCommand:
 
 
 def render(args: list[str]) -> int:
-    command = tyro.cli(RenderCommand, prog=f"{PROG} render", args=args)
+    command = parse(RenderCommand, Command(f"{PROG} render", ("--run",)), args)
     check(command)
     device, rasterize = backend(command.device, command.rasterizer, False, False)
     opened = [run_folder.open_run(run, device, command.step if run == command.run else None) for run in (command.run, *command.beside)]

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
-from scene_experts.cli import PROG
+from scene_experts.arguments.option import Option
+from scene_experts.arguments.parse import Command, parse
+from scene_experts.commands import PROG
 from scene_experts.report import page
 
 
@@ -16,13 +16,13 @@ from scene_experts.report import page
 class ReportCommand:
     """Write one self-contained HTML page of evaluated runs: figures, curves, views with a slider, experts, commands."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    runs: Annotated[tuple[Path, ...], Option(value="RUN")]
     """Run folders; several are set beside each other."""
     out: Path | None = None
     """File to write; RUN/report.html by default for one run."""
 
 
 def report(args: list[str]) -> int:
-    command = tyro.cli(ReportCommand, prog=f"{PROG} report", args=args)
+    command = parse(ReportCommand, Command(f"{PROG} report", ("--runs",)), args)
     print(f"wrote {page.write(command.runs, command.out)}")
     return 0

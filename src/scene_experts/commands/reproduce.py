@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from rich.console import Console
 
-from scene_experts.cli import PROG
+from scene_experts.arguments.option import Option
+from scene_experts.arguments.parse import Command, parse
+from scene_experts.commands import PROG
 from scene_experts.core.errors import InputError, RunError, expect_at_least, nearest
 from scene_experts.core.signals import handled
 from scene_experts.data.fetch import catalog
@@ -25,7 +26,7 @@ from scene_experts.reproduce.runner import Failure, Runner, Say
 class ReproduceCommand:
     """Make the paper's tables and figures: runs what is missing, goes on with what was interrupted, reuses what is done."""
 
-    experiments: Annotated[tuple[str, ...], tyro.conf.Positional]
+    experiments: Annotated[tuple[str, ...], Option(value="EXPERIMENT")]
     """table1, table2, table3, table4, fig1b, fig3, fig5, fig6, fig7, appendix, or all of them; or extras, which the paper has not."""
     captures: tuple[Path, ...] = ()
     """Your own captures, in place of the paper's scenes."""
@@ -75,8 +76,7 @@ class Plan:
 
 
 def reproduce(args: list[str]) -> int:
-    expect_values(args)
-    command = tyro.cli(ReproduceCommand, prog=f"{PROG} reproduce", args=args)
+    command = parse(ReproduceCommand, Command(f"{PROG} reproduce", ("--experiments",)), args)
     workers = command.workers if command.workers is not None else max(1, len(command.devices))
     expect_at_least([("--workers", workers, 1), *(("--seeds", seed, 0) for seed in command.seeds)])
     plan = planned(command)
@@ -104,14 +104,6 @@ def reproduce(args: list[str]) -> int:
             f"expected {len(plan.wanted)} runs to end well, found {len(failures)} that failed (what ended well is kept): {lines}"
         )
     return 0
-
-
-def expect_values(args: list[str]) -> None:
-    """Raises InputError for an option that lists things and lists none: it would be as if it were not given."""
-    several = {f"--{name}" for name, value in vars(ReproduceCommand(())).items() if isinstance(value, tuple)}
-    for flag, after in zip(args, [*args[1:], "--"]):
-        if flag in several and after.startswith("--"):
-            raise InputError(f"expected one or more values after {flag}, found none; give some, or leave it out")
 
 
 def planned(command: ReproduceCommand) -> Plan:

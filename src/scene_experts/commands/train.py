@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import signal
 import sys
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from rich.console import Console
 
 from scene_experts.api import recording
-from scene_experts.cli import PROG
+from scene_experts.arguments.help import columns
+from scene_experts.arguments.option import Option
+from scene_experts.arguments.parse import HELP, HELP_ALL, Command, HelpAsked, parse
+from scene_experts.arguments.table import rows
+from scene_experts.commands import PROG
 from scene_experts.commands.shared import Device, Raster, backend
-from scene_experts.core.errors import InputError, nearest
+from scene_experts.core.errors import InputError, few, nearest
 from scene_experts.core.signals import handled
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.catalog import PREFIX, Numbers, one
@@ -30,15 +34,48 @@ from scene_experts.training.progress import Progress
 from scene_experts.view.live import Live
 from scene_experts.view.server import check_port, viser
 
+FIRST = (
+    "--data",
+    "--out",
+    "--resolution",
+    "--iterations",
+    "--max-anchors",
+    "--max-memory",
+    "--seed",
+    "--device",
+    "--preview-every",
+    "--viewer",
+    "--resume",
+    "--overwrite",
+)
+"""The options that people use first, for --help."""
+
+GROUPS = {
+    "Methods": "scaffold-gs|moe-gs|3dgs|3dgs-mcmc|octree-gs|octree-moe-gs|sags",
+    "Variants of MoE-GS": "moe-gs-(?!e[2-5]-(top|dense)).*",
+    "MoE-GS with other numbers of experts (Figure 6)": "moe-gs-e[2-5]-(top[12]|dense)",
+    "Variants of Scaffold-GS": "scaffold-gs-(?!depth).*",
+    "Scaffold-GS with deeper networks (Figure 7)": "scaffold-gs-depth.*",
+    "Other recipes": ".*",
+}
+"""Headings of the recipes in the help, each with a pattern of the recipes' names; the first that fits counts."""
+
+EXAMPLES = (
+    "moe-gs --data demo/buddha --out runs/buddha",
+    "scaffold-gs --data CAPTURE --out RUN --iterations 7000",
+    "moe-gs --data CAPTURE --out RUN --resume",
+    "moe-gs --data catalog:bonsai --out RUN",
+)
+
 
 @dataclass(frozen=True)
 class TrainCommand:
     """Train a scene."""
 
-    data: Annotated[Data, tyro.conf.arg(name="")]
-    out: Annotated[Path, tyro.conf.arg(aliases=["-m"])]
+    data: Annotated[Data, Option(name="")]
+    out: Annotated[Path, Option(short="-m", value="RUN")]
     """Run folder to write."""
-    cfg: Annotated[Train, tyro.conf.arg(name="")]
+    cfg: Annotated[Train, Option(name="")]
     overwrite: bool = False
     """Begin anew in a run folder that holds an earlier run, whose checkpoints are removed."""
     resume: bool = False
@@ -97,47 +134,59 @@ def run_of(command: TrainCommand, line: str) -> Run:
 
 
 def parse_train(args: list[str]) -> TrainCommand:
-    """The recipe and its flags. Every recipe is a subcommand whose defaults are its numbers."""
-    if args and not args[0].startswith("-") and args[0] not in RECIPES:
-        raise InputError(
-            f"expected a recipe, found '{args[0]}'{nearest(args[0], RECIPES)}; there are {', '.join(RECIPES)}; see {PROG} train --help"
-        )
-    chosen = {args[0]: RECIPES[args[0]]} if args and args[0] in RECIPES else RECIPES
-    data, numbers = of_the_catalog(args)
-    defaults = {
-        name: (text, TrainCommand(data=data, out=tyro.MISSING, cfg=with_numbers(cfg, numbers)))  # type: ignore[arg-type]
-        for name, (text, cfg) in chosen.items()
-    }
-    if len(defaults) == 1:
-        ((name, (text, default)),) = defaults.items()
-        return tyro.cli(
-            TrainCommand,
-            default=default,
-            args=args[1:],
-            prog=f"{PROG} train {name}",
-            description=text,
-            config=(tyro.conf.AvoidSubcommands,),
-        )
-    return tyro.extras.overridable_config_cli(defaults, args=args, prog=f"{PROG} train", description=flags_of_all())
-
-
-def of_the_catalog(args: list[str]) -> tuple[Data, Numbers]:
-    """The defaults that a scene of the paper brings (its own units, its data set's numbers); flags have the last word."""
-    named = next((word for arg in args if (word := arg.removeprefix("--data=")).startswith(PREFIX)), None)
-    if named is None:
-        return Data(path=tyro.MISSING), ()  # type: ignore[arg-type]
-    return Data(path=tyro.MISSING, normalise="none"), one(named).collection.numbers  # type: ignore[arg-type]
-
-
-def flags_of_all() -> str:
-    """For the help without a recipe: the flags that every recipe takes."""
-    parts = {"path", "cfg", "scene", "loss", "growth", "rates", "recipe", "schedule"}  # set by the recipe, or by flags of their own
-    names = {f.name for part in (Data, Train, TrainCommand) for f in fields(part)} - parts
-    own = sorted(f"--{name.replace('_', '-')}" for name in names)
-    return (
-        f"Train a scene: {PROG} train RECIPE --data CAPTURE --out RUN. Every recipe takes {', '.join(own)}, and the numbers of its "
-        f"parts (--scene..., --loss..., --growth..., --rates...): {PROG} train RECIPE --help says them all."
+    """The recipe and its options. The numbers of the recipe are the defaults. Raises InputError, or HelpAsked for --help."""
+    name = args[0] if args else ""
+    if name not in RECIPES:
+        if any(arg in (*HELP, HELP_ALL) for arg in args):
+            raise HelpAsked(help_of_recipes())
+        raise InputError(no_recipe(args))
+    text, cfg = RECIPES[name]
+    defaults, numbers = of_the_catalog(args)
+    command = Command(
+        f"{PROG} train {name}",
+        first=FIRST,
+        about=f"{text}.",
+        defaults={**defaults, "cfg": with_numbers(cfg, numbers)},
+        elsewhere=other_recipes,
     )
+    return parse(TrainCommand, command, args[1:])
+
+
+def no_recipe(args: list[str]) -> str:
+    """What to say where the first word is no recipe."""
+    name = args[0] if args else ""
+    if name and not name.startswith("-"):
+        return f"expected a recipe, found '{name}'{nearest(name, RECIPES) or f'; `{PROG} train --help` lists them'}"
+    like = next((arg for arg in args if arg in RECIPES), "moe-gs")
+    rest = "..." if args else "--data CAPTURE --out RUN"
+    return f"expected a recipe after `{PROG} train`, found {name or 'none'}; write for example {PROG} train {like} {rest}"
+
+
+def other_recipes(flag: str) -> str:
+    """Which recipes have an option that the chosen one does not have."""
+    found = [name for name, (_, cfg) in RECIPES.items() if any(flag in row.names for row in rows(TrainCommand, {"cfg": cfg}))]
+    return f"this recipe does not have it ({few(found)} {'has' if len(found) == 1 else 'have'} it)" if found else ""
+
+
+def of_the_catalog(args: list[str]) -> tuple[dict[str, str], Numbers]:
+    """The defaults that a scene of the paper brings (its own units, its data set's numbers); options have the last word."""
+    named = next((word for arg in args if (word := arg.removeprefix("--data=")).startswith(PREFIX)), None)
+    return ({}, ()) if named is None else ({"data.normalise": "none"}, one(named).collection.numbers)
+
+
+def help_of_recipes() -> str:
+    """The help without a recipe: the recipes in groups, and examples."""
+    left = dict(RECIPES)
+    parts = [
+        f"usage: {PROG} train RECIPE --data CAPTURE --out RUN [options]",
+        "Train a scene on a capture. A recipe is a method with its numbers.",
+    ]
+    for title, pattern in GROUPS.items():
+        names = [name for name in left if re.fullmatch(pattern, name)]
+        lines = [line for name in names for line in columns(f"  {name}", left.pop(name)[0])]
+        parts += ["\n".join([f"{title}:", *lines])] if names else []
+    parts.append("\n".join(["Examples:", *(f"  {PROG} train {example}" for example in EXAMPLES)]))
+    return "\n\n".join([*parts, f"`{PROG} train RECIPE --help` shows the options of a recipe."])
 
 
 def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasterizer, console: Console) -> int:

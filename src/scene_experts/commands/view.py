@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
-from scene_experts.cli import PROG
+from scene_experts.arguments.option import Option
+from scene_experts.arguments.parse import Command, parse
+from scene_experts.commands import PROG
 from scene_experts.commands.shared import Device, Raster, backend
 from scene_experts.render import as_trained
 from scene_experts.training import run_folder
@@ -20,12 +20,12 @@ from scene_experts.view.server import Viewer, check_port, viser
 class ViewCommand:
     """Look at a run in a browser; the scene is drawn here, so the browser needs no GPU."""
 
-    run: Annotated[Path, tyro.conf.Positional]
+    run: Annotated[Path, Option(value="RUN")]
     """Run folder."""
     port: int = 8080
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 lets other machines in (there is no password)."""
-    data: Annotated[Path | None, tyro.conf.arg(aliases=["-s"])] = None
+    data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
     """Where the capture is now, if it moved."""
     step: int | None = None
     """Checkpoint to show; the newest by default."""
@@ -34,7 +34,7 @@ class ViewCommand:
 
 
 def view(args: list[str]) -> int:
-    command = tyro.cli(ViewCommand, prog=f"{PROG} view", args=args)
+    command = parse(ViewCommand, Command(f"{PROG} view", ("--run",)), args)
     check_port(command.port)
     viser()  # says what is missing before anything is read
     device, rasterize = backend(command.device, command.rasterizer, False, False)

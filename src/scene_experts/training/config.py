@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tyro
-
+from scene_experts.arguments.option import Option
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.schedule import Rate
 from scene_experts.scene.anchors.scene import Anchors, Rates
@@ -33,7 +32,7 @@ LARGEST_SEED = 2**63 - 2  # torch takes signed 64 bits, and growth draws from th
 class Train:
     """A recipe with its numbers."""
 
-    recipe: tyro.conf.Suppress[str]
+    recipe: Annotated[str, Option(hidden=True)]
     scene: Anchors | Explicit | GraphPoints = Anchors()
     loss: Weights = Weights()
     growth: GrowAnchors | GrowOctree | GrowPoints | SplitClone | MCMC = GrowAnchors()
@@ -49,7 +48,7 @@ class Train:
     """Stop growing at this many anchors; 0 is no cap."""
     sparse_adam: bool = False
     """Move only what a view decoded (gsplat's SelectiveAdam): faster where views see a small part; changes results."""
-    schedule: tyro.conf.Suppress[int] = SCHEDULE
+    schedule: Annotated[int, Option(hidden=True)] = SCHEDULE
     """The iterations that this recipe's windows are written for."""
 
     def scaled(self) -> Train:
@@ -71,11 +70,11 @@ class Train:
 class Data:
     """Which capture, and how it is read."""
 
-    path: Annotated[Path, tyro.conf.arg(name="data", aliases=["-s"])]
+    path: Annotated[Path, Option(name="data", short="-s", value="CAPTURE")]
     """Folder of the capture: a COLMAP folder (images/, sparse/0/) or one with transforms*.json; or catalog:SCENE, fetched by `download`."""
     images: str | None = None
     """Image folder inside the capture, e.g. images_4."""
-    resolution: Annotated[str, tyro.conf.arg(aliases=["-r"])] = "auto"
+    resolution: Annotated[str, Option(short="-r", value="POLICY")] = "auto"
     """as-is, factor:N, longest:PX, cap1600, share:S (of what cap1600 gives), inria:N, or auto (cap1600)."""
     split: str = "auto"
     """mod8 (every 8th view is held out), mod:N, first:N, none, files, or auto: files where the capture brings its own split, else mod8."""

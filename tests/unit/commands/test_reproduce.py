@@ -19,21 +19,20 @@ def test_runs_tables_and_figures_and_nothing_twice(tmp_path, capsys):
     args = [
         "--captures",
         str(capture),
-        "--out",
-        str(tmp_path / "out"),
         "--iterations",
         "40",
         "--recipes",
         "moe-gs-e3-top2",
         "moe-gs-e3-no-load",
     ]
-    assert cli.main(["reproduce", "fig3", *args]) == 0
+    here = ["--out", str(tmp_path / "out")]
+    assert cli.main(["reproduce", "fig3", *args, *here]) == 0
     first = capsys.readouterr().out
     assert "2 runs, 0 of them done" in first and len(store.load(tmp_path / "out" / "records")) == 2
     assert (tmp_path / "out" / "fig3_box.png").is_file() and (tmp_path / "out" / "README.md").is_file()
-    assert cli.main(["reproduce", "fig3", "fig5", *args]) == 0
+    assert cli.main(["reproduce", "fig3", "fig5", *args, *here]) == 0
     assert "2 runs, 2 of them done" in capsys.readouterr().out and (tmp_path / "out" / "fig5_box.png").is_file()
-    assert cli.main(["reproduce", "fig3", *args, "--dry-run"]) == 0
+    assert cli.main(["reproduce", "fig3", *args, *here, "--dry-run"]) == 0
     assert capsys.readouterr().out.count("done ") == 2
     elsewhere = ["--out", str(tmp_path / "other"), "--records", str(tmp_path / "out" / "records")]
     assert cli.main(["reproduce", "fig3", *args, *elsewhere]) == 0
@@ -112,7 +111,7 @@ def test_names_that_are_none(tmp_path, capsys):
     with pytest.raises(InputError, match=r"expected a folder at .*, found a file"):
         planned(ReproduceCommand(("table1",), captures=(tmp_path / "box",), out=tmp_path / "note"))
     for flag in ("--captures", "--seeds", "--devices"):
-        assert cli.main(["reproduce", "table3", flag, "--dry-run"]) == 2 and f"values after {flag}, found none" in capsys.readouterr().err
+        assert cli.main(["reproduce", "table3", flag, "--dry-run"]) == 2 and f"a value after {flag}, found none" in capsys.readouterr().err
     with pytest.raises(InputError, match="or 'rome'"):
         scenes_of(ReproduceCommand(("table1",), data=tmp_path, scenes=("roma",)))
     with pytest.raises(InputError, match="expected rome"):

@@ -1,9 +1,9 @@
-"""The choice of device and rasteriser; first words."""
+"""The choice of device and rasteriser."""
 
 import pytest
 import torch
 
-from scene_experts.commands.shared import backend, positional
+from scene_experts.commands.shared import backend
 from scene_experts.core.errors import InputError
 
 
@@ -14,8 +14,3 @@ def test_the_device_and_rasteriser_that_were_asked_for(monkeypatch):
     assert backend("auto", "reference", False, False)[0] == "cpu"
     with pytest.raises(InputError, match="expected a CUDA device, found none"):
         backend("cuda", "auto", False, False)
-
-
-def test_the_first_word_may_stand_for_its_flag():
-    assert positional(["folder", "--split", "none"], "--data") == ["--data", "folder", "--split", "none"]
-    assert positional(["--data", "folder"], "--data") == ["--data", "folder"] and positional([], "--data") == []

@@ -5,7 +5,9 @@ from pathlib import Path
 import pytest
 
 from scene_experts.api import recording
-from scene_experts.commands.train import TrainCommand, parse_train, run_of, train
+from scene_experts.arguments.parse import HelpAsked
+from scene_experts.arguments.table import rows
+from scene_experts.commands.train import FIRST, TrainCommand, parse_train, run_of, train
 from scene_experts.core.errors import InputError
 from scene_experts.recipes import RECIPES
 from scene_experts.training import run_folder
@@ -77,13 +79,41 @@ def test_flags_reach_the_parts_of_explicit_recipes():
         check_settings(parse_train(["3dgs-mcmc", *PLACES, "--scene.sh-degree", "4"]))
 
 
-def test_the_help_without_a_recipe_names_the_flags_that_all_take(capsys):
-    with pytest.raises(SystemExit):
+def test_the_help_without_a_recipe_lists_every_recipe_once():
+    with pytest.raises(HelpAsked) as asked:
         parse_train(["--help"])
-    said = " ".join(capsys.readouterr().out.split())
-    for flag in ("--data", "--out", "--iterations", "--resolution", "--resume", "--device", "--seed"):
-        assert f"{flag}," in said
-    assert "scene-experts train RECIPE --help" in said and "--schedule" not in said
+    lines = str(asked.value).splitlines()
+    named = [line.split()[0] for line in lines if line.startswith("  ") and line.split()[0] in RECIPES]
+    assert sorted(named) == sorted(RECIPES) and max(map(len, lines)) <= 100
+
+
+@pytest.mark.parametrize("recipe", list(RECIPES))
+def test_the_help_of_a_recipe_shows_what_people_use_first_and_help_all_the_rest(recipe):
+    short, whole = (asked(recipe, flag) for flag in ("--help", "--help-all"))
+    assert all(f"{flag} " in short for flag in FIRST[:6]) and "--help-all" in short and "--scene." not in short
+    table = rows(TrainCommand, {"cfg": RECIPES[recipe][1]})
+    assert all(row.flag in whole for row in table) and len(short.splitlines()) < 50 < len(whole.splitlines())
+
+
+def asked(*args: str) -> str:
+    with pytest.raises(HelpAsked) as asked:
+        parse_train(list(args))
+    return str(asked.value)
+
+
+def test_an_option_of_another_recipe_says_whose_it_is():
+    with pytest.raises(InputError, match=r"--scene\.decoder\.num.*moe-gs") as error:
+        parse_train(["scaffold-gs", *PLACES, "--scene.decoder.num", "3"])
+    assert "octree-moe-gs" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("args", "fact"), [([], "moe-gs --data"), (["--data", "x"], "found --data"), (["--data", "x", "sags"], "train sags")]
+)
+def test_a_missing_recipe(args, fact):
+    with pytest.raises(InputError, match="expected a recipe") as error:
+        parse_train(args)
+    assert fact in str(error.value)
 
 
 def test_a_finished_run_keeps_its_files_when_resumed(tmp_path, capsys):

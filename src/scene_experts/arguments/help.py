@@ -1,0 +1,125 @@
+"""The help of a command as plain text: how it is written, what it does, and its options in groups."""
+
+from __future__ import annotations
+
+import shutil
+import textwrap
+from collections.abc import Sequence
+
+from scene_experts.arguments import docs
+from scene_experts.arguments.table import Row
+from scene_experts.arguments.values import described as known
+from scene_experts.arguments.values import placeholder, spelled
+
+INDENT = 2
+COLUMN = 26  # where the text beside an option begins
+SMALL = 3  # a dataclass of at most so many options is shown in the group around it
+
+
+def page(kind: type, name: str, about: str, table: Sequence[Row], positional: Sequence[str], first: Sequence[str]) -> str:
+    """The help of the command `name`. first: the options to show, in this order; empty for all, in groups."""
+    width = page_width()
+    by_flag = {row.flag: row for row in table}
+    words = [by_flag[flag] for flag in positional]
+    shown = [by_flag[flag] for flag in first] or [row for row in table if row not in words]
+    usage = f"usage: {written(name, table, positional)}" + (" [options]" if shown else "")
+    parts = [
+        textwrap.fill(usage, width, subsequent_indent=" " * 7, break_on_hyphens=False),
+        paragraphs(about or docs.of_class(kind), width),
+    ]
+    if words:
+        parts.append("\n".join(["Arguments:", *(line for row in words for line in entry(row, width, word=True))]))
+    if first:
+        parts.append("\n".join(["Options:", *(line for row in shown for line in entry(row, width))]))
+        parts.append(f"`{name} --help-all` shows all {len(table) - len(words)} options.")
+    else:
+        parts += [group(title, rows, width) for title, rows in groups(kind, shown)]
+    return "\n\n".join(part for part in parts if part)
+
+
+def page_width() -> int:
+    """Columns of the terminal, at most 100."""
+    return max(60, min(shutil.get_terminal_size().columns, 100))
+
+
+def written(name: str, table: Sequence[Row], positional: Sequence[str]) -> str:
+    """How a command is written with what it must be given: "scene-experts info CAPTURE"."""
+    by_flag = {row.flag: row for row in table}
+    first = [by_flag[flag] for flag in positional]
+    words = [text if row.required else f"[{text}]" for row in first if (text := stands_for(row))]
+    words += [f"{row.flag} {stands_for(row)}" for row in table if row.required and row not in first]
+    return " ".join([name, *words])
+
+
+def stands_for(row: Row) -> str:
+    """What stands for a row's value: CAPTURE, or what its type says."""
+    text = placeholder(row.kind, row.option.value)
+    return text.removesuffix(" ...") if row.option.repeat else text
+
+
+def paragraphs(text: str, width: int) -> str:
+    """Text wrapped to `width`; lines that begin with a blank stay as they are."""
+    parts = text.strip().split("\n\n")
+    return "\n\n".join(part if part.startswith(" ") else wrapped(part, width) for part in parts)
+
+
+def wrapped(text: str, width: int, indent: int = 0) -> str:
+    space = " " * indent
+    return textwrap.fill(
+        " ".join(text.split()), width, initial_indent=space, subsequent_indent=space, break_on_hyphens=False, break_long_words=False
+    )
+
+
+def groups(kind: type, shown: Sequence[Row]) -> list[tuple[str, list[Row]]]:
+    """Rows under their headings: the dataclass that declares them, or, of a small one, the dataclass around it."""
+    out: dict[tuple[str, type | None], list[Row]] = {}
+    for row in shown:
+        out.setdefault(_group(row, shown), []).append(row)
+    titles = []
+    for (prefix, owner), rows in out.items():
+        text = docs.title(owner) if owner and owner is not kind else ""
+        titles.append((f"{prefix.removesuffix('.')}: {text}" if prefix and text else prefix.removesuffix(".") or text or "Options", rows))
+    return titles
+
+
+def _prefix(row: Row) -> str:
+    before, dot, _ = row.flag.removeprefix("--").rpartition(".")
+    return before + dot
+
+
+def _group(row: Row, shown: Sequence[Row]) -> tuple[str, type | None]:
+    prefix, owner = _prefix(row), row.owner
+    if prefix and len([each for each in shown if _prefix(each) == prefix]) <= SMALL and "." in prefix[:-1]:
+        prefix = prefix[:-1].rpartition(".")[0] + "."
+        owner = next((each.owner for each in shown if _prefix(each) == prefix), None)
+    return prefix, owner
+
+
+def group(title: str, rows: Sequence[Row], width: int) -> str:
+    return "\n".join([wrapped(f"{title}:", width), *(line for row in rows for line in entry(row, width))])
+
+
+def entry(row: Row, width: int, word: bool = False) -> list[str]:
+    """The lines of one option: its name and, beside or below it, what it does."""
+    switch = row.negative if row.default is True else ""  # the form that changes something
+    names = ", ".join(name for name in (row.option.short, row.flag, switch) if name)
+    return columns(" " * INDENT + (stands_for(row) if word else f"{names} {stands_for(row)}".rstrip()), described(row), width)
+
+
+def columns(left: str, text: str, width: int | None = None) -> list[str]:
+    """A name with its text in a column beside it, or below where the name is long."""
+    lines = textwrap.wrap(text, (width or page_width()) - COLUMN, break_on_hyphens=False, break_long_words=False)
+    if lines and len(left) + 2 <= COLUMN:
+        left, lines = left.ljust(COLUMN) + lines[0], lines[1:]
+    return [left, *(" " * COLUMN + line for line in lines)]
+
+
+def described(row: Row) -> str:
+    """What an option does, and its default where the text does not say it."""
+    text = docs.of_field(row.owner, row.place[-1])
+    if stands_for(row) == "NAME":
+        text = f"{text} One of {known(row.kind)}.".strip()
+    plain = row.required or row.default is None or row.default is False or row.default == ()
+    if plain or "default" in text:
+        return text
+    return f"{text} (default: {'on' if row.default is True else spelled(row.default)})".strip()

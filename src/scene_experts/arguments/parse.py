@@ -1,0 +1,144 @@
+"""Words of a command line to a dataclass. Every command reads its options here, so all of them accept and refuse words alike."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field
+from typing import Any, TypeVar
+
+from scene_experts.arguments.help import page, stands_for, written
+from scene_experts.arguments.table import Place, Row, make, rows
+from scene_experts.arguments.values import NONE, convert, count, spelled, without_none
+from scene_experts.core.errors import InputError, nearest
+
+T = TypeVar("T")
+NUMBER = re.compile(r"-(\d|\.\d|inf|nan)")
+HELP, HELP_ALL = ("-h", "--help"), "--help-all"
+
+
+class HelpAsked(Exception):
+    """The words ask for help instead of a command; the text is the exception's argument."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `parse` knows of a command beside its options."""
+
+    name: str
+    """As it is typed: "scene-experts eval"."""
+    positional: tuple[str, ...] = ()
+    """Options that may be given without their name, in this order: ("--run",). Only the last may take several values."""
+    first: tuple[str, ...] = ()
+    """Options that --help shows, where --help-all shows the rest too. Empty: all."""
+    about: str = ""
+    """What the command does; the dataclass's docstring by default."""
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    """Values by dotted place that replace the dataclass's own: {"data.normalise": "none"}."""
+    elsewhere: Callable[[str], str] = lambda flag: ""
+    """What to say of an option that is none here: where it belongs, or nothing."""
+
+
+def parse(kind: type[T], command: Command, args: Sequence[str]) -> T:
+    """The dataclass that `args` describe.
+
+    Raises InputError, in one sentence, for words that do not fit, and HelpAsked for -h, --help and --help-all.
+    """
+    table = rows(kind, command.defaults)
+    if any(arg in HELP or arg == HELP_ALL for arg in args):
+        raise HelpAsked(page(kind, command.name, command.about, table, command.positional, () if HELP_ALL in args else command.first))
+    given = _Reader(command, table).read(list(args))
+    missing = [row for row in table if row.required and row.place not in given]
+    if missing:
+        how = written(command.name, table, command.positional)
+        raise InputError(f"expected {_both(missing, command)}, found {_none(missing)}; write {how}")
+    return make(kind, given, command.defaults)
+
+
+class _Reader:
+    """Walks once over the words and keeps the value of each option that they give."""
+
+    def __init__(self, command: Command, table: Sequence[Row]) -> None:
+        self.command = command
+        self.by_name = {name: row for row in table for name in row.names}
+        self.waiting = [self.by_name[flag] for flag in command.positional]
+        self.given: dict[Place, Any] = {}
+        self.written: dict[Place, str] = {}
+
+    def read(self, args: list[str]) -> dict[Place, Any]:
+        while args:
+            if is_name(args[0]):
+                self._option(args)
+            else:
+                self._word(args)
+        return self.given
+
+    def _option(self, args: list[str]) -> None:
+        word = args.pop(0)
+        written, joined, value = word.partition("=")
+        name = written.replace("_", "-")
+        row = self.by_name.get(name)
+        if row is None:
+            raise InputError(f"expected an option of `{self.command.name}`, found {written}; {self._advice(name)}")
+        if row.kind is bool:
+            if joined:
+                raise InputError(f"expected {written} without a value, found '{word}'; write {row.flag} or {row.negative}")
+            self._keep(row, name, name != row.negative)
+        else:
+            self._keep(row, name, self._value(row, name, [value] if joined else _take(row, args)))
+
+    def _word(self, args: list[str]) -> None:
+        left = [row for row in self.waiting if row.place not in self.given]
+        if not args[0]:
+            raise InputError("expected a value after the command, found an empty one; give one, or leave it out")
+        if not left:
+            takes = " ".join(map(stands_for, self.waiting)) or "only options"
+            raise InputError(f"expected {takes} after `{self.command.name}`, found also '{args[0]}'; leave it out")
+        row = left[0]
+        self._keep(row, stands_for(row), self._value(row, stands_for(row), _take(row, args)))
+
+    def _value(self, row: Row, name: str, words: list[str]) -> Any:
+        if "" in words:
+            raise InputError(f"expected a value after {name}, found an empty one; give one, or leave it out")
+        default = row.default if row.default not in (MISSING, None, ()) else None
+        example = f"{row.flag} {stands_for(row) if default is None else spelled(default)}"
+        if not words:
+            raise InputError(f"expected a value after {name}, found none; write for example {example}")
+        return convert(row.kind, words, name, example)
+
+    def _keep(self, row: Row, name: str, value: Any) -> None:
+        if row.place in self.given:
+            if not row.option.repeat:
+                names = dict.fromkeys((self.written[row.place], name))
+                raise InputError(f"expected {row.flag} once, found {' and '.join(names) if len(names) > 1 else 'it twice'}; leave one out")
+            value = self.given[row.place] + value
+        self.given[row.place], self.written[row.place] = value, name
+
+    def _advice(self, name: str) -> str:
+        close = nearest(name, [known for known in self.by_name if known.startswith("--")]).removeprefix("; ")
+        return self.command.elsewhere(name) or close or f"`{self.command.name} {HELP_ALL}` lists them"
+
+
+def is_name(word: str) -> bool:
+    """Whether a word is an option's name, and no value: a negative number is a value."""
+    return len(word) > 1 and word.startswith("-") and not NUMBER.match(word)
+
+
+def _take(row: Row, args: list[str]) -> list[str]:
+    """The words of a row's value, taken away from the front of `args`."""
+    most = 1 if row.option.repeat or (args and args[0] in NONE and without_none(row.kind)[1]) else count(row.kind)[1]
+    end = next((i for i, word in enumerate(args) if is_name(word)), len(args))
+    end = end if most is None else min(end, most)
+    words = args[:end]
+    del args[:end]
+    return words
+
+
+def _both(missing: Sequence[Row], command: Command) -> str:
+    """The options that are missing, as "--data and --out"."""
+    *some, last = [stands_for(row) if row.flag in command.positional else row.flag for row in missing]
+    return f"{', '.join(some)} and {last}" if some else last
+
+
+def _none(missing: Sequence[Row]) -> str:
+    return ("none", "neither")[len(missing) - 1] if len(missing) < 3 else "none of them"

@@ -1,0 +1,137 @@
+"""The options of a dataclass: one row for each field, with its name, type and default; and the value that given options make."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from typing import Annotated, Any
+
+from scene_experts.arguments.option import Option
+
+Place = tuple[str, ...]
+"""Names of the fields from the root to a value, as ("cfg", "scene", "voxel_size")."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One option."""
+
+    flag: str
+    """`--scene.voxel-size`"""
+    place: Place
+    kind: Any
+    """Type of the value, without its annotation."""
+    default: Any
+    """dataclasses.MISSING where the option must be given."""
+    option: Option
+    owner: type
+    """The dataclass that declares the field."""
+
+    @property
+    def required(self) -> bool:
+        return self.default is MISSING
+
+    @property
+    def negative(self) -> str:
+        """The name that turns a switch off, `--growth.no-elimination`; empty for other types."""
+        before, dot, last = self.flag.rpartition(".")
+        if self.kind is not bool:
+            return ""
+        return f"{before}{dot}no-{last}" if dot else f"--no-{last.removeprefix('--')}"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name for name in (self.flag, self.option.short, self.negative) if name)
+
+
+def rows(kind: type, defaults: Mapping[str, Any]) -> list[Row]:
+    """The options of a dataclass and of the dataclasses in it, in the order of their fields.
+
+    defaults: values by dotted place ("data.split") that replace those of the fields. A field that may hold one of several dataclasses
+    has the options of its default's class.
+    """
+    return _rows(kind, MISSING, "", (), defaults)
+
+
+def _rows(kind: type, value: Any, prefix: str, place: Place, defaults: Mapping[str, Any]) -> list[Row]:
+    out: list[Row] = []
+    for field in fields(kind):
+        option, inner = _annotation(kind, field.name)
+        here = (*place, field.name)
+        default = _default(field, value, here, defaults)
+        part = _dataclass_of(inner, default)
+        name = option.name if option.name is not None else field.name.replace("_", "-")
+        if option.hidden or not field.init or (part is None and _may_be_dataclass(inner)):
+            continue
+        if part is not None:
+            out += _rows(part, default, f"{prefix}{name}." if name else prefix, here, defaults)
+        else:
+            out.append(Row(f"--{prefix}{name}", here, inner, default, option, kind))
+    return out
+
+
+def make(kind: type, given: Mapping[Place, Any], defaults: Mapping[str, Any]) -> Any:
+    """The value of a dataclass whose fields are `given` by place, else their defaults."""
+    return _make(kind, MISSING, (), given, defaults)
+
+
+def _make(kind: type, value: Any, place: Place, given: Mapping[Place, Any], defaults: Mapping[str, Any]) -> Any:
+    changes: dict[str, Any] = {}
+    for field in fields(kind):
+        if not field.init:
+            continue
+        here = (*place, field.name)
+        default = _default(field, value, here, defaults)
+        part = _dataclass_of(_annotation(kind, field.name)[1], default)
+        if here in given:
+            changes[field.name] = given[here]
+        elif part is not None:
+            changes[field.name] = _make(part, default, here, given, defaults)
+        else:
+            changes[field.name] = default
+    if value is MISSING:
+        return kind(**changes)
+    return replace(value, **{name: new for name, new in changes.items() if new is not getattr(value, name)})
+
+
+def _default(field: dataclasses.Field[Any], value: Any, place: Place, defaults: Mapping[str, Any]) -> Any:
+    if (dotted := ".".join(place)) in defaults:
+        return defaults[dotted]
+    if value is not MISSING:
+        return getattr(value, field.name)
+    return field.default_factory() if field.default_factory is not MISSING else field.default
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    return typing.get_type_hints(kind, include_extras=True)
+
+
+def _annotation(kind: type, name: str) -> tuple[Option, Any]:
+    """The Option of a field, and its type."""
+    hint = _hints(kind)[name]
+    if typing.get_origin(hint) is not Annotated:
+        return Option(), hint
+    inner, *notes = typing.get_args(hint)
+    return next((note for note in notes if isinstance(note, Option)), Option()), inner
+
+
+def _dataclass_of(kind: Any, default: Any) -> type | None:
+    """The dataclass whose fields are the options of a field, or None where the field is an option itself."""
+    if is_dataclass(default) and not isinstance(default, type):
+        return type(default)
+    return kind if default is MISSING and isinstance(kind, type) and is_dataclass(kind) else None
+
+
+def _may_be_dataclass(kind: Any) -> bool:
+    return any(is_dataclass(each) for each in members(kind))
+
+
+def members(kind: Any) -> tuple[Any, ...]:
+    """The types of a union; of any other type, the type alone."""
+    union = typing.get_origin(kind) in (typing.Union, types.UnionType)
+    return typing.get_args(kind) if union else (kind,)

@@ -1,0 +1,104 @@
+"""Words of a command line to values of a field's type. One sentence for a word that does not fit."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from scene_experts.arguments.table import members
+from scene_experts.core.errors import InputError, nearest
+
+NONE = ("none", "None")
+LONG = 40  # characters; longer choices are listed in the text beside an option
+WORDS: dict[Any, tuple[str, str, Callable[[str], Any]]] = {
+    int: ("a whole number", "N", int),
+    float: ("a number", "X", float),
+    str: ("a value", "TEXT", str),
+    Path: ("a path", "PATH", Path),
+}
+"""Of the plain types: how a sentence calls them, how the help writes them, and how a word becomes one."""
+
+
+def count(kind: Any) -> tuple[int, int | None]:
+    """How many words a value takes: at least, at most (None: any number)."""
+    inner, optional = without_none(kind)
+    if inner is bool:
+        return 0, 0
+    if typing.get_origin(inner) is not tuple:
+        return 1, 1
+    many = len(each := typing.get_args(inner)) == 2 and each[1] is Ellipsis
+    return (1, None) if many else (1 if optional else len(each), len(each))
+
+
+def convert(kind: Any, words: Sequence[str], name: str, example: str) -> Any:
+    """The value that words spell. Raises InputError, naming the option `name` and giving an `example` of what is right."""
+    inner, optional = without_none(kind)
+    if optional and len(words) == 1 and words[0] in NONE:
+        return None
+    if typing.get_origin(inner) is not tuple:
+        return _one(inner, words[0], name, example)
+    each = typing.get_args(inner)
+    least, most = count(inner)
+    if most is not None and len(words) != most:
+        raise InputError(f"expected {least} values after {name}, found {len(words)}; write {example}")
+    kinds = [each[0]] * len(words) if most is None else each
+    return tuple(_one(one, word, name, example) for one, word in zip(kinds, words))
+
+
+def _one(kind: Any, word: str, name: str, example: str) -> Any:
+    if typing.get_origin(kind) is Literal:
+        known = {str(choice): choice for choice in typing.get_args(kind)}
+        if word not in known:
+            raise InputError(f"expected {described(kind)} after {name}, found '{word}'{nearest(word, known) or '; choose one of these'}")
+        return known[word]
+    what, _, make = WORDS[kind]
+    try:
+        return make(word)
+    except ValueError:
+        raise InputError(f"expected {what} after {name}, found '{word}'; write for example {example}") from None
+
+
+def described(kind: Any) -> str:
+    """What a sentence calls a value of the type: "a whole number", "auto, cpu or cuda"."""
+    inner, _ = without_none(kind)
+    if typing.get_origin(inner) is Literal:
+        *some, last = map(str, typing.get_args(inner))
+        return f"{', '.join(some)} or {last}" if some else last
+    if typing.get_origin(inner) is tuple:
+        each, most = typing.get_args(inner), count(inner)[1]
+        return f"one or more values ({described(each[0])})" if most is None else f"{most} numbers"
+    return WORDS[inner][0]
+
+
+def placeholder(kind: Any, name: str = "") -> str:
+    """What stands for the value in the help: "N", "auto|cpu|cuda", "N ...". name: in place of the type's own."""
+    inner, _ = without_none(kind)
+    if inner is bool:
+        return ""
+    if typing.get_origin(inner) is tuple:
+        each, most = typing.get_args(inner), count(inner)[1]
+        one = placeholder(each[0], name)
+        return f"{one} ..." if most is None else " ".join(placeholder(kind, name) for kind in each)
+    if name:
+        return name
+    if typing.get_origin(inner) is Literal:
+        choices = "|".join(map(str, typing.get_args(inner)))
+        return choices if len(choices) <= LONG else "NAME"
+    return WORDS[inner][1]
+
+
+def spelled(value: Any) -> str:
+    """A value as one writes it on the command line."""
+    if isinstance(value, tuple):
+        return " ".join(map(spelled, value))
+    return "none" if value is None else f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else str(value)
+
+
+def without_none(kind: Any) -> tuple[Any, bool]:
+    """The type that is no None, and whether None is a value too."""
+    rest = [each for each in members(kind) if each is not type(None)]
+    if len(rest) != 1:
+        raise TypeError(f"an option cannot be one of {rest}")
+    return rest[0], len(rest) < len(members(kind))
