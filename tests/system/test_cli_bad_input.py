@@ -288,7 +288,7 @@ def test_truncated_checkpoints(made, trained, tmp_path, capsys):
     code, sentence = said(capsys, "eval", run, "--no-lpips", "--step", "8")
     assert code == 2
     as_recorded("checkpoint truncated", sentence, tmp_path)
-    assert said(capsys, *resume, "--resume") == (0, "") and eight.stat().st_size == len(whole)
+    assert said(capsys, *resume, "--resume") == (0, "") and checkpoint.load(eight)[1]["step"] == 8
     for path in (four, eight):
         path.write_bytes(b"")
     before = state(run)
