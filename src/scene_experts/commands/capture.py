@@ -15,8 +15,7 @@ from scene_experts.commands import PROG
 from scene_experts.core.errors import InputError, expect_at_least, few
 from scene_experts.core.signals import handled
 from scene_experts.sfm import reconstruct as run
-from scene_experts.sfm.frames import MOST
-from scene_experts.sfm.pairs import Matching
+from scene_experts.sfm.frames import MOST_FRAMES
 from scene_experts.training.progress import Bar, clock
 
 FEW = 0.9  # a smaller share of photographs with a pose is worth a word of advice
@@ -36,7 +35,7 @@ class CaptureCommand:
     """Folder of the capture: OUT/images, OUT/sparse/0, OUT/capture.json."""
     frames: int = run.Options.frames
     """Of a video: how many frames to take, the sharpest of as many stretches."""
-    matching: Matching = run.Options.matching
+    matching: run.Matching = run.Options.matching
     """Which photographs are compared: all with all, or neighbours in order of names (a video, a walk). auto: all up to 300."""
     camera_model: run.CameraModel = run.Options.camera_model
     """COLMAP's model of the lens. Photographs of one size, camera and focal length share one."""
@@ -56,13 +55,13 @@ def capture(args: list[str]) -> int:
     command = parse(CaptureCommand, Command(f"{PROG} capture", ("--photos",)), args)
     least = {"frames": 3, "max_side": 64, "threads": 0, "seed": 0}
     expect_at_least([(f"--{name.replace('_', '-')}", getattr(command, name), low) for name, low in least.items()])
-    if command.frames > MOST:
-        raise InputError(f"expected --frames of at most {MOST:,}, found {command.frames:,}; give fewer: 100 to 300 make a scene")
+    if command.frames > MOST_FRAMES:
+        raise InputError(f"expected --frames of at most {MOST_FRAMES:,}, found {command.frames:,}; give fewer: 100 to 300 make a scene")
     console = Console(highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
     options = run.Options(**{name: getattr(command, name) for name in vars(run.Options())})
     with handled(interrupt), Bar(console) as bar:
-        note = run.make(command.photos, command.out, options, overwrite=command.overwrite, say=say, progress=bar)
+        note = run.reconstruct(command.photos, command.out, options, overwrite=command.overwrite, say=say, progress=bar)
     for line in told(note):
         say(line)
     say(f"next: {PROG} train moe-gs --data {shlex.quote(str(command.out))} --out RUN")

@@ -1,4 +1,4 @@
-"""A video's sharpest frames, spread evenly over its length, through imageio's own ffmpeg."""
+"""Extracts the sharpest frames of a video, spread evenly over its length, with the ffmpeg that imageio installs."""
 
 from __future__ import annotations
 
@@ -14,55 +14,55 @@ from PIL import Image
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_atomic
 
-LOOK = 480  # px: the width at which sharpness is judged
-QUALITY = 95
-MOST = 5000  # frames: more have no room in one command of ffmpeg's
+GRADING_WIDTH = 480  # px; frames are scaled to this width before their sharpness is measured
+JPEG_QUALITY = 95
+MOST_FRAMES = 5000  # more frame numbers do not fit into one ffmpeg command
 
-Told = Callable[[str, int, int], None]
+Progress = Callable[[str, int, int], None]  # name of the work, how much is done, how much there is
 
 
-def take(video: Path, folder: Path, count: int, progress: Told) -> list[str]:
-    """Write about `count` frames of `video` as frame_00001.jpg, ... into `folder`; returns their names.
+def extract_frames(video: Path, folder: Path, count: int, progress: Progress) -> list[str]:
+    """Write about `count` frames of `video` into `folder` as frame_00001.jpg, ... and return their names.
 
-    The frames of a video are divided into `count` stretches of the same length, and of each the sharpest is taken.
-    Raises InputError where imageio-ffmpeg is missing or the file is no video.
+    The video is divided into `count` segments of equal length, and the sharpest frame of each is extracted.
+    Raises InputError if imageio-ffmpeg is missing or ffmpeg cannot decode the file.
     """
-    grades, expected, pictures = [], *read(video, f"scale={LOOK}:-2,format=gray", "gray", 1)
-    for picture in pictures:
-        grades.append(sharpness(picture[..., 0]))
+    grades, expected, frames = [], *read_frames(video, f"scale={GRADING_WIDTH}:-2,format=gray", "gray", 1)
+    for frame in frames:
+        grades.append(sharpness(frame[..., 0]))
         progress("looking for sharp frames", len(grades), max(expected, len(grades)))
-    chosen = sharpest(grades, count)
+    chosen = choose_sharpest(grades, count)
     if not chosen:
-        raise InputError(f"expected a video with frames at {video}, found none; convert it to mp4 or take its frames by another tool")
+        raise InputError(f"expected a video with frames at {video}, found none; convert it to mp4 or extract its frames with another tool")
     names = [f"frame_{i + 1:05d}.jpg" for i in range(len(chosen))]
     wanted = "+".join(rf"eq(n\,{index})" for index in chosen)
     folder.mkdir(parents=True, exist_ok=True)
-    for i, (name, picture) in enumerate(zip(names, read(video, f"select={wanted}", "rgb24", 3)[1])):
-        image = Image.fromarray(picture)
-        write_atomic(folder / name, lambda temporary, image=image: image.save(temporary, "JPEG", quality=QUALITY, subsampling=0))
+    for i, (name, frame) in enumerate(zip(names, read_frames(video, f"select={wanted}", "rgb24", 3)[1])):
+        image = Image.fromarray(frame)
+        write_atomic(folder / name, lambda temporary, image=image: image.save(temporary, "JPEG", quality=JPEG_QUALITY, subsampling=0))
         progress("frames", i + 1, len(names))
     return names
 
 
-def sharpest(grades: Sequence[float], count: int) -> list[int]:
-    """The index of the highest grade in each of `count` stretches of the same length; every index where there are fewer."""
+def choose_sharpest(grades: Sequence[float], count: int) -> list[int]:
+    """Return the index of the highest grade in each of `count` segments of equal length, or every index if there are fewer."""
     edges = np.linspace(0, len(grades), min(count, len(grades)) + 1).round().astype(int)
     return [int(a + np.argmax(grades[a:b])) for a, b in pairwise(edges)]
 
 
 def sharpness(gray: np.ndarray) -> float:
-    """Variance of the Laplacian of a picture [H, W]: small where motion or focus blurs it."""
+    """Return the variance of the Laplacian of an image [H, W]. Blur lowers it."""
     g = gray.astype(np.float32)
     laplacian = g[1:-1, :-2] + g[1:-1, 2:] + g[:-2, 1:-1] + g[2:, 1:-1] - 4 * g[1:-1, 1:-1]
     return float(laplacian.var())
 
 
-def read(video: Path, filters: str, pixels: str, channels: int) -> tuple[int, Iterator[np.ndarray]]:
-    """About how many frames a video has, and those [H, W, channels] uint8 that ffmpeg's `filters` leave, none doubled or dropped.
+def read_frames(video: Path, filters: str, pixels: str, channels: int) -> tuple[int, Iterator[np.ndarray]]:
+    """Return the approximate number of frames of a video, and the frames [H, W, channels] uint8 that ffmpeg's `filters` keep.
 
-    Raises InputError where imageio-ffmpeg is missing or the file cannot be read.
+    No frame is duplicated or dropped. Raises InputError if imageio-ffmpeg is missing or ffmpeg cannot decode the file.
     """
-    ffmpeg = reader()
+    ffmpeg = import_ffmpeg()
     options = ["-vf", filters, "-fps_mode", "passthrough"]
     frames = ffmpeg.read_frames(str(video), pix_fmt=pixels, bpp=channels, bits_per_pixel=8 * channels, output_params=options)
 
@@ -71,7 +71,7 @@ def read(video: Path, filters: str, pixels: str, channels: int) -> tuple[int, It
             yield from frames
         except (OSError, RuntimeError, ValueError) as error:
             why = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
-            raise InputError(f"expected a video that ffmpeg reads at {video}, found one it does not ({why}); convert it to mp4") from error
+            raise InputError(f"cannot decode the video {video}: {why}; convert it to mp4") from error
 
     stream = guarded()
     facts = next(stream)
@@ -80,11 +80,11 @@ def read(video: Path, filters: str, pixels: str, channels: int) -> tuple[int, It
     return count, (np.frombuffer(frame, np.uint8).reshape(height, width, channels) for frame in stream)
 
 
-def reader() -> Any:
-    """The module that decodes. Raises InputError with what to install where it is missing."""
+def import_ffmpeg() -> Any:
+    """Return the module imageio_ffmpeg. Raises InputError, which says what to install, if it is missing."""
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise InputError("expected imageio-ffmpeg to read videos, found none; pip install 'scene-experts[video]'") from error
-    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # it warns of the size that we ask it for
+        raise InputError("reading videos requires imageio-ffmpeg: pip install 'scene-experts[video]'") from error
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # it warns about the frame size that is requested here
     return imageio_ffmpeg

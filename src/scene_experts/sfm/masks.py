@@ -1,4 +1,4 @@
-"""Which pixels of the photographs count, as COLMAP reads it: no feature is sought where none does."""
+"""Writes the masks of photographs in COLMAP's format. COLMAP extracts no features where a mask is black."""
 
 from __future__ import annotations
 
@@ -15,58 +15,64 @@ from scene_experts.sfm.photos import Photo
 from scene_experts.sfm.work import remove
 
 
-def write(photos: Sequence[Photo], images: Path, folder: Path) -> list[str]:
-    """Write FOLDER/NAME.png for every photograph NAME in folder `images`, if any has a mask: a file (where training looks for it) or alpha.
+def write_masks(photos: Sequence[Photo], images: Path, folder: Path) -> list[str]:
+    """Write FOLDER/NAME.png for every photograph NAME in the folder `images`, if any photograph has a mask.
 
-    0 where no feature is to be sought, 255 elsewhere, of the photograph's size. Where some
-    have one, COLMAP passes over those that have none: they get a white one. Returns what tells these masks from others, [] for none.
-    Raises InputError for a mask file that is not whole.
+    The mask of a photograph is a mask file, found as training finds it, or its alpha channel. It is written at the size of the
+    photograph, 255 where features are extracted and 0 elsewhere. COLMAP skips photographs without a mask if others have one,
+    so those get a white mask.
+
+    Returns a checksum of each written mask; an empty list if no photograph has a mask.
+    Raises InputError if a mask file is unreadable.
     """
     remove(folder)
-    if not any(mask_file(photo, images) or see_through(images / photo.name) for photo in photos):
+    if not any(find_photo_mask(photo, images) or has_alpha(images / photo.name) for photo in photos):
         return []
-    marks = []
+    checksums = []
     for photo in photos:
-        path = mask_file(photo, images)
-        mask = read(path, photo) if path else alpha(images / photo.name)
+        path = find_photo_mask(photo, images)
+        mask = read_mask(path, photo) if path else read_alpha(images / photo.name)
         new = folder / f"{photo.name}.png"
         new.parent.mkdir(parents=True, exist_ok=True)
         mask.save(new)
-        marks.append(hashlib.sha256(new.read_bytes()).hexdigest())
-    return marks
+        checksums.append(hashlib.sha256(new.read_bytes()).hexdigest())
+    return checksums
 
 
-def mask_file(photo: Photo, images: Path) -> Path | None:
-    """Where the mask of a photograph is, if it has one."""
+def find_photo_mask(photo: Photo, images: Path) -> Path | None:
+    """Return the mask file of a photograph, or None."""
     return find_mask(images.parent, photo.name, images / photo.name)
 
 
-def see_through(path: Path) -> bool:
-    """Whether a photograph has an alpha channel."""
+def has_alpha(path: Path) -> bool:
+    """Return whether an image has an alpha channel or a transparent colour."""
     with Image.open(path) as image:
         return "A" in image.getbands() or "transparency" in image.info
 
 
-def read(path: Path, photo: Photo) -> Image.Image:
-    """The mask file of `photo`, at its size, lying as the photograph is stored, also where EXIF turns this one and the mask is upright."""
+def read_mask(path: Path, photo: Photo) -> Image.Image:
+    """Read the mask file of `photo` at the size and in the orientation of the stored photograph.
+
+    A mask that is upright although EXIF rotates its photograph is rotated back. Raises InputError if the file is unreadable.
+    """
     try:
         with Image.open(path) as image:
             mask = to_mask(image)
     except (OSError, ValueError, SyntaxError) as error:
-        raise InputError(f"expected a whole mask at {path}, found one that is not ({error}); replace it or take it away") from error
+        raise InputError(f"cannot read the mask {path}: {error}; replace or remove it") from error
     width, height = photo.size
     if photo.orientation in (5, 6, 7, 8) and (mask.width > mask.height) != (width > height):
         mask.getexif()[0x0112] = {6: 8, 8: 6}.get(photo.orientation, photo.orientation)
         mask = ImageOps.exif_transpose(mask)
-    return mask.resize(photo.size, Image.Resampling.NEAREST).point(binary)
+    return mask.resize(photo.size, Image.Resampling.NEAREST).point(binarise)
 
 
-def alpha(path: Path) -> Image.Image:
-    """The alpha of a photograph, white where it has none."""
+def read_alpha(path: Path) -> Image.Image:
+    """Return the alpha channel of a photograph as a mask. It is white if there is no alpha channel."""
     with Image.open(path) as image:
-        return image.convert("RGBA").getchannel("A").point(binary) if see_through(path) else Image.new("L", image.size, 255)
+        return image.convert("RGBA").getchannel("A").point(binarise) if has_alpha(path) else Image.new("L", image.size, 255)
 
 
-def binary(value: int) -> int:
-    """255 for what counts at least by half."""
+def binarise(value: int) -> int:
+    """Return 255 for a value of at least 128, otherwise 0."""
     return 255 if value >= 128 else 0

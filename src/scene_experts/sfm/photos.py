@@ -1,4 +1,4 @@
-"""The photographs of a folder: found, looked at, grouped by the camera that took them, made ready for COLMAP."""
+"""Finds and inspects the photographs of a folder, groups them by camera, and copies them in a form that COLMAP reads."""
 
 from __future__ import annotations
 
@@ -17,73 +17,70 @@ from scene_experts.core.io import read_json, write_atomic, write_json
 from scene_experts.data.images import to_8_bit
 from scene_experts.data.match import EXTENSIONS
 
-FEWEST = 3  # photographs: fewer than that have no scene in common
-ELSEWHERE = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw")  # photographs that Pillow does not read
-PLAIN = ("JPEG", "MPO", "PNG", "BMP", "TIFF")  # what COLMAP reads
-MASKS = (".mask.png", "_mask.png")  # behind the stem of a photograph beside them
+FEWEST = 3  # photographs needed for a reconstruction
+UNSUPPORTED = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw")  # photographs that Pillow does not read
+COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "BMP", "TIFF")  # what COLMAP reads
+MASK_ENDINGS = (".mask.png", "_mask.png")  # after the stem of a photograph in the same folder
 COPIED = "copied.json"
 _MAKE, _MODEL, _ORIENTATION, _EXIF, _FOCAL, _LENS = 0x010F, 0x0110, 0x0112, 0x8769, 0x920A, 0xA434
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph: its name below its folder, its size in pixels, what says which camera took it.
+    """A photograph: its name, its size and what identifies its camera."""
 
-    orientation: EXIF's, 1 to 8.  suffix: of the file it must be written as, because COLMAP does not read the one it is; "" where it does.
-    stamp: bytes and time of the file, and of its mask.  mask: the name of the file that says which pixels count, where one lies beside it.
-    """
-
-    name: str
-    size: tuple[int, int]
-    camera: tuple[str, ...] = ()
-    orientation: int = 1
-    suffix: str = ""
-    stamp: tuple[int, ...] = (0, 0)
-    mask: str = ""
+    name: str  # relative to its folder
+    size: tuple[int, int]  # px, as stored
+    camera: tuple[str, ...] = ()  # maker, model, lens and focal length from EXIF
+    orientation: int = 1  # from EXIF, 1 to 8
+    suffix: str = ""  # extension to convert the file to because COLMAP does not read it; "": no conversion
+    stamp: tuple[int, ...] = (0, 0)  # bytes and modification time of the file, then of its mask
+    mask: str = ""  # name of the mask file beside it
 
     @property
     def stored(self) -> str:
-        """Its name in the capture: in COLMAP's lists of pairs blanks divide names, and a first # begins a comment."""
+        """Its name in the capture. COLMAP's lists of pairs allow neither blanks nor a leading "#"."""
         name = re.sub(r"\s+", "_", self.name)
         name = "_" + name[1:] if name.startswith("#") else name
         return str(PurePosixPath(name).with_suffix(self.suffix)) if self.suffix else name
 
     @property
     def upright(self) -> Photo:
-        """As it is in the capture: under its stored name, turned as it is to be looked at."""
+        """The photograph as it is copied into a capture: under its stored name and rotated upright."""
         size = (self.size[1], self.size[0]) if self.orientation in (5, 6, 7, 8) else self.size
         return Photo(self.stored, size, self.camera, stamp=self.stamp)
 
 
-def find(folder: Path, but: Path | None = None) -> list[Photo]:
-    """The photographs below `folder` and not below `but`, "2.jpg" before "10.jpg". Every one is decoded, at an eighth of its size.
+def find_photos(folder: Path, exclude: Path | None = None) -> list[Photo]:
+    """Return the photographs in `folder` and its subfolders except `exclude`, sorted so that "2.jpg" precedes "10.jpg".
 
-    Raises InputError where there are too few, or one is not whole or has a name that cannot be kept.
+    Every photograph is decoded at an eighth of its size to verify it.
+    Raises InputError if there are too few, or if one is damaged or its name cannot be used.
     """
-    files = below(folder, but)
-    names = sorted((path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in EXTENSIONS), key=natural)
-    masks = masks_of(names)
+    files = list_files(folder, exclude)
+    names = sorted((path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in EXTENSIONS), key=natural_key)
+    masks = find_masks_beside(names)
     names = [name for name in names if name not in masks.values()]
     if len(names) < FEWEST:
-        raw = sorted({path.suffix.lower() for path in files} & set(ELSEWHERE))
-        advice = f"save the {', '.join(raw)} files as JPEG" if raw else "take more: tens, each showing most of what the one before shows"
+        raw = sorted({path.suffix.lower() for path in files} & set(UNSUPPORTED))
+        advice = f"save the {', '.join(raw)} files as JPEG" if raw else "take dozens that overlap strongly"
         raise InputError(f"expected at least {FEWEST} photographs ({', '.join(EXTENSIONS)}) in {folder}, found {len(names)}; {advice}")
-    found = [look(folder, name, masks.get(name, "")) for name in names]
+    found = [inspect_photo(folder, name, masks.get(name, "")) for name in names]
     for one, other in pairwise(sorted(found, key=lambda photo: photo.stored)):
         if one.stored == other.stored:
             raise InputError(
-                f"expected names that differ by more than blanks or kind in {folder}, found '{one.name}' and '{other.name}'; rename one"
+                f"expected names in {folder} that differ not only in blanks or extension, found '{one.name}' and '{other.name}'; rename one"
             )
     return found
 
 
-def below(folder: Path, but: Path | None) -> list[Path]:
-    """The files below `folder`, links followed, hidden ones and those below `but` left out."""
+def list_files(folder: Path, exclude: Path | None) -> list[Path]:
+    """Return the files in `folder` and its subfolders except hidden ones and `exclude`. Symbolic links are followed."""
     out, seen = [], set()
     for place, folders, files in os.walk(folder, followlinks=True):
         here = Path(place).resolve()
         folders[:] = [name for name in folders if not name.startswith(".")]
-        if here in seen or (but is not None and here == but.resolve() and here != folder.resolve()):
+        if here in seen or (exclude is not None and here == exclude.resolve() and here != folder.resolve()):
             folders.clear()
             continue
         seen.add(here)
@@ -91,20 +88,20 @@ def below(folder: Path, but: Path | None) -> list[Path]:
     return out
 
 
-def natural(name: str) -> list[tuple[int, str]]:
-    """A key that puts numbers in names in their own order."""
+def natural_key(name: str) -> list[tuple[int, str]]:
+    """Return a sort key that orders the numbers in names by value."""
     return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name)]
 
 
-def masks_of(names: Sequence[str]) -> dict[str, str]:
-    """Masks that lie beside photographs, by the name of the photograph."""
+def find_masks_beside(names: Sequence[str]) -> dict[str, str]:
+    """Return the names of masks in the same folder as their photographs, by the name of the photograph."""
     there = set(names)
     stems = ((name, str(PurePosixPath(name).with_suffix(""))) for name in names)
-    return {name: f"{stem}{ending}" for name, stem in stems for ending in MASKS if f"{stem}{ending}" in there}
+    return {name: f"{stem}{ending}" for name, stem in stems for ending in MASK_ENDINGS if f"{stem}{ending}" in there}
 
 
-def look(folder: Path, name: str, mask: str) -> Photo:
-    """What a photograph is and states. Raises InputError where it is not whole."""
+def inspect_photo(folder: Path, name: str, mask: str) -> Photo:
+    """Read the size and EXIF data of a photograph. Raises InputError if it is damaged or its name is not UTF-8."""
     path = folder / name
     try:
         name.encode()
@@ -112,85 +109,83 @@ def look(folder: Path, name: str, mask: str) -> Photo:
         raise InputError(f"expected names in UTF-8 in {folder}, found {name!r}; rename the file") from None
     try:
         with Image.open(path) as image:
-            size, plain, png = image.size, image.format in PLAIN and not deep(image), "A" in image.getbands() or deep(image)
+            size, deep = image.size, is_deep(image)
+            readable, lossless = image.format in COLMAP_FORMATS and not deep, "A" in image.getbands() or deep
             exif = image.getexif()
             inner = exif.get_ifd(_EXIF)
             image.draft(None, (max(1, size[0] // 8), max(1, size[1] // 8)))
             image.load()
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"expected a whole photograph at {path}, found one that is not ({error}); replace it or take it away") from error
-    stated = (exif.get(_MAKE), exif.get(_MODEL), inner.get(_LENS), inner.get(_FOCAL))
-    turned = exif.get(_ORIENTATION, 1)
+        raise InputError(f"cannot read the photograph {path}: {error}; replace or remove it") from error
+    camera = (exif.get(_MAKE), exif.get(_MODEL), inner.get(_LENS), inner.get(_FOCAL))
+    orientation = exif.get(_ORIENTATION, 1)
     return Photo(
         name,
         size,
-        tuple(str(value).strip() for value in stated) if any(stated) else (),
-        turned if turned in range(1, 9) else 1,
-        "" if plain else ".png" if png else ".jpg",
-        stamp(path) + (stamp(folder / mask) if mask else ()),
+        tuple(str(value).strip() for value in camera) if any(camera) else (),
+        orientation if orientation in range(1, 9) else 1,
+        "" if readable else ".png" if lossless else ".jpg",
+        file_stamp(path) + (file_stamp(folder / mask) if mask else ()),
         mask,
     )
 
 
-def deep(image: Image.Image) -> bool:
-    """Whether a picture is grey of more than 8 bits, which COLMAP does not read."""
+def is_deep(image: Image.Image) -> bool:
+    """Return whether an image is grey with more than 8 bits, which COLMAP does not read."""
     return image.mode.startswith("I") or image.mode == "F"
 
 
-def stamp(path: Path) -> tuple[int, int]:
-    """Bytes and time of a file."""
+def file_stamp(path: Path) -> tuple[int, int]:
+    """Return the size in bytes and the modification time of a file."""
     return path.stat().st_size, path.stat().st_mtime_ns
 
 
-def by_camera(photos: Sequence[Photo]) -> list[list[str]]:
-    """Names by camera: photographs of the same size, maker, model, lens and focal length (a zoom makes another camera)."""
+def group_by_camera(photos: Sequence[Photo]) -> list[list[str]]:
+    """Group names by camera: the same size, maker, model, lens and focal length. Each zoom setting is a camera of its own."""
     groups: dict[object, list[str]] = {}
     for photo in photos:
         groups.setdefault((photo.size, photo.camera), []).append(photo.name)
     return list(groups.values())
 
 
-def in_place(photos: Sequence[Photo], folder: Path) -> list[Photo]:
-    """The photographs of a capture's own folder of images, which stay as they are. Raises InputError where COLMAP cannot take one so."""
+def check_in_place(photos: Sequence[Photo], folder: Path) -> list[Photo]:
+    """Return the photographs of a capture's own image folder, which are not modified. Raises InputError if COLMAP cannot read one."""
     if other := next((photo for photo in photos if photo.name != photo.stored), None):
-        raise InputError(f"expected photographs as COLMAP takes them in {folder}, found '{other.name}'; make a new capture of them (--out)")
+        raise InputError(f"COLMAP cannot read '{other.name}' in {folder} as it is; make a new capture from these photographs with --out")
     return list(photos)
 
 
-def copy(photos: Sequence[Photo], source: Path, target: Path) -> list[Photo]:
-    """Make folder `target` hold the photographs under their stored names and nothing else; returns them as they are there.
+def copy_photos(photos: Sequence[Photo], source: Path, target: Path) -> list[Photo]:
+    """Copy photographs and their masks into `target` under their stored names and return them. Other files in `target` are removed.
 
-    Those that EXIF turns are written upright, with hardly a loss: COLMAP takes the stored pixels, and a scene of sideways photographs would
-    lie on its side. Copies that are there already stay.
+    Photographs that EXIF rotates are written upright at high quality: COLMAP uses the stored pixels, and a scene of sideways
+    photographs would lie on its side. Existing copies are kept.
     """
     note = target.with_name(COPIED)
     kept: dict[str, list[int]] = read_json(note, "list of copies") if note.is_file() else {}
     wanted = {photo.stored: photo for photo in photos}
-    masks = {str(target / stem(photo)) + ending(photo.mask) for photo in photos if photo.mask}
+    masks = {photo.stored: _mask_copy(photo, target) for photo in photos if photo.mask}
     for path in [path for path in target.rglob("*") if path.is_file()]:
-        if path.relative_to(target).as_posix() not in wanted and str(path) not in masks:
+        if path.relative_to(target).as_posix() not in wanted and path not in masks.values():
             path.unlink()
     for name, photo in wanted.items():
         new = target / name
         if not new.is_file() or tuple(kept.get(name, ())) != photo.stamp:
             transfer(source / photo.name, new, photo.orientation, photo.suffix)
             if photo.mask:
-                transfer(source / photo.mask, Path(f"{target / stem(photo)}{ending(photo.mask)}"), photo.orientation)
+                transfer(source / photo.mask, masks[name], photo.orientation)
             kept[name] = list(photo.stamp)
     write_json(note, {name: stamp for name, stamp in kept.items() if name in wanted})
     return [photo.upright for photo in photos]
 
 
-def stem(photo: Photo) -> str:
-    return str(PurePosixPath(photo.stored).with_suffix(""))
-
-
-def ending(mask: str) -> str:
-    return next(end for end in MASKS if mask.endswith(end))
+def _mask_copy(photo: Photo, target: Path) -> Path:
+    ending = next(end for end in MASK_ENDINGS if photo.mask.endswith(end))
+    return target / f"{PurePosixPath(photo.stored).with_suffix('')}{ending}"
 
 
 def transfer(old: Path, new: Path, orientation: int, suffix: str = "") -> None:
-    """Copy a photograph, or write it anew: turned upright, or as another kind of file (`suffix`)."""
+    """Copy an image file, or rewrite it rotated upright (`orientation` as in EXIF) or in another format (`suffix`)."""
     new.parent.mkdir(parents=True, exist_ok=True)
     if orientation == 1 and not suffix:
         write_atomic(new, lambda temporary: shutil.copyfile(old, temporary))
@@ -199,7 +194,7 @@ def transfer(old: Path, new: Path, orientation: int, suffix: str = "") -> None:
         form = {".jpg": "JPEG", ".png": "PNG"}.get(suffix) or ("JPEG" if image.format == "MPO" else image.format)
         image.getexif()[_ORIENTATION] = orientation  # that of the photograph, for its mask too
         upright = ImageOps.exif_transpose(image)
-        exif, upright = upright.getexif(), to_8_bit(upright) if deep(upright) else upright
+        exif, upright = upright.getexif(), to_8_bit(upright) if is_deep(upright) else upright
     if form == "JPEG":
         upright = upright if upright.mode in ("L", "RGB", "CMYK") else upright.convert("RGB")
         options = {"quality": 96, "subsampling": 0}

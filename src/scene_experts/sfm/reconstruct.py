@@ -1,4 +1,4 @@
-"""From photographs or a video to a capture: images, poses, points, and how they were made."""
+"""Makes a capture from photographs or a video: images, camera poses, points, and a note about how they were made."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,66 +22,80 @@ from scene_experts.core.io import read_json, write_json
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
-from scene_experts.sfm import frames, masks, photos, work, worker
-from scene_experts.sfm.pairs import Matching, pairs
+from scene_experts.sfm import frames, photos, work, worker
+from scene_experts.sfm.masks import write_masks
 from scene_experts.sfm.photos import Photo
 
 LOG, NOTE = "colmap.log", "capture.json"
 INSTALL = "pip install 'scene-experts[sfm]'"
+MOST_EXHAUSTIVE = 300  # photographs that are all matched with each other: 44,850 pairs, about ten minutes on two cores
+NEIGHBOURS = 10  # following photographs that each photograph is matched with
 
 CameraModel = Literal[
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE"
 ]
 Mapper = Literal["auto", "incremental", "global"]
+Matching = Literal["auto", "exhaustive", "sequential"]
 Say = Callable[[str], None]
-Told = Callable[[str, int, int], None]
+Progress = Callable[[str, int, int], None]  # name of the work, how much is done, how much there is
 
 
 @dataclass(frozen=True)
 class Options:
-    """How a capture is made."""
+    """Settings of a reconstruction."""
 
-    frames: int = 150  # of a video
+    frames: int = 150  # frames to extract from a video
     matching: Matching = "auto"
     camera_model: CameraModel = "OPENCV"
     mapper: Mapper = "auto"
-    max_side: int = 1600  # px at which features are sought
-    threads: int = 0  # 0: all that this process may use
+    max_side: int = 1600  # px; larger photographs are scaled down before features are extracted
+    threads: int = 0  # 0: all cores that this process may use
     seed: int = 0
 
 
-def make(
-    source: Path, out: Path, options: Options, *, overwrite: bool = False, say: Say = print, progress: Told = lambda *_: None
+def reconstruct(
+    source: Path, out: Path, options: Options, *, overwrite: bool = False, say: Say = print, progress: Progress = lambda *_: None
 ) -> dict[str, Any]:
-    """Make the capture `out` of the photographs in folder `source`, or of the frames of video `source`; returns what capture.json holds.
+    """Make the capture `out` from the photographs in the folder `source`, or from the frames of the video `source`.
 
-    The same call goes on where an interrupted one stopped; before all is done nothing in `out` changes but a hidden folder.
-    Raises InputError for photographs that give no poses, RunError where COLMAP fails.
+    An interrupted call is continued by the same call. Until it is complete, only a hidden folder in `out` changes.
+
+    Args:
+        overwrite: Replace an existing capture once the new one is complete.
+        say: Called with each message.
+        progress: Called with the name of the work, how much is done and how much there is.
+
+    Returns:
+        The content of capture.json.
+
+    Raises:
+        InputError: if the photographs cannot be used or no poses are found, or if pycolmap is missing.
+        RunError: if COLMAP fails.
     """
-    check(source, out, overwrite)
-    found = [] if source.is_file() else photos.find(source, but=out)
-    with work.opened(out) as desk:
-        check(source, out, overwrite)  # a killed process's poses may just have come to their place
+    check_request(source, out, overwrite)
+    found = [] if source.is_file() else photos.find_photos(source, exclude=out)
+    with work.open_work_folder(out) as folder:
+        check_request(source, out, overwrite)  # again: results of a killed process may just have been published
         own = source.resolve() == (out / "images").resolve()
-        images = out / "images" if own else desk / work.DONE / "images"
+        images = out / "images" if own else folder / work.DONE / "images"
         if source.is_file():
-            found = taken(source, images, options, progress)
+            found = extract_photos(source, images, options, progress)
         else:
-            found = photos.in_place(found, source) if own else photos.copy(found, source, images)
-        groups = photos.by_camera(found)
+            found = photos.check_in_place(found, source) if own else photos.copy_photos(found, source, images)
+        groups = photos.group_by_camera(found)
         say(f"{len(found)} photographs, {len(groups)} camera{'s' if len(groups) > 1 else ''}")
         names = [photo.name for photo in found]
-        matched = pairs(len(names), options.matching)
-        masked = masks.write(found, images, desk / "masks")
-        prepare(desk, found, options, masked)
+        pairs = choose_pairs(len(names), options.matching)
+        masks = write_masks(found, images, folder / "masks")
+        prepare_folder(folder, found, options, masks)
         request = {
-            "database": str(desk / "database" / "colmap.db"),
+            "database": str(folder / "database" / "colmap.db"),
             "images": str(images),
-            "masks": str(desk / "masks") if masked else "",
-            "maps": str(desk / "maps"),
-            "model": str(desk / work.DONE / "model"),
+            "masks": str(folder / "masks") if masks else "",
+            "maps": str(folder / "maps"),
+            "model": str(folder / work.DONE / "model"),
             "groups": groups,
-            "pairs": [(names[i], names[j]) for i, j in matched],
+            "pairs": [(names[i], names[j]) for i, j in pairs],
             "threads": options.threads or native.count_cores(),
             "max_side": options.max_side,
             "camera_model": options.camera_model,
@@ -88,81 +103,94 @@ def make(
             "seed": options.seed,
         }
         began = time.monotonic()
-        result = reconstructed(request, desk / LOG, say, progress)
+        result = run_worker(request, folder / LOG, say, progress)
         if not result["registered"]:
             raise InputError(
-                f"expected photographs of one scene that overlap, found none that fit together in {source}; take more, sharp ones, each "
-                f"from another place and showing most of what the one before shows (COLMAP's words: {desk / LOG})"
+                f"expected overlapping photographs of one scene in {source}, found none that fit together; take more sharp photographs "
+                f"from different places, each showing most of what the previous one shows (COLMAP's log: {folder / LOG})"
             )
-        note = noted(
-            result, found, options, time.monotonic() - began, copied=not own, every=len(matched) == len(names) * (len(names) - 1) // 2
-        )
-        write_json(desk / work.DONE / NOTE, note)
+        exhaustive = len(pairs) == len(names) * (len(names) - 1) // 2
+        note = describe_result(result, found, options, time.monotonic() - began, copied=not own, exhaustive=exhaustive)
+        write_json(folder / work.DONE / NOTE, note)
         work.publish(out)
     shutil.rmtree(out / work.NAME, ignore_errors=True)
     return note
 
 
-def check(source: Path, out: Path, overwrite: bool) -> None:
-    """Raises InputError for what cannot be made a capture of, or would take the place of what is somebody's."""
+def check_request(source: Path, out: Path, overwrite: bool) -> None:
+    """Raise InputError if no capture can be made from `source`, or if `out` contains files that must not be replaced."""
     if not source.exists():
         raise InputError(f"expected a folder of photographs or a video at {source}, found nothing; correct the path")
     if source.is_file() and source.suffix.lower() in EXTENSIONS:
-        raise InputError(f"expected a folder of photographs or a video, found one photograph at {source}; give its folder")
+        raise InputError(f"expected a folder of photographs or a video, found the single photograph {source}; give its folder")
     if importlib.util.find_spec("pycolmap") is None:
-        raise InputError(f"expected pycolmap to find poses, found none; {INSTALL}")
+        raise InputError(f"finding camera poses requires pycolmap: {INSTALL}")
     here, images = source.resolve(), (out / "images").resolve()
     if here == out.resolve():
         raise InputError(
-            f"expected a folder of its own for the capture, found {out} for it and the photographs; choose another --out "
-            f"(or move the photographs into {out / 'images'} and give that)"
+            f"expected a capture folder that is not the folder of the photographs, found {out} for both; choose another --out, or move the "
+            f"photographs into {out / 'images'} and give that folder"
         )
     for ours in (out / "sparse", out / work.NAME, images):
         if here != images and here.is_relative_to(ours.resolve()):
-            raise InputError(f"expected photographs outside of {ours}, which a capture is made of, found {source}; move them")
+            raise InputError(f"expected photographs outside {ours}, which belongs to the capture, found {source}; move them")
     if is_capture(out) and not overwrite:
-        raise InputError(
-            f"expected no capture in {out} yet, found one; train on it, choose another --out, or give --overwrite for new poses"
-        )
+        raise InputError(f"there is already a capture in {out}; train on it, choose another --out, or find new poses with --overwrite")
     note = read_json(out / NOTE, "note of a capture") if (out / NOTE).is_file() else None
     if here != images and images.exists() and not (isinstance(note, dict) and note.get("copied")):
-        raise InputError(f"expected no images at {out / 'images'} but those of an earlier `capture`, found others; choose another --out")
+        raise InputError(f"{out / 'images'} holds images that `capture` did not copy there; choose another --out")
 
 
-def taken(video: Path, images: Path, options: Options, progress: Told) -> list[Photo]:
-    """The frames of a video, in `images`; those of the same video are there already where an earlier call took them."""
+def extract_photos(video: Path, images: Path, options: Options, progress: Progress) -> list[Photo]:
+    """Extract the frames of a video into `images` and return them. Frames of an earlier call with the same video are reused."""
     note, mark = images.with_name("video.txt"), f"{video.name} {video.stat().st_size} {video.stat().st_mtime_ns} {options.frames}"
     if not note.is_file() or note.read_text() != mark:
         work.remove(images)
         note.unlink(missing_ok=True)
-        names = frames.take(video, images, options.frames, progress)
+        names = frames.extract_frames(video, images, options.frames, progress)
         if len(names) < photos.FEWEST:
-            raise InputError(f"expected a video of at least {photos.FEWEST} frames at {video}, found {len(names)}; film for longer")
+            raise InputError(f"expected a video of at least {photos.FEWEST} frames at {video}, found {len(names)}; use a longer video")
         note.write_text(mark)
-    return photos.find(images)
+    return photos.find_photos(images)
 
 
-def prepare(desk: Path, found: list[Photo], options: Options, masked: list[str]) -> None:
-    """Room for this request, with the database of the same photographs, looked at the same way, if there is one.
+def choose_pairs(count: int, matching: Matching = "auto", neighbours: int = NEIGHBOURS) -> list[tuple[int, int]]:
+    """Return the pairs (i, j), i < j, of `count` photographs in order that are matched with each other.
 
-    masked: what says that masks are the same.
+    "exhaustive": all pairs. "sequential": each photograph with its next `neighbours`, and with those 16, 32, 64, ... further on,
+    which closes loops. "auto": exhaustive up to MOST_EXHAUSTIVE photographs, otherwise sequential.
     """
-    facts = [[(photo.name, photo.size, photo.camera, photo.stamp) for photo in found], options.camera_model, options.max_side, masked]
+    if matching == "exhaustive" or (matching == "auto" and count <= MOST_EXHAUSTIVE):
+        return list(combinations(range(count), 2))
+    far = [1 << k for k in range(count.bit_length()) if 1 << k > neighbours]
+    steps = [*range(1, neighbours + 1), *far]
+    return [(i, i + step) for i in range(count) for step in steps if i + step < count]
+
+
+def prepare_folder(folder: Path, found: list[Photo], options: Options, masks: list[str]) -> None:
+    """Empty the work folder for this request. The database is kept if it holds features of the same photographs and masks.
+
+    masks: Checksums of the masks.
+    """
+    facts = [[(photo.name, photo.size, photo.camera, photo.stamp) for photo in found], options.camera_model, options.max_side, masks]
     mark = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
-    database, note = desk / "database", desk / "database" / "of.txt"
+    database, note = folder / "database", folder / "database" / "of.txt"
     if not note.is_file() or note.read_text() != mark:
         work.remove(database)
         database.mkdir(parents=True)
         note.write_text(mark)
-    for left in (desk / "maps", desk / work.DONE / "model"):
+    for left in (folder / "maps", folder / work.DONE / "model"):
         work.remove(left)
 
 
-def reconstructed(request: dict[str, Any], log: Path, say: Say, progress: Told) -> dict[str, Any]:
-    """What the worker says at its end. Raises InputError where pycolmap cannot be used, RunError where the worker fails."""
+def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress) -> dict[str, Any]:
+    """Run COLMAP in a process of its own (`worker.py`) and return its last message.
+
+    Raises InputError if pycolmap cannot be used, RunError if the worker fails.
+    """
     environment = {**os.environ, "OMP_NUM_THREADS": str(request["threads"])}
     with log.open("w") as stream:
-        # -P: the worker's folder is not searched for modules. In a session of its own: Ctrl-C is ours to pass on.
+        # -P: modules are not searched in the worker's folder. In a new session, because this process handles Ctrl-C.
         process = subprocess.Popen(
             [sys.executable, "-P", worker.__file__],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream, text=True, env=environment, start_new_session=True,
@@ -172,13 +200,13 @@ def reconstructed(request: dict[str, Any], log: Path, say: Say, progress: Told) 
         try:
             with suppress(BrokenPipeError):  # a worker that died at once: its exit code says so
                 process.stdin.write(json.dumps(request) + "\n")
-                process.stdin.flush()  # and stays open: the worker ends when this process does, however it ends
+                process.stdin.flush()  # it stays open: the worker ends when this process does, however it ends
             for line in process.stdout:
                 last = json.loads(line)
                 if "total" in last:
                     progress(last["step"], last["done"], last["total"])
                 elif last["step"] == "failed":
-                    say(f"the {last['mapper']} mapper gave up: {last['why']}")
+                    say(f"the {last['mapper']} mapper failed: {last['why']}")
                 elif last["step"] == "unread":
                     say(f"warning: COLMAP cannot read {', '.join(last['names'])}")
             code = process.wait()
@@ -189,23 +217,26 @@ def reconstructed(request: dict[str, Any], log: Path, say: Say, progress: Told) 
             with suppress(BrokenPipeError):
                 process.stdin.close()
     if last.get("step") == "missing":
-        raise InputError(f"expected pycolmap to find poses, found one that does not work ({last['why']}); {INSTALL}")
+        raise InputError(f"pycolmap cannot be imported ({last['why']}): {INSTALL}")
     if code != 0 or last.get("step") != "done":
-        raise RunError(
-            f"expected COLMAP to end well, found that it did not (exit code {code}): {last_words(log)}; all of its words are in {log}"
-        )
+        raise RunError(f"COLMAP failed with exit code {code}: {last_log_line(log)}; its log is {log}")
     return last
 
 
-def last_words(log: Path) -> str:
-    """The last line that COLMAP wrote, without the time and place in its code."""
+def last_log_line(log: Path) -> str:
+    """Return the last line that COLMAP logged, without its time and source location."""
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    lines = [line for line in lines if not line.startswith(("@", "***", "PC:"))]  # a trace of the stack
-    return lines[-1].rpartition("] ")[2] if lines else "it said nothing"
+    lines = [line for line in lines if not line.startswith(("@", "***", "PC:"))]  # a stack trace
+    return lines[-1].rpartition("] ")[2] if lines else "it logged nothing"
 
 
-def noted(result: dict[str, Any], found: list[Photo], options: Options, seconds: float, *, copied: bool, every: bool) -> dict[str, Any]:
-    """What capture.json keeps. copied: whether `images` is ours.  every: whether all photographs were compared with all."""
+def describe_result(
+    result: dict[str, Any], found: list[Photo], options: Options, seconds: float, *, copied: bool, exhaustive: bool
+) -> dict[str, Any]:
+    """Return the content of capture.json.
+
+    copied: Whether the capture's images are copies. exhaustive: Whether all photographs were matched with each other.
+    """
     registered = set(result["registered"])
     facts = {k: v for k, v in result.items() if k not in ("step", "registered", "version")}
     return {
@@ -214,7 +245,7 @@ def noted(result: dict[str, Any], found: list[Photo], options: Options, seconds:
         "photographs": len(found),
         "with_pose": len(registered),
         "without_pose": [photo.name for photo in found if photo.name not in registered],
-        "all_compared": every,
+        "all_compared": exhaustive,
         **facts,
         "options": asdict(options),
         "seconds": round(seconds, 1),

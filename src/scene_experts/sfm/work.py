@@ -1,4 +1,4 @@
-"""Where a capture is in the making: a hidden folder of its own. Nothing else of the capture is touched before all of it is done."""
+"""The hidden folder in which a capture is made. The rest of the capture is not touched until everything in it is complete."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from scene_experts.core.io import check_writable, locked
 
 NAME, DONE, WHOLE = ".capture", "done", "whole"
 PLACES = {"images": "images", "model": "sparse/0", "capture.json": "capture.json"}
-"""What is made, by its name in the work folder's `done`, and its place in the capture."""
+"""The results by name in the work folder's `done`, and their places in the capture."""
 
 
 @contextmanager
-def opened(out: Path) -> Iterator[Path]:
-    """The work folder of capture `out`, held for this process; what a killed one had made whole is put in its place first.
+def open_work_folder(out: Path) -> Iterator[Path]:
+    """Lock the work folder of the capture `out` for this process and yield it. Complete results of a killed process are published first.
 
-    Raises InputError where another process is at it, RunError where `out` cannot be written.
+    Raises InputError if another process holds the lock, RunError if `out` is not writable.
     """
-    work = out / NAME
-    check_writable(work / ".lock")
-    with locked(work / ".lock", f"expected {out} for this capture alone, found another process making one there; wait for it"):
-        if (work / WHOLE).exists():
+    folder = out / NAME
+    check_writable(folder / ".lock")
+    with locked(folder / ".lock", f"another process is making a capture in {out}; wait until it ends"):
+        if (folder / WHOLE).exists():
             publish(out)
-        yield work
+        yield folder
 
 
 def publish(out: Path) -> None:
-    """Move what is done to its place; what was there goes once all has moved. Killed at any moment, it goes on where it was."""
-    work = out / NAME
-    (work / WHOLE).touch()
+    """Move the results to their places, then remove what they replace. A process that is killed meanwhile is continued by the next call."""
+    folder = out / NAME
+    (folder / WHOLE).touch()
     for name, place in PLACES.items():
-        new, there, old = work / DONE / name, out / place, work / f"old-{name}"
+        new, there, old = folder / DONE / name, out / place, folder / f"old-{name}"
         if not new.exists():
             continue
         if there.exists():
@@ -41,14 +41,14 @@ def publish(out: Path) -> None:
             there.rename(old)
         there.parent.mkdir(parents=True, exist_ok=True)
         new.rename(there)
-    for path in work.iterdir():
+    for path in folder.iterdir():
         if path.name not in (".lock", WHOLE):
             remove(path)
-    (work / WHOLE).unlink()
+    (folder / WHOLE).unlink()
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a folder, if it is there."""
+    """Remove a file or a folder if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

@@ -1,7 +1,8 @@
-"""Runs pycolmap in a process of its own, started by its path: beside Pillow, torch or OpenCV pycolmap can corrupt the process's memory.
+"""Runs pycolmap in a process of its own, because pycolmap can corrupt memory in a process that also loads Pillow, torch or OpenCV.
 
-Reads a request (JSON) from standard input, writes a line of JSON for each step to standard output; COLMAP's own words go to standard error.
-Imports nothing of this project. What is done is kept in the database, so a request that is made again goes on where it was stopped.
+The script is started by its path and imports nothing of this project. It reads a request (JSON) from standard input and writes a
+line of JSON per step to standard output; COLMAP logs to standard error. Finished work stays in the database, so a repeated
+request continues where the previous one stopped.
 """
 
 from __future__ import annotations
@@ -14,22 +15,23 @@ import threading
 from pathlib import Path
 from typing import Any
 
-CHUNK = 8  # photographs whose features are sought between two lines
-PAIRS = 200  # pairs that are matched between two lines
-ENOUGH = 0.9  # share of photographs with a pose at which the second mapper is not tried
+CHUNK = 8  # photographs per progress message during feature extraction
+PAIRS = 200  # pairs per progress message during matching
+ENOUGH = 0.9  # fraction of photographs with a pose at which the second mapper is not tried
 
 
-def tell(**what: Any) -> None:
+def report(**what: Any) -> None:
+    """Write a line of JSON to standard output."""
     print(json.dumps(what), flush=True)
 
 
-def features(colmap: Any, ask: dict[str, Any]) -> None:
-    """Find the features of every photograph that has none yet; the photographs of a group share one camera."""
+def extract_features(colmap: Any, ask: dict[str, Any]) -> None:
+    """Extract the features of every photograph that has none yet. The photographs of a group share one camera."""
     options = colmap.FeatureExtractionOptions()
     options.num_threads, options.max_image_size, options.use_gpu = ask["threads"], ask["max_side"], False
     total, done = sum(map(len, ask["groups"])), 0
     for names in ask["groups"]:
-        camera, missing = known(colmap, ask["database"], names)
+        camera, missing = read_done(colmap, ask["database"], names)
         done += len(names) - len(missing)
         while missing:
             some, missing = missing[:CHUNK], missing[CHUNK:]
@@ -43,15 +45,15 @@ def features(colmap: Any, ask: dict[str, Any]) -> None:
                 ask["database"], ask["images"], some,
                 camera_mode=colmap.CameraMode.SINGLE, reader_options=reader, extraction_options=options, device=colmap.Device.cpu,
             )  # fmt: skip
-            camera, lacking = known(colmap, ask["database"], names)
+            camera, lacking = read_done(colmap, ask["database"], names)
             if unread := [name for name in some if name in lacking]:
-                tell(step="unread", names=unread)
+                report(step="unread", names=unread)
             done += len(some)
-            tell(step="features", done=done, total=total)
+            report(step="features", done=done, total=total)
 
 
-def known(colmap: Any, database: str, names: list[str]) -> tuple[int | None, list[str]]:
-    """The camera of a group, None before its first photograph, and which of its photographs are not in the database."""
+def read_done(colmap: Any, database: str, names: list[str]) -> tuple[int | None, list[str]]:
+    """Return the camera id of a group, or None if no photograph of it is done, and the names of the photographs without features."""
     if not Path(database).exists():
         return None, names
     with colmap.Database.open(database) as there:
@@ -61,8 +63,8 @@ def known(colmap: Any, database: str, names: list[str]) -> tuple[int | None, lis
     return camera, [name for name in names if name not in have]
 
 
-def matches(colmap: Any, ask: dict[str, Any]) -> None:
-    """Match the pairs; COLMAP passes over those that are done."""
+def match_pairs(colmap: Any, ask: dict[str, Any]) -> None:
+    """Match the pairs. COLMAP skips those that are done."""
     options = colmap.FeatureMatchingOptions()
     options.num_threads, options.use_gpu = ask["threads"], False
     pairs = ask["pairs"]
@@ -74,21 +76,21 @@ def matches(colmap: Any, ask: dict[str, Any]) -> None:
             pairing = colmap.ImportedPairingOptions()
             pairing.match_list_path = str(path)
             colmap.match_image_pairs(ask["database"], matching_options=options, pairing_options=pairing, device=colmap.Device.cpu)
-        tell(step="matches", done=first + len(some), total=len(pairs))
+        report(step="matches", done=first + len(some), total=len(pairs))
 
 
-def poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
-    """Reconstruct, and write the best model; says what it is."""
+def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
+    """Reconstruct the scene, write the best model and return a description of it."""
     total = sum(map(len, ask["groups"]))
     found: list[tuple[str, Any]] = []
     for mapper in ("incremental", "global") if ask["mapper"] == "auto" else (ask["mapper"],):
         out = Path(ask["maps"]) / mapper
         out.mkdir(parents=True)
-        tell(step=f"poses ({mapper})", done=0, total=total)
+        report(step=f"poses ({mapper})", done=0, total=total)
         try:
             models = MAPPERS[mapper](colmap, ask, str(out), total)
-        except Exception as error:  # a mapper that gives up is told of, and the other one may do
-            tell(step="failed", mapper=mapper, why=str(error))
+        except Exception as error:  # report it; the other mapper may succeed
+            report(step="failed", mapper=mapper, why=str(error))
             continue
         found += [(mapper, model) for model in models.values()]
         if found and max(model.num_reg_images() for _, model in found) >= ENOUGH * total:
@@ -98,8 +100,8 @@ def poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
     mapper, best = max(found, key=lambda one: (one[1].num_reg_images(), one[1].num_points3D()))
     os.makedirs(ask["model"])
     best.write_binary(ask["model"])
-    have = posed(best)
-    others = [posed(model) - have for one, model in found if one == mapper]
+    have = registered_names(best)
+    others = [registered_names(model) - have for one, model in found if one == mapper]
     return {
         "mapper": mapper,
         "registered": sorted(have),
@@ -114,55 +116,56 @@ def poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def posed(model: Any) -> set[str]:
-    """The names of the photographs with a pose in a model."""
+def registered_names(model: Any) -> set[str]:
+    """Return the names of the photographs that have a pose in a model."""
     return {model.images[i].name for i in model.reg_image_ids()}
 
 
-def incremental(colmap: Any, ask: dict[str, Any], out: str, total: int) -> dict[int, Any]:
-    """COLMAP: one photograph after the other."""
+def map_incrementally(colmap: Any, ask: dict[str, Any], out: str, total: int) -> dict[int, Any]:
+    """Run COLMAP's mapper, which adds one photograph at a time."""
     options, count = colmap.IncrementalPipelineOptions(), 2
     options.num_threads, options.random_seed, options.ba_use_gpu = ask["threads"], ask["seed"], False
     options.min_model_size = 3
 
-    def another() -> None:
+    def count_image() -> None:
         nonlocal count
         count += 1
-        tell(step="poses (incremental)", done=min(count, total), total=total)
+        report(step="poses (incremental)", done=min(count, total), total=total)
 
-    return colmap.incremental_mapping(ask["database"], ask["images"], out, options=options, next_image_callback=another)
+    return colmap.incremental_mapping(ask["database"], ask["images"], out, options=options, next_image_callback=count_image)
 
 
-def at_once(colmap: Any, ask: dict[str, Any], out: str, total: int) -> dict[int, Any]:
-    """GLOMAP: all photographs together."""
+def map_globally(colmap: Any, ask: dict[str, Any], out: str, total: int) -> dict[int, Any]:
+    """Run GLOMAP, which solves for all photographs together."""
     options = colmap.GlobalPipelineOptions()
     options.num_threads, options.random_seed = ask["threads"], ask["seed"]
     return colmap.global_mapping(ask["database"], ask["images"], out, options=options)
 
 
-MAPPERS = {"incremental": incremental, "global": at_once}
+MAPPERS = {"incremental": map_incrementally, "global": map_globally}
 
 
-def watch() -> None:
-    """End this process when the one that started it is gone: its end of standard input closes then."""
+def exit_with_parent() -> None:
+    """End this process when its parent ends, which closes standard input."""
     sys.stdin.read()
     os._exit(1)
 
 
 def main() -> int:
+    """Serve one request and return the exit code."""
     ask = json.loads(sys.stdin.readline())
     try:
         import pycolmap as colmap
     except ImportError as error:
-        tell(step="missing", why=str(error))
+        report(step="missing", why=str(error))
         return 0
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=exit_with_parent, daemon=True).start()
     colmap.set_random_seed(ask["seed"])
-    features(colmap, ask)
-    matches(colmap, ask)
-    tell(step="done", version=colmap.__version__, **poses(colmap, ask))
+    extract_features(colmap, ask)
+    match_pairs(colmap, ask)
+    report(step="done", version=colmap.__version__, **estimate_poses(colmap, ask))
     sys.stdout.flush()
-    os._exit(0)  # the thread that waits would hold the interpreter's end up
+    os._exit(0)  # the waiting thread would delay the end of the interpreter
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ def test_what_was_found_and_what_to_do():
 def test_a_capture_and_the_next_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("scene_experts.sfm.reconstruct.importlib.util.find_spec", lambda name: name)
     said = {**NOTE, "registered": ["0.jpg", "1.jpg", "2.jpg"], "cameras": []}
-    monkeypatch.setattr("scene_experts.sfm.reconstruct.reconstructed", fake_worker(**said))
+    monkeypatch.setattr("scene_experts.sfm.reconstruct.run_worker", fake_worker(**said))
     assert cli.main(["capture", str(write_black(tmp_path / "photos")), "--out", str(tmp_path / "box")]) == 0
     out = capsys.readouterr().out
     assert "3 photographs, 1 camera" in out and f"next: scene-experts train moe-gs --data {tmp_path / 'box'} --out RUN" in out
@@ -39,7 +39,7 @@ def test_a_capture_and_the_next_command(tmp_path, monkeypatch, capsys):
 def test_unusable_input_is_told(tmp_path, capsys):
     folder = str(write_black(tmp_path / "photos"))
     for args, words in [
-        ([folder, "--out", folder], "expected a folder of its own for the capture"),
+        ([folder, "--out", folder], "choose another --out"),
         ([folder, "--out", str(tmp_path / "o"), "--max-side", "8"], "expected --max-side of at least 64"),
         ([str(tmp_path / "none"), "--out", str(tmp_path / "o")], "expected a folder of photographs or a video at"),
     ]:

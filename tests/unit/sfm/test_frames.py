@@ -9,8 +9,8 @@ from scene_experts.sfm import frames
 
 
 def test_one_of_each_stretch_is_taken():
-    assert frames.sharpest([1, 3, 2, 9, 8, 7, 0, 0, 5], 3) == [1, 3, 8]
-    assert frames.sharpest([1.0, 2.0], 5) == [0, 1] and frames.sharpest([], 5) == []
+    assert frames.choose_sharpest([1, 3, 2, 9, 8, 7, 0, 0, 5], 3) == [1, 3, 8]
+    assert frames.choose_sharpest([1.0, 2.0], 5) == [0, 1] and frames.choose_sharpest([], 5) == []
 
 
 def test_blur_lowers_the_grade():
@@ -30,7 +30,7 @@ def test_the_sharp_frames_of_a_video_come_out_whole_and_in_order(tmp_path):
             stream.send(np.ascontiguousarray(noise.filter(ImageFilter.GaussianBlur(blur))))
     stream.close()
     said = []
-    names = frames.take(tmp_path / "walk.mp4", tmp_path / "out", 3, lambda *a: said.append(a))
+    names = frames.extract_frames(tmp_path / "walk.mp4", tmp_path / "out", 3, lambda *a: said.append(a))
     assert names == ["frame_00001.jpg", "frame_00002.jpg", "frame_00003.jpg"] and said[-1] == ("frames", 3, 3)
     pictures = [np.asarray(Image.open(tmp_path / "out" / name)).astype(float) for name in names]
     assert [p.shape for p in pictures] == [(64, 96, 3)] * 3
@@ -41,5 +41,5 @@ def test_the_sharp_frames_of_a_video_come_out_whole_and_in_order(tmp_path):
 def test_a_file_that_is_no_video_is_told(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     (tmp_path / "broken.mp4").write_bytes(b"nothing of the kind")
-    with pytest.raises(InputError, match="expected a video that ffmpeg reads"):
-        frames.take(tmp_path / "broken.mp4", tmp_path / "out", 3, lambda *_: None)
+    with pytest.raises(InputError, match=r"broken\.mp4"):
+        frames.extract_frames(tmp_path / "broken.mp4", tmp_path / "out", 3, lambda *_: None)

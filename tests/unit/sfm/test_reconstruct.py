@@ -51,7 +51,7 @@ def test_poses_of_photographs_are_those_that_are_known(tmp_path):
         with Image.open(source / name) as picture:
             Image.fromarray(top).resize(picture.size, Image.Resampling.NEAREST).save(source / f"{Path(name).stem}_mask.png")
     steps = []
-    note = run.make(source, out, Options(max_side=640, threads=2), say=lambda _: None, progress=lambda *a: steps.append(a))
+    note = run.reconstruct(source, out, Options(max_side=640, threads=2), say=lambda _: None, progress=lambda *a: steps.append(a))
     assert note == json.loads((out / NOTE).read_text()) and note["with_pose"] == 8 and note["error"] < 1.0
     assert not (out / NAME).exists() and {s[0] for s in steps} >= {"features", "matches", "poses (incremental)"}
     made, known = load(out, split="none", normalise="none"), load(BUDDHA, split="none", normalise="none")
@@ -60,8 +60,8 @@ def test_poses_of_photographs_are_those_that_are_known(tmp_path):
     assert off.max() < 0.03 * torch.cdist(theirs, theirs).max(), off
     lowest = lowest_features(out)
     assert max(lowest[name] for name in TOGETHER[:2]) < 0.75 and max(lowest.values()) > 0.9, lowest
-    with pytest.raises(InputError, match=r"expected no capture in .* yet, found one"):
-        run.make(source, out, Options())
+    with pytest.raises(InputError, match="--overwrite"):
+        run.reconstruct(source, out, Options())
 
 
 def lowest_features(capture: Path) -> dict[str, float]:
@@ -93,12 +93,12 @@ def with_pycolmap(monkeypatch, request):
 
 
 def make(source, out, options=Options(), **more):  # noqa: B008
-    return run.make(source, out, options, say=lambda _: None, **more)
+    return run.reconstruct(source, out, options, say=lambda _: None, **more)
 
 
 def test_photographs_that_fit_nowhere_leave_the_reason_and_nothing_else(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "reconstructed", fake_worker())
-    with pytest.raises(InputError, match="found none that fit together"):
+    monkeypatch.setattr(run, "run_worker", fake_worker())
+    with pytest.raises(InputError, match="fit together"):
         make(write_black(tmp_path / "photos"), tmp_path / "out")
     assert [p.name for p in (tmp_path / "out").iterdir()] == [NAME]
     with pytest.raises(InputError, match=r"unfinished.*scene-experts capture PHOTOS"):
@@ -106,7 +106,7 @@ def test_photographs_that_fit_nowhere_leave_the_reason_and_nothing_else(tmp_path
 
 
 def test_frames_of_a_video_are_taken_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "reconstructed", fake_worker())
+    monkeypatch.setattr(run, "run_worker", fake_worker())
     taken = []
 
     def take(video, folder, count, progress):
@@ -114,17 +114,17 @@ def test_frames_of_a_video_are_taken_once(tmp_path, monkeypatch):
         write_black(folder, count)
         return list(range(count))
 
-    monkeypatch.setattr(run.frames, "take", take)
+    monkeypatch.setattr(run.frames, "extract_frames", take)
     video = tmp_path / "walk.mp4"
     video.write_bytes(b"frames")
-    for count, message in [(5, "fit together"), (5, "fit together"), (4, "fit together"), (2, "a video of at least 3 frames")]:
+    for count, message in [(5, "fit together"), (5, "fit together"), (4, "fit together"), (2, "at least 3 frames")]:
         with pytest.raises(InputError, match=message):
             make(video, tmp_path / "out", Options(frames=count))
     assert taken == [5, 4, 2]
 
 
 def test_the_same_request_finds_its_database_again_and_another_does_not(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "reconstructed", fake_worker())
+    monkeypatch.setattr(run, "run_worker", fake_worker())
     source, kept = write_black(tmp_path / "photos"), tmp_path / "out" / NAME / "database" / "colmap.db"
 
     def ask(options=Options()):  # noqa: B008
@@ -145,7 +145,7 @@ def test_the_same_request_finds_its_database_again_and_another_does_not(tmp_path
 
 def test_new_poses_take_the_place_of_old_ones_whole(tmp_path, monkeypatch):
     worker = fake_worker(**FOUND)
-    monkeypatch.setattr(run, "reconstructed", worker)
+    monkeypatch.setattr(run, "run_worker", worker)
     out = tmp_path / "out"
     note = make(write_black(tmp_path / "photos"), out)
     assert note["without_pose"] == ["1.jpg"] and note["with_pose"] == 2 and note["copied"] and note["all_compared"]
@@ -159,38 +159,38 @@ def test_new_poses_take_the_place_of_old_ones_whole(tmp_path, monkeypatch):
 
 def test_a_capture_s_own_images_stay_as_they_are(tmp_path, monkeypatch):
     worker = fake_worker(**FOUND)
-    monkeypatch.setattr(run, "reconstructed", worker)
+    monkeypatch.setattr(run, "run_worker", worker)
     images = write_black(tmp_path / "images")
     (images / "notes.txt").write_text("mine")
     assert not make(images, tmp_path)["copied"] and worker.requests[0]["images"] == str(images)
     assert (images / "notes.txt").exists()
-    with pytest.raises(InputError, match=r"expected no images at .*found others; choose another --out"):
+    with pytest.raises(InputError, match=r"images.*--out"):
         make(write_black(tmp_path.parent / "elsewhere"), tmp_path, overwrite=True)
 
 
 def test_what_is_somebody_s_is_not_touched(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "reconstructed", fake_worker(**FOUND))
+    monkeypatch.setattr(run, "run_worker", fake_worker(**FOUND))
     out = tmp_path / "out"
     for inside in (f"{NAME}/done", "sparse/photos", "images/more"):
-        with pytest.raises(InputError, match="expected photographs outside of"):
+        with pytest.raises(InputError, match="expected photographs outside"):
             make(write_black(out / inside), out)
         assert len(list((out / inside).iterdir())) == 3
-    with pytest.raises(InputError, match="expected a folder of its own for the capture"):
+    with pytest.raises(InputError, match="choose another --out"):
         make(write_black(tmp_path / "photos"), tmp_path / "photos")
     (tmp_path / "old" / "sparse").mkdir(parents=True)
     for name in ("cameras", "images", "points3D"):
         (tmp_path / "old" / "sparse" / f"{name}.bin").write_bytes(b"")
-    with pytest.raises(InputError, match=r"expected no capture in .* yet, found one"):
+    with pytest.raises(InputError, match="--overwrite"):
         make(tmp_path / "photos", tmp_path / "old")
 
 
 def test_what_is_no_folder_and_no_video_is_told(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match="found one photograph at"):
+    with pytest.raises(InputError, match=r"1\.jpg.*give its folder"):
         make(write_photo(tmp_path / "1.jpg"), tmp_path / "out")
-    with pytest.raises(InputError, match="found nothing; correct the path"):
+    with pytest.raises(InputError, match="none, found nothing"):
         make(tmp_path / "none", tmp_path / "out")
     monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"found none; pip install 'scene-experts\[sfm\]'"):
+    with pytest.raises(InputError, match=r"pycolmap.*scene-experts\[sfm\]"):
         make(write_black(tmp_path / "photos"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -198,13 +198,27 @@ def test_what_is_no_folder_and_no_video_is_told(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("code", "error", "message"),
     [
-        ("print('{\"step\": \"missing\", \"why\": \"no module\"}')", InputError, r"expected pycolmap .*no module.*scene-experts\[sfm\]"),
-        ("import os; print('{\"step\": \"features\"}', flush=True); os.abort()", RunError, "code -6.*: it said nothing; all"),
-        ("import sys; sys.exit('E20261122 10:00 1 sqlite.h:9] disk is full')", RunError, "exit code 1.*: disk is full; all of its words"),
+        ("print('{\"step\": \"missing\", \"why\": \"no module\"}')", InputError, r"pycolmap .*no module.*scene-experts\[sfm\]"),
+        ("import os; print('{\"step\": \"features\"}', flush=True); os.abort()", RunError, "code -6.*nothing"),
+        ("import sys; sys.exit('E20261122 10:00 1 sqlite.h:9] disk is full')", RunError, "code 1: disk is full"),
     ],
 )  # fmt: skip
 def test_a_worker_that_fails_is_told(tmp_path, monkeypatch, code, error, message):
     (tmp_path / "worker.py").write_text(code)
     monkeypatch.setattr(run.worker, "__file__", str(tmp_path / "worker.py"))
     with pytest.raises(error, match=message):
-        run.reconstructed({"threads": 1, "pairs": ["x" * 200] * 1000}, tmp_path / LOG, lambda _: None, lambda *_: None)
+        run.run_worker({"threads": 1, "pairs": ["x" * 200] * 1000}, tmp_path / LOG, lambda _: None, lambda *_: None)
+
+
+def test_all_pairs_up_to_a_number_and_neighbours_beyond():
+    most = run.MOST_EXHAUSTIVE
+    assert len(run.choose_pairs(5)) == 10 and len(run.choose_pairs(most)) == most * (most - 1) // 2
+    assert len(run.choose_pairs(most + 1)) < 16 * most
+    assert run.choose_pairs(most + 1, "exhaustive")[-1] == (most - 1, most)
+
+
+@pytest.mark.parametrize("count", [1, 2, 11, 40])
+def test_sequential_is_the_next_ones_and_powers_of_two(count):
+    steps = {1, 2, 3, 4, 8, 16, 32}
+    expected = {(i, j) for i in range(count) for j in range(i + 1, count) if j - i in steps}
+    assert set(run.choose_pairs(count, "sequential", neighbours=3)) == expected

@@ -25,7 +25,7 @@ def there(out):
 
 def test_what_is_done_takes_the_place_of_what_was_there(tmp_path):
     for text in ("old", "new"):
-        with work.opened(tmp_path) as desk:
+        with work.open_work_folder(tmp_path) as desk:
             made(desk, text)
             (desk / "database").mkdir()
             work.publish(tmp_path)
@@ -35,7 +35,7 @@ def test_what_is_done_takes_the_place_of_what_was_there(tmp_path):
 
 @pytest.mark.parametrize("moves", range(7))
 def test_killed_between_any_two_moves_it_goes_on(tmp_path, monkeypatch, moves):
-    with work.opened(tmp_path) as desk:
+    with work.open_work_folder(tmp_path) as desk:
         made(desk, "old")
         work.publish(tmp_path)
         made(desk, "new")
@@ -51,17 +51,17 @@ def test_killed_between_any_two_moves_it_goes_on(tmp_path, monkeypatch, moves):
         with suppress(KeyboardInterrupt):
             work.publish(tmp_path)
         monkeypatch.undo()
-    with work.opened(tmp_path):
+    with work.open_work_folder(tmp_path):
         assert there(tmp_path) == ["new"] * 3
 
 
 def test_what_was_not_whole_is_not_published(tmp_path):
-    with work.opened(tmp_path) as desk:
+    with work.open_work_folder(tmp_path) as desk:
         made(desk, "half")
-    with work.opened(tmp_path):
+    with work.open_work_folder(tmp_path):
         assert not (tmp_path / "images").exists()
 
 
 def test_one_process_at_a_time(tmp_path):
-    with work.opened(tmp_path), pytest.raises(InputError, match="another process making one there; wait"), work.opened(tmp_path):
+    with work.open_work_folder(tmp_path), pytest.raises(InputError, match="another process"), work.open_work_folder(tmp_path):
         pass

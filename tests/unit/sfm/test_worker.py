@@ -81,7 +81,7 @@ def reconstruct(tmp_path, monkeypatch):
         monkeypatch.setattr(worker, "MAPPERS", {"incremental": mapping("incremental", incremental), "global": mapping("global", at_once)})
         folder = tmp_path / str(len(calls))
         ask = {"maps": str(folder / "maps"), "model": str(folder / "model"), "groups": [list("abcdefghij")], "mapper": mapper}
-        return ran, written, worker.poses(None, ask)
+        return ran, written, worker.estimate_poses(None, ask)
 
     return reconstructed
 
