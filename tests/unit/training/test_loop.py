@@ -22,6 +22,7 @@ from scene_experts.training.config import Data, RunConfig
 from scene_experts.training.events import Adjusted, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.loop import Run, iterate, rows_to_move, stepped, without_graph
 from scene_experts.training.state import Training
+from support.messages import naming
 from support.places import GOLDEN
 from support.scenes import METHODS
 from support.synthetic import make_capture
@@ -145,7 +146,7 @@ def test_a_view_that_sees_nothing_trains_on(folder):
 
 def test_random_background_and_another_configuration_on_resume(folder, tmp_path):
     list(events(config(random_background=True), folder, tmp_path, stop_at=5))
-    with pytest.raises(InputError, match="other settings"):
+    with pytest.raises(InputError, match="--out"):
         list(events(config(), folder, tmp_path, stop_at=6, resume=True))
     with pytest.raises(InputError, match="scaffold-gs"):
         list(events(config("scaffold-gs"), folder, tmp_path, stop_at=6, resume=True))
@@ -179,7 +180,7 @@ def test_steps_tell_the_balance_of_the_experts(folder):
 def test_resuming_on_other_views_is_refused(folder, tmp_path):
     list(events(config(), folder, tmp_path, stop_at=3))
     capture = load(folder)
-    with pytest.raises(InputError, match="other views"):
+    with pytest.raises(InputError, match="--data"):
         list(events(config(), folder, tmp_path, world=replace(capture, train=capture.train[:2]), stop_at=6, resume=True))
     capture.images.close()
 
@@ -192,13 +193,13 @@ def test_losses_that_are_no_numbers_end_the_run_and_keep_its_checkpoint(folder, 
         return {"l1": render.image.mean() * (math.nan if step > 8 else 1.0)}
 
     monkeypatch.setattr("scene_experts.training.loop.terms", broken)
-    with pytest.raises(RunError, match="expected finite losses, found l1 = nan at iteration 9"):
+    with pytest.raises(RunError, match=naming("l1", "nan", 9)):
         list(events(config(), folder, tmp_path, stop_at=60, log_every=1, resume=True))
     assert_same(before, last_tensors(tmp_path))
-    with pytest.raises(RunError, match="at iteration 11"):  # not a moment to tell of it, but one to save
+    with pytest.raises(RunError, match=naming(11)):  # not a moment to tell of it, but one to save
         list(events(config(), folder, tmp_path, stop_at=60, log_every=20, save_every=11, resume=True))
     assert_same(before, last_tensors(tmp_path))
-    with pytest.raises(RunError, match="at iteration 10"):  # stopped
+    with pytest.raises(RunError, match=naming(10)):  # stopped
         stop: list[str] = []
         for event in events(config(), folder, tmp_path, stop_at=60, log_every=20, preview_every=10, stop=stop, resume=True):
             stop += ["SIGTERM"] if isinstance(event, Previewed) else []
@@ -206,9 +207,9 @@ def test_losses_that_are_no_numbers_end_the_run_and_keep_its_checkpoint(folder, 
 
 
 def test_more_anchors_than_the_cap_to_start_with_is_said(folder):
-    with pytest.raises(InputError, match="at most 100 anchors to start with"):
+    with pytest.raises(InputError, match=naming(100, "--max-anchors")):
         list(events(config(max_anchors=100), folder, stop_at=1))
-    with pytest.raises(InputError, match=r"at most 100 Gaussians to start with, found [0-9,]+; raise --max-anchors$"):
+    with pytest.raises(InputError, match=naming(100, "--max-anchors")):
         list(events(config("3dgs", max_anchors=100), folder, stop_at=1))
 
 
@@ -216,7 +217,7 @@ def test_more_gaussians_than_the_recipes_own_cap_start_and_none_is_added(folder,
     made = config("3dgs-mcmc")
     made = replace(made, growth=replace(made.growth, max_anchors=100))
     done = list(events(made, folder, stop_at=3))
-    assert isinstance(done[-1], Finished) and "more than the recipe's 100: none will be added" in caplog.text
+    assert isinstance(done[-1], Finished) and "100" in caplog.text
 
 
 def test_the_routing_of_the_whole_scene_is_told_beside_the_views(folder, monkeypatch):

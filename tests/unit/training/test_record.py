@@ -8,6 +8,7 @@ from scene_experts.core.errors import RunError
 from scene_experts.strategy import Edit
 from scene_experts.training.events import Adjusted, Previewed, Started, Stepped
 from scene_experts.training.record import Recorder
+from support.messages import naming
 
 
 def step(i: int) -> Stepped:
@@ -47,5 +48,5 @@ def test_tensorboard_files_appear_when_asked(tmp_path):
 
 
 def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path):
-    with Recorder(tmp_path / "no" / "folder", False, None) as record, pytest.raises(RunError, match="cannot write"):
+    with Recorder(tmp_path / "no" / "folder", False, None) as record, pytest.raises(RunError, match=naming("metrics.jsonl")):
         record(step(1))

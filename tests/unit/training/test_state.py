@@ -9,6 +9,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.data.capture import load
 from scene_experts.recipes import RECIPES
 from scene_experts.training.state import Training, config_hash, resume, save, scene_from
+from support.messages import naming
 from support.synthetic import make_capture
 
 
@@ -60,13 +61,13 @@ def test_another_configuration_is_refused(capture):
     training = started(capture)
     other = replace(training.cfg, seed=5)
     assert config_hash(other) != config_hash(training.cfg)
-    with pytest.raises(InputError, match="other settings"):
+    with pytest.raises(InputError):
         Training.restore(other, training.tensors(), training.meta(), "cpu")
 
 
 def test_networks_of_another_recipe_are_refused(capture):
     training = started(capture)
-    with pytest.raises(InputError, match="networks of this recipe"):
+    with pytest.raises(InputError):
         scene_from(RECIPES["scaffold-gs"][1].scaled(), training.tensors(), training.meta())
 
 
@@ -77,7 +78,7 @@ def test_saved_is_found_again_and_none_is_none(capture, tmp_path):
     found = resume(training.cfg, tmp_path, "cpu")
     assert found is not None and found.step == 7
     (next(tmp_path.glob("ckpt_*"))).write_bytes(b"torn")
-    with pytest.raises(InputError, match="damaged"):
+    with pytest.raises(InputError, match=naming(tmp_path)):
         resume(training.cfg, tmp_path, "cpu")
 
 

@@ -139,7 +139,7 @@ def test_switches():
     assert f_.grad is None
     positioned = head(router=Router(input_pos=True))
     assert positioned.router_w.shape == (5, F + 3)
-    with pytest.raises(ValueError, match="positions"):
+    with pytest.raises(ValueError, match="input_pos"):
         positioned(x, f, SPARSE)
     positioned(x, f, SPARSE, torch.zeros(A, 3, dtype=torch.float64))
     noisy = head(router=Router(noise_std=1.0))
@@ -162,14 +162,14 @@ def test_aligned_quaternions_do_not_cancel():
 
 def test_top_1_warns(caplog):
     Experts(top_k=1).build("opacity", D, H, 10, F)
-    assert "does not train the routers" in caplog.text
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
 def test_nonsense_is_refused():
     for wrong, said in (
-        (Experts(num=2, top_k=3), r"--scene\.decoder\.top-k between 1"),
-        (Experts(top_k=0), r"--scene\.decoder\.top-k between 1"),
-        (Experts(num=0), r"--scene\.decoder\.num of at least 1"),
+        (Experts(num=2, top_k=3), r"--scene\.decoder\.top-k"),
+        (Experts(top_k=0), r"--scene\.decoder\.top-k"),
+        (Experts(num=0), r"--scene\.decoder\.num"),
         (Experts(warmup=-1), r"--scene\.decoder\.warmup"),
     ):
         with pytest.raises(InputError, match=said):

@@ -11,6 +11,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.experts import Experts, Router
 from scene_experts.scene.anchors.frozen import Frozen
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
+from support.messages import naming
 
 needs_native = pytest.mark.skipif(native.load() is None, reason="no compiled library")
 DONE = 1_000_000  # a step after every warm-up
@@ -107,7 +108,7 @@ def test_memory_is_what_it_says():
 @needs_native
 def test_another_step_and_training_are_refused():
     frozen = trained(Anchors(), n=20).frozen(7)
-    with pytest.raises(ValueError, match="step 7"):
+    with pytest.raises(ValueError, match=naming(7, 8)):
         frozen(camera(), 8, Mode.DRAW, halves)
     with pytest.raises(ValueError, match="TRAIN"):
         frozen(camera(), 7, Mode.TRAIN, halves)

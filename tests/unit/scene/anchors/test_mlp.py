@@ -3,6 +3,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.scene.anchors.mlp import ACTIVATIONS, MLP, Plain, linear_init
+from support.messages import naming
 
 
 @pytest.mark.parametrize("attribute", ["opacity", "cov", "color"])
@@ -24,7 +25,7 @@ def test_depth_adds_square_layers():
     assert sum(p.numel() for p in deep.parameters()) == 2142 + 3 * (32 * 32 + 32)
     assert deep(torch.randn(4, 35), torch.randn(4, 32), 1)[0].shape == (4, 30)
     assert Plain().build("color", 35, 32, 30, 32).weights(1).k is None
-    with pytest.raises(InputError, match="at least 2"):
+    with pytest.raises(InputError, match=naming(2, 1)):
         Plain(depth=1).build("color", 35, 32, 30, 32)
 
 

@@ -8,6 +8,7 @@ import torch
 from scene_experts.native import library as native
 from scene_experts.scene.anchors import native_decode
 from support.decoding import CASES, EXTENT, compare, leaves, objective, oracle, problem, single_precision
+from support.messages import naming
 
 pytestmark = pytest.mark.skipif(native.load() is None, reason="no compiled library")
 LEVELS = [level for level in native.list_levels() if native.find(level)]
@@ -133,7 +134,7 @@ def test_what_does_not_fit_is_refused():
         call(with_dist={"opacity": False, "cov": False, "color": True})
     with pytest.raises(ValueError, match="float32"):
         call(feature=columns["feature"].double())
-    with pytest.raises(ValueError, match="k between"):
+    with pytest.raises(ValueError, match=naming("cov", 3, 4)):
         call(heads=heads | {"cov": replace(heads["cov"], k=4)})
-    with pytest.raises(IndexError, match="rows from 0 to 99"):
+    with pytest.raises(IndexError, match=naming(99, 100)):
         call(rows=torch.tensor([3, 100]))

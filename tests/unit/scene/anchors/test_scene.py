@@ -13,6 +13,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.experts import Experts, Router
 from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.scene.anchors.scene import ATTRIBUTES, Anchors, AnchorScene, Rates
+from support.messages import naming
 
 EVERYTHING = lambda means, scales, camera: torch.ones(len(means), dtype=torch.bool)  # noqa: E731
 
@@ -157,10 +158,10 @@ def test_switches_the_native_decode_does_not_cover_fall_back_or_are_refused():
         pytest.skip("no compiled library")
     for uncovered, named in (
         (Anchors(quat_align=True), "quat-align"),
-        (Anchors(mix=FeatureBank()), "a feature bank"),
-        (odd, "opacity head"),
+        (Anchors(mix=FeatureBank()), "feature bank"),
+        (odd, "opacity"),
     ):
-        with pytest.raises(InputError, match=rf"{named}.*--scene\.decode auto"):
+        with pytest.raises(InputError, match=naming(named, "--scene.decode auto")):
             scene(replace(uncovered, decode="native"), n=4).native_weights(1)
     with pytest.raises(InputError, match=r"torch\.float64"):
         scene(Anchors(decode="native"), n=4).double().native_weights(1)

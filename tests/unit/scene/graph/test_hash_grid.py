@@ -9,6 +9,7 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.native import library as native
 from scene_experts.scene.graph.hash_grid import PRIMES, Grid, HashGrid, encode
+from support.messages import naming
 
 SMALL = HashGrid(levels=5, features=3, log2_table=7, base=2, growth=1.6)
 
@@ -90,7 +91,7 @@ def test_no_places_and_sizes_that_cannot_be():
     assert built()(places(0)).shape == (0, 15)
     HashGrid().check()
     for wrong, flag in (({"levels": 0}, "levels"), ({"log2_table": 0}, "log2-table"), ({"log2_table": 60}, "log2-table")):
-        with pytest.raises(InputError, match=rf"--scene\.grid\.{flag} of at"):
+        with pytest.raises(InputError, match=naming(f"--scene.grid.{flag}")):
             HashGrid(**wrong).check()
 
 

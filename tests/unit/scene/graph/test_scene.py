@@ -14,6 +14,7 @@ from scene_experts.scene.graph.hash_grid import HashGrid
 from scene_experts.scene.graph.network import Graph, blended
 from scene_experts.scene.graph.scene import GraphPoints, GraphRates, GraphScene
 from support.graph_scenes import CAMERA, cloud, everyone, start_graph
+from support.messages import naming
 
 
 def test_networks_have_the_sizes_of_sags():
@@ -163,5 +164,5 @@ def test_settings_that_cannot_be():
         ({"voxel_size": -1.0}, "voxel-size"),
         ({"offset_hidden": 0}, "offset-hidden"),
     ):
-        with pytest.raises(InputError, match=f"--scene.{flag}"):
+        with pytest.raises(InputError, match=naming(f"--scene.{flag}")):
             GraphPoints(**changes).check()
