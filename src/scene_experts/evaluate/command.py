@@ -11,6 +11,7 @@ from scene_experts.evaluate.score import About, evaluate
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.training import run_folder
 from scene_experts.training.progress import Bar
+from scene_experts.training.run_folder import OpenRun
 
 
 def evaluate_run(
@@ -33,15 +34,6 @@ def evaluate_run(
     opened = run_folder.open_run(run, device, step)
     rasterize = as_trained(rasterize, opened.cfg.antialias)
     capture = run_folder.capture_of(opened, data)
-    about = About(
-        recipe=opened.config.train.recipe,
-        iterations=opened.cfg.iterations if opened.step else 0,  # an imported file that says nothing of its training
-        seed=opened.cfg.seed,
-        train_seconds=opened.clock.seconds,
-        cpu_seconds=opened.clock.cpu_seconds,
-        load=opened.clock.load,
-        versions=opened.config.versions,
-    )
     try:
         with Bar(Console(stderr=True)) as tell:
             return evaluate(
@@ -55,8 +47,21 @@ def evaluate_run(
                 lpips=lpips,
                 lpips_weights=lpips_weights,
                 download=download,
-                about=about,
+                about=about(opened),
                 progress=tell,
             )
     finally:
         capture.images.close()
+
+
+def about(run: OpenRun) -> About:
+    """What the results file says of the training of an opened run."""
+    return About(
+        recipe=run.config.train.recipe,
+        iterations=run.cfg.iterations if run.step else 0,  # an imported file that says nothing of its training
+        seed=run.cfg.seed,
+        train_seconds=run.clock.seconds,
+        cpu_seconds=run.clock.cpu_seconds,
+        load=run.clock.load,
+        versions=run.config.versions,
+    )

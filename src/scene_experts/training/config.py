@@ -33,13 +33,19 @@ class Train:
     """A recipe with its numbers."""
 
     recipe: Annotated[str, Option(hidden=True)]
+    """Name of the recipe."""
     scene: Anchors | Explicit | GraphPoints = Anchors()
+    """What the scene is made of: anchors and their decoders, Gaussians, or graph points."""
     loss: Weights = Weights()
+    """Weights of the loss terms."""
     growth: GrowAnchors | GrowOctree | GrowPoints | SplitClone | MCMC = GrowAnchors()
+    """Densification: where rows are added and removed."""
     rates: Rates | ExplicitRates | GraphRates = Rates()
+    """Learning rates."""
     iterations: int = SCHEDULE
     """Length of the training. Another length rescales the whole schedule (learning rates, densification windows, warm-up)."""
     seed: int = 0
+    """Seed of all random numbers, at least 0."""
     antialias: bool = False
     """Compensate opacity for the 0.3 px blur (Mip-Splatting's 2D filter)."""
     random_background: bool = False

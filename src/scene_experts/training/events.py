@@ -1,4 +1,4 @@
-"""What a training tells its listeners: the terminal, the run folder, a viewer."""
+"""Events of a training, for its listeners: the terminal, the run folder, the viewer, a script."""
 
 from __future__ import annotations
 
@@ -12,52 +12,90 @@ from scene_experts.strategy import Edit
 
 @dataclass(frozen=True)
 class Started:
-    step: int  # 0, or where the run resumes
-    total: int  # the last iteration of this run
+    """The training begins, or resumes. It is the first event."""
+
+    step: int
+    """Number of iterations already trained: 0, or where the run resumes."""
+    total: int
+    """The last iteration of this training."""
     anchors: int
-    voxel: float = 0.0  # edge of the finest lattice cell, trained world units; 0: explicit Gaussians on no lattice
+    """Number of rows: anchors, Gaussians or graph points."""
+    voxel: float = 0.0
+    """Edge of the finest lattice cell, trained units; 0 for Gaussians that are on no lattice."""
 
 
 @dataclass(frozen=True)
 class Stepped:
+    """Figures of an iteration and of the one view that it saw. Yielded every 10 iterations unless asked otherwise."""
+
     step: int
-    terms: dict[str, float]  # weighted, by name
-    psnr: float  # of the training view where its mask counts, dB
+    """The iteration, counted from 1."""
+    terms: dict[str, float]
+    """Terms of the loss by name, weighted; their sum is the loss."""
+    psnr: float
+    """PSNR of the training view, dB, where its mask counts."""
     anchors: int
-    visible: int  # anchors this view decoded
-    gaussians: int  # handed to the rasteriser: of these anchors, with positive opacity
-    active: float  # share of decoded Gaussians with positive opacity
-    seconds: float  # of training so far, without saving and previews
-    routing: dict[str, list[float]]  # share of this view's assignments per expert, by attribute; of its gates while dense
-    balance: dict[str, float] = field(default_factory=dict)  # L_load^S / k, or L_load^D while dense, by attribute: 1 is perfect balance
-    entropy: dict[str, float] = field(default_factory=dict)  # of the gates, by attribute: 1 all experts alike, 0 one alone
-    scene_routing: dict[str, list[float]] = field(default_factory=dict)  # as routing, of anchors all over the scene
-    scene_gates: dict[str, list[float]] = field(default_factory=dict)  # their mean gate per expert
+    """Number of rows: anchors, Gaussians or graph points."""
+    visible: int
+    """Number of rows that this view decoded."""
+    gaussians: int
+    """Number of Gaussians handed to the rasteriser: those of the visible rows with positive opacity."""
+    active: float
+    """Share of the decoded Gaussians with positive opacity, 0 to 1; 0 for scenes without decoders."""
+    seconds: float
+    """Wall time of the iterations so far, s, without saving and previews."""
+    routing: dict[str, list[float]]
+    """Each expert's share of this view's anchors, 0 to 1, by attribute; its share of the gates during the dense warm-up."""
+    balance: dict[str, float] = field(default_factory=dict)
+    """Load-balancing loss by attribute, L_load^S / k (L_load^D during the dense warm-up); 1 is perfect balance."""
+    entropy: dict[str, float] = field(default_factory=dict)
+    """Entropy of the gates by attribute, 0 to 1: 1 if all experts count alike, 0 if one counts alone."""
+    scene_routing: dict[str, list[float]] = field(default_factory=dict)
+    """As `routing`, of anchors sampled all over the scene."""
+    scene_gates: dict[str, list[float]] = field(default_factory=dict)
+    """Mean gate of each expert over the same anchors, 0 to 1, by attribute."""
 
 
 @dataclass(frozen=True)
 class Adjusted:
+    """Densification added or removed rows."""
+
     step: int
+    """The iteration."""
     edit: Edit
+    """Numbers of rows grown and pruned, rows afterwards, and whether a limit held growth back."""
 
 
 @dataclass(frozen=True)
 class Previewed:
+    """A held-out view (a training view if none is held out) was rendered."""
+
     step: int
+    """The iteration."""
     view: int
-    picture: Tensor  # [H, W, 3]
+    """Index of the view in the capture."""
+    picture: Tensor
+    """[H, W, 3] float32 on the CPU, RGB in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class Saved:
+    """A checkpoint was written."""
+
     step: int
+    """The iteration."""
     path: Path
+    """The checkpoint file."""
 
 
 @dataclass(frozen=True)
 class Stopped:
+    """The training was stopped early, and is saved. It is the last event."""
+
     step: int
+    """The last iteration trained."""
     reason: str
+    """The reason given, for example "SIGINT"."""
 
 
 @dataclass(frozen=True)
@@ -65,14 +103,21 @@ class Exported:
     """The scene was written to the run folder in the layout that other tools read."""
 
     step: int
-    path: Path  # RUN/point_cloud/iteration_N
-    warnings: tuple[str, ...] = ()  # what other readers of the layout get wrong
+    """The iteration."""
+    path: Path
+    """The folder RUN/point_cloud/iteration_N."""
+    warnings: tuple[str, ...] = ()
+    """What other readers of the layout get wrong, one sentence each."""
 
 
 @dataclass(frozen=True)
 class Finished:
+    """The training is complete. It is the last event."""
+
     step: int
+    """The last iteration."""
     seconds: float
+    """Wall time of all iterations, s, without saving and previews."""
 
 
 Event = Started | Stepped | Adjusted | Previewed | Saved | Stopped | Exported | Finished

@@ -1,0 +1,47 @@
+"""The command line that repeats a scripted training, for its config.json."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from pathlib import Path
+from typing import Any
+
+from scene_experts.recipes import RECIPES
+from scene_experts.training.config import Data, Train, flag
+
+
+def command_of(cfg: Train, data: Data, out: Path | None, deterministic: bool, stop_at: int | None) -> str:
+    """`scene-experts train ...` with every number that differs from the recipe; empty where no command can say it."""
+    if cfg.recipe not in RECIPES:
+        return ""
+    changed = changes(RECIPES[cfg.recipe][1], cfg)
+    if changed is None or out is None:
+        return ""
+    words = ["scene-experts", "train", cfg.recipe, "--data", str(data.path), "--out", str(out)]
+    words += [word for place, value in [*(changes(Data(data.path), data) or []), *changed] for word in words_of(place, value)]
+    words += ["--deterministic"] * deterministic + ([] if stop_at is None else ["--stop-at", str(stop_at)])
+    return shlex.join(words)
+
+
+def changes(old: Any, new: Any, above: str = "") -> list[tuple[str, Any]] | None:
+    """Dotted places and values of the numbers in which two dataclasses differ; None where a part is of another kind."""
+    out = []
+    for field in dataclasses.fields(new):
+        was, now = getattr(old, field.name), getattr(new, field.name)
+        if not dataclasses.is_dataclass(now):
+            out += [(above + field.name, now)] if now != was else []
+            continue
+        below = changes(was, now, f"{above}{field.name}.") if type(was) is type(now) else None
+        if below is None:
+            return None
+        out += below
+    return out
+
+
+def words_of(place: str, value: Any) -> list[str]:
+    """The flag that sets a number."""
+    if isinstance(value, bool):
+        head, _, last = flag(place).removeprefix("--").rpartition(".")
+        return [f"--{head}{'.' if head else ''}{'' if value else 'no-'}{last}"]
+    return [flag(place), *(map(str, value) if isinstance(value, tuple) else [str(value)])]

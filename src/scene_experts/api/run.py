@@ -1,0 +1,400 @@
+"""`Run`: a trained scene to draw, score and export."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from scene_experts.api import recording
+from scene_experts.api.backend import Device, Raster, backend
+from scene_experts.api.camera import Camera, to_trained
+from scene_experts.api.capture import Capture, load_capture
+from scene_experts.api.recipe import Recipe
+from scene_experts.core import types
+from scene_experts.core.errors import InputError
+from scene_experts.evaluate.command import about
+from scene_experts.evaluate.pictures import to_8bit
+from scene_experts.evaluate.score import evaluate
+from scene_experts.files.bake.bake import Bake
+from scene_experts.files.bake.export import Options, export_standard
+from scene_experts.files.bake.refine import Refine
+from scene_experts.files.export import export_run, import_result
+from scene_experts.render import Rasterizer, as_trained
+from scene_experts.report import page
+from scene_experts.scene import Draws, Scene
+from scene_experts.training import run_folder, state
+from scene_experts.training.run_folder import OpenRun
+from scene_experts.training.state import Training
+from scene_experts.view import video
+from scene_experts.view.paint import MODES, Look, Show, paint
+
+Format = Literal["compact", "anchors", "ply", "compressed-ply", "splat", "spz", "sog", "glb", "html"]
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """What a camera sees of a scene."""
+
+    image: NDArray[np.float32]
+    """[H, W, 3] RGB in [0, 1], the background blended in."""
+    depth: NDArray[np.float32]
+    """[H, W] Depth along z, capture's unit: the mean over what is drawn, weighted by contribution; 0 where nothing is drawn."""
+    alpha: NDArray[np.float32]
+    """[H, W] Opacity in [0, 1]; the background has the weight 1 - alpha."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of a run: means over the views of a split."""
+
+    psnr: float
+    """Peak signal-to-noise ratio, dB; higher is better."""
+    ssim: float
+    """Structural similarity, at most 1; higher is better."""
+    lpips: float | None
+    """Learned perceptual distance as 3DGS computes it, at least 0; lower is better. None where its weights are not on this machine."""
+    per_view: dict[str, dict[str, Any]]
+    """The scores and counts of each view, by the name of its photograph."""
+    details: dict[str, Any]
+    """Everything that RUN/results.json holds: other variants of the metrics, sizes, expert shares, frames a second, versions."""
+
+
+class Run:
+    """A trained scene with its recipe and capture. `train`, `open_run`, `import_run` and `Trainer.run` return one."""
+
+    def __init__(
+        self,
+        opened: OpenRun,
+        device: str,
+        rasterize: Rasterizer,
+        *,
+        capture: Capture | None = None,
+        data: Path | None = None,
+        training: Training | None = None,
+    ) -> None:
+        """capture: that of the run, where it is loaded already.  data: where it is now, if it moved.  training: of a scene in memory."""
+        self._opened, self._device, self._capture, self._data, self._training = opened, device, capture, data, training
+        self._rasterize = as_trained(rasterize, opened.cfg.antialias)
+        self._draws: Draws | None = None
+
+    @property
+    def path(self) -> Path | None:
+        """The run folder; None for a scene that is only in memory."""
+        return None if self._training else self._opened.path
+
+    @property
+    def recipe(self) -> Recipe:
+        """The recipe with the numbers that the scene was trained with."""
+        return self._opened.config.train
+
+    @property
+    def step(self) -> int:
+        """Number of iterations trained so far."""
+        return self._training.step if self._training else self._opened.step
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of these iterations, seconds."""
+        return (self._training or self._opened).clock.seconds
+
+    @property
+    def scene(self) -> Scene:
+        """The scene in the trained world, as the package's own modules use it: a torch module with a table of rows."""
+        return self._training.scene if self._training else self._opened.scene
+
+    @property
+    def capture(self) -> Capture:
+        """The capture that the scene was trained on. It is loaded on first use.
+
+        Raises:
+            InputError: The capture is gone, or has other views than during the training. `open_run(..., data=FOLDER)` states where it is.
+        """
+        if self._capture is None:
+            config, loaded = self._opened.config, run_folder.capture_of(self._opened, self._data)
+            self._capture = Capture(replace(config.data, path=loaded.root), loaded, config.train.seed)
+        return self._capture
+
+    @property
+    def train_cameras(self) -> list[Camera]:
+        """The cameras of the views that the training saw."""
+        return self.capture.train_cameras
+
+    @property
+    def test_cameras(self) -> list[Camera]:
+        """The cameras of the held-out views."""
+        return self.capture.test_cameras
+
+    def render(
+        self, camera: Camera, show: Show = "picture", *, attribute: Literal["opacity", "cov", "color"] = "color"
+    ) -> NDArray[np.float32]:
+        """Render the picture that a camera sees.
+
+        Args:
+            camera: A camera in the capture's frame; its position may be anywhere.
+            show: "picture", or false colours: "depth" (near is light), "alpha", "experts" (a colour for each expert), "entropy" (of the
+                gates) or "activation" (share of the Gaussians of an anchor that are drawn).
+            attribute: The attribute whose experts are shown.
+
+        Returns:
+            [H, W, 3] float32, RGB in [0, 1].
+
+        Raises:
+            InputError: `show` is unknown, or needs experts that the scene does not have.
+        """
+        if show not in MODES:
+            raise InputError(f"expected show among {', '.join(MODES)}, found {show!r}; choose one of those")
+        view, background = self._view(camera)
+        return numpy(paint(self.scene, view, self.step, self._rasterize, background, Look(show, attribute), self._frozen()))
+
+    @torch.no_grad()
+    def render_layers(self, camera: Camera) -> Layers:
+        """Render the picture, the depth and the opacity that a camera sees."""
+        view, background = self._view(camera)
+        decoded = self._frozen()(view, self.step, types.Mode.DRAW, self._rasterize.visible)
+        drawn = self._rasterize(decoded.gaussians, view, background)
+        seen = drawn.alpha > 0
+        depth = torch.where(seen, drawn.depth / drawn.alpha.clamp_min(1e-12), 0.0) / self.capture.loaded.world.scale
+        return Layers(numpy(drawn.image.clamp(0, 1)), numpy(depth), numpy(drawn.alpha.clamp(0, 1)))
+
+    def write_video(
+        self, out: str | Path, cameras: Sequence[Camera], *, fps: float = 24.0, show: Show = "picture", quality: int = 8
+    ) -> Path:
+        """Render cameras to a video or to numbered PNG files.
+
+        Args:
+            out: FILE.mp4, .mov, .mkv or .webm (needs `pip install 'scene-experts[video]'`), or a folder for PNG files.
+            cameras: One for each frame, all of one size for a video.
+            fps: Frames per second, above 0.
+            show: As in `render`.
+            quality: Of the video, 1 to 10.
+
+        Returns:
+            The path of the video or folder.
+
+        Raises:
+            InputError: There is no camera, the cameras differ in size, a value is out of range, or the encoder is not installed.
+            RunError: The encoder fails, or the disk is full.
+        """
+        path = Path(out)
+        if not cameras or not 0 < fps < 1000 or not 1 <= quality <= 10:
+            raise InputError(f"expected cameras, fps above 0 and quality from 1 to 10, found {len(cameras)} cameras, {fps} and {quality}")
+        if path.suffix and not video.is_video(path) and not path.is_dir():
+            raise InputError(f"expected a folder or a file ending in {', '.join(video.VIDEO)}, found {path}; choose one of those")
+        frames = (to_8bit(torch.from_numpy(self.render(camera, show))) for camera in cameras)
+        if not video.is_video(path):
+            video.write_pictures(path, frames)
+            return path
+        sizes = {(camera.width, camera.height) for camera in cameras}
+        if len(sizes) > 1:
+            raise InputError(f"expected cameras of one size for a video, found {len(sizes)} sizes; use `Camera.resized`, or give a folder")
+        video.write_video(path, frames, fps, quality)
+        return path
+
+    def evaluate(
+        self,
+        views: Literal["test", "train"] = "test",
+        *,
+        appearance: Literal["rule", "half"] = "rule",
+        lpips: bool = True,
+        lpips_weights: str | Path | None = None,
+        download_lpips: bool = False,
+    ) -> Scores:
+        """Render the held-out views and score them as 8-bit pictures, as `scene-experts eval` does.
+
+        If the run is in a folder, results.json, per_view.json and the pictures are written there.
+
+        Args:
+            views: Which views to score: the held-out ones, or those of the training.
+            appearance: For scenes with appearance codes: "rule" draws a held-out view with the code that the recipe chooses. "half" fits a
+                code to the left half of each photograph and scores the right half.
+            lpips: Score LPIPS if its weights are found.
+            lpips_weights: Folder or file with these weights. Default: where `scene-experts eval` looks for them.
+            download_lpips: Download the weights if they are not on this machine.
+
+        Raises:
+            InputError: The split has no views.
+            RunError: The disk is full.
+        """
+        with self._folder() as folder:
+            details = evaluate(
+                self.scene,
+                self.capture.loaded,
+                self._rasterize,
+                folder,
+                step=self.step,
+                views=views,
+                appearance=appearance,
+                lpips=lpips,
+                lpips_weights=None if lpips_weights is None else Path(lpips_weights),
+                download=download_lpips,
+                about=about(self._now()),
+            )
+            suffix = "_half" if appearance == "half" else "" if views == "test" else f"_{views}"
+            per_view = run_folder.read_json(folder / f"per_view{suffix}.json", "scores by view")
+        return Scores(details["psnr"], details["ssim"], details["lpips"], per_view, details)  # type: ignore[arg-type]
+
+    def export(
+        self,
+        format: Format = "compact",
+        out: str | Path | None = None,
+        *,
+        sh_degree: int = 3,
+        max_gaussians: int = 0,
+        prune: float = 0.0,
+        refine: int = 1000,
+        frame: Literal["capture", "trained"] = "capture",
+    ) -> Path:
+        """Write the scene to a file that other tools or later runs read.
+
+        Args:
+            format: "compact" is one small file of this package. "anchors" is the Scaffold-GS folder layout. "ply", "compressed-ply",
+                "splat", "spz", "sog", "glb" and "html" (a page with a viewer) are standard files of Gaussians; scenes of anchors are baked
+                for them, which takes minutes.
+            out: File or folder. Default: inside the run folder.
+            sh_degree: Standard files: degree of the spherical harmonics, 0 to 3.
+            max_gaussians: Standard files: keep this many Gaussians, those that contribute most; 0 keeps all.
+            prune: Standard files: leave out the Gaussians that contribute least, up to this share (0 to 1) of all contributions.
+            refine: Standard files: iterations that fit the baked Gaussians to pictures of the run; 0 for none.
+            frame: Standard files: the frame of the capture, or the trained world.
+
+        Returns:
+            The path of the file or folder.
+
+        Raises:
+            InputError: The format cannot hold the scene, the run is only in memory, or a value is out of range.
+            RunError: The disk is full.
+        """
+        run, where = self._in_folder("export"), None if out is None else Path(out)
+        if format in ("compact", "anchors"):
+            lines = export_run(run, format, where, self.step, None, self._data)
+        else:
+            options = Options(Bake(sh_degree, max_gaussians, prune, Refine(refine)), frame, False, False)
+            lines = export_standard(run, format, where, self.step, self._rasterize, options, self._data)
+        return Path(lines[0].removeprefix("wrote "))
+
+    def report(self) -> Path:
+        """Write RUN/report.html, a page with curves, held-out views, experts and the command that repeats the run.
+
+        Returns:
+            The path of the page.
+
+        Raises:
+            InputError: The run is only in memory, or was not evaluated.
+        """
+        return page.write([self._in_folder("report")])
+
+    def save(self, out: str | Path) -> Run:
+        """Write a run that is only in memory to a run folder. Every command accepts the folder, and training can resume from it.
+
+        Returns:
+            The run in the folder.
+
+        Raises:
+            InputError: The run is in a folder already, or `out` holds something else.
+            RunError: The disk is full.
+        """
+        training, folder, config = self._training, Path(out), self._opened.config
+        if training is None:
+            raise InputError(f"expected a run in memory to save, found one in {self._opened.path}; copy that folder")
+        run_folder.check(folder, config, resume=False)
+        with run_folder.held(folder):
+            run_folder.prepare(folder, config, resume=False)
+            state.save(training, folder / "checkpoints", keep=2)
+            recording.export_layout(folder, self.capture.loaded)
+        return Run(run_folder.open_run(folder, self._device), self._device, self._rasterize, capture=self._capture)
+
+    def _now(self) -> OpenRun:
+        """The run as the package's own modules know it."""
+        live = self._training
+        return self._opened if live is None else replace(self._opened, scene=live.scene, step=live.step, clock=live.clock)
+
+    def _view(self, camera: Camera) -> tuple[types.Camera, Tensor]:
+        """The camera in the trained world and the background, on the run's device."""
+        capture = self.capture.loaded
+        if camera.view >= len(capture.views):
+            raise InputError(f"expected a camera of {capture.name}, found view {camera.view} of {len(capture.views)}; use another")
+        view = to_trained(camera, capture.world, capture.views[0].camera.near)
+        return view.to(self._device), torch.tensor(capture.background, dtype=torch.float32, device=self._device)
+
+    def _frozen(self) -> Draws:
+        """The scene ready for drawing: what no camera changes is computed once, where it is not being trained."""
+        if self._training:
+            return self._training.scene
+        if self._draws is None:
+            self._draws = self._opened.scene.frozen(self._opened.step)
+        return self._draws
+
+    def _in_folder(self, what: str) -> Path:
+        if self._training:
+            raise InputError(f"expected a run in a folder for `{what}`, found one in memory; call `save(FOLDER)` first")
+        return self._opened.path
+
+    @contextmanager
+    def _folder(self) -> Iterator[Path]:
+        """The run folder, or a temporary one for a run in memory."""
+        if self._training is None:
+            yield self._opened.path
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            yield Path(folder)
+
+    def __repr__(self) -> str:
+        return f"Run({self.recipe.recipe!r}, step {self.step:,}, {len(self.scene.table):,} rows, {self.path or 'in memory'})"
+
+
+def numpy(tensor: Tensor) -> NDArray[np.float32]:
+    return tensor.detach().to("cpu", torch.float32).numpy()
+
+
+def open_run(
+    path: str | Path,
+    *,
+    step: int | None = None,
+    data: str | Path | None = None,
+    device: Device = "auto",
+    rasterizer: Raster = "auto",
+) -> Run:
+    """Open a run folder.
+
+    Args:
+        path: The folder that `train`, `scene-experts train` or an import wrote.
+        step: Which checkpoint to open. Default: the newest whole one.
+        data: Where the capture is now, if it moved.
+        device: "cpu", "cuda", or "auto" (CUDA if torch finds it).
+        rasterizer: "cpu" (compiled), "gsplat" (CUDA), "reference" (plain torch, slow), or "auto" (the fastest that works on the device).
+
+    Raises:
+        InputError: The folder is no run, has no such checkpoint, or the device or rasteriser is not available.
+    """
+    where, rasterize = backend(device, rasterizer, False, False)
+    return Run(run_folder.open_run(Path(path), where, step), where, rasterize, data=None if data is None else Path(data))
+
+
+def import_run(
+    source: str | Path, capture: Capture | str | Path, out: str | Path, *, iteration: int | None = None, device: Device = "auto"
+) -> Run:
+    """Make a run folder of a published result, or of a file that `Run.export` wrote.
+
+    Args:
+        source: Result folder (with point_cloud/iteration_N) of Scaffold-GS, Octree-GS, SAGS or 3DGS, a compact file, or Gaussians as ply,
+            compressed-ply, splat, spz, sog, glb or html.
+        capture: The capture that it was trained on, or its folder.
+        out: Run folder to write.
+        iteration: Which iteration of a result folder. Default: the newest.
+        device: As in `open_run`.
+
+    Raises:
+        InputError: The source holds no scene, the capture does not fit it, or `out` holds something else.
+    """
+    known = capture if isinstance(capture, Capture) else load_capture(capture)
+    import_result(Path(source), known.data, Path(out), iteration)
+    return open_run(out, device=device)

@@ -1,0 +1,233 @@
+"""`train` and `Trainer`: a recipe and a capture to a run."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypedDict, Unpack
+
+from rich.console import Console
+
+from scene_experts.api import recording
+from scene_experts.api.backend import Device, Raster, device_of
+from scene_experts.api.backend import deterministic as deterministic_algorithms
+from scene_experts.api.capture import Capture, load_capture
+from scene_experts.api.command_line import command_of
+from scene_experts.api.recipe import Recipe, recipe
+from scene_experts.api.run import Run
+from scene_experts.core.errors import InputError
+from scene_experts.render import choose
+from scene_experts.training import loop, run_folder
+from scene_experts.training.config import RunConfig
+from scene_experts.training.events import Event
+from scene_experts.training.memory import reuse_freed
+from scene_experts.training.progress import Progress
+from scene_experts.training.run_folder import OpenRun
+from scene_experts.training.state import Training
+
+
+class Trainer:
+    """A training to iterate over: `for event in trainer` trains, and yields the events.
+
+    `break` pauses the training, and another loop continues it. `stop` saves it and ends it.
+    """
+
+    recipe: Recipe
+    """The recipe that is trained."""
+    capture: Capture
+    """The capture that it is trained on."""
+
+    def __init__(
+        self,
+        method: Recipe | str,
+        capture: Capture | str | Path,
+        out: str | Path | None = None,
+        *,
+        resume: bool = False,
+        overwrite: bool = False,
+        stop_at: int | None = None,
+        deterministic: bool = False,
+        device: Device = "auto",
+        rasterizer: Raster = "auto",
+        save_every: int = 5000,
+        preview_every: int = 1000,
+        log_every: int = 10,
+        max_memory: float = 0.0,
+        tensorboard: bool = False,
+    ) -> None:
+        """Prepare a training. Nothing is trained or written before the first event.
+
+        Args:
+            method: A recipe, or the name of one.
+            capture: A capture, or its folder.
+            out: Run folder to write, as `scene-experts train --out` does. Default: the scene stays in memory.
+            resume: Continue from the newest whole checkpoint in `out`.
+            overwrite: Start again in a folder that holds an earlier run, whose checkpoints are removed.
+            stop_at: Stop at this iteration of the unchanged schedule; `iterations` of the recipe rescales the schedule instead.
+            deterministic: Bit-identical results on one machine, resumed or not; a little slower. Until the training ends, torch uses
+                deterministic algorithms in the whole process.
+            device: "cpu", "cuda", or "auto" (CUDA if torch finds it).
+            rasterizer: "cpu" (compiled), "gsplat" (CUDA), "reference" (plain torch, slow), or "auto" (the fastest on the device).
+            save_every: Iterations between checkpoints, at least 1.
+            preview_every: Iterations between `Previewed` events; 0 for none.
+            log_every: Iterations between `Stepped` events, at least 1.
+            max_memory: GiB of resident memory at which growth stops; 0 for no limit.
+            tensorboard: Write `out`/tensorboard too (needs `pip install 'scene-experts[tensorboard]'`).
+
+        Raises:
+            InputError: A setting is invalid, the capture cannot be used, or the folder cannot hold the run.
+        """
+        self.recipe = recipe(method)
+        folder = None if out is None else Path(out)
+        if folder is None and (resume or overwrite or tensorboard):
+            raise InputError("expected a run folder `out` for resume, overwrite or tensorboard, found None; name one")
+        if log_every < 1:
+            raise InputError(f"expected log_every of at least 1, found {log_every}; give a larger number")
+        where = device_of(device)
+        rasterize = choose(rasterizer, where, antialias=self.recipe.antialias, deterministic=deterministic)
+        loaded = capture if isinstance(capture, Capture) else load_capture(capture, seed=self.recipe.seed)
+        self.capture = loaded.with_seed(self.recipe.seed)
+        words = command_of(self.recipe, self.capture.data, folder, deterministic, stop_at)
+        config = RunConfig(self.recipe, self.capture.data, words, deterministic, stop_at, run_folder.versions())
+        self._run = loop.Run(
+            config=config,
+            out=folder,
+            device=where,
+            resume=resume,
+            save_every=save_every,
+            preview_every=preview_every,
+            log_every=log_every,
+            max_memory=max_memory,
+            begin=self._begin,
+        )
+        recording.check_settings(self._run)
+        if folder is not None:
+            run_folder.check(folder, config, resume, overwrite)
+        self._rasterize, self._deterministic = rasterize, deterministic
+        self._training: Training | None = None
+        self._ended = False
+        self._events = self._train(overwrite, tensorboard)
+
+    def __iter__(self) -> Iterator[Event]:
+        """Return the trainer itself: a loop continues where an earlier one was left."""
+        return self
+
+    def __next__(self) -> Event:
+        """Train until the next event. Raises StopIteration when the training has ended."""
+        return next(self._events)
+
+    @property
+    def run(self) -> Run:
+        """The scene as it is now. After the end of a training with a folder, the run in that folder.
+
+        Raises:
+            InputError: The training has not begun: no event was yielded yet.
+        """
+        training, out = self._training, self._run.out
+        if self._ended and out is not None:
+            return Run(run_folder.open_run(out, self._run.device), self._run.device, self._rasterize, capture=self.capture)
+        if training is None:
+            raise InputError("expected a training that has begun, found one without an event; iterate over it first")
+        opened = OpenRun(out or Path(), self._run.config, training.cfg, training.scene, training.step, training.clock, training.capture)
+        return Run(opened, self._run.device, self._rasterize, capture=self.capture, training=training)
+
+    def stop(self, reason: str = "stop") -> None:
+        """End the training after this iteration, and save it if it has a folder. The last event is `Stopped`, with the reason."""
+        self._run.stop.append(reason)
+
+    def finish(self) -> Run:
+        """Train to the end, and return the run."""
+        for _ in self:
+            pass
+        return self.run
+
+    def _begin(self, training: Training) -> None:
+        self._training = training
+
+    def _train(self, overwrite: bool, tensorboard: bool) -> Iterator[Event]:
+        reuse_freed()
+        with deterministic_algorithms(self._deterministic):
+            yield from recording.train(self._run, self.capture.loaded, self._rasterize, overwrite=overwrite, tensorboard=tensorboard)
+        self._ended = True
+        if self._run.out is not None:
+            self._training = None  # the run is in its folder now
+
+    def __repr__(self) -> str:
+        step = self._training.step if self._training else 0
+        return f"Trainer({self.recipe.recipe!r} on {self.capture.name!r}, step {step:,} of {self.recipe.iterations:,})"
+
+
+class Settings(TypedDict, total=False):
+    """How `train` trains. Each is described at `Trainer`."""
+
+    resume: bool
+    overwrite: bool
+    stop_at: int | None
+    deterministic: bool
+    device: Device
+    rasterizer: Raster
+    save_every: int
+    preview_every: int
+    log_every: int
+    max_memory: float
+    tensorboard: bool
+
+
+def train(
+    method: Recipe | str,
+    capture: Capture | str | Path,
+    out: str | Path | None = None,
+    *,
+    progress: bool = True,
+    **settings: Unpack[Settings],
+) -> Run:
+    """Train a recipe on a capture.
+
+    Ctrl-C saves a training that has a folder and then raises KeyboardInterrupt; a second Ctrl-C does not wait.
+
+    Args:
+        method: A recipe, or the name of one.
+        capture: A capture, or its folder.
+        out: Run folder to write, as `scene-experts train --out` does. Default: the scene stays in memory.
+        progress: Print iterations, losses and PSNR.
+        settings: `resume`, `overwrite`, `stop_at`, `deterministic`, `device` and the other settings of `Trainer`.
+
+    Returns:
+        The run.
+
+    Raises:
+        InputError: A setting is invalid, the capture cannot be used, or the folder cannot hold the run.
+        RunError: A loss is not finite, or a file cannot be written.
+    """
+    trainer = Trainer(method, capture, out, **settings)
+    console = Console(highlight=False, quiet=not progress)
+    with saved_on_interrupt(trainer, out is not None), Progress(console) as show:
+        for event in trainer:
+            show(event)
+    return trainer.run
+
+
+@contextmanager
+def saved_on_interrupt(trainer: Trainer, on: bool) -> Iterator[None]:
+    """Let the first Ctrl-C stop the training, which saves it, and raise KeyboardInterrupt afterwards."""
+    if not on or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    asked: list[int] = []
+
+    def stop(number: int, _: object) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+        trainer.stop("SIGINT")
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if asked:
+        raise KeyboardInterrupt

@@ -1,0 +1,94 @@
+"""Captures as the Python API shows them."""
+
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import scene_experts as se
+from scene_experts.data.readers.colmap_model import read_model
+
+
+def test_a_capture_is_in_its_own_frame_and_unit(folder, capture):
+    model = read_model(folder / "sparse" / "0")
+    xyz, rgb = capture.points
+    assert np.allclose(np.sort(xyz, 0), np.sort(model.xyz, 0)) and rgb.dtype == np.uint8
+    poses = {image.name: image.world_to_cam() for image in model.images}
+    for name, camera in zip(capture.names, capture.cameras, strict=True):
+        assert np.allclose(camera.world_to_camera, poses[name], atol=1e-5) and capture.names[camera.view] == name
+    assert len(capture.train_cameras) == 7 and [c.view for c in capture.test_cameras] == [0, 8]
+    assert capture.name == "balls" and capture.path == folder and capture.background == (0.0, 0.0, 0.0)
+    assert "7 training views" in repr(capture)
+
+
+def test_photographs_are_the_files(folder, capture):
+    file = np.asarray(Image.open(folder / "images" / capture.names[1]), np.float32) / 255
+    photo = capture.photo(1)
+    assert photo.dtype == np.float32 and np.array_equal(photo, file) and np.array_equal(capture.photo(capture.cameras[1]), photo)
+    assert photo.shape == (capture.cameras[1].height, capture.cameras[1].width, 3) and capture.mask(1) is None
+    for wrong in (9, -1, capture.look_at((9, 9, 9))):
+        with pytest.raises(se.InputError, match="view from 0 to 8"):
+            capture.photo(wrong)
+
+
+def test_masks_are_between_0_and_1(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "masked")
+    name = "view_001"
+    with Image.open(tmp_path / f"masked/images/{name}.png") as photo:
+        left = Image.new("L", photo.size, 255)
+        left.paste(0, (0, 0, 5, photo.height))
+        left.save(tmp_path / f"masked/images/{name}_mask.png")
+    mask = se.load_capture(tmp_path / "masked").mask(1)
+    assert mask is not None and mask.dtype == np.float32 and (mask[:, :5] == 0).all() and (mask[:, 5:] == 1).all()
+
+
+def test_a_new_camera_takes_the_lens_of_the_photographs(capture):
+    camera = capture.look_at((8, 0, 4))
+    assert np.allclose(camera.position, (8, 0, 4)) and camera.view == -1
+    middle = camera.K @ (camera.world_to_camera @ np.append(capture.center, 1))[:3]
+    assert np.allclose(middle[:2] / middle[2], (camera.width / 2, camera.height / 2))
+    assert (camera.width, camera.height) in {(c.width, c.height) for c in capture.cameras}
+    assert capture.up @ (0, 0, 1) > 0.9 and np.linalg.norm(capture.up) == pytest.approx(1)
+    small = capture.look_at((8, 0, 4), (1, 1, 1), (0, 1, 0), size=(20, 10), fov=33)
+    assert (small.width, small.height, round(small.fov)) == (20, 10, 33)
+
+
+def test_an_orbit_goes_around_the_centre(capture):
+    cameras = capture.camera_path("orbit", frames=5, size=(20, 10))
+    away = [np.linalg.norm(camera.position - capture.center) for camera in cameras]
+    assert len(cameras) == 5 and np.allclose(away, away[0]) and {(c.width, c.height) for c in cameras} == {(20, 10)}
+    assert len(capture.camera_path(frames=3)) == 3
+    for kind, frames in (("zigzag", 3), ("orbit", 0)):
+        with pytest.raises(se.InputError):
+            capture.camera_path(kind, frames=frames)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"missing": "skip"}, "missing"),
+        ({"normalise": "no"}, "normalise"),
+        ({"init": "sfm"}, "init"),
+        ({"split": "half"}, "split"),
+        ({"resolution": "huge"}, "resolution"),
+        ({"background": (0.0, 0.0, 2.0)}, "background"),
+        ({"near": -1.0}, "near"),
+        ({"max_views": 0}, "max-views"),
+        ({"images": "images_8"}, "images_8"),
+    ],
+)
+def test_arguments_that_cannot_be_used_are_named(folder, arguments, said):
+    with pytest.raises(se.InputError, match=said) as error:
+        se.load_capture(folder, **arguments)
+    assert "\n" not in str(error.value)
+    with pytest.raises(se.InputError, match="absent"):
+        se.load_capture(folder / "absent")
+
+
+def test_random_points_follow_the_seed(folder, capture):
+    random = se.load_capture(folder, init="random")
+    assert random.with_seed(0) is random and capture.with_seed(3) is capture
+    other = random.with_seed(3)
+    assert not np.array_equal(other.points[0], random.points[0])
+    assert np.array_equal(other.points[0], se.load_capture(folder, init="random", seed=3).points[0])

@@ -1,0 +1,104 @@
+"""Runs: drawn, scored, exported, found again."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import scene_experts as se
+from scene_experts.evaluate.pictures import to_8bit
+
+
+def test_a_picture_is_the_one_that_eval_draws(run, capture):
+    scores = run.evaluate(lpips=False)
+    for camera in run.test_cameras:
+        picture = run.render(camera)
+        assert picture.dtype == np.float32 and picture.shape == (camera.height, camera.width, 3)
+        assert picture.min() >= 0 and picture.max() <= 1
+        name = capture.names[camera.view]
+        assert np.array_equal(to_8bit(torch.from_numpy(picture)), np.asarray(Image.open(run.path / "test" / "renders" / name)))
+    assert scores.psnr == pytest.approx(np.mean([view["psnr"] for view in scores.per_view.values()])) and 0 < scores.ssim <= 1
+    assert scores.lpips is None and scores.details["step"] == 6 and (run.path / "results.json").is_file()
+    assert run.report() == run.path / "report.html" and (run.path / "report.html").is_file()
+
+
+def test_layers_are_in_the_units_of_the_capture(run, capture):
+    camera = capture.look_at(capture.center + 9 * capture.up)
+    layers = run.render_layers(camera)
+    shape = (camera.height, camera.width)
+    assert layers.image.shape == (*shape, 3) and layers.depth.shape == layers.alpha.shape == shape
+    assert np.array_equal(layers.image, run.render(camera)) and layers.alpha.max() <= 1 and layers.depth.dtype == np.float32
+    dense = layers.alpha > 0.9
+    assert dense.any() and 4 < np.median(layers.depth[dense]) < 12, "the scene is about 9 below the camera, in the capture's unit"
+    assert (layers.depth[layers.alpha == 0] == 0).all()
+
+
+def test_false_colours(run, capture):
+    camera = run.test_cameras[0]
+    pictures = {show: run.render(camera, show) for show in ("depth", "alpha", "experts", "entropy", "activation")}
+    assert all(picture.shape == (camera.height, camera.width, 3) for picture in pictures.values())
+    with pytest.raises(se.InputError, match="show"):
+        run.render(camera, "normals")
+    with pytest.raises(se.InputError, match="use another"):
+        run.render(se.Camera(camera.world_to_camera, camera.K, 8, 8, view=99))
+
+
+def test_a_run_opens_from_any_folder(run, capture, tmp_path, monkeypatch):
+    picture = run.render(run.test_cameras[0])
+    monkeypatch.chdir(tmp_path)
+    opened = se.open_run(run.path)
+    assert np.array_equal(opened.render(opened.test_cameras[0]), picture)
+    assert (opened.step, opened.recipe, opened.path) == (run.step, run.recipe, run.path) and opened.seconds > 0
+    assert len(opened.train_cameras) == 7 and "step 6" in repr(opened) and opened.scene.table is not None
+
+
+def test_a_capture_that_moved_is_named(run, capture, small, tmp_path):
+    moved = tmp_path / "moved"
+    shutil.copytree(capture.path, tmp_path / "first")
+    path = se.train(small, tmp_path / "first", tmp_path / "run", progress=False, stop_at=1).path
+    (tmp_path / "first").rename(moved)
+    opened = se.open_run(path)
+    with pytest.raises(se.InputError, match="first"):
+        _ = opened.capture
+    assert se.open_run(path, data=moved).capture.path == moved
+
+
+def test_a_checkpoint_may_be_chosen(capture, small, tmp_path):
+    path = se.train(small, capture, tmp_path, save_every=3, progress=False).path
+    assert se.open_run(path, step=3).step == 3
+    with pytest.raises(se.InputError, match="step 5"):
+        se.open_run(path, step=5)
+    with pytest.raises(se.InputError, match="absent"):
+        se.open_run(tmp_path / "absent")
+
+
+def test_files_come_back(run, capture, tmp_path):
+    compact = run.export("compact", tmp_path / "scene.compact")
+    anchors = run.export("anchors", tmp_path / "anchors")
+    baked = run.export("ply", tmp_path / "scene.ply", sh_degree=1, refine=0)
+    assert compact.stat().st_size < 300_000 and anchors.is_dir() and baked.is_file()
+    camera = capture.test_cameras[0]
+    for source in (compact, tmp_path / "anchors", baked):
+        again = se.import_run(source, capture, tmp_path / f"from_{source.name}")
+        assert np.abs(again.render(camera) - run.render(camera)).mean() < 0.1
+    with pytest.raises(se.InputError, match="obj"):
+        run.export("obj")
+    with pytest.raises(se.InputError):
+        se.import_run(tmp_path / "absent", capture, tmp_path / "nothing")
+
+
+def test_frames_go_to_pictures_or_a_video(run, capture, tmp_path):
+    cameras = capture.camera_path("orbit", frames=3, size=(16, 16))
+    folder = run.write_video(tmp_path / "frames", cameras)
+    assert sorted(path.name for path in folder.glob("*.png")) == ["00000.png", "00001.png", "00002.png"]
+    first = np.asarray(Image.open(folder / "00000.png"))
+    assert np.array_equal(first, to_8bit(torch.from_numpy(run.render(cameras[0]))))
+    pytest.importorskip("imageio_ffmpeg")
+    assert run.write_video(tmp_path / "orbit.mp4", cameras, fps=3).stat().st_size > 500
+    with pytest.raises(se.InputError, match="one size"):
+        run.write_video(tmp_path / "sizes.mp4", [cameras[0], cameras[1].resized(20, 20)])
+    for out, some, fps in (("a.mp4", [], 24.0), ("a.mp4", cameras, 0.0), ("a.txt", cameras, 24.0)):
+        with pytest.raises(se.InputError):
+            run.write_video(tmp_path / out, some, fps=fps)

@@ -1,0 +1,143 @@
+"""Scripted trainings: events, pauses, stops, and the same bits as the command."""
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import scene_experts as se
+from scene_experts.api.trainer import Settings
+from scene_experts.cli import main
+from scene_experts.core import checkpoint
+from scene_experts.training.run_folder import read_config
+
+FLAGS = ["--iterations", "6", "--scene.voxel-size", "0.2", "--deterministic", "--device", "cpu", "--save-every", "3"]
+
+
+@pytest.fixture(autouse=True)
+def _undeterministic():
+    yield
+    torch.use_deterministic_algorithms(False)  # the command leaves them on
+
+
+def tensors(run: Path, step: int = 6) -> dict[str, torch.Tensor]:
+    return checkpoint.load(run / f"checkpoints/ckpt_{step:06d}.safetensors")[0]
+
+
+def files(run: Path) -> set[str]:
+    return {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
+
+
+def test_a_scripted_training_is_the_command_bit_for_bit(folder, small, tmp_path):
+    script, command = tmp_path / "script", tmp_path / "command"
+    run = se.train(small, folder, script, deterministic=True, device="cpu", save_every=3, progress=False)
+    assert not torch.are_deterministic_algorithms_enabled(), "the earlier choice is back"
+    assert main(["train", "moe-gs", "--data", str(folder), "--out", str(command), *FLAGS]) == 0
+    assert run.path == script and files(script) == files(command)
+    for step in (3, 6):
+        ours, theirs = tensors(script, step), tensors(command, step)
+        assert ours.keys() == theirs.keys() and all(torch.equal(ours[name], theirs[name]) for name in ours)
+    layout = "point_cloud/iteration_6/point_cloud.ply"
+    assert (script / layout).read_bytes() == (command / layout).read_bytes()
+    ours, theirs = read_config(script), read_config(command)
+    assert replace(ours, command="") == replace(theirs, command="")
+
+
+def test_the_commands_accept_a_scripted_run(folder, small, tmp_path, capsys):
+    se.train(small, folder, tmp_path / "run", deterministic=True, device="cpu", stop_at=3, progress=False)
+    run, flags = str(tmp_path / "run"), [word for word in FLAGS if word not in ("--save-every", "3")]
+    assert main(["train", "moe-gs", "--data", str(folder), "--out", run, *flags, "--resume"]) == 0
+    assert main(["eval", run, "--no-lpips"]) == 0 and main(["export", run, "--no-measure"]) == 0 and main(["report", run]) == 0
+    whole = se.train(small, folder, tmp_path / "whole", deterministic=True, device="cpu", progress=False)
+    ours, theirs = tensors(tmp_path / "run"), tensors(whole.path or Path())
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours), "resumed by the command, bit for bit"
+    again = se.train(small, folder, tmp_path / "run", deterministic=True, device="cpu", resume=True, progress=False)
+    assert again.step == 6
+    capsys.readouterr()
+
+
+def test_a_training_in_memory_is_the_same_scene(capture, small, run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    kinds, trainer = [], se.Trainer(small, capture, preview_every=3)
+    for event in trainer:
+        kinds.append(type(event))
+        if isinstance(event, se.Previewed):
+            view = trainer.run.render(capture.test_cameras[0])
+            assert np.allclose(view, event.picture.numpy(), atol=1e-6) and trainer.run.step == event.step
+    assert kinds[0] is se.Started and kinds[-1] is se.Finished and se.Saved not in kinds and not list(tmp_path.iterdir())
+    scene = trainer.run
+    assert scene.path is None and scene.step == 6 and scene.seconds > 0 and "in memory" in repr(scene)
+    camera = capture.test_cameras[0]
+    assert np.allclose(scene.render(camera), run.render(camera), atol=2e-3)
+    with pytest.raises(se.InputError, match="save"):
+        scene.export("compact")
+    saved = scene.save(tmp_path / "saved")
+    assert np.allclose(saved.render(camera), scene.render(camera), atol=1e-6) and saved.export("compact").is_file()
+    assert saved.evaluate(lpips=False).psnr == pytest.approx(scene.evaluate(lpips=False).psnr, abs=0.05)
+    assert main(["train", "moe-gs", "--data", str(capture.path), "--out", str(tmp_path / "saved"), *FLAGS[:4], "--resume"]) == 0
+    with pytest.raises(se.InputError, match="in memory"):
+        saved.save(tmp_path / "other")
+
+
+def test_a_loop_may_pause_go_on_and_stop(capture, small, tmp_path):
+    trainer = se.Trainer(small, capture, tmp_path / "run", log_every=1)
+    with pytest.raises(se.InputError, match="iterate"):
+        _ = trainer.run
+    for event in trainer:
+        if isinstance(event, se.Stepped) and event.step == 2:
+            break
+    assert trainer.run.step == 2 and trainer.run.path is None and "step 2 of 6" in repr(trainer)
+    last = None
+    for last in trainer:
+        if isinstance(last, se.Stepped) and last.step == 4:
+            trainer.stop("enough")
+    assert last == se.Stopped(4, "enough") and trainer.run.path == tmp_path / "run" and trainer.run.step == 4
+    done = se.Trainer(small, capture, tmp_path / "run", resume=True).finish()
+    assert done.step == 6 and list(trainer) == []
+
+
+def test_ctrl_c_saves_and_is_raised(capture, tmp_path, monkeypatch):
+    long = se.recipe("scaffold-gs", iterations=100_000, **{"scene.voxel_size": 0.2})
+    monkeypatch.setattr("scene_experts.api.trainer.Progress.__call__", lambda self, event: os.kill(os.getpid(), signal.SIGINT))
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        se.train(long, capture, tmp_path / "run", progress=False)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"resume": True}, "out"),
+        ({"tensorboard": True}, "out"),
+        ({"save_every": 0}, "save-every"),
+        ({"preview_every": -1}, "preview-every"),
+        ({"log_every": 0}, "log_every"),
+        ({"stop_at": 0}, "stop-at"),
+        ({"max_memory": -1.0}, "max-memory"),
+        ({"device": "gpu"}, "'gpu'"),
+        ({"rasterizer": "opengl"}, "opengl"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_named(capture, settings, said):
+    with pytest.raises(se.InputError, match=said) as error:
+        se.Trainer("moe-gs", capture, **settings)
+    assert "\n" not in str(error.value)
+
+
+def test_an_earlier_run_is_not_lost_by_accident(run, capture, small, folder):
+    with pytest.raises(se.InputError, match="overwrite"):
+        se.Trainer(small, capture, run.path)
+    with pytest.raises(se.InputError):
+        se.Trainer("moe-gs", folder / "absent")
+
+
+def test_train_takes_every_setting_of_the_trainer():
+    import inspect
+
+    settings = {name: p for name, p in inspect.signature(se.Trainer).parameters.items() if p.kind is p.KEYWORD_ONLY}
+    assert settings.keys() == Settings.__annotations__.keys()
