@@ -33,6 +33,7 @@ from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
 from scene_experts.scene import Scene
+from scene_experts.training import capture_place
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import Data, RunConfig, Train, from_json, to_json
 from scene_experts.training.state import scene_from
@@ -153,17 +154,29 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False)
                 shutil.rmtree(scored / pictures, ignore_errors=True)
         for sidecar in (out / "point_cloud").glob("iteration_*/scene.json"):  # a later iteration's would be taken for the new run's
             shutil.rmtree(sidecar.parent, ignore_errors=True)
-    write_json(out / "config.json", {"format": FORMAT, **to_json(config)})
+    _write_config(out, config)
+
+
+def _write_config(out: Path, config: RunConfig) -> None:
+    """Write config.json with the path of the capture from the root and from the run folder."""
+    path = capture_place.absolute(named(config.data).path)
+    relative = capture_place.from_run(out, path)
+    beside = {} if relative is None else {capture_place.KEY: relative}
+    config = replace(config, data=replace(config.data, path=path))
+    write_json(out / "config.json", {"format": FORMAT, **beside, **to_json(config)})
 
 
 def read_config(run: Path) -> RunConfig:
-    """The configuration of a run folder. Raises InputError when it is none."""
+    """The configuration of a run folder, with the path of its capture where it is now. Raises InputError when it is none."""
     if not (run / "config.json").is_file():
         raise InputError(f"expected a run folder with config.json at {run}, found none; give the folder that `train --out` wrote")
     value = read_json(run / "config.json", "run configuration")
     if not isinstance(value, dict) or value.pop("format", None) != FORMAT:
         raise InputError(f"expected a run configuration of format {FORMAT} in {run}, found another; train it again with this version")
-    return from_json(RunConfig, value)
+    relative = value.pop(capture_place.KEY, None)
+    config = from_json(RunConfig, value)
+    path = capture_place.find(run, config.data.path, relative if isinstance(relative, str) else None)
+    return replace(config, data=replace(config.data, path=path))
 
 
 def named(data: Data) -> Data:
@@ -201,12 +214,10 @@ def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
     """The capture that a run was trained on; data: where it is now, if it moved.
 
     Raises InputError, naming --data, where it is gone, and where there are other views (its world would be another).
-    A run keeps the path as its training was given it, and a relative one is read from the current folder.
     """
     where = named(run.config.data if data is None else replace(run.config.data, path=data))
     if data is None and not where.path.exists():
-        origin = "" if where.path.is_absolute() else " below the current folder"
-        raise InputError(f"expected the run's capture at {where.path}{origin}, found none; say where it is with --data")
+        raise InputError(f"expected the run's capture at {where.path}, found nothing there; say where it is with --data")
     capture = load_capture(where, run.cfg.seed)
     if run.capture not in ("", capture.fingerprint()):
         capture.images.close()

@@ -18,7 +18,7 @@ from support.messages import naming
 from support.synthetic import make_capture
 
 CFG = replace(RECIPES["moe-gs"][1], iterations=300)
-CONFIG = RunConfig(CFG, Data(Path("capture")))
+CONFIG = RunConfig(CFG, Data(Path("capture").absolute()))
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_what_is_refused_changes_nothing(config, options, facts, run):
 
 
 def test_resuming_may_move_the_capture_and_the_stop(run):
-    moved = RunConfig(CFG, replace(CONFIG.data, path=Path("elsewhere")), stop_at=100)
+    moved = RunConfig(CFG, replace(CONFIG.data, path=Path("elsewhere").absolute()), stop_at=100)
     run_folder.check(run, moved, resume=True)
     assert run_folder.read_config(run) == CONFIG, "checking writes nothing"
     run_folder.prepare(run, moved, resume=True)
