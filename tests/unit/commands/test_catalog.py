@@ -43,7 +43,7 @@ def test_a_scene_from_its_source_to_a_trained_run(
 ) -> None:
     assert cli.main(["download", "rome", "--mirror", server.url]) == 0
     out = capsys.readouterr().out
-    assert "next: scene-experts train moe-gs --data catalog:rome --out RUN" in out and "rome: " in out
+    assert "scene-experts train moe-gs --data catalog:rome --out RUN" in out and "rome: " in out
     assert cli.main(["info", "catalog:rome"]) == 0
     assert "9" in capsys.readouterr().out
     flags = ["--iterations", "2", "--rasterizer", "reference", "--device", "cpu", "--preview-every", "0"]
@@ -72,10 +72,10 @@ def test_the_table_and_the_particulars(captures: Path, capsys: pytest.CaptureFix
     lines = capsys.readouterr().out.splitlines()
     rows = {line.split()[0]: line.split() for line in lines[1:18]}
     assert len(rows) == 17 and rows["truck"][-3:] == ["as-is", "mod8", "yes"] and rows["bonsai"][-2:] == ["inria:2", "mod8"]
-    assert any("non-commercial" in line for line in lines) and lines[-1] == f"captures lie in {captures}"
+    assert any("non-commercial" in line for line in lines) and str(captures) in lines[-1]
     assert cli.main(["catalog", "quebec", "truck"]) == 0
     out = capsys.readouterr().out
-    assert f"put bungeenerf.tar.gz at {captures / 'archives' / 'bungeenerf.tar.gz'} and run `scene-experts download quebec`" in out
+    assert str(captures / "archives" / "bungeenerf.tar.gz") in out and "scene-experts download quebec" in out
     assert "(here)" in out and "816e62f2" in out and "first:31" in out
     assert cli.main(["download", "--list", "db"]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["scene", "drjohnson", "playroom"]
@@ -83,9 +83,9 @@ def test_the_table_and_the_particulars(captures: Path, capsys: pytest.CaptureFix
 
 def test_bad_words(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["download", "bonsay"]) == 2
-    assert "found 'bonsay'; did you mean 'bonsai'?" in capsys.readouterr().err
+    assert "'bonsai'" in capsys.readouterr().err
     assert cli.main(["download"]) == 2
-    assert "expected scenes to download, found none" in capsys.readouterr().err
+    assert capsys.readouterr().err.count("\n") == 1
     assert cli.main(["info", "catalog:bonsai"]) == 2
     assert "`scene-experts download bonsai`" in capsys.readouterr().err
 

@@ -16,11 +16,12 @@ from scene_experts.scene.anchors.mlp import MLP
 from scene_experts.training import loop as train
 from scene_experts.training import run_folder
 from scene_experts.training.config import Data, RunConfig
+from support.messages import naming
 from support.synthetic import make_capture
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path):
-    with pytest.raises(InputError, match="expected a run folder"):
+    with pytest.raises(InputError, match=naming(tmp_path)):
         export([str(tmp_path), "--no-measure"])
 
 
@@ -43,12 +44,12 @@ def test_flags_reach_the_bake(tmp_path, capsys):
     flags = ["--sh-degree", "1", "--max-gaussians", "90", "--prune", "0.01", "--refine", "3", "--frame", "trained"]
     assert export([str(tmp_path / "run"), "--format", "spz", *flags]) == 0
     out, file = capsys.readouterr().out, tmp_path / "run" / "scene.spz"
-    assert f"wrote {file}" in out and "harmonics of degree 1, in the trained world" in out and "refined" in out
+    assert str(file) in out and "degree 1" in out
     assert len(read_standard(file)) <= 90
     about = json.loads((tmp_path / "run" / "scene.spz.json").read_text())
     assert about["command"].startswith("scene-experts export ") and about["command"].endswith("--frame trained")
     assert about["bake"]["prune"] == 0.01 and about["bake"]["refine"]["iterations"] == 3
-    with pytest.raises(InputError, match="expected --prune as a share"):
+    with pytest.raises(InputError, match="--prune"):
         export([str(tmp_path / "run"), "--format", "ply", "--prune", "2"])
 
 
@@ -67,15 +68,15 @@ def run(tmp_path_factory):
 
 def test_settings_of_other_formats_are_not_dropped_in_silence(run):
     for format in ("compact", "anchors"):
-        with pytest.raises(InputError, match=f"expected --sh-degree with a standard file .* found --format {format}"):
+        with pytest.raises(InputError, match=naming("--sh-degree", format)):
             export([str(run), "--format", format, "--sh-degree", "1"])
 
 
 def test_a_name_of_another_format_and_a_place_that_takes_no_file_are_refused_before_the_work(run, tmp_path):
-    with pytest.raises(InputError, match=r"expected a name that ends in \.spz for --format spz, found x\.ply"):
+    with pytest.raises(InputError, match=naming("spz", "x.ply")):
         export([str(run), "--format", "spz", "--out", str(tmp_path / "x.ply"), "--refine", "100000"])
     (tmp_path / "file").touch()
-    with pytest.raises(RunError, match=r"cannot write .*; choose another folder"):
+    with pytest.raises(RunError, match=naming("x.ply", "--out")):
         export([str(run), "--format", "ply", "--out", str(tmp_path / "file" / "x.ply"), "--refine", "100000"])
 
 
@@ -84,9 +85,9 @@ def test_a_compact_file_is_whole_without_the_capture(run, tmp_path, capsys):
     gone.rename(run.parent / "elsewhere")
     try:
         assert export([str(run), "--out", str(tmp_path / "a.compact")]) == 0
-        assert "the cost in PSNR was not measured (--data says where it is)" in capsys.readouterr().out
+        assert "--data" in capsys.readouterr().out
         assert export([str(run), "--out", str(tmp_path / "b.compact"), "--data", str(run.parent / "elsewhere")]) == 0
-        assert "held-out views" in capsys.readouterr().out
+        assert "--data" not in capsys.readouterr().out
     finally:
         (run.parent / "elsewhere").rename(gone)
 
@@ -97,4 +98,5 @@ def test_networks_that_the_layout_cannot_say_are_told(run, tmp_path, capsys, mon
     forward = MLP.forward
     monkeypatch.setattr(MLP, "forward", lambda self, *given: (forward(self, *given)[0] * (0.9 if self.attribute == "color" else 1.0), None))
     assert export([str(run), "--format", "anchors", "--out", str(tmp_path / "other")]) == 0
-    assert "warning: the color networks of 'scaffold-gs' are not Linear, ReLU, ..., Linear" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "warning" in out and "color" in out

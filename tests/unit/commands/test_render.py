@@ -26,7 +26,7 @@ def run(tmp_path_factory):
 def test_pictures_beside_each_other_and_the_path_as_a_file(run, tmp_path, capsys):
     args = ["render", str(run), "--out", str(tmp_path / "frames"), "--size", "48x32", "--fps", "4", "--seconds", "1", "--path", "orbit"]
     assert cli.main([*args, "--show", "picture", "experts", "--save-path", str(tmp_path / "p.json")]) == 0
-    assert "4 frames, 1.0 s" in capsys.readouterr().out
+    assert "4 frames" in capsys.readouterr().out
     assert pictures.read(tmp_path / "frames" / "00003.png").shape == (32, 2 * 48 + 4, 3)
     assert len(json.loads((tmp_path / "p.json").read_text())["keyframes"]) == 4
     again = ["render", str(run), "--out", str(tmp_path / "again"), "--path", str(tmp_path / "p.json"), "--show", "picture"]
@@ -56,21 +56,21 @@ def test_a_video_lands_in_the_run_folder(run, capsys):
 
 
 def test_flags_that_no_video_can_have(run, tmp_path, capsys):
-    for wrong, word in (
+    for wrong, fact in (
         (["--quality", "20"], "--quality"),
         (["--fps", "0"], "--fps"),
-        (["--only", "9"], "experts 1 to 5"),
-        (["--out", str(tmp_path / "a.gif")], "ending in .mp4"),
-        (["--path", "bogus"], "test or a file"),
+        (["--only", "9"], "1 to 5"),
+        (["--out", str(tmp_path / "a.gif")], ".mp4"),
+        (["--path", "bogus"], "bogus"),
     ):
         assert cli.main(["render", str(run), *wrong]) == 2
-        assert word in capsys.readouterr().err
+        assert fact in capsys.readouterr().err
 
 
 def test_sizes():
     assert size_of("640x360") == (640, 360) and size_of(None) is None
     for wrong in ("640", "640x", "0x10", "1x99999", "-5x5"):
-        with pytest.raises(InputError, match="WIDTHxHEIGHT"):
+        with pytest.raises(InputError, match="--size"):
             size_of(wrong)
     assert resized(CAMERA, (96, 32)).fx == pytest.approx(2 * CAMERA.fx) and resized(CAMERA, None) is CAMERA
     assert torch.allclose(resized(CAMERA, (96, 64)).K[:2], CAMERA.K[:2] * 2)

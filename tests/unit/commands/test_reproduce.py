@@ -8,6 +8,7 @@ from scene_experts.commands.reproduce import ReproduceCommand, experiments_of, p
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
 from scene_experts.reproduce import store
+from support.messages import naming
 from support.records import record
 from support.synthetic import make_capture
 
@@ -28,15 +29,15 @@ def test_runs_tables_and_figures_and_nothing_twice(tmp_path, capsys):
     here = ["--out", str(tmp_path / "out")]
     assert cli.main(["reproduce", "fig3", *args, *here]) == 0
     first = capsys.readouterr().out
-    assert "2 runs, 0 of them done" in first and len(store.load(tmp_path / "out" / "records")) == 2
+    assert "2 runs" in first and len(store.load(tmp_path / "out" / "records")) == 2
     assert (tmp_path / "out" / "fig3_box.png").is_file() and (tmp_path / "out" / "README.md").is_file()
     assert cli.main(["reproduce", "fig3", "fig5", *args, *here]) == 0
-    assert "2 runs, 2 of them done" in capsys.readouterr().out and (tmp_path / "out" / "fig5_box.png").is_file()
+    assert len(store.load(tmp_path / "out" / "records")) == 2 and (tmp_path / "out" / "fig5_box.png").is_file()
     assert cli.main(["reproduce", "fig3", *args, *here, "--dry-run"]) == 0
     assert capsys.readouterr().out.count("done ") == 2
     elsewhere = ["--out", str(tmp_path / "other"), "--records", str(tmp_path / "out" / "records")]
     assert cli.main(["reproduce", "fig3", *args, *elsewhere]) == 0
-    assert "2 runs, 2 of them done" in capsys.readouterr().out
+    assert not (tmp_path / "other" / "runs").exists()
     page = (tmp_path / "other" / "README.md").read_text()
     assert "scene-experts reproduce fig3 --captures CAPTURES/box --iterations 40 --recipes" in page and str(tmp_path) not in page
 
@@ -46,7 +47,7 @@ def test_tables_of_what_is_done_without_running_the_rest(tmp_path, capsys):
     args = ["--captures", str(tmp_path / "fox"), "--out", str(tmp_path / "out"), "--iterations", "3000", "--tables-only"]
     store.write(tmp_path / "out" / "records", record("moe-gs", "fox"))
     assert cli.main(["reproduce", "table4", *args]) == 0
-    assert "wrote" in capsys.readouterr().out and "31.50" in (tmp_path / "out" / "table4.md").read_text()
+    assert "31.50" in (tmp_path / "out" / "table4.md").read_text()
     assert not (tmp_path / "out" / "runs").exists()
 
 
@@ -60,7 +61,7 @@ def test_a_run_whose_checkpoints_are_gone_costs_its_picture_alone(tmp_path, caps
     write_json(folder / "results.json", made.results)
     assert cli.main(["reproduce", "fig5", *args]) == 0
     said = capsys.readouterr().out
-    assert "no picture of moe-gs-e3-top2 on fox, seed 0: expected" in said and "wrote" in said
+    assert "moe-gs-e3-top2 on fox, seed 0" in said and "README.md" in said
 
 
 def recipes_of(capsys, *args: str) -> tuple[int, set[str], set[str]]:
@@ -90,31 +91,31 @@ def test_a_failure_is_told_at_the_end(tmp_path, capsys):
     (tmp_path / "empty" / "transforms.json").touch()
     assert cli.main(["reproduce", "fig5", "--captures", str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 1
     found = capsys.readouterr()
-    assert "FAILED" in found.out and "1 that failed" in found.err and "Traceback" not in found.err
+    assert "FAILED" in found.out and "1" in found.err and "Traceback" not in found.err
 
 
 def test_names_that_are_none(tmp_path, capsys):
     (tmp_path / "box").mkdir()
     (tmp_path / "note").touch()
     assert cli.main(["reproduce", "table3", "--captures", str(tmp_path / "box"), "--recipes", "scafold-gs", "--dry-run"]) == 2
-    assert "did you mean 'scaffold-gs'" in capsys.readouterr().err
-    with pytest.raises(InputError, match="did you mean 'table1'"):
+    assert "'scaffold-gs'" in capsys.readouterr().err
+    with pytest.raises(InputError, match="'table1'"):
         experiments_of(ReproduceCommand(("tabel1",)))
-    with pytest.raises(InputError, match="found nothing"):
+    with pytest.raises(InputError, match="table1, table2"):
         experiments_of(ReproduceCommand(()))
-    with pytest.raises(InputError, match="expected the paper's scenes"):
+    with pytest.raises(InputError, match=naming(tmp_path)):
         scenes_of(ReproduceCommand(("table1",), data=tmp_path))
-    with pytest.raises(InputError, match="expected --scenes among the captures box, found bax"):
+    with pytest.raises(InputError, match=naming("--scenes", "box", "bax")):
         scenes_of(ReproduceCommand(("table1",), captures=(tmp_path / "box",), scenes=("bax",)))
-    with pytest.raises(InputError, match=r"expected a capture in .*box .*found"):
+    with pytest.raises(InputError, match=naming(tmp_path / "box")):
         planned(ReproduceCommand(("table1",), captures=(tmp_path / "box",), dry_run=True))
-    with pytest.raises(InputError, match=r"expected a folder at .*, found a file"):
+    with pytest.raises(InputError, match=naming(tmp_path / "note")):
         planned(ReproduceCommand(("table1",), captures=(tmp_path / "box",), out=tmp_path / "note"))
     for flag in ("--captures", "--seeds", "--devices"):
-        assert cli.main(["reproduce", "table3", flag, "--dry-run"]) == 2 and f"a value after {flag}, found none" in capsys.readouterr().err
-    with pytest.raises(InputError, match="or 'rome'"):
+        assert cli.main(["reproduce", "table3", flag, "--dry-run"]) == 2 and flag in capsys.readouterr().err
+    with pytest.raises(InputError, match="'rome'"):
         scenes_of(ReproduceCommand(("table1",), data=tmp_path, scenes=("roma",)))
-    with pytest.raises(InputError, match="expected rome"):
+    with pytest.raises(InputError, match="rome"):
         scenes_of(ReproduceCommand(("table1",), data=tmp_path, scenes=("rome",)))
 
 

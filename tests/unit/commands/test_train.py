@@ -11,6 +11,7 @@ from scene_experts.commands.train import FIRST, TrainCommand, parse_train, run_o
 from scene_experts.core.errors import InputError
 from scene_experts.recipes import RECIPES
 from scene_experts.training import run_folder
+from support.messages import naming
 from support.synthetic import make_capture
 
 PLACES = ["--data", "c", "--out", "r"]
@@ -44,7 +45,7 @@ def test_a_recipe_without_flags_is_the_recipe(recipe):
     ],
 )
 def test_numbers_no_training_can_have_name_their_flag(flag, value):
-    with pytest.raises(InputError, match=f"expected {flag} of at least"):
+    with pytest.raises(InputError, match=flag):
         check_settings(parse_train(["moe-gs", *PLACES, flag, value]))
 
 
@@ -52,12 +53,12 @@ def test_a_memory_cap_needs_a_system_that_tells(monkeypatch):
     made = parse_train(["moe-gs", "--data", "capture", "--out", "run", "--max-memory", "4"])
     check_settings(made)
     monkeypatch.setattr("scene_experts.api.recording.used_bytes", lambda device: 0)
-    with pytest.raises(InputError, match="use --max-anchors"):
+    with pytest.raises(InputError, match="--max-anchors"):
         check_settings(made)
 
 
 def test_an_unknown_recipe_names_the_nearest():
-    with pytest.raises(InputError, match="did you mean 'moe-gs'"):
+    with pytest.raises(InputError, match="'moe-gs'"):
         parse_train(["moegs", *PLACES])
 
 
@@ -107,23 +108,20 @@ def test_an_option_of_another_recipe_says_whose_it_is():
     assert "octree-moe-gs" in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("args", "fact"), [([], "moe-gs --data"), (["--data", "x"], "found --data"), (["--data", "x", "sags"], "train sags")]
-)
+@pytest.mark.parametrize(("args", "fact"), [([], "moe-gs --data"), (["--data", "x"], "--data"), (["--data", "x", "sags"], "train sags")])
 def test_a_missing_recipe(args, fact):
-    with pytest.raises(InputError, match="expected a recipe") as error:
+    with pytest.raises(InputError, match=naming(fact)):
         parse_train(args)
-    assert fact in str(error.value)
 
 
-def test_a_finished_run_keeps_its_files_when_resumed(tmp_path, capsys):
+def test_a_finished_run_keeps_its_files_when_resumed(tmp_path):
     capture = make_capture(tmp_path / "capture", views=9, size=(48, 32)).folder
     args = ["scaffold-gs", "--data", str(capture), "--out", str(tmp_path / "run"), "--iterations", "3", "--preview-every", "0"]
     assert train(args) == 0
     layout = tmp_path / "run" / "point_cloud" / "iteration_3"
     (layout / "point_cloud.ply").write_bytes(b"mine")
     assert train([*args, "--resume"]) == 0 and "--resume" not in run_folder.read_config(tmp_path / "run").command
-    assert "nothing was left to train" in capsys.readouterr().out and (layout / "point_cloud.ply").read_bytes() == b"mine"
+    assert (layout / "point_cloud.ply").read_bytes() == b"mine"
     (layout / "point_cloud.ply").unlink()
     assert train([*args, "--resume"]) == 0 and (layout / "point_cloud.ply").is_file()  # a run that was killed before it wrote them
 
@@ -131,7 +129,7 @@ def test_a_finished_run_keeps_its_files_when_resumed(tmp_path, capsys):
 def test_two_trainings_into_one_folder(tmp_path):
     capture = make_capture(tmp_path / "capture", views=9, size=(48, 32)).folder
     args = ["scaffold-gs", "--data", str(capture), "--out", str(tmp_path / "run"), "--iterations", "3", "--preview-every", "0"]
-    with run_folder.held(tmp_path / "run"), pytest.raises(InputError, match="found a training at work"):
+    with run_folder.held(tmp_path / "run"), pytest.raises(InputError, match=naming(tmp_path / "run")):
         train(args)
     assert [p.name for p in (tmp_path / "run").iterdir()] == [".lock"]
     assert train(args) == 0

@@ -6,6 +6,7 @@ import pytest
 
 from scene_experts.commands import view as command
 from scene_experts.core.errors import InputError
+from support.messages import naming
 
 
 def test_without_viser_the_error_says_what_to_install(monkeypatch):
@@ -21,5 +22,5 @@ def test_a_port_that_is_none_is_refused(tmp_path):
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path):
     pytest.importorskip("viser")
-    with pytest.raises(InputError, match="expected a run folder"):
+    with pytest.raises(InputError, match=naming(tmp_path)):
         command.view([str(tmp_path)])

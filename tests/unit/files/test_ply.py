@@ -7,6 +7,7 @@ from plyfile import PlyData, PlyElement
 
 from scene_experts.core.errors import InputError
 from scene_experts.files import ply
+from support.messages import naming
 
 K, F = 10, 32
 
@@ -118,49 +119,49 @@ HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty floa
 
 
 @pytest.mark.parametrize(
-    ("data", "message"),
+    ("data", "fact"),
     [
-        (b"", "found something else"),
-        (b"plain text", "found something else"),
-        (HEADER[:-5], "found something else"),
-        (HEADER + bytes(7), "expected 2 vertices in .*, found 1: the file was cut short"),
-        (HEADER.replace(b"binary_little_endian", b"ascii") + b"1\n", "expected 2 vertices in .*, found 1"),
-        (HEADER.replace(b"binary_little_endian", b"ascii") + b"1\n1 2\n", "expected 1 numbers a line"),
-        (HEADER.replace(b"binary_little_endian", b"ascii") + b"1\nx\n", "expected 1 numbers a line"),
-        (HEADER.replace(b"float", b"quad"), "expected known PLY types in .*, found 'quad'"),
-        (HEADER.replace(b"binary_little_endian", b"morse"), "expected known PLY types in .*, found 'morse'"),
-        (HEADER.replace(b"property float x", b"property list uchar int x"), "its vertices have lists"),
-        (HEADER.replace(b"vertex 2", b"face 2"), "its first element is not 'vertex'"),
-        (HEADER.replace(b"vertex 2", b"vertex -2"), "does not fit"),
-        (HEADER.replace(b"vertex 2", b"vertex two"), "does not fit"),
-        (HEADER.replace(b"vertex 2", b"vertex 999999999999999"), "cut short"),
-        (HEADER.replace(b"property float x", b"property float x\nproperty float x"), "named twice"),
-        (HEADER.replace(b"property float x\n", b""), "does not fit"),
-        (HEADER.replace(b"vertex 2", b"vertex 0"), "expected anchors .* found only x"),
-        (HEADER.replace(b"vertex 2", b"vertex 0").replace(b"float x", b"float f_dc_0"), "found Gaussians of 3DGS"),
-        (HEADER.replace(b"vertex 2", b"vertex 0").replace(b"float x", b"float f_offset_0"), "expected the columns x, y, z"),
+        (b"", ""),
+        (b"plain text", ""),
+        (HEADER[:-5], ""),
+        (HEADER + bytes(7), 2),
+        (HEADER.replace(b"binary_little_endian", b"ascii") + b"1\n", 2),
+        (HEADER.replace(b"binary_little_endian", b"ascii") + b"1\n1 2\n", 1),
+        (HEADER.replace(b"binary_little_endian", b"ascii") + b"1\nx\n", 1),
+        (HEADER.replace(b"float", b"quad"), "quad"),
+        (HEADER.replace(b"binary_little_endian", b"morse"), "morse"),
+        (HEADER.replace(b"property float x", b"property list uchar int x"), "list"),
+        (HEADER.replace(b"vertex 2", b"face 2"), "vertex"),
+        (HEADER.replace(b"vertex 2", b"vertex -2"), ""),
+        (HEADER.replace(b"vertex 2", b"vertex two"), ""),
+        (HEADER.replace(b"vertex 2", b"vertex 999999999999999"), "999,999,999,999,999"),
+        (HEADER.replace(b"property float x", b"property float x\nproperty float x"), ""),
+        (HEADER.replace(b"property float x\n", b""), ""),
+        (HEADER.replace(b"vertex 2", b"vertex 0"), "f_anchor_feat_*"),
+        (HEADER.replace(b"vertex 2", b"vertex 0").replace(b"float x", b"float f_dc_0"), "3DGS"),
+        (HEADER.replace(b"vertex 2", b"vertex 0").replace(b"float x", b"float f_offset_0"), "x, y, z"),
     ],
 )
-def test_damaged_or_other_files(tmp_path, data, message):
+def test_damaged_or_other_files(tmp_path, data, fact):
     (tmp_path / "bad.ply").write_bytes(data)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=naming("bad.ply", fact)):
         ply.read_anchor_ply(tmp_path / "bad.ply")
 
 
 def test_an_absent_file_and_values_that_are_not_finite(tmp_path):
-    with pytest.raises(InputError, match="found none"):
+    with pytest.raises(InputError, match=naming("absent.ply")):
         ply.read_vertices(tmp_path / "absent.ply")
     xyz, offsets, feature, scaling = anchors()
     feature[3, 4] = float("nan")
     ply.write_anchor_ply(tmp_path / "p.ply", xyz, offsets, feature, scaling)
-    with pytest.raises(InputError, match=r"expected finite feature in .*, found 1 anchors"):
+    with pytest.raises(InputError, match=naming("feature", "p.ply")):
         ply.read_anchor_ply(tmp_path / "p.ply")
     xyz, offsets, feature, scaling = anchors()
     for name, value in (("level", float("nan")), ("level", 1e9), ("level", -3.0), ("extra_level", float("inf")), ("info", float("nan"))):
         levels = {column: torch.ones(len(xyz)) for column in ("level", "extra_level", "info")}
         levels[name][2] = value
         ply.write_anchor_ply(tmp_path / "p.ply", xyz, offsets, feature, scaling, levels)
-        with pytest.raises(InputError, match="expected finite levels between 0 and 64"):
+        with pytest.raises(InputError, match=naming(0, 64, "p.ply")):
             ply.read_anchor_ply(tmp_path / "p.ply")
-    with pytest.raises(InputError, match="expected Gaussians of 3DGS"):
+    with pytest.raises(InputError, match=naming("3DGS", "p.ply")):
         ply.read_gaussian_ply(tmp_path / "p.ply")

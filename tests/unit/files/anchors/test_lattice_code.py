@@ -39,5 +39,5 @@ def test_short_steps_take_one_byte_and_the_longest_nine():
 
 @pytest.mark.parametrize("data", [[0x80], [0, 0x80], [0x80] * 9 + [0], [0xFF] * 20])
 def test_bytes_that_are_no_steps(data):
-    with pytest.raises(ValueError, match="a step is"):
+    with pytest.raises(ValueError):
         decode_steps(np.array(data, np.uint8))

@@ -22,6 +22,7 @@ from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 from scene_experts.training import run_folder
 from scene_experts.training.config import Data
 from scene_experts.training.state import resume
+from support.messages import naming
 from support.synthetic import make_capture
 
 VOXEL = 0.0173
@@ -88,7 +89,7 @@ def test_positions_on_no_lattice_are_drawn_but_not_packed(tmp_path, folder):
     write_anchor_ply(path, torch.randn(n, 3), torch.randn(n, 10, 3), torch.randn(n, 32), torch.randn(n, 6) - 3)
     out = import_result(tmp_path / "result", Data(folder), tmp_path / "run")
     assert len(run_folder.open_run(out).scene.table) == n
-    with pytest.raises(InputError, match="expected anchors on a lattice"):
+    with pytest.raises(InputError, match="--format anchors"):
         export_run(out, "compact")
     assert export_run(out, "anchors", tmp_path / "again")
 
@@ -96,16 +97,16 @@ def test_positions_on_no_lattice_are_drawn_but_not_packed(tmp_path, folder):
 def test_an_imported_run_cannot_be_resumed(tmp_path, folder):
     published(tmp_path / "result")
     out = import_result(tmp_path / "result", Data(folder), tmp_path / "run")
-    with pytest.raises(InputError, match="trained with other settings"):
+    with pytest.raises(InputError, match="--out"):
         resume(run_folder.open_run(out).cfg, out / "checkpoints", "cpu")
-    with pytest.raises(InputError, match="found checkpoints"):
+    with pytest.raises(InputError, match="--out"):
         import_result(tmp_path / "result", Data(folder), out)
 
 
 def test_another_world_is_refused(tmp_path, folder):
     published(tmp_path / "result")
     out = import_result(tmp_path / "result", Data(folder), tmp_path / "run")
-    with pytest.raises(InputError, match=r"expected the capture in the world of the scene .* --normalise"):
+    with pytest.raises(InputError, match="--normalise"):
         import_result(out, Data(folder, normalise="extent"), tmp_path / "other")
     assert checkpoint.latest(tmp_path / "other" / "checkpoints") is None
 
@@ -115,18 +116,18 @@ def test_what_cannot_be_drawn_is_refused(tmp_path, folder):
     published(root)
     iteration = root / "point_cloud" / "iteration_30000"
     torch.save({"embedding.weight": torch.zeros(99, 0)}, iteration / "embedding_appearance.pt")
-    with pytest.raises(InputError, match="expected 99 training views"):
+    with pytest.raises(InputError, match=naming(99, "--split")):
         import_result(root, Data(folder), tmp_path / "run")
     assert not (tmp_path / "run").exists()
     (iteration / "embedding_appearance.pt").unlink()
-    with pytest.raises(InputError, match="expected a result folder or a file of a scene"):
+    with pytest.raises(InputError, match="absent"):
         import_result(tmp_path / "absent", Data(folder), tmp_path / "run")
     plain = read_vertices(iteration / "point_cloud.ply")
     write_vertices(iteration / "point_cloud.ply", {**plain, "level": plain["x"] * 0, "extra_level": plain["x"] * 0, "info": plain["x"] * 0})
-    with pytest.raises(InputError, match="cell edge and the distance of Octree-GS"):
+    with pytest.raises(InputError, match="info"):
         import_result(root, Data(folder), tmp_path / "run")
     write_vertices(iteration / "point_cloud.ply", plain)
-    with pytest.raises(InputError, match="expected the folder of a capture"):
+    with pytest.raises(InputError, match="absent"):
         import_result(root, replace(Data(folder), path=tmp_path / "absent"), tmp_path / "run")
 
 
@@ -174,7 +175,7 @@ def test_a_published_octree_draws_the_levels_its_distances_ask_for(tmp_path, fol
     asked = getattr(torch, rule)(torch.log(standard / r) / math.log(fork) + extra).clamp(0, 2)
     assert opened.scene.select(table, camera, 30_000, False).tolist() == (level <= asked).nonzero().squeeze(1).tolist()
     assert (opened.config.train.scene.select.fork, opened.config.train.scene.select.rule) == (fork, rule)
-    with pytest.raises(InputError, match="found ones that see the level too"):
+    with pytest.raises(InputError, match=naming(tmp_path)):
         (tmp_path / "result" / "cfg_args").write_text("Namespace(add_level=True)")
         import_result(tmp_path / "result", Data(folder), tmp_path / "other")
     assert opened.config.train.recipe == "octree-gs" and opened.scene.heads["color"].w1.shape == scene.heads["color"].w1.shape

@@ -39,7 +39,7 @@ def test_a_reference_to_the_outside_keeps_its_key():
 
 def test_a_pickle_too_large_to_be_a_network(monkeypatch):
     monkeypatch.setattr(pickle_data, "SIZE_LIMIT", 10)
-    with pytest.raises(NotData, match="11 bytes"):
+    with pytest.raises(NotData, match="11"):
         decode(b"x" * 11)
     with pytest.raises(NotData):
         decode(b"\x80\x04N")  # no end

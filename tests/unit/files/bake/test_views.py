@@ -63,5 +63,5 @@ def test_sums_go_over_the_training_views_and_free_ones(capture, monkeypatch):
 
 
 def test_a_capture_without_training_views_is_refused(capture):
-    with pytest.raises(InputError, match="expected training views"):
+    with pytest.raises(InputError, match="--split"):
         Views.of(replace(capture, train=()))

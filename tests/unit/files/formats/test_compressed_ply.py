@@ -10,6 +10,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.files.formats.comments import read_note
 from scene_experts.files.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from scene_experts.files.formats.splats import Splats
+from support.messages import naming
 from support.splat_quanta import check, scene
 
 
@@ -42,19 +43,19 @@ def test_damaged_files(tmp_path):
     path = tmp_path / "a.ply"
     write_compressed_ply(path, scene(300, 1), {})
     good = path.read_bytes()
-    for data, words in (
-        (good[:-1], "asks for more"),
-        (good[:300], "no end of its header"),
-        (good.replace(b"element vertex 300", b"element vertex 999"), "another layout|asks for more"),
-        (good.replace(b"element vertex 300", b"element vertex -30"), "another layout"),
-        (good.replace(b"property uint packed_position", b"property float packed_position"), "another layout"),
-        (good.replace(b"property float min_x", b"property uint min_x"), "another layout"),
-        (good.replace(b"property uchar f_rest_0", b"property float f_rest_0"), "another layout"),
-        (good.replace(b"element chunk 2", b"element chunk 1"), "1 chunks for 300|asks for more"),
-        (good.replace(b"property float min_x", b"property float min_q"), "another layout"),
-        (good.replace(b"property uint packed_scale", b"property quad packed_scale"), "another layout"),
-        (good.replace(b"f_rest_8", b"f_rest_9"), "another layout"),
+    for data in (
+        good[:-1],
+        good[:300],
+        good.replace(b"element vertex 300", b"element vertex 999"),
+        good.replace(b"element vertex 300", b"element vertex -30"),
+        good.replace(b"property uint packed_position", b"property float packed_position"),
+        good.replace(b"property float min_x", b"property uint min_x"),
+        good.replace(b"property uchar f_rest_0", b"property float f_rest_0"),
+        good.replace(b"element chunk 2", b"element chunk 1"),
+        good.replace(b"property float min_x", b"property float min_q"),
+        good.replace(b"property uint packed_scale", b"property quad packed_scale"),
+        good.replace(b"f_rest_8", b"f_rest_9"),
     ):
         path.write_bytes(data)
-        with pytest.raises(InputError, match=f"expected a whole compressed PLY file at .*({words})"):
+        with pytest.raises(InputError, match=naming(path)):
             read_compressed_ply(path)

@@ -14,6 +14,7 @@ from scene_experts.files.formats import gltf
 from scene_experts.geometry.rotation import covariance
 from scene_experts.geometry.sh import sh_to_rgb
 from support.gltf import column, parsed
+from support.messages import naming
 from support.splat_quanta import check, scene
 
 
@@ -86,29 +87,29 @@ def test_damaged_files(tmp_path):
     gltf.write_glb(path, scene(20, 1), {})
     good, (doc, body) = path.read_bytes(), parsed(path)
 
-    def refused(words):
-        with pytest.raises(InputError, match=f"expected a whole glTF file at .*{words}"):
+    def refused(fact=""):
+        with pytest.raises(InputError, match=naming(path, fact)):
             gltf.read_glb(path)
 
-    for data, words in ((good[:-8], "its header says"), (good[:10], "another header"), (b"glTF" + bytes(40), "another header")):
+    for data in (good[:-8], good[:10], b"glTF" + bytes(40)):
         path.write_bytes(data)
-        refused(words)
-    for change, words in (
-        (lambda d: d["accessors"][0].update(count=10**9), "beyond the file"),
-        (lambda d: d["accessors"][0].update(count=float("inf")), "do not fit"),
-        (lambda d: d["bufferViews"][0].update(byteOffset=-4), "beyond the file"),
-        (lambda d: d["accessors"][0].update(componentType=1), "do not fit"),
-        (lambda d: d["accessors"][3].update(count=19), "several lengths"),
-        (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), "do not fit"),
-        (lambda d: d.update(meshes=[], extensionsUsed=[]), "no primitive with"),
-        (lambda d: d.update(meshes=5), "do not fit"),
-        (lambda d: d.update(meshes=[], extensionsUsed=None), "do not fit"),
-        (lambda d: d["accessors"][2].update(type="VEC3"), "other widths"),
-        (lambda d: d["accessors"][0].update(type="VEC2"), "other widths"),
+        refused()
+    for change, fact in (
+        (lambda d: d["accessors"][0].update(count=10**9), "accessor 0"),
+        (lambda d: d["accessors"][0].update(count=float("inf")), ""),
+        (lambda d: d["bufferViews"][0].update(byteOffset=-4), "accessor 0"),
+        (lambda d: d["accessors"][0].update(componentType=1), ""),
+        (lambda d: d["accessors"][3].update(count=19), ""),
+        (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), ""),
+        (lambda d: d.update(meshes=[], extensionsUsed=[]), "KHR_gaussian_splatting"),
+        (lambda d: d.update(meshes=5), ""),
+        (lambda d: d.update(meshes=[], extensionsUsed=None), ""),
+        (lambda d: d["accessors"][2].update(type="VEC3"), ""),
+        (lambda d: d["accessors"][0].update(type="VEC2"), ""),
     ):
         changed = json.loads(json.dumps(doc))
         change(changed)
         rebuilt(path, changed, body)
-        refused(words)
+        refused(fact)
     rebuilt(path, [1], body)
-    refused("no object")
+    refused()

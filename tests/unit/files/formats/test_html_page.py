@@ -22,6 +22,7 @@ from scene_experts.files.formats.splats import Splats
 from scene_experts.geometry.rotation import quat_to_matrix
 from scene_experts.geometry.sh import sh_to_rgb
 from scene_experts.render.reference import ReferenceRasterizer
+from support.messages import naming
 from support.splat_quanta import check, scene
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -138,7 +139,7 @@ def test_settings_of_the_page():
     assert page_settings(s.rows(torch.zeros(0, dtype=torch.int64)), {})["distance"] > 0
     assert json.loads(json.dumps(found)) == found
     for bad in ({"position": [0, 0]}, entry | {"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, entry | {"fov": 180}, {"a": 1}):
-        with pytest.raises(InputError, match="expected cameras with position"):
+        with pytest.raises(InputError, match="position"):
             page_settings(s, {"camera": bad})
 
 
@@ -158,14 +159,14 @@ def test_a_capture_s_views_in_the_frame_of_the_file():
 
 def test_damaged_pages(tmp_path):
     path = tmp_path / "a.html"
-    for text, words in (
-        ("<html>", "no scene in it"),
-        ('<script type="text/plain" id="scene">%%%</script>', "no base64"),
-        ('<script type="text/plain" id="scene">AAAA</script>', "SPZ"),
-        ('<script type="text/plain" id="scene">AAAA', "no scene in it"),
+    for text in (
+        "<html>",
+        '<script type="text/plain" id="scene">%%%</script>',
+        '<script type="text/plain" id="scene">AAAA</script>',
+        '<script type="text/plain" id="scene">AAAA',
     ):
         path.write_text(text)
-        with pytest.raises(InputError, match=words):
+        with pytest.raises(InputError, match=naming(path)):
             read_html(path)
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scene_experts.core.errors import InputError
 from scene_experts.files.formats import spz
 from scene_experts.files.formats.splats import Splats
+from support.messages import naming
 from support.splat_quanta import check, scene
 
 
@@ -100,25 +101,25 @@ def test_damaged_files(tmp_path):
     raw = gzip.decompress(good)
     bomb = gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 40_000_000, 3, 12, 0, 0) + bytes(10_000_000))
     cases = {
-        good[:-20]: "attributes where|does not unpack",
-        good[:8]: "no whole header|does not unpack",
-        b"\x1f\x8b rubbish": "does not unpack",
-        gzip.compress(raw[:-5]): "bytes of attributes where",
-        gzip.compress(raw + b"x"): "bytes of attributes where",
-        gzip.compress(b"XXXX" + raw[4:]): "another header",
-        gzip.compress(raw[:4] + struct.pack("<I", 9) + raw[8:]): "a header of version 9",
-        gzip.compress(raw[:12] + b"\x09" + raw[13:]): "harmonics of degree 9",
-        gzip.compress(raw[:8] + struct.pack("<I", 1 << 31) + raw[12:]): "above the limit",
-        bomb: "bytes that unpack to",
-        version_4(scene(30))[:-9]: "a stream",
-        version_4(scene(30))[:40]: "table",
-        version_4(scene(30), degree=1): "a stream",
-        version_4(scene(30))[:20]: "no whole header",
+        good[:-20]: "",
+        good[:8]: "",
+        b"\x1f\x8b rubbish": "",
+        gzip.compress(raw[:-5]): "1,320",
+        gzip.compress(raw + b"x"): "1,320",
+        gzip.compress(b"XXXX" + raw[4:]): "",
+        gzip.compress(raw[:4] + struct.pack("<I", 9) + raw[8:]): "9",
+        gzip.compress(raw[:12] + b"\x09" + raw[13:]): "9",
+        gzip.compress(raw[:8] + struct.pack("<I", 1 << 31) + raw[12:]): "2,147,483,648",
+        bomb: "2,600,000,000",
+        version_4(scene(30))[:-9]: "",
+        version_4(scene(30))[:40]: "6",
+        version_4(scene(30), degree=1): "",
+        version_4(scene(30))[:20]: "",
     }
-    for i, (data, words) in enumerate(cases.items()):
+    for i, (data, fact) in enumerate(cases.items()):
         path = tmp_path / f"{i}.spz"
         path.write_bytes(data)
-        with pytest.raises(InputError, match=f"expected a whole SPZ file at .*({words})"):
+        with pytest.raises(InputError, match=naming(path, fact)):
             spz.read_spz(path)
-    with pytest.raises(InputError, match="expected positions within"):
+    with pytest.raises(InputError, match="SPZ"):
         spz.spz_bytes(scene(3, 0, 0, 1e8))

@@ -11,6 +11,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.files.formats.comments import read_note
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.formats.standard import FORMATS, format_of, read_standard, write_standard
+from support.messages import naming
 from support.splats import splats
 
 NOTE = {"recipe": "moe-gs", "psnr": 21.88}
@@ -33,16 +34,16 @@ def test_every_format_is_known_by_its_content(tmp_path, format):
 
 
 def test_what_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"expected a format of ply.*, found 'plx'; did you mean 'ply'"):
+    with pytest.raises(InputError, match=naming("plx", "ply")):
         write_standard(tmp_path / "a", splats(), "plx", {})
     s = splats()
     s.sh[2, 1, 0] = float("nan")
-    with pytest.raises(InputError, match="expected finite sh, found 1 Gaussians"):
+    with pytest.raises(InputError, match=naming("sh", 1)):
         write_standard(tmp_path / "a", s, "ply", {})
-    with pytest.raises(InputError, match="found none; check the path"):
+    with pytest.raises(InputError, match=naming(tmp_path / "a")):
         read_standard(tmp_path / "a")
     (tmp_path / "a").write_bytes(b"plain words")
-    with pytest.raises(InputError, match="found something else"):
+    with pytest.raises(InputError, match=naming(tmp_path / "a")):
         read_standard(tmp_path / "a")
 
 
@@ -83,6 +84,6 @@ def test_damage_of_any_kind_is_a_sentence_or_a_scene(good, tmp_path_factory, for
     try:
         found = read_standard(path)
     except InputError as error:
-        assert str(error).startswith("expected ")
+        assert str(error) and "\n" not in str(error)
     else:
         assert isinstance(found, Splats)

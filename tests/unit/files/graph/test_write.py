@@ -15,6 +15,7 @@ from scene_experts.files.ply import read_vertices
 from scene_experts.render import choose
 from scene_experts.scene.graph.scene import GraphScene
 from scene_experts.training import run_folder
+from support.messages import naming
 
 
 def test_a_row_takes_196_bytes_in_the_layout_of_sags(made):
@@ -55,5 +56,5 @@ def test_the_files_alone_give_the_same_picture_in_the_capture_s_own_frame(made):
 
 @pytest.mark.parametrize("format", ["anchors", "compact"])
 def test_formats_that_cannot_hold_it_say_so(format, made):
-    with pytest.raises(InputError, match="'sags'; use a standard format such as ply; its own files are in point_cloud"):
+    with pytest.raises(InputError, match=naming("sags", "ply")):
         export_run(made[0], format)
