@@ -1,11 +1,16 @@
-"""The figures of README.md and docs/results.md are those of the records: whoever adds a record must say what it says."""
+"""The figures of README.md, docs/results.md and the pages of results/ are those of the records."""
 
+import functools
 import json
 import re
+import shlex
 import statistics
+from pathlib import Path
 
 import pytest
 
+from scene_experts import cli
+from scene_experts.reproduce import figures, store
 from support.places import ROOT
 
 RECORDS = ROOT / "results" / "records"
@@ -96,3 +101,37 @@ def test_the_claims_are_quoted_as_they_were_judged():
 
 def claimed(low: str, high: str) -> str:
     return rf"(?:95 % interval )?{re.escape(low)} to {re.escape(high)}\)"
+
+
+def commands() -> dict[str, list[str]]:
+    """The arguments of each command of results/README.md, by its --out."""
+    text = (ROOT / "results" / "README.md").read_text().replace("\\\n", " ")
+    found = [shlex.split(line) for line in text.splitlines() if line.startswith("scene-experts reproduce")]
+    return {words[words.index("--out") + 1]: words[1:] for words in found}
+
+
+@pytest.mark.parametrize("folder", ["seeds", "parts", "parts/fox", "suite", "long", "long/fox", "extras"])
+def test_pages_are_what_their_commands_write(folder, tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+
+    def no_picture(figure, path: Path) -> list[Path]:
+        figures.discard(figure)
+        return [path.with_suffix(".png"), path.with_suffix(".svg")]
+
+    monkeypatch.setattr(figures, "save", no_picture)
+    monkeypatch.setattr(store, "load", lambda place: records(RECORDS))
+    page, out = ROOT / "results" / folder, tmp_path / "out"
+    out.mkdir()
+    for strip in page.glob("fig5_*"):
+        (out / strip.name).touch()
+    args = commands()[f"results/{folder}"]
+    args = [word.replace("CAPTURES", str(tmp_path)).replace("RUNS", str(tmp_path)).replace(f"results/{folder}", str(out)) for word in args]
+    for word in args:
+        if word.startswith(f"{tmp_path}/") and word != str(out):
+            Path(word).mkdir()
+    assert cli.main([*args, "--tables-only"]) == 0
+    for path in sorted(path for path in page.iterdir() if path.suffix in (".md", ".csv", ".tex")):
+        assert (out / path.name).read_text() == path.read_text(), path
+
+
+records = functools.cache(store.load)

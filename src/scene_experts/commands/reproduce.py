@@ -18,7 +18,7 @@ from scene_experts.data.fetch import catalog
 from scene_experts.data.fetch.obtain import captures_dir
 from scene_experts.reproduce import report, store
 from scene_experts.reproduce.experiments import EXPERIMENTS, OURS, Experiment
-from scene_experts.reproduce.plan import Scale, Scene, Spec, distinct, expect_captures, own_scenes, paper_scenes, specs
+from scene_experts.reproduce.plan import Scale, Scene, Spec, check_folders, drop_repeated, find_own_scenes, find_paper_scenes, list_runs
 from scene_experts.reproduce.runner import Failure, Runner, Say
 
 
@@ -86,13 +86,13 @@ def reproduce(args: list[str]) -> int:
         say("nothing to run: these scenes are in none of these experiments")
     for run in command.adopt:
         say(f"adopted {report.adopt(run, plan.records)}")
-    store.expect_of_captures(store.load(plan.records), plan.wanted)
+    store.check_captures(store.load(plan.records), plan.wanted)
     if command.dry_run:
         tell(plan, say)
         return 0
     runner = Runner(plan.runs, plan.records, workers, command.devices, command.discard, say, artist(command, plan))
     failures = [] if command.tables_only else made(runner, plan, command.out)
-    found = store.of_specs(store.load(plan.records), plan.shown)
+    found = store.find_all(store.load(plan.records), plan.shown)
     for path in report.write(command.out, plan.experiments, plan.scenes, found, said(command, plan.scenes)):
         say(f"wrote {path}")
     if runner.stop.is_set():
@@ -115,10 +115,10 @@ def planned(command: ReproduceCommand) -> Plan:
     scale = Scale.of(command.scale, command.iterations, command.resolution)
     chosen = rows_of(chosen, command.recipes) if command.recipes else chosen
     if not command.tables_only:
-        expect_captures(scenes)
-    shown = specs(chosen, scenes, command.seeds or (0,), scale)
+        check_folders(scenes)
+    shown = list_runs(chosen, scenes, command.seeds or (0,), scale)
     records, runs = command.records or command.out / "records", command.runs or command.out / "runs"
-    return Plan(chosen, scenes, shown, distinct(shown), records, runs)
+    return Plan(chosen, scenes, shown, drop_repeated(shown), records, runs)
 
 
 def tell(plan: Plan, say: Say) -> None:
@@ -136,7 +136,7 @@ def artist(command: ReproduceCommand, plan: Plan) -> Callable[[Spec, Path], None
 
     def draw(spec: Spec, folder: Path) -> None:
         if spec.recipe in figure5 and spec.seed == min(command.seeds or (0,)):
-            report.expert_strip(spec, folder, command.out)
+            report.draw_experts(spec, folder, command.out)
 
     return draw
 
@@ -144,7 +144,7 @@ def artist(command: ReproduceCommand, plan: Plan) -> Callable[[Spec, Path], None
 def made(runner: Runner, plan: Plan, out: Path) -> list[Failure]:
     """Makes what is not done, and the pictures in `out` of what was done before they were asked for; returns the runs that failed."""
     with handled(lambda *_: runner.end()):
-        failures = runner.make(plan.wanted)
+        failures = runner.run_all(plan.wanted)
     for spec in plan.wanted:
         folder = spec.folder(plan.runs)
         if (folder / "results.json").is_file() and not report.strip_path(out, spec.scene.name).is_file():
@@ -194,7 +194,7 @@ def experiments_of(command: ReproduceCommand) -> list[Experiment]:
 def scenes_of(command: ReproduceCommand) -> list[Scene]:
     """The captures to run on: the user's own, or those of the paper that are there."""
     root = command.data or captures_dir()
-    scenes = own_scenes(command.captures) if command.captures else paper_scenes(root)
+    scenes = find_own_scenes(command.captures) if command.captures else find_paper_scenes(root)
     unknown = set(command.scenes) - {s.name for s in scenes}
     if unknown and command.captures:
         names = ", ".join(s.name for s in scenes)

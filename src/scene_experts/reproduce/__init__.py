@@ -1,1 +1,1 @@
-"""The paper's tables and figures, from runs that are made, continued or reused."""
+"""The paper's tables and figures, from runs that are trained, resumed or reused."""

@@ -1,4 +1,4 @@
-"""The paper's charts from our records: Figures 1(b), 3, 6 and 7, as PNG and SVG."""
+"""Figures 1(b), 3, 6 and 7 of the paper from our records, as PNG and SVG."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from PIL import Image
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
 from scene_experts.reproduce.experiments import ROUTINGS, Experiment
-from scene_experts.reproduce.statistics import mean, of_recipe, shared
+from scene_experts.reproduce.statistics import clock_of, mean, on_common_scenes, select
 from scene_experts.reproduce.store import Record
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # told apart by colour-blind readers
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # distinct for colour-blind readers
 
 ROUTING_NAMES = {"top1": "Top-1", "top2": "Top-2", "dense": "dense"}
 
 
 def canvas(columns: int = 1, width: float = 6.4, height: float = 3.8) -> tuple[Any, Any]:
-    """A figure and its axes. Raises InputError without matplotlib."""
+    """Return a figure and its axes [1, columns]; `width` and `height` in inches. Raises InputError without matplotlib."""
     try:
         import matplotlib
     except ImportError as error:
@@ -34,10 +34,10 @@ def canvas(columns: int = 1, width: float = 6.4, height: float = 3.8) -> tuple[A
 
 
 def save(figure: Any, path: Path) -> list[Path]:
-    """Write PNG and SVG beside each other, each whole or not at all; the same bytes each time."""
+    """Write PNG and SVG files, each whole or not at all. The same figure gives the same bytes."""
     from matplotlib import pyplot, rcParams
 
-    rcParams["svg.hashsalt"] = "scene-experts"  # names of parts in the file
+    rcParams["svg.hashsalt"] = "scene-experts"  # makes the ids in the file deterministic
     out = []
     for ending in ("png", "svg"):
         stream = io.BytesIO()
@@ -48,8 +48,8 @@ def save(figure: Any, path: Path) -> list[Path]:
     return out
 
 
-def framed(picture: Path) -> Path:
-    """The SVG beside a PNG: a frame of its size that holds it."""
+def wrap_in_svg(picture: Path) -> Path:
+    """Write an SVG of the same size beside a PNG, which it embeds."""
     with Image.open(picture) as image:
         width, height = image.size
     data = base64.b64encode(picture.read_bytes()).decode()
@@ -60,56 +60,57 @@ def framed(picture: Path) -> Path:
 
 
 def relative_psnr(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str], path: Path) -> list[Path]:
-    """Figure 1(b): PSNR relative to the first row (3DGS) in percent, scenes in order of Scaffold-GS's anchors."""
-    anchors = {s: m.value for s in scenes if (m := mean(of_recipe(records, "scaffold-gs", s), "anchors"))}
+    """Draw Figure 1(b): PSNR relative to the first row (3DGS) in %, scenes in the order of Scaffold-GS's anchor counts."""
+    anchors = {s: m.value for s in scenes if (m := mean(select(records, "scaffold-gs", s), "anchors"))}
     (_, first), *others = experiment.rows.items()
-    base = {s: m.value for s in scenes if (m := mean(of_recipe(records, first, s), "psnr"))}
+    base = {s: m.value for s in scenes if (m := mean(select(records, first, s), "psnr"))}
     shown = sorted((s for s in scenes if s in anchors and s in base), key=lambda s: anchors[s])
     if not shown:
         return []
     figure, axes = canvas(width=max(6.4, 0.9 * len(shown)))
     for i, (name, recipe) in enumerate(others):
-        found = [(j, m.value) for j, s in enumerate(shown) if (m := mean(of_recipe(records, recipe, s), "psnr"))]
+        found = [(j, m.value) for j, s in enumerate(shown) if (m := mean(select(records, recipe, s), "psnr"))]
         xs = [j + (i - (len(others) - 1) / 2) * 0.38 for j, _ in found]
         axes[0, 0].bar(xs, [100 * (v / base[shown[j]] - 1) for j, v in found], 0.36, color=COLOURS[i], label=name)
     axes[0, 0].axhline(0, color="black", linewidth=0.8)
     axes[0, 0].set_xticks(range(len(shown)), [f"{s}\n{anchors[s] / 1000:.0f}k" for s in shown])
-    axes[0, 0].set(ylabel="PSNR relative to 3DGS, %", xlabel="scene, by anchors of Scaffold-GS")
+    axes[0, 0].set(ylabel="PSNR relative to 3DGS, %", xlabel="scene, sorted by the number of Scaffold-GS anchors")
     figure.legend(loc="outside upper center", ncols=len(others))
     return save(figure, path)
 
 
-def shares(experiment: Experiment, records: Sequence[Record], scene: str, path: Path, attribute: str = "cov") -> list[Path]:
-    """Figure 3: share of the assignments per expert over training (of the gates while dense), one panel per row."""
-    found = [(name, of_recipe(records, recipe, scene)) for name, recipe in experiment.rows.items()]
+def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str, path: Path, attribute: str = "cov") -> list[Path]:
+    """Draw Figure 3: each expert's share of the assignments (of the gates while dense) during training, one panel per row."""
+    found = [(name, select(records, recipe, scene)) for name, recipe in experiment.rows.items()]
     found = [(name, min(rows, key=lambda r: r.seed)) for name, rows in found if rows]
     found = [(name, record) for name, record in found if any(attribute in c.get("routing", {}) for c in record.curves)]
     if not found:
         return []
     figure, axes = canvas(len(found))
     for axis, (name, record) in zip(axes[0], found):
-        whose = "scene_routing" if any("scene_routing" in c for c in record.curves) else "routing"  # older records: a view's anchors
+        whose = "scene_routing" if any("scene_routing" in c for c in record.curves) else "routing"  # older records: anchors of one view
         points = [(c["step"], c[whose][attribute]) for c in record.curves if attribute in c.get(whose, {})]
         for e in range(len(points[0][1]) if points else 0):
             axis.plot([s for s, _ in points], [100 * v[e] for _, v in points], color=COLOURS[e], label=f"expert {e + 1}")
         decoder = getattr(record.config.train.scaled().scene, "decoder", None)
         axis.axvline(getattr(decoder, "warmup", 0), color="grey", linestyle=":", linewidth=1, label="end of the dense warm-up")
         axis.set(title=f"{name} ({scene})", xlabel="iteration", ylim=(0, 100))
-        axis.set_ylabel(f"share of {attribute} assignments, % (dense: of gates)")
+        axis.set_ylabel(f"share of {attribute} assignments (dense: of gates), %")
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
     return save(figure, path)
 
 
 def cost(experiment: Experiment, records: Sequence[Record], path: Path) -> list[Path]:
-    """Figure 6: PSNR against training time; a line per routing, a point per number of experts."""
+    """Draw Figure 6: PSNR against training time, one line per routing, one point per number of experts."""
     figure, axes = canvas()
-    drawn, records = False, shared(records, experiment.rows.values())
+    drawn, records = False, on_common_scenes(records, experiment.rows.values())
+    clock = clock_of(records)
     for i, routing in enumerate(ROUTINGS):
         points = []
         for num in (2, 3, 4, 5):
-            rows = of_recipe(records, f"moe-gs-e{num}-{routing}")
-            psnr, seconds = mean(rows, "psnr"), mean(rows, "train_seconds")
+            rows = select(records, f"moe-gs-e{num}-{routing}")
+            psnr, seconds = mean(rows, "psnr"), mean(rows, clock)
             if psnr and seconds:
                 points.append((seconds.value / 60, psnr.value, num))
         if points:
@@ -117,36 +118,38 @@ def cost(experiment: Experiment, records: Sequence[Record], path: Path) -> list[
             axes[0, 0].plot([p[0] for p in points], [p[1] for p in points], "o-", color=COLOURS[i], label=ROUTING_NAMES[routing])
             for x, y, num in points:
                 axes[0, 0].annotate(str(num), (x, y), textcoords="offset points", xytext=(5, 4), fontsize=8)
-    axes[0, 0].set(xlabel=f"training, minutes (mean over {names(records)})", ylabel="PSNR, dB; numbers: experts")
+    time = "CPU" if clock == "cpu_seconds" else "wall"
+    label = f"training, {time} minutes (mean over {list_scenes(records)})"
+    axes[0, 0].set(xlabel=label, ylabel="PSNR, dB (labels: number of experts)")
     if drawn:
         figure.legend(loc="outside upper center", ncols=len(ROUTINGS))
     return save(figure, path) if drawn else discard(figure)
 
 
 def layers(experiment: Experiment, records: Sequence[Record], path: Path) -> list[Path]:
-    """Figure 7: scores of Scaffold-GS against the number of linear layers."""
+    """Draw Figure 7: scores of Scaffold-GS against the number of linear layers."""
     columns = [("psnr", "PSNR, dB"), ("ssim", "SSIM"), ("lpips_3dgs", "LPIPS")]
     figure, axes = canvas(len(columns), width=4.2)
-    drawn, records = False, shared(records, experiment.rows.values())
+    drawn, records = False, on_common_scenes(records, experiment.rows.values())
     for axis, (column, title) in zip(axes[0], columns):
-        found = [(int(name.split()[0]), mean(of_recipe(records, recipe), column)) for name, recipe in experiment.rows.items()]
+        found = [(int(name.split()[0]), mean(select(records, recipe), column)) for name, recipe in experiment.rows.items()]
         points = [(n, m) for n, m in found if m is not None]
         if points:
             drawn = True
             spreads = [m.spread or 0.0 for _, m in points]
             axis.errorbar([n for n, _ in points], [m.value for _, m in points], spreads, fmt="o-", color=COLOURS[0], capsize=3)
         axis.set(xlabel="linear layers", ylabel=title, xticks=[n for n, _ in found])
-    figure.suptitle(f"mean over {names(records)}", fontsize="medium")
+    figure.suptitle(f"mean over {list_scenes(records)}", fontsize="medium")
     return save(figure, path) if drawn else discard(figure)
 
 
-def names(records: Sequence[Record]) -> str:
-    """The scenes of records, for a label."""
+def list_scenes(records: Sequence[Record]) -> str:
+    """List the scenes of records, for a label."""
     return ", ".join(sorted({r.scene for r in records}))
 
 
 def discard(figure: Any) -> list[Path]:
-    """Close a figure on which nothing was drawn."""
+    """Close an empty figure."""
     from matplotlib import pyplot
 
     pyplot.close(figure)

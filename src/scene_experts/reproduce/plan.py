@@ -1,4 +1,4 @@
-"""Which runs an experiment needs, each with everything that changes its numbers, and how short a smaller experiment is."""
+"""The runs that an experiment needs, each with every setting that changes its numbers, and the size of a smaller experiment."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from scene_experts.reproduce.experiments import Experiment
 from scene_experts.training.config import Data, Train, flags_of, to_json, with_numbers
 
 COLLECTIONS = {"mipnerf360": "MipNeRF360", "tandt": "TanksAndTemples", "db": "DeepBlending", "bungeenerf": "BungeeNeRF"}
-OWN = "captures"  # the name of the user's own captures among the data sets
+OWN = "captures"  # the data set of the user's own captures
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A capture to train on. `options`: what its protocol sets in Data (resolution, split, normalise, ...); `numbers`: in Train."""
+    """A capture to train on. Its protocol sets `options` of Data (resolution, split, normalise, ...) and `numbers` of Train."""
 
     name: str
     dataset: str
@@ -35,28 +35,31 @@ class Scene:
 
 @dataclass(frozen=True)
 class Scale:
-    """How large an experiment is: the share of each recipe's schedule, or iterations, and the picture's size (None: the protocol's)."""
+    """The size of an experiment."""
 
     share: float = 1.0
-    iterations: int | None = None  # in place of the share, the same for all recipes
+    """Share of each recipe's schedule, in (0, 1]."""
+    iterations: int | None = None
+    """Iterations of every recipe; replaces the share."""
     resolution: str | None = None
+    """Resolution policy; None: that of the scene's protocol."""
 
     @classmethod
     def of(cls, scale: float, iterations: int | None = None, resolution: str | None = None) -> Scale:
-        """`scale` in (0, 1] shortens the schedule and the pictures' sides together; the other two override it. Raises InputError."""
+        """Make a scale. `scale` in (0, 1] shortens the schedule and the pictures' sides; the other two override it. Raises InputError."""
         if not 0 < scale <= 1:
-            raise InputError(f"expected --scale above 0 and at most 1, found {scale}; 1 is the paper's own size")
+            raise InputError(f"expected --scale above 0 and at most 1, found {scale}; 1 is the paper's size")
         if iterations is not None and iterations < 1:
             raise InputError(f"expected --iterations of at least 1, found {iterations}; give a larger number or leave it out")
         return cls(scale, iterations, check_policy(resolution) if resolution and resolution != "auto" else resolution)
 
     def length(self, cfg: Train) -> int:
-        """Iterations of a recipe: Octree-GS is written for 40,000, the others for 30,000."""
+        """Return the iterations of a recipe. The full schedule of Octree-GS has 40,000, that of the others 30,000."""
         return self.iterations or max(1, round(cfg.schedule * self.share))
 
 
-def smaller(policy: str, share: float) -> str:
-    """The resolution policy that gives `share` of the sides that `policy` gives; what inria:N reads is made of the full photographs."""
+def shrink(policy: str, share: float) -> str:
+    """Return the policy whose pictures have `share` of the side lengths of `policy`. inria:N becomes factor:M of the full photographs."""
     kind, _, number = policy.partition(":")
     if kind in ("inria", "factor", "as-is"):
         return f"factor:{float(number or 1) / share:g}"
@@ -85,17 +88,17 @@ class Spec:
         if self.scale.resolution:
             options["resolution"] = self.scale.resolution
         elif self.scale.share < 1:
-            options["resolution"] = smaller(options.get("resolution", "auto"), self.scale.share)
+            options["resolution"] = shrink(options.get("resolution", "auto"), self.scale.share)
         return Data(path=self.scene.path, **options)
 
     @property
     def key(self) -> str:
-        """A short hash of everything that changes the run's numbers but the place of the capture."""
+        """A short hash of every setting that changes the run's numbers. The path of the capture is left out."""
         return identity(self.scene.name, self.train, self.data)
 
     @property
     def numbers(self) -> str:
-        """The same hash without the recipe's name: some rows of different experiments are one and the same training."""
+        """The same hash without the recipe's name. Rows of different experiments with the same hash are the same training."""
         return identity(self.scene.name, replace(self.train, recipe=""), self.data)
 
     @property
@@ -103,11 +106,11 @@ class Spec:
         return f"{self.recipe} on {self.scene.name}, seed {self.seed}"
 
     def folder(self, root: Path) -> Path:
-        """Where its run folder is: readable, and never that of another configuration."""
+        """Return the path of the run folder. No two configurations share one."""
         return root / self.scene.name / self.recipe / f"seed{self.seed}-{self.key}"
 
     def arguments(self, out: Path) -> list[str]:
-        """The arguments of `scene-experts train` that make it."""
+        """Return the arguments of `scene-experts` that train the run."""
         args = ["train", self.recipe, "--data", str(self.scene.path), "--out", str(out)]
         args += ["--iterations", str(self.train.iterations), "--seed", str(self.seed), "--preview-every", "0"]
         args += flags_of(self.train, self.scene.numbers)
@@ -118,31 +121,31 @@ class Spec:
 
 
 def identity(scene: str, train: Train, data: Data) -> str:
-    """The hash that names a run: scene, recipe with all numbers, how the capture is read; not where it lies."""
+    """Return the hash that names a run: of the scene's name, the recipe with all numbers and how the capture is read, not of its path."""
     text = json.dumps([scene, to_json(train), data.settings()], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def own_scenes(captures: Sequence[Path]) -> list[Scene]:
-    """The user's captures as scenes of one data set. Raises InputError where two have one name or one is not there."""
+def find_own_scenes(captures: Sequence[Path]) -> list[Scene]:
+    """Return the user's captures as scenes of one data set. Raises InputError where a folder is missing or two have the same name."""
     scenes = [Scene(path.resolve().name, OWN, path) for path in captures]
     for scene in scenes:
         if not scene.path.is_dir():
             raise InputError(f"expected a capture folder at {scene.path}, found none; correct --captures")
         if sum(other.name == scene.name for other in scenes) > 1:
-            raise InputError(f"expected captures of different names, found several called '{scene.name}'; rename or link one of them")
+            raise InputError(f"expected captures with different names, found several called '{scene.name}'; rename or link one of them")
     return scenes
 
 
-def expect_captures(scenes: Sequence[Scene]) -> None:
-    """Raises InputError for a scene whose folder is no capture: all of its runs would fail."""
+def check_folders(scenes: Sequence[Scene]) -> None:
+    """Raise InputError for a scene whose folder is not a capture: all its runs would fail."""
     for scene in scenes:
         if not is_capture(scene.path):
             raise unrecognised_error(scene.path)
 
 
-def paper_scenes(root: Path) -> list[Scene]:
-    """The paper's scenes that lie below `root`, each with the paper's protocol; trained in their own units, as the paper's code does."""
+def find_paper_scenes(root: Path) -> list[Scene]:
+    """Find the paper's scenes below `root`, each with the paper's protocol. As in the paper's code, they keep their own units."""
     found = []
     for scene in catalog.SCENES:
         if is_present(root, scene):
@@ -151,10 +154,10 @@ def paper_scenes(root: Path) -> list[Scene]:
     return found
 
 
-def specs(experiments: Iterable[Experiment], scenes: Sequence[Scene], seeds: Sequence[int], scale: Scale) -> list[Spec]:
-    """The runs that experiments need, each once: seed by seed, so that a whole first table stands early.
+def list_runs(experiments: Iterable[Experiment], scenes: Sequence[Scene], seeds: Sequence[int], scale: Scale) -> list[Spec]:
+    """List the runs that experiments need, each once. All runs of a seed come before the next seed, so a table is complete early.
 
-    A user's own captures stand for every data set; the paper's scenes serve the experiments that name them.
+    The user's own captures are used in place of every data set. The paper's scenes are used in the experiments that name them.
     """
     wanted: dict[Spec, None] = {}
     for seed in seeds:
@@ -167,8 +170,8 @@ def specs(experiments: Iterable[Experiment], scenes: Sequence[Scene], seeds: Seq
     return list(wanted)
 
 
-def distinct(wanted: Iterable[Spec]) -> list[Spec]:
-    """The first of all runs that have the same numbers, in order."""
+def drop_repeated(wanted: Iterable[Spec]) -> list[Spec]:
+    """Keep the first of the runs with the same numbers, in order."""
     first: dict[str, Spec] = {}
     for spec in wanted:
         first.setdefault(spec.numbers, spec)

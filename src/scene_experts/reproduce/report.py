@@ -1,4 +1,4 @@
-"""Writes what an experiment shows: its tables and figures, the claims, and one page that leads to them."""
+"""Write the tables and figures of experiments, the checklist of claims, and a page that links to them."""
 
 from __future__ import annotations
 
@@ -15,55 +15,58 @@ from scene_experts.render import choose
 from scene_experts.reproduce import claims, figures, store, tables
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN, Scene, Spec
-from scene_experts.reproduce.statistics import SEED_SD, SEED_WEIGHT, shared
+from scene_experts.reproduce.statistics import SEED_SD, SEED_WEIGHT, on_common_scenes
 from scene_experts.reproduce.store import Record
 from scene_experts.training import run_folder
 from scene_experts.training.config import SCHEDULE
 
-SHORT = 2000  # iterations; fewer hardly leave the dense warm-up
+SHORT = 2000  # iterations; shorter trainings hardly pass the dense warm-up
 
 
 def write(
     out: Path, experiments: Sequence[Experiment], scenes: Sequence[Scene], records: Sequence[Record], command: str = ""
 ) -> list[Path]:
-    """Write every experiment's files below `out`; returns them. Records of other scenes are not counted. `command` made them."""
+    """Write the files of experiments below `out` and return their paths. Ignores records of other scenes. The page quotes `command`."""
     wanted = {scene.name for scene in scenes}
     records = [r for r in records if r.scene in wanted]
     written: list[Path] = []
-    page = ["# Reproduced", "", *(["```sh", command, "```", ""] if command else [])]
+    page = ["# Reproduced tables and figures", "", *(["```sh", command, "```", ""] if command else [])]
     for experiment in experiments:
         made = [*write_tables(out, experiment, scenes, records), *write_figures(out, experiment, scenes, records)]
         if experiment.name == "fig5":
             made += [p for s in scenes for p in (strip_path(out, s.name), strip_path(out, s.name).with_suffix(".svg")) if p.is_file()]
         written += made
-        page += [f"## {experiment.title}", "", ", ".join(f"[{p.name}]({p.name})" for p in made) or "No run is done yet.", ""]
+        page += [f"## {experiment.title}", "", ", ".join(f"[{p.name}]({p.name})" for p in made) or "No run is finished yet.", ""]
         page += [f"![{p.stem}]({p.name})\n" for p in made if p.suffix == ".png"]
-    page += ["## The paper's claims", "", *short_runs(records), claims.to_markdown(claims.check(records))]
-    page += ["Differences are paired over views and seeds; the interval is of other views and other seeds on these captures (Student's t)."]
-    noise = f"{SEED_SD['psnr']} dB, which counts as {SEED_WEIGHT} degrees of freedom"
-    page += [f"What another seed changes is one standard deviation for all captures, pooled from the seeds at hand and from {noise}."]
-    page += ["On training views: the same difference as the trainings showed it, over their second half, paired by iteration.", ""]
+    page += ["## The paper's claims", "", *caveat(records), claims.to_markdown(claims.check(records))]
+    noise = f"{SEED_SD['psnr']} dB with {SEED_WEIGHT} degrees of freedom"
+    page += [
+        "Differences are paired by view and seed. The interval covers other views and other seeds of these captures (Student's t).",
+        f"The standard deviation over seeds is the same for all captures. It is pooled from the measured seeds and from {noise}.",
+        '"On training views" is the difference in PSNR on training views over the second half of the trainings, paired by iteration.',
+        "",
+    ]
     path = out / "README.md"
     write_bytes(path, "\n".join(page).encode())
     return [*written, path]
 
 
-def short_runs(records: Sequence[Record]) -> list[str]:
-    """What must be said before claims are judged by trainings shorter than the paper's."""
+def caveat(records: Sequence[Record]) -> list[str]:
+    """Return the caveat for verdicts from trainings that are shorter than the paper's; empty for full-length ones."""
     length = max((r.config.train.iterations for r in records), default=SCHEDULE)
     if length >= SCHEDULE:
         return []
-    counts = {tables.adjustments(r.config.train) for r in records if r.config.train.iterations == length}
+    counts = {tables.densifications(r.config.train) for r in records if r.config.train.iterations == length}
     made = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
-    few = "what they leave open or contradict may hold in longer ones"
+    meaning = "An undecided or contradicted claim may hold in longer trainings."
     if length < SHORT:
-        few = "so little has grown and been learnt by then that **they say nothing of the paper**"
-    size = f"{length:,} iterations with {made} adjustments of density, not of {SCHEDULE:,} and 134 (Scaffold-GS's)"
-    return [f"The verdicts are of trainings of {size}: {few}.", ""]
+        meaning = "Too little is learnt by then: **these verdicts say nothing about the paper**."
+    size = f"{length:,} iterations with {made} densification steps, not {SCHEDULE:,} with 134 (Scaffold-GS)"
+    return [f"The verdicts are from trainings of {size}. {meaning}", ""]
 
 
 def write_tables(out: Path, experiment: Experiment, scenes: Sequence[Scene], records: Sequence[Record]) -> list[Path]:
-    """An experiment's tables: one per data set, and its first column scene by scene."""
+    """Write an experiment's tables: means for each data set, and the first column scene by scene."""
     made: dict[str, Table] = {}
     datasets = list(dict.fromkeys(s.dataset for s in scenes if s.dataset == OWN or s.dataset in experiment.datasets))
     for dataset in datasets:
@@ -72,17 +75,17 @@ def write_tables(out: Path, experiment: Experiment, scenes: Sequence[Scene], rec
         done = [name for name in names if any(r.scene == name and r.recipe in experiment.rows.values() for r in records)]
         if done:
             here = [r for r in records if r.scene in done]
-            every = {r.scene for r in shared(here, experiment.rows.values())}
+            every = {r.scene for r in on_common_scenes(here, experiment.rows.values())}
             even = [name for name in done if name in every] or done
             table = tables.by_dataset(experiment, records, dataset, even)
             if even != done:
                 missed = ", ".join(name for name in done if name not in even)
-                table = replace(table, notes=(*table.notes, f"left out of the means, as not every row has a run there: {missed}"))
+                table = replace(table, notes=(*table.notes, f"Not in the means, as not every row has a run there: {missed}."))
             made[f"{dataset}: means over {', '.join(even)}"] = table
             made[f"{dataset}: scene by scene"] = tables.by_scene(experiment, records, done)
         if experiment.name == "fig3":
-            shared_out = {name: found for name in done if (found := tables.expert_shares(experiment, records, name))}
-            made |= {f"{name}: share of the assignments at the end, %": found for name, found in shared_out.items()}
+            shares = {name: found for name in done if (found := tables.expert_shares(experiment, records, name))}
+            made |= {f"{name}: share of the assignments at the end, %": found for name, found in shares.items()}
     out_paths = []
     for ending, text in tables.write_all(experiment.title, made).items() if made else ():
         path = out / f"{experiment.name}.{ending}"
@@ -92,14 +95,14 @@ def write_tables(out: Path, experiment: Experiment, scenes: Sequence[Scene], rec
 
 
 def write_figures(out: Path, experiment: Experiment, scenes: Sequence[Scene], records: Sequence[Record]) -> list[Path]:
-    """The charts of a figure (nothing for a table, or where no run is done)."""
+    """Write the charts of a figure; nothing for a table, or where no run is finished."""
     names = [s.name for s in scenes]
     if experiment.name == "fig1b":
         return figures.relative_psnr(experiment, records, names, out / "fig1b")
     if experiment.name == "fig3":
-        drawn = [(name, attribute) for name in names for attribute in ("cov", "opacity", "color")]  # the paper shows the first
+        drawn = [(name, attribute) for name in names for attribute in ("cov", "opacity", "color")]  # the paper shows cov
         places = {pair: f"fig3_{pair[0]}{'' if pair[1] == 'cov' else '_' + pair[1]}" for pair in drawn}
-        return [path for (name, a), place in places.items() for path in figures.shares(experiment, records, name, out / place, a)]
+        return [path for (name, a), place in places.items() for path in figures.expert_shares(experiment, records, name, out / place, a)]
     if experiment.name == "fig6":
         return figures.cost(experiment, records, out / "fig6")
     if experiment.name == "fig7":
@@ -108,12 +111,12 @@ def write_figures(out: Path, experiment: Experiment, scenes: Sequence[Scene], re
 
 
 def strip_path(out: Path, scene: str) -> Path:
-    """Where `expert_strip` puts its picture."""
+    """Return the path of the picture of `draw_experts`."""
     return out / f"fig5_{scene}.png"
 
 
-def expert_strip(spec: Spec, run: Path, out: Path, attribute: str = "color") -> Path:
-    """Figure 5 of one run: the first held-out view whole, then each expert's anchors alone; at `strip_path`."""
+def draw_experts(spec: Spec, run: Path, out: Path, attribute: str = "color") -> Path:
+    """Draw Figure 5 of a run: the first held-out view, then the anchors of each expert alone. Returns `strip_path`."""
     opened = run_folder.open_run(run)
     capture = run_folder.load_capture(replace(opened.config.data, path=spec.scene.path), spec.seed)
     try:
@@ -125,11 +128,11 @@ def expert_strip(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
         capture.images.close()
     path = strip_path(out, spec.scene.name)
     pictures.write(path, sheet)
-    figures.framed(path)
+    figures.wrap_in_svg(path)
     return path
 
 
 def adopt(run: Path, folder: Path) -> Path:
-    """Keep the record of a run folder that something else made. Its scene is the name of its capture."""
+    """Write the record of a run folder that another command trained. Its scene is the name of its capture."""
     scene = Path(run_folder.read_config(run).data.path).resolve().name
-    return store.write(folder, store.of_run(run, scene))
+    return store.write(folder, store.read_run(run, scene))

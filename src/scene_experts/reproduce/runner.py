@@ -1,4 +1,4 @@
-"""Makes the runs of a plan: skips what is done, resumes what is not, several at a time; one failure does not lose the rest."""
+"""Train the runs of an experiment, several at a time: skip those that are done, resume those that stopped, go on after a failure."""
 
 from __future__ import annotations
 
@@ -27,44 +27,50 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Failure:
-    """A run that did not end well."""
+    """A run that failed. `why` is the reason or the last line of its log."""
 
     spec: Spec
-    why: str  # the last line it said
+    why: str
     log: Path
 
 
 @dataclass
 class Runner:
-    """Runs specs in processes of their own."""
+    """Trains each run in its own process."""
 
-    runs: Path  # run folders
-    records: Path  # where records are kept
+    runs: Path
+    """Folder of the run folders."""
+    records: Path
+    """Folder of the records."""
     workers: int = 1
-    devices: Sequence[str] = ()  # CUDA devices to share out, by index; none: the CPU, or the first device
-    discard: bool = False  # remove a run folder once its record is written
+    """Runs at a time."""
+    devices: Sequence[str] = ()
+    """Indices of the CUDA devices to share among the workers. Empty: the CPU, or the first device."""
+    discard: bool = False
+    """Remove a run folder once its record is written."""
     say: Say = print
-    after: Callable[[Spec, Path], None] = lambda spec, folder: None  # what else to take from a run folder before it may go
+    after: Callable[[Spec, Path], None] = lambda spec, folder: None
+    """Called with each finished run folder before it may be removed."""
     stop: threading.Event = field(default_factory=threading.Event)
     _running: set[subprocess.Popen[str]] = field(default_factory=set)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def make(self, specs: Sequence[Spec]) -> list[Failure]:
-        """Make every run that has no record yet; returns those that failed."""
+    def run_all(self, specs: Sequence[Spec]) -> list[Failure]:
+        """Train every run that has no record yet; return the failures."""
         done = store.load(self.records)
         todo = [spec for spec in specs if store.find(done, spec) is None]
         self.say(f"{len(specs)} runs, {len(specs) - len(todo)} of them done")
         free = list(range(self.workers))
         failures: list[Failure] = []
 
-        def one(numbered: tuple[int, Spec]) -> None:
+        def work(numbered: tuple[int, Spec]) -> None:
             number, spec = numbered
             if self.stop.is_set():
                 return
             with self._lock:
                 slot = free.pop()
             try:
-                failure = self.one(spec, slot, f"[{number + 1}/{len(todo)}]")
+                failure = self.run(spec, slot, f"[{number + 1}/{len(todo)}]")
             finally:
                 with self._lock:
                     free.append(slot)
@@ -72,11 +78,11 @@ class Runner:
                 failures.append(failure)
 
         with ThreadPoolExecutor(self.workers) as pool:
-            list(pool.map(one, enumerate(todo)))
+            list(pool.map(work, enumerate(todo)))
         return failures
 
-    def one(self, spec: Spec, slot: int, place: str) -> Failure | None:
-        """Train, evaluate and record one run."""
+    def run(self, spec: Spec, slot: int, place: str) -> Failure | None:
+        """Train, evaluate and record one run. `slot` is the number of its worker, `place` its number among all runs as text."""
         folder = spec.folder(self.runs)
         log = folder.parent / f"{folder.name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -87,35 +93,35 @@ class Runner:
             try:
                 with held(folder):
                     if latest(folder / "checkpoints") is None:
-                        shutil.rmtree(folder)  # it never came to a whole checkpoint
+                        shutil.rmtree(folder)  # it stopped before its first checkpoint
                     else:
                         train.append("--resume")
             except InputError:
-                why = f"expected {folder} for this training alone, found one at work there; once it has ended, give the same command again"
-                return self.failed(spec, why, log, place)
+                why = f"expected no other training in {folder}, found a running one; repeat the command when it has ended"
+                return self.fail(spec, why, log, place)
         for args in (train, ["eval", str(folder)]):
-            code = self.command(args, slot, log)
+            code = self.call(args, slot, log)
             if self.stop.is_set():
-                return None  # the next time goes on from here
+                return None  # the same command resumes it
             if code != 0:
-                return self.failed(spec, last_line(log) or f"exit code {code}", log, place)
+                return self.fail(spec, last_line(log) or f"exit code {code}", log, place)
         try:
-            record = store.of_run(folder, spec.scene.name)
+            record = store.read_run(folder, spec.scene.name)
             store.write(self.records, record)
             self.say(f"{place} {spec.label}: {record.results['psnr']:.2f} dB, {(time.monotonic() - began) / 60:.1f} min")
             self.after(spec, folder)
         except (InputError, RunError, OSError) as error:
-            return self.failed(spec, str(error), log, place)
+            return self.fail(spec, str(error), log, place)
         if self.discard:
             shutil.rmtree(folder, ignore_errors=True)
         return None
 
-    def failed(self, spec: Spec, why: str, log: Path, place: str) -> Failure:
+    def fail(self, spec: Spec, why: str, log: Path, place: str) -> Failure:
         self.say(f"{place} {spec.label}: FAILED: {why}")
         return Failure(spec, why, log)
 
-    def command(self, args: list[str], slot: int, log: Path) -> int:
-        """Run `scene-experts ARGS` with the worker's share of the machine, its words going to the log; returns the exit code."""
+    def call(self, args: list[str], slot: int, log: Path) -> int:
+        """Run `scene-experts ARGS` with the worker's share of the cores, append its output to the log, return the exit code."""
         environment = {**os.environ, PARENT: str(os.getpid())}
         if self.workers > 1:
             environment["OMP_NUM_THREADS"] = str(max(1, native.count_cores() // self.workers))
@@ -124,7 +130,7 @@ class Runner:
         with log.open("a") as stream:
             stream.write(f"$ scene-experts {' '.join(args)}\n")
             stream.flush()
-            # In a process group of its own: a terminal's Ctrl-C would reach it beside our own signal, and a second signal does not save.
+            # Its own process group: a terminal's Ctrl-C must not reach it beside our SIGTERM, as a second signal ends it without saving.
             process = subprocess.Popen(
                 [sys.executable, "-m", "scene_experts", *args],
                 stdout=stream,
@@ -135,7 +141,7 @@ class Runner:
             )
             with self._lock:
                 self._running.add(process)
-                if self.stop.is_set():  # `end` came while it was being started and did not see it
+                if self.stop.is_set():  # `end` was called while the process started
                     process.send_signal(signal.SIGTERM)
             try:
                 return process.wait()
@@ -144,7 +150,7 @@ class Runner:
                     self._running.discard(process)
 
     def end(self) -> None:
-        """Stop: running trainings save and end; nothing new begins."""
+        """Stop: running trainings save and end, no other one starts."""
         self.stop.set()
         with self._lock:
             for process in self._running:

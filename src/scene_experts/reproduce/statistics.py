@@ -1,4 +1,4 @@
-"""Means over scenes with their spread over seeds, and differences between recipes paired over views and seeds."""
+"""Means over scenes with their spread over seeds, and differences between recipes, paired by view and seed."""
 
 from __future__ import annotations
 
@@ -13,40 +13,42 @@ from numpy.typing import NDArray
 from scene_experts.reproduce.store import Record
 
 SEED_SD = {"psnr": 0.2, "ssim": 0.002, "lpips_3dgs": 0.004}
-"""Standard deviation over seeds of the difference of two runs on one capture (measured: docs/results.md); PSNR in dB."""
+"""Standard deviation over seeds of the difference of two runs on one capture, as measured in docs/results.md. PSNR in dB."""
 VIEW_SD = {"psnr": 0.4, "ssim": 0.003, "lpips_3dgs": 0.004}
-"""The same over the views of a capture, for captures of one view."""
-SEED_WEIGHT = 4  # degrees of freedom that SEED_SD counts for beside those of the seeds at hand
+"""The same over the views of a capture. Used for captures with a single view."""
+SEED_WEIGHT = 4
+"""Degrees of freedom of SEED_SD where it is pooled with the variance of the measured seeds."""
 Verdict = Literal["confirmed", "contradicted", "undecided"]
 
 
-def of_recipe(records: Sequence[Record], recipe: str, scene: str | None = None) -> list[Record]:
+def select(records: Sequence[Record], recipe: str, scene: str | None = None) -> list[Record]:
+    """Select the records of a recipe, on one scene or on all."""
     return [r for r in records if r.recipe == recipe and (scene is None or r.scene == scene)]
 
 
-def shared(records: Sequence[Record], recipes: Iterable[str]) -> list[Record]:
-    """The records of recipes that have any, on the scenes that all of these have: means over different scenes would compare scenes."""
-    by = {recipe: rows for recipe in recipes if (rows := of_recipe(records, recipe))}
+def on_common_scenes(records: Sequence[Record], recipes: Iterable[str]) -> list[Record]:
+    """Select the records of recipes on the scenes that every recipe with a run has: means over different scenes cannot be compared."""
+    by = {recipe: rows for recipe in recipes if (rows := select(records, recipe))}
     scenes = set.intersection(*({r.scene for r in rows} for rows in by.values())) if by else set()
     return [r for rows in by.values() for r in rows if r.scene in scenes]
 
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean over scenes; `spread` is the standard deviation of that mean over seeds (None with one seed)."""
+    """A mean over scenes. `spread` is its standard deviation over seeds; None with one seed."""
 
     value: float
     spread: float | None
 
 
-def whole_seeds(records: Sequence[Record]) -> set[int]:
-    """The seeds of a recipe's records that have all of its scenes."""
+def complete_seeds(records: Sequence[Record]) -> set[int]:
+    """Return the seeds with a record on every scene of a recipe's records."""
     scenes, seeds = {r.scene for r in records}, {r.seed for r in records}
     return {seed for seed in seeds if {r.scene for r in records if r.seed == seed} == scenes}
 
 
 def mean(records: Sequence[Record], column: str) -> Mean | None:
-    """Mean over scenes of a column, per seed, then over the seeds that have every scene. None where nothing has it."""
+    """Average a column over scenes for each seed, then over the seeds that have every scene. None where no record has a value."""
     found = {(r.seed, r.scene): value for r in records if (value := r.value(column)) is not None}
     if not found:
         return None
@@ -54,7 +56,7 @@ def mean(records: Sequence[Record], column: str) -> Mean | None:
     by_seed = {
         seed: [found[seed, scene] for scene in scenes] for seed in {s for s, _ in found} if all((seed, scene) in found for scene in scenes)
     }
-    if not by_seed:  # no seed has every scene: the scenes' own means, and no spread
+    if not by_seed:  # no seed has every scene: average each scene over its seeds, without a spread
         own = [statistics.fmean(v for (_, s), v in found.items() if s == scene) for scene in scenes]
         return Mean(statistics.fmean(own), None)
     means = [statistics.fmean(values) for values in by_seed.values()]
@@ -63,25 +65,25 @@ def mean(records: Sequence[Record], column: str) -> Mean | None:
 
 @dataclass(frozen=True)
 class Difference:
-    """A - B in a score: the mean over captures with its 95 % interval, from differences paired over views and seeds. PSNR in dB."""
+    """A - B in a score, paired by view and seed: mean over captures and 95 % interval. PSNR in dB."""
 
     mean: float
     low: float
     high: float
     captures: int
     seeds: tuple[int, int]
-    """Fewest and most seeds of a capture."""
+    """Least and greatest number of seeds of a capture."""
     views: int
     gains: int
-    """Captures on which A is above B."""
+    """Number of captures where A is above B."""
     fit: float | None = None
-    """A - B in PSNR (dB) on training views over the second half of the trainings: whether A fits better, generalised or not."""
+    """A - B in PSNR (dB) on training views in the second half of the trainings: tells whether A fits the training views better."""
     metric: str = "psnr"
 
     def verdict(self, sign: int) -> Verdict:
-        """Whether A - B has the claimed sign (+1 or -1), its opposite, or may be either.
+        """Judge the claim that A - B has a sign (+1 or -1).
 
-        A sign is one where the interval and most of the captures have it: a large gain on one of three is no rule.
+        The difference has a sign where the whole interval and more than half of the captures have it.
         """
         most = 2 * self.gains - self.captures
         found = 1 if self.low > 0 and most > 0 else -1 if self.high < 0 and most < 0 else 0
@@ -89,7 +91,7 @@ class Difference:
 
 
 def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -> Difference | None:
-    """The difference of two recipes in a score of SEED_SD, on the captures, seeds and views that both have. None where nothing pairs."""
+    """Compute the difference of two recipes in a score of SEED_SD on the captures, seeds and views of both. None without a pair."""
     theirs = {(r.scene, r.seed): r for r in b}
     blocks: dict[str, dict[int, dict[str, float]]] = {}
     for record in a:
@@ -106,19 +108,19 @@ def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -
     for seeds in blocks.values():
         common = sorted(set.intersection(*(set(views) for views in seeds.values())))
         grids.append(np.array([[views[v] for v in common] for views in seeds.values()]))
-    centre, half = interval(grids, SEED_SD[metric], VIEW_SD[metric])
+    centre, half = estimate(grids, SEED_SD[metric], VIEW_SD[metric])
     counts = [len(grid) for grid in grids]
     views, gains = sum(grid.shape[1] for grid in grids), sum(bool(grid.mean() > 0) for grid in grids)
-    return Difference(centre, centre - half, centre + half, len(grids), (min(counts), max(counts)), views, gains, fit(a, b), metric)
+    return Difference(centre, centre - half, centre + half, len(grids), (min(counts), max(counts)), views, gains, compare_fit(a, b), metric)
 
 
-def interval(grids: Sequence[NDArray[np.float64]], seed_sd: float, view_sd: float) -> tuple[float, float]:
-    """The mean over captures of differences [seeds, views], and half the width of its 95 % interval.
+def estimate(grids: Sequence[NDArray[np.float64]], seed_sd: float, view_sd: float) -> tuple[float, float]:
+    """Return the mean over captures of differences [seeds, views], and half the width of its 95 % interval.
 
-    The interval is of other views and other seeds on these captures: captures stay. Two variances add: that of a capture's mean over
-    views, from its views (means over seeds; `view_sd` for a single view); and that over seeds, one for all captures, from those with
-    several seeds and from `seed_sd`, which counts as SEED_WEIGHT more of them. Student's t, with the degrees of freedom of the sum by
-    Satterthwaite (1946).
+    The interval covers other views and other seeds of the same captures. Its variance is a sum of two. The variance over views is that
+    of each capture's views, averaged over seeds (`view_sd` for a single view). The variance over seeds is the same for all captures; it
+    is pooled from the captures with several seeds and from `seed_sd`, which has SEED_WEIGHT degrees of freedom. Student's t, with the
+    degrees of freedom of the sum after Satterthwaite (1946).
     """
     terms: list[tuple[float, int]] = []  # variance of the mean, degrees of freedom
     squares, freedom = SEED_WEIGHT * seed_sd**2, SEED_WEIGHT
@@ -135,7 +137,7 @@ def interval(grids: Sequence[NDArray[np.float64]], seed_sd: float, view_sd: floa
 
 
 def student(freedom: float) -> float:
-    """The 97.5 % quantile of Student's t, by its expansion about the normal one (Abramowitz and Stegun 26.7.5); 1 % off at 2 degrees."""
+    """Return the 97.5 % quantile of Student's t (Abramowitz and Stegun 26.7.5). Its error is 1 % at 2 degrees of freedom, less above."""
     z = 1.959964
     terms = (
         (z**3 + z) / 4,
@@ -146,10 +148,11 @@ def student(freedom: float) -> float:
     return z + sum(term / freedom ** (k + 1) for k, term in enumerate(terms))
 
 
-def fit(a: Sequence[Record], b: Sequence[Record]) -> float | None:
-    """Mean A - B in PSNR (dB) of the view trained on, paired over the iterations of the second half that both curves have.
+def compare_fit(a: Sequence[Record], b: Sequence[Record]) -> float | None:
+    """Average A - B in PSNR (dB) of the training views, paired by iteration, over the second half of the trainings.
 
-    The same seed shows the same views in the same order, whatever the recipe. Mean over seeds, then captures; None where nothing pairs.
+    Trainings with the same seed see the same views in the same order, whatever the recipe. The mean is over seeds, then over captures.
+    None where nothing pairs.
     """
     theirs = {(r.scene, r.seed): training_psnr(r) for r in b}
     found: dict[str, list[float]] = {}
@@ -162,5 +165,10 @@ def fit(a: Sequence[Record], b: Sequence[Record]) -> float | None:
 
 
 def training_psnr(record: Record) -> dict[int, float]:
-    """PSNR (dB) of the view of an iteration, by iteration."""
+    """Return the PSNR (dB) of each iteration's training view, by iteration."""
     return {point["step"]: point["psnr"] for point in record.curves if point.get("psnr") is not None}
+
+
+def clock_of(records: Iterable[Record]) -> str:
+    """Return the column with the time of these trainings: CPU time where every record has it, else wall time."""
+    return "cpu_seconds" if all(r.value("cpu_seconds") is not None for r in records) else "train_seconds"

@@ -1,4 +1,4 @@
-"""An experiment's tables: ours with the spread over seeds, the paper's numbers beside them; Markdown, CSV and LaTeX."""
+"""Tables of an experiment with the spread over seeds and the paper's numbers, as Markdown, CSV and LaTeX."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ from dataclasses import dataclass
 from scene_experts.evaluate.tables import Table, paper, to_markdown
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN
-from scene_experts.reproduce.statistics import Mean, mean, whole_seeds
+from scene_experts.reproduce.statistics import Mean, clock_of, complete_seeds, mean
 from scene_experts.reproduce.store import Record
 from scene_experts.training.config import Train
 
 
 @dataclass(frozen=True)
 class Column:
+    """A column of a table. `best`: 1 where more is better, -1 where less is, 0 where neither is."""
+
     title: str
     digits: int
-    best: int  # which end is better
+    best: int
 
 
 COLUMNS = {
@@ -28,44 +30,54 @@ COLUMNS = {
     "lpips_3dgs": Column("LPIPS", 3, -1),
     "size_mb": Column("MB", 1, -1),
     "active_percent": Column("active %", 1, 0),
-    "train_seconds": Column("training s", 0, -1),
+    "train_seconds": Column("training, wall s", 0, 0),
+    "cpu_seconds": Column("training, CPU s", 0, -1),
 }
 
 
 def rows_of(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str]) -> dict[str, list[Record]]:
-    """The records of each row, on the given scenes."""
+    """Return the records of each row on the given scenes."""
     return {name: [r for r in records if r.recipe == recipe and r.scene in scenes] for name, recipe in experiment.rows.items()}
 
 
-def drawn(records: Sequence[Record]) -> set[tuple[str, int]]:
-    """What a mean is over: scenes and seeds."""
+def cases(records: Sequence[Record]) -> set[tuple[str, int]]:
+    """Return the pairs of scene and seed that a mean covers."""
     return {(r.scene, r.seed) for r in records}
 
 
 def by_dataset(experiment: Experiment, records: Sequence[Record], dataset: str, scenes: Sequence[str]) -> Table:
-    """One row per method: our columns, then the paper's for this data set where it has them. Means over `scenes`."""
+    """Make the table with one row per method and means over `scenes`: our columns, then the paper's where it has this data set."""
     found = rows_of(experiment, records, scenes)
-    theirs = published(experiment, dataset)
-    titles = ["", *(COLUMNS[c].title for c in experiment.columns)]
+    theirs = paper_numbers(experiment, dataset)
+    together = [r for some in found.values() for r in some]
+    columns = columns_of(experiment, together)
+    titles = ["", *(COLUMNS[c].title for c in columns)]
     titles += [f"{COLUMNS[c].title} (paper)" for c in experiment.columns] if theirs else []
     rows, values = [], []
-    every = drawn([r for some in found.values() for r in some])
+    every = cases(together)
     for name in experiment.rows:
-        means = [mean(found[name], c) for c in experiment.columns]
-        fair = drawn(found[name]) == every  # a mean over fewer scenes or other seeds is no rival
+        means = [mean(found[name], c) for c in columns]
+        fair = cases(found[name]) == every  # means over other scenes or seeds are not marked as best
         values.append([m.value if m and fair else None for m in means])
-        cells = [text(m, c) for m, c in zip(means, experiment.columns)]
+        cells = [text(m, c) for m, c in zip(means, columns)]
         if theirs:
             numbers = theirs.get(name)
             cells += (
                 [f"{v:.{COLUMNS[c].digits}f}" for v, c in zip(numbers, experiment.columns)] if numbers else ["-"] * len(experiment.columns)
             )
         rows.append((name, *cells))
-    return Table(tuple(titles), tuple(rows), best(values, experiment.columns), notes(found))
+    said = notes(found) + (time_notes(together) if {"train_seconds", "cpu_seconds"} & set(columns) else ())
+    return Table(tuple(titles), tuple(rows), best(values, columns), said)
+
+
+def columns_of(experiment: Experiment, records: Sequence[Record]) -> list[str]:
+    """Return the columns of a table of these records: "time" as CPU or wall time, and `added` columns that every record has."""
+    own = [clock_of(records) if c == "time" else c for c in experiment.columns]
+    return own + [c for c in experiment.added if records and all(r.value(c) is not None for r in records)]
 
 
 def by_scene(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str]) -> Table:
-    """PSNR (or the experiment's first column) of each method on each scene."""
+    """Make the table of the experiment's first column (PSNR as a rule), one row per method and one column per scene."""
     found, column = rows_of(experiment, records, scenes), experiment.columns[0]
     rows, values = [], []
     every = {scene: {r.seed for some in found.values() for r in some if r.scene == scene} for scene in scenes}
@@ -79,9 +91,9 @@ def by_scene(experiment: Experiment, records: Sequence[Record], scenes: Sequence
 
 
 def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str) -> Table | None:
-    """How each attribute's experts share the whole scene at the end: % of the assignments (of N k, then of the N anchors), first seed.
+    """Make the table of each expert's share of all N anchors at the end of the training, in %: of the N k assignments, then of the anchors.
 
-    None where no row has experts there.
+    Uses the first seed. None where no row has experts on this scene.
     """
     rows: list[tuple[str, ...]] = []
     for name, recipe in experiment.rows.items():
@@ -97,8 +109,8 @@ def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str)
     return Table(titles, tuple(rows))
 
 
-def published(experiment: Experiment, dataset: str) -> dict[str, list[float]]:
-    """The paper's numbers by row for a data set; empty where it prints none."""
+def paper_numbers(experiment: Experiment, dataset: str) -> dict[str, list[float]]:
+    """Return the paper's numbers of a data set by row; empty where it has none."""
     if experiment.paper is None or dataset == OWN:
         return {}
     section = paper()[experiment.paper]
@@ -108,7 +120,7 @@ def published(experiment: Experiment, dataset: str) -> dict[str, list[float]]:
 
 
 def text(value: Mean | None, column: str) -> str:
-    """A mean, and its spread where several seeds give one."""
+    """Format a mean, and its spread where there is one."""
     if value is None:
         return "-"
     digits = COLUMNS[column].digits
@@ -116,7 +128,7 @@ def text(value: Mean | None, column: str) -> str:
 
 
 def best(values: list[list[float | None]], columns: Sequence[str]) -> frozenset[tuple[int, int]]:
-    """The best cell of each of our columns, as (row, column of the table)."""
+    """Return the best cell of each of our columns, as (row, column of the table)."""
     out = set()
     for j, column in enumerate(columns):
         present = [(row[j], i) for i, row in enumerate(values) if row[j] is not None]
@@ -126,44 +138,58 @@ def best(values: list[list[float | None]], columns: Sequence[str]) -> frozenset[
 
 
 def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
-    """What the reader must know: seeds, iterations, resolution; rows that lack a scene."""
+    """Write the notes of a table: iterations, resolution, seeds, and the runs that rows lack."""
     records = [r for rows in found.values() for r in rows]
     if not records:
-        return ("no run of this table is done",)
+        return ("No run of this table is finished.",)
     lengths: dict[int, set[int]] = {}
     for r in records:
-        lengths.setdefault(r.config.train.iterations, set()).add(adjustments(r.config.train))
+        lengths.setdefault(r.config.train.iterations, set()).add(densifications(r.config.train))
     sizes = sorted({r.config.data.resolution for r in records})
     seeds = sorted({r.seed for r in records})
     between = {n: " to ".join(str(m) for m in sorted({min(many), max(many)})) for n, many in lengths.items()}
-    made = ", ".join(f"{n:,} iterations ({many} adjustments of density)" for n, many in sorted(between.items()))
-    out = [f"{made}; resolution {', '.join(sizes)}; seeds {', '.join(map(str, seeds))}"]
+    made = ", ".join(f"{n:,} iterations ({many} densification steps)" for n, many in sorted(between.items()))
+    out = [f"{made}; resolution {', '.join(sizes)}; seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}."]
     for name, rows in found.items():
-        whole = sorted(whole_seeds(rows))
+        whole = sorted(complete_seeds(rows))
         if rows and whole != seeds:
-            counted = f"means of seeds {', '.join(map(str, whole))}, the others lack scenes" if whole else "no seed has every scene"
-            out.append(f"{name}: {counted}")
-    every, none = drawn(records), [name for name, rows in found.items() if not rows]
+            counted = f"mean over seeds {', '.join(map(str, whole))}; other seeds lack scenes" if whole else "no seed has every scene"
+            out.append(f"{name}: {counted}.")
+    every, none = cases(records), [name for name, rows in found.items() if not rows]
     for name, rows in found.items():
         scenes = {r.scene for r in rows}
         lacking = sorted({scene for scene, _ in every} - scenes)
         if rows and lacking:
-            out.append(f"{name}: no run on {', '.join(lacking)}")
-        fewer = sorted((scene, seed) for scene, seed in every - drawn(rows) if scene in scenes)
+            out.append(f"{name}: no run on {', '.join(lacking)}.")
+        fewer = sorted((scene, seed) for scene, seed in every - cases(rows) if scene in scenes)
         if fewer:
-            out.append(f"{name}: no run on {', '.join(f'{scene} with seed {seed}' for scene, seed in fewer)}")
+            out.append(f"{name}: no run on {', '.join(f'{scene} with seed {seed}' for scene, seed in fewer)}.")
     if none:
-        out.append(f"no run: {'; '.join(none)}")
+        out.append(f"No run: {'; '.join(none)}.")
     return tuple(out)
 
 
-def adjustments(train: Train) -> int:
-    """How often density control acts: a short training adjusts as often per iteration, so more rarely in all."""
+def time_notes(records: Sequence[Record]) -> tuple[str, ...]:
+    """Write the notes of a column of training times: which time it is, and the load of the machine."""
+    if clock_of(records) == "cpu_seconds":
+        out = ["Training times are CPU times of all threads of the training loop."]
+    else:
+        out = ["Training times are wall times, which other work on the machine lengthens: not every record has the CPU time."]
+    known = [load for r in records if None not in ((load := r.results.get("load") or {}).get("start"), load.get("end"), load.get("cores"))]
+    if known and len(known) == len(records):
+        averages = [load[when] for load in known for when in ("start", "end")]
+        cores = sorted({load["cores"] for load in known})
+        out.append(f"The load average was {min(averages):.1f} to {max(averages):.1f} on {' or '.join(map(str, cores))} cores.")
+    return tuple(out)
+
+
+def densifications(train: Train) -> int:
+    """Return the number of densification steps. Shorter trainings densify at the same interval, so less often in total."""
     return train.scaled().growth.adjust.count(train.iterations)
 
 
 def to_latex(table: Table, caption: str) -> str:
-    """A booktabs table, the best of each column bold."""
+    """Format a booktabs table with the best cell of each column in bold."""
     rows = [
         [rf"\textbf{{{escape(c)}}}" if (i, j) in table.best else escape(c) for j, c in enumerate(row)] for i, row in enumerate(table.rows)
     ]
@@ -175,13 +201,14 @@ def to_latex(table: Table, caption: str) -> str:
 
 
 def escape(cell: str) -> str:
+    """Escape what LaTeX would interpret."""
     for old, new in (("\\", r"\textbackslash "), ("_", r"\_"), ("%", r"\%"), ("&", r"\&"), ("#", r"\#"), ("±", r"$\pm$")):
         cell = cell.replace(old, new)
     return cell
 
 
 def to_csv(tables: dict[str, Table]) -> str:
-    """One line a cell: table, row, column, value, spread over seeds. What is absent is left out."""
+    """Format one line per cell: table, row, column, value, spread over seeds. Empty cells are left out."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(("table", "row", "column", "value", "spread"))
@@ -195,7 +222,7 @@ def to_csv(tables: dict[str, Table]) -> str:
 
 
 def write_all(title: str, tables: dict[str, Table]) -> dict[str, str]:
-    """Files of an experiment by ending: one Markdown page, one CSV, one LaTeX file, its tables one after the other."""
+    """Return the text of the files of an experiment by suffix: md, csv and tex, each with all its tables."""
     markdown = f"# {title}\n\n" + "\n".join(f"## {name}\n\n{to_markdown(table)}" for name, table in tables.items())
     return {
         "md": markdown,

@@ -15,11 +15,11 @@ def get(records, word):
 def test_without_runs_nothing_is_claimed():
     findings = check([])
     assert len(findings) >= 16 and all(f.verdict is None for f in findings)
-    assert to_markdown(findings) == "These runs judge none of them.\n"
+    assert "|" not in to_markdown(findings)
     some = check([record("moe-gs"), record("scaffold-gs")])
-    table, others = to_markdown(some).split("Without the runs to judge by: ")
+    table, others = to_markdown(some).split("Claims without runs:")
     assert [f.claim for f in some if f.verdict] == [line.split(" | ")[0][2:] for line in table.splitlines()[2:] if line]
-    assert [f.claim for f in some if not f.verdict] == others.strip().rstrip(".").split("; ")
+    assert [f.claim for f in some if not f.verdict] == [line[2:] for line in others.split("\n") if line]
 
 
 def test_more_psnr_at_equal_size():

@@ -20,16 +20,18 @@ def whole(paths):
 
 def test_no_runs_no_charts(tmp_path):
     assert figures.layers(EXPERIMENTS["fig7"], [], tmp_path / "a") == figures.cost(EXPERIMENTS["fig6"], [], tmp_path / "b") == []
-    assert figures.shares(EXPERIMENTS["fig3"], [], "fox", tmp_path / "c") == []
+    assert figures.expert_shares(EXPERIMENTS["fig3"], [], "fox", tmp_path / "c") == []
     assert figures.relative_psnr(EXPERIMENTS["fig1b"], [record()], ["fox"], tmp_path / "d") == [] and not list(tmp_path.iterdir())
 
 
 def test_figure_3_and_7_and_6(tmp_path):
     pair = [record("moe-gs-e3-top2"), record("moe-gs-e3-no-load")]
-    assert whole(figures.shares(EXPERIMENTS["fig3"], pair, "fox", tmp_path / "fig3"))
-    assert figures.shares(EXPERIMENTS["fig3"], pair, "fox", tmp_path / "other", attribute="opacity") == []  # nothing was logged of it
+    assert whole(figures.expert_shares(EXPERIMENTS["fig3"], pair, "fox", tmp_path / "fig3"))
+    assert (
+        figures.expert_shares(EXPERIMENTS["fig3"], pair, "fox", tmp_path / "other", attribute="opacity") == []
+    )  # nothing was logged of it
     first = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
-    figures.shares(EXPERIMENTS["fig3"], pair, "fox", tmp_path / "fig3")
+    figures.expert_shares(EXPERIMENTS["fig3"], pair, "fox", tmp_path / "fig3")
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == first  # the same bytes again
     depths = [record(f"scaffold-gs-depth{n}", seed=s, psnr=30 - n + s) for n in (2, 3) for s in (0, 1)]
     assert whole(figures.layers(EXPERIMENTS["fig7"], depths, tmp_path / "fig7"))
@@ -51,6 +53,6 @@ def test_figure_1b_is_relative_to_3dgs_in_order_of_anchors(tmp_path, monkeypatch
 
 def test_a_picture_in_an_svg_is_the_picture(tmp_path):
     Image.new("RGB", (30, 20), (255, 0, 0)).save(tmp_path / "fig5_fox.png")
-    text = figures.framed(tmp_path / "fig5_fox.png").read_text()
+    text = figures.wrap_in_svg(tmp_path / "fig5_fox.png").read_text()
     held = base64.b64decode(text.partition("base64,")[2].partition('"')[0])
     assert 'viewBox="0 0 30 20"' in text and held == (tmp_path / "fig5_fox.png").read_bytes()

@@ -11,21 +11,21 @@ from scene_experts.data.fetch import catalog
 from scene_experts.data.images import check_policy, target_size
 from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS
-from scene_experts.reproduce.plan import COLLECTIONS, OWN, Scale, Scene, Spec, own_scenes, paper_scenes, smaller, specs
+from scene_experts.reproduce.plan import COLLECTIONS, OWN, Scale, Scene, Spec, find_own_scenes, find_paper_scenes, list_runs, shrink
 from scene_experts.training.config import flags_of
 
 FOX = Scene("fox", OWN, Path("captures/fox"))
 
 
 def test_a_run_that_several_tables_need_is_made_once():
-    found = specs([EXPERIMENTS["table3"], EXPERIMENTS["table4"]], [FOX], [0, 1], Scale())
+    found = list_runs([EXPERIMENTS["table3"], EXPERIMENTS["table4"]], [FOX], [0, 1], Scale())
     assert len(found) == len(set(found)) == 2 * 6  # scaffold-gs, its opacity form (both tables), four MoE rows
     assert [s.seed for s in found] == [0] * 6 + [1] * 6
 
 
 def test_the_papers_scenes_serve_the_experiments_that_name_them():
     scenes = [Scene("truck", "TanksAndTemples", Path("truck")), Scene("rome", "BungeeNeRF", Path("rome"))]
-    assert {s.scene.name for s in specs([EXPERIMENTS["table3"]], scenes, [0], Scale())} == {"truck"}
+    assert {s.scene.name for s in list_runs([EXPERIMENTS["table3"]], scenes, [0], Scale())} == {"truck"}
 
 
 def test_the_arguments_make_the_run_that_the_key_names(tmp_path):
@@ -68,27 +68,27 @@ def test_scale():
 def test_a_smaller_scale_is_a_smaller_picture_whatever_the_protocol():
     scales = (1.0, 0.95, 0.5, 0.1)
     for policy, full in (("auto", (4946, 3286)), ("auto", (684, 385)), ("longest:800", (4946, 3286)), ("as-is", (684, 385))):
-        sizes = [target_size(check_policy(smaller(policy, s) if s < 1 else policy), full) for s in scales]
+        sizes = [target_size(check_policy(shrink(policy, s) if s < 1 else policy), full) for s in scales]
         assert all(abs(w - s * sizes[0][0]) <= 1 and abs(h - s * sizes[0][1]) <= 1 for s, (w, h) in zip(scales, sizes)), policy
     # inria:4 reads images_4, which is 1237 px wide of 4946
-    assert target_size(check_policy(smaller("inria:4", 0.5)), (4946, 3286))[0] == 618
-    assert max(target_size(check_policy(smaller("auto", 0.001)), (684, 385))) == 16
+    assert target_size(check_policy(shrink("inria:4", 0.5)), (4946, 3286))[0] == 618
+    assert max(target_size(check_policy(shrink("auto", 0.001)), (684, 385))) == 16
 
 
 def test_own_captures_need_folders_and_names_of_their_own(tmp_path):
     (tmp_path / "a" / "fox").mkdir(parents=True)
     (tmp_path / "b" / "fox").mkdir(parents=True)
-    assert own_scenes([tmp_path / "a" / "fox"])[0].name == "fox"
+    assert find_own_scenes([tmp_path / "a" / "fox"])[0].name == "fox"
     with pytest.raises(InputError, match="different names"):
-        own_scenes([tmp_path / "a" / "fox", tmp_path / "b" / "fox"])
+        find_own_scenes([tmp_path / "a" / "fox", tmp_path / "b" / "fox"])
     with pytest.raises(InputError, match="capture folder"):
-        own_scenes([tmp_path / "none"])
+        find_own_scenes([tmp_path / "none"])
 
 
 def test_the_papers_scenes_are_found_with_their_protocol(tmp_path):
     for name in ("images", "sparse"):
         (tmp_path / "mipnerf360" / "garden" / name).mkdir(parents=True)
-    (scene,) = paper_scenes(tmp_path)
+    (scene,) = find_paper_scenes(tmp_path)
     assert (scene.name, scene.dataset, scene.options["resolution"]) == ("garden", "MipNeRF360", "inria:4")
     spec = Spec(scene, "moe-gs", 0, Scale())
     made = parse_train(spec.arguments(tmp_path / "run")[1:])

@@ -23,7 +23,7 @@ def spec(recipe="moe-gs", seed=0, scene="fox"):
 class Fake(Runner):
     """Writes what the commands would; recipes in `broken` fail in training."""
 
-    def command(self, args, slot, log):
+    def call(self, args, slot, log):
         self.calls.append(args)  # type: ignore[attr-defined]
         if args[0] == "train":
             if args[1] in self.broken:  # type: ignore[attr-defined]
@@ -47,14 +47,14 @@ def runner(tmp_path):
 
 
 def test_what_is_done_is_not_done_again(runner):
-    assert runner.make([spec(), spec(seed=1)]) == [] and len(runner.calls) == 4
-    assert runner.make([spec(), spec(seed=1), spec("scaffold-gs")]) == [] and len(runner.calls) == 6
+    assert runner.run_all([spec(), spec(seed=1)]) == [] and len(runner.calls) == 4
+    assert runner.run_all([spec(), spec(seed=1), spec("scaffold-gs")]) == [] and len(runner.calls) == 6
     assert len(store.load(runner.records)) == 3
 
 
 def test_one_failure_does_not_lose_the_rest(runner):
     runner.broken, runner.workers = {"moe-gs"}, 2
-    failures = runner.make([spec(), spec("scaffold-gs")])
+    failures = runner.run_all([spec(), spec("scaffold-gs")])
     assert [f.spec.recipe for f in failures] == ["moe-gs"] and "expected luck" in failures[0].why
     assert [r.recipe for r in store.load(runner.records)] == ["scaffold-gs"]
     assert "expected luck" in last_line(failures[0].log)
@@ -66,20 +66,20 @@ def test_a_picture_that_fails_does_not_lose_the_rest_either(runner):
             raise InputError("expected experts, found none")
 
     runner.after = after
-    failures = runner.make([spec(), spec("scaffold-gs")])
+    failures = runner.run_all([spec(), spec("scaffold-gs")])
     assert [(f.spec.recipe, f.why) for f in failures] == [("moe-gs", "expected experts, found none")]
     assert {r.recipe for r in store.load(runner.records)} == {"moe-gs", "scaffold-gs"}
 
 
 def test_a_stop_between_training_and_scoring_leaves_both_for_the_next_time(runner):
-    command = runner.command
+    call = runner.call
 
     def stopping(args, slot, log):
         runner.stop.set()
-        return command(args, slot, log)
+        return call(args, slot, log)
 
-    runner.command = stopping
-    assert runner.make([spec()]) == [] and [args[0] for args in runner.calls] == ["train"] and store.load(runner.records) == []
+    runner.call = stopping
+    assert runner.run_all([spec()]) == [] and [args[0] for args in runner.calls] == ["train"] and store.load(runner.records) == []
 
 
 def test_a_stop_while_a_run_is_being_started_reaches_it(tmp_path, monkeypatch):
@@ -91,14 +91,14 @@ def test_a_stop_while_a_run_is_being_started_reaches_it(tmp_path, monkeypatch):
             made.end()  # it is not yet among those that run
 
     monkeypatch.setattr(subprocess, "Popen", Popen)
-    assert made.command(["train"], 0, tmp_path / "log") == -signal.SIGTERM
+    assert made.call(["train"], 0, tmp_path / "log") == -signal.SIGTERM
 
 
 def test_a_run_without_a_whole_checkpoint_begins_anew(runner):
     folder = spec().folder(runner.runs)
     (folder / "checkpoints").mkdir(parents=True)
     (folder / "config.json").write_text("torn")
-    assert runner.make([spec()]) == [] and "--resume" not in runner.calls[0]
+    assert runner.run_all([spec()]) == [] and "--resume" not in runner.calls[0]
 
 
 def test_a_run_that_another_process_is_at_is_left_alone(runner):
@@ -106,24 +106,20 @@ def test_a_run_that_another_process_is_at_is_left_alone(runner):
     folder.mkdir(parents=True)
     (folder / "metrics.jsonl").write_text("the other's")
     with held(folder):
-        (failure,) = runner.make([spec()])
-    assert (
-        "found one at work there; once it has ended, give the same command" in failure.why
-        and (folder / "metrics.jsonl").read_text() == "the other's"
-        and not runner.calls
-    )
+        (failure,) = runner.run_all([spec()])
+    assert str(folder) in failure.why and (folder / "metrics.jsonl").read_text() == "the other's" and not runner.calls
 
 
 def test_run_folders_go_when_asked_after_what_else_is_taken(runner):
     seen = []
     runner.discard, runner.after = True, lambda made, folder: seen.append((made.recipe, folder.is_dir()))
-    runner.make([spec()])
+    runner.run_all([spec()])
     assert seen == [("moe-gs", True)] and not spec().folder(runner.runs).exists() and len(store.load(runner.records)) == 1
 
 
 def test_nothing_begins_after_a_stop(runner):
     runner.end()
-    assert runner.make([spec()]) == [] and runner.calls == []
+    assert runner.run_all([spec()]) == [] and runner.calls == []
 
 
 def test_a_terminal_s_ctrl_c_reaches_a_run_once(tmp_path, monkeypatch):
@@ -136,4 +132,4 @@ def test_a_terminal_s_ctrl_c_reaches_a_run_once(tmp_path, monkeypatch):
             super().__init__(["true"], **options)
 
     monkeypatch.setattr(subprocess, "Popen", Popen)
-    assert Runner(tmp_path, tmp_path).command(["train"], 0, tmp_path / "log") == 0 and seen["process_group"] == 0
+    assert Runner(tmp_path, tmp_path).call(["train"], 0, tmp_path / "log") == 0 and seen["process_group"] == 0

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from scene_experts.reproduce.statistics import SEED_SD, SEED_WEIGHT, difference, interval, mean, shared, student, whole_seeds
+from scene_experts.reproduce.statistics import SEED_SD, SEED_WEIGHT, complete_seeds, difference, estimate, mean, on_common_scenes, student
 from support.records import record
 
 
@@ -21,7 +21,7 @@ def test_mean_over_scenes_spread_over_seeds():
 def test_a_seed_that_lacks_a_scene_does_not_move_the_mean():
     runs = [record(scene=s, seed=k, psnr=p, views=1) for s, k, p in (("a", 0, 30), ("b", 0, 20), ("a", 1, 99))]
     found = mean(runs, "psnr")
-    assert found is not None and found.value == 25 and whole_seeds(runs) == {0}
+    assert found is not None and found.value == 25 and complete_seeds(runs) == {0}
 
 
 def test_equal_gains_on_every_view_leave_the_doubt_of_other_seeds():
@@ -48,7 +48,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(captures, seeds, views):
         seed = random.normal(0, SEED_SD["psnr"], (captures, seeds, 1))
         view = random.normal(0, 0.4, (captures, 1, views))
         rest = random.normal(0, 0.3, (captures, seeds, views))
-        centre, half = interval(list(truth[:, None, None] + seed + view + rest), SEED_SD["psnr"], 0.4)
+        centre, half = estimate(list(truth[:, None, None] + seed + view + rest), SEED_SD["psnr"], 0.4)
         held += abs(centre - truth.mean()) <= half
     assert held / 600 >= 0.93
 
@@ -101,5 +101,8 @@ def test_a_large_gain_on_one_of_three_captures_is_no_rule():
 
 def test_shared_scenes_are_those_of_every_recipe_that_ran():
     runs = [record("moe-gs", scene="x"), record("moe-gs", scene="y"), record("scaffold-gs", scene="y")]
-    assert [(r.recipe, r.scene) for r in shared(runs, ["moe-gs", "scaffold-gs", "3dgs"])] == [("moe-gs", "y"), ("scaffold-gs", "y")]
-    assert shared([], ["moe-gs"]) == []
+    assert [(r.recipe, r.scene) for r in on_common_scenes(runs, ["moe-gs", "scaffold-gs", "3dgs"])] == [
+        ("moe-gs", "y"),
+        ("scaffold-gs", "y"),
+    ]
+    assert on_common_scenes([], ["moe-gs"]) == []

@@ -8,8 +8,8 @@ import pytest
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
-from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec, distinct
-from scene_experts.reproduce.store import POINTS, curves, expect_of_captures, find, load, of_run, of_specs, read, unpacked, write
+from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec, drop_repeated
+from scene_experts.reproduce.store import POINTS, check_captures, find, find_all, load, read, read_curves, read_run, unpack, write
 from scene_experts.training.config import to_json
 from scene_experts.training.run_folder import load_capture
 from support.records import record
@@ -29,7 +29,7 @@ def test_a_record_comes_back_as_it_was_without_the_place_of_the_capture(tmp_path
 def test_a_record_of_the_first_format_opens(tmp_path):
     made = record()
     path = write(tmp_path, made)
-    value = unpacked(json.loads(path.read_text()))
+    value = unpack(json.loads(path.read_text()))
     assert value["curves"] == made.curves and value["per_view"] == made.per_view
     path.write_text(json.dumps({**value, "format": 1}, indent=2))
     assert read(path) == made
@@ -46,11 +46,11 @@ def test_records_of_another_capture_of_the_same_name_are_refused(tmp_path):
     spec = Spec(Scene("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
     capture = load_capture(spec.data)
     own = replace(record(scene="box"), per_view={capture.views[i].name: {"psnr": 30.0} for i in capture.test})
-    expect_of_captures([own], [spec])
-    expect_of_captures([record(scene="box", seed=1)], [spec])  # counts as no run that is asked for
-    with pytest.raises(InputError, match=r"found scores of 0\.png, 1\.png, 2\.png and 1 more, so of another capture of that name; rename"):
-        expect_of_captures([record(scene="box")], [spec])
-    expect_of_captures([record(scene="box")], [replace(spec, scene=replace(spec.scene, path=tmp_path / "gone"))])
+    check_captures([own], [spec])
+    check_captures([record(scene="box", seed=1)], [spec])  # counts as no run that is asked for
+    with pytest.raises(InputError, match=r"0\.png, 1\.png, 2\.png and 1 more.*--records"):
+        check_captures([record(scene="box")], [spec])
+    check_captures([record(scene="box")], [replace(spec, scene=replace(spec.scene, path=tmp_path / "gone"))])
 
 
 def test_changed_figures_are_refused(tmp_path):
@@ -58,7 +58,7 @@ def test_changed_figures_are_refused(tmp_path):
     value = json.loads(path.read_text())
     value["results"]["psnr"] = 99.0
     path.write_text(json.dumps(value))
-    with pytest.raises(InputError, match="expected results as they were written"):
+    with pytest.raises(InputError, match="expected results"):
         read(path)
     path = write(tmp_path, record())
     value = json.loads(path.read_text())
@@ -74,7 +74,7 @@ def test_changed_figures_are_refused(tmp_path):
 
 def test_a_folder_without_results_is_refused(tmp_path):
     with pytest.raises(InputError, match="expected an evaluated run"):
-        of_run(tmp_path, "fox")
+        read_run(tmp_path, "fox")
 
 
 def test_a_training_scored_before_its_end_is_no_record(tmp_path):
@@ -82,10 +82,10 @@ def test_a_training_scored_before_its_end_is_no_record(tmp_path):
     write_json(tmp_path / "config.json", {"format": 1, **to_json(made.config)})
     write_json(tmp_path / "per_view.json", made.per_view)
     write_json(tmp_path / "results.json", {**made.results, "step": 1200})
-    with pytest.raises(InputError, match=r"scores of all 3,000 iterations in .* found those after 1,200"):
-        of_run(tmp_path, "fox")
+    with pytest.raises(InputError, match=r"3,000 iterations.*1,200"):
+        read_run(tmp_path, "fox")
     write_json(tmp_path / "results.json", {**made.results, "step": 3000})
-    assert of_run(tmp_path, "fox").key == made.key
+    assert read_run(tmp_path, "fox").key == made.key
 
 
 def test_curves_keep_the_ends_and_skip_torn_lines(tmp_path):
@@ -96,9 +96,9 @@ def test_curves_keep_the_ends_and_skip_torn_lines(tmp_path):
         '{"step": 99',
     ]
     path.write_bytes("\n".join(lines).encode() + b"\n\xff\xfe")
-    found = curves(path)
+    found = read_curves(path)
     assert len(found) == POINTS and (found[0]["step"], found[-1]["step"]) == (1, 1000) and "terms" not in found[0]
-    assert curves(tmp_path / "none") == []
+    assert read_curves(tmp_path / "none") == []
 
 
 def test_columns():
@@ -111,11 +111,11 @@ def test_a_run_counts_for_every_recipe_of_the_same_numbers(tmp_path):
     """Five experts with Top-2 in Figure 6 are the main recipe, two layers in Figure 7 are Scaffold-GS."""
     scene = Scene("fox", OWN, tmp_path)
     pair = [Spec(scene, recipe, 0, Scale(iterations=3000)) for recipe in ("moe-gs", "moe-gs-e5-top2")]
-    assert distinct([*pair, Spec(scene, "moe-gs-e4-top2", 0, Scale(iterations=3000))]) == [
+    assert drop_repeated([*pair, Spec(scene, "moe-gs-e4-top2", 0, Scale(iterations=3000))]) == [
         pair[0],
         Spec(scene, "moe-gs-e4-top2", 0, Scale(iterations=3000)),
     ]
     write(tmp_path, record("moe-gs", "fox"))
-    found = of_specs(load(tmp_path), pair)
+    found = find_all(load(tmp_path), pair)
     assert [r.recipe for r in found] == ["moe-gs", "moe-gs-e5-top2"] and [r.key for r in found] == [s.key for s in pair]
     assert find(load(tmp_path), Spec(scene, "moe-gs-e5-top1", 0, Scale(iterations=3000))) is None

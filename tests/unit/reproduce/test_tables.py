@@ -1,7 +1,7 @@
 """Tables: ours beside the paper's, spreads, best cells, notes; LaTeX that escapes."""
 
 from scene_experts.reproduce.experiments import EXPERIMENTS
-from scene_experts.reproduce.tables import by_dataset, by_scene, escape, expert_shares, published, to_latex, write_all
+from scene_experts.reproduce.tables import COLUMNS, by_dataset, by_scene, escape, expert_shares, paper_numbers, to_latex, write_all
 from support.records import record
 
 TABLE4, TABLE3 = EXPERIMENTS["table4"], EXPERIMENTS["table3"]
@@ -18,23 +18,23 @@ def test_ours_stand_beside_the_papers():
     rows = {row[0]: row for row in table.rows}
     assert rows["MoE-GS"][1] == "24.50 ± 0.71" and rows["MoE-GS"][5] == "24.61"
     assert rows["w/o MoE"][1] == "23.00" and rows["w/o CL"][1] == "-" and rows["w/o CL"][5] == "24.42"
-    assert not table.best and "w/o MoE: no run on truck with seed 1" in table.notes  # means over other seeds are no rivals
+    assert not table.best and "w/o MoE: no run on truck with seed 1." in table.notes  # means over other seeds are no rivals
     table = by_dataset(TABLE4, [r for r in runs() if r.seed == 0], "TanksAndTemples", ["truck"])
     assert (list(rows).index("MoE-GS"), 1) in table.best and (list(rows).index("w/o MoE"), 4) in table.best
     table = by_dataset(TABLE4, runs(), "TanksAndTemples", ["truck"])
     assert (
-        any(note.startswith("no run: w/o CL") for note in table.notes)
-        and "3,000 iterations (13 adjustments of density), 30,000 iterations (134 " in table.notes[0]
+        any(note.startswith("No run: w/o CL") for note in table.notes)
+        and "3,000 iterations (13 densification steps), 30,000 iterations (134 " in table.notes[0]
     )
 
 
 def test_own_captures_have_no_published_numbers():
-    assert published(TABLE4, "captures") == {}
+    assert paper_numbers(TABLE4, "captures") == {}
     assert len(by_dataset(TABLE4, runs(), "captures", ["truck"]).titles) == 5
 
 
 def test_table_3_is_of_one_column():
-    assert published(TABLE3, "DeepBlending") == {"Scaffold-GS": [41.0], "Scaffold-GS+L_opacity": [70.5]}
+    assert paper_numbers(TABLE3, "DeepBlending") == {"Scaffold-GS": [41.0], "Scaffold-GS+L_opacity": [70.5]}
     table = by_dataset(TABLE3, [record("scaffold-gs", "playroom", active=0.4)], "DeepBlending", ["playroom"])
     assert table.rows[0] == ("Scaffold-GS", "40.0", "41.0") and not table.best
 
@@ -61,14 +61,14 @@ def test_a_row_that_lacks_a_scene_is_no_rival():
     table = by_dataset(
         TABLE4, [*runs(), record("scaffold-gs-opacity", "train", 0, psnr=10.0, views=1)], "TanksAndTemples", ["truck", "train"]
     )
-    assert (list(TABLE4.rows).index("MoE-GS"), 1) not in table.best and "MoE-GS: no run on train" in table.notes
+    assert (list(TABLE4.rows).index("MoE-GS"), 1) not in table.best and "MoE-GS: no run on train." in table.notes
 
 
 def test_notes_say_which_seeds_each_mean_is_of():
     pair = [record("moe-gs", s, seed, psnr=24.0 + seed) for s in ("truck", "train") for seed in (0, 1)]
     lacking = [record("scaffold-gs-opacity", s, seed) for s, seed in (("truck", 0), ("truck", 1), ("train", 0))]
     found = by_dataset(TABLE4, [*pair, *lacking], "TanksAndTemples", ["truck", "train"]).notes
-    assert "w/o MoE: means of seeds 0, the others lack scenes" in found and not any("MoE-GS: means" in note for note in found)
+    assert any("w/o MoE: mean over seeds 0;" in note for note in found) and not any("MoE-GS: mean" in note for note in found)
 
 
 def test_shares_of_experts_at_the_end():
@@ -78,3 +78,23 @@ def test_shares_of_experts_at_the_end():
     assert table.titles[3:5] == ("expert 3", "expert 1, of anchors")
     dense = {"cov": {"share": None, "per_anchor": None, "mean_gate": [0.5, 0.5], "entropy": 1.0}}
     assert expert_shares(EXPERIMENTS["fig3"], [record("moe-gs-e3-top2", experts=dense)], "fox") is None
+
+
+def test_training_times_are_cpu_time_where_every_record_has_it():
+    rows = [f"moe-gs-e{n}-top1" for n in (2, 3)]
+    old = record(rows[0], seconds=100.0)
+    new = [record(row, seconds=90.0, cpu_seconds=150.0, load={"cores": 2, "start": 0.4, "end": 1.9}) for row in rows]
+    cpu, wall = (by_dataset(EXPERIMENTS["fig6"], runs, "captures", ["fox"]) for runs in (new, [old, new[1]]))
+    assert cpu.titles[2] == COLUMNS["cpu_seconds"].title and cpu.rows[0][2] == "150"
+    assert any("0.4 to 1.9 on 2 cores" in note for note in cpu.notes)
+    assert wall.titles[2] == COLUMNS["train_seconds"].title and wall.rows[0][2] == "100"
+    assert any("wall times" in note for note in wall.notes) and not any("load average" in note for note in wall.notes)
+
+
+def test_table_1_has_the_cpu_time_beside_the_paper_s_columns_where_every_record_has_it():
+    table1 = EXPERIMENTS["table1"]
+    new = [record("moe-gs", "truck", cpu_seconds=150.0), record("scaffold-gs", "truck", cpu_seconds=90.0)]
+    table = by_dataset(table1, new, "TanksAndTemples", ["truck"])
+    assert table.titles[5:7] == ("training, CPU s", "PSNR (paper)") and len(table.rows[0]) == len(table.titles)
+    assert table.rows[list(table1.rows).index("MoE-GS")][5] == "150"
+    assert "training, CPU s" not in by_dataset(table1, [*new, record("3dgs", "truck")], "TanksAndTemples", ["truck"]).titles
