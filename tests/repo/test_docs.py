@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from scene_experts.arguments.table import rows as rows_of
 from scene_experts.commands.evaluate import EvalCommand
+from scene_experts.commands.render import RenderCommand
 from scene_experts.commands.reproduce import ReproduceCommand
 from scene_experts.commands.train import TrainCommand
 from scene_experts.recipes import RECIPES
-from scene_experts.training.config import Data, Train
 from support.places import ROOT
 
 PLACES = (ROOT / "src" / "scene_experts", ROOT / "csrc", ROOT / "tests", ROOT)
@@ -99,27 +100,12 @@ def test_every_equation_names_its_code_and_its_test():
     assert [rule[:3] for rule in numbered[:9]] == [f"({i})" for i in range(1, 10)]
 
 
-def flags(part: object, prefix: str = "") -> set[str]:
-    """Every flag of a recipe's or a command's value, with the negations of the switches."""
-    out: set[str] = set()
-    for name, value in vars(part).items():
-        flag = name.replace("_", "-")
-        if hasattr(value, "__dataclass_fields__"):  # a part has flags and is none
-            out |= flags(value, f"{prefix}{flag}.")
-        else:
-            out |= {prefix + flag} | ({f"{prefix}no-{flag}"} if isinstance(value, bool) else set())
-    return out
-
-
 @functools.cache
 def every_flag() -> frozenset[str]:
-    out = {
-        name.replace("_", "-") for kind in (TrainCommand, Data, Train, EvalCommand, ReproduceCommand) for name in kind.__dataclass_fields__
-    }
-    out |= {"only", "attribute"}  # of `render`
-    for _, recipe in RECIPES.values():
-        out |= flags(recipe)
-    return frozenset(out)
+    """Every option of these commands and of every recipe, without dashes, with the negations of the switches."""
+    tables = [rows_of(kind, {}) for kind in (EvalCommand, RenderCommand, ReproduceCommand)]
+    tables += [rows_of(TrainCommand, {"cfg": recipe}) for _, recipe in RECIPES.values()]
+    return frozenset(name.lstrip("-") for table in tables for row in table for name in row.names)
 
 
 def test_the_switches_of_the_differences_exist():

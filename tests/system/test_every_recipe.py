@@ -10,6 +10,7 @@ import pytest
 from scene_experts.core import checkpoint
 from scene_experts.core.types import Points
 from scene_experts.data.capture import Capture, load
+from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.score import evaluate
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
@@ -58,7 +59,7 @@ def test_it_trains_grows_resumes_to_the_bit_and_is_scored(recipe, buddha, tmp_pa
 
     tensors, meta = checkpoint.load(checkpoint.latest(parts / "checkpoints"))
     scene = scene_from(cfg.scaled(), tensors, meta)
-    evaluate(scene, buddha, choose("auto", "cpu", deterministic=True), tmp_path, step=LAST, lpips=False)
+    evaluate(scene, buddha, choose("auto", "cpu", deterministic=True), tmp_path, EvalOptions(lpips=False), step=LAST)
     results, per_view = (json.loads((tmp_path / name).read_text()) for name in ("results.json", "per_view.json"))
     assert math.isfinite(results["psnr"]) and results["anchors"] == counts[-1]
     assert len(per_view) == results["view_count"] == len(buddha.test) == 2

@@ -22,6 +22,7 @@ from scene_experts.api.recipe import Recipe
 from scene_experts.core import types
 from scene_experts.core.errors import InputError
 from scene_experts.evaluate.command import about
+from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.pictures import to_8bit
 from scene_experts.evaluate.score import evaluate
 from scene_experts.files.bake.bake import Bake
@@ -224,22 +225,10 @@ class Run:
             InputError: The split has no views.
             RunError: The disk is full.
         """
+        options = EvalOptions(views, appearance, lpips, None if lpips_weights is None else Path(lpips_weights), download_lpips)
         with self._folder() as folder:
-            details = evaluate(
-                self.scene,
-                self.capture.loaded,
-                self._rasterize,
-                folder,
-                step=self.step,
-                views=views,
-                appearance=appearance,
-                lpips=lpips,
-                lpips_weights=None if lpips_weights is None else Path(lpips_weights),
-                download=download_lpips,
-                about=about(self._now()),
-            )
-            suffix = "_half" if appearance == "half" else "" if views == "test" else f"_{views}"
-            per_view = run_folder.read_json(folder / f"per_view{suffix}.json", "scores by view")
+            details = evaluate(self.scene, self.capture.loaded, self._rasterize, folder, options, step=self.step, about=about(self._now()))
+            per_view = run_folder.read_json(folder / f"per_view{options.suffix}.json", "scores by view")
         return Scores(details["psnr"], details["ssim"], details["lpips"], per_view, details)  # type: ignore[arg-type]
 
     def export(

@@ -12,30 +12,27 @@ from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
 from scene_experts.commands.shared import Device, Raster, backend
+from scene_experts.evaluate.options import EvalOptions
 
 
 @dataclass(frozen=True)
 class EvalCommand:
-    """Render the held-out views of a run to disk and score the 8-bit files."""
+    """Render the held-out views of a run, save them as 8-bit pictures and score these.
+
+    Writes RUN/results.json, RUN/per_view.json, the pictures in RUN/test and RUN/report.html.
+    """
 
     run: Annotated[Path, Option(value="RUN")]
     """Run folder."""
+    options: Annotated[EvalOptions, Option(name="")] = EvalOptions()
     data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
-    """Where the capture is now, if it moved."""
-    views: Literal["test", "train"] = "test"
-    appearance: Literal["rule", "half"] = "rule"
-    """Appearance codes of held-out views: as the recipe's rule has it, or found on the left half of each photograph, whose right half is
-    then scored (NeRF in the Wild's protocol; written beside the other results)."""
+    """Folder of the capture, if it has moved."""
     step: int | None = None
-    """Checkpoint to score; the newest by default."""
-    lpips: bool = True
-    """Score LPIPS where its weights are found."""
-    lpips_weights: Path | None = None
-    """Folder or file with the LPIPS weights."""
-    download_lpips: bool = False
-    """Fetch the LPIPS weights if they are nowhere on this machine."""
+    """Iteration of the checkpoint to score; by default the newest."""
     device: Device = "auto"
+    """Device to render on. auto: CUDA if available."""
     rasterizer: Raster = "auto"
+    """Rasteriser. auto: the fastest that works on the device."""
 
 
 def evaluate(args: list[str]) -> int:
@@ -45,20 +42,9 @@ def evaluate(args: list[str]) -> int:
 
     command = parse(EvalCommand, Command(f"{PROG} eval", ("--run",)), args)
     device, rasterize = backend(command.device, command.rasterizer, False, False)
-    results = evaluate_run(
-        command.run,
-        device,
-        rasterize,
-        data=command.data,
-        views=command.views,
-        appearance=command.appearance,
-        step=command.step,
-        lpips=command.lpips,
-        lpips_weights=command.lpips_weights,
-        download=command.download_lpips,
-    )
+    results = evaluate_run(command.run, device, rasterize, command.options, data=command.data, step=command.step)
     print_results(results, Console(highlight=False), command.run)
-    if command.views == "test" and command.appearance == "rule":
+    if not command.options.suffix:  # the page shows the held-out views
         print(f"wrote {page.write([command.run])}")
     return 0
 

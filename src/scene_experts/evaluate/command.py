@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from rich.console import Console
 
+from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.score import About, evaluate
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.training import run_folder
@@ -15,41 +16,18 @@ from scene_experts.training.run_folder import OpenRun
 
 
 def evaluate_run(
-    run: Path,
-    device: str,
-    rasterize: Rasterizer,
-    *,
-    data: Path | None = None,
-    views: Literal["test", "train"] = "test",
-    appearance: Literal["rule", "half"] = "rule",
-    step: int | None = None,
-    lpips: bool = True,
-    lpips_weights: Path | None = None,
-    download: bool = False,
+    run: Path, device: str, rasterize: Rasterizer, options: EvalOptions, *, data: Path | None = None, step: int | None = None
 ) -> dict[str, Any]:
-    """Evaluate the newest checkpoint of a run folder (or the one at `step`) on its capture, which `data` may say has moved.
+    """Evaluate the newest checkpoint of a run folder, or the one at `step`. data: the folder of the capture, if it has moved.
 
-    The rasteriser's antialiasing follows the run's recipe where it can. Raises InputError for anything that does not fit.
+    The rasteriser antialiases as the run's recipe does, if it can. Raises InputError if run, checkpoint, capture and options do not fit.
     """
     opened = run_folder.open_run(run, device, step)
     rasterize = as_trained(rasterize, opened.cfg.antialias)
     capture = run_folder.capture_of(opened, data)
     try:
         with Bar(Console(stderr=True)) as tell:
-            return evaluate(
-                opened.scene,
-                capture,
-                rasterize,
-                run,
-                step=opened.step,
-                views=views,
-                appearance=appearance,
-                lpips=lpips,
-                lpips_weights=lpips_weights,
-                download=download,
-                about=about(opened),
-                progress=tell,
-            )
+            return evaluate(opened.scene, capture, rasterize, run, options, step=opened.step, about=about(opened), progress=tell)
     finally:
         capture.images.close()
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from scene_experts.core.types import Camera, Decoded, Mode, Render
 from scene_experts.evaluate import expert_pictures, halves, pictures, timing
 from scene_experts.evaluate.experts import expert_shares
 from scene_experts.evaluate.metrics import VARIANTS, Perceptual, score
+from scene_experts.evaluate.options import EvalOptions
 from scene_experts.training import run_folder
 
 if TYPE_CHECKING:
@@ -52,35 +53,30 @@ def evaluate(
     capture: Capture,
     rasterize: Rasterizer,
     out: Path,
+    options: EvalOptions | None = None,
     *,
     step: int,
-    views: Literal["test", "train"] = "test",
-    appearance: Literal["rule", "half"] = "rule",
-    lpips: bool = True,
-    lpips_weights: Path | None = None,
-    download: bool = False,
     about: About | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Render, score and time the views of a split; returns what results.json then holds.
+    """Render, score and time the views of a split. The scene is drawn on the device of its parameters.
 
-    appearance: a held-out view's code is what the scene's rule says, or is found on its left half, and only its right half is scored. The
-    scene is drawn on the device its parameters are on. Raises InputError where the split holds no view, RunError on a full disk.
+    step: iteration whose schedule values (such as Top-k) the scene uses.
+    Returns what results.json holds. Raises InputError if the split has no views, RunError if the disk is full.
     """
-    chosen = _chosen(capture, views, appearance)
+    options = options or EvalOptions()
+    chosen = _chosen(capture, options)
     began = time.perf_counter()
     tell = progress or (lambda *_: None)
     device = next(iter(scene.table.params.values())).device
     background = torch.tensor(capture.background, dtype=torch.float32, device=device)
-    fetching = lambda have, total: tell("fetching LPIPS weights, MiB", have >> 20, total >> 20)  # noqa: E731
-    perceptual = Perceptual.find(lpips_weights, device, fetch=download, progress=fetching) if lpips else Perceptual.off()
+    perceptual = _perceptual(options, device, tell)
     names = pictures.file_names(capture.views[i].name for i in chosen)
     cameras = [capture.views[i].camera.to(device) for i in chosen]
-    half = appearance == "half"
+    half = options.appearance == "half"
     if half:
         halves.fit(scene, capture, rasterize, chosen, step, background, lambda done, total: tell("finding appearance codes", done, total))
-    suffix = "_half" if half else "" if views == "test" else f"_{views}"
-    folder = out / (f"{views}_half" if half else views)
+    folder = out / options.folder
     pictures.clear(folder)
     per_view: dict[str, dict[str, Any]] = {}
     draws = scene.frozen(step)
@@ -101,20 +97,28 @@ def evaluate(
         "gaussians_rendered": _mean(per_view, "gaussians_rendered"),
         "activation_ratio": _mean(per_view, "activation_ratio"),
         "fps": asdict(timing.measure(scene, cameras, step, rasterize, background)),
-        **_views_scored(capture, views, cameras, appearance),
+        **_views_scored(capture, cameras, options),
         **_about(about or About(), step, rasterize, perceptual),
         "evaluation_seconds": time.perf_counter() - began,
     }
-    write_json(out / f"per_view{suffix}.json", per_view)
-    write_json(out / f"results{suffix}.json", results)
+    write_json(out / f"per_view{options.suffix}.json", per_view)
+    write_json(out / f"results{options.suffix}.json", results)
     return results
 
 
-def _views_scored(capture: Capture, views: str, cameras: Sequence[Camera], appearance: str) -> dict[str, Any]:
+def _perceptual(options: EvalOptions, device: torch.device, tell: Progress) -> Perceptual:
+    """The LPIPS networks that can be used."""
+    if not options.lpips:
+        return Perceptual.off()
+    fetching = lambda have, total: tell("fetching LPIPS weights, MiB", have >> 20, total >> 20)  # noqa: E731
+    return Perceptual.find(options.lpips_weights, device, fetch=options.download_lpips, progress=fetching)
+
+
+def _views_scored(capture: Capture, cameras: Sequence[Camera], options: EvalOptions) -> dict[str, Any]:
     return {
         "capture": capture.name,
-        "views": views,
-        **({"appearance": appearance} if appearance == "half" else {}),
+        "views": options.views,
+        **({"appearance": "half"} if options.appearance == "half" else {}),
         "view_count": len(cameras),
         "split": capture.split,
         "resolution": capture.resolution,
@@ -122,12 +126,13 @@ def _views_scored(capture: Capture, views: str, cameras: Sequence[Camera], appea
     }
 
 
-def _chosen(capture: Capture, views: str, appearance: str) -> tuple[int, ...]:
-    """The views to score. Raises InputError where there is none, or where the training's views have codes already."""
+def _chosen(capture: Capture, options: EvalOptions) -> tuple[int, ...]:
+    """The views to score. Raises InputError if there are none, or if the training views have codes already."""
+    views = options.views
     chosen = capture.test if views == "test" else capture.train
     if not chosen:
         raise InputError(f"expected at least one {views} view in {capture.name}, found none (split {capture.split}); {EMPTY[views]}")
-    if appearance == "half" and views == "train":
+    if options.appearance == "half" and views == "train":
         raise InputError("expected held-out views for --appearance half, found --views train, which have codes; leave one of them out")
     return chosen
 

@@ -11,6 +11,7 @@ import pytest
 
 from scene_experts.core.errors import InputError
 from scene_experts.evaluate import command
+from scene_experts.evaluate.options import EvalOptions
 from scene_experts.recipes import RECIPES
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import Data, RunConfig
@@ -44,14 +45,14 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(command.run_folder, "open_run", lambda run, device, step: opened)
     monkeypatch.setattr(command.run_folder, "load_capture", load)
     monkeypatch.setattr(command, "evaluate", evaluate)
-    result = command.evaluate_run(tmp_path, "cpu", Raster(), data=Path("new"), views="train", lpips=False)  # type: ignore[arg-type]
+    result = command.evaluate_run(tmp_path, "cpu", Raster(), EvalOptions("train", lpips=False), data=Path("new"))  # type: ignore[arg-type]
     assert result == {"psnr": 1.0} and closed == [True]
     assert seen["data"] == Data(Path("new"), split="mod:4")
-    assert seen["args"] == ("scene", capture, Raster(antialias), tmp_path)
-    assert seen["step"] == 250 and seen["views"] == "train" and not seen["lpips"]
+    assert seen["args"] == ("scene", capture, Raster(antialias), tmp_path, EvalOptions("train", lpips=False))
+    assert seen["step"] == 250
     about = seen["about"]
     assert (about.recipe, about.iterations, about.seed, about.versions) == ("moe-gs", 300, 4, {"torch": "x"})
     assert (about.train_seconds, about.cpu_seconds, about.load) == (9.0, 17.0, {"cores": 2})
     opened.capture = "b"
     with pytest.raises(InputError, match="other views in new"):
-        command.evaluate_run(tmp_path, "cpu", Raster(), data=Path("new"), lpips=False)  # type: ignore[arg-type]
+        command.evaluate_run(tmp_path, "cpu", Raster(), EvalOptions(), data=Path("new"))  # type: ignore[arg-type]

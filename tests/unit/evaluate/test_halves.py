@@ -10,6 +10,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
 from scene_experts.evaluate import halves
+from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.score import evaluate
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
@@ -66,8 +67,8 @@ def test_the_code_is_found_on_the_left_half_alone(capture):
 
 def test_right_halves_are_scored_beside_the_usual_results(capture, tmp_path):
     scene, draw = started(capture), choose("auto", "cpu")
-    usual = evaluate(scene, capture, draw, tmp_path, step=STEP, lpips=False)
-    half = evaluate(scene, capture, draw, tmp_path, step=STEP, lpips=False, appearance="half")
+    usual = evaluate(scene, capture, draw, tmp_path, EvalOptions(lpips=False), step=STEP)
+    half = evaluate(scene, capture, draw, tmp_path, EvalOptions(appearance="half", lpips=False), step=STEP)
     assert "appearance" not in usual and half["appearance"] == "half" and half["masked"]
     assert half["psnr"] > usual["psnr"]  # these codes fit the photographs
     assert json.loads((tmp_path / "results.json").read_text())["psnr"] == usual["psnr"]
@@ -75,4 +76,4 @@ def test_right_halves_are_scored_beside_the_usual_results(capture, tmp_path):
     assert any((tmp_path / "test_half" / "masks").iterdir()) and (tmp_path / "per_view_half.json").is_file()
     for wrong, options in ((started(capture, 0), {}), (scene, {"views": "train"})):
         with pytest.raises(InputError, match="--appearance half"):
-            evaluate(wrong, capture, draw, tmp_path, step=STEP, lpips=False, appearance="half", **options)
+            evaluate(wrong, capture, draw, tmp_path, EvalOptions(appearance="half", lpips=False, **options), step=STEP)

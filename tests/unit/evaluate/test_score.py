@@ -18,6 +18,7 @@ from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Render, Routing
 from scene_experts.evaluate import metrics, pictures, weights
 from scene_experts.evaluate import score as run
+from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.score import About, evaluate
 from scene_experts.scene import Scene, Traits
 from support.lpips import random_tensors
@@ -112,7 +113,9 @@ def no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def evaluated(out: Path, capture: Any = None, rasterize: Any = None, scene: Any = None, **options: Any) -> dict[str, Any]:
-    return evaluate(scene or FakeScene(), capture or FakeCapture(), rasterize or FakeRasterizer(), out, step=700, **options)  # type: ignore[arg-type]
+    more = {name: options.pop(name) for name in ("about", "progress") if name in options}
+    parts = (scene or FakeScene(), capture or FakeCapture(), rasterize or FakeRasterizer())
+    return evaluate(*parts, out, EvalOptions(**options), step=700, **more)
 
 
 def test_files_and_figures(tmp_path: Path) -> None:
