@@ -24,7 +24,7 @@ struct Constants {
 };
 
 // The first n < LANES floats at p, the others zero; and the way back.
-inline V load_some(const float* p, int64_t n) {
+inline Vec load_part(const float* p, int64_t n) {
 #if defined(__AVX512F__)
   return {_mm512_maskz_loadu_ps(static_cast<__mmask16>((1u << n) - 1), p)};
 #else
@@ -34,7 +34,7 @@ inline V load_some(const float* p, int64_t n) {
 #endif
 }
 
-inline void store_some(float* p, V a, int64_t n) {
+inline void store_some(float* p, Vec a, int64_t n) {
 #if defined(__AVX512F__)
   _mm512_mask_storeu_ps(p, static_cast<__mmask16>((1u << n) - 1), a.v);
 #else
@@ -44,25 +44,26 @@ inline void store_some(float* p, V a, int64_t n) {
 #endif
 }
 
-void span(const Constants& c, const SeAdamTensor& t, int64_t begin, int64_t end) {
-  const V rate1 = all(c.rate1), beta2 = all(c.beta2), rate2 = all(c.rate2), eps = all(c.eps), step = all(-c.step_size), root = all(c.root);
+void update_span(const Constants& c, const SeAdamTensor& t, int64_t begin, int64_t end) {
+  const Vec rate1 = broadcast(c.rate1), beta2 = broadcast(c.beta2), rate2 = broadcast(c.rate2), eps = broadcast(c.eps),
+            step = broadcast(-c.step_size), root = broadcast(c.root);
   int64_t i = begin;
   for (; i + LANES <= end; i += LANES) {
-    const V g = load(t.gradient + i), old = load(t.first + i);
-    const V first = fma(rate1, g - old, old);
-    const V second = fma(rate2 * g, g, load(t.second + i) * beta2);
+    const Vec g = load(t.gradient + i), old = load(t.first + i);
+    const Vec first = fma(rate1, g - old, old);
+    const Vec second = fma(rate2 * g, g, load(t.second + i) * beta2);
     store(t.first + i, first);
     store(t.second + i, second);
     store(t.value + i, load(t.value + i) + step * first / (square_root(second) / root + eps));
   }
   if (t.rows && i < end) {  // the rest of a row, which ends everywhere: one register
     const int64_t n = end - i;
-    const V g = load_some(t.gradient + i, n), old = load_some(t.first + i, n);
-    const V first = fma(rate1, g - old, old);
-    const V second = fma(rate2 * g, g, load_some(t.second + i, n) * beta2);
+    const Vec g = load_part(t.gradient + i, n), old = load_part(t.first + i, n);
+    const Vec first = fma(rate1, g - old, old);
+    const Vec second = fma(rate2 * g, g, load_part(t.second + i, n) * beta2);
     store_some(t.first + i, first, n);
     store_some(t.second + i, second, n);
-    store_some(t.value + i, load_some(t.value + i, n) + step * first / (square_root(second) / root + eps), n);
+    store_some(t.value + i, load_part(t.value + i, n) + step * first / (square_root(second) / root + eps), n);
     return;
   }
   // PyTorch's kernel works eight by eight; in what is left after that, its compiler fuses the other product.
@@ -75,7 +76,7 @@ void span(const Constants& c, const SeAdamTensor& t, int64_t begin, int64_t end)
   }
 }
 
-inline void fetch(const SeAdamTensor& t, int64_t row) {
+inline void prefetch_row(const SeAdamTensor& t, int64_t row) {
   for (int64_t i = row * t.width; i < (row + 1) * t.width; i += 16) {
     __builtin_prefetch(t.gradient + i, 0);
     __builtin_prefetch(t.first + i, 1);
@@ -85,19 +86,19 @@ inline void fetch(const SeAdamTensor& t, int64_t row) {
 }
 
 // Neighbouring rows are one span, so that short rows do not end in a rest each.
-void spans(const Constants& c, const SeAdamTensor& t, int64_t begin, int64_t end) {
+void update_rows(const Constants& c, const SeAdamTensor& t, int64_t begin, int64_t end) {
   while (begin < end) {
     int64_t last = begin + 1;
     while (last < end && t.rows[last] == t.rows[last - 1] + 1) ++last;
-    for (int64_t ahead = begin + kAhead; ahead < std::min(end, last + kAhead); ++ahead) fetch(t, t.rows[ahead]);
-    span(c, t, t.rows[begin] * t.width, (t.rows[last - 1] + 1) * t.width);
+    for (int64_t ahead = begin + kAhead; ahead < std::min(end, last + kAhead); ++ahead) prefetch_row(t, t.rows[ahead]);
+    update_span(c, t, t.rows[begin] * t.width, (t.rows[last - 1] + 1) * t.width);
     begin = last;
   }
 }
 
-int64_t grain(const SeAdamTensor& t) { return std::max<int64_t>(1, kGrain / std::max<int64_t>(1, t.width)); }
+int64_t chunk_size(const SeAdamTensor& t) { return std::max<int64_t>(1, kGrain / std::max<int64_t>(1, t.width)); }
 
-int64_t chunks(const SeAdamTensor& t) { return (t.count + grain(t) - 1) / grain(t); }
+int64_t count_chunks(const SeAdamTensor& t) { return (t.count + chunk_size(t) - 1) / chunk_size(t); }
 
 }  // namespace
 }  // namespace se
@@ -105,16 +106,16 @@ int64_t chunks(const SeAdamTensor& t) { return (t.count + grain(t) - 1) / grain(
 // tensors [n]; where `rows` is given, each row at most once and inside of the tensor.
 SE_EXPORT void se_adam_step(const SeAdamTensor* tensors, int64_t count, double beta1, double beta2, double eps, int32_t threads) {
   int64_t total = 0;
-  for (int64_t i = 0; i < count; ++i) total += se::chunks(tensors[i]);
+  for (int64_t i = 0; i < count; ++i) total += se::count_chunks(tensors[i]);
   const auto single = [](double x) { return static_cast<float>(x); };
   se::parallel_for(total, 1, threads, [&](int64_t chunk, int64_t, int) {
     const SeAdamTensor* t = tensors;
-    for (; chunk >= se::chunks(*t); ++t) chunk -= se::chunks(*t);
+    for (; chunk >= se::count_chunks(*t); ++t) chunk -= se::count_chunks(*t);
     const se::Constants c{single(1 - beta1), single(beta2), single(1 - beta2), single(eps), single(t->step_size), single(t->root)};
-    const int64_t from = chunk * se::grain(*t), to = std::min(t->count, from + se::grain(*t));
+    const int64_t from = chunk * se::chunk_size(*t), to = std::min(t->count, from + se::chunk_size(*t));
     if (t->rows)
-      se::spans(c, *t, from, to);
+      se::update_rows(c, *t, from, to);
     else
-      se::span(c, *t, from, to);
+      se::update_span(c, *t, from, to);
   });
 }

@@ -2,8 +2,8 @@
 //
 // A anchors are seen, each with K slots, a feature of F values and inputs z = (f, direction, 1, distance, position): the 1 carries the
 // first layer's bias, the position is for routers that ask for it. Three heads (opacity, covariance, colour) have E experts
-// W2 relu(.. relu(W1 z)) + b2, each with its own tanh, identity or sigmoid, mixed with weights w: none (one network), all gates (dense), or
-// the softmax over the k largest logits (ties to the lowest index).
+// W2 relu(.. relu(W1 z)) + b2, each with its own tanh, identity or sigmoid, mixed with weights w: none (one network), broadcast gates
+// (dense), or the softmax over the k largest logits (ties to the lowest index).
 //
 // Work is cut into CHUNK anchors; within a chunk the anchors of one expert are gathered, so that its weights stay in the first-level cache
 // (`products.h`). Covariance and colour are computed for anchors of which something is drawn. Gradients of weights are summed in at most
@@ -27,7 +27,7 @@ using Head = SeDecodeHead;
 using Decode = SeDecode;
 
 inline bool has_one_expert(const Head& h) { return h.E == 1 || h.k == 1; }       // one expert of weight 1 per anchor
-inline bool uses_all_experts(const Head& h) { return !h.router_w || h.k == 0; }  // all experts see all anchors
+inline bool uses_all_experts(const Head& h) { return !h.router_w || h.k == 0; }  // broadcast experts see broadcast anchors
 inline int experts_per_anchor(const Head& h) { return static_cast<int>(h.k ? h.k : h.E); }
 inline int64_t count_chunks(const Decode& d) { return (d.A + CHUNK - 1) / CHUNK; }
 // The row of gates, chosen and chosen_weight that belongs to `anchor`.
@@ -35,16 +35,16 @@ inline int64_t routing_row(const Decode& d, int64_t anchor) { return d.frozen ? 
 
 // Sizes of padded blocks.
 struct Sizes {
-  int K, F, Fp, Z, R, Rp;  // slots; feature; of one row z; logits of all heads together
-  int router, routerp;     // inputs of the routers: F, or z up to the position
-  int shares, L, Hp_most;  // the most of any head
+  int K, F, Fp, Z, R, Rp;                               // slots; feature; of one row z; logits of broadcast heads together
+  int router, routerp;                                  // inputs of the routers: F, or z up to the position
+  int shares, L, Hp_most;                               // the most of any head
   int H[3], Hp[3], out[3], Op[3], inputs[3], first[3];  // first: of the head's logits
   explicit Sizes(const Decode& d);
 };
 
-// Calls f(head, expert) for all, on all threads.
+// Calls f(head, expert) for broadcast, on broadcast threads.
 template <class F>
-void each_expert(const Decode& d, F&& f) {
+void for_each_expert(const Decode& d, F&& f) {
   const int64_t first = d.heads[0].E, second = first + d.heads[1].E;
   parallel_for(second + d.heads[2].E, 1, static_cast<int>(d.threads), [&](int64_t e, int64_t, int) {
     if (e < first)
@@ -71,20 +71,20 @@ struct Packed {
 
 // What a worker writes on: one block of memory that belongs to the thread, found once a chunk.
 struct Work {
-  float* z;          // [CHUNK][Z]
-  float* block;      // [BLOCK][Z]
-  float* hidden;     // [1 + L + 2][BLOCK][Hp]: activations of each layer, then two gradients
-  float* out;        // [2][BLOCK][Op]
-  float* mixed[3];   // [CHUNK][Op]: mixed outputs, or their gradients
-  float* logits;     // [CHUNK][Rp], then 4 times [Rp][CHUNK]
-  float* feature;    // [CHUNK][Fp]: gradient
-  float* weights;    // [CHUNK][shares]: the mixture's, gradient
-  float* size;       // [CHUNK][8]: exp(l) of offsets, 1, of scales, 1
-  float* spread;     // [CHUNK * K][3]
-  float* weight;     // lists: the mixture's weight, [CHUNK * shares]
-  int *anchor, *place;   // lists: index in the chunk; anchor * shares + the place among its shares
-  uint64_t* bits;    // one for each slot of the chunk: it is drawn
-  uint8_t* live;     // [CHUNK]: something of it is
+  float* z;                       // [CHUNK][Z]
+  float* block;                   // [BLOCK][Z]
+  float* hidden;                  // [1 + L + 2][BLOCK][Hp]: activations of each layer, then two gradients
+  float* out;                     // [2][BLOCK][Op]
+  float* mixed[3];                // [CHUNK][Op]: mixed outputs, or their gradients
+  float* logits;                  // [CHUNK][Rp], then 4 times [Rp][CHUNK]
+  float* feature;                 // [CHUNK][Fp]: gradient
+  float* weights;                 // [CHUNK][shares]: the mixture's, gradient
+  float* size;                    // [CHUNK][8]: exp(l) of offsets, 1, of scales, 1
+  float* spread;                  // [CHUNK * K][3]
+  float* weight;                  // lists: the mixture's weight, [CHUNK * shares]
+  int *anchor, *place;            // lists: index in the chunk; anchor * shares + the place among its shares
+  uint64_t* bits;                 // one for each slot of the chunk: it is drawn
+  uint8_t* live;                  // [CHUNK]: something of it is
   explicit Work(const Sizes& s);  // valid until the thread's next one
 };
 
@@ -107,31 +107,31 @@ inline void copy_row(const float* from, int n, float* to) {
 }
 inline void zero_row(float* to, int n) {
   int i = 0;
-  for (; i + LANES <= n; i += LANES) store(to + i, all(0.f));
-  if (i < n) store_part(to + i, all(0.f), n - i);
+  for (; i + LANES <= n; i += LANES) store(to + i, broadcast(0.f));
+  if (i < n) store_part(to + i, broadcast(0.f), n - i);
 }
 
 // Up to 32 slots of an anchor from `slot` on that are drawn: bit j is slot + j.
-inline uint32_t slots(const Work& w, int K, int anchor, int slot) {
+inline uint32_t drawn_slots(const Work& w, int K, int anchor, int slot) {
   const int at = anchor * K + slot, n = K - slot < 32 ? K - slot : 32;
   const uint64_t low = w.bits[at >> 6] >> (at & 63), high = (w.bits[(at >> 6) + 1] << 1) << (63 - (at & 63));
   return static_cast<uint32_t>((low | high) & ((uint64_t(1) << n) - 1));
 }
 template <class F>
-inline void for_drawn(const Work& w, int K, int anchor, F&& f) {
+inline void for_each_drawn(const Work& w, int K, int anchor, F&& f) {
   for (int slot = 0; slot < K; slot += 32)
-    for (uint32_t bits = slots(w, K, anchor, slot); bits; bits &= bits - 1) f(slot + __builtin_ctz(bits));
+    for (uint32_t bits = drawn_slots(w, K, anchor, slot); bits; bits &= bits - 1) f(slot + __builtin_ctz(bits));
 }
 
 void gather(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w);
 void find_drawn(const Decode& d, const Chunk& chunk, Work& w);  // bits and live, from raw
-void scaling(const Decode& d, const Chunk& chunk, Work& w);
+void compute_sizes(const Decode& d, const Chunk& chunk, Work& w);
 // The chunk's anchors by expert; `live_only`: those that are.
-void groups(const Decode& d, const Head& head, const Chunk& chunk, bool live_only, Work& w, std::vector<Group>& found);
-void block_inputs(const Work& w, const Sizes& s, const Group& g, int from, int n);
+void group_by_expert(const Decode& d, const Head& head, const Chunk& chunk, bool live_only, Work& w, std::vector<Group>& found);
+void copy_block_inputs(const Work& w, const Sizes& s, const Group& g, int from, int n);
 // Hidden layers of w.block; the last of them.
-float* hidden(const Packed::Expert& e, const Sizes& s, int head, int middle, int n, Work& w);
-void outputs(const Packed::Expert& e, const Sizes& s, int head, int n, const float* h, float* y);
+float* compute_hidden(const Packed::Expert& e, const Sizes& s, int head, int middle, int n, Work& w);
+void compute_outputs(const Packed::Expert& e, const Sizes& s, int head, int n, const float* h, float* y);
 void activate(int head, float* y, int n);
 inline int block_size(int n) {  // equal parts of at most BLOCK
   const int parts = (n + BLOCK - 1) / BLOCK;
@@ -140,9 +140,9 @@ inline int block_size(int n) {  // equal parts of at most BLOCK
 
 void route(const Decode& d, const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w);
 // Gradients of the mixture's weights (w.weights) and of the gates -> of the logits.
-void route_backward(const Decode& d, const Sizes& s, const Chunk& chunk, int head, Work& w);
+void differentiate_routing(const Decode& d, const Sizes& s, const Chunk& chunk, int head, Work& w);
 // The Gaussians of a chunk from its mixed outputs, and back.
-void emit(const Decode& d, const Sizes& s, const Chunk& chunk, int64_t first, Work& w);
-void emit_backward(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w);
+void emit_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk, int64_t first, Work& w);
+void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w);
 
 }  // namespace se

@@ -39,7 +39,7 @@ struct Layout {
 // to[j] += sum over n rows of rows[i][j]
 void add_rows(int n, int width, const float* rows, int stride, float* to) {
   for (int j = 0; j < width; j += LANES) {
-    V even = load(to + j), odd = all(0.f);
+    Vec even = load(to + j), odd = broadcast(0.f);
     int i = 0;
     for (; i + 2 <= n; i += 2) {
       even = even + load(rows + int64_t(i) * stride + j);
@@ -59,27 +59,27 @@ class Backward {
     const Chunk chunk{begin, static_cast<int>(end - begin)};
     gather(d_, s_, chunk, w_);
     find_drawn(d_, chunk, w_);
-    emit_backward(d_, s_, chunk, w_);
+    differentiate_gaussians(d_, s_, chunk, w_);
     std::fill_n(w_.feature, int64_t(chunk.n) * s_.Fp, 0.f);
-    for (int i = 0; i < 3; ++i) head(chunk, i);
-    if (s_.R) router(chunk);
+    for (int i = 0; i < 3; ++i) differentiate_head(chunk, i);
+    if (s_.R) differentiate_router(chunk);
     for (int a = 0; a < chunk.n; ++a) copy_row(w_.feature + int64_t(a) * s_.Fp, s_.F, d_.d_feature + d_.rows[begin + a] * s_.F);
   }
 
  private:
-  void head(const Chunk& chunk, int i) {
+  void differentiate_head(const Chunk& chunk, int i) {
     const Head& head = d_.heads[i];
-    groups(d_, head, chunk, i > 0 || !d_.d_raw, w_, found_);
+    group_by_expert(d_, head, chunk, i > 0 || !d_.d_raw, w_, found_);
     if (!has_one_expert(head)) std::fill_n(w_.weights, int64_t(chunk.n) * experts_per_anchor(head), 0.f);
     for (const Group& g : found_) {
       const int step = block_size(g.n);
-      for (int from = 0; from < g.n; from += step) block(i, g, from, std::min(step, g.n - from));
+      for (int from = 0; from < g.n; from += step) differentiate_block(i, g, from, std::min(step, g.n - from));
     }
-    if (head.router_w) route_backward(d_, s_, chunk, i, w_);
+    if (head.router_w) differentiate_routing(d_, s_, chunk, i, w_);
   }
 
   // One expert on a block of its anchors.
-  void block(int i, const Group& g, int from, int n) {
+  void differentiate_block(int i, const Group& g, int from, int n) {
     const Head& head = d_.heads[i];
     const Packed::Expert& expert = packed_.experts[i][g.expert];
     const Layout::Expert& at = layout_.experts[i][g.expert];
@@ -87,18 +87,19 @@ class Backward {
     const int64_t layer = int64_t(BLOCK + SLACK) * Hp;
     const float* weight = w_.weight + g.first + from;
     const int *anchor = w_.anchor + g.first + from, *place = w_.place + g.first + from;
-    block_inputs(w_, s_, g, from, n);
-    float *h = hidden(expert, s_, i, L, n, w_), *dh = h + layer, *other = dh + layer, *y = w_.out, *dy = y + int64_t(BLOCK + SLACK) * Op;
+    copy_block_inputs(w_, s_, g, from, n);
+    float *h = compute_hidden(expert, s_, i, L, n, w_), *dh = h + layer, *other = dh + layer, *y = w_.out,
+          *dy = y + int64_t(BLOCK + SLACK) * Op;
     if (!has_one_expert(head) && i != 1) {
-      outputs(expert, s_, i, n, h, y);
+      compute_outputs(expert, s_, i, n, h, y);
       activate(i, y, n * Op);
     }
-    output_gradients(i, n, anchor, place, weight, expert.b2.data(), y, dy);
-    product(n, Hp, s_.out[i], dy, Op, expert.w2.data(), Hp, nullptr, Store{dh, Hp});
+    compute_output_gradients(i, n, anchor, place, weight, expert.b2.data(), y, dy);
+    multiply(n, Hp, s_.out[i], dy, Op, expert.w2.data(), Hp, nullptr, Store{dh, Hp});
     if (i == 1 && !has_one_expert(head))
-      weigh(n, Hp, Op, place, weight, h, dh, dy, sums_ + at.b2);
+      apply_weights(n, Hp, Op, place, weight, h, dh, dy, sums_ + at.b2);
     else {
-      mask(n * Hp, h, dh);
+      mask_relu(n * Hp, h, dh);
       add_rows(n, Op, dy, Op, sums_ + at.b2);
     }
     accumulate(n, s_.out[i], Hp, dy, Op, h, Hp, sums_ + at.w2, Hp);
@@ -106,72 +107,72 @@ class Backward {
       h -= layer;
       add_rows(n, Hp, dh, Hp, sums_ + at.bm + l * Hp);
       accumulate(n, H, Hp, dh, Hp, h, Hp, sums_ + at.wm + l * Hp * Hp, Hp);
-      product(n, Hp, H, dh, Hp, expert.wm.data() + int64_t(l) * H * Hp, Hp, nullptr, Store{other, Hp});
+      multiply(n, Hp, H, dh, Hp, expert.wm.data() + int64_t(l) * H * Hp, Hp, nullptr, Store{other, Hp});
       std::swap(dh, other);
-      mask(n * Hp, h, dh);
+      mask_relu(n * Hp, h, dh);
     }
     accumulate(n, s_.inputs[i], Hp, w_.block, s_.Z, dh, Hp, sums_ + at.w1t, Hp);
     int rows[BLOCK + SLACK];
     std::copy_n(anchor, n, rows);
     std::fill_n(rows + n, SLACK, CHUNK);  // a row that nobody reads
-    product(n, s_.Fp, H, dh, Hp, expert.w1.data(), s_.Fp, nullptr, AddToRows{w_.feature, s_.Fp, rows});
+    multiply(n, s_.Fp, H, dh, Hp, expert.w1.data(), s_.Fp, nullptr, AddToRows{w_.feature, s_.Fp, rows});
   }
 
   // Gradients of one expert's outputs before their activation (covariance: not weighted yet), and <gradient, outputs> for the mixture's
   // weights (covariance: the bias's part of it).
-  void output_gradients(int i, int n, const int* anchor, const int* place, const float* weight, const float* bias, const float* y,
-                        float* dy) {
+  void compute_output_gradients(int i, int n, const int* anchor, const int* place, const float* weight, const float* bias, const float* y,
+                                float* dy) {
     const int Op = s_.Op[i];
     const bool single = has_one_expert(d_.heads[i]);
     for (int t = 0; t < n; ++t, y += Op, dy += Op) {
       const float* given = w_.mixed[i] + int64_t(anchor[t]) * Op;
-      const V share = all(weight[t]);
-      V along = all(0.f);
+      const Vec share = broadcast(weight[t]);
+      Vec along = broadcast(0.f);
       for (int o = 0; o < Op; o += LANES) {
-        const V g = load(given + o);
+        const Vec g = load(given + o);
         if (single) {
           store(dy + o, g);
         } else if (i == 1) {
           along = fma(g, load(bias + o), along);
           store(dy + o, g);
         } else {
-          const V v = load(y + o);
+          const Vec v = load(y + o);
           along = fma(g, v, along);
-          store(dy + o, share * g * (i == 0 ? all(1.f) - v * v : v - v * v));
+          store(dy + o, share * g * (i == 0 ? broadcast(1.f) - v * v : v - v * v));
         }
       }
       if (!single) w_.weights[place[t]] = sum(along);
     }
   }
 
-  static void mask(int n, const float* h, float* dh) {
-    for (int j = 0; j < n; j += LANES) store(dh + j, greater(load(h + j), all(0.f), load(dh + j), all(0.f)));
+  static void mask_relu(int n, const float* h, float* dh) {
+    for (int j = 0; j < n; j += LANES) store(dh + j, select_greater(load(h + j), broadcast(0.f), load(dh + j), broadcast(0.f)));
   }
 
   // The covariance is linear, so that <dy, y> = <dh, h> + <dy, b2>: its outputs need not be computed again. Then the weights go in.
-  void weigh(int n, int Hp, int Op, const int* place, const float* weight, float* h, float* dh, const float* dy, float* b2) {
+  void apply_weights(int n, int Hp, int Op, const int* place, const float* weight, float* h, float* dh, const float* dy, float* b2) {
     for (int t = 0; t < n; ++t, h += Hp, dh += Hp) {
-      const V share = all(weight[t]);
-      V along = all(0.f);
+      const Vec share = broadcast(weight[t]);
+      Vec along = broadcast(0.f);
       for (int j = 0; j < Hp; j += LANES) {
-        const V x = load(h + j), gradient = load(dh + j);
+        const Vec x = load(h + j), gradient = load(dh + j);
         along = fma(gradient, x, along);
-        store(dh + j, greater(x, all(0.f), gradient * share, all(0.f)));
+        store(dh + j, select_greater(x, broadcast(0.f), gradient * share, broadcast(0.f)));
         store(h + j, x * share);
       }
       w_.weights[place[t]] += sum(along);
     }
     for (int o = 0; o < Op; o += LANES) {
-      V total = load(b2 + o);
-      for (int t = 0; t < n; ++t) total = fma(all(weight[t]), load(dy + int64_t(t) * Op + o), total);
+      Vec total = load(b2 + o);
+      for (int t = 0; t < n; ++t) total = fma(broadcast(weight[t]), load(dy + int64_t(t) * Op + o), total);
       store(b2 + o, total);
     }
   }
 
-  void router(const Chunk& chunk) {
+  void differentiate_router(const Chunk& chunk) {
     int rows[CHUNK + SLACK];
     for (int a = 0; a < CHUNK + SLACK; ++a) rows[a] = a < chunk.n ? a : CHUNK;
-    product(chunk.n, s_.Fp, s_.R, w_.logits, s_.Rp, packed_.router.data(), s_.Fp, nullptr, AddToRows{w_.feature, s_.Fp, rows});
+    multiply(chunk.n, s_.Fp, s_.R, w_.logits, s_.Rp, packed_.router.data(), s_.Fp, nullptr, AddToRows{w_.feature, s_.Fp, rows});
     accumulate(chunk.n, s_.R, s_.routerp, w_.logits, s_.Rp, w_.z, s_.Z, sums_ + layout_.router, s_.routerp);
     add_rows(chunk.n, s_.Rp, w_.logits, s_.Rp, sums_ + layout_.router_b);
   }
@@ -218,7 +219,7 @@ void write_routers(const Decode& d, const Sizes& s, const Layout& layout, const 
 }
 
 // Memory for that many floats, kept from call to call: made anew it would cost its page faults each time.
-float* partial_sums(int64_t floats) {
+float* reserve_sums(int64_t floats) {
   static thread_local std::unique_ptr<float[]> memory;
   static thread_local int64_t size = 0;
   if (floats > size) {
@@ -232,7 +233,7 @@ float* partial_sums(int64_t floats) {
 
 }  // namespace
 
-// Gradients of the table's rows and of all weights.
+// Gradients of the table's rows and of broadcast weights.
 SE_EXPORT int32_t se_decode_backward(const Decode* decode) {
   return run_guarded([&] {
     const Decode& d = *decode;
@@ -241,7 +242,7 @@ SE_EXPORT int32_t se_decode_backward(const Decode* decode) {
     const Layout layout(d, s);
     const int64_t grain = std::max<int64_t>(1, (count_chunks(d) + BUFFERS - 1) / BUFFERS) * CHUNK;
     const int64_t buffers = std::max<int64_t>(1, (d.A + grain - 1) / grain);
-    float* sums = partial_sums(buffers * layout.total);
+    float* sums = reserve_sums(buffers * layout.total);
     if (!d.A) std::fill_n(sums, layout.total, 0.f);
     const int threads = static_cast<int>(d.threads);
     parallel_for(d.A, grain, threads, [&](int64_t begin, int64_t end, int) {
@@ -254,7 +255,7 @@ SE_EXPORT int32_t se_decode_backward(const Decode* decode) {
       for (int64_t b = 1; b < buffers; ++b)
         for (int64_t i = begin; i < end; ++i) sums[i] += sums[b * layout.total + i];
     });
-    each_expert(d, [&](int i, int e) { write_expert(d, s, layout.experts[i][e], sums, i, e); });
+    for_each_expert(d, [&](int i, int e) { write_expert(d, s, layout.experts[i][e], sums, i, e); });
     write_routers(d, s, layout, sums);
   });
 }

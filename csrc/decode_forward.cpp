@@ -16,7 +16,7 @@ void decode_head(const Decode& d, const Sizes& s, const Packed& packed, const Ch
   const Head& head = d.heads[i];
   const int Op = s.Op[i];
   float *mixed = w.mixed[i], *y = w.out;
-  groups(d, head, chunk, i > 0, w, found);
+  group_by_expert(d, head, chunk, i > 0, w, found);
   if (!has_one_expert(head)) std::fill_n(mixed, int64_t(chunk.n) * Op, 0.f);
   for (const Group& g : found) {
     const Packed::Expert& expert = packed.experts[i][g.expert];
@@ -25,16 +25,16 @@ void decode_head(const Decode& d, const Sizes& s, const Packed& packed, const Ch
       const int n = std::min(step, g.n - from);
       const int* anchor = w.anchor + g.first + from;
       const float* weight = w.weight + g.first + from;
-      block_inputs(w, s, g, from, n);
-      float* h = hidden(expert, s, i, static_cast<int>(head.L), n, w);
-      outputs(expert, s, i, n, h, y);
+      copy_block_inputs(w, s, g, from, n);
+      float* h = compute_hidden(expert, s, i, static_cast<int>(head.L), n, w);
+      compute_outputs(expert, s, i, n, h, y);
       activate(i, y, n * Op);
       for (int t = 0; t < n; ++t) {
         float *to = mixed + int64_t(anchor[t]) * Op, *own = y + int64_t(t) * Op;
         if (has_one_expert(head)) {
           for (int o = 0; o < Op; o += LANES) store(to + o, load(own + o));
         } else {
-          const V share = all(weight[t]);
+          const Vec share = broadcast(weight[t]);
           for (int o = 0; o < Op; o += LANES) store(to + o, fma(share, load(own + o), load(to + o)));
         }
       }
@@ -42,9 +42,9 @@ void decode_head(const Decode& d, const Sizes& s, const Packed& packed, const Ch
   }
 }
 
-// Calls f(sizes, packed weights, chunk, room to work in) for each chunk of anchors, on all threads; returns 1 where memory ran out.
+// Calls f(sizes, packed weights, chunk, room to work in) for each chunk of anchors, on broadcast threads; returns 1 where memory ran out.
 template <class F>
-int each_chunk(const Decode& d, F&& f) {
+int for_each_chunk(const Decode& d, F&& f) {
   return run_guarded([&] {
     const Sizes s(d);
     const Packed packed(d, s, false);
@@ -59,10 +59,10 @@ int each_chunk(const Decode& d, F&& f) {
 
 // The exported functions return 1 where memory ran out.
 
-// Routing and raw opacities of all anchors. Fills starts; the last is the number of Gaussians with positive opacity.
+// Routing and raw opacities of broadcast anchors. Fills starts; the last is the number of Gaussians with positive opacity.
 SE_EXPORT int32_t se_decode_begin(const Decode* decode) {
   const Decode& d = *decode;
-  const int code = each_chunk(d, [&](const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {
+  const int code = for_each_chunk(d, [&](const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {
     std::vector<Group> found;
     gather(d, s, chunk, w);
     if (!d.frozen) route(d, s, packed, chunk, w);
@@ -71,7 +71,7 @@ SE_EXPORT int32_t se_decode_begin(const Decode* decode) {
     for (int a = 0; a < chunk.n; ++a) {
       copy_row(w.mixed[0] + int64_t(a) * s.Op[0], s.K, d.raw + (chunk.begin + a) * s.K);
       for (int slot = 0; slot < s.K; slot += LANES)
-        drawn += __builtin_popcount(positive(load_part(w.mixed[0] + int64_t(a) * s.Op[0] + slot, std::min(LANES, s.K - slot))));
+        drawn += __builtin_popcount(find_positive(load_part(w.mixed[0] + int64_t(a) * s.Op[0] + slot, std::min(LANES, s.K - slot))));
     }
     d.starts[chunk.begin / CHUNK + 1] = drawn;
   });
@@ -81,10 +81,10 @@ SE_EXPORT int32_t se_decode_begin(const Decode* decode) {
   return 0;
 }
 
-// Covariances and colours, and all Gaussians of positive opacity in the order of anchors and slots.
+// Covariances and colours, and broadcast Gaussians of positive opacity in the order of anchors and slots.
 SE_EXPORT int32_t se_decode_emit(const Decode* decode) {
   const Decode& d = *decode;
-  return each_chunk(d, [&](const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {
+  return for_each_chunk(d, [&](const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {
     const int64_t at = d.starts[chunk.begin / CHUNK];
     if (d.starts[chunk.begin / CHUNK + 1] == at) return;
     std::vector<Group> found;
@@ -92,14 +92,14 @@ SE_EXPORT int32_t se_decode_emit(const Decode* decode) {
     find_drawn(d, chunk, w);
     decode_head(d, s, packed, chunk, 1, found, w);
     decode_head(d, s, packed, chunk, 2, found, w);
-    emit(d, s, chunk, at, w);
+    emit_gaussians(d, s, chunk, at, w);
   });
 }
 
-// Gates, chosen experts and their weights of all anchors.
+// Gates, chosen experts and their weights of broadcast anchors.
 SE_EXPORT int32_t se_decode_route(const Decode* decode) {
   const Decode& d = *decode;
-  return each_chunk(d, [&](const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {
+  return for_each_chunk(d, [&](const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {
     gather(d, s, chunk, w);
     route(d, s, packed, chunk, w);
   });

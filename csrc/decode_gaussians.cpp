@@ -7,24 +7,24 @@
 
 namespace se {
 
-void emit(const Decode& d, const Sizes& s, const Chunk& chunk, int64_t first, Work& w) {
+void emit_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk, int64_t first, Work& w) {
   const int K = s.K;
-  scaling(d, chunk, w);
+  compute_sizes(d, chunk, w);
   int64_t at = first;
   for (int a = 0; a < chunk.n; ++a) {
     if (!w.live[a]) continue;
     const int64_t row = d.rows[chunk.begin + a];
-    const Quad x = load3(d.xyz + row * 3), reach = load4(w.size + 8 * a), size = load4(w.size + 8 * a + 4);
+    const F32x4 x = load3(d.xyz + row * 3), reach = load4(w.size + 8 * a), size = load4(w.size + 8 * a + 4);
     const float *offsets = d.offsets + row * K * 3, *raw = d.raw + (chunk.begin + a) * K;
     const float *cov = w.mixed[1] + int64_t(a) * s.Op[1], *color = w.mixed[2] + int64_t(a) * s.Op[2];
-    for_drawn(w, K, a, [&](int slot) {
-      const Quad q = load4(cov + COV * slot + 3);
+    for_each_drawn(w, K, a, [&](int slot) {
+      const F32x4 q = load4(cov + COV * slot + 3);
       const float inverse = 1.f / std::max(std::sqrt(dot(q, q)), 1e-12f);
       store3(d.means + 3 * at, x + load3(offsets + 3 * slot) * reach);
       store3(d.colors + 3 * at, load3(color + 3 * slot));
       store3(d.scales + 3 * at, load3(cov + COV * slot));
       store4(w.spread + 3 * (at - first), size);
-      store4(d.quats + 4 * at, q * four(inverse));
+      store4(d.quats + 4 * at, q * broadcast4(inverse));
       d.opacities[at] = raw[slot];
       d.per_length[at] = inverse;
       d.source[at] = row * K + slot;
@@ -41,7 +41,7 @@ void emit(const Decode& d, const Sizes& s, const Chunk& chunk, int64_t first, Wo
 
 namespace {
 
-void clear(const Decode& d, int64_t from, int64_t to) {
+void clear_rows(const Decode& d, int64_t from, int64_t to) {
   if (from >= to) return;
   std::fill(d.d_feature + from * d.F, d.d_feature + to * d.F, 0.f);
   std::fill(d.d_log_scaling + from * 6, d.d_log_scaling + to * 6, 0.f);
@@ -50,15 +50,15 @@ void clear(const Decode& d, int64_t from, int64_t to) {
 
 // Rows of the table between this anchor's and the one before it, and after the last: nobody else writes them.
 void clear_gap(const Decode& d, int64_t anchor) {
-  clear(d, anchor ? d.rows[anchor - 1] + 1 : 0, d.rows[anchor]);
-  if (anchor == d.A - 1) clear(d, d.rows[anchor] + 1, d.N);
+  clear_rows(d, anchor ? d.rows[anchor - 1] + 1 : 0, d.rows[anchor]);
+  if (anchor == d.A - 1) clear_rows(d, d.rows[anchor] + 1, d.N);
 }
 
 }  // namespace
 
-void emit_backward(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w) {
+void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w) {
   const int K = s.K;
-  scaling(d, chunk, w);
+  compute_sizes(d, chunk, w);
   int64_t at = d.starts[chunk.begin / CHUNK];
   for (int a = 0; a < chunk.n; ++a) {
     const int64_t anchor = chunk.begin + a, row = d.rows[anchor];
@@ -68,40 +68,40 @@ void emit_backward(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w)
     const float *raw = d.raw + anchor * K, *d_raw = d.d_raw ? d.d_raw + anchor * K : nullptr;
     for (int slot = 0; slot < s.Op[0]; slot += LANES) {
       const int n = std::max(0, std::min(LANES, K - slot));
-      const V sigma = load_part(raw + slot, n), g = d_raw ? load_part(d_raw + slot, n) : all(0.f);
-      store(opacity + slot, has_one_expert(d.heads[0]) ? g * (all(1.f) - sigma * sigma) : g);
+      const Vec sigma = load_part(raw + slot, n), g = d_raw ? load_part(d_raw + slot, n) : broadcast(0.f);
+      store(opacity + slot, has_one_expert(d.heads[0]) ? g * (broadcast(1.f) - sigma * sigma) : g);
     }
-    Quad to_reach = four(0.f), to_size = four(0.f);
+    F32x4 to_reach = broadcast4(0.f), to_size = broadcast4(0.f);
     if (w.live[a]) {
       float *cov = w.mixed[1] + int64_t(a) * s.Op[1], *color = w.mixed[2] + int64_t(a) * s.Op[2];
-      const Quad reach = load4(w.size + 8 * a), inverse = four(1.f) / load4(w.size + 8 * a + 4);
+      const F32x4 reach = load4(w.size + 8 * a), inverse = broadcast4(1.f) / load4(w.size + 8 * a + 4);
       zero_row(cov, s.Op[1]);
       zero_row(color, s.Op[2]);
       const float* offsets = d.offsets + row * K * 3;
-      for_drawn(w, K, a, [&](int slot) {
+      for_each_drawn(w, K, a, [&](int slot) {
         if (d.d_opacities) {  // not added to what was just stored: a load behind a wider masked store waits long
           const float g = d.d_opacities[at] + (d_raw ? d_raw[slot] : 0.f);
           opacity[slot] = has_one_expert(d.heads[0]) ? g * (1.f - raw[slot] * raw[slot]) : g;
         }
         if (d.d_means) {
-          const Quad g = load3(d.d_means + 3 * at) * reach;
+          const F32x4 g = load3(d.d_means + 3 * at) * reach;
           store3(d_offsets + 3 * slot, g);
           to_reach += g * load3(offsets + 3 * slot);
         }
         if (d.d_scales) {
-          const Quad scale = load3(d.scales + 3 * at), g = load3(d.d_scales + 3 * at) * scale;
+          const F32x4 scale = load3(d.scales + 3 * at), g = load3(d.d_scales + 3 * at) * scale;
           to_size += g;
-          store3(cov + COV * slot, g * (four(1.f) - scale * inverse));
+          store3(cov + COV * slot, g * (broadcast4(1.f) - scale * inverse));
         }
         if (d.d_quats) {
-          const Quad q = load4(d.quats + 4 * at), g = load4(d.d_quats + 4 * at);
+          const F32x4 q = load4(d.quats + 4 * at), g = load4(d.d_quats + 4 * at);
           const float per_length = d.per_length[at];
           // A length below 1e-12 was replaced by it, a constant.
           const float along = per_length < 1e12f ? dot(q, g) : 0.f;
-          store4(cov + COV * slot + 3, four(per_length) * (g - four(along) * q));
+          store4(cov + COV * slot + 3, broadcast4(per_length) * (g - broadcast4(along) * q));
         }
         if (d.d_colors) {
-          const Quad g = load3(d.d_colors + 3 * at), c = load3(d.colors + 3 * at);
+          const F32x4 g = load3(d.d_colors + 3 * at), c = load3(d.colors + 3 * at);
           store3(color + 3 * slot, has_one_expert(d.heads[2]) ? g * (c - c * c) : g);
         }
         ++at;

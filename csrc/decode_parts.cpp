@@ -55,7 +55,7 @@ Packed::Expert::Expert(const Decode& d, const Sizes& s, int i, int e, bool backw
 
 Packed::Packed(const Decode& d, const Sizes& s, bool backward) {
   for (int i = 0; i < 3; ++i) experts[i].resize(d.heads[i].E);
-  each_expert(d, [&](int i, int e) { experts[i][e] = Expert(d, s, i, e, backward); });
+  for_each_expert(d, [&](int i, int e) { experts[i][e] = Expert(d, s, i, e, backward); });
   router_t.assign(int64_t(s.router) * s.Rp, 0.f), router_b.assign(s.Rp, 0.f), router.assign(int64_t(s.R) * s.Fp, 0.f);
   for (int i = 0; i < 3; ++i) {
     const Head& head = d.heads[i];
@@ -73,7 +73,7 @@ Packed::Packed(const Decode& d, const Sizes& s, bool backward) {
 
 namespace {
 
-std::vector<float>& memory() {
+std::vector<float>& thread_memory() {
   static thread_local std::vector<float> block;
   return block;
 }
@@ -89,13 +89,24 @@ Work::Work(const Sizes& s) {
     total += (floats + 15) / 16 * 16;  // whole cache lines
     return at;
   };
-  const int64_t parts[] = {
-      take(rows * s.Z), take(block_rows * s.Z), take((s.L + 3) * block_rows * s.Hp_most), take(2 * block_rows * Op),
-      take(rows * s.Op[0]), take(rows * s.Op[1]), take(rows * s.Op[2]), take(rows * s.Rp + 4 * int64_t(s.Rp) * CHUNK),
-      take(rows * s.Fp), take(int64_t(CHUNK) * s.shares + LANES), take(8 * CHUNK), take(3 * int64_t(CHUNK) * s.K + LANES),
-      take(int64_t(CHUNK) * s.shares), take(int64_t(CHUNK) * s.shares), take(int64_t(CHUNK) * s.shares),
-      take(2 * (int64_t(CHUNK) * s.K / 64 + 2)), take(CHUNK)};
-  std::vector<float>& own = memory();
+  const int64_t parts[] = {take(rows * s.Z),
+                           take(block_rows * s.Z),
+                           take((s.L + 3) * block_rows * s.Hp_most),
+                           take(2 * block_rows * Op),
+                           take(rows * s.Op[0]),
+                           take(rows * s.Op[1]),
+                           take(rows * s.Op[2]),
+                           take(rows * s.Rp + 4 * int64_t(s.Rp) * CHUNK),
+                           take(rows * s.Fp),
+                           take(int64_t(CHUNK) * s.shares + LANES),
+                           take(8 * CHUNK),
+                           take(3 * int64_t(CHUNK) * s.K + LANES),
+                           take(int64_t(CHUNK) * s.shares),
+                           take(int64_t(CHUNK) * s.shares),
+                           take(int64_t(CHUNK) * s.shares),
+                           take(2 * (int64_t(CHUNK) * s.K / 64 + 2)),
+                           take(CHUNK)};
+  std::vector<float>& own = thread_memory();
   if (static_cast<int64_t>(own.size()) < total + 16) own.resize(total + 16);
   float* base = own.data() + (64 - reinterpret_cast<uintptr_t>(own.data()) % 64) % 64 / sizeof(float);
   z = base + parts[0], block = base + parts[1], hidden = base + parts[2], out = base + parts[3];
@@ -107,7 +118,7 @@ Work::Work(const Sizes& s) {
 }
 
 void gather(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w) {
-  const Quad camera = load3(d.camera);
+  const F32x4 camera = load3(d.camera);
   const float extent = static_cast<float>(d.extent);
   constexpr int AHEAD = 12;
   for (int a = 0; a < chunk.n; ++a) {
@@ -116,13 +127,13 @@ void gather(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w) {
     __builtin_prefetch(d.xyz + next * 3);
     float* z = w.z + int64_t(a) * s.Z;
     copy_row(d.feature + row * s.F, s.F, z);
-    const Quad x = load3(d.xyz + row * 3), v = x - camera;
+    const F32x4 x = load3(d.xyz + row * 3), v = x - camera;
     const float distance = std::sqrt(dot(v, v));
-    Quad direction = v * four(1.f / std::max(distance, 1e-12f));
+    F32x4 direction = v * broadcast4(1.f / std::max(distance, 1e-12f));
     direction[3] = 1.f;
     store4(z + s.F, direction);
     z[s.F + 4] = distance;
-    if (s.router > s.F) store3(z + s.F + 5, Quad{x[0] / extent, x[1] / extent, x[2] / extent, 0.f});
+    if (s.router > s.F) store3(z + s.F + 5, F32x4{x[0] / extent, x[1] / extent, x[2] / extent, 0.f});
   }
 }
 
@@ -131,16 +142,16 @@ void find_drawn(const Decode& d, const Chunk& chunk, Work& w) {
   const float* raw = d.raw + chunk.begin * K;
   std::fill_n(w.bits, count / 64 + 2, 0);
   int i = 0;
-  for (; i + LANES <= count; i += LANES) w.bits[i >> 6] |= static_cast<uint64_t>(positive(load(raw + i))) << (i & 63);
-  if (i < count) w.bits[i >> 6] |= static_cast<uint64_t>(positive(load_part(raw + i, count - i))) << (i & 63);
+  for (; i + LANES <= count; i += LANES) w.bits[i >> 6] |= static_cast<uint64_t>(find_positive(load(raw + i))) << (i & 63);
+  if (i < count) w.bits[i >> 6] |= static_cast<uint64_t>(find_positive(load_part(raw + i, count - i))) << (i & 63);
   for (int a = 0; a < chunk.n; ++a) {
     uint32_t any = 0;
-    for (int slot = 0; slot < K; slot += 32) any |= slots(w, K, a, slot);
+    for (int slot = 0; slot < K; slot += 32) any |= drawn_slots(w, K, a, slot);
     w.live[a] = any != 0;
   }
 }
 
-void scaling(const Decode& d, const Chunk& chunk, Work& w) {
+void compute_sizes(const Decode& d, const Chunk& chunk, Work& w) {
   for (int a = 0; a < chunk.n; ++a) {
     const float* l = d.log_scaling + d.rows[chunk.begin + a] * 6;
     store4(w.size + 8 * a, load3(l));
@@ -150,7 +161,7 @@ void scaling(const Decode& d, const Chunk& chunk, Work& w) {
   for (int i = 0; i < n; i += LANES) store(w.size + i, exponential(load(w.size + i)));
 }
 
-void groups(const Decode& d, const Head& head, const Chunk& chunk, bool live_only, Work& w, std::vector<Group>& found) {
+void group_by_expert(const Decode& d, const Head& head, const Chunk& chunk, bool live_only, Work& w, std::vector<Group>& found) {
   found.clear();
   const int n = chunk.n, E = static_cast<int>(head.E), k = static_cast<int>(head.k);
   if (uses_all_experts(head)) {
@@ -196,7 +207,7 @@ void groups(const Decode& d, const Head& head, const Chunk& chunk, bool live_onl
   }
 }
 
-void block_inputs(const Work& w, const Sizes& s, const Group& g, int from, int n) {
+void copy_block_inputs(const Work& w, const Sizes& s, const Group& g, int from, int n) {
   const int* anchor = w.anchor + g.first + from;
   for (int i = 0; i < n; ++i) {
     const float* z = w.z + int64_t(anchor[i]) * s.Z;
@@ -205,23 +216,23 @@ void block_inputs(const Work& w, const Sizes& s, const Group& g, int from, int n
   }
 }
 
-float* hidden(const Packed::Expert& e, const Sizes& s, int head, int middle, int n, Work& w) {
+float* compute_hidden(const Packed::Expert& e, const Sizes& s, int head, int middle, int n, Work& w) {
   const int Hp = s.Hp[head], H = s.H[head];
-  product(n, Hp, s.inputs[head], w.block, s.Z, e.w1t.data(), Hp, nullptr, StoreRelu{w.hidden, Hp});
+  multiply(n, Hp, s.inputs[head], w.block, s.Z, e.w1t.data(), Hp, nullptr, StoreRelu{w.hidden, Hp});
   const int64_t layer = int64_t(BLOCK + SLACK) * Hp;
   float* h = w.hidden;
   for (int l = 0; l < middle; ++l, h += layer)
-    product(n, Hp, H, h, Hp, e.wmt.data() + int64_t(l) * H * Hp, Hp, e.bm.data() + int64_t(l) * Hp, StoreRelu{h + layer, Hp});
+    multiply(n, Hp, H, h, Hp, e.wmt.data() + int64_t(l) * H * Hp, Hp, e.bm.data() + int64_t(l) * Hp, StoreRelu{h + layer, Hp});
   return h;
 }
 
-void outputs(const Packed::Expert& e, const Sizes& s, int head, int n, const float* h, float* y) {
-  product(n, s.Op[head], s.H[head], h, s.Hp[head], e.w2t.data(), s.Op[head], e.b2.data(), Store{y, s.Op[head]});
+void compute_outputs(const Packed::Expert& e, const Sizes& s, int head, int n, const float* h, float* y) {
+  multiply(n, s.Op[head], s.H[head], h, s.Hp[head], e.w2t.data(), s.Op[head], e.b2.data(), Store{y, s.Op[head]});
 }
 
 void activate(int head, float* y, int n) {
   if (head == 0)
-    for (int i = 0; i < n; i += LANES) store(y + i, tangent(load(y + i)));
+    for (int i = 0; i < n; i += LANES) store(y + i, tanh(load(y + i)));
   if (head == 2)
     for (int i = 0; i < n; i += LANES) store(y + i, sigmoid(load(y + i)));
 }

@@ -12,14 +12,14 @@ namespace {
 // Softmax over `count` rows of CHUNK lanes each, in place.
 void softmax(float* rows, int count, int n) {
   for (int a = 0; a < n; a += LANES) {
-    V largest = load(rows + a), total = all(0.f);
+    Vec largest = load(rows + a), total = broadcast(0.f);
     for (int e = 1; e < count; ++e) largest = max(largest, load(rows + e * CHUNK + a));
     for (int e = 0; e < count; ++e) {
-      const V x = exponential(load(rows + e * CHUNK + a) - largest);
+      const Vec x = exponential(load(rows + e * CHUNK + a) - largest);
       store(rows + e * CHUNK + a, x);
       total = total + x;
     }
-    const V inverse = all(1.f) / total;
+    const Vec inverse = broadcast(1.f) / total;
     for (int e = 0; e < count; ++e) store(rows + e * CHUNK + a, load(rows + e * CHUNK + a) * inverse);
   }
 }
@@ -28,18 +28,18 @@ void softmax(float* rows, int count, int n) {
 void choose(float* logits, int E, int k, int n, float* values, float* places) {
   for (int a = 0; a < n; a += LANES)
     for (int r = 0; r < k; ++r) {
-      V best = load(logits + a), place = all(0.f);
+      Vec best = load(logits + a), place = broadcast(0.f);
       for (int e = 1; e < E; ++e) {
-        const V x = load(logits + e * CHUNK + a);
-        place = greater(x, best, all(float(e)), place);
-        best = greater(x, best, x, best);
+        const Vec x = load(logits + e * CHUNK + a);
+        place = select_greater(x, best, broadcast(float(e)), place);
+        best = select_greater(x, best, x, best);
       }
       store(values + r * CHUNK + a, best);
       store(places + r * CHUNK + a, place);
-      const V gone = all(-std::numeric_limits<float>::infinity());
+      const Vec gone = broadcast(-std::numeric_limits<float>::infinity());
       for (int e = 0; e < E; ++e) {
-        const V x = load(logits + e * CHUNK + a);
-        store(logits + e * CHUNK + a, greater(place, all(e - 0.5f), greater(all(e + 0.5f), place, gone, x), x));
+        const Vec x = load(logits + e * CHUNK + a);
+        store(logits + e * CHUNK + a, select_greater(place, broadcast(e - 0.5f), select_greater(broadcast(e + 0.5f), place, gone, x), x));
       }
     }
 }
@@ -49,7 +49,7 @@ void choose(float* logits, int E, int k, int n, float* values, float* places) {
 void route(const Decode& d, const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {
   if (!s.R) return;
   float* across = w.logits + int64_t(CHUNK + SLACK) * s.Rp;  // [R][CHUNK]: anchors along the lanes
-  product(chunk.n, s.Rp, s.router, w.z, s.Z, packed.router_t.data(), s.Rp, packed.router_b.data(), Store{w.logits, s.Rp});
+  multiply(chunk.n, s.Rp, s.router, w.z, s.Z, packed.router_t.data(), s.Rp, packed.router_b.data(), Store{w.logits, s.Rp});
   for (int r = 0; r < s.R; ++r)
     for (int a = 0; a < chunk.n; ++a) across[r * CHUNK + a] = w.logits[a * s.Rp + r];
   for (int i = 0; i < 3; ++i) {
@@ -76,7 +76,7 @@ void route(const Decode& d, const Sizes& s, const Packed& packed, const Chunk& c
   }
 }
 
-void route_backward(const Decode& d, const Sizes& s, const Chunk& chunk, int i, Work& w) {
+void differentiate_routing(const Decode& d, const Sizes& s, const Chunk& chunk, int i, Work& w) {
   const Head& head = d.heads[i];
   const int E = static_cast<int>(head.E), k = static_cast<int>(head.k), shares = experts_per_anchor(head);
   const bool dense = k == 0 && E > 1;

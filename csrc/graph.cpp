@@ -1,6 +1,6 @@
 // What a point learns from its neighbours in a graph (scene/graph/network.py has the definition), and a multi-resolution hash grid
-// (scene/graph/hash_grid.py), forward and backward. Every output row, or every level of the grid, belongs to one worker, which adds in a fixed
-// order: the bits do not depend on the number of threads.
+// (scene/graph/hash_grid.py), forward and backward. Every output row, or every level of the grid, belongs to one worker, which adds in a
+// fixed order: the bits do not depend on the number of threads.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -26,7 +26,7 @@ struct Level {
 };
 
 // Table rows and weights of the eight corners around a place; z changes fastest.
-inline void corners(const float* unit, const Level& level, int32_t row[8], float weight[8]) {
+inline void find_corners(const float* unit, const Level& level, int32_t row[8], float weight[8]) {
   int64_t at[3];
   float share[3][2];
   for (int a = 0; a < 3; ++a) {
@@ -58,7 +58,7 @@ void blend_level(const Level& level, const float* table, const float* unit, int6
   for (int64_t a = begin; a < end; ++a) {
     int32_t row[8];
     float weight[8];
-    corners(unit + 3 * a, level, row, weight);
+    find_corners(unit + 3 * a, level, row, weight);
     float* to = out + a * stride;
     for (int64_t c = 0; c < n; ++c) {
       float sum = 0.f;
@@ -69,19 +69,19 @@ void blend_level(const Level& level, const float* table, const float* unit, int6
 }
 
 template <int C>
-void spread_level(const Level& level, const float* unit, const float* grad, int64_t A, int64_t stride, int64_t features, float* out) {
+void scatter_level(const Level& level, const float* unit, const float* grad, int64_t A, int64_t stride, int64_t features, float* out) {
   const int64_t n = C ? C : features;
   for (int64_t a = 0; a < A; ++a) {
     int32_t row[8];
     float weight[8];
-    corners(unit + 3 * a, level, row, weight);
+    find_corners(unit + 3 * a, level, row, weight);
     const float* from = grad + a * stride;
     for (int i = 0; i < 8; ++i)
       for (int64_t c = 0; c < n; ++c) out[row[i] * n + c] += weight[i] * from[c];
   }
 }
 
-inline Level level_of(const int64_t* cells, const int64_t* rows, int64_t l) {
+inline Level describe_level(const int64_t* cells, const int64_t* rows, int64_t l) {
   int64_t first = 0;
   for (int64_t i = 0; i < l; ++i) first += rows[i];
   const int64_t side = cells[l] + 1;
@@ -129,7 +129,8 @@ SE_EXPORT void se_graph_forward(const float* feature, const int64_t* found, cons
   });
 }
 
-// grad [A, F] of out -> gradient [A, F] of feature; h, shared [A, F]: room for the gradients of the differences and of each minimum's holders.
+// grad [A, F] of out -> gradient [A, F] of feature; h, shared [A, F]: room for the gradients of the differences and of each minimum's
+// holders.
 SE_EXPORT void se_graph_backward(const float* feature, const float* least, const float* grad, const int64_t* found, const float* weight,
                                  const int32_t* start, const int32_t* known, int64_t A, int64_t k, int64_t F, float share, float* h,
                                  float* shared, float* out, int32_t threads) {
@@ -171,7 +172,7 @@ SE_EXPORT void se_grid_forward(const float* table, const float* unit, const int6
                                int64_t features, float* out, int32_t threads) {
   se::parallel_for(A, kPlaces, threads, [&](int64_t begin, int64_t end, int) {
     for (int64_t l = 0; l < levels; ++l) {  // level by level, so that its part of the table stays near
-      const Level level = level_of(cells, rows, l);
+      const Level level = describe_level(cells, rows, l);
       const auto run = features == 2 ? blend_level<2> : blend_level<0>;
       run(level, table + level.first * features, unit, begin, end, levels * features, features, out + l * features);
     }
@@ -183,8 +184,8 @@ SE_EXPORT void se_grid_backward(const float* unit, const float* grad, const int6
                                 int64_t features, float* out, int32_t threads) {
   se::parallel_for(levels, 1, threads, [&](int64_t begin, int64_t end, int) {
     for (int64_t l = begin; l < end; ++l) {
-      const Level level = level_of(cells, rows, l);
-      const auto run = features == 2 ? spread_level<2> : spread_level<0>;
+      const Level level = describe_level(cells, rows, l);
+      const auto run = features == 2 ? scatter_level<2> : scatter_level<0>;
       run(level, unit, grad + l * features, A, levels * features, features, out + level.first * features);
     }
   });

@@ -19,31 +19,31 @@ struct Noise {
 };
 
 // Columns of rows of `width` values across the lanes; what lies beyond `n` repeats the last.
-void across(const float* from, int64_t begin, int n, int width, float to[][CHUNK]) {
+void load_columns(const float* from, int64_t begin, int n, int width, float to[][CHUNK]) {
   for (int i = 0; i < round_up(n, LANES); ++i)
     for (int k = 0; k < width; ++k) to[k][i] = from[width * (begin + (i < n ? i : n - 1)) + k];
 }
 
-void disturb(const Noise& a, int64_t begin, int64_t end) {
+void add_noise(const Noise& a, int64_t begin, int64_t end) {
   const int n = static_cast<int>(end - begin);
   alignas(64) float q[4][CHUNK], s[3][CHUNK], o[1][CHUNK], e[3][CHUNK], out[3][CHUNK];
-  across(a.quats, begin, n, 4, q);
-  across(a.log_scales, begin, n, 3, s);
-  across(a.raw_opacity, begin, n, 1, o);
-  across(a.eta, begin, n, 3, e);
-  const V one = all(1.f), two = all(2.f);
+  load_columns(a.quats, begin, n, 4, q);
+  load_columns(a.log_scales, begin, n, 3, s);
+  load_columns(a.raw_opacity, begin, n, 1, o);
+  load_columns(a.eta, begin, n, 3, e);
+  const Vec one = broadcast(1.f), two = broadcast(2.f);
   for (int i = 0; i < n; i += LANES) {
-    V w = load(q[0] + i), x = load(q[1] + i), y = load(q[2] + i), z = load(q[3] + i);
-    const V inverse = one / max(square_root(w * w + x * x + y * y + z * z), all(1e-12f));
+    Vec w = load(q[0] + i), x = load(q[1] + i), y = load(q[2] + i), z = load(q[3] + i);
+    const Vec inverse = one / max(square_root(w * w + x * x + y * y + z * z), broadcast(1e-12f));
     w = w * inverse, x = x * inverse, y = y * inverse, z = z * inverse;
-    const V r[3][3] = {{one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)},
-                       {two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)},
-                       {two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)}};
-    const V eta[3] = {load(e[0] + i), load(e[1] + i), load(e[2] + i)};
-    const V gate = sigmoid(all(-a.sharpness) * (sigmoid(load(o[0] + i)) - all(a.faint))) * all(a.size);
-    V along[3];
+    const Vec r[3][3] = {{one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)},
+                         {two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)},
+                         {two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)}};
+    const Vec eta[3] = {load(e[0] + i), load(e[1] + i), load(e[2] + i)};
+    const Vec gate = sigmoid(broadcast(-a.sharpness) * (sigmoid(load(o[0] + i)) - broadcast(a.faint))) * broadcast(a.size);
+    Vec along[3];
     for (int k = 0; k < 3; ++k) {
-      const V scale = exponential(load(s[k] + i));
+      const Vec scale = exponential(load(s[k] + i));
       along[k] = (r[0][k] * eta[0] + r[1][k] * eta[1] + r[2][k] * eta[2]) * scale * scale * gate;
     }
     for (int k = 0; k < 3; ++k) store(out[k] + i, r[k][0] * along[0] + r[k][1] * along[1] + r[k][2] * along[2]);
@@ -56,8 +56,8 @@ void disturb(const Noise& a, int64_t begin, int64_t end) {
 }  // namespace se
 
 // means [N, 3] changed in place; quats [N, 4] of any length, log_scales [N, 3], raw_opacity [N] (logits), eta [N, 3] of unit variance.
-SE_EXPORT void se_mcmc_add_noise(float* means, const float* quats, const float* log_scales, const float* raw_opacity, const float* eta, int64_t count,
-                        float size, float sharpness, float faint, int32_t threads) {
+SE_EXPORT void se_mcmc_add_noise(float* means, const float* quats, const float* log_scales, const float* raw_opacity, const float* eta,
+                                 int64_t count, float size, float sharpness, float faint, int32_t threads) {
   const se::Noise noise{means, quats, log_scales, raw_opacity, eta, size, sharpness, faint};
-  se::parallel_for(count, se::CHUNK, threads, [&](int64_t begin, int64_t end, int) { se::disturb(noise, begin, end); });
+  se::parallel_for(count, se::CHUNK, threads, [&](int64_t begin, int64_t end, int) { se::add_noise(noise, begin, end); });
 }

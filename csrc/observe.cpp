@@ -10,7 +10,7 @@ namespace {
 constexpr int64_t kRows = 1024, kDrawn = 8192;  // what a worker takes at a time
 
 // Sum of max(0, x[k]) over K < 512 values: eight lanes in four strands, strands added up, then the rest and the lanes one by one.
-float positive_sum(const float* x, int64_t K) {
+float sum_positive(const float* x, int64_t K) {
   if (K < 8) {
     float part[4] = {};
     const int64_t whole = K / 4 * 4;
@@ -33,7 +33,7 @@ SE_EXPORT void se_observe_rows(const int64_t* rows, const float* raw, int64_t co
                                int32_t threads) {
   se::parallel_for(count, kRows, threads, [&](int64_t begin, int64_t end, int) {
     for (int64_t a = begin; a < end; ++a) {
-      const float sum = positive_sum(raw + a * K, K);
+      const float sum = sum_positive(raw + a * K, K);
       visits[rows[a]] += 1.f;
       opacity[rows[a]] += sum;
     }

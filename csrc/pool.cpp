@@ -9,7 +9,6 @@
 #include <thread>
 #include <vector>
 
-
 namespace se {
 namespace {
 
@@ -22,7 +21,7 @@ struct Job {
   std::atomic<bool> failed{false};
   std::exception_ptr error;  // the first one thrown; the caller throws it again when everybody has left
 
-  void work(int worker) noexcept {
+  void run_chunks(int worker) noexcept {
     try {
       for (;;) {
         const int64_t chunk = next.fetch_add(1, std::memory_order_relaxed);
@@ -48,7 +47,7 @@ inline void pause() {
 // virtual machine, hundreds. First with the core held, which must be short, since the other thread may need it; then giving it to whoever
 // asks, which costs others little, as long as the gaps between jobs of one frame. Returns whether it happened.
 template <class Condition>
-bool soon(Condition&& condition) {
+bool spin_until(Condition&& condition) {
   const auto begin = std::chrono::steady_clock::now();
   for (;;) {
     for (int i = 0; i < 16; ++i) {
@@ -68,7 +67,7 @@ class Pool {
     {
       std::lock_guard lock(mutex_);
       try {
-        while (static_cast<int>(workers_.size()) < threads - 1) workers_.emplace_back([this] { loop(); });
+        while (static_cast<int>(workers_.size()) < threads - 1) workers_.emplace_back([this] { run_worker(); });
       } catch (const std::exception&) {  // no room for another: those that there are do the work
       }
       job_ = &job;
@@ -78,12 +77,12 @@ class Pool {
       wake = asleep_ > 0;
     }
     if (wake) wake_.notify_all();
-    job.work(0);
+    job.run_chunks(0);
     {
       std::lock_guard lock(mutex_);
       job_ = nullptr;  // nobody joins from here on
     }
-    soon([&] { return active_.load(std::memory_order_acquire) == 0; });
+    spin_until([&] { return active_.load(std::memory_order_acquire) == 0; });
     std::unique_lock lock(mutex_);
     idle_.wait(lock, [&] { return active_ == 0; });
   }
@@ -98,14 +97,14 @@ class Pool {
   }
 
  private:
-  void loop() {
+  void run_worker() {
     uint64_t seen = 0;
     std::unique_lock lock(mutex_);
     for (;;) {
       const auto called = [&] { return stop_ || (job_ && generation_ != seen); };
       if (!called()) {
         lock.unlock();
-        soon([&] { return generation_.load(std::memory_order_acquire) != seen; });
+        spin_until([&] { return generation_.load(std::memory_order_acquire) != seen; });
         lock.lock();
         ++asleep_;
         wake_.wait(lock, called);
@@ -118,7 +117,7 @@ class Pool {
       const int worker = ++joined_;
       ++active_;
       lock.unlock();
-      job->work(worker);
+      job->run_chunks(worker);
       lock.lock();
       if (--active_ == 0) idle_.notify_all();
     }
@@ -154,7 +153,7 @@ void parallel_chunks(int64_t n, int64_t grain, int threads, void (*body)(void*, 
   threads = static_cast<int>(std::min<int64_t>(threads, job.chunks));
   std::unique_lock lock(run_mutex, std::defer_lock);
   if (threads <= 1 || !lock.try_lock()) {
-    job.work(0);
+    job.run_chunks(0);
   } else {
     pool().run(job, threads);
   }

@@ -15,8 +15,7 @@ template <class F>
 void parallel_for(int64_t n, int64_t grain, int threads, F&& f) {
   using Fn = std::remove_reference_t<F>;
   parallel_chunks(
-      n, grain, threads,
-      [](void* c, int64_t begin, int64_t end, int worker) { (*static_cast<Fn*>(c))(begin, end, worker); },
+      n, grain, threads, [](void* c, int64_t begin, int64_t end, int worker) { (*static_cast<Fn*>(c))(begin, end, worker); },
       const_cast<std::remove_const_t<Fn>*>(&f));
 }
 

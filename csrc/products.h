@@ -1,7 +1,7 @@
 // The two small matrix products of the decode, on row-major blocks that stay in the first-level cache.
-//   product:     C[m][n] = (bias[n] or 0) + sum_k A[m][k] B[k][n], stored or added by Out
+//   multiply:     C[m][n] = (bias[n] or 0) + sum_k A[m][k] B[k][n], stored or added by Out
 //   accumulate:  C[p][n] += sum_m A[m][p] B[m][n]
-// n runs along the registers and must be a multiple of 16; m is rounded up to TILE_STEP in product and p in accumulate, so A and C need
+// n runs along the registers and must be a multiple of 16; m is rounded up to TILE_STEP in multiply and p in accumulate, so A and C need
 // that many rows (columns of A in accumulate) of room, whose content does not matter.
 #pragma once
 #include "lanes.h"
@@ -15,46 +15,46 @@ constexpr int TILE = 6, TILE_STEP = 2;
 #endif
 constexpr int SLACK = TILE;
 
-// Where product puts C.
+// Where multiply puts C.
 struct Store {
   float* c;
   int stride;
-  void operator()(int row, int column, V sum) const { store(c + row * static_cast<int64_t>(stride) + column, sum); }
+  void operator()(int row, int column, Vec sum) const { store(c + row * static_cast<int64_t>(stride) + column, sum); }
 };
 struct StoreRelu {
   float* c;
   int stride;
   // max(0, x) in this order: NaN stays NaN
-  void operator()(int row, int column, V sum) const { store(c + row * static_cast<int64_t>(stride) + column, max(all(0.f), sum)); }
+  void operator()(int row, int column, Vec sum) const { store(c + row * static_cast<int64_t>(stride) + column, max(broadcast(0.f), sum)); }
 };
 struct AddToRows {  // row i is added to row index[i]; no two alike but for rows that nobody reads
   float* c;
   int stride;
   const int* index;
-  void operator()(int row, int column, V sum) const {
+  void operator()(int row, int column, Vec sum) const {
     float* to = c + index[row] * static_cast<int64_t>(stride) + column;
     store(to, load(to) + sum);
   }
 };
 
-// Sums of TILE rows by `wide` registers; a compile-time stride (0: given at run time) lets one pointer address all rows of A.
+// Sums of TILE rows by `wide` registers; a compile-time stride (0: given at run time) lets one pointer address broadcast rows of A.
 template <int rows, int wide, int fixed, class Out>
-inline void product_tile(const float* a, int a_stride, const float* b, int b_stride, int k, const float* bias, const Out& out, int row,
-                         int column) {
+inline void multiply_tile(const float* a, int a_stride, const float* b, int b_stride, int k, const float* bias, const Out& out, int row,
+                          int column) {
   const int64_t stride = fixed ? fixed : a_stride;
-  V sums[rows][wide];
+  Vec sums[rows][wide];
   for (int j = 0; j < wide; ++j) {
-    const V start = bias ? load(bias + j * LANES) : all(0.f);
+    const Vec start = bias ? load(bias + j * LANES) : broadcast(0.f);
 #pragma GCC unroll 12
     for (int i = 0; i < rows; ++i) sums[i][j] = start;
   }
   for (int t = 0; t < k; ++t) {
-    V right[wide];
+    Vec right[wide];
 #pragma GCC unroll 2
     for (int j = 0; j < wide; ++j) right[j] = load(b + t * static_cast<int64_t>(b_stride) + j * LANES);
 #pragma GCC unroll 12
     for (int i = 0; i < rows; ++i) {
-      const V left = all(a[i * stride + t]);
+      const Vec left = broadcast(a[i * stride + t]);
 #pragma GCC unroll 2
       for (int j = 0; j < wide; ++j) sums[i][j] = fma(left, right[j], sums[i][j]);
     }
@@ -66,49 +66,54 @@ inline void product_tile(const float* a, int a_stride, const float* b, int b_str
 }
 
 template <int wide, int fixed, class Out>
-inline void product_columns(int m, int k, const float* a, int as, const float* b, int bs, const float* bias, const Out& out, int column) {
+inline void multiply_columns(int m, int k, const float* a, int as, const float* b, int bs, const float* bias, const Out& out, int column) {
   int i = 0;
-  for (; i + TILE <= m; i += TILE) product_tile<TILE, wide, fixed>(a + i * as, as, b, bs, k, bias, out, i, column);
+  for (; i + TILE <= m; i += TILE) multiply_tile<TILE, wide, fixed>(a + i * as, as, b, bs, k, bias, out, i, column);
   if (m - i > 2 * TILE_STEP)
-    product_tile<TILE, wide, fixed>(a + i * as, as, b, bs, k, bias, out, i, column);
+    multiply_tile<TILE, wide, fixed>(a + i * as, as, b, bs, k, bias, out, i, column);
   else if (m - i > TILE_STEP)
-    product_tile<2 * TILE_STEP, wide, fixed>(a + i * as, as, b, bs, k, bias, out, i, column);
+    multiply_tile<2 * TILE_STEP, wide, fixed>(a + i * as, as, b, bs, k, bias, out, i, column);
   else if (m > i)
-    product_tile<TILE_STEP, wide, fixed>(a + i * as, as, b, bs, k, bias, out, i, column);
+    multiply_tile<TILE_STEP, wide, fixed>(a + i * as, as, b, bs, k, bias, out, i, column);
 }
 
 template <int fixed, class Out>
-void product_strided(int m, int n, int k, const float* a, int as, const float* b, int bs, const float* bias, const Out& out) {
+void multiply_strided(int m, int n, int k, const float* a, int as, const float* b, int bs, const float* bias, const Out& out) {
   int j = 0;
-  for (; j + 2 * LANES <= n; j += 2 * LANES) product_columns<2, fixed>(m, k, a, as, b + j, bs, bias ? bias + j : nullptr, out, j);
-  for (; j + LANES <= n; j += LANES) product_columns<1, fixed>(m, k, a, as, b + j, bs, bias ? bias + j : nullptr, out, j);
+  for (; j + 2 * LANES <= n; j += 2 * LANES) multiply_columns<2, fixed>(m, k, a, as, b + j, bs, bias ? bias + j : nullptr, out, j);
+  for (; j + LANES <= n; j += LANES) multiply_columns<1, fixed>(m, k, a, as, b + j, bs, bias ? bias + j : nullptr, out, j);
 }
 
 template <class Out>
-inline void product(int m, int n, int k, const float* a, int as, const float* b, int bs, const float* bias, const Out& out) {
+inline void multiply(int m, int n, int k, const float* a, int as, const float* b, int bs, const float* bias, const Out& out) {
   switch (as) {
-    case 16: return product_strided<16>(m, n, k, a, as, b, bs, bias, out);
-    case 32: return product_strided<32>(m, n, k, a, as, b, bs, bias, out);
-    case 48: return product_strided<48>(m, n, k, a, as, b, bs, bias, out);
-    case 80: return product_strided<80>(m, n, k, a, as, b, bs, bias, out);
-    default: return product_strided<0>(m, n, k, a, as, b, bs, bias, out);
+    case 16:
+      return multiply_strided<16>(m, n, k, a, as, b, bs, bias, out);
+    case 32:
+      return multiply_strided<32>(m, n, k, a, as, b, bs, bias, out);
+    case 48:
+      return multiply_strided<48>(m, n, k, a, as, b, bs, bias, out);
+    case 80:
+      return multiply_strided<80>(m, n, k, a, as, b, bs, bias, out);
+    default:
+      return multiply_strided<0>(m, n, k, a, as, b, bs, bias, out);
   }
 }
 
 template <int columns, int wide>
 inline void accumulate_tile(int m, const float* a, int as, const float* b, int bs, float* c, int cs) {
-  V sums[columns][wide];
+  Vec sums[columns][wide];
 #pragma GCC unroll 12
   for (int i = 0; i < columns; ++i)
 #pragma GCC unroll 2
     for (int j = 0; j < wide; ++j) sums[i][j] = load(c + i * cs + j * LANES);
   for (int t = 0; t < m; ++t, a += as, b += bs) {
-    V right[wide];
+    Vec right[wide];
 #pragma GCC unroll 2
     for (int j = 0; j < wide; ++j) right[j] = load(b + j * LANES);
 #pragma GCC unroll 12
     for (int i = 0; i < columns; ++i) {
-      const V left = all(a[i]);
+      const Vec left = broadcast(a[i]);
 #pragma GCC unroll 2
       for (int j = 0; j < wide; ++j) sums[i][j] = fma(left, right[j], sums[i][j]);
     }

@@ -4,22 +4,22 @@
 
 namespace se {
 
-typedef float Quad __attribute__((vector_size(16)));
+typedef float F32x4 __attribute__((vector_size(16)));
 
-inline Quad load4(const float* p) {
-  Quad q;
+inline F32x4 load4(const float* p) {
+  F32x4 q;
   std::memcpy(&q, p, 16);
   return q;
 }
-inline void store4(float* p, Quad q) { std::memcpy(p, &q, 16); }
-inline Quad load3(const float* p) { return Quad{p[0], p[1], p[2], 0.f}; }
-inline void store3(float* p, Quad q) {
+inline void store4(float* p, F32x4 q) { std::memcpy(p, &q, 16); }
+inline F32x4 load3(const float* p) { return F32x4{p[0], p[1], p[2], 0.f}; }
+inline void store3(float* p, F32x4 q) {
   std::memcpy(p, &q, 8);
   p[2] = q[2];
 }
-inline Quad four(float x) { return Quad{x, x, x, x}; }
-inline float dot(Quad a, Quad b) {
-  const Quad p = a * b;
+inline F32x4 broadcast4(float x) { return F32x4{x, x, x, x}; }
+inline float dot(F32x4 a, F32x4 b) {
+  const F32x4 p = a * b;
   return (p[0] + p[2]) + (p[1] + p[3]);
 }
 

@@ -13,21 +13,20 @@
 #include "se_api.h"
 #endif
 
-
 namespace se::raster {
 namespace {
 
 // States go back here when their graph is gone, so that the next picture finds its memory already mapped.
-class Spare {
+class StatePool {
  public:
-  std::unique_ptr<State> take() {
+  std::unique_ptr<State> acquire() {
     std::lock_guard lock(mutex_);
     if (free_.empty()) return std::make_unique<State>();
     std::unique_ptr<State> state = std::move(free_.back());
     free_.pop_back();
     return state;
   }
-  void give(std::unique_ptr<State> state) {
+  void release(std::unique_ptr<State> state) {
     std::lock_guard lock(mutex_);
     if (free_.size() < 2) free_.push_back(std::move(state));
   }
@@ -41,27 +40,27 @@ class Spare {
   std::vector<std::unique_ptr<State>> free_;
 };
 
-Spare& spare() {
-  static Spare* instance = new Spare;  // never destroyed: graphs may outlive static destructors at interpreter exit
+StatePool& state_pool() {
+  static StatePool* instance = new StatePool;  // never destroyed: graphs may outlive static destructors at interpreter exit
   return *instance;
 }
 
 // Processor time of this thread where the system tells, so that a busy machine does not blur a benchmark.
-double now() {
+double thread_seconds() {
 #if defined(__unix__) || defined(__APPLE__)
   timespec t;
   clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
   return static_cast<double>(t.tv_sec) + 1e-9 * static_cast<double>(t.tv_nsec);
 #else
-  return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+  return std::chrono::duration<double>(std::chrono::steady_clock::thread_seconds().time_since_epoch()).count();
 #endif
 }
 
-class Stages {
+class StageTimer {
  public:
-  explicit Stages(double* seconds) : seconds_(seconds), last_(now()) {}
-  void done() {
-    const double time = now();
+  explicit StageTimer(double* seconds) : seconds_(seconds), last_(thread_seconds()) {}
+  void record() {
+    const double time = thread_seconds();
     *seconds_++ = time - last_;
     last_ = time;
   }
@@ -88,26 +87,26 @@ Inputs inputs_of(const Call& a) {
 // `state` null: nothing is kept for backward; else *state must be given to se_raster_release once.
 SE_EXPORT int32_t se_raster_forward(const SeRasterForward* a, void** state) {
   try {
-    std::unique_ptr<State> s = spare().take();
+    std::unique_ptr<State> s = state_pool().acquire();
     s->camera = a->camera;
     s->antialias = a->antialias != 0;
     s->m = a->m;
     s->tiles_x = (a->camera.width + kTile - 1) / kTile;
     s->tiles_y = (a->camera.height + kTile - 1) / kTile;
-    Stages stages(s->seconds);
+    StageTimer timer(s->seconds);
     project(*s, inputs_of(*a), a->radii, a->threads);
-    stages.done();
+    timer.record();
     bin(*s, a->threads);
-    stages.done();
+    timer.record();
     blend(*s, a->background, {a->image, a->alpha, a->depth}, a->threads);
-    stages.done();
+    timer.record();
     if (state)
       *state = s.release();
     else
-      spare().give(std::move(s));
+      state_pool().release(std::move(s));
     return 0;
   } catch (const std::exception&) {
-    spare().clear();
+    state_pool().clear();
     return 1;
   }
 }
@@ -118,28 +117,28 @@ SE_EXPORT int32_t se_raster_backward(void* state, const SeRasterBackward* a) {
     // With many workers one row of sums per worker and Gaussian would take more memory than one per pair.
     const bool slots = a->deterministic || (a->threads > 4 && a->threads * s.visible > s.pairs);
     const int rows = slots ? 0 : std::max(1, a->threads);
-    Stages stages(s.seconds + 3);
+    StageTimer timer(s.seconds + 3);
     blend_backward(s, a->background, {a->g_image, a->g_alpha, a->g_depth}, a->d_background, rows, a->threads);
-    stages.done();
+    timer.record();
     project_backward(s, inputs_of(*a), {a->d_means, a->d_quats, a->d_scales, a->d_opacities, a->d_colors, a->d_mean2d}, rows, a->threads);
-    stages.done();
+    timer.record();
     return 0;
   } catch (const std::exception&) {
-    spare().clear();
+    state_pool().clear();
     return 1;
   }
 }
 
 SE_EXPORT void se_raster_release(void* state) {
-  if (state) spare().give(std::unique_ptr<State>(static_cast<State*>(state)));
+  if (state) state_pool().release(std::unique_ptr<State>(static_cast<State*>(state)));
 }
 
 SE_EXPORT void se_raster_find_visible(const SeCamera* camera, const float* means, const float* scales, int64_t m, uint8_t* visible,
-                                 int32_t threads) {
+                                      int32_t threads) {
   project_visible(*camera, means, scales, m, visible, threads);
 }
 
-// For benchmarks: [visible Gaussians, (Gaussian, tile) pairs, (Gaussian, block) pairs drawn] and the stages' seconds.
+// For benchmarks: [visible Gaussians, (Gaussian, tile) pairs, (Gaussian, block) pairs drawn] and the timer' seconds.
 SE_EXPORT void se_raster_count(const void* state, int64_t* counts, double* seconds) {
   const State& s = *static_cast<const State*>(state);
   int64_t blocks = 0;

@@ -2,7 +2,7 @@
 //
 //   project    every Gaussian -> a 64-byte Record (whitened ellipse, colour, depth) and its rectangle of tiles
 //   bin        a stable scatter into areas of 4 x 4 tiles of 16 x 16 pixels, then each area's sort by depth and its tiles' lists
-//   forward    per tile: which 4 x 4 pixel blocks does each Gaussian touch (exact), then block by block, one block per F16
+//   forward    per tile: which 4 x 4 pixel blocks does each Gaussian touch (exact), then block by block, one block per F32x16
 //   backward   per tile, batch by batch from the last, from checkpoints that forward left; sums per Gaussian; then the chain rule through
 //              the projection
 //
@@ -26,12 +26,12 @@
 
 namespace se::raster {
 
-constexpr int kTile = 16;     // pixels
-constexpr int kArea = 4;      // tiles
-constexpr int kMostAreas = 65536;  // of a picture: 268 million pixels
-constexpr int kChunk = 4096;  // Gaussians that one worker projects at a time; a multiple of 16
-constexpr int kBatch = 512;   // Gaussians of a tile worked on at a time: each batch's end costs every block some hundred cycles
-constexpr int kAhead = 128;   // how many of a tile's Gaussians ahead memory is fetched
+constexpr int kTile = 16;             // pixels
+constexpr int kArea = 4;              // tiles
+constexpr int kMaxAreas = 65536;      // of a picture: 268 million pixels
+constexpr int kChunk = 4096;          // Gaussians that one worker projects at a time; a multiple of 16
+constexpr int kBatch = 512;           // Gaussians of a tile worked on at a time: each batch's end costs every block some hundred cycles
+constexpr int kAhead = 128;           // how many of a tile's Gaussians ahead memory is fetched
 constexpr int kBeyond = kAhead + 16;  // entries after the last list, so that looking ahead needs no test
 constexpr float kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
 constexpr float kMinAlphaLog2 = -7.994353437f;  // log2(1 / 255)
@@ -55,7 +55,7 @@ static_assert(sizeof(Item) == 16);
 
 // A Gaussian in one area: its key, then 16 bits for its number in its part, then bit 4 y + x for the area's tile in column x, row y.
 using Entry = uint64_t;
-constexpr int kMostSpan = 65536 / kChunk;  // chunks of a part
+constexpr int kMaxPartChunks = 65536 / kChunk;  // chunks of a part
 
 // Sums over pixels for one Gaussian, W = d loss / d power at a pixel: W, W dx, W dy, W dx^2, W dx dy, W dy^2, then colour and depth.
 // The places below kSums but kDepth are 0: a tile keeps the Gaussian's own numbers there, in the same cache line.
@@ -120,25 +120,25 @@ struct State {
   int tiles_x = 0, tiles_y = 0;
   bool antialias = false;
 
-  Buffer<Record> records;         // [chunk-aligned m]; chunk c holds its visible ones from c * kChunk on
-  Buffer<Item> items;             // same places
-  Buffer<uint16_t> group_mask;    // [m / 16] which of sixteen neighbours are visible
-  Buffer<uint32_t> group_first;   // [m / 16] place of the first of them
-  Buffer<uint32_t> chunk_count;   // [chunks] visible ones
-  Buffer<uint32_t> chunk_entries; // [chunks] areas that its Gaussians meet
-  Buffer<uint32_t> part_begin;    // [parts + 1] into the entries
-  Buffer<uint32_t> area_begin;    // [parts, areas + 1] into the entries
-  Buffer<uint32_t> area_at;       // [areas + 1] how many entries come before each area's
-  Buffer<uint32_t> tile_begin;    // [tiles + 1] into `list`
-  Buffer<uint32_t> tile_used;     // [tiles] how many of its list a tile looked at before all its pixels had stopped
-  Buffer<uint32_t> list;          // [pairs] places, per tile near to far
-  Buffer<uint16_t> masks;         // [batches, 16 blocks, kBatch / 16] which of a tile's blocks a Gaussian touches, see batch()
-  Buffer<uint16_t> drawn;         // [batches, 16 blocks] how many of those were blended before all the block's pixels had stopped
-  Buffer<float> transmittance;    // [tiles * 256] what is left at the end, in block order
-  Buffer<float> checkpoints;      // [batches * 256] what is left before each batch but a tile's first, see batch()
-  Buffer<Sums> sums;              // backward: one row per place and worker, or (deterministic) per pair; binning works here
-  Buffer<uint32_t> slots;         // deterministic backward: first row of each place
-  Buffer<double> background;      // backward: [tiles * 3]
+  Buffer<Record> records;          // [chunk-aligned m]; chunk c holds its visible ones from c * kChunk on
+  Buffer<Item> items;              // same places
+  Buffer<uint16_t> group_mask;     // [m / 16] which of sixteen neighbours are visible
+  Buffer<uint32_t> group_first;    // [m / 16] place of the first of them
+  Buffer<uint32_t> chunk_count;    // [chunks] visible ones
+  Buffer<uint32_t> chunk_entries;  // [chunks] areas that its Gaussians meet
+  Buffer<uint32_t> part_begin;     // [parts + 1] into the entries
+  Buffer<uint32_t> area_begin;     // [parts, areas + 1] into the entries
+  Buffer<uint32_t> area_at;        // [areas + 1] how many entries come before each area's
+  Buffer<uint32_t> tile_begin;     // [tiles + 1] into `list`
+  Buffer<uint32_t> tile_used;      // [tiles] how many of its list a tile looked at before all its pixels had stopped
+  Buffer<uint32_t> list;           // [pairs] places, per tile near to far
+  Buffer<uint16_t> masks;          // [batches, 16 blocks, kBatch / 16] which of a tile's blocks a Gaussian touches, see batch()
+  Buffer<uint16_t> drawn;          // [batches, 16 blocks] how many of those were blended before all the block's pixels had stopped
+  Buffer<float> transmittance;     // [tiles * 256] what is left at the end, in block order
+  Buffer<float> checkpoints;       // [batches * 256] what is left before each batch but a tile's first, see batch()
+  Buffer<Sums> sums;               // backward: one row per place and worker, or (deterministic) per pair; binning works here
+  Buffer<uint32_t> slots;          // deterministic backward: first row of each place
+  Buffer<double> background;       // backward: [tiles * 3]
 
   double seconds[5] = {};  // processor time of the calling thread: project, bin, blend, blend backward, project backward
 

@@ -61,10 +61,10 @@ class AreaSort {
     const uint32_t n = n_, low = low_;
     uint64_t *a = a_.data(), *b = b_.get(n);
     if (n <= kFew) {
-      insert(a, n);
+      sort_by_insertion(a, n);
       return a;
     }
-    const int digit = std::clamp(static_cast<int>(std::bit_width(n)) - 1, 6, kMostDigit);
+    const int digit = std::clamp(static_cast<int>(std::bit_width(n)) - 1, 6, kMaxDigit);
     const int shift = std::max(0, static_cast<int>(std::bit_width(high_ - low)) - 2 * digit);
     const uint32_t radix = 1u << digit;
     std::fill(first_, first_ + radix, 0u), std::fill(second_, second_ + radix, 0u);
@@ -75,21 +75,21 @@ class AreaSort {
       first_[d] = std::exchange(sum[0], sum[0] + first_[d]), second_[d] = std::exchange(sum[1], sum[1] + second_[d]);
     for (uint32_t i = 0; i < n; ++i) b[first_[lead(a[i]) & (radix - 1)]++] = a[i];
     for (uint32_t i = 0; i < n; ++i) a[second_[lead(b[i]) >> digit]++] = b[i];
-    if (shift > 0) finish(a, n, lead);
+    if (shift > 0) finish_sort(a, n, lead);
     return a;
   }
 
   template <class F>
-  static void finish(uint64_t* a, uint32_t n, const F& lead) {
+  static void finish_sort(uint64_t* a, uint32_t n, const F& lead) {
     for (uint32_t i = kFew; i < n; ++i)
       if (lead(a[i]) == lead(a[i - kFew])) {  // a long run of one leading part
         std::sort(a, a + n);
         return;
       }
-    insert(a, n);
+    sort_by_insertion(a, n);
   }
 
-  static void insert(uint64_t* a, uint32_t n) {
+  static void sort_by_insertion(uint64_t* a, uint32_t n) {
     for (uint32_t i = 1; i < n; ++i) {
       const uint64_t x = a[i];
       uint32_t k = i;
@@ -99,12 +99,12 @@ class AreaSort {
   }
 
   static constexpr uint32_t kFew = 32;
-  static constexpr int kMostDigit = 11;
+  static constexpr int kMaxDigit = 11;
   static constexpr uint32_t kRoom = 255;
-  static constexpr int kFar = 4;  // parts ahead
+  static constexpr int kFar = 4;    // parts ahead
   Buffer<uint64_t> a_, b_, value_;  // a_: keys as read
   uint32_t n_ = 0, low_ = 0, high_ = 0;
-  uint32_t first_[1 << kMostDigit], second_[1 << kMostDigit];
+  uint32_t first_[1 << kMaxDigit], second_[1 << kMaxDigit];
   uint64_t bytes_[256] = {};
 };
 

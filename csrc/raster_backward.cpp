@@ -19,31 +19,31 @@ struct Pixels {
 struct Work {
   Batch batch;
   // Of one block's list: w, and alpha, whose place W takes.
-  F16 w[kBatch + 16], alpha[kBatch + 16];
+  F32x16 w[kBatch + 16], alpha[kBatch + 16];
   float depth[kBatch + 16];  // the batch's sums for depth
 };
 
 // Upstream gradients of one block by column: lane l of column c is the pixel in column c of l's row.
 template <bool Depth>
 struct Columns {
-  F16 color[3][4], depth[Depth ? 4 : 1];
+  F32x16 color[3][4], depth[Depth ? 4 : 1];
   Columns(const Pixels& px, int block) {
     for (int c = 0; c < 3; ++c) split(load(px.color[c] + block * 16), color[c]);
     if constexpr (Depth) split(load(px.depth + block * 16), depth);
   }
-  static void split(F16 pixels, F16 (&columns)[4]) {
+  static void split(F32x16 pixels, F32x16 (&columns)[4]) {
     columns[0] = column<0>(pixels), columns[1] = column<1>(pixels), columns[2] = column<2>(pixels), columns[3] = column<3>(pixels);
   }
 };
 
 // Weighted sums over the block's pixels of sixteen Gaussians' w, one Gaussian per lane.
 template <bool Depth>
-void reduce_colors(const F16* w, const Columns<Depth>& by, F16* out, F16& depth) {
-  F16 part[3][4], part_depth[4];
+void reduce_colors(const F32x16* w, const Columns<Depth>& by, F32x16* out, F32x16& depth) {
+  F32x16 part[3][4], part_depth[4];
   for (int j = 0; j < 4; ++j) {  // four Gaussians at a time; lanes: row of the block, then Gaussian
-    F16 c[4] = {w[4 * j], w[4 * j + 1], w[4 * j + 2], w[4 * j + 3]};
+    F32x16 c[4] = {w[4 * j], w[4 * j + 1], w[4 * j + 2], w[4 * j + 3]};
     transpose4(c);
-    const auto sum = [&](const F16 (&g)[4]) { return fma(c[0], g[0], fma(c[1], g[1], fma(c[2], g[2], c[3] * g[3]))); };
+    const auto sum = [&](const F32x16(&g)[4]) { return fma(c[0], g[0], fma(c[1], g[1], fma(c[2], g[2], c[3] * g[3]))); };
     for (int k = 0; k < 3; ++k) part[k][j] = sum(by.color[k]);
     if constexpr (Depth) part_depth[j] = sum(by.depth);
   }
@@ -53,18 +53,18 @@ void reduce_colors(const F16* w, const Columns<Depth>& by, F16* out, F16& depth)
 
 // Sums of W over the pixels: m, and with x and y in half pixels from the block's centre (-3 -1 1 3) those of W x, W y, W x^2, W x y, W y^2.
 struct Moments {
-  F16 m, x, y, xx, xy, yy;
-  explicit Moments(const F16* W) {
-    const F16 three = bcast(3.0f), nine = bcast(9.0f);
-    F16 row0[4], row1[4], row2[4];  // sums along a row: of W, W x, W x^2
+  F32x16 m, x, y, xx, xy, yy;
+  explicit Moments(const F32x16* W) {
+    const F32x16 three = broadcast(3.0f), nine = broadcast(9.0f);
+    F32x16 row0[4], row1[4], row2[4];  // sums along a row: of W, W x, W x^2
     for (int j = 0; j < 4; ++j) {
-      F16 c[4] = {W[4 * j], W[4 * j + 1], W[4 * j + 2], W[4 * j + 3]};
+      F32x16 c[4] = {W[4 * j], W[4 * j + 1], W[4 * j + 2], W[4 * j + 3]};
       transpose4(c);
-      const F16 outer = c[0] + c[3], inner = c[1] + c[2];
+      const F32x16 outer = c[0] + c[3], inner = c[1] + c[2];
       row0[j] = outer + inner, row1[j] = fma(three, c[3] - c[0], c[2] - c[1]), row2[j] = fma(nine, outer, inner);
     }
     transpose_quarters(row0), transpose_quarters(row1), transpose_quarters(row2);
-    const F16 outer = row0[0] + row0[3], inner = row0[1] + row0[2];
+    const F32x16 outer = row0[0] + row0[3], inner = row0[1] + row0[2];
     m = outer + inner;
     y = fma(three, row0[3] - row0[0], row0[2] - row0[1]), yy = fma(nine, outer, inner);
     x = (row1[0] + row1[3]) + (row1[1] + row1[2]), xx = (row2[0] + row2[3]) + (row2[1] + row2[2]);
@@ -76,7 +76,7 @@ struct Moments {
 template <bool Depth>
 void reduce(Work& work, int first, const Columns<Depth>& by, int block, const Tile& tile) {
   const uint16_t* place = work.batch.list.place + first;
-  F16 color[3], depth;
+  F32x16 color[3], depth;
   reduce_colors<Depth>(work.w + first, by, color, depth);
   if constexpr (Depth) {
     alignas(64) float value[16];
@@ -89,17 +89,17 @@ void reduce(Work& work, int first, const Columns<Depth>& by, int block, const Ti
   Row* rows[16];
   const float* centre[16];
   for (int k = 0; k < 16; ++k) rows[k] = &work.batch.row(place[k]), centre[k] = &rows[k]->u;
-  F16 u, v;
+  F32x16 u, v;
   load_pairs(centre, u, v);
-  const F16 dx = u + u - bcast(2 * (tile.centre_x + 4.0f * static_cast<float>(block % 4) - 6.0f));
-  const F16 dy = v + v - bcast(2 * (tile.centre_y + 4.0f * static_cast<float>(block / 4) - 6.0f));
-  const F16 zero = bcast(0.0f), sx = dx * b.m - b.x, sy = dy * b.m - b.y;
-  F16 q1[4] = {zero, zero, zero, b.m};
-  F16 q2[4] = {sx, sy, fma(dx, sx - b.x, b.xx), fma(dx, sy, fnma(dy, b.x, b.xy))};
-  F16 q3[4] = {fma(dy, sy - b.y, b.yy), color[0], color[1], color[2]};
+  const F32x16 dx = u + u - broadcast(2 * (tile.centre_x + 4.0f * static_cast<float>(block % 4) - 6.0f));
+  const F32x16 dy = v + v - broadcast(2 * (tile.centre_y + 4.0f * static_cast<float>(block / 4) - 6.0f));
+  const F32x16 zero = broadcast(0.0f), sx = dx * b.m - b.x, sy = dy * b.m - b.y;
+  F32x16 q1[4] = {zero, zero, zero, b.m};
+  F32x16 q2[4] = {sx, sy, fma(dx, sx - b.x, b.xx), fma(dx, sy, fnma(dy, b.x, b.xy))};
+  F32x16 q3[4] = {fma(dy, sy - b.y, b.yy), color[0], color[1], color[2]};
   transpose4(q1), transpose4(q2), transpose4(q3);
   for (int k = 0; k < 4; ++k) {
-    F16 line[4] = {zero, q1[k], q2[k], q3[k]};
+    F32x16 line[4] = {zero, q1[k], q2[k], q3[k]};
     transpose_quarters(line);
     for (int j = 0; j < 4; ++j) {
       float* sums = &rows[4 * j + k]->l1;
@@ -109,20 +109,20 @@ void reduce(Work& work, int first, const Columns<Depth>& by, int block, const Ti
 }
 
 // alpha and w of the first `count` of the block's list, near to far.
-void weigh(Work& work, int count, int block, const float* checkpoint, const Exp2& exp2) {
+void compute_weights(Work& work, int count, int block, const float* checkpoint, const Exp2& exp2) {
   const Batch& batch = work.batch;
-  const F16 y = block_y(block / 4), stop = bcast(kMinTransmittance);
+  const F32x16 y = block_y(block / 4), stop = broadcast(kMinTransmittance);
   const int column = block % 4;
-  F16 through = load(checkpoint + block * 16);
+  F32x16 through = load(checkpoint + block * 16);
   for (int i = 0; i < count; i += 4) {
     const Row* row[4];
-    F16 alpha[4];
+    F32x16 alpha[4];
     for (int k = 0; k < 4; ++k) row[k] = &batch.row(batch.list.place[i + k]);
-    alphas(row, column, y, exp2, alpha);
+    compute_alphas(row, column, y, exp2, alpha);
     for (int k = 0; k < 4; ++k) {
-      const F16 weight = through * alpha[k];
+      const F32x16 weight = through * alpha[k];
       through = fnma(through, alpha[k], through);
-      const M16 drawn = ge(through, stop);
+      const Mask16 drawn = ge(through, stop);
       work.w[i + k] = keep(drawn, weight);
       work.alpha[i + k] = keep(drawn, alpha[k]);
     }
@@ -130,20 +130,20 @@ void weigh(Work& work, int count, int block, const float* checkpoint, const Exp2
 }
 
 template <bool Depth>
-void block_backward(Work& work, int count, int block, const float* checkpoint, Pixels& px, const Tile& tile, const Exp2& exp2) {
+void differentiate_block(Work& work, int count, int block, const float* checkpoint, Pixels& px, const Tile& tile, const Exp2& exp2) {
   const Batch& batch = work.batch;
-  weigh(work, count, block, checkpoint, exp2);
-  const F16 most = bcast(kMaxAlpha), zero = bcast(0.0f), one = bcast(1.0f);
+  compute_weights(work, count, block, checkpoint, exp2);
+  const F32x16 most = broadcast(kMaxAlpha), zero = broadcast(0.0f), one = broadcast(1.0f);
   const int at = block * 16;
   const Columns<Depth> by(px, block);
-  F16 behind = load(px.behind + at);
-  const F16 red = load(px.color[0] + at), green = load(px.color[1] + at), blue = load(px.color[2] + at), depth = load(px.depth + at);
+  F32x16 behind = load(px.behind + at);
+  const F32x16 red = load(px.color[0] + at), green = load(px.color[1] + at), blue = load(px.color[2] + at), depth = load(px.depth + at);
   for (int i = count; i < (count + 15) / 16 * 16; ++i) work.w[i] = work.alpha[i] = zero;
   for (int i = count - 1; i >= 0; --i) {
     const Row& row = batch.row(batch.list.place[i]);
-    F16 s = fma(red, bcast(row.r), fma(green, bcast(row.g), blue * bcast(row.b)));
-    if constexpr (Depth) s = fma(depth, bcast(row.z), s);
-    const F16 alpha = work.alpha[i];
+    F32x16 s = fma(red, broadcast(row.r), fma(green, broadcast(row.g), blue * broadcast(row.b)));
+    if constexpr (Depth) s = fma(depth, broadcast(row.z), s);
+    const F32x16 alpha = work.alpha[i];
     work.alpha[i] = mul_keep(gt(most, alpha), work.w[i], s - behind);
     behind = fma(one - alpha, behind, alpha * s);  // the one chain from Gaussian to Gaussian: a single step long
   }
@@ -163,15 +163,15 @@ void begin_tile(State& s, int number, const Tile& tile, const float* background,
   read(up.image, px.color);
   read(up.depth, px.depth);
   read(up.alpha, alpha);
-  inside(s.camera, tile, px.through);
+  mark_inside(s.camera, tile, px.through);
   const float* left = s.transmittance.data() + number * 256;
-  F16 total[3] = {bcast(0.0f), bcast(0.0f), bcast(0.0f)};
+  F32x16 total[3] = {broadcast(0.0f), broadcast(0.0f), broadcast(0.0f)};
   for (int k = 0; k < 256; k += 16) {
-    F16 behind = bcast(0.0f) - load(alpha + k);
-    const F16 l = load(left + k);
+    F32x16 behind = broadcast(0.0f) - load(alpha + k);
+    const F32x16 l = load(left + k);
     for (int c = 0; c < 3; ++c) {
-      const F16 g = load(px.color[c] + k);
-      behind = fma(g, bcast(background[c]), behind);
+      const F32x16 g = load(px.color[c] + k);
+      behind = fma(g, broadcast(background[c]), behind);
       total[c] = fma(g, l, total[c]);
     }
     store(px.behind + k, behind);
@@ -193,7 +193,7 @@ struct Sink {
     const Rect r = s.items.data()[place].rect;
     return s.sums.data()[s.slots.data()[place] + static_cast<uint32_t>((tile.y - r.y0) * (r.x1 - r.x0) + tile.x - r.x0)];
   }
-  void add(uint32_t place, const Tile& tile, F16 sums) const {
+  void add(uint32_t place, const Tile& tile, F32x16 sums) const {
     if (own)
       store(own[place].x, load(own[place].x) + sums);
     else
@@ -202,7 +202,7 @@ struct Sink {
 };
 
 template <bool Depth>
-void tile_backward(State& s, int number, Work& work, const float* background, const Upstream& up, const Sink& sink, const Exp2& exp2) {
+void differentiate_tile(State& s, int number, Work& work, const float* background, const Upstream& up, const Sink& sink, const Exp2& exp2) {
   const Tile tile = tile_at(s, number);
   Pixels px;
   begin_tile(s, number, tile, background, up, px);
@@ -219,7 +219,7 @@ void tile_backward(State& s, int number, Work& work, const float* background, co
     uint16_t any[kGroups];
     uint32_t blocks = 0;
     for (int b = 0; b < 16; ++b) blocks |= (drawn[b] > 0 ? 1u : 0u) << b;
-    any_block(touched, blocks, n, any);
+    merge_blocks(touched, blocks, n, any);
     for (int k = 0; k < n; ++k) __builtin_prefetch(&s.records.data()[from[k + kAhead]]);
     batch.load_rows(s.records.data(), from, any, n, tile);
     if constexpr (Depth) std::fill(work.depth, work.depth + kBatch, 0.0f);
@@ -227,8 +227,8 @@ void tile_backward(State& s, int number, Work& work, const float* background, co
       for (int k = 0; k < n; ++k) __builtin_prefetch(&sink.own[from[k]], 1);
     for (const int b : kBlockOrder) {
       if (!drawn[b]) continue;
-      batch.list_block(touched, b, n);
-      block_backward<Depth>(work, drawn[b], b, checkpoint, px, tile, exp2);
+      batch.fill_list(touched, b, n);
+      differentiate_block<Depth>(work, drawn[b], b, checkpoint, px, tile, exp2);
     }
     for (int first = 0; first < n; first += 16) {
       if (!sink.own) {  // every slot is written
@@ -237,15 +237,14 @@ void tile_backward(State& s, int number, Work& work, const float* background, co
       }
       for (uint32_t left = any[first / 16]; left; left &= left - 1) {
         const int k = first + __builtin_ctz(left);
-        F16 sums = load_from<kSums>(&batch.rows[k].l1);
+        F32x16 sums = load_from<kSums>(&batch.rows[k].l1);
         if constexpr (Depth) sums = sums + at_lane(kDepth, work.depth[k]);
         sink.add(from[k], tile, sums);
       }
     }
   }
   if (!sink.own)
-    for (uint32_t at = end; at < s.tile_begin.data()[number + 1]; ++at)
-      std::memset(&sink.slot(s.list.data()[at], tile), 0, sizeof(Sums));
+    for (uint32_t at = end; at < s.tile_begin.data()[number + 1]; ++at) std::memset(&sink.slot(s.list.data()[at], tile), 0, sizeof(Sums));
 }
 
 // The first slot of each place: slots of a place are contiguous, in row order of its rectangle.
@@ -280,15 +279,15 @@ void prepare_sums(State& s, int rows, int threads) {
 void blend_backward(State& s, const float* background, const Upstream& up, float* g_background, int rows, int threads) {
   prepare_sums(s, rows, threads);
   double* total = s.background.get(static_cast<size_t>(s.tiles()) * 3);
-  share_tiles(s, threads, [&](int begin, int end, int worker) {
-    Work& work = scratch<Work>();
+  distribute_tiles(s, threads, [&](int begin, int end, int worker) {
+    Work& work = thread_scratch<Work>();
     const Exp2 exp2;
     const Sink sink{s, rows ? s.sums.data() + worker * s.places() : nullptr};
     for (int t = begin; t < end; ++t) {
       if (up.depth)
-        tile_backward<true>(s, t, work, background, up, sink, exp2);
+        differentiate_tile<true>(s, t, work, background, up, sink, exp2);
       else
-        tile_backward<false>(s, t, work, background, up, sink, exp2);
+        differentiate_tile<false>(s, t, work, background, up, sink, exp2);
     }
   });
   for (int c = 0; c < 3; ++c) {

@@ -1,5 +1,5 @@
-// Tile lists in two steps, each in the nearest caches and the jobs of one independent of each other: part by part of the Gaussians, a stable
-// scatter into areas of 4 x 4 tiles; then area by area a sort by depth, and the lists of the area's tiles.
+// Tile lists in two steps, each in the nearest caches and the jobs of one independent of each other: part by part of the Gaussians, a
+// stable scatter into areas of 4 x 4 tiles; then area by area a sort by depth, and the lists of the area's tiles.
 #include <algorithm>
 #include <utility>
 
@@ -10,7 +10,7 @@ namespace se::raster {
 namespace {
 
 // Chunks that are scattered together: the more areas, the more, so that an area's share of a part is no single Gaussian.
-int64_t span(const State& s) { return std::min<int64_t>(1 + s.areas() / 128, kMostSpan); }
+int64_t chunks_per_part(const State& s) { return std::min<int64_t>(1 + s.areas() / 128, kMaxPartChunks); }
 
 // Counts what is visible; returns each part's first entry, and the number of all.
 uint64_t number_entries(State& s, int64_t parts) {
@@ -19,7 +19,7 @@ uint64_t number_entries(State& s, int64_t parts) {
   uint64_t sum = 0;
   s.visible = 0;
   for (int64_t c = 0; c < chunks; ++c) {
-    if (c % span(s) == 0) begin[c / span(s)] = static_cast<uint32_t>(sum);
+    if (c % chunks_per_part(s) == 0) begin[c / chunks_per_part(s)] = static_cast<uint32_t>(sum);
     s.visible += s.chunk_count.data()[c], sum += s.chunk_entries.data()[c];
     if (sum > UINT32_MAX) throw std::bad_alloc();
   }
@@ -28,7 +28,7 @@ uint64_t number_entries(State& s, int64_t parts) {
 }
 
 // Bit y of four goes to bit 4 y.
-inline uint32_t apart(uint32_t rows) {
+inline uint32_t spread_bits(uint32_t rows) {
   static constexpr uint16_t bits[16] = {0x0000, 0x0001, 0x0010, 0x0011, 0x0100, 0x0101, 0x0110, 0x0111,
                                         0x1000, 0x1001, 0x1010, 0x1011, 0x1100, 0x1101, 0x1110, 0x1111};
   return bits[rows];
@@ -39,7 +39,7 @@ inline uint64_t pack(uint64_t area, uint64_t number, uint64_t tiles) { return ar
 
 // Writes an item's entries, one for each area that it meets, and returns their end. Those of up to 2 x 2 areas are written without a branch
 // on how many there are.
-uint64_t* expand(const Rect r, uint64_t number, uint32_t areas_x, uint64_t* to) {
+uint64_t* write_entries(const Rect r, uint64_t number, uint32_t areas_x, uint64_t* to) {
   const uint32_t x = r.x0 / kArea, y = r.y0 / kArea, from_x = r.x0 % kArea, from_y = r.y0 % kArea;
   const uint32_t end_x = r.x1 - x * kArea, end_y = r.y1 - y * kArea;
   if (std::max(end_x, end_y) > 2 * kArea) {
@@ -47,12 +47,12 @@ uint64_t* expand(const Rect r, uint64_t number, uint32_t areas_x, uint64_t* to) 
       for (uint32_t i = 0; i * kArea < end_x; ++i) {
         const uint32_t columns = (1u << std::min<uint32_t>(end_x - i * kArea, kArea)) - (i == 0 ? 1u << from_x : 1u);
         const uint32_t rows = (1u << std::min<uint32_t>(end_y - j * kArea, kArea)) - (j == 0 ? 1u << from_y : 1u);
-        *to++ = pack((y + j) * areas_x + x + i, number, columns * apart(rows));
+        *to++ = pack((y + j) * areas_x + x + i, number, columns * spread_bits(rows));
       }
     return to;
   }
   const uint32_t columns = (1u << end_x) - (1u << from_x), rows = (1u << end_y) - (1u << from_y);  // of two areas, four bits each
-  const uint32_t left = columns & 15, right = columns >> 4, top = apart(rows & 15), bottom = apart(rows >> 4);
+  const uint32_t left = columns & 15, right = columns >> 4, top = spread_bits(rows & 15), bottom = spread_bits(rows >> 4);
   const uint64_t first = pack(y * areas_x + x, number, 0), beside = pack(1, 0, 0), below = pack(areas_x, 0, 0);
   *to = first | left * top, ++to;
   *to = (first + beside) | right * top, to += right > 0;
@@ -65,14 +65,14 @@ uint64_t* expand(const Rect r, uint64_t number, uint32_t areas_x, uint64_t* to) 
 void scatter(const State& s, int64_t part, Entry* entries, uint32_t* begin) {
   const int areas = s.areas();
   const uint32_t first = s.part_begin.data()[part], n = s.part_begin.data()[part + 1] - first;
-  const int64_t first_chunk = part * span(s), last_chunk = std::min(s.places() / kChunk, first_chunk + span(s));
+  const int64_t first_chunk = part * chunks_per_part(s), last_chunk = std::min(s.places() / kChunk, first_chunk + chunks_per_part(s));
   const Item* items = s.items.data() + first_chunk * kChunk;
-  uint64_t *flat = scratch<Buffer<uint64_t>>().get(n + 4), *end = flat;
+  uint64_t *flat = thread_scratch<Buffer<uint64_t>>().get(n + 4), *end = flat;
   for (int64_t c = first_chunk; c < last_chunk; ++c) {
     const uint32_t from = static_cast<uint32_t>((c - first_chunk) * kChunk), to = from + s.chunk_count.data()[c];
     for (uint32_t i = from; i < to; ++i) {
       __builtin_prefetch(entries + first + (end - flat), 1);
-      end = expand(items[i].rect, i, static_cast<uint32_t>(s.areas_x()), end);
+      end = write_entries(items[i].rect, i, static_cast<uint32_t>(s.areas_x()), end);
     }
   }
   std::fill(begin, begin + areas + 1, 0u);
@@ -90,7 +90,7 @@ void scatter(const State& s, int64_t part, Entry* entries, uint32_t* begin) {
 
 // Calls f(tile, its bit) for the area's tiles in the picture.
 template <class F>
-void each_tile(const State& s, int64_t area, F&& f) {
+void for_each_tile(const State& s, int64_t area, F&& f) {
   const int x = static_cast<int>(area) % s.areas_x() * kArea, y = static_cast<int>(area) / s.areas_x() * kArea;
   for (int j = 0; j < std::min(kArea, s.tiles_y - y); ++j)
     for (int i = 0; i < std::min(kArea, s.tiles_x - x); ++i) f((y + j) * s.tiles_x + x + i, j * kArea + i);
@@ -112,7 +112,7 @@ uint64_t number_lists(State& s) {
 
 void bin(State& s, int threads) {
   const int areas = s.areas();
-  const int64_t parts = (s.places() / kChunk + span(s) - 1) / span(s);
+  const int64_t parts = (s.places() / kChunk + chunks_per_part(s) - 1) / chunks_per_part(s);
   const size_t total = number_entries(s, parts);
   // Until backward needs them, the rows of sums hold the entries and, per area near to far, their places and tiles.
   const size_t room = total + kBeyond;
@@ -131,20 +131,20 @@ void bin(State& s, int threads) {
   s.tile_used.get(static_cast<size_t>(s.tiles()));
   uint32_t* length = s.tile_begin.get(static_cast<size_t>(s.tiles()) + 1);
   parallel_for(areas, 1, threads, [&](int64_t a, int64_t, int) {
-    AreaSort& sort = scratch<AreaSort>();
+    AreaSort& sort = thread_scratch<AreaSort>();
     uint32_t count[kArea * kArea];
-    sort.read(entries, begin + a, parts, areas + 1, span(s) * kChunk, area_at[a + 1] - area_at[a], count);
+    sort.read(entries, begin + a, parts, areas + 1, chunks_per_part(s) * kChunk, area_at[a + 1] - area_at[a], count);
     sort(places + area_at[a], tiles_of + area_at[a]);
-    each_tile(s, a, [&](int tile, int bit) { length[tile] = count[bit]; });
+    for_each_tile(s, a, [&](int tile, int bit) { length[tile] = count[bit]; });
   });
 
   s.pairs = static_cast<int64_t>(number_lists(s));
   uint32_t* list = s.list.get(static_cast<size_t>(s.pairs) + kBeyond);
   parallel_for(areas, 1, threads, [&](int64_t a, int64_t, int) {
     const uint32_t n = area_at[a + 1] - area_at[a];
-    uint32_t* picked = scratch<Buffer<uint32_t>>().get(n + 16);
+    uint32_t* picked = thread_scratch<Buffer<uint32_t>>().get(n + 16);
     const Picking pick;
-    each_tile(s, a, [&](int tile, int bit) {
+    for_each_tile(s, a, [&](int tile, int bit) {
       const uint32_t* end = pick(picked, places + area_at[a], tiles_of + area_at[a], n, bit);
       std::copy(static_cast<const uint32_t*>(picked), end, list + s.tile_begin.data()[tile]);
     });

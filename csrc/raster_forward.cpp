@@ -1,4 +1,4 @@
-// Front-to-back blending, one 4 x 4 block of pixels per F16.
+// Front-to-back blending, one 4 x 4 block of pixels per F32x16.
 #include <algorithm>
 
 #include "pool.h"
@@ -14,20 +14,20 @@ struct Pixels {  // a tile's pixels in block order
 // Blends the batch's list into one block, as long as any pixel lets light through; returns how many of the list that took.
 // `through` runs on past the stop (it only falls); `left` keeps the value before it.
 int blend_block(const Batch& batch, int block, Pixels& px, const Exp2& exp2, bool& alive) {
-  const F16 y = block_y(block / 4), stop = bcast(kMinTransmittance);
+  const F32x16 y = block_y(block / 4), stop = broadcast(kMinTransmittance);
   const int at = block * 16, column = block % 4;
-  F16 through = load(px.through + at), left = load(px.left + at);
-  F16 sum[4] = {load(px.color[0] + at), load(px.color[1] + at), load(px.color[2] + at), load(px.depth + at)};
+  F32x16 through = load(px.through + at), left = load(px.left + at);
+  F32x16 sum[4] = {load(px.color[0] + at), load(px.color[1] + at), load(px.color[2] + at), load(px.depth + at)};
   int i = 0;
   for (alive = true; i < batch.list.count && alive; i += 4) {
     const Row* row[4];
-    F16 alpha[4];
+    F32x16 alpha[4];
     for (int k = 0; k < 4; ++k) row[k] = &batch.row(batch.list.place[i + k]);
-    alphas(row, column, y, exp2, alpha);
+    compute_alphas(row, column, y, exp2, alpha);
     for (int k = 0; k < 4; ++k) {
-      const F16 weight = through * alpha[k];
+      const F32x16 weight = through * alpha[k];
       through = fnma(through, alpha[k], through);
-      const M16 drawn = ge(through, stop);
+      const Mask16 drawn = ge(through, stop);
       left = select(drawn, through, left);
       add_where(drawn, weight, &row[k]->r, sum);
     }
@@ -38,12 +38,12 @@ int blend_block(const Batch& batch, int block, Pixels& px, const Exp2& exp2, boo
   return i;
 }
 
-void finish(State& s, int number, const Tile& tile, Pixels& px, const float* background, const Outputs& out) {
+void write_tile(State& s, int number, const Tile& tile, Pixels& px, const float* background, const Outputs& out) {
   std::copy(px.left, px.left + 256, s.transmittance.data() + number * 256);
   for (int k = 0; k < 256; k += 16) {
-    const F16 left = load(px.left + k);
-    for (int c = 0; c < 3; ++c) store(px.color[c] + k, fma(left, bcast(background[c]), load(px.color[c] + k)));
-    store(px.left + k, bcast(1.0f) - left);
+    const F32x16 left = load(px.left + k);
+    for (int c = 0; c < 3; ++c) store(px.color[c] + k, fma(left, broadcast(background[c]), load(px.color[c] + k)));
+    store(px.left + k, broadcast(1.0f) - left);
   }
   store_tile(out.image, s.camera, tile, px.color);
   store_tile(out.alpha, s.camera, tile, px.left);
@@ -53,7 +53,7 @@ void finish(State& s, int number, const Tile& tile, Pixels& px, const float* bac
 void blend_tile(State& s, int number, Batch& batch, const float* background, const Outputs& out, const Exp2& exp2) {
   const Tile tile = tile_at(s, number);
   Pixels px;
-  inside(s.camera, tile, px.through);
+  mark_inside(s.camera, tile, px.through);
   std::copy(px.through, px.through + 256, px.left);
   std::fill(&px.color[0][0], &px.color[0][0] + 768, 0.0f);
   std::fill(px.depth, px.depth + 256, 0.0f);
@@ -68,14 +68,14 @@ void blend_tile(State& s, int number, Batch& batch, const float* background, con
     if (at > begin) std::copy(px.through, px.through + 256, s.checkpoints.data() + number_of_batch * 256);
     Touched& touched = *reinterpret_cast<Touched*>(s.masks.data() + number_of_batch * kBatch);
     uint16_t* drawn = s.drawn.data() + number_of_batch * 16;
-    touch_blocks(s.records.data(), from, n, tile, touched);
+    test_blocks(s.records.data(), from, n, tile, touched);
     uint16_t any[kGroups];
-    any_block(touched, alive, n, any);
+    merge_blocks(touched, alive, n, any);
     batch.load_rows(s.records.data(), from, any, n, tile);
     for (const int b : kBlockOrder) {
       drawn[b] = 0;
       if (!(alive >> b & 1)) continue;
-      batch.list_block(touched, b, n);
+      batch.fill_list(touched, b, n);
       if (batch.list.count == 0) continue;
       bool still;
       drawn[b] = static_cast<uint16_t>(blend_block(batch, b, px, exp2, still));
@@ -84,7 +84,7 @@ void blend_tile(State& s, int number, Batch& batch, const float* background, con
     at += static_cast<uint32_t>(n);
   }
   s.tile_used.data()[number] = at - begin;
-  finish(s, number, tile, px, background, out);
+  write_tile(s, number, tile, px, background, out);
 }
 
 }  // namespace
@@ -93,8 +93,8 @@ void blend(State& s, const float* background, const Outputs& out, int threads) {
   s.transmittance.get(static_cast<size_t>(s.tiles()) * 256);
   s.checkpoints.get(s.batches() * 256);
   s.masks.get(s.batches() * kBatch), s.drawn.get(s.batches() * 16);
-  share_tiles(s, threads, [&](int begin, int end, int) {
-    Batch& batch = scratch<Batch>();
+  distribute_tiles(s, threads, [&](int begin, int end, int) {
+    Batch& batch = thread_scratch<Batch>();
     const Exp2 exp2;
     for (int t = begin; t < end; ++t) blend_tile(s, t, batch, background, out, exp2);
   });

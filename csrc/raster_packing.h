@@ -17,14 +17,14 @@ struct Packing {
   }
 
   void pack(uint16_t* to, uint32_t mask, int first) const {
-    eight(to, mask & 255, first);
-    eight(to + __builtin_popcount(mask & 255), mask >> 8, first + 8);
+    pack_eight(to, mask & 255, first);
+    pack_eight(to + __builtin_popcount(mask & 255), mask >> 8, first + 8);
   }
 
  private:
-  typedef uint16_t U8 __attribute__((vector_size(16)));
-  void eight(uint16_t* to, uint32_t mask, int first) const {
-    U8 packed;
+  typedef uint16_t U16x8 __attribute__((vector_size(16)));
+  void pack_eight(uint16_t* to, uint32_t mask, int first) const {
+    U16x8 packed;
     std::memcpy(&packed, places[mask], 16);
     packed += static_cast<uint16_t>(first * Step);
     std::memcpy(to, &packed, 16);

@@ -9,8 +9,8 @@ namespace se::raster {
 namespace {
 
 // The sums of one visible Gaussian, over its workers' rows or over its tiles' slots, always in the same order.
-F16 total(const State& s, uint32_t place, int rows) {
-  F16 sum = bcast(0.0f);
+F32x16 sum_gradients(const State& s, uint32_t place, int rows) {
+  F32x16 sum = broadcast(0.0f);
   if (rows > 0) {
     const int64_t places = s.places();
     for (int r = 0; r < rows; ++r) sum = sum + load(s.sums.data()[r * places + place].x);
@@ -24,47 +24,48 @@ F16 total(const State& s, uint32_t place, int rows) {
 }
 
 struct Chain {  // one Gaussian per lane
-  F16 mean[3], quat[4], scale[3], mean2d[2];
+  F32x16 mean[3], quat[4], scale[3], mean2d[2];
 
   // d loss / d 2D covariance: 1/2 C^-1 S C^-1 with S the second moments of W, and the antialias factor's part.
-  static void covariance(const Projection& p, const F16 (&sum)[16], bool antialias, F16& gxx, F16& gxy, F16& gyy) {
-    const F16 inv = bcast(1.0f) / p.det, half = bcast(0.5f), zero = bcast(0.0f);
-    const F16 a = p.cyy * inv, b = zero - p.xy * inv, c = p.cxx * inv;
-    const F16 r0 = fma(a, sum[kSxx], b * sum[kSxy]), r1 = fma(a, sum[kSxy], b * sum[kSyy]);
-    const F16 q0 = fma(b, sum[kSxx], c * sum[kSxy]), q1 = fma(b, sum[kSxy], c * sum[kSyy]);
+  static void differentiate_covariance(const Projection& p, const F32x16 (&sum)[16], bool antialias, F32x16& gxx, F32x16& gxy,
+                                       F32x16& gyy) {
+    const F32x16 inv = broadcast(1.0f) / p.det, half = broadcast(0.5f), zero = broadcast(0.0f);
+    const F32x16 a = p.cyy * inv, b = zero - p.xy * inv, c = p.cxx * inv;
+    const F32x16 r0 = fma(a, sum[kSxx], b * sum[kSxy]), r1 = fma(a, sum[kSxy], b * sum[kSyy]);
+    const F32x16 q0 = fma(b, sum[kSxx], c * sum[kSxy]), q1 = fma(b, sum[kSxy], c * sum[kSyy]);
     gxx = half * fma(r0, a, r1 * b);
     gxy = half * fma(r0, b, r1 * c);
     gyy = half * fma(q0, b, q1 * c);
     if (!antialias) return;
     // ln compensation = 1/2 (ln sharp - ln det), and the derivative of a determinant's logarithm is the inverse matrix.
-    const M16 smooth = gt(p.sharp, p.det * bcast(kMinCompensation2));
-    const F16 g = keep(smooth, half * sum[kS]), one_sharp = bcast(1.0f) / select(smooth, p.sharp, bcast(1.0f));
+    const Mask16 smooth = gt(p.sharp, p.det * broadcast(kMinCompensation2));
+    const F32x16 g = keep(smooth, half * sum[kS]), one_sharp = broadcast(1.0f) / select(smooth, p.sharp, broadcast(1.0f));
     gxx = fma(g, fma(p.yy, one_sharp, zero - a), gxx);
     gxy = fma(g, fnma(p.xy, one_sharp, zero - b), gxy);
     gyy = fma(g, fma(p.xx, one_sharp, zero - c), gyy);
   }
 
-  static void quaternion(const F16 (&q)[4], const F16 (&d)[3][3], F16 (&out)[4]) {
-    const F16 w = q[0], x = q[1], y = q[2], z = q[3], two = bcast(2.0f);
-    const F16 a = d[2][1] - d[1][2], b = d[0][2] - d[2][0], c = d[1][0] - d[0][1];
-    const F16 e = d[0][1] + d[1][0], f = d[0][2] + d[2][0], g = d[1][2] + d[2][1];
+  static void differentiate_quaternion(const F32x16 (&q)[4], const F32x16 (&d)[3][3], F32x16 (&out)[4]) {
+    const F32x16 w = q[0], x = q[1], y = q[2], z = q[3], two = broadcast(2.0f);
+    const F32x16 a = d[2][1] - d[1][2], b = d[0][2] - d[2][0], c = d[1][0] - d[0][1];
+    const F32x16 e = d[0][1] + d[1][0], f = d[0][2] + d[2][0], g = d[1][2] + d[2][1];
     out[0] = two * fma(x, a, fma(y, b, z * c));
     out[1] = two * (fma(w, a, fma(y, e, z * f)) - two * x * (d[1][1] + d[2][2]));
     out[2] = two * (fma(w, b, fma(x, e, z * g)) - two * y * (d[0][0] + d[2][2]));
     out[3] = two * (fma(w, c, fma(x, f, y * g)) - two * z * (d[0][0] + d[1][1]));
   }
 
-  Chain(const State& s, const Projection& p, const F16 (&q)[4], const F16 (&size)[3], const F16 (&sum)[16]) {
+  Chain(const State& s, const Projection& p, const F32x16 (&q)[4], const F32x16 (&size)[3], const F32x16 (&sum)[16]) {
     const SeCamera& cam = s.camera;
-    const F16 two = bcast(2.0f), zero = bcast(0.0f), inv = bcast(1.0f) / p.det;
-    const F16 gu = (p.xy * sum[kSy] - p.cyy * sum[kSx]) * inv, gv = (p.xy * sum[kSx] - p.cxx * sum[kSy]) * inv;
-    mean2d[0] = gu * bcast(0.5f * static_cast<float>(cam.width)), mean2d[1] = gv * bcast(0.5f * static_cast<float>(cam.height));
-    F16 gxx, gxy, gyy;
-    covariance(p, sum, s.antialias, gxx, gxy, gyy);
+    const F32x16 two = broadcast(2.0f), zero = broadcast(0.0f), inv = broadcast(1.0f) / p.det;
+    const F32x16 gu = (p.xy * sum[kSy] - p.cyy * sum[kSx]) * inv, gv = (p.xy * sum[kSx] - p.cxx * sum[kSy]) * inv;
+    mean2d[0] = gu * broadcast(0.5f * static_cast<float>(cam.width)), mean2d[1] = gv * broadcast(0.5f * static_cast<float>(cam.height));
+    F32x16 gxx, gxy, gyy;
+    differentiate_covariance(p, sum, s.antialias, gxx, gxy, gyy);
     const Rotation rotation(q);
-    F16 d_rotation[3][3], d_t[2][3], d_a[2][3];
+    F32x16 d_rotation[3][3], d_t[2][3], d_a[2][3];
     for (int j = 0; j < 3; ++j) {
-      const F16 b0 = two * fma(gxx, p.b[0][j], gxy * p.b[1][j]), b1 = two * fma(gxy, p.b[0][j], gyy * p.b[1][j]);
+      const F32x16 b0 = two * fma(gxx, p.b[0][j], gxy * p.b[1][j]), b1 = two * fma(gxy, p.b[0][j], gyy * p.b[1][j]);
       scale[j] = fma(b0, p.a[0][j], b1 * p.a[1][j]);
       d_a[0][j] = b0 * size[j], d_a[1][j] = b1 * size[j];
       for (int k = 0; k < 3; ++k) d_rotation[k][j] = fma(p.t[0][k], d_a[0][j], p.t[1][k] * d_a[1][j]);
@@ -72,22 +73,22 @@ struct Chain {  // one Gaussian per lane
     for (int i = 0; i < 2; ++i)
       for (int k = 0; k < 3; ++k)
         d_t[i][k] = fma(d_a[i][0], rotation.r[k][0], fma(d_a[i][1], rotation.r[k][1], d_a[i][2] * rotation.r[k][2]));
-    quaternion(q, d_rotation, quat);
+    differentiate_quaternion(q, d_rotation, quat);
 
     // t[0][k] = fx / z (R0k - tx R2k), t[1][k] = fy / z (R1k - ty R2k); u = fx x / z + cx; z is the depth.
-    const F16 fx = bcast(cam.fx), fy = bcast(cam.fy);
-    F16 jx = zero, jy = zero, dtx = zero, dty = zero;
+    const F32x16 fx = broadcast(cam.fx), fy = broadcast(cam.fy);
+    F32x16 jx = zero, jy = zero, dtx = zero, dty = zero;
     for (int k = 0; k < 3; ++k) {
-      const F16 r2 = bcast(cam.view[8 + k]);
-      jx = fma(d_t[0][k], fnma(p.tx, r2, bcast(cam.view[k])), jx);
-      jy = fma(d_t[1][k], fnma(p.ty, r2, bcast(cam.view[4 + k])), jy);
+      const F32x16 r2 = broadcast(cam.view[8 + k]);
+      jx = fma(d_t[0][k], fnma(p.tx, r2, broadcast(cam.view[k])), jx);
+      jy = fma(d_t[1][k], fnma(p.ty, r2, broadcast(cam.view[4 + k])), jy);
       dtx = fma(d_t[0][k], r2, dtx), dty = fma(d_t[1][k], r2, dty);
     }
-    const F16 gx = fx * (gu - keep(p.free_x, p.rz * dtx)), gy = fy * (gv - keep(p.free_y, p.rz * dty));  // d / d (x / z), d / d (y / z)
-    const F16 dx = gx * p.rz, dy = gy * p.rz;
-    const F16 dz = sum[kDepth] - p.rz * (fma(dx, p.vx, dy * p.vy) + p.rz * fma(fx, jx, fy * jy));
+    const F32x16 gx = fx * (gu - keep(p.free_x, p.rz * dtx)), gy = fy * (gv - keep(p.free_y, p.rz * dty));  // d / d (x / z), d / d (y / z)
+    const F32x16 dx = gx * p.rz, dy = gy * p.rz;
+    const F32x16 dz = sum[kDepth] - p.rz * (fma(dx, p.vx, dy * p.vy) + p.rz * fma(fx, jx, fy * jy));
     for (int k = 0; k < 3; ++k)
-      mean[k] = fma(bcast(cam.view[k]), dx, fma(bcast(cam.view[4 + k]), dy, bcast(cam.view[8 + k]) * dz));
+      mean[k] = fma(broadcast(cam.view[k]), dx, fma(broadcast(cam.view[4 + k]), dy, broadcast(cam.view[8 + k]) * dz));
   }
 };
 
@@ -96,34 +97,42 @@ void zero_rows(const Gradients& out, int64_t i, int count) {
   clear(out.means, 3), clear(out.quats, 4), clear(out.scales, 3), clear(out.opacities, 1), clear(out.colors, 3), clear(out.mean2d, 2);
 }
 
-void group_backward(const State& s, const Inputs& in, const Gradients& out, int rows, int64_t i, int count, uint32_t drawn) {
-  F16 sum[16];
+void differentiate_group(const State& s, const Inputs& in, const Gradients& out, int rows, int64_t i, int count, uint32_t drawn) {
+  F32x16 sum[16];
   uint32_t place = s.group_first.data()[i / 16];
-  for (int k = 0; k < 16; ++k) sum[k] = drawn >> k & 1 ? total(s, place++, rows) : bcast(0.0f);
+  for (int k = 0; k < 16; ++k) sum[k] = drawn >> k & 1 ? sum_gradients(s, place++, rows) : broadcast(0.0f);
   transpose(sum);
-  for (const int k : {kSx, kSy}) sum[k] = sum[k] * bcast(0.5f);  // they came in half pixels
-  for (const int k : {kSxx, kSxy, kSyy}) sum[k] = sum[k] * bcast(0.25f);
-  F16 mean[3], quat[4], scale[3], opacity[1];
+  for (const int k : {kSx, kSy}) sum[k] = sum[k] * broadcast(0.5f);  // they came in half pixels
+  for (const int k : {kSxx, kSxy, kSyy}) sum[k] = sum[k] * broadcast(0.25f);
+  F32x16 mean[3], quat[4], scale[3], opacity[1];
   load_columns(in.means + 3 * i, count, mean);
   load_columns(in.quats + 4 * i, count, quat);
   load_columns(in.scales + 3 * i, count, scale);
   load_columns(in.opacities + i, count, opacity);
   Projection p;
-  p.centre(s.camera, mean);
-  p.shape(quat, scale);
+  p.project_centre(s.camera, mean);
+  p.project_shape(quat, scale);
   const Chain chain(s, p, quat, scale, sum);
   // Lanes that are not drawn may hold anything (a point behind the camera, NaN): they get 0.
   alignas(64) float flags[16];
   for (int k = 0; k < 16; ++k) flags[k] = drawn >> k & 1 ? 1.0f : 0.0f;
-  const M16 ok = gt(load(flags), bcast(0.0f));
+  const Mask16 ok = gt(load(flags), broadcast(0.0f));
   const auto put = [&](float* to, auto columns) {
     for (auto& column : columns.c) column = keep(ok, column);
     store_columns(to, count, columns.c);
   };
-  struct C1 { F16 c[1]; };
-  struct C2 { F16 c[2]; };
-  struct C3 { F16 c[3]; };
-  struct C4 { F16 c[4]; };
+  struct C1 {
+    F32x16 c[1];
+  };
+  struct C2 {
+    F32x16 c[2];
+  };
+  struct C3 {
+    F32x16 c[3];
+  };
+  struct C4 {
+    F32x16 c[4];
+  };
   put(out.means + 3 * i, C3{{chain.mean[0], chain.mean[1], chain.mean[2]}});
   put(out.quats + 4 * i, C4{{chain.quat[0], chain.quat[1], chain.quat[2], chain.quat[3]}});
   put(out.scales + 3 * i, C3{{chain.scale[0], chain.scale[1], chain.scale[2]}});
@@ -140,7 +149,7 @@ void project_backward(State& s, const Inputs& in, const Gradients& out, int rows
       const int count = static_cast<int>(std::min<int64_t>(16, end - i));
       const uint32_t drawn = s.group_mask.data()[i / 16];
       if (drawn)
-        group_backward(s, in, out, rows, i, count, drawn);
+        differentiate_group(s, in, out, rows, i, count, drawn);
       else
         zero_rows(out, i, count);
     }

@@ -1,13 +1,13 @@
-// The one vector type of the rasteriser: F16, sixteen floats, either the 4 x 4 pixels of a block or sixteen Gaussians; M16 is its mask.
-// Each instruction set implements the same functions (in one register, two, or four), so the algorithms are written once:
-//   load store bcast bcast4 (four floats, repeated), + - * /, fma(a, b, c) = a b + c, fnma = c - a b, min max sqrt ceil floor,
+// The one vector type of the rasteriser: F32x16, sixteen floats, either the 4 x 4 pixels of a block or sixteen Gaussians; Mask16 is its
+// mask. Each instruction set implements the same functions (in one register, two, or four), so the algorithms are written once:
+//   load store broadcast broadcast4 (four floats, repeated), + - * /, fma(a, b, c) = a b + c, fnma = c - a b, min max sqrt ceil floor,
 //   ge gt &, select(m, a, b), keep(m, a) = a or 0, mul_keep, min_keep, bits any, store_int (truncated),
 //   Exp2 (relative error below 4e-7; anything where p < -126), split_exponent, transpose (16 x 16),
 //   load_pairs(p, a, b): p[0][0] p[1][0] ... and p[0][1] p[1][1] ...
 #pragma once
 #include <cstdint>
 
-// Four of the eight lanes of two vectors.
+// F32x4 of the eight lanes of two vectors.
 #if defined(__has_builtin)
 #if __has_builtin(__builtin_shufflevector)
 #define SE_SHUFFLE __builtin_shufflevector
@@ -27,20 +27,20 @@
 
 namespace se {
 
-inline F16 at_lane(int lane, float x) {
+inline F32x16 at_lane(int lane, float x) {
   alignas(64) float all[16] = {};
   all[lane] = x;
   return load(all);
 }
 
 // log2(a) for normal a > 0 (absolute error about one rounding of the result).
-inline F16 log2(F16 a) {
-  F16 m, e;
+inline F32x16 log2(F32x16 a) {
+  F32x16 m, e;
   split_exponent(a, m, e);
-  const F16 one = bcast(1.0f), s = (m - one) / (m + one), s2 = s * s;  // log2 m = 2 / ln 2 * atanh s, |s| <= 0.2
-  F16 q = fma(s2, bcast(0.43905754f), bcast(0.57639673f));
-  q = fma(s2, q, bcast(0.96180218f));
-  q = fma(s2, q, bcast(2.88539007f));
+  const F32x16 one = broadcast(1.0f), s = (m - one) / (m + one), s2 = s * s;  // log2 m = 2 / ln 2 * atanh s, |s| <= 0.2
+  F32x16 q = fma(s2, broadcast(0.43905754f), broadcast(0.57639673f));
+  q = fma(s2, q, broadcast(0.96180218f));
+  q = fma(s2, q, broadcast(2.88539007f));
   return fma(s, q, e);
 }
 

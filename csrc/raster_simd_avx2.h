@@ -3,31 +3,32 @@
 #include <immintrin.h>
 
 #include <cstdint>
+
 #include "raster_packing.h"
 
 namespace se {
 
-constexpr int kSideBySide = 1;  // there are too few registers for more
+constexpr int kInterleaved = 1;  // there are too few registers for more
 
-struct F16 {
+struct F32x16 {
   __m256 lo, hi;
 };
-struct M16 {
+struct Mask16 {
   __m256 lo, hi;
 };
 
-inline F16 load(const float* p) { return {_mm256_loadu_ps(p), _mm256_loadu_ps(p + 8)}; }
-inline void store(float* p, F16 a) {
+inline F32x16 load(const float* p) { return {_mm256_loadu_ps(p), _mm256_loadu_ps(p + 8)}; }
+inline void store(float* p, F32x16 a) {
   _mm256_storeu_ps(p, a.lo);
   _mm256_storeu_ps(p + 8, a.hi);
 }
-inline F16 bcast(float x) { return {_mm256_set1_ps(x), _mm256_set1_ps(x)}; }
-inline F16 bcast4(const float* p) {
+inline F32x16 broadcast(float x) { return {_mm256_set1_ps(x), _mm256_set1_ps(x)}; }
+inline F32x16 broadcast4(const float* p) {
   const __m256 v = _mm256_broadcast_ps(reinterpret_cast<const __m128*>(p));
   return {v, v};
 }
 #define SE_BOTH(name, op) \
-  inline F16 name(F16 a, F16 b) { return {op(a.lo, b.lo), op(a.hi, b.hi)}; }
+  inline F32x16 name(F32x16 a, F32x16 b) { return {op(a.lo, b.lo), op(a.hi, b.hi)}; }
 SE_BOTH(operator+, _mm256_add_ps)
 SE_BOTH(operator-, _mm256_sub_ps)
 SE_BOTH(operator*, _mm256_mul_ps)
@@ -35,26 +36,26 @@ SE_BOTH(operator/, _mm256_div_ps)
 SE_BOTH(min, _mm256_min_ps)
 SE_BOTH(max, _mm256_max_ps)
 #undef SE_BOTH
-inline F16 fma(F16 a, F16 b, F16 c) { return {_mm256_fmadd_ps(a.lo, b.lo, c.lo), _mm256_fmadd_ps(a.hi, b.hi, c.hi)}; }
-inline F16 fnma(F16 a, F16 b, F16 c) { return {_mm256_fnmadd_ps(a.lo, b.lo, c.lo), _mm256_fnmadd_ps(a.hi, b.hi, c.hi)}; }
-inline F16 sqrt(F16 a) { return {_mm256_sqrt_ps(a.lo), _mm256_sqrt_ps(a.hi)}; }
-inline F16 ceil(F16 a) { return {_mm256_ceil_ps(a.lo), _mm256_ceil_ps(a.hi)}; }
-inline F16 floor(F16 a) { return {_mm256_floor_ps(a.lo), _mm256_floor_ps(a.hi)}; }
-inline M16 ge(F16 a, F16 b) { return {_mm256_cmp_ps(a.lo, b.lo, _CMP_GE_OQ), _mm256_cmp_ps(a.hi, b.hi, _CMP_GE_OQ)}; }
-inline M16 gt(F16 a, F16 b) { return {_mm256_cmp_ps(a.lo, b.lo, _CMP_GT_OQ), _mm256_cmp_ps(a.hi, b.hi, _CMP_GT_OQ)}; }
-inline M16 operator&(M16 a, M16 b) { return {_mm256_and_ps(a.lo, b.lo), _mm256_and_ps(a.hi, b.hi)}; }
-inline F16 select(M16 m, F16 a, F16 b) { return {_mm256_blendv_ps(b.lo, a.lo, m.lo), _mm256_blendv_ps(b.hi, a.hi, m.hi)}; }
-inline F16 keep(M16 m, F16 a) { return {_mm256_and_ps(m.lo, a.lo), _mm256_and_ps(m.hi, a.hi)}; }
-inline F16 mul_keep(M16 m, F16 a, F16 b) { return keep(m, a * b); }
-inline F16 min_keep(M16 m, F16 a, F16 b) { return keep(m, min(a, b)); }
+inline F32x16 fma(F32x16 a, F32x16 b, F32x16 c) { return {_mm256_fmadd_ps(a.lo, b.lo, c.lo), _mm256_fmadd_ps(a.hi, b.hi, c.hi)}; }
+inline F32x16 fnma(F32x16 a, F32x16 b, F32x16 c) { return {_mm256_fnmadd_ps(a.lo, b.lo, c.lo), _mm256_fnmadd_ps(a.hi, b.hi, c.hi)}; }
+inline F32x16 sqrt(F32x16 a) { return {_mm256_sqrt_ps(a.lo), _mm256_sqrt_ps(a.hi)}; }
+inline F32x16 ceil(F32x16 a) { return {_mm256_ceil_ps(a.lo), _mm256_ceil_ps(a.hi)}; }
+inline F32x16 floor(F32x16 a) { return {_mm256_floor_ps(a.lo), _mm256_floor_ps(a.hi)}; }
+inline Mask16 ge(F32x16 a, F32x16 b) { return {_mm256_cmp_ps(a.lo, b.lo, _CMP_GE_OQ), _mm256_cmp_ps(a.hi, b.hi, _CMP_GE_OQ)}; }
+inline Mask16 gt(F32x16 a, F32x16 b) { return {_mm256_cmp_ps(a.lo, b.lo, _CMP_GT_OQ), _mm256_cmp_ps(a.hi, b.hi, _CMP_GT_OQ)}; }
+inline Mask16 operator&(Mask16 a, Mask16 b) { return {_mm256_and_ps(a.lo, b.lo), _mm256_and_ps(a.hi, b.hi)}; }
+inline F32x16 select(Mask16 m, F32x16 a, F32x16 b) { return {_mm256_blendv_ps(b.lo, a.lo, m.lo), _mm256_blendv_ps(b.hi, a.hi, m.hi)}; }
+inline F32x16 keep(Mask16 m, F32x16 a) { return {_mm256_and_ps(m.lo, a.lo), _mm256_and_ps(m.hi, a.hi)}; }
+inline F32x16 mul_keep(Mask16 m, F32x16 a, F32x16 b) { return keep(m, a * b); }
+inline F32x16 min_keep(Mask16 m, F32x16 a, F32x16 b) { return keep(m, min(a, b)); }
 // sum[k] += weight * by[k] in the lanes of the mask.
-inline void add_where(M16 m, F16 weight, const float* by, F16 (&sum)[4]) {
-  const F16 kept = keep(m, weight);
-  for (int k = 0; k < 4; ++k) sum[k] = fma(kept, bcast(by[k]), sum[k]);
+inline void add_where(Mask16 m, F32x16 weight, const float* by, F32x16 (&sum)[4]) {
+  const F32x16 kept = keep(m, weight);
+  for (int k = 0; k < 4; ++k) sum[k] = fma(kept, broadcast(by[k]), sum[k]);
 }
-inline uint32_t bits(M16 m) { return static_cast<uint32_t>(_mm256_movemask_ps(m.lo) | _mm256_movemask_ps(m.hi) << 8); }
-inline bool any(M16 m) { return _mm256_movemask_ps(_mm256_or_ps(m.lo, m.hi)) != 0; }
-inline void store_int(int32_t* p, F16 a) {
+inline uint32_t bits(Mask16 m) { return static_cast<uint32_t>(_mm256_movemask_ps(m.lo) | _mm256_movemask_ps(m.hi) << 8); }
+inline bool any(Mask16 m) { return _mm256_movemask_ps(_mm256_or_ps(m.lo, m.hi)) != 0; }
+inline void store_int(int32_t* p, F32x16 a) {
   _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), _mm256_cvttps_epi32(a.lo));
   _mm256_storeu_si256(reinterpret_cast<__m256i*>(p + 8), _mm256_cvttps_epi32(a.hi));
 }
@@ -73,7 +74,7 @@ struct Exp2 {
     return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(q), _mm256_slli_epi32(_mm256_castps_si256(rounded), 23)));
   }
   template <int N>
-  void operator()(F16 (&p)[N]) const {
+  void operator()(F32x16 (&p)[N]) const {
     for (int k = 0; k < N; ++k) p[k] = {half(p[k].lo), half(p[k].hi)};
   }
 };
@@ -87,26 +88,26 @@ inline void split_exponent_half(__m256 a, __m256& m, __m256& e) {
 }
 // The first N of sixteen floats, the others 0.
 template <int N>
-inline F16 load_first(const float* p) {
+inline F32x16 load_first(const float* p) {
   static_assert(N == 7);
   return {_mm256_blend_ps(_mm256_loadu_ps(p), _mm256_setzero_ps(), 0x80), _mm256_setzero_ps()};
 }
 
 // Sixteen floats, the first N of them taken as 0.
 template <int N>
-inline F16 load_from(const float* p) {
+inline F32x16 load_from(const float* p) {
   static_assert(N == 7);
   return {_mm256_blend_ps(_mm256_setzero_ps(), _mm256_loadu_ps(p), 0x80), _mm256_loadu_ps(p + 8)};
 }
 
 // First halves of a and b, then second halves.
-inline void store_halves(float* p, F16 a, F16 b) {
+inline void store_halves(float* p, F32x16 a, F32x16 b) {
   _mm256_storeu_ps(p, a.lo), _mm256_storeu_ps(p + 8, b.lo);
   _mm256_storeu_ps(p + 16, a.hi), _mm256_storeu_ps(p + 24, b.hi);
 }
 
 // Sixteen rows of three floats as three columns.
-inline void load3(const float* p, F16& a, F16& b, F16& c) {
+inline void load3(const float* p, F32x16& a, F32x16& b, F32x16& c) {
   alignas(64) float column[3][16];
   for (int i = 0; i < 16; ++i)
     for (int k = 0; k < 3; ++k) column[k][i] = p[3 * i + k];
@@ -115,23 +116,23 @@ inline void load3(const float* p, F16& a, F16& b, F16& c) {
 
 // Columns of sixteen rows, one row after the other.
 template <int N>
-inline void interleave(F16 (&r)[N]) {
+inline void interleave(F32x16 (&r)[N]) {
   alignas(64) float column[N][16], row[16 * N];
   for (int k = 0; k < N; ++k) store(column[k], r[k]);
   for (int i = 0; i < 16; ++i)
     for (int k = 0; k < N; ++k) row[N * i + k] = column[k][i];
   for (int k = 0; k < N; ++k) r[k] = load(row + 16 * k);
 }
-inline void interleave2(F16 (&r)[2]) { interleave(r); }
-inline void interleave3(F16 (&r)[3]) { interleave(r); }
+inline void interleave2(F32x16 (&r)[2]) { interleave(r); }
+inline void interleave3(F32x16 (&r)[3]) { interleave(r); }
 
 // a = m * 2^e with m in [0.75, 1.5)
-inline void split_exponent(F16 a, F16& m, F16& e) {
+inline void split_exponent(F32x16 a, F32x16& m, F32x16& e) {
   split_exponent_half(a.lo, m.lo, e.lo);
   split_exponent_half(a.hi, m.hi, e.hi);
 }
 
-inline void load_pairs(const float* const (&p)[16], F16& first, F16& second) {
+inline void load_pairs(const float* const (&p)[16], F32x16& first, F32x16& second) {
   const auto four = [&](int k) {
     const auto two = [&](int j) {
       return _mm_loadh_pd(_mm_load_sd(reinterpret_cast<const double*>(p[j])), reinterpret_cast<const double*>(p[j + 1]));
@@ -150,29 +151,30 @@ inline void load_pairs(const float* const (&p)[16], F16& first, F16& second) {
 
 // Sixteen lanes are four quarters of four. Column<C>: lane C of each quarter in all its lanes.
 template <int C>
-inline F16 column(F16 a) {
+inline F32x16 column(F32x16 a) {
   return {_mm256_permute_ps(a.lo, C * 0x55), _mm256_permute_ps(a.hi, C * 0x55)};
 }
 // Each quarter of four values, as a 4 x 4 matrix.
-inline void transpose4(F16 (&r)[4]) {
+inline void transpose4(F32x16 (&r)[4]) {
   const auto half = [](__m256& w, __m256& x, __m256& y, __m256& z) {
     const __m256 a = _mm256_unpacklo_ps(w, x), b = _mm256_unpackhi_ps(w, x), c = _mm256_unpacklo_ps(y, z), d = _mm256_unpackhi_ps(y, z);
-    w = _mm256_shuffle_ps(a, c, 0x44), x = _mm256_shuffle_ps(a, c, 0xee), y = _mm256_shuffle_ps(b, d, 0x44), z = _mm256_shuffle_ps(b, d, 0xee);
+    w = _mm256_shuffle_ps(a, c, 0x44), x = _mm256_shuffle_ps(a, c, 0xee), y = _mm256_shuffle_ps(b, d, 0x44),
+    z = _mm256_shuffle_ps(b, d, 0xee);
   };
   half(r[0].lo, r[1].lo, r[2].lo, r[3].lo);
   half(r[0].hi, r[1].hi, r[2].hi, r[3].hi);
 }
 // Quarter q of value j becomes quarter j of value q.
-inline void transpose_quarters(F16 (&r)[4]) {
+inline void transpose_quarters(F32x16 (&r)[4]) {
   const auto first = [](__m256 a, __m256 b) { return _mm256_permute2f128_ps(a, b, 0x20); };
   const auto second = [](__m256 a, __m256 b) { return _mm256_permute2f128_ps(a, b, 0x31); };
-  const F16 a = r[0], b = r[1], c = r[2], d = r[3];
+  const F32x16 a = r[0], b = r[1], c = r[2], d = r[3];
   r[0] = {first(a.lo, b.lo), first(c.lo, d.lo)}, r[1] = {second(a.lo, b.lo), second(c.lo, d.lo)};
   r[2] = {first(a.hi, b.hi), first(c.hi, d.hi)}, r[3] = {second(a.hi, b.hi), second(c.hi, d.hi)};
 }
 // Quarter j of the result is the sum of value j's quarters.
-inline F16 sum_quarters(const F16 (&r)[4]) {
-  const auto pair = [](F16 a, F16 b) {
+inline F32x16 sum_quarters(const F32x16 (&r)[4]) {
+  const auto pair = [](F32x16 a, F32x16 b) {
     const __m256 x = _mm256_add_ps(a.lo, a.hi), y = _mm256_add_ps(b.lo, b.hi);
     return _mm256_add_ps(_mm256_permute2f128_ps(x, y, 0x20), _mm256_permute2f128_ps(x, y, 0x31));
   };
@@ -196,7 +198,7 @@ inline void transpose8(__m256 (&r)[8]) {
   }
 }
 
-inline void transpose(F16 (&r)[16]) {
+inline void transpose(F32x16 (&r)[16]) {
   __m256 a[8], b[8], c[8], d[8];
   for (int i = 0; i < 8; ++i) a[i] = r[i].lo, b[i] = r[i].hi, c[i] = r[8 + i].lo, d[i] = r[8 + i].hi;
   transpose8(a);

@@ -6,44 +6,44 @@
 
 namespace se {
 
-constexpr int kSideBySide = 4;  // Gaussians whose exponentials are computed together
+constexpr int kInterleaved = 4;  // Gaussians whose exponentials are computed together
 
-struct F16 {
+struct F32x16 {
   __m512 v;
 };
-struct M16 {
+struct Mask16 {
   __mmask16 m;
 };
 
-inline F16 load(const float* p) { return {_mm512_loadu_ps(p)}; }
-inline void store(float* p, F16 a) { _mm512_storeu_ps(p, a.v); }
-inline F16 bcast(float x) { return {_mm512_set1_ps(x)}; }
-inline F16 bcast4(const float* p) { return {_mm512_broadcast_f32x4(_mm_loadu_ps(p))}; }
-inline F16 operator+(F16 a, F16 b) { return {_mm512_add_ps(a.v, b.v)}; }
-inline F16 operator-(F16 a, F16 b) { return {_mm512_sub_ps(a.v, b.v)}; }
-inline F16 operator*(F16 a, F16 b) { return {_mm512_mul_ps(a.v, b.v)}; }
-inline F16 operator/(F16 a, F16 b) { return {_mm512_div_ps(a.v, b.v)}; }
-inline F16 fma(F16 a, F16 b, F16 c) { return {_mm512_fmadd_ps(a.v, b.v, c.v)}; }
-inline F16 fnma(F16 a, F16 b, F16 c) { return {_mm512_fnmadd_ps(a.v, b.v, c.v)}; }
-inline F16 min(F16 a, F16 b) { return {_mm512_min_ps(a.v, b.v)}; }
-inline F16 max(F16 a, F16 b) { return {_mm512_max_ps(a.v, b.v)}; }
-inline F16 sqrt(F16 a) { return {_mm512_sqrt_ps(a.v)}; }
-inline F16 ceil(F16 a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC)}; }
-inline F16 floor(F16 a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
-inline M16 ge(F16 a, F16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
-inline M16 gt(F16 a, F16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)}; }
-inline M16 operator&(M16 a, M16 b) { return {_kand_mask16(a.m, b.m)}; }
-inline F16 select(M16 m, F16 a, F16 b) { return {_mm512_mask_blend_ps(m.m, b.v, a.v)}; }
-inline F16 keep(M16 m, F16 a) { return {_mm512_maskz_mov_ps(m.m, a.v)}; }
-inline F16 mul_keep(M16 m, F16 a, F16 b) { return {_mm512_maskz_mul_ps(m.m, a.v, b.v)}; }
-inline F16 min_keep(M16 m, F16 a, F16 b) { return {_mm512_maskz_min_ps(m.m, a.v, b.v)}; }
+inline F32x16 load(const float* p) { return {_mm512_loadu_ps(p)}; }
+inline void store(float* p, F32x16 a) { _mm512_storeu_ps(p, a.v); }
+inline F32x16 broadcast(float x) { return {_mm512_set1_ps(x)}; }
+inline F32x16 broadcast4(const float* p) { return {_mm512_broadcast_f32x4(_mm_loadu_ps(p))}; }
+inline F32x16 operator+(F32x16 a, F32x16 b) { return {_mm512_add_ps(a.v, b.v)}; }
+inline F32x16 operator-(F32x16 a, F32x16 b) { return {_mm512_sub_ps(a.v, b.v)}; }
+inline F32x16 operator*(F32x16 a, F32x16 b) { return {_mm512_mul_ps(a.v, b.v)}; }
+inline F32x16 operator/(F32x16 a, F32x16 b) { return {_mm512_div_ps(a.v, b.v)}; }
+inline F32x16 fma(F32x16 a, F32x16 b, F32x16 c) { return {_mm512_fmadd_ps(a.v, b.v, c.v)}; }
+inline F32x16 fnma(F32x16 a, F32x16 b, F32x16 c) { return {_mm512_fnmadd_ps(a.v, b.v, c.v)}; }
+inline F32x16 min(F32x16 a, F32x16 b) { return {_mm512_min_ps(a.v, b.v)}; }
+inline F32x16 max(F32x16 a, F32x16 b) { return {_mm512_max_ps(a.v, b.v)}; }
+inline F32x16 sqrt(F32x16 a) { return {_mm512_sqrt_ps(a.v)}; }
+inline F32x16 ceil(F32x16 a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC)}; }
+inline F32x16 floor(F32x16 a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
+inline Mask16 ge(F32x16 a, F32x16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
+inline Mask16 gt(F32x16 a, F32x16 b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)}; }
+inline Mask16 operator&(Mask16 a, Mask16 b) { return {_kand_mask16(a.m, b.m)}; }
+inline F32x16 select(Mask16 m, F32x16 a, F32x16 b) { return {_mm512_mask_blend_ps(m.m, b.v, a.v)}; }
+inline F32x16 keep(Mask16 m, F32x16 a) { return {_mm512_maskz_mov_ps(m.m, a.v)}; }
+inline F32x16 mul_keep(Mask16 m, F32x16 a, F32x16 b) { return {_mm512_maskz_mul_ps(m.m, a.v, b.v)}; }
+inline F32x16 min_keep(Mask16 m, F32x16 a, F32x16 b) { return {_mm512_maskz_min_ps(m.m, a.v, b.v)}; }
 // sum[k] += weight * by[k] in the lanes of the mask.
-inline void add_where(M16 m, F16 weight, const float* by, F16 (&sum)[4]) {
+inline void add_where(Mask16 m, F32x16 weight, const float* by, F32x16 (&sum)[4]) {
   for (int k = 0; k < 4; ++k) sum[k].v = _mm512_mask3_fmadd_ps(weight.v, _mm512_set1_ps(by[k]), sum[k].v, m.m);
 }
-inline uint32_t bits(M16 m) { return m.m; }
-inline bool any(M16 m) { return m.m != 0; }
-inline void store_int(int32_t* p, F16 a) { _mm512_storeu_si512(p, _mm512_cvttps_epi32(a.v)); }
+inline uint32_t bits(Mask16 m) { return m.m; }
+inline bool any(Mask16 m) { return m.m != 0; }
+inline void store_int(int32_t* p, F32x16 a) { _mm512_storeu_si512(p, _mm512_cvttps_epi32(a.v)); }
 
 // 2^p: nearest multiple of 1/16 from a table held in a register, the rest from a quadratic; 1.5 * 2^19 puts the multiple in the low bits
 // of a float's mantissa, and the table's entries are short of the exponent that those bits carry over.
@@ -60,7 +60,7 @@ struct Exp2 {
   }
   // Several at a time, step by step: the processor then finds independent work next to each other.
   template <int N>
-  void operator()(F16 (&p)[N]) const {
+  void operator()(F32x16 (&p)[N]) const {
     const __m512 magic = _mm512_set1_ps(786432.0f);  // 1.5 * 2^19
     const __m512 linear = _mm512_set1_ps(kLinear), quadratic = _mm512_set1_ps(kQuadratic), one = _mm512_set1_ps(1.0f);
     __m512 rounded[N], f[N], q[N];
@@ -79,18 +79,18 @@ struct Exp2 {
 
 // The first N of sixteen floats, the others 0.
 template <int N>
-inline F16 load_first(const float* p) {
+inline F32x16 load_first(const float* p) {
   return {_mm512_maskz_loadu_ps((1u << N) - 1, p)};
 }
 
 // Sixteen floats, the first N of them taken as 0.
 template <int N>
-inline F16 load_from(const float* p) {
+inline F32x16 load_from(const float* p) {
   return {_mm512_maskz_loadu_ps(0xffffu & ~((1u << N) - 1), p)};
 }
 
 // First halves of a and b, then second halves.
-inline void store_halves(float* p, F16 a, F16 b) {
+inline void store_halves(float* p, F32x16 a, F32x16 b) {
   _mm512_storeu_ps(p, _mm512_shuffle_f32x4(a.v, b.v, 0x44));
   _mm512_storeu_ps(p + 16, _mm512_shuffle_f32x4(a.v, b.v, 0xee));
 }
@@ -100,7 +100,8 @@ template <int Step>
 struct Packing {
   __m512i lane = _mm512_mullo_epi32(_mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15), _mm512_set1_epi32(Step));
   void pack(uint16_t* to, uint32_t mask, int first) const {
-    const __m512i packed = _mm512_maskz_compress_epi32(static_cast<__mmask16>(mask), _mm512_add_epi32(lane, _mm512_set1_epi32(first * Step)));
+    const __m512i packed =
+        _mm512_maskz_compress_epi32(static_cast<__mmask16>(mask), _mm512_add_epi32(lane, _mm512_set1_epi32(first * Step)));
     _mm256_storeu_si256(reinterpret_cast<__m256i*>(to), _mm512_cvtepi32_epi16(packed));
   }
 };
@@ -123,9 +124,11 @@ struct Picking {
 };
 
 // Sixteen rows of three floats as three columns.
-inline void load3(const float* p, F16& a, F16& b, F16& c) {
+inline void load3(const float* p, F32x16& a, F32x16& b, F32x16& c) {
   const __m512 x = _mm512_loadu_ps(p), y = _mm512_loadu_ps(p + 16), z = _mm512_loadu_ps(p + 32);
-  const auto column = [&](__m512i from_xy, __m512i from_z) { return _mm512_permutex2var_ps(_mm512_permutex2var_ps(x, from_xy, y), from_z, z); };
+  const auto column = [&](__m512i from_xy, __m512i from_z) {
+    return _mm512_permutex2var_ps(_mm512_permutex2var_ps(x, from_xy, y), from_z, z);
+  };
   a.v = column(_mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 0, 0, 0, 0, 0),
                _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29));
   b.v = column(_mm512_setr_epi32(1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, 0, 0, 0, 0, 0),
@@ -135,14 +138,16 @@ inline void load3(const float* p, F16& a, F16& b, F16& c) {
 }
 
 // Two and three columns of sixteen rows, one row after the other.
-inline void interleave2(F16 (&r)[2]) {
+inline void interleave2(F32x16 (&r)[2]) {
   const __m512i low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
   const __m512 a = r[0].v, b = r[1].v;
   r[0].v = _mm512_permutex2var_ps(a, low, b), r[1].v = _mm512_permutex2var_ps(a, _mm512_add_epi32(low, _mm512_set1_epi32(8)), b);
 }
-inline void interleave3(F16 (&r)[3]) {
+inline void interleave3(F32x16 (&r)[3]) {
   const __m512 a = r[0].v, b = r[1].v, c = r[2].v;
-  const auto line = [&](__m512i from_ab, __m512i from_c) { return _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, from_ab, b), from_c, c); };
+  const auto line = [&](__m512i from_ab, __m512i from_c) {
+    return _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, from_ab, b), from_c, c);
+  };
   r[0].v = line(_mm512_setr_epi32(0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5),
                 _mm512_setr_epi32(0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15));
   r[1].v = line(_mm512_setr_epi32(21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26),
@@ -152,14 +157,14 @@ inline void interleave3(F16 (&r)[3]) {
 }
 
 // a = m * 2^e with m in [0.75, 1.5)
-inline void split_exponent(F16 a, F16& m, F16& e) {
+inline void split_exponent(F32x16 a, F32x16& m, F32x16& e) {
   m.v = _mm512_getmant_ps(a.v, _MM_MANT_NORM_p75_1p5, _MM_MANT_SIGN_src);
   const __m512 up = _mm512_getexp_ps(a.v);  // floor(log2 a)
   const __m512 mant = _mm512_getmant_ps(a.v, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_src);
   e.v = _mm512_mask_add_ps(up, _mm512_cmp_ps_mask(mant, _mm512_set1_ps(1.5f), _CMP_GE_OQ), up, _mm512_set1_ps(1.0f));
 }
 
-inline void load_pairs(const float* const (&p)[16], F16& first, F16& second) {
+inline void load_pairs(const float* const (&p)[16], F32x16& first, F32x16& second) {
   __m512d quarter[4];
   for (int i = 0; i < 4; ++i) {
     const auto two = [&](int k) {
@@ -176,25 +181,25 @@ inline void load_pairs(const float* const (&p)[16], F16& first, F16& second) {
 
 // A register is four quarters of four lanes. Column<C>: lane C of each quarter in all its lanes.
 template <int C>
-inline F16 column(F16 a) {
+inline F32x16 column(F32x16 a) {
   return {_mm512_permute_ps(a.v, C * 0x55)};
 }
 // Each quarter of four registers, as a 4 x 4 matrix.
-inline void transpose4(F16 (&r)[4]) {
+inline void transpose4(F32x16 (&r)[4]) {
   const __m512 a = _mm512_unpacklo_ps(r[0].v, r[1].v), b = _mm512_unpackhi_ps(r[0].v, r[1].v);
   const __m512 c = _mm512_unpacklo_ps(r[2].v, r[3].v), d = _mm512_unpackhi_ps(r[2].v, r[3].v);
   r[0].v = _mm512_shuffle_ps(a, c, 0x44), r[1].v = _mm512_shuffle_ps(a, c, 0xee);
   r[2].v = _mm512_shuffle_ps(b, d, 0x44), r[3].v = _mm512_shuffle_ps(b, d, 0xee);
 }
 // Quarter q of register j becomes quarter j of register q.
-inline void transpose_quarters(F16 (&r)[4]) {
+inline void transpose_quarters(F32x16 (&r)[4]) {
   const __m512 a = _mm512_shuffle_f32x4(r[0].v, r[1].v, 0x44), b = _mm512_shuffle_f32x4(r[0].v, r[1].v, 0xee);
   const __m512 c = _mm512_shuffle_f32x4(r[2].v, r[3].v, 0x44), d = _mm512_shuffle_f32x4(r[2].v, r[3].v, 0xee);
   r[0].v = _mm512_shuffle_f32x4(a, c, 0x88), r[1].v = _mm512_shuffle_f32x4(a, c, 0xdd);
   r[2].v = _mm512_shuffle_f32x4(b, d, 0x88), r[3].v = _mm512_shuffle_f32x4(b, d, 0xdd);
 }
 // Quarter j of the result is the sum of register j's quarters.
-inline F16 sum_quarters(const F16 (&r)[4]) {
+inline F32x16 sum_quarters(const F32x16 (&r)[4]) {
   const auto halves = [](__m512 a, __m512 b) {  // first half: of a, second: of b
     return _mm512_add_ps(_mm512_mask_blend_ps(0xff00, a, b), _mm512_shuffle_f32x4(a, b, 0x4e));
   };
@@ -202,7 +207,7 @@ inline F16 sum_quarters(const F16 (&r)[4]) {
   return {_mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x88), _mm512_shuffle_f32x4(a, b, 0xdd))};
 }
 
-inline void transpose(F16 (&r)[16]) {
+inline void transpose(F32x16 (&r)[16]) {
   __m512 t[16];
   for (int i = 0; i < 8; ++i) {
     t[2 * i] = _mm512_unpacklo_ps(r[2 * i].v, r[2 * i + 1].v);

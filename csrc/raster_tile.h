@@ -1,6 +1,6 @@
 // A tile's share of the work: the Gaussians of one batch laid out for blending, and which blocks each of them touches.
 //
-// Block b of a tile is 4 x 4 pixels, column b % 4, row b / 4; lane l of its F16 is the pixel in column l % 4, row l / 4. Coordinates are
+// Block b of a tile is 4 x 4 pixels, column b % 4, row b / 4; lane l of its F32x16 is the pixel in column l % 4, row l / 4. Coordinates are
 // relative to the tile's centre. Both directions of the blending run `alpha` on the same numbers, so they agree to the last bit.
 #pragma once
 #include <algorithm>
@@ -14,16 +14,16 @@
 namespace se::raster {
 
 struct Tile {
-  int x, y;          // in tiles
+  int x, y;                  // in tiles
   float centre_x, centre_y;  // px
-  bool whole;        // inside the picture to its last pixel
+  bool whole;                // inside the picture to its last pixel
 };
 
 // One Gaussian of a batch, as the tile's blocks read it.
 struct alignas(64) Row {
-  float shape[2][2][8];            // by half of the tile: eight columns' heights, then their slopes, see raster.h
-  float l1, r, g, b, z, u, v;      // as in the record
-  float sums[16 - kSums];          // backward: what blocks have added up so far
+  float shape[2][2][8];        // by half of the tile: eight columns' heights, then their slopes, see raster.h
+  float l1, r, g, b, z, u, v;  // as in the record
+  float sums[16 - kSums];      // backward: what blocks have added up so far
   const float* height(int block_column) const { return shape[block_column / 2][0] + block_column % 2 * 4; }
   static constexpr int kSlope = 8;  // from a height to its slope
 };
@@ -42,7 +42,7 @@ constexpr int kPlace = sizeof(Row) / 8;
 
 struct Batch {
   Row rows[kBatch + 16];  // those beyond the end are Gaussians that draw nothing, which fill up lists
-  List list;             // of the current block
+  List list;              // of the current block
   const Packing<kPlace> packing;
 
   Batch() {
@@ -55,10 +55,10 @@ struct Batch {
   Row& row(uint16_t place) { return *reinterpret_cast<Row*>(reinterpret_cast<char*>(rows) + place * size_t{8}); }
 
   void load_rows(const Record* records, const uint32_t* from, const uint16_t (&any)[kGroups], int n, const Tile& tile);
-  void list_block(const Touched& touched, int block, int n);
+  void fill_list(const Touched& touched, int block, int n);
 };
 
-inline void Batch::list_block(const Touched& touched, int block, int n) {
+inline void Batch::fill_list(const Touched& touched, int block, int n) {
   int count = 0;
   for (int i = 0; i < n; i += 16) {
     packing.pack(list.place + count, touched[i / 16][block], i);
@@ -78,22 +78,22 @@ inline const float* lane_x() {
 }
 
 // Row of each lane's pixel in block row 0..3, relative to the tile's centre.
-inline F16 block_y(int block_row) {
+inline F32x16 block_y(int block_row) {
   alignas(64) static const float y[16] = {-7.5f, -7.5f, -7.5f, -7.5f, -6.5f, -6.5f, -6.5f, -6.5f,
                                           -5.5f, -5.5f, -5.5f, -5.5f, -4.5f, -4.5f, -4.5f, -4.5f};
-  return load(y) + bcast(4.0f * static_cast<float>(block_row));
+  return load(y) + broadcast(4.0f * static_cast<float>(block_row));
 }
 
 // Fills the rows of the Gaussians that `any` names.
 inline void Batch::load_rows(const Record* records, const uint32_t* from, const uint16_t (&any)[kGroups], int n, const Tile& tile) {
-  const F16 columns = load(lane_x()) + bcast(tile.centre_x), centre_y = bcast(tile.centre_y);
+  const F32x16 columns = load(lane_x()) + broadcast(tile.centre_x), centre_y = broadcast(tile.centre_y);
   for (int first = 0; first < n; first += 16) {
     for (uint32_t left = any[first / 16]; left; left &= left - 1) {
       const int k = first + __builtin_ctz(left);
       const Record& r = records[from[k]];
       Row& row = rows[k];
-      const F16 dx = bcast(r.u) - columns, f = bcast(r.l3) * dx, ly = bcast(r.l1) * (bcast(r.v) - centre_y);
-      store_halves(&row.shape[0][0][0], fnma(f, f, bcast(r.log_opacity)), fma(bcast(r.l2), dx, ly));
+      const F32x16 dx = broadcast(r.u) - columns, f = broadcast(r.l3) * dx, ly = broadcast(r.l1) * (broadcast(r.v) - centre_y);
+      store_halves(&row.shape[0][0][0], fnma(f, f, broadcast(r.log_opacity)), fma(broadcast(r.l2), dx, ly));
       store(&row.l1, load_first<kSums>(&r.l1));
     }
   }
@@ -101,29 +101,29 @@ inline void Batch::load_rows(const Record* records, const uint32_t* from, const 
 
 // Exact test of ellipse against block: the least distance over the box of its pixel centres lies on one of the two sides that face the
 // centre, and on a side it is where the ellipse is tangent to it, or at its end. Sixteen Gaussians per lane.
-inline void touch_blocks(const Record* records, const uint32_t* from, int n, const Tile& tile, Touched& touched) {
-  const F16 zero = bcast(0.0f);
+inline void test_blocks(const Record* records, const uint32_t* from, int n, const Tile& tile, Touched& touched) {
+  const F32x16 zero = broadcast(0.0f);
   for (int i = 0; i < n; i += 16) {
-    F16 c[16];
+    F32x16 c[16];
     for (int k = 0; k < 16; ++k) __builtin_prefetch(&records[from[i + k + kAhead]]);
     for (int k = 0; k < 16; ++k) c[k] = load(&records[from[i + k < n ? i + k : n - 1]].l1);
     transpose(c);
-    const F16 l1 = c[0], l2 = c[8], l3 = c[9], U = c[5] - bcast(tile.centre_x), V = c[6] - bcast(tile.centre_y);
-    const F16 limit = c[7] - bcast(kMinAlphaLog2 - 1e-3f);  // the slack covers rounding
-    const F16 per_x = zero - l2 / l1, per_y = zero - l1 * l2 / fma(l2, l2, l3 * l3);
-    F16 lo_y[4], hi_y[4], far_e[4], best_x[4];
+    const F32x16 l1 = c[0], l2 = c[8], l3 = c[9], U = c[5] - broadcast(tile.centre_x), V = c[6] - broadcast(tile.centre_y);
+    const F32x16 limit = c[7] - broadcast(kMinAlphaLog2 - 1e-3f);  // the slack covers rounding
+    const F32x16 per_x = zero - l2 / l1, per_y = zero - l1 * l2 / fma(l2, l2, l3 * l3);
+    F32x16 lo_y[4], hi_y[4], far_e[4], best_x[4];
     for (int y = 0; y < 4; ++y) {
-      lo_y[y] = V - bcast(4.0f * static_cast<float>(y) - 4.5f), hi_y[y] = lo_y[y] + bcast(3.0f);
-      const F16 dy = min(max(zero, lo_y[y]), hi_y[y]);
+      lo_y[y] = V - broadcast(4.0f * static_cast<float>(y) - 4.5f), hi_y[y] = lo_y[y] + broadcast(3.0f);
+      const F32x16 dy = min(max(zero, lo_y[y]), hi_y[y]);
       far_e[y] = l1 * dy, best_x[y] = per_y * dy;
     }
     const uint32_t valid = n - i < 16 ? (1u << (n - i)) - 1 : 0xffffu;
     for (int x = 0; x < 4; ++x) {
-      const F16 lo_x = U - bcast(4.0f * static_cast<float>(x) - 4.5f), hi_x = lo_x + bcast(3.0f);
-      const F16 dx = min(max(zero, lo_x), hi_x), f = l3 * dx, near_f2 = f * f, near_e = l2 * dx, best_y = per_x * dx;
+      const F32x16 lo_x = U - broadcast(4.0f * static_cast<float>(x) - 4.5f), hi_x = lo_x + broadcast(3.0f);
+      const F32x16 dx = min(max(zero, lo_x), hi_x), f = l3 * dx, near_f2 = f * f, near_e = l2 * dx, best_y = per_x * dx;
       for (int y = 0; y < 4; ++y) {
-        const F16 e1 = fma(l1, min(max(best_y, lo_y[y]), hi_y[y]), near_e);
-        const F16 there = min(max(best_x[y], lo_x), hi_x), e2 = fma(l2, there, far_e[y]), f2 = l3 * there;
+        const F32x16 e1 = fma(l1, min(max(best_y, lo_y[y]), hi_y[y]), near_e);
+        const F32x16 there = min(max(best_x[y], lo_x), hi_x), e2 = fma(l2, there, far_e[y]), f2 = l3 * there;
         touched[i / 16][4 * y + x] = static_cast<uint16_t>(bits(ge(limit, min(fma(e1, e1, near_f2), fma(e2, e2, f2 * f2)))) & valid);
       }
     }
@@ -131,7 +131,7 @@ inline void touch_blocks(const Record* records, const uint32_t* from, int n, con
 }
 
 // Which of a batch's Gaussians touch any of the blocks whose bits are set.
-inline void any_block(const Touched& touched, uint32_t blocks, int n, uint16_t (&any)[kGroups]) {
+inline void merge_blocks(const Touched& touched, uint32_t blocks, int n, uint16_t (&any)[kGroups]) {
   uint16_t use[16];
   for (int b = 0; b < 16; ++b) use[b] = blocks >> b & 1 ? 0xffff : 0;
   for (int i = 0; i < (n + 15) / 16; ++i) {
@@ -142,47 +142,47 @@ inline void any_block(const Touched& touched, uint32_t blocks, int n, uint16_t (
 }
 
 // Alpha of four Gaussians at a block's pixels; 0 where it is below 1/255.
-inline void alphas(const Row* const (&row)[4], int block_column, F16 y, const Exp2& exp2, F16 (&alpha)[4]) {
-  constexpr int N = kSideBySide;
-  const F16 limit = bcast(kMinAlphaLog2), most = bcast(kMaxAlpha);
+inline void compute_alphas(const Row* const (&row)[4], int block_column, F32x16 y, const Exp2& exp2, F32x16 (&alpha)[4]) {
+  constexpr int N = kInterleaved;
+  const F32x16 limit = broadcast(kMinAlphaLog2), most = broadcast(kMaxAlpha);
   for (int i = 0; i < 4; i += N) {
-    F16 e[N], p[N];
-    M16 drawn[N];
-    for (int k = 0; k < N; ++k) e[k] = fnma(bcast(row[i + k]->l1), y, bcast4(row[i + k]->height(block_column) + Row::kSlope));
-    for (int k = 0; k < N; ++k) p[k] = fnma(e[k], e[k], bcast4(row[i + k]->height(block_column)));
+    F32x16 e[N], p[N];
+    Mask16 drawn[N];
+    for (int k = 0; k < N; ++k) e[k] = fnma(broadcast(row[i + k]->l1), y, broadcast4(row[i + k]->height(block_column) + Row::kSlope));
+    for (int k = 0; k < N; ++k) p[k] = fnma(e[k], e[k], broadcast4(row[i + k]->height(block_column)));
     for (int k = 0; k < N; ++k) drawn[k] = ge(p[k], limit);
     exp2(p);
     for (int k = 0; k < N; ++k) alpha[i + k] = min_keep(drawn[k], p[k], most);
   }
 }
 
-// Four pixels of three interleaved channels, apart and together again.
-typedef float Four __attribute__((vector_size(16)));
+// F32x4 pixels of three interleaved channels, apart and together again.
+typedef float F32x4 __attribute__((vector_size(16)));
 
 inline void split_rgb(const float* p, float* r, float* g, float* b) {
-  Four x, y, z;  // r0 g0 b0 r1, g1 b1 r2 g2, b2 r3 g3 b3
+  F32x4 x, y, z;  // r0 g0 b0 r1, g1 b1 r2 g2, b2 r3 g3 b3
   std::memcpy(&x, p, 16), std::memcpy(&y, p + 4, 16), std::memcpy(&z, p + 8, 16);
-  const Four low = SE_SHUFFLE(x, y, 1, 2, 4, 5), high = SE_SHUFFLE(y, z, 2, 3, 5, 6);  // g0 b0 g1 b1, r2 g2 r3 g3
-  const Four red = SE_SHUFFLE(x, high, 0, 3, 4, 6), green = SE_SHUFFLE(low, high, 0, 2, 5, 7), blue = SE_SHUFFLE(low, z, 1, 3, 4, 7);
+  const F32x4 low = SE_SHUFFLE(x, y, 1, 2, 4, 5), high = SE_SHUFFLE(y, z, 2, 3, 5, 6);  // g0 b0 g1 b1, r2 g2 r3 g3
+  const F32x4 red = SE_SHUFFLE(x, high, 0, 3, 4, 6), green = SE_SHUFFLE(low, high, 0, 2, 5, 7), blue = SE_SHUFFLE(low, z, 1, 3, 4, 7);
   std::memcpy(r, &red, 16), std::memcpy(g, &green, 16), std::memcpy(b, &blue, 16);
 }
 
 inline void join_rgb(float* p, const float* r, const float* g, const float* b) {
-  Four red, green, blue;
+  F32x4 red, green, blue;
   std::memcpy(&red, r, 16), std::memcpy(&green, g, 16), std::memcpy(&blue, b, 16);
-  const Four rg = SE_SHUFFLE(red, green, 0, 4, 1, 5), gb = SE_SHUFFLE(green, blue, 1, 5, 2, 6), br = SE_SHUFFLE(blue, red, 0, 5, 2, 7);
-  const Four x = SE_SHUFFLE(rg, br, 0, 1, 4, 5);               // r0 g0 b0 r1
-  const Four middle = SE_SHUFFLE(red, green, 2, 6, 3, 7);      // r2 g2 r3 g3
-  const Four y = SE_SHUFFLE(gb, middle, 0, 1, 4, 5);           // g1 b1 r2 g2
-  const Four end = SE_SHUFFLE(middle, blue, 2, 3, 7, 7);       // r3 g3 b3 b3
-  const Four z = SE_SHUFFLE(br, end, 2, 4, 5, 6);              // b2 r3 g3 b3
+  const F32x4 rg = SE_SHUFFLE(red, green, 0, 4, 1, 5), gb = SE_SHUFFLE(green, blue, 1, 5, 2, 6), br = SE_SHUFFLE(blue, red, 0, 5, 2, 7);
+  const F32x4 x = SE_SHUFFLE(rg, br, 0, 1, 4, 5);           // r0 g0 b0 r1
+  const F32x4 middle = SE_SHUFFLE(red, green, 2, 6, 3, 7);  // r2 g2 r3 g3
+  const F32x4 y = SE_SHUFFLE(gb, middle, 0, 1, 4, 5);       // g1 b1 r2 g2
+  const F32x4 end = SE_SHUFFLE(middle, blue, 2, 3, 7, 7);   // r3 g3 b3 b3
+  const F32x4 z = SE_SHUFFLE(br, end, 2, 4, 5, 6);          // b2 r3 g3 b3
   std::memcpy(p, &x, 16), std::memcpy(p + 4, &y, 16), std::memcpy(p + 8, &z, 16);
 }
 
 // Calls whole(offset in the picture, place in block order) for four neighbours at a time where the tile lies inside the picture,
 // else one(...) for single pixels.
 template <class Whole, class One>
-inline void each_pixel(const SeCamera& c, const Tile& tile, Whole&& whole, One&& one) {
+inline void for_each_pixel(const SeCamera& c, const Tile& tile, Whole&& whole, One&& one) {
   const int width = std::min(kTile, c.width - tile.x * kTile), height = std::min(kTile, c.height - tile.y * kTile);
   for (int j = 0; j < height; ++j) {
     const int64_t row = static_cast<int64_t>(tile.y * kTile + j) * c.width + tile.x * kTile;
@@ -196,14 +196,14 @@ inline void each_pixel(const SeCamera& c, const Tile& tile, Whole&& whole, One&&
 // [channels][16 blocks, 16 lanes] of a tile from a picture [H, W, channels]; 0 outside.
 inline void load_tile(const float* picture, const SeCamera& c, const Tile& tile, float (&plane)[256]) {
   if (!tile.whole) std::memset(plane, 0, sizeof plane);
-  each_pixel(
+  for_each_pixel(
       c, tile, [&](int64_t from, int to) { std::memcpy(plane + to, picture + from, 16); },
       [&](int64_t from, int to) { plane[to] = picture[from]; });
 }
 
 inline void load_tile(const float* picture, const SeCamera& c, const Tile& tile, float (&planes)[3][256]) {
   if (!tile.whole) std::memset(planes, 0, sizeof planes);
-  each_pixel(
+  for_each_pixel(
       c, tile, [&](int64_t from, int to) { split_rgb(picture + 3 * from, planes[0] + to, planes[1] + to, planes[2] + to); },
       [&](int64_t from, int to) {
         for (int k = 0; k < 3; ++k) planes[k][to] = picture[3 * from + k];
@@ -211,23 +211,23 @@ inline void load_tile(const float* picture, const SeCamera& c, const Tile& tile,
 }
 
 inline void store_tile(float* picture, const SeCamera& c, const Tile& tile, const float (&plane)[256]) {
-  each_pixel(
+  for_each_pixel(
       c, tile, [&](int64_t to, int from) { std::memcpy(picture + to, plane + from, 16); },
       [&](int64_t to, int from) { picture[to] = plane[from]; });
 }
 
 inline void store_tile(float* picture, const SeCamera& c, const Tile& tile, const float (&planes)[3][256]) {
-  each_pixel(
+  for_each_pixel(
       c, tile, [&](int64_t to, int from) { join_rgb(picture + 3 * to, planes[0] + from, planes[1] + from, planes[2] + from); },
       [&](int64_t to, int from) {
         for (int k = 0; k < 3; ++k) picture[3 * to + k] = planes[k][from];
       });
 }
 
-// Runs f(begin, end, worker) over all tiles. Each worker has its own part of the picture, since neighbours share Gaussians, and then helps with
-// the parts of others. Some tiles at a time, as they fetch each other's Gaussians ahead; few, as the last ones keep all waiting.
+// Runs f(begin, end, worker) over all tiles. Each worker has its own part of the picture, since neighbours share Gaussians, and then helps
+// with the parts of others. Some tiles at a time, as they fetch each other's Gaussians ahead; few, as the last ones keep all waiting.
 template <class F>
-void share_tiles(const State& s, int threads, F&& f) {
+void distribute_tiles(const State& s, int threads, F&& f) {
   struct alignas(64) Part {
     std::atomic<int> next;
     int end;
@@ -241,14 +241,15 @@ void share_tiles(const State& s, int threads, F&& f) {
   parallel_for(parts, 1, threads, [&](int64_t own, int64_t, int worker) {
     for (int k = 0; k < parts; ++k) {
       Part& from = part[(own + k) % parts];
-      for (int begin; (begin = from.next.fetch_add(step, std::memory_order_relaxed)) < from.end;) f(begin, std::min(begin + step, from.end), worker);
+      for (int begin; (begin = from.next.fetch_add(step, std::memory_order_relaxed)) < from.end;)
+        f(begin, std::min(begin + step, from.end), worker);
     }
   });
 }
 
 // One T per thread, made at its first use. (A plain thread_local object in a shared library is found anew at each access, in inner loops.)
 template <class T>
-T& scratch() {
+T& thread_scratch() {
   thread_local const std::unique_ptr<T> own = std::make_unique<T>();
   return *own;
 }
@@ -260,7 +261,7 @@ inline Tile tile_at(const State& s, int number) {
 }
 
 // 1 for pixels inside the picture, 0 for the rest of a tile at the edge.
-inline void inside(const SeCamera& c, const Tile& tile, float (&one)[256]) {
+inline void mark_inside(const SeCamera& c, const Tile& tile, float (&one)[256]) {
   if (tile.whole) {
     std::fill(one, one + 256, 1.0f);
     return;

@@ -55,7 +55,7 @@ typedef struct {
   int32_t deterministic, threads;
   const float *means, *quats, *scales, *opacities, *colors;  // those of the forward pass
   const float* background;
-  const float *g_image, *g_alpha, *g_depth;  // gradients of the outputs; null: zero
+  const float *g_image, *g_alpha, *g_depth;                                                // gradients of the outputs; null: zero
   float *d_means, *d_quats, *d_scales, *d_opacities, *d_colors, *d_mean2d, *d_background;  // output; d_mean2d [M, 2], in NDC units
 } SeRasterBackward;
 
@@ -80,8 +80,8 @@ typedef struct {
   int64_t* chosen;                   // [A, k]; null without a router or if k = 0
   float* chosen_weight;              // [A, k], mixture weights of the chosen experts; null like `chosen`
   float *d_router_w, *d_router_b, *d_w1, *d_b1, *d_middle_w, *d_middle_b, *d_w2, *d_b2;  // gradients; null like the tensors
-  const float* d_gates;        // [A, E]; null: zero
-  int64_t E, k, H, L, out;     // out: outputs of an expert
+  const float* d_gates;                                                                  // [A, E]; null: zero
+  int64_t E, k, H, L, out;                                                               // out: outputs of an expert
   int64_t distance, position;  // 1 if the first layer sees the distance; 1 if the router sees the position
 } SeDecodeHead;
 
@@ -162,9 +162,8 @@ SE_EXPORT void se_sh_backward(const float* means, const float* dc, const float* 
 SE_EXPORT void se_graph_reverse(const int64_t* found, int64_t A, int64_t k, int32_t* start, int32_t* known);
 // out [A, F] = feature + share * sum over neighbours of weight (feature - least) of the neighbour; least [A, F], the minima over the points
 // that know a point.
-SE_EXPORT void se_graph_forward(const float* feature, const int64_t* found, const float* weight, const int32_t* start,
-                                const int32_t* known, int64_t A, int64_t k, int64_t F, float share, float* least, float* out,
-                                int32_t threads);
+SE_EXPORT void se_graph_forward(const float* feature, const int64_t* found, const float* weight, const int32_t* start, const int32_t* known,
+                                int64_t A, int64_t k, int64_t F, float share, float* least, float* out, int32_t threads);
 // out [A, F]: the gradient of the features; h and shared [A, F] are scratch memory.
 SE_EXPORT void se_graph_backward(const float* feature, const float* least, const float* grad, const int64_t* found, const float* weight,
                                  const int32_t* start, const int32_t* known, int64_t A, int64_t k, int64_t F, float share, float* h,

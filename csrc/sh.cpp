@@ -54,43 +54,45 @@ void gather(const Harmonics& h, int64_t begin, int64_t end, Chunk& c) {
   }
 }
 
-void harmonics(int degree, int n, Chunk& c) {
+void evaluate_basis(int degree, int n, Chunk& c) {
   for (int i = 0; i < n; i += LANES) {
-    V x = load(c.x + i), y = load(c.y + i), z = load(c.z + i);
-    const V inverse = all(1.f) / max(square_root(fma(x, x, fma(y, y, z * z))), all(1e-12f));
+    Vec x = load(c.x + i), y = load(c.y + i), z = load(c.z + i);
+    const Vec inverse = broadcast(1.f) / max(square_root(fma(x, x, fma(y, y, z * z))), broadcast(1e-12f));
     x = x * inverse, y = y * inverse, z = z * inverse;
     store(c.x + i, x), store(c.y + i, y), store(c.z + i, z), store(c.inverse + i, inverse);
     float* b = c.basis + i;
-    store(b, all(C0));
+    store(b, broadcast(C0));
     if (degree < 1) continue;
-    store(b + 1 * CHUNK, all(-C1) * y), store(b + 2 * CHUNK, all(C1) * z), store(b + 3 * CHUNK, all(-C1) * x);
+    store(b + 1 * CHUNK, broadcast(-C1) * y), store(b + 2 * CHUNK, broadcast(C1) * z), store(b + 3 * CHUNK, broadcast(-C1) * x);
     if (degree < 2) continue;
-    const V xx = x * x, yy = y * y, zz = z * z, xy = x * y;
-    store(b + 4 * CHUNK, all(D0) * xy), store(b + 5 * CHUNK, all(-D0) * (y * z));
-    store(b + 6 * CHUNK, all(D2) * (zz + zz - xx - yy));
-    store(b + 7 * CHUNK, all(-D0) * (x * z)), store(b + 8 * CHUNK, all(D4) * (xx - yy));
+    const Vec xx = x * x, yy = y * y, zz = z * z, xy = x * y;
+    store(b + 4 * CHUNK, broadcast(D0) * xy), store(b + 5 * CHUNK, broadcast(-D0) * (y * z));
+    store(b + 6 * CHUNK, broadcast(D2) * (zz + zz - xx - yy));
+    store(b + 7 * CHUNK, broadcast(-D0) * (x * z)), store(b + 8 * CHUNK, broadcast(D4) * (xx - yy));
     if (degree < 3) continue;
-    const V four = all(4.f) * zz - xx - yy, three = all(3.f);
-    store(b + 9 * CHUNK, all(E0) * y * (three * xx - yy)), store(b + 10 * CHUNK, all(E1) * xy * z);
-    store(b + 11 * CHUNK, all(E2) * y * four), store(b + 12 * CHUNK, all(E3) * z * (zz + zz - three * (xx + yy)));
-    store(b + 13 * CHUNK, all(E2) * x * four), store(b + 14 * CHUNK, all(E5) * z * (xx - yy));
-    store(b + 15 * CHUNK, all(E0) * x * (xx - three * yy));
+    const Vec four = broadcast(4.f) * zz - xx - yy, three = broadcast(3.f);
+    store(b + 9 * CHUNK, broadcast(E0) * y * (three * xx - yy)), store(b + 10 * CHUNK, broadcast(E1) * xy * z);
+    store(b + 11 * CHUNK, broadcast(E2) * y * four), store(b + 12 * CHUNK, broadcast(E3) * z * (zz + zz - three * (xx + yy)));
+    store(b + 13 * CHUNK, broadcast(E2) * x * four), store(b + 14 * CHUNK, broadcast(E5) * z * (xx - yy));
+    store(b + 15 * CHUNK, broadcast(E0) * x * (xx - three * yy));
   }
 }
 
 // Gradient of sum_j t_j basis_j with respect to the unit direction, for lanes at `i`; t [MOST].
-void through_direction(int degree, const Chunk& c, int i, const V* t, V* g) {
-  const V x = load(c.x + i), y = load(c.y + i), z = load(c.z + i), c1 = all(C1);
-  g[0] = all(0.f) - c1 * t[3], g[1] = all(0.f) - c1 * t[1], g[2] = c1 * t[2];
+void differentiate_direction(int degree, const Chunk& c, int i, const Vec* t, Vec* g) {
+  const Vec x = load(c.x + i), y = load(c.y + i), z = load(c.z + i), c1 = broadcast(C1);
+  g[0] = broadcast(0.f) - c1 * t[3], g[1] = broadcast(0.f) - c1 * t[1], g[2] = c1 * t[2];
   if (degree < 2) return;
-  const V a = all(D0) * t[4], b = all(-D0) * t[5], d = all(2.f * D2) * t[6], e = all(-D0) * t[7], f = all(2.f * D4) * t[8];
+  const Vec a = broadcast(D0) * t[4], b = broadcast(-D0) * t[5], d = broadcast(2.f * D2) * t[6], e = broadcast(-D0) * t[7],
+            f = broadcast(2.f * D4) * t[8];
   g[0] = g[0] + y * a - x * d + z * e + x * f;
   g[1] = g[1] + x * a + z * b - y * d - y * f;
-  g[2] = g[2] + y * b + all(2.f) * z * d + x * e;
+  g[2] = g[2] + y * b + broadcast(2.f) * z * d + x * e;
   if (degree < 3) return;
-  const V xx = x * x, yy = y * y, zz = z * z, xy = x * y, yz = y * z, xz = x * z, minus = xx - yy;
-  const V p = all(E0) * t[9], q = all(E1) * t[10], r = all(E2) * t[11], s = all(3.f * E3) * t[12], u = all(E2) * t[13], v = all(E5) * t[14],
-          w = all(E0) * t[15], two = all(2.f), three = all(3.f), four = all(4.f), six = all(6.f), eight = all(8.f);
+  const Vec xx = x * x, yy = y * y, zz = z * z, xy = x * y, yz = y * z, xz = x * z, minus = xx - yy;
+  const Vec p = broadcast(E0) * t[9], q = broadcast(E1) * t[10], r = broadcast(E2) * t[11], s = broadcast(3.f * E3) * t[12],
+            u = broadcast(E2) * t[13], v = broadcast(E5) * t[14], w = broadcast(E0) * t[15], two = broadcast(2.f), three = broadcast(3.f),
+            four = broadcast(4.f), six = broadcast(6.f), eight = broadcast(8.f);
   g[0] = g[0] + six * xy * p + yz * q - two * xy * r - two * xz * s + (four * zz - three * xx - yy) * u + two * xz * v + three * minus * w;
   g[1] = g[1] + three * minus * p + xz * q + (four * zz - xx - three * yy) * r - two * yz * s - two * xy * u - two * yz * v - six * xy * w;
   g[2] = g[2] + xy * q + eight * yz * r + (two * zz - xx - yy) * s + eight * xz * u + minus * v;
@@ -100,14 +102,14 @@ void forward(const Harmonics& h, int64_t begin, int64_t end, float* out) {
   Chunk c;
   gather(h, begin, end, c);
   const int n = static_cast<int>(end - begin), used = h.used();
-  harmonics(h.degree, n, c);
+  evaluate_basis(h.degree, n, c);
   alignas(64) float colour[3][CHUNK];
   for (int i = 0; i < n; i += LANES)
     for (int k = 0; k < 3; ++k) {
-      V sum = all(0.f);
+      Vec sum = broadcast(0.f);
       for (int j = 0; j < used; ++j) sum = fma(load(c.basis + j * CHUNK + i), load(c.coefficients + (3 * j + k) * CHUNK + i), sum);
-      sum = sum + all(0.5f);
-      store(colour[k] + i, greater(all(0.f), sum, all(0.f), sum));  // a NaN stays one
+      sum = sum + broadcast(0.5f);
+      store(colour[k] + i, select_greater(broadcast(0.f), sum, broadcast(0.f), sum));  // a NaN stays one
     }
   for (int i = 0; i < n; ++i)
     for (int k = 0; k < 3; ++k) out[3 * (begin + i) + k] = colour[k][i];
@@ -118,21 +120,21 @@ void backward(const Harmonics& h, int64_t begin, int64_t end, const float* colou
   Chunk c;
   gather(h, begin, end, c);
   const int n = static_cast<int>(end - begin), used = h.used();
-  harmonics(h.degree, n, c);
+  evaluate_basis(h.degree, n, c);
   alignas(64) float g[3][CHUNK] = {}, d[3][CHUNK] = {};
   for (int i = 0; i < n; ++i)
     for (int k = 0; k < 3; ++k) g[k][i] = colours[3 * (begin + i) + k] > 0.f ? upstream[3 * (begin + i) + k] : 0.f;
   if (h.degree > 0)
     for (int i = 0; i < n; i += LANES) {
-      const V red = load(g[0] + i), green = load(g[1] + i), blue = load(g[2] + i);
-      V t[MOST], by[3];
+      const Vec red = load(g[0] + i), green = load(g[1] + i), blue = load(g[2] + i);
+      Vec t[MOST], by[3];
       for (int j = 1; j < used; ++j) {
         const float* s = c.coefficients + 3 * j * CHUNK + i;
         t[j] = fma(red, load(s), fma(green, load(s + CHUNK), blue * load(s + 2 * CHUNK)));
       }
-      through_direction(h.degree, c, i, t, by);
-      const V x = load(c.x + i), y = load(c.y + i), z = load(c.z + i), inverse = load(c.inverse + i);
-      const V along = fma(x, by[0], fma(y, by[1], z * by[2]));  // the part along the direction changes its length alone
+      differentiate_direction(h.degree, c, i, t, by);
+      const Vec x = load(c.x + i), y = load(c.y + i), z = load(c.z + i), inverse = load(c.inverse + i);
+      const Vec along = fma(x, by[0], fma(y, by[1], z * by[2]));  // the part along the direction changes its length alone
       store(d[0] + i, (by[0] - x * along) * inverse);
       store(d[1] + i, (by[1] - y * along) * inverse);
       store(d[2] + i, (by[2] - z * along) * inverse);
@@ -152,7 +154,7 @@ void backward(const Harmonics& h, int64_t begin, int64_t end, const float* colou
 }  // namespace
 }  // namespace se
 
-// means [A, 3]; dc [N, 3] and rest [N, width, 3], of which rows [A] (null: all, A = N) belong to them; position [3] -> out [A, 3].
+// means [A, 3]; dc [N, 3] and rest [N, width, 3], of which rows [A] (null: broadcast, A = N) belong to them; position [3] -> out [A, 3].
 SE_EXPORT void se_sh_forward(const float* means, const float* dc, const float* rest, const int64_t* rows, int64_t count, int64_t width,
                              int32_t degree, const float* position, float* out, int32_t threads) {
   const se::Harmonics h{means, dc, rest, rows, width, degree, position};
@@ -164,7 +166,6 @@ SE_EXPORT void se_sh_backward(const float* means, const float* dc, const float* 
                               const float* colours, const float* upstream, float* d_means, float* d_dc, float* d_rest, int64_t count,
                               int64_t width, int32_t degree, int32_t threads) {
   const se::Harmonics h{means, dc, rest, rows, width, degree, position};
-  se::parallel_for(count, se::CHUNK, threads, [&](int64_t begin, int64_t end, int) {
-    se::backward(h, begin, end, colours, upstream, d_means, d_dc, d_rest);
-  });
+  se::parallel_for(count, se::CHUNK, threads,
+                   [&](int64_t begin, int64_t end, int) { se::backward(h, begin, end, colours, upstream, d_means, d_dc, d_rest); });
 }

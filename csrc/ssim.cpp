@@ -22,8 +22,8 @@ namespace {
 using namespace se;
 
 constexpr int TAPS = 11, RADIUS = 5, BAND = 48;
-constexpr int EDGE = 3 * RADIUS;     // neighbours of one colour are 3 floats apart in an interleaved row
-constexpr int MARGIN = EDGE + 16;    // room for a whole register beyond the last value
+constexpr int EDGE = 3 * RADIUS;   // neighbours of one colour are 3 floats apart in an interleaved row
+constexpr int MARGIN = EDGE + 16;  // room for a whole register beyond the last value
 constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
 
 struct Window {
@@ -65,26 +65,26 @@ class Band {
   // Rows [begin, end): adds the sums of |x - y| and of 1 - S to sums[0], sums[1] and writes the gradient.
   void run(int64_t begin, int64_t end, double* sums) {
     const int64_t first = p_.gradient ? begin - RADIUS : begin, last = p_.gradient ? end + RADIUS : end;
-    for (int64_t r = first - RADIUS; r < first + RADIUS; ++r) take(r);
+    for (int64_t r = first - RADIUS; r < first + RADIUS; ++r) load_row(r);
     for (int64_t r = first; r < last; ++r) {
-      take(r + RADIUS);
+      load_row(r + RADIUS);
       const bool inside = r >= 0 && r < p_.H;
       if (inside) {
         filter_columns(r);
-        const double total = dissimilarity();
+        const double total = compute_dissimilarity();
         if (r >= begin && r < end) sums[1] += total;
       }
       if (!p_.gradient) continue;
       inside ? filter_partials(r) : clear_ring(r);
-      if (r - RADIUS >= begin) sums[0] += gradient(r - RADIUS);
+      if (r - RADIUS >= begin) sums[0] += write_gradient(r - RADIUS);
     }
     if (!p_.gradient)
-      for (int64_t r = begin; r < end; ++r) sums[0] += difference(r);
+      for (int64_t r = begin; r < end; ++r) sums[0] += sum_difference(r);
   }
 
  private:
   // s and d of row r into the ring of rows; outside of the picture x = y = 0.
-  void take(int64_t r) {
+  void load_row(int64_t r) {
     const int slot = static_cast<int>((r % TAPS + TAPS) % TAPS);
     float *s = s_.pixels(0, slot), *d = s_.pixels(1, slot);
     if (r < 0 || r >= p_.H) {
@@ -106,9 +106,9 @@ class Band {
     }
     float *ms = s_.filtered(0), *md = s_.filtered(1), *ss = s_.filtered(2), *dd = s_.filtered(3);
     for (int64_t i = 0; i < p_.row; i += LANES) {
-      V a = all(0.f), b = a, e = a, f = a;
+      Vec a = broadcast(0.f), b = a, e = a, f = a;
       for (int t = 0; t < TAPS; ++t) {
-        const V w = all(window_.w[t]), u = load(s[t] + i), v = load(d[t] + i), wu = w * u, wv = w * v;
+        const Vec w = broadcast(window_.w[t]), u = load(s[t] + i), v = load(d[t] + i), wu = w * u, wv = w * v;
         a = a + wu;
         b = b + wv;
         e = fma(wu, u, e);
@@ -127,28 +127,28 @@ class Band {
     }
   }
 
-  static V across(const float* row, const float* w) {
-    V a = all(w[RADIUS]) * load(row);
-    for (int t = 1; t <= RADIUS; ++t) a = fma(all(w[RADIUS + t]), load(row - 3 * t) + load(row + 3 * t), a);
+  static Vec filter_row(const float* row, const float* w) {
+    Vec a = broadcast(w[RADIUS]) * load(row);
+    for (int t = 1; t <= RADIUS; ++t) a = fma(broadcast(w[RADIUS + t]), load(row - 3 * t) + load(row + 3 * t), a);
     return a;
   }
 
   // The horizontal half: 1 - S summed over the row, and P, Q, R.
-  double dissimilarity() {
+  double compute_dissimilarity() {
     const float *m0 = s_.filtered(0), *m1 = s_.filtered(1), *m2 = s_.filtered(2), *m3 = s_.filtered(3);
     float *P = s_.partial(0), *Q = s_.partial(1), *R = s_.partial(2);
-    const V half = all(0.5f), two = all(2.f), one = all(1.f);
+    const Vec half = broadcast(0.5f), two = broadcast(2.f), one = broadcast(1.f);
     double total = 0;
-    V sums = all(0.f);
+    Vec sums = broadcast(0.f);
     for (int64_t i = 0; i < p_.row; i += LANES) {
-      const V ms = across(m0 + i, window_.w), md = across(m1 + i, window_.w), m = ms + one;
-      const V vd = across(m3 + i, window_.w) - md * md, vs = across(m2 + i, window_.w) - ms * ms;
-      const V B1 = fma(half, fma(m, m, md * md), all(C1)), B2 = fma(half, vs + vd, all(C2));
-      const V inverse = one / (B1 * B2), by1 = B2 * inverse, by2 = B1 * inverse;
-      const V p = md * md * by1, q = vd * by2, S = fma(p, one - q, q);  // 1 - S of the formula
+      const Vec ms = filter_row(m0 + i, window_.w), md = filter_row(m1 + i, window_.w), m = ms + one;
+      const Vec vd = filter_row(m3 + i, window_.w) - md * md, vs = filter_row(m2 + i, window_.w) - ms * ms;
+      const Vec B1 = fma(half, fma(m, m, md * md), broadcast(C1)), B2 = fma(half, vs + vd, broadcast(C2));
+      const Vec inverse = one / (B1 * B2), by1 = B2 * inverse, by2 = B1 * inverse;
+      const Vec p = md * md * by1, q = vd * by2, S = fma(p, one - q, q);  // 1 - S of the formula
       if (p_.gradient) {
-        const V a = (one - p) * by2, b = (one - q) * by1, aq = a * q, r = a * (two - q);
-        store(P + i, fma(m * b, p, fma(md, r - b * (two - p), all(0.f) - ms * aq)));
+        const Vec a = (one - p) * by2, b = (one - q) * by1, aq = a * q, r = a * (two - q);
+        store(P + i, fma(m * b, p, fma(md, r - b * (two - p), broadcast(0.f) - ms * aq)));
         store(Q + i, aq);
         store(R + i, r);
       }
@@ -170,7 +170,7 @@ class Band {
       std::fill(row - EDGE, row, 0.f);
       std::fill(row + p_.row, row + p_.row + EDGE, 0.f);
       float* out = s_.ring(map, r);
-      for (int64_t i = 0; i < p_.row; i += LANES) store(out + i, across(row + i, window_.w));
+      for (int64_t i = 0; i < p_.row; i += LANES) store(out + i, filter_row(row + i, window_.w));
     }
   }
 
@@ -179,7 +179,7 @@ class Band {
   }
 
   // The vertical half around row r, and the gradient of both terms there. Returns the row's sum of |x - y|.
-  double gradient(int64_t r) {
+  double write_gradient(int64_t r) {
     const float* map[3][TAPS];
     for (int m = 0; m < 3; ++m)
       for (int t = 0; t < TAPS; ++t) map[m][t] = s_.ring(m, r + t - RADIUS);
@@ -188,23 +188,23 @@ class Band {
     const double n = static_cast<double>(p_.H) * p_.row;
     const float by_l1 = static_cast<float>(p_.weight_l1 / n), by_ssim = static_cast<float>(-p_.weight_ssim / n);
     double total = 0;
-    V sums = all(0.f);
+    Vec sums = broadcast(0.f);
     for (int64_t i = 0; i < p_.row; i += LANES) {
-      V g[3];
+      Vec g[3];
       for (int m = 0; m < 3; ++m) {
-        V a = all(0.f);
-        for (int t = 0; t < TAPS; ++t) a = fma(all(window_.w[t]), load(map[m][t] + i), a);
+        Vec a = broadcast(0.f);
+        for (int t = 0; t < TAPS; ++t) a = fma(broadcast(window_.w[t]), load(map[m][t] + i), a);
         g[m] = a;
       }
       const int64_t left = p_.row - i;
       float tx[LANES] = {}, ty[LANES] = {};
       if (left < LANES) std::copy(x + i, x + p_.row, tx), std::copy(y + i, y + p_.row, ty);
-      const V u = left < LANES ? load(tx) : load(x + i), v = left < LANES ? load(ty) : load(y + i);
-      const V d = u - v, zero = all(0.f);
-      const V sign = greater(d, zero, all(by_l1), greater(zero, d, all(-by_l1), zero));
-      const V slope = fma(u + v - all(1.f), g[1], g[0] - d * g[2]);
-      const V full = fma(all(by_ssim), slope, sign);
-      const V distance = max(d, zero - d);
+      const Vec u = left < LANES ? load(tx) : load(x + i), v = left < LANES ? load(ty) : load(y + i);
+      const Vec d = u - v, zero = broadcast(0.f);
+      const Vec sign = select_greater(d, zero, broadcast(by_l1), select_greater(zero, d, broadcast(-by_l1), zero));
+      const Vec slope = fma(u + v - broadcast(1.f), g[1], g[0] - d * g[2]);
+      const Vec full = fma(broadcast(by_ssim), slope, sign);
+      const Vec distance = max(d, zero - d);
       if (left < LANES) {
         store(tx, full), store(ty, distance);
         for (int64_t t = 0; t < left; ++t) out[i + t] = tx[t], total += ty[t];
@@ -216,7 +216,7 @@ class Band {
     return total + sum(sums);
   }
 
-  double difference(int64_t r) const {
+  double sum_difference(int64_t r) const {
     double total = 0;
     for (int64_t i = r * p_.row; i < (r + 1) * p_.row; ++i) total += std::fabs(p_.x[i] - p_.y[i]);
     return total;
@@ -232,7 +232,7 @@ class Band {
 // out[0] = mean |x - y|, out[1] = 1 - mean SSIM; gradient (may be null) = d (weight_l1 out[0] + weight_ssim out[1]) / dx.
 // Returns 1 where memory ran out.
 SE_EXPORT int32_t se_photometric_loss(const float* x, const float* y, int64_t H, int64_t W, float weight_l1, float weight_ssim, int threads,
-                             float* gradient, double* out) {
+                                      float* gradient, double* out) {
   return run_guarded([&] {
     const Picture picture{x, y, H, 3 * W, weight_l1, weight_ssim, gradient};
     const int64_t bands = (H + BAND - 1) / BAND;
@@ -240,10 +240,10 @@ SE_EXPORT int32_t se_photometric_loss(const float* x, const float* y, int64_t H,
     parallel_for(H, BAND, threads, [&](int64_t begin, int64_t end, int) {
       Scratch scratch(picture.row);
       Band(picture, scratch).run(begin, end, &sums[2 * (begin / BAND)]);
-  });
-  out[0] = out[1] = 0;
-  for (int64_t b = 0; b < bands; ++b) out[0] += sums[2 * b], out[1] += sums[2 * b + 1];
-  const double n = static_cast<double>(H) * 3 * W;
-  out[0] /= n, out[1] /= n;
+    });
+    out[0] = out[1] = 0;
+    for (int64_t b = 0; b < bands; ++b) out[0] += sums[2 * b], out[1] += sums[2 * b + 1];
+    const double n = static_cast<double>(H) * 3 * W;
+    out[0] /= n, out[1] /= n;
   });
 }

@@ -9,7 +9,7 @@
 namespace {
 constexpr int64_t kGrain = 8192;
 
-inline double total(const double* lanes) {
+inline double sum_lanes(const double* lanes) {
   return ((lanes[0] + lanes[1]) + (lanes[2] + lanes[3])) + ((lanes[4] + lanes[5]) + (lanes[6] + lanes[7]));
 }
 }  // namespace
@@ -22,7 +22,7 @@ SE_EXPORT void se_volume_forward(const float* scales, int64_t count, double* par
   se::parallel_for(count, kGrain, threads, [&](int64_t begin, int64_t end, int) {
     double lanes[8] = {};
     for (int64_t i = begin; i < end; ++i) lanes[i % 8] += scales[3 * i] * scales[3 * i + 1] * scales[3 * i + 2];
-    partial[begin / kGrain] = total(lanes);
+    partial[begin / kGrain] = sum_lanes(lanes);
   });
 }
 
@@ -46,7 +46,7 @@ SE_EXPORT void se_hinge_forward(const float* raw, int64_t count, float tau, doub
     for (; i + 8 <= end; i += 8)
       for (int j = 0; j < 8; ++j) lanes[j] += std::max(tau - raw[i + j], 0.f);
     for (; i < end; ++i) lanes[0] += std::max(tau - raw[i], 0.f);
-    partial[begin / kGrain] = total(lanes);
+    partial[begin / kGrain] = sum_lanes(lanes);
   });
 }
 
