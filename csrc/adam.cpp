@@ -1,10 +1,10 @@
-// Adam (Kingma and Ba 2015) over many tensors in one call and one pass over memory, bit for bit as PyTorch's fused Adam with AVX2 or
-// AVX-512 computes it, so that a training may go on with either.
+// Adam (Kingma and Ba 2015) over many tensors in one call and one pass over memory. The result equals PyTorch's
+// fused Adam (AVX2, AVX-512) bit for bit, so a training can continue with either.
 //
 //   m += (1 - beta1) (g - m),  v = beta2 v + (1 - beta2) g g,  p -= step_size m / (sqrt(v) / root + eps)
 //
-// step_size is the learning rate over 1 - beta1^t, root is sqrt(1 - beta2^t). With `rows`, only those rows move; the others keep their
-// value and moments.
+// step_size is the learning rate / (1 - beta1^t) and root is sqrt(1 - beta2^t). With `rows`, only these rows are
+// updated; the others keep their values and moments.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -16,33 +16,12 @@
 namespace se {
 namespace {
 
-constexpr int64_t kGrain = 32768;  // elements a worker takes at a time: 900 kB of traffic, long beside the claim of a chunk
-constexpr int64_t kAhead = 8;      // rows that are on their way from memory while one is worked on
+constexpr int64_t kGrain = 32768;  // elements per chunk: 900 kB of memory traffic, long compared to claiming a chunk
+constexpr int64_t kAhead = 8;      // prefetch distance in rows
 
 struct Constants {
   float rate1, beta2, rate2, eps, step_size, root;  // rates: 1 - beta
 };
-
-// The first n < LANES floats at p, the others zero; and the way back.
-inline Vec load_part(const float* p, int64_t n) {
-#if defined(__AVX512F__)
-  return {_mm512_maskz_loadu_ps(static_cast<__mmask16>((1u << n) - 1), p)};
-#else
-  float x[LANES] = {};
-  for (int64_t j = 0; j < n; ++j) x[j] = p[j];
-  return load(x);
-#endif
-}
-
-inline void store_some(float* p, Vec a, int64_t n) {
-#if defined(__AVX512F__)
-  _mm512_mask_storeu_ps(p, static_cast<__mmask16>((1u << n) - 1), a.v);
-#else
-  float x[LANES];
-  store(x, a);
-  for (int64_t j = 0; j < n; ++j) p[j] = x[j];
-#endif
-}
 
 void update_span(const Constants& c, const SeAdamTensor& t, int64_t begin, int64_t end) {
   const Vec rate1 = broadcast(c.rate1), beta2 = broadcast(c.beta2), rate2 = broadcast(c.rate2), eps = broadcast(c.eps),
@@ -56,17 +35,17 @@ void update_span(const Constants& c, const SeAdamTensor& t, int64_t begin, int64
     store(t.second + i, second);
     store(t.value + i, load(t.value + i) + step * first / (square_root(second) / root + eps));
   }
-  if (t.rows && i < end) {  // the rest of a row, which ends everywhere: one register
-    const int64_t n = end - i;
+  if (t.rows && i < end) {  // the tail of a row may end at the end of memory: one partial register
+    const int n = static_cast<int>(end - i);
     const Vec g = load_part(t.gradient + i, n), old = load_part(t.first + i, n);
     const Vec first = fma(rate1, g - old, old);
     const Vec second = fma(rate2 * g, g, load_part(t.second + i, n) * beta2);
-    store_some(t.first + i, first, n);
-    store_some(t.second + i, second, n);
-    store_some(t.value + i, load_part(t.value + i, n) + step * first / (square_root(second) / root + eps), n);
+    store_part(t.first + i, first, n);
+    store_part(t.second + i, second, n);
+    store_part(t.value + i, load_part(t.value + i, n) + step * first / (square_root(second) / root + eps), n);
     return;
   }
-  // PyTorch's kernel works eight by eight; in what is left after that, its compiler fuses the other product.
+  // PyTorch's kernel computes eight elements at a time. In its scalar tail the compiler fuses the other product.
   const int64_t eights = begin + (end - begin) / 8 * 8;
   for (; i < end; ++i) {
     const float g = t.gradient[i], scaled = c.rate2 * g;
@@ -85,7 +64,7 @@ inline void prefetch_row(const SeAdamTensor& t, int64_t row) {
   }
 }
 
-// Neighbouring rows are one span, so that short rows do not end in a rest each.
+// Adjacent rows form one span, so that short rows have no tail each.
 void update_rows(const Constants& c, const SeAdamTensor& t, int64_t begin, int64_t end) {
   while (begin < end) {
     int64_t last = begin + 1;
@@ -103,7 +82,6 @@ int64_t count_chunks(const SeAdamTensor& t) { return (t.count + chunk_size(t) - 
 }  // namespace
 }  // namespace se
 
-// tensors [n]; where `rows` is given, each row at most once and inside of the tensor.
 SE_EXPORT void se_adam_step(const SeAdamTensor* tensors, int64_t count, double beta1, double beta2, double eps, int32_t threads) {
   int64_t total = 0;
   for (int64_t i = 0; i < count; ++i) total += se::count_chunks(tensors[i]);

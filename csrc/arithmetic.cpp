@@ -1,5 +1,5 @@
-// What this processor can do at most: a loop of multiply-adds that waits for nothing, through the pool that broadcast native work goes
-// through.
+// Arithmetic peak of this processor: a loop of independent multiply-adds, run by the thread pool of all native
+// work.
 #include <algorithm>
 #include <atomic>
 
@@ -10,10 +10,10 @@
 namespace se {
 namespace {
 
-constexpr int64_t kRounds = 4096;  // of a chunk: some tens of microseconds
+constexpr int64_t kRounds = 4096;  // per chunk: some tens of microseconds
 constexpr int kChains = 12;        // independent sums: more than latency times units, fewer than registers
 
-// The compiler may not shorten this: floats are not reassociated here, and every chain starts elsewhere.
+// The compiler cannot simplify this loop: it may not reassociate floats, and every chain has its own start.
 float run_chunk(float start) {
   const Vec a = broadcast(0.999f), b = broadcast(0.001f);
   Vec s0 = broadcast(start), s1 = broadcast(start + 1), s2 = broadcast(start + 2), s3 = broadcast(start + 3), s4 = broadcast(start + 4),
@@ -30,12 +30,11 @@ float run_chunk(float start) {
 }  // namespace
 }  // namespace se
 
-// Runs `chunks` chunks of multiply-adds on at most `threads` workers. Returns how many multiply-adds of single floats that were.
 SE_EXPORT double se_benchmark_multiply_adds(int64_t chunks, int32_t threads) {
   std::atomic<int> strange{0};
   se::parallel_for(chunks, 1, threads, [&](int64_t begin, int64_t end, int) {
     for (int64_t c = begin; c < end; ++c)
-      if (!(se::run_chunk(static_cast<float>(c)) > 0)) strange.fetch_add(1);  // never; keeps the sums from being left out
+      if (!(se::run_chunk(static_cast<float>(c)) > 0)) strange.fetch_add(1);  // never true; keeps the compiler from removing the loop
   });
   return static_cast<double>(chunks - strange.load()) * se::kRounds * se::kChains * se::LANES;
 }

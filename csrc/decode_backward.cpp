@@ -1,4 +1,4 @@
-// Backward pass of the fused decode. Hidden layers are computed again instead of stored. See decode.h.
+// Backward pass of the fused decode. It recomputes hidden layers instead of storing them. See decode.h.
 #include <algorithm>
 #include <memory>
 
@@ -12,10 +12,10 @@ namespace {
 
 using namespace se;
 
-// Where the parts of one partial sum of weight gradients start, in floats.
+// Offsets of the parts of one partial sum of weight gradients, in floats.
 struct Layout {
   struct Expert {
-    int64_t w1t, wm, bm, w2, b2;  // [inputs][Hp] (with the bias as an input), [L][H][Hp], [L][Hp], [out][Hp], [Op]; rows rounded up to 16
+    int64_t w1t, wm, bm, w2, b2;  // [inputs][Hp] with the bias as an input, [L][H][Hp], [L][Hp], [out][Hp], [Op]; rows padded to 16
   };
   std::vector<Expert> experts[3];
   int64_t router = 0, router_b = 0, total = 0;  // [R][routerp], [Rp]
@@ -36,7 +36,7 @@ struct Layout {
   }
 };
 
-// to[j] += sum over n rows of rows[i][j]
+// Add the sum of n rows: to[j] += sum_i rows[i][j].
 void add_rows(int n, int width, const float* rows, int stride, float* to) {
   for (int j = 0; j < width; j += LANES) {
     Vec even = load(to + j), odd = broadcast(0.f);
@@ -78,7 +78,7 @@ class Backward {
     if (head.router_w) differentiate_routing(d_, s_, chunk, i, w_);
   }
 
-  // One expert on a block of its anchors.
+  // Differentiate one expert on a block of its anchors.
   void differentiate_block(int i, const Group& g, int from, int n) {
     const Head& head = d_.heads[i];
     const Packed::Expert& expert = packed_.experts[i][g.expert];
@@ -114,12 +114,13 @@ class Backward {
     accumulate(n, s_.inputs[i], Hp, w_.block, s_.Z, dh, Hp, sums_ + at.w1t, Hp);
     int rows[BLOCK + SLACK];
     std::copy_n(anchor, n, rows);
-    std::fill_n(rows + n, SLACK, CHUNK);  // a row that nobody reads
+    std::fill_n(rows + n, SLACK, CHUNK);  // a row that is never read
     multiply(n, s_.Fp, H, dh, Hp, expert.w1.data(), s_.Fp, nullptr, AddToRows{w_.feature, s_.Fp, rows});
   }
 
-  // Gradients of one expert's outputs before their activation (covariance: not weighted yet), and <gradient, outputs> for the mixture's
-  // weights (covariance: the bias's part of it).
+  // Compute the gradients of one expert's outputs before their activation (covariance: before the mixture weight
+  // is applied) and <gradient, outputs> for the gradient of the mixture weights (covariance: only the bias's
+  // part).
   void compute_output_gradients(int i, int n, const int* anchor, const int* place, const float* weight, const float* bias, const float* y,
                                 float* dy) {
     const int Op = s_.Op[i];
@@ -149,7 +150,8 @@ class Backward {
     for (int j = 0; j < n; j += LANES) store(dh + j, select_greater(load(h + j), broadcast(0.f), load(dh + j), broadcast(0.f)));
   }
 
-  // The covariance is linear, so that <dy, y> = <dh, h> + <dy, b2>: its outputs need not be computed again. Then the weights go in.
+  // The covariance head is linear, so <dy, y> = <dh, h> + <dy, b2> and its outputs need not be recomputed. Then
+  // apply the mixture weights.
   void apply_weights(int n, int Hp, int Op, const int* place, const float* weight, float* h, float* dh, const float* dy, float* b2) {
     for (int t = 0; t < n; ++t, h += Hp, dh += Hp) {
       const Vec share = broadcast(weight[t]);
@@ -186,7 +188,7 @@ class Backward {
   std::vector<Group> found_;
 };
 
-// One expert's gradients in the order of its tensors.
+// Write one expert's gradients in the layout of its tensors.
 void write_expert(const Decode& d, const Sizes& s, const Layout::Expert& at, const float* sums, int i, int e) {
   const Head& head = d.heads[i];
   const int H = s.H[i], Hp = s.Hp[i], out = s.out[i], D = s.F + 3 + static_cast<int>(head.distance);
@@ -218,7 +220,7 @@ void write_routers(const Decode& d, const Sizes& s, const Layout& layout, const 
   }
 }
 
-// Memory for that many floats, kept from call to call: made anew it would cost its page faults each time.
+// Memory for `floats` floats, kept from call to call: new memory would cost page faults every time.
 float* reserve_sums(int64_t floats) {
   static thread_local std::unique_ptr<float[]> memory;
   static thread_local int64_t size = 0;
@@ -233,7 +235,6 @@ float* reserve_sums(int64_t floats) {
 
 }  // namespace
 
-// Gradients of the table's rows and of broadcast weights.
 SE_EXPORT int32_t se_decode_backward(const Decode* decode) {
   return run_guarded([&] {
     const Decode& d = *decode;

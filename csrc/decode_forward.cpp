@@ -1,4 +1,5 @@
-// Forward pass of the fused decode: routing and opacities first, which say how many Gaussians there are; then the rest. See decode.h.
+// Forward pass of the fused decode. se_decode_begin computes routing and opacities, which give the number of
+// Gaussians; se_decode_emit computes the rest. See decode.h.
 #include <algorithm>
 
 #include "decode.h"
@@ -11,7 +12,7 @@ namespace {
 
 using namespace se;
 
-// Activated, mixed outputs of one head, [n][Op].
+// Compute the activated, mixed outputs of one head, [n][Op].
 void decode_head(const Decode& d, const Sizes& s, const Packed& packed, const Chunk& chunk, int i, std::vector<Group>& found, Work& w) {
   const Head& head = d.heads[i];
   const int Op = s.Op[i];
@@ -42,7 +43,8 @@ void decode_head(const Decode& d, const Sizes& s, const Packed& packed, const Ch
   }
 }
 
-// Calls f(sizes, packed weights, chunk, room to work in) for each chunk of anchors, on broadcast threads; returns 1 where memory ran out.
+// Call f(sizes, packed weights, chunk, workspace) for each chunk of anchors, on all threads. Return 1 if memory
+// runs out.
 template <class F>
 int for_each_chunk(const Decode& d, F&& f) {
   return run_guarded([&] {
@@ -57,9 +59,6 @@ int for_each_chunk(const Decode& d, F&& f) {
 
 }  // namespace
 
-// The exported functions return 1 where memory ran out.
-
-// Routing and raw opacities of broadcast anchors. Fills starts; the last is the number of Gaussians with positive opacity.
 SE_EXPORT int32_t se_decode_begin(const Decode* decode) {
   const Decode& d = *decode;
   const int code = for_each_chunk(d, [&](const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {
@@ -75,13 +74,12 @@ SE_EXPORT int32_t se_decode_begin(const Decode* decode) {
     }
     d.starts[chunk.begin / CHUNK + 1] = drawn;
   });
-  if (code) return code;  // the counts are not whole
+  if (code) return code;  // the counts are incomplete
   d.starts[0] = 0;
   for (int64_t c = 0; c < count_chunks(d); ++c) d.starts[c + 1] += d.starts[c];
   return 0;
 }
 
-// Covariances and colours, and broadcast Gaussians of positive opacity in the order of anchors and slots.
 SE_EXPORT int32_t se_decode_emit(const Decode* decode) {
   const Decode& d = *decode;
   return for_each_chunk(d, [&](const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {
@@ -96,7 +94,6 @@ SE_EXPORT int32_t se_decode_emit(const Decode* decode) {
   });
 }
 
-// Gates, chosen experts and their weights of broadcast anchors.
 SE_EXPORT int32_t se_decode_route(const Decode* decode) {
   const Decode& d = *decode;
   return for_each_chunk(d, [&](const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {

@@ -1,4 +1,4 @@
-// From mixed outputs to Gaussians and back: a mean, a scale, a quaternion and a colour at a time. See decode.h.
+// From mixed outputs to Gaussians and back, one mean, scale, quaternion and colour at a time. See decode.h.
 #include <algorithm>
 #include <cmath>
 
@@ -48,7 +48,8 @@ void clear_rows(const Decode& d, int64_t from, int64_t to) {
   std::fill(d.d_offsets + from * d.K * 3, d.d_offsets + to * d.K * 3, 0.f);
 }
 
-// Rows of the table between this anchor's and the one before it, and after the last: nobody else writes them.
+// Clear the rows of the table between the previous anchor and this one, and those after the last anchor. No
+// other worker writes them.
 void clear_gap(const Decode& d, int64_t anchor) {
   clear_rows(d, anchor ? d.rows[anchor - 1] + 1 : 0, d.rows[anchor]);
   if (anchor == d.A - 1) clear_rows(d, d.rows[anchor] + 1, d.N);
@@ -79,7 +80,7 @@ void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk
       zero_row(color, s.Op[2]);
       const float* offsets = d.offsets + row * K * 3;
       for_each_drawn(w, K, a, [&](int slot) {
-        if (d.d_opacities) {  // not added to what was just stored: a load behind a wider masked store waits long
+        if (d.d_opacities) {  // not added to the value just stored: a load after a wider masked store stalls
           const float g = d.d_opacities[at] + (d_raw ? d_raw[slot] : 0.f);
           opacity[slot] = has_one_expert(d.heads[0]) ? g * (1.f - raw[slot] * raw[slot]) : g;
         }
@@ -96,7 +97,7 @@ void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk
         if (d.d_quats) {
           const F32x4 q = load4(d.quats + 4 * at), g = load4(d.d_quats + 4 * at);
           const float per_length = d.per_length[at];
-          // A length below 1e-12 was replaced by it, a constant.
+          // Lengths below 1e-12 are replaced by this constant, which has no gradient.
           const float along = per_length < 1e12f ? dot(q, g) : 0.f;
           store4(cov + COV * slot + 3, broadcast4(per_length) * (g - broadcast4(along) * q));
         }

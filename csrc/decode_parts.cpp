@@ -1,4 +1,4 @@
-// The parts of the fused decode that its forward and backward pass share. See decode.h.
+// Parts of the fused decode that the forward and the backward pass share. See decode.h.
 #include <algorithm>
 #include <cmath>
 

@@ -1,4 +1,4 @@
-// Gates, chosen experts and their weights, and the way back. See decode.h.
+// Gates, chosen experts and their mixture weights, and their gradients. See decode.h.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -9,7 +9,7 @@
 namespace se {
 namespace {
 
-// Softmax over `count` rows of CHUNK lanes each, in place.
+// Softmax over `count` rows of CHUNK lanes, in place.
 void softmax(float* rows, int count, int n) {
   for (int a = 0; a < n; a += LANES) {
     Vec largest = load(rows + a), total = broadcast(0.f);
@@ -24,7 +24,8 @@ void softmax(float* rows, int count, int n) {
   }
 }
 
-// The k largest of E rows of logits: their values and their places (as floats), largest first, ties to the lowest place. Spoils `logits`.
+// Find the k largest of E rows of logits: their values and their indices (as floats), largest first. Ties go to
+// the lowest index. Overwrites `logits`.
 void choose(float* logits, int E, int k, int n, float* values, float* places) {
   for (int a = 0; a < n; a += LANES)
     for (int r = 0; r < k; ++r) {
@@ -48,7 +49,7 @@ void choose(float* logits, int E, int k, int n, float* values, float* places) {
 
 void route(const Decode& d, const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {
   if (!s.R) return;
-  float* across = w.logits + int64_t(CHUNK + SLACK) * s.Rp;  // [R][CHUNK]: anchors along the lanes
+  float* across = w.logits + int64_t(CHUNK + SLACK) * s.Rp;  // [R][CHUNK], transposed: anchors along the lanes
   multiply(chunk.n, s.Rp, s.router, w.z, s.Z, packed.router_t.data(), s.Rp, packed.router_b.data(), Store{w.logits, s.Rp});
   for (int r = 0; r < s.R; ++r)
     for (int a = 0; a < chunk.n; ++a) across[r * CHUNK + a] = w.logits[a * s.Rp + r];
@@ -82,7 +83,7 @@ void differentiate_routing(const Decode& d, const Sizes& s, const Chunk& chunk, 
   const bool dense = k == 0 && E > 1;
   for (int a = 0; a < chunk.n; ++a) {
     const int64_t anchor = chunk.begin + a;
-    float* to = w.logits + int64_t(a) * s.Rp + s.first[i];  // nothing else writes here
+    float* to = w.logits + int64_t(a) * s.Rp + s.first[i];  // no other worker writes here
     const float* own = w.weights + int64_t(a) * shares;
     const float *gates = head.gates + anchor * E, *direct = head.d_gates ? head.d_gates + anchor * E : nullptr;
     float mean = 0;

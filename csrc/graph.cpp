@@ -1,6 +1,6 @@
-// What a point learns from its neighbours in a graph (scene/graph/network.py has the definition), and a multi-resolution hash grid
-// (scene/graph/hash_grid.py), forward and backward. Every output row, or every level of the grid, belongs to one worker, which adds in a
-// fixed order: the bits do not depend on the number of threads.
+// Features of graph points blended with their neighbours' (scene/graph/network.py) and a multi-resolution hash
+// grid (scene/graph/hash_grid.py), forward and backward. One worker owns each output row, or each level of the
+// grid, and adds in a fixed order, so the number of threads does not change a bit.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -9,13 +9,13 @@
 #include "se_api.h"
 
 namespace {
-constexpr int64_t kRows = 256, kPlaces = 512;  // what a worker takes at a time
+constexpr int64_t kRows = 256, kPlaces = 512;  // per chunk
 constexpr uint32_t kPrimeY = 2654435761u, kPrimeZ = 805459861u;
 
 struct Edges {
   const int64_t* found;  // [A, k], -1: no neighbour
   const float* weight;   // [A, k]
-  const int32_t* start;  // [A + 1]: where the list of those who know a point begins
+  const int32_t* start;  // [A + 1]: begin of the list of edges that lead to a point
   const int32_t* known;  // edges u k + j that lead to it, ascending
   int64_t k;
 };
@@ -25,7 +25,7 @@ struct Level {
   bool dense;
 };
 
-// Table rows and weights of the eight corners around a place; z changes fastest.
+// Table rows and weights of the eight corners around a point; z changes fastest.
 inline void find_corners(const float* unit, const Level& level, int32_t row[8], float weight[8]) {
   int64_t at[3];
   float share[3][2];
@@ -50,7 +50,7 @@ inline void find_corners(const float* unit, const Level& level, int32_t row[8], 
   for (int i = 0; i < 8; ++i) weight[i] = share[0][i >> 2] * share[1][(i >> 1) & 1] * share[2][i & 1];
 }
 
-// One level for places [begin, end): C features a row, or `features` of them where C is 0.
+// One level for points [begin, end) with C features per row, or `features` if C is 0.
 template <int C>
 void blend_level(const Level& level, const float* table, const float* unit, int64_t begin, int64_t end, int64_t stride, int64_t features,
                  float* out) {
@@ -89,7 +89,6 @@ inline Level describe_level(const int64_t* cells, const int64_t* rows, int64_t l
 }
 }  // namespace
 
-// found [A, k] -> start [A + 1], known [start[A]] (room for A k): the graph the other way round.
 SE_EXPORT void se_graph_reverse(const int64_t* found, int64_t A, int64_t k, int32_t* start, int32_t* known) {
   std::fill(start, start + A + 1, 0);
   for (int64_t e = 0; e < A * k; ++e)
@@ -97,18 +96,17 @@ SE_EXPORT void se_graph_reverse(const int64_t* found, int64_t A, int64_t k, int3
   for (int64_t v = 0; v < A; ++v) start[v + 1] += start[v];
   for (int64_t e = 0; e < A * k; ++e)
     if (found[e] >= 0) known[start[found[e]]++] = static_cast<int32_t>(e);
-  for (int64_t v = A; v > 0; --v) start[v] = start[v - 1];  // each now stands at the next one's begin
+  for (int64_t v = A; v > 0; --v) start[v] = start[v - 1];  // each start is now the begin of the next point's list: shift by one
   start[0] = 0;
 }
 
-// feature [A, F] -> least [A, F], the element-wise minimum over those who know a point, and out = f_u + share sum_v w_uv (f_v - least_v).
 SE_EXPORT void se_graph_forward(const float* feature, const int64_t* found, const float* weight, const int32_t* start, const int32_t* known,
                                 int64_t A, int64_t k, int64_t F, float share, float* least, float* out, int32_t threads) {
   const Edges e{found, weight, start, known, k};
   se::parallel_for(A, kRows, threads, [&](int64_t begin, int64_t end, int) {
     for (int64_t v = begin; v < end; ++v) {
       float* to = least + v * F;
-      for (int64_t c = 0; c < F; ++c) to[c] = feature[v * F + c];  // a point knows itself
+      for (int64_t c = 0; c < F; ++c) to[c] = feature[v * F + c];  // every point counts as its own neighbour
       for (int32_t i = e.start[v]; i < e.start[v + 1]; ++i) {
         const float* f = feature + e.known[i] / e.k * F;
         for (int64_t c = 0; c < F; ++c) to[c] = std::min(to[c], f[c]);
@@ -129,8 +127,6 @@ SE_EXPORT void se_graph_forward(const float* feature, const int64_t* found, cons
   });
 }
 
-// grad [A, F] of out -> gradient [A, F] of feature; h, shared [A, F]: room for the gradients of the differences and of each minimum's
-// holders.
 SE_EXPORT void se_graph_backward(const float* feature, const float* least, const float* grad, const int64_t* found, const float* weight,
                                  const int32_t* start, const int32_t* known, int64_t A, int64_t k, int64_t F, float share, float* h,
                                  float* shared, float* out, int32_t threads) {
@@ -167,11 +163,10 @@ SE_EXPORT void se_graph_backward(const float* feature, const float* least, const
   });
 }
 
-// table [rows of all levels, features], unit [A, 3], cells and rows [levels] -> out [A, levels, features].
 SE_EXPORT void se_grid_forward(const float* table, const float* unit, const int64_t* cells, const int64_t* rows, int64_t A, int64_t levels,
                                int64_t features, float* out, int32_t threads) {
   se::parallel_for(A, kPlaces, threads, [&](int64_t begin, int64_t end, int) {
-    for (int64_t l = 0; l < levels; ++l) {  // level by level, so that its part of the table stays near
+    for (int64_t l = 0; l < levels; ++l) {  // level by level, so that its part of the table stays in the cache
       const Level level = describe_level(cells, rows, l);
       const auto run = features == 2 ? blend_level<2> : blend_level<0>;
       run(level, table + level.first * features, unit, begin, end, levels * features, features, out + l * features);
@@ -179,7 +174,6 @@ SE_EXPORT void se_grid_forward(const float* table, const float* unit, const int6
   });
 }
 
-// grad [A, levels, features] -> added to out [rows of all levels, features], which comes as zeros; a level is one worker's.
 SE_EXPORT void se_grid_backward(const float* unit, const float* grad, const int64_t* cells, const int64_t* rows, int64_t A, int64_t levels,
                                 int64_t features, float* out, int32_t threads) {
   se::parallel_for(levels, 1, threads, [&](int64_t begin, int64_t end, int) {

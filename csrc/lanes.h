@@ -1,5 +1,5 @@
-// LANES floats at once: one register of the instruction set this library is built for, with the elementary functions that the
-// fused loss and the fused decode need. Everything is inline and the symbols stay inside one shared library, one per instruction set.
+// Vec: LANES floats in one register of the instruction set of this build, with the elementary functions of the
+// fused loss and the fused decode. All functions are inline; their symbols stay inside the shared library.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -23,7 +23,8 @@ inline Vec operator-(Vec a, Vec b) { return {_mm512_sub_ps(a.v, b.v)}; }
 inline Vec operator*(Vec a, Vec b) { return {_mm512_mul_ps(a.v, b.v)}; }
 inline Vec operator/(Vec a, Vec b) { return {_mm512_div_ps(a.v, b.v)}; }
 inline Vec fma(Vec a, Vec b, Vec c) { return {_mm512_fmadd_ps(a.v, b.v, c.v)}; }  // a b + c
-// The maskz forms compile to the plain instructions; GCC 12's plain forms of some warn about their own headers.
+// The maskz forms compile to the plain instructions. GCC 12 warns about its own headers for some of the plain
+// forms.
 inline Vec max(Vec a, Vec b) { return {_mm512_maskz_max_ps(0xffff, a.v, b.v)}; }
 inline Vec min(Vec a, Vec b) { return {_mm512_maskz_min_ps(0xffff, a.v, b.v)}; }
 inline Vec select_greater(Vec a, Vec b, Vec yes, Vec no) {
@@ -34,7 +35,7 @@ inline Vec load_part(const float* p, int n) { return {_mm512_maskz_loadu_ps(stat
 inline void store_part(float* p, Vec a, int n) { _mm512_mask_storeu_ps(p, static_cast<__mmask16>((1u << n) - 1), a.v); }
 inline uint32_t find_positive(Vec a) { return _mm512_cmp_ps_mask(a.v, _mm512_setzero_ps(), _CMP_GT_OQ); }
 inline Vec round_to_nearest(Vec a) { return {_mm512_maskz_roundscale_ps(0xffff, a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC)}; }
-inline Vec scale_by_power_of_two(Vec a, Vec n) { return {_mm512_maskz_scalef_ps(0xffff, a.v, n.v)}; }  // n integral
+inline Vec scale_by_power_of_two(Vec a, Vec n) { return {_mm512_maskz_scalef_ps(0xffff, a.v, n.v)}; }  // n: integers
 inline float sum(Vec a) {
   const __m256 high = _mm256_castpd_ps(_mm512_maskz_extractf64x4_pd(0xf, _mm512_castps_pd(a.v), 1));
   const __m256 o = _mm256_add_ps(_mm512_castps512_ps256(a.v), high);
@@ -108,7 +109,7 @@ inline void store_part(float* p, Vec a, int n) {
 }
 inline uint32_t find_positive(Vec a) { return (a.v[0] > 0) | (a.v[1] > 0) << 1 | (a.v[2] > 0) << 2 | (a.v[3] > 0) << 3; }
 inline Vec round_to_nearest(Vec a) {
-  const F32x4 magic = {12582912.f, 12582912.f, 12582912.f, 12582912.f};  // 1.5 2^23: adding it leaves no bits below 1
+  const F32x4 magic = {12582912.f, 12582912.f, 12582912.f, 12582912.f};  // 1.5 2^23: adding it rounds to an integer
   return {(a.v + magic) - magic};
 }
 inline Vec scale_by_power_of_two(Vec a, Vec n) {
@@ -145,15 +146,18 @@ inline Vec scale_by_power_of_two(Vec a, Vec n) { return {std::ldexp(a.v, static_
 inline float sum(Vec a) { return a.v; }
 #endif
 
-// load_part and store_part touch the first n < LANES values alone, the rest is zero; positive: one bit for each lane above zero.
+// load_part and store_part access only the first n < LANES values and set the others to zero. find_positive
+// returns one bit per lane.
 
-// e^x to 2 ulp, x clamped to [-87, 87]. max and min return their second operand where one is no number, so NaN stays NaN.
+// e^x with an error of 2 ulp, x clamped to [-87, 87]. max and min return their second operand if one is NaN, so
+// NaN stays NaN.
 inline Vec exponential(Vec x) {
   x = min(broadcast(87.f), max(broadcast(-87.f), x));
   const Vec n = round_to_nearest(x * broadcast(1.44269504088896f));
   Vec r = fma(n, broadcast(-0.693145751953125f), x);
   r = fma(n, broadcast(-1.42860682e-6f), r);
-  // e^r - 1 - r over r^2 on |r| <= ln 2 / 2: weighted least squares on Chebyshev nodes, relative error of e^r 4e-9
+  // (e^r - 1 - r) / r^2 on |r| <= ln 2 / 2: weighted least squares on Chebyshev nodes, relative error of e^r
+  // 4e-9
   Vec p = fma(broadcast(0.0013751150f), r, broadcast(0.0083689876f));
   p = fma(p, r, broadcast(0.0416695438f));
   p = fma(p, r, broadcast(0.1666651815f));
@@ -163,10 +167,10 @@ inline Vec exponential(Vec x) {
 
 inline Vec sigmoid(Vec x) { return broadcast(1.f) / (broadcast(1.f) + exponential(broadcast(0.f) - x)); }
 
-// tanh with a small relative error also near 0, where its sign decides whether a Gaussian is drawn.
+// tanh with a small relative error near 0 too, where its sign decides whether a Gaussian is drawn.
 inline Vec tanh(Vec x) {
   const Vec z = x * x;
-  // tanh(x) / x - 1 over x^2 on |x| <= 0.625, fitted in the same way, relative error of tanh 2e-10
+  // (tanh(x) / x - 1) / x^2 on |x| <= 0.625, fitted in the same way, relative error of tanh 2e-10
   Vec p = fma(broadcast(0.0021428037f), z, broadcast(-0.0081770932f));
   p = fma(p, z, broadcast(0.0217005014f));
   p = fma(p, z, broadcast(-0.0539467037f));

@@ -1,6 +1,7 @@
-// Noise on the positions of explicit Gaussians (3DGS-MCMC), shaped like each Gaussian and fading with its opacity:
+// Noise on the positions of explicit Gaussians (3DGS-MCMC), shaped like each Gaussian and fading with its
+// opacity:
 //   mean += Sigma eta size sigmoid(-sharpness (opacity - faint)),  Sigma = R S S^T R^T
-// Gaussians along the lanes, CHUNK at a time; strategy/mcmc.py has the same in torch.
+// Computed for CHUNK Gaussians at a time with Gaussians along the lanes. strategy/mcmc.py has the same in torch.
 #include <cstdint>
 
 #include "lanes.h"
@@ -18,7 +19,7 @@ struct Noise {
   float size, sharpness, faint;
 };
 
-// Columns of rows of `width` values across the lanes; what lies beyond `n` repeats the last.
+// Load rows of `width` values as columns; the lanes beyond `n` repeat the last row.
 void load_columns(const float* from, int64_t begin, int n, int width, float to[][CHUNK]) {
   for (int i = 0; i < round_up(n, LANES); ++i)
     for (int k = 0; k < width; ++k) to[k][i] = from[width * (begin + (i < n ? i : n - 1)) + k];
@@ -55,7 +56,7 @@ void add_noise(const Noise& a, int64_t begin, int64_t end) {
 }  // namespace
 }  // namespace se
 
-// means [N, 3] changed in place; quats [N, 4] of any length, log_scales [N, 3], raw_opacity [N] (logits), eta [N, 3] of unit variance.
+// Quaternions may have any length; raw_opacity holds logits; eta has unit variance.
 SE_EXPORT void se_mcmc_add_noise(float* means, const float* quats, const float* log_scales, const float* raw_opacity, const float* eta,
                                  int64_t count, float size, float sharpness, float faint, int32_t threads) {
   const se::Noise noise{means, quats, log_scales, raw_opacity, eta, size, sharpness, faint};

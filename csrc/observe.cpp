@@ -1,4 +1,5 @@
-// Density statistics of one view, added to the table's counts in one pass; the sums in torch's order, so that both give the same bits.
+// Add the density statistics of one view to the table in one pass. Sums are in torch's order, so both give the
+// same bits.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -7,9 +8,10 @@
 #include "se_api.h"
 
 namespace {
-constexpr int64_t kRows = 1024, kDrawn = 8192;  // what a worker takes at a time
+constexpr int64_t kRows = 1024, kDrawn = 8192;  // per chunk
 
-// Sum of max(0, x[k]) over K < 512 values: eight lanes in four strands, strands added up, then the rest and the lanes one by one.
+// Sum of max(0, x[k]) over K < 512 values in torch's order: eight lanes in four strands, then the sum of the
+// strands, then the tail and the lanes one by one.
 float sum_positive(const float* x, int64_t K) {
   if (K < 8) {
     float part[4] = {};
@@ -28,7 +30,7 @@ float sum_positive(const float* x, int64_t K) {
 }
 }  // namespace
 
-// rows [A], each once; raw [A, K] -> visits [N], opacity [N].
+// Each row occurs at most once.
 SE_EXPORT void se_observe_rows(const int64_t* rows, const float* raw, int64_t count, int64_t K, float* visits, float* opacity,
                                int32_t threads) {
   se::parallel_for(count, kRows, threads, [&](int64_t begin, int64_t end, int) {
@@ -40,7 +42,7 @@ SE_EXPORT void se_observe_rows(const int64_t* rows, const float* raw, int64_t co
   });
 }
 
-// radii [M], gradient [M, 2], source [M], each slot once -> grad and count of the slots of what was drawn.
+// Each slot occurs at most once in `source`.
 SE_EXPORT void se_observe_drawn(const int32_t* radii, const float* gradient, const int64_t* source, int64_t count, float* grad,
                                 float* counted, int32_t threads) {
   se::parallel_for(count, kDrawn, threads, [&](int64_t begin, int64_t end, int) {

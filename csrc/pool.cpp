@@ -19,7 +19,7 @@ struct Job {
   int slots = 0;  // workers that may still join
   std::atomic<int64_t> next{0};
   std::atomic<bool> failed{false};
-  std::exception_ptr error;  // the first one thrown; the caller throws it again when everybody has left
+  std::exception_ptr error;  // the first exception thrown; the caller rethrows it after all workers have left
 
   void run_chunks(int worker) noexcept {
     try {
@@ -43,9 +43,9 @@ inline void pause() {
 #endif
 }
 
-// Waits for what another thread is about to do, without sleep: waking up takes some microseconds, and on an idle core, most of all one of a
-// virtual machine, hundreds. First with the core held, which must be short, since the other thread may need it; then giving it to whoever
-// asks, which costs others little, as long as the gaps between jobs of one frame. Returns whether it happened.
+// Spin until the condition holds or a millisecond has passed; return whether it holds. Sleeping would be slower:
+// waking up takes microseconds, and hundreds of them on an idle core of a virtual machine. For 25 us the thread
+// keeps its core; then it yields to other threads, for about as long as the gaps between the jobs of one frame.
 template <class Condition>
 bool spin_until(Condition&& condition) {
   const auto begin = std::chrono::steady_clock::now();
@@ -68,7 +68,7 @@ class Pool {
       std::lock_guard lock(mutex_);
       try {
         while (static_cast<int>(workers_.size()) < threads - 1) workers_.emplace_back([this] { run_worker(); });
-      } catch (const std::exception&) {  // no room for another: those that there are do the work
+      } catch (const std::exception&) {  // no memory for another worker: the existing ones do the work
       }
       job_ = &job;
       joined_ = 0;
@@ -80,7 +80,7 @@ class Pool {
     job.run_chunks(0);
     {
       std::lock_guard lock(mutex_);
-      job_ = nullptr;  // nobody joins from here on
+      job_ = nullptr;  // no worker joins from here on
     }
     spin_until([&] { return active_.load(std::memory_order_acquire) == 0; });
     std::unique_lock lock(mutex_);
@@ -127,7 +127,7 @@ class Pool {
   std::condition_variable wake_, idle_;
   std::vector<std::thread> workers_;
   Job* job_ = nullptr;
-  std::atomic<uint64_t> generation_ = 0;  // changed under the mutex, as all here; read without it while waiting awake
+  std::atomic<uint64_t> generation_ = 0;  // changed under the mutex like all members; read without it while spinning
   std::atomic<int> active_ = 0;
   int joined_ = 0, asleep_ = 0;
   bool stop_ = false;

@@ -1,21 +1,22 @@
-// The two small matrix products of the decode, on row-major blocks that stay in the first-level cache.
-//   multiply:     C[m][n] = (bias[n] or 0) + sum_k A[m][k] B[k][n], stored or added by Out
+// The two small matrix products of the decode, on row-major blocks that stay in the L1 cache.
+//   multiply:    C[m][n] = (bias[n] or 0) + sum_k A[m][k] B[k][n], stored or added by Out
 //   accumulate:  C[p][n] += sum_m A[m][p] B[m][n]
-// n runs along the registers and must be a multiple of 16; m is rounded up to TILE_STEP in multiply and p in accumulate, so A and C need
-// that many rows (columns of A in accumulate) of room, whose content does not matter.
+// n runs along the registers and must be a multiple of 16. m (in multiply) and p (in accumulate) are rounded up
+// to TILE_STEP, so A and C need room for that many rows (columns of A in accumulate), whose content does not
+// matter.
 #pragma once
 #include "lanes.h"
 
 namespace se {
 
 #if defined(__AVX512F__) || defined(__aarch64__)
-constexpr int TILE = 12, TILE_STEP = 4;  // TILE x 2 registers of sums, with room for the operands among 32
+constexpr int TILE = 12, TILE_STEP = 4;  // TILE x 2 registers of sums, which leaves room for the operands among 32
 #else
 constexpr int TILE = 6, TILE_STEP = 2;
 #endif
 constexpr int SLACK = TILE;
 
-// Where multiply puts C.
+// Where multiply stores C.
 struct Store {
   float* c;
   int stride;
@@ -24,10 +25,10 @@ struct Store {
 struct StoreRelu {
   float* c;
   int stride;
-  // max(0, x) in this order: NaN stays NaN
+  // The order max(0, x) keeps NaN.
   void operator()(int row, int column, Vec sum) const { store(c + row * static_cast<int64_t>(stride) + column, max(broadcast(0.f), sum)); }
 };
-struct AddToRows {  // row i is added to row index[i]; no two alike but for rows that nobody reads
+struct AddToRows {  // add row i to row index[i]; only rows that are never read may occur twice
   float* c;
   int stride;
   const int* index;
@@ -37,7 +38,8 @@ struct AddToRows {  // row i is added to row index[i]; no two alike but for rows
   }
 };
 
-// Sums of TILE rows by `wide` registers; a compile-time stride (0: given at run time) lets one pointer address broadcast rows of A.
+// Sums of `rows` rows by `wide` registers. A compile-time stride (`fixed`, 0: at run time) lets one pointer
+// address all rows of A.
 template <int rows, int wide, int fixed, class Out>
 inline void multiply_tile(const float* a, int a_stride, const float* b, int b_stride, int k, const float* bias, const Out& out, int row,
                           int column) {

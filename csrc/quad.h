@@ -1,4 +1,5 @@
-// Four floats at once: what one Gaussian's mean, scale, colour or quaternion needs on every processor. Rows of three have a zero behind.
+// F32x4: four floats, for one Gaussian's mean, scale, colour or quaternion on every processor. Rows of three
+// have a zero as the fourth.
 #pragma once
 #include <cstring>
 

@@ -1,4 +1,4 @@
-// The C interface of the rasteriser. Every call returns 0, or 1 when memory ran out.
+// The C interface of the rasteriser; see se_api.h.
 #include "raster.h"
 
 #include <algorithm>
@@ -16,7 +16,7 @@
 namespace se::raster {
 namespace {
 
-// States go back here when their graph is gone, so that the next picture finds its memory already mapped.
+// States return here when their graph is gone, so that the next image finds its memory already mapped.
 class StatePool {
  public:
   std::unique_ptr<State> acquire() {
@@ -45,7 +45,7 @@ StatePool& state_pool() {
   return *instance;
 }
 
-// Processor time of this thread where the system tells, so that a busy machine does not blur a benchmark.
+// Processor time of this thread if the system has it, so that a busy machine does not distort a benchmark.
 double thread_seconds() {
 #if defined(__unix__) || defined(__APPLE__)
   timespec t;
@@ -84,7 +84,6 @@ Inputs inputs_of(const Call& a) {
 
 }  // namespace
 
-// `state` null: nothing is kept for backward; else *state must be given to se_raster_release once.
 SE_EXPORT int32_t se_raster_forward(const SeRasterForward* a, void** state) {
   try {
     std::unique_ptr<State> s = state_pool().acquire();
@@ -114,7 +113,7 @@ SE_EXPORT int32_t se_raster_forward(const SeRasterForward* a, void** state) {
 SE_EXPORT int32_t se_raster_backward(void* state, const SeRasterBackward* a) {
   try {
     State& s = *static_cast<State*>(state);
-    // With many workers one row of sums per worker and Gaussian would take more memory than one per pair.
+    // With many workers, one row of sums per worker and Gaussian would take more memory than one row per pair.
     const bool slots = a->deterministic || (a->threads > 4 && a->threads * s.visible > s.pairs);
     const int rows = slots ? 0 : std::max(1, a->threads);
     StageTimer timer(s.seconds + 3);
@@ -138,7 +137,6 @@ SE_EXPORT void se_raster_find_visible(const SeCamera* camera, const float* means
   project_visible(*camera, means, scales, m, visible, threads);
 }
 
-// For benchmarks: [visible Gaussians, (Gaussian, tile) pairs, (Gaussian, block) pairs drawn] and the timer' seconds.
 SE_EXPORT void se_raster_count(const void* state, int64_t* counts, double* seconds) {
   const State& s = *static_cast<const State*>(state);
   int64_t blocks = 0;

@@ -1,14 +1,16 @@
-// What the stages of the CPU rasteriser share. The picture's definition is render/reference.py; here is how it is computed:
+// Types shared by the stages of the CPU rasteriser. render/reference.py defines the image; this code computes it
+// in four stages:
 //
 //   project    every Gaussian -> a 64-byte Record (whitened ellipse, colour, depth) and its rectangle of tiles
-//   bin        a stable scatter into areas of 4 x 4 tiles of 16 x 16 pixels, then each area's sort by depth and its tiles' lists
-//   forward    per tile: which 4 x 4 pixel blocks does each Gaussian touch (exact), then block by block, one block per F32x16
-//   backward   per tile, batch by batch from the last, from checkpoints that forward left; sums per Gaussian; then the chain rule through
-//              the projection
+//   bin        a stable scatter into areas of 4 x 4 tiles of 16 x 16 pixels, then per area a sort by depth and the tile lists
+//   blend      per tile: find the 4 x 4 pixel blocks that each Gaussian touches (exactly), then blend block by block, one per F32x16
+//   backward   per tile, from the last batch to the first, starting from the forward pass's checkpoints; sums per Gaussian; then the
+//              chain rule through the projection
 //
-// Whitened ellipse: with d = centre - pixel, log2 of the Gaussian's value is log_opacity - (l1 dy + l2 dx)^2 - (l3 dx)^2. As a sum of
-// squares it has no cancellation for thin Gaussians, and within a tile it costs two operations per block: for every column x of the tile
-// height[x] = log_opacity - (l3 dx)^2 and slope[x] = l1 (v - tile's centre) + l2 dx are made once, then p = height - (slope - l1 y)^2.
+// Whitened ellipse: with d = centre - pixel, log2 of a Gaussian's value is log_opacity - (l1 dy + l2 dx)^2 - (l3
+// dx)^2. This sum of squares has no cancellation for thin Gaussians and costs two operations per block of a
+// tile: height[x] = log_opacity - (l3 dx)^2 and slope[x] = l1 (v - centre of the tile) + l2 dx are computed once
+// per column x of the tile, and then p = height - (slope - l1 y)^2.
 #pragma once
 #include <cstdint>
 #include <cstdlib>
@@ -28,16 +30,16 @@ namespace se::raster {
 
 constexpr int kTile = 16;             // pixels
 constexpr int kArea = 4;              // tiles
-constexpr int kMaxAreas = 65536;      // of a picture: 268 million pixels
-constexpr int kChunk = 4096;          // Gaussians that one worker projects at a time; a multiple of 16
-constexpr int kBatch = 512;           // Gaussians of a tile worked on at a time: each batch's end costs every block some hundred cycles
-constexpr int kAhead = 128;           // how many of a tile's Gaussians ahead memory is fetched
-constexpr int kBeyond = kAhead + 16;  // entries after the last list, so that looking ahead needs no test
+constexpr int kMaxAreas = 65536;      // of an image: 268 million pixels
+constexpr int kChunk = 4096;          // Gaussians per job of the projection; a multiple of 16
+constexpr int kBatch = 512;           // Gaussians of a tile processed at a time: the end of a batch costs every block some hundred cycles
+constexpr int kAhead = 128;           // prefetch distance in the list of a tile
+constexpr int kBeyond = kAhead + 16;  // entries after the last list, so that prefetching needs no test
 constexpr float kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
 constexpr float kMinAlphaLog2 = -7.994353437f;  // log2(1 / 255)
 constexpr float kWhiten = 0.84932180f;          // sqrt(log2(e) / 2)
 
-// A Gaussian that reaches the picture; colours and ellipse first, as blending reads them.
+// A visible Gaussian; colour and ellipse come first because blending reads them.
 struct alignas(64) Record {
   float l1, r, g, b, z, u, v, log_opacity, l2, l3, spare[6];
 };
@@ -48,23 +50,26 @@ struct Rect {  // tiles, end exclusive
 };
 
 struct alignas(16) Item {
-  uint32_t key, place;  // depth bits; place of the record
+  uint32_t key, place;  // bits of the depth; place of the record
   Rect rect;
 };
 static_assert(sizeof(Item) == 16);
 
-// A Gaussian in one area: its key, then 16 bits for its number in its part, then bit 4 y + x for the area's tile in column x, row y.
+// A Gaussian in one area: its key, 16 bits for its number in its part, and bit 4 y + x for the area's tile in
+// column x, row y.
 using Entry = uint64_t;
-constexpr int kMaxPartChunks = 65536 / kChunk;  // chunks of a part
+constexpr int kMaxPartChunks = 65536 / kChunk;  // chunks per part, at most
 
-// Sums over pixels for one Gaussian, W = d loss / d power at a pixel: W, W dx, W dy, W dx^2, W dx dy, W dy^2, then colour and depth.
-// The places below kSums but kDepth are 0: a tile keeps the Gaussian's own numbers there, in the same cache line.
+// Sums over pixels for one Gaussian, with W = d loss / d power at a pixel: W, W dx, W dy, W dx^2, W dx dy, W
+// dy^2, then colour and depth. The entries below kSums, except kDepth, are 0: a tile keeps the Gaussian's own
+// numbers there, in the same cache line.
 struct alignas(64) Sums {
   float x[16];
 };
 enum { kDepth = 4, kS = 7, kSx, kSy, kSxx, kSxy, kSyy, kRed, kGreen, kBlue, kSums = kS };
 
-// Uninitialised memory that only grows. Large pieces ask for huge pages: their random reads would miss the translation cache otherwise.
+// Uninitialised memory that only grows. Large buffers ask for huge pages, because random reads would miss the
+// TLB otherwise.
 template <class T>
 class Buffer {
  public:
@@ -113,40 +118,41 @@ class Buffer {
   size_t size_ = 0;
 };
 
-// Everything of one picture that backward needs, and the scratch memory of the stages; reused from picture to picture.
+// Everything that the backward pass of one image needs, and the scratch memory of the stages. Reused from image
+// to image.
 struct State {
   SeCamera camera{};
   int64_t m = 0, visible = 0, pairs = 0;
   int tiles_x = 0, tiles_y = 0;
   bool antialias = false;
 
-  Buffer<Record> records;          // [chunk-aligned m]; chunk c holds its visible ones from c * kChunk on
-  Buffer<Item> items;              // same places
+  Buffer<Record> records;          // [m rounded up to chunks]; the visible Gaussians of chunk c start at c * kChunk
+  Buffer<Item> items;              // in the same order
   Buffer<uint16_t> group_mask;     // [m / 16] which of sixteen neighbours are visible
-  Buffer<uint32_t> group_first;    // [m / 16] place of the first of them
-  Buffer<uint32_t> chunk_count;    // [chunks] visible ones
-  Buffer<uint32_t> chunk_entries;  // [chunks] areas that its Gaussians meet
-  Buffer<uint32_t> part_begin;     // [parts + 1] into the entries
-  Buffer<uint32_t> area_begin;     // [parts, areas + 1] into the entries
-  Buffer<uint32_t> area_at;        // [areas + 1] how many entries come before each area's
-  Buffer<uint32_t> tile_begin;     // [tiles + 1] into `list`
-  Buffer<uint32_t> tile_used;      // [tiles] how many of its list a tile looked at before all its pixels had stopped
+  Buffer<uint32_t> group_first;    // [m / 16] place of the first visible one
+  Buffer<uint32_t> chunk_count;    // [chunks] visible Gaussians
+  Buffer<uint32_t> chunk_entries;  // [chunks] entries of their Gaussians
+  Buffer<uint32_t> part_begin;     // [parts + 1] first entry
+  Buffer<uint32_t> area_begin;     // [parts, areas + 1] first entry
+  Buffer<uint32_t> area_at;        // [areas + 1] number of entries before each area's
+  Buffer<uint32_t> tile_begin;     // [tiles + 1] first element of `list`
+  Buffer<uint32_t> tile_used;      // [tiles] how much of its list a tile used before all its pixels stopped
   Buffer<uint32_t> list;           // [pairs] places, per tile near to far
-  Buffer<uint16_t> masks;          // [batches, 16 blocks, kBatch / 16] which of a tile's blocks a Gaussian touches, see batch()
-  Buffer<uint16_t> drawn;          // [batches, 16 blocks] how many of those were blended before all the block's pixels had stopped
-  Buffer<float> transmittance;     // [tiles * 256] what is left at the end, in block order
-  Buffer<float> checkpoints;       // [batches * 256] what is left before each batch but a tile's first, see batch()
-  Buffer<Sums> sums;               // backward: one row per place and worker, or (deterministic) per pair; binning works here
+  Buffer<uint16_t> masks;          // [batches, 16 blocks, kBatch / 16] which blocks of a tile each Gaussian touches, see batch()
+  Buffer<uint16_t> drawn;          // [batches, 16 blocks] how many Gaussians were blended before all pixels of the block stopped
+  Buffer<float> transmittance;     // [tiles * 256] final transmittance, in block order
+  Buffer<float> checkpoints;       // [batches * 256] transmittance before each batch except a tile's first, see batch()
+  Buffer<Sums> sums;               // backward: one row per place and worker, or (deterministic) per pair; binning uses the memory too
   Buffer<uint32_t> slots;          // deterministic backward: first row of each place
   Buffer<double> background;       // backward: [tiles * 3]
 
   double seconds[5] = {};  // processor time of the calling thread: project, bin, blend, blend backward, project backward
 
   int tiles() const { return tiles_x * tiles_y; }
-  // With one more column and row, which stay empty: rectangles end there.
+  // One extra column and row, which stay empty: rectangles end there.
   int areas_x() const { return (tiles_x + kArea - 1) / kArea + 1; }
   int areas() const { return areas_x() * ((tiles_y + kArea - 1) / kArea + 1); }
-  // A number for each batch of each tile: no two share one, and no table is needed.
+  // A distinct number for each batch of each tile, without a table.
   int64_t batch(int tile, int index) const { return static_cast<int64_t>(tile_begin.data()[tile]) / kBatch + tile + index; }
   size_t batches() const { return static_cast<size_t>(pairs / kBatch + tiles() + 1); }
   int64_t places() const { return (m + kChunk - 1) / kChunk * kChunk; }
@@ -168,14 +174,14 @@ struct Gradients {
   float *means, *quats, *scales, *opacities, *colors, *mean2d;
 };
 
-// Projects all; fills records, items and groups per chunk, and radii [m].
+// Project all Gaussians: fill records, items, groups per chunk, and radii [m].
 void project(State& s, const Inputs& in, int32_t* radii, int threads);
-// Radii alone, of unrotated Gaussians.
+// Find which unrotated Gaussians are visible.
 void project_visible(const SeCamera& camera, const float* means, const float* scales, int64_t m, uint8_t* visible, int threads);
-// Sorts by depth and fills the tiles' lists.
+// Sort by depth and fill the lists of the tiles.
 void bin(State& s, int threads);
 void blend(State& s, const float* background, const Outputs& out, int threads);
-// Fills `sums` and the background's gradient; returns the number of rows that hold one Gaussian's sums (0: slots per pair).
+// Fill `sums` and the background's gradient. `rows`: rows of sums per Gaussian (0: one slot per pair).
 void blend_backward(State& s, const float* background, const Upstream& up, float* g_background, int rows, int threads);
 void project_backward(State& s, const Inputs& in, const Gradients& out, int rows, int threads);
 

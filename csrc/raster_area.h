@@ -1,4 +1,4 @@
-// One area of 4 x 4 tiles: its Gaussians in order of depth, and how many each of its tiles gets.
+// One area of 4 x 4 tiles: sort its Gaussians by depth and count those of each tile.
 #pragma once
 #include <algorithm>
 #include <bit>
@@ -15,8 +15,8 @@ class AreaSort {
       for (int k = 0; k < 8; ++k) bytes_[mask] |= static_cast<uint64_t>(mask >> k & 1) << 8 * k;
   }
 
-  // Takes in the area's n entries, from `begin` to the number after it in each part's row of `stride`, and counts each tile's; a part has
-  // `places` places.
+  // Read the area's n entries and count those of each tile. The entries of a part are begin[0] .. begin[1] - 1
+  // in the part's row of `stride` numbers; a part has `places` places.
   void read(const Entry* entries, const uint32_t* begin, int64_t parts, int stride, int64_t places, uint32_t n,
             uint32_t (&count)[kArea * kArea]) {
     n_ = n;
@@ -39,7 +39,7 @@ class AreaSort {
     add(sum, count);
   }
 
-  // Writes places and tiles near to far, ties as they came.
+  // Write places and tiles from near to far; the sort is stable.
   void operator()(uint32_t* places, uint16_t* tiles) {
     const uint64_t *order = sort(), *value = value_.data();
     for (uint32_t i = 0; i < n_; ++i) {
@@ -49,14 +49,14 @@ class AreaSort {
   }
 
  private:
-  // Eight tiles' counters are the bytes of one number, for as long as none of them can overflow.
+  // Each byte of a number counts for one tile, until one of them could overflow.
   static void add(uint64_t (&sum)[2], uint32_t (&count)[kArea * kArea]) {
     for (int k = 0; k < kArea * kArea; ++k) count[k] += sum[k / 8] >> 8 * (k % 8) & 255;
     sum[0] = sum[1] = 0;
   }
 
-  // Keys above, the entries' numbers below. Two counting passes over the leading bits of the keys' range, fewer bits for fewer entries;
-  // what they leave is nearly in order.
+  // Sort by key (upper half); the lower half is the number of the entry. Two counting passes over the leading
+  // bits of the range of keys, with fewer bits for fewer entries, leave an almost sorted sequence.
   const uint64_t* sort() {
     const uint32_t n = n_, low = low_;
     uint64_t *a = a_.data(), *b = b_.get(n);
@@ -82,7 +82,7 @@ class AreaSort {
   template <class F>
   static void finish_sort(uint64_t* a, uint32_t n, const F& lead) {
     for (uint32_t i = kFew; i < n; ++i)
-      if (lead(a[i]) == lead(a[i - kFew])) {  // a long run of one leading part
+      if (lead(a[i]) == lead(a[i - kFew])) {  // a long run with the same leading bits
         std::sort(a, a + n);
         return;
       }
@@ -101,7 +101,7 @@ class AreaSort {
   static constexpr uint32_t kFew = 32;
   static constexpr int kMaxDigit = 11;
   static constexpr uint32_t kRoom = 255;
-  static constexpr int kFar = 4;    // parts ahead
+  static constexpr int kFar = 4;    // prefetch distance in parts
   Buffer<uint64_t> a_, b_, value_;  // a_: keys as read
   uint32_t n_ = 0, low_ = 0, high_ = 0;
   uint32_t first_[1 << kMaxDigit], second_[1 << kMaxDigit];

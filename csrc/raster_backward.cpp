@@ -1,8 +1,10 @@
-// Backward blending. With s_i = colour_i . g (and depth) and behind_i what is seen behind Gaussian i, weighted alike,
+// Backward blending. Let s_i = colour_i . g (plus depth), and behind_i the same for what lies behind Gaussian i.
+// Then
 //   behind_(i-1) = alpha_i s_i + (1 - alpha_i) behind_i,   W_i = w_i (s_i - behind_i) = d loss / d power_i,   w_i = T_i alpha_i,
-// so nothing is divided and nothing cancels: for each batch, last one first, a pass near to far makes alpha_i and w_i from the checkpoint
-// that forward left, and a pass far to near makes W_i. All gradients of the ellipse are six moments of W over the pixels; sixteen Gaussians
-// are reduced together, one per lane.
+// without division or cancellation. Batches are processed from the last to the first: a near-to-far pass
+// computes alpha_i and w_i from the checkpoint of the forward pass, and a far-to-near pass computes W_i. All
+// gradients of the ellipse are six moments of W over the pixels. Sixteen Gaussians are reduced together, one per
+// lane.
 #include <algorithm>
 #include <cstring>
 
@@ -18,12 +20,12 @@ struct Pixels {
 
 struct Work {
   Batch batch;
-  // Of one block's list: w, and alpha, whose place W takes.
+  // Of one block's list: w, and alpha, which W replaces.
   F32x16 w[kBatch + 16], alpha[kBatch + 16];
-  float depth[kBatch + 16];  // the batch's sums for depth
+  float depth[kBatch + 16];  // the batch's sums of depth
 };
 
-// Upstream gradients of one block by column: lane l of column c is the pixel in column c of l's row.
+// Upstream gradients of one block by column: lane l of column c is the pixel in column c of the row of l.
 template <bool Depth>
 struct Columns {
   F32x16 color[3][4], depth[Depth ? 4 : 1];
@@ -36,7 +38,8 @@ struct Columns {
   }
 };
 
-// Weighted sums over the block's pixels of sixteen Gaussians' w, one Gaussian per lane.
+// Sum the weights w of sixteen Gaussians over the pixels of the block, times the upstream gradients; one
+// Gaussian per lane.
 template <bool Depth>
 void reduce_colors(const F32x16* w, const Columns<Depth>& by, F32x16* out, F32x16& depth) {
   F32x16 part[3][4], part_depth[4];
@@ -51,7 +54,8 @@ void reduce_colors(const F32x16* w, const Columns<Depth>& by, F32x16* out, F32x1
   if constexpr (Depth) depth = sum_quarters(part_depth);
 }
 
-// Sums of W over the pixels: m, and with x and y in half pixels from the block's centre (-3 -1 1 3) those of W x, W y, W x^2, W x y, W y^2.
+// Sums of W over the pixels: m; and those of W x, W y, W x^2, W x y, W y^2, with x and y in half pixels from the
+// centre of the block (-3 -1 1 3).
 struct Moments {
   F32x16 m, x, y, xx, xy, yy;
   explicit Moments(const F32x16* W) {
@@ -72,7 +76,7 @@ struct Moments {
   }
 };
 
-// Adds the sums over one block of sixteen Gaussians of its list to their rows.
+// Add the sums over one block to the rows of sixteen Gaussians of its list.
 template <bool Depth>
 void reduce(Work& work, int first, const Columns<Depth>& by, int block, const Tile& tile) {
   const uint16_t* place = work.batch.list.place + first;
@@ -85,7 +89,7 @@ void reduce(Work& work, int first, const Columns<Depth>& by, int block, const Ti
   }
   const Moments b(work.alpha + first);
 
-  // To moments about each Gaussian's centre, in half pixels.
+  // Shift the moments to the centre of each Gaussian, in half pixels.
   Row* rows[16];
   const float* centre[16];
   for (int k = 0; k < 16; ++k) rows[k] = &work.batch.row(place[k]), centre[k] = &rows[k]->u;
@@ -108,7 +112,7 @@ void reduce(Work& work, int first, const Columns<Depth>& by, int block, const Ti
   }
 }
 
-// alpha and w of the first `count` of the block's list, near to far.
+// Compute alpha and w of the first `count` Gaussians of the block's list, near to far.
 void compute_weights(Work& work, int count, int block, const float* checkpoint, const Exp2& exp2) {
   const Batch& batch = work.batch;
   const F32x16 y = block_y(block / 4), stop = broadcast(kMinTransmittance);
@@ -145,13 +149,14 @@ void differentiate_block(Work& work, int count, int block, const float* checkpoi
     if constexpr (Depth) s = fma(depth, broadcast(row.z), s);
     const F32x16 alpha = work.alpha[i];
     work.alpha[i] = mul_keep(gt(most, alpha), work.w[i], s - behind);
-    behind = fma(one - alpha, behind, alpha * s);  // the one chain from Gaussian to Gaussian: a single step long
+    behind = fma(one - alpha, behind, alpha * s);  // the only dependency from Gaussian to Gaussian: one step long
   }
   store(px.behind + at, behind);
   for (int first = 0; first < count; first += 16) reduce<Depth>(work, first, by, block, tile);
 }
 
-// Upstream gradients of a tile in block order, what is seen behind everything, and the background's gradient.
+// Load the upstream gradients of a tile in block order, the value behind all Gaussians, and the background's
+// gradient.
 void begin_tile(State& s, int number, const Tile& tile, const float* background, const Upstream& up, Pixels& px) {
   const auto read = [&](const float* picture, auto& planes) {
     if (picture)
@@ -185,7 +190,8 @@ void begin_tile(State& s, int number, const Tile& tile, const float* background,
   }
 }
 
-// Where a batch's sums go: added to the worker's own rows, or (slots) stored in the row of this Gaussian and tile.
+// Where the sums of a batch go: added to the worker's own rows, or (slots) stored in the row of this Gaussian
+// and tile.
 struct Sink {
   State& s;
   Sums* own;
@@ -215,7 +221,7 @@ void differentiate_tile(State& s, int number, Work& work, const float* backgroun
     const int64_t number_of_batch = s.batch(number, index);
     const Touched& touched = *reinterpret_cast<const Touched*>(s.masks.data() + number_of_batch * kBatch);
     const float* checkpoint = index > 0 ? s.checkpoints.data() + number_of_batch * 256 : px.through;
-    const uint16_t* drawn = s.drawn.data() + number_of_batch * 16;  // multiples of 4: the lists are filled up
+    const uint16_t* drawn = s.drawn.data() + number_of_batch * 16;  // multiples of 4: the lists are padded
     uint16_t any[kGroups];
     uint32_t blocks = 0;
     for (int b = 0; b < 16; ++b) blocks |= (drawn[b] > 0 ? 1u : 0u) << b;
@@ -231,7 +237,7 @@ void differentiate_tile(State& s, int number, Work& work, const float* backgroun
       differentiate_block<Depth>(work, drawn[b], b, checkpoint, px, tile, exp2);
     }
     for (int first = 0; first < n; first += 16) {
-      if (!sink.own) {  // every slot is written
+      if (!sink.own) {  // every slot must be written
         for (int k = first; k < std::min(n, first + 16); ++k)
           if (!(any[first / 16] >> (k - first) & 1)) std::memset(&sink.slot(from[k], tile), 0, sizeof(Sums));
       }
@@ -247,7 +253,7 @@ void differentiate_tile(State& s, int number, Work& work, const float* backgroun
     for (uint32_t at = end; at < s.tile_begin.data()[number + 1]; ++at) std::memset(&sink.slot(s.list.data()[at], tile), 0, sizeof(Sums));
 }
 
-// The first slot of each place: slots of a place are contiguous, in row order of its rectangle.
+// Find the first slot of each place. The slots of a place are contiguous, in row order of its rectangle.
 void number_slots(State& s) {
   uint32_t* slots = s.slots.get(static_cast<size_t>(s.places()));
   uint32_t at = 0;

@@ -1,5 +1,6 @@
-// Tile lists in two steps, each in the nearest caches and the jobs of one independent of each other: part by part of the Gaussians, a
-// stable scatter into areas of 4 x 4 tiles; then area by area a sort by depth, and the lists of the area's tiles.
+// Build the tile lists in two steps whose jobs are independent and stay in the cache. First, each part of the
+// Gaussians is scattered into areas of 4 x 4 tiles (a stable scatter). Then each area is sorted by depth and the
+// lists of its tiles are written.
 #include <algorithm>
 #include <utility>
 
@@ -9,10 +10,11 @@
 namespace se::raster {
 namespace {
 
-// Chunks that are scattered together: the more areas, the more, so that an area's share of a part is no single Gaussian.
+// Chunks per part. It grows with the number of areas, so that an area's share of a part is more than a single
+// Gaussian.
 int64_t chunks_per_part(const State& s) { return std::min<int64_t>(1 + s.areas() / 128, kMaxPartChunks); }
 
-// Counts what is visible; returns each part's first entry, and the number of all.
+// Count visible Gaussians and find the first entry of each part. Return the number of entries.
 uint64_t number_entries(State& s, int64_t parts) {
   const int64_t chunks = s.places() / kChunk;
   uint32_t* begin = s.part_begin.get(static_cast<size_t>(parts) + 1);
@@ -27,18 +29,19 @@ uint64_t number_entries(State& s, int64_t parts) {
   return sum;
 }
 
-// Bit y of four goes to bit 4 y.
+// Move bit y of four to bit 4 y.
 inline uint32_t spread_bits(uint32_t rows) {
   static constexpr uint16_t bits[16] = {0x0000, 0x0001, 0x0010, 0x0011, 0x0100, 0x0101, 0x0110, 0x0111,
                                         0x1000, 0x1001, 0x1010, 0x1011, 0x1100, 0x1101, 0x1110, 0x1111};
   return bits[rows];
 }
 
-// An entry on its way: the item's number in its part, the area, and the tiles; in one number, so that it is written at once.
+// An entry during the scatter: area, the item's number in its part, and tiles, in one number that is written at
+// once.
 inline uint64_t pack(uint64_t area, uint64_t number, uint64_t tiles) { return area << 32 | number << 16 | tiles; }
 
-// Writes an item's entries, one for each area that it meets, and returns their end. Those of up to 2 x 2 areas are written without a branch
-// on how many there are.
+// Write an item's entries, one for each area that it touches, and return their end. Up to 2 x 2 areas take no
+// branch on their number.
 uint64_t* write_entries(const Rect r, uint64_t number, uint32_t areas_x, uint64_t* to) {
   const uint32_t x = r.x0 / kArea, y = r.y0 / kArea, from_x = r.x0 % kArea, from_y = r.y0 % kArea;
   const uint32_t end_x = r.x1 - x * kArea, end_y = r.y1 - y * kArea;
@@ -61,7 +64,8 @@ uint64_t* write_entries(const Rect r, uint64_t number, uint32_t areas_x, uint64_
   return to;
 }
 
-// One part: its chunks' entries, area after area, from `entries` on; `begin` [areas + 1] tells where each area's are.
+// Scatter one part: write the entries of its chunks, area by area, to `entries`; `begin` [areas + 1] gives the
+// first of each area.
 void scatter(const State& s, int64_t part, Entry* entries, uint32_t* begin) {
   const int areas = s.areas();
   const uint32_t first = s.part_begin.data()[part], n = s.part_begin.data()[part + 1] - first;
@@ -84,11 +88,11 @@ void scatter(const State& s, int64_t part, Entry* entries, uint32_t* begin) {
     const uint64_t key = items[*e >> 16 & 0xffff].key;
     entries[begin[*e >> 32]++] = key << 32 | (*e & 0xffffffff);
   }
-  for (int a = areas - 1; a > 0; --a) begin[a] = begin[a - 1];  // each stands at its end now, where the next begins
+  for (int a = areas - 1; a > 0; --a) begin[a] = begin[a - 1];  // each begin is now the next area's: shift by one
   begin[0] = first;
 }
 
-// Calls f(tile, its bit) for the area's tiles in the picture.
+// Call f(tile, its bit) for each tile of the area that lies in the image.
 template <class F>
 void for_each_tile(const State& s, int64_t area, F&& f) {
   const int x = static_cast<int>(area) % s.areas_x() * kArea, y = static_cast<int>(area) / s.areas_x() * kArea;
@@ -96,9 +100,9 @@ void for_each_tile(const State& s, int64_t area, F&& f) {
     for (int i = 0; i < std::min(kArea, s.tiles_x - x); ++i) f((y + j) * s.tiles_x + x + i, j * kArea + i);
 }
 
-// Where the lists begin; returns how many places they hold.
+// Turn list lengths into list begins and return the total length.
 uint64_t number_lists(State& s) {
-  uint32_t* begin = s.tile_begin.data();  // so far each list's length
+  uint32_t* begin = s.tile_begin.data();  // the lengths until now
   uint64_t sum = 0;
   for (int t = 0; t < s.tiles(); ++t) {
     sum += std::exchange(begin[t], static_cast<uint32_t>(sum));
@@ -114,7 +118,8 @@ void bin(State& s, int threads) {
   const int areas = s.areas();
   const int64_t parts = (s.places() / kChunk + chunks_per_part(s) - 1) / chunks_per_part(s);
   const size_t total = number_entries(s, parts);
-  // Until backward needs them, the rows of sums hold the entries and, per area near to far, their places and tiles.
+  // Until the backward pass needs `sums`, its memory holds the entries and, per area from near to far, their
+  // places and tiles.
   const size_t room = total + kBeyond;
   Entry* entries = reinterpret_cast<Entry*>(s.sums.get(room * (sizeof(Entry) + sizeof(uint32_t) + sizeof(uint16_t)) / sizeof(Sums) + 1));
   uint32_t* places = reinterpret_cast<uint32_t*>(entries + room);

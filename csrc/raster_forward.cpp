@@ -7,12 +7,12 @@
 namespace se::raster {
 namespace {
 
-struct Pixels {  // a tile's pixels in block order
+struct Pixels {  // the pixels of a tile in block order
   alignas(64) float through[256], left[256], color[3][256], depth[256];
 };
 
-// Blends the batch's list into one block, as long as any pixel lets light through; returns how many of the list that took.
-// `through` runs on past the stop (it only falls); `left` keeps the value before it.
+// Blend the batch's list into one block until no pixel lets light through. Return how many Gaussians of the list
+// that took. `through` falls below the stop; `left` keeps the value before it.
 int blend_block(const Batch& batch, int block, Pixels& px, const Exp2& exp2, bool& alive) {
   const F32x16 y = block_y(block / 4), stop = broadcast(kMinTransmittance);
   const int at = block * 16, column = block % 4;
@@ -58,7 +58,7 @@ void blend_tile(State& s, int number, Batch& batch, const float* background, con
   std::fill(&px.color[0][0], &px.color[0][0] + 768, 0.0f);
   std::fill(px.depth, px.depth + 256, 0.0f);
   uint32_t alive = 0;
-  for (int b = 0; b < 16; ++b) alive |= (px.through[16 * b] > 0.0f ? 1u : 0u) << b;  // a block's first pixel is inside if any is
+  for (int b = 0; b < 16; ++b) alive |= (px.through[16 * b] > 0.0f ? 1u : 0u) << b;  // if any pixel of a block is inside, the first one is
   const uint32_t begin = s.tile_begin.data()[number], end = s.tile_begin.data()[number + 1];
   uint32_t at = begin;
   while (at < end && alive) {

@@ -1,11 +1,11 @@
-// Lists from masks by a table, for instruction sets that cannot pack a register.
+// Packing by tables, for instruction sets that cannot compress a register.
 #pragma once
 #include <cstdint>
 #include <cstring>
 
 namespace se {
 
-// Writes (first + lane) * Step of the mask's lanes to `to`, packed to the front of sixteen values.
+// Write (first + lane) * Step for each lane of the mask to the front of the sixteen values at `to`.
 template <int Step>
 struct Packing {
   alignas(16) uint16_t places[256][8] = {};  // for each mask of eight lanes
@@ -31,7 +31,8 @@ struct Packing {
   }
 };
 
-// Copies the places whose tiles have the bit to `to`, which needs room for n + 16, and returns their end; may read 16 beyond n.
+// Copy the places whose tiles have the bit to `to` and return their end. `to` needs room for n + 16; reads up to
+// 16 beyond n.
 struct Picking {
   uint32_t* operator()(uint32_t* to, const uint32_t* place, const uint16_t* tiles, uint32_t n, int bit) const {
     for (uint32_t i = 0; i < n; ++i) *to = place[i], to += tiles[i] >> bit & 1;

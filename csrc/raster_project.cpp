@@ -10,26 +10,27 @@
 namespace se::raster {
 namespace {
 
-struct Reach {  // tiles that hold a pixel centre within the ellipse of alpha >= 1/255
+struct TileRange {  // tiles with a pixel centre inside the ellipse of alpha >= 1/255
   F32x16 x0, y0, x1, y1;
   Mask16 drawn;
 
-  // How many areas these meet (lanes beyond the last Gaussian count too). A chunk's sum in one lane is exact: at most 2^24 for kMaxAreas.
+  // Number of areas that the tiles lie in, also for lanes beyond the last Gaussian. A chunk's sum in one lane is
+  // exact: at most 2^24 for kMaxAreas.
   F32x16 areas() const {
     const F32x16 inv = broadcast(1.0f / kArea);
     return keep(drawn, (ceil(x1 * inv) - floor(x0 * inv)) * (ceil(y1 * inv) - floor(y0 * inv)));
   }
 };
 
-Reach find_reach(const Projection& p, F32x16 log_opacity, F32x16 radius, int tiles_x, int tiles_y) {
+TileRange find_tiles(const Projection& p, F32x16 log_opacity, F32x16 radius, int tiles_x, int tiles_y) {
   const F32x16 zero = broadcast(0.0f);
   const F32x16 above = log_opacity - broadcast(kMinAlphaLog2);
-  // A little more than needed, so that rounding here never takes a pixel from the exact test in the blending.
+  // Slightly enlarged, so that rounding here never removes a pixel that the exact test of the blending keeps.
   const F32x16 sigmas = sqrt(max(above, zero) * broadcast(1.3862944f)) * broadcast(1.0005f);
   const F32x16 ex = fma(sigmas, sqrt(p.cxx), broadcast(0.01f)), ey = fma(sigmas, sqrt(p.cyy), broadcast(0.01f));
   const F32x16 inv = broadcast(1.0f / kTile), most_x = broadcast(static_cast<float>(tiles_x)),
                most_y = broadcast(static_cast<float>(tiles_y));
-  Reach r;
+  TileRange r;
   r.x0 = min(max(ceil((p.u - ex - broadcast(kTile - 0.5f)) * inv), zero), most_x);
   r.y0 = min(max(ceil((p.v - ey - broadcast(kTile - 0.5f)) * inv), zero), most_y);
   r.x1 = min(max(floor((p.u + ex - broadcast(0.5f)) * inv) + broadcast(1.0f), zero), most_x);
@@ -38,9 +39,9 @@ Reach find_reach(const Projection& p, F32x16 log_opacity, F32x16 radius, int til
   return r;
 }
 
-struct Lanes {  // the parts of sixteen records that are not their depth key
+struct RecordLanes {  // sixteen records, without the depth key
   F32x16 row[16];
-  explicit Lanes(const Projection& p, F32x16 log_opacity, const F32x16 (&color)[3]) {
+  explicit RecordLanes(const Projection& p, F32x16 log_opacity, const F32x16 (&color)[3]) {
     const F32x16 whiten = broadcast(kWhiten), rx = broadcast(1.0f) / sqrt(p.cxx), rd = broadcast(1.0f) / sqrt(p.det);
     row[0] = whiten * p.cxx * rx * rd;  // l1 = sqrt(cxx / det)
     row[1] = color[0], row[2] = color[1], row[3] = color[2], row[4] = p.vz;
@@ -52,7 +53,7 @@ struct Lanes {  // the parts of sixteen records that are not their depth key
   }
 };
 
-// The sum of sixteen whole numbers.
+// Sum of sixteen integers.
 uint32_t sum_integers(F32x16 a) {
   alignas(64) int32_t lane[16];
   store_int(lane, a);
@@ -89,15 +90,15 @@ void project_chunk(State& s, const Inputs& in, int32_t* radii, int64_t begin, in
     if (s.antialias) o = o * sqrt(p.compensation2());
     const Mask16 positive = ge(o, broadcast(1e-30f)) & gt(broadcast(1e30f), o);
     const F32x16 log_opacity = select(positive, log2(select(positive, o, broadcast(1.0f))), broadcast(-100.0f));
-    const Reach r = find_reach(p, log_opacity, radius, s.tiles_x, s.tiles_y);
+    const TileRange r = find_tiles(p, log_opacity, radius, s.tiles_x, s.tiles_y);
     const uint32_t drawn = bits(r.drawn) & valid;
     s.group_mask.data()[i / 16] = static_cast<uint16_t>(drawn);
     if (!drawn) continue;
     entries = entries + r.areas();
     load_columns(in.colors + 3 * i, count, color);
-    const Lanes lanes(p, log_opacity, color);
+    const RecordLanes lanes(p, log_opacity, color);
     alignas(64) int32_t x0[16], y0[16], x1[16], y1[16];
-    alignas(64) uint32_t key_bits[16];  // positive floats order as their bits do
+    alignas(64) uint32_t key_bits[16];  // positive floats sort like their bits
     store(reinterpret_cast<float*>(key_bits), p.vz);
     store_int(x0, r.x0), store_int(y0, r.y0), store_int(x1, r.x1), store_int(y1, r.y1);
     for (uint32_t left = drawn; left; left &= left - 1) {

@@ -1,4 +1,5 @@
-// The projection of sixteen Gaussians at once, shared by forward, backward and the visibility filter.
+// Projection of sixteen Gaussians at once, shared by the forward pass, the backward pass and the visibility
+// filter.
 #pragma once
 #include "raster.h"
 #include "raster_simd.h"
@@ -10,7 +11,7 @@ constexpr float kMinCompensation2 = 2.5e-5f;  // 0.005^2
 
 inline float tiles_to_pixels(int tiles) { return static_cast<float>(tiles * kTile); }
 
-// Reads sixteen rows of `Width` floats as columns; rows from `count` on repeat the last one.
+// Load sixteen rows of `Width` floats as columns; rows from `count` on repeat the last one.
 template <int Width>
 inline void load_columns(const float* rows, int count, F32x16 (&column)[Width]) {
   if (count == 16) {
@@ -20,7 +21,8 @@ inline void load_columns(const float* rows, int count, F32x16 (&column)[Width]) 
       load3(rows, column[0], column[1], column[2]);
     } else {
       static_assert(Width == 4);
-      // F32x4 rows to a register, a row to a quarter: quarters become registers of quarters' rows, then rows become columns.
+      // Each register holds four rows, one per quarter. Collect quarters of the same index, then transpose rows
+      // and columns.
       for (int k = 0; k < 4; ++k) column[k] = load(rows + 16 * k);
       transpose_quarters(column);  // register q: rows q, 4 + q, 8 + q, 12 + q
       transpose4(column);          // register k: column k, quarter j: rows 4 j + 0..3
@@ -33,7 +35,7 @@ inline void load_columns(const float* rows, int count, F32x16 (&column)[Width]) 
   for (int k = 0; k < Width; ++k) column[k] = load(temporary[k]);
 }
 
-// The way back.
+// Store columns as rows.
 template <int Width>
 inline void store_columns(float* rows, int count, const F32x16 (&column)[Width]) {
   if (count == 16) {
@@ -62,14 +64,14 @@ struct Rotation {
   }
 };
 
-// One Gaussian per lane, from the world to its ellipse in the picture.
+// One Gaussian per lane, from the world to its ellipse in the image.
 struct Projection {
-  F32x16 vx, vy, vz, rz;     // camera point, 1 / z
+  F32x16 vx, vy, vz, rz;     // point in camera coordinates, 1 / z
   F32x16 u, v;               // px
-  F32x16 tx, ty;             // x / z and y / z inside the limits of the Jacobian
+  F32x16 tx, ty;             // x / z and y / z, limited for the Jacobian
   Mask16 free_x, free_y;     // not limited
   F32x16 t[2][3];            // Jacobian times camera rotation
-  F32x16 a[2][3], b[2][3];   // t times Gaussian's rotation; times scales
+  F32x16 a[2][3], b[2][3];   // t times the Gaussian's rotation; a times scales
   F32x16 xx, xy, yy, sharp;  // 2D covariance without blur, its determinant
   F32x16 cxx, cyy, det;      // with blur
   Mask16 front;
@@ -124,7 +126,7 @@ struct Projection {
     compute_ellipse(scale);
   }
 
-  // The radius of the 3 sigma rule, 0 where it meets no tile; NaN and infinity fail a comparison and give 0.
+  // The radius of the 3 sigma rule, 0 where it touches no tile. NaN and infinity fail a comparison and give 0.
   F32x16 radius(int tiles_x, int tiles_y) const {
     const F32x16 half = (cxx - cyy) * broadcast(0.5f), zero = broadcast(0.0f);
     const F32x16 spread = sqrt(max(fma(half, half, xy * xy), broadcast(0.1f)));

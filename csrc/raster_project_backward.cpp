@@ -1,4 +1,4 @@
-// From the sums over pixels back through the projection to the Gaussians' own parameters.
+// From the sums over pixels back through the projection to the parameters of the Gaussians.
 #include <algorithm>
 #include <cstring>
 
@@ -8,7 +8,8 @@
 namespace se::raster {
 namespace {
 
-// The sums of one visible Gaussian, over its workers' rows or over its tiles' slots, always in the same order.
+// Add up the sums of one visible Gaussian over the workers' rows or over its tiles' slots, always in the same
+// order.
 F32x16 sum_gradients(const State& s, uint32_t place, int rows) {
   F32x16 sum = broadcast(0.0f);
   if (rows > 0) {
@@ -23,10 +24,11 @@ F32x16 sum_gradients(const State& s, uint32_t place, int rows) {
   return sum;
 }
 
-struct Chain {  // one Gaussian per lane
+struct ProjectionGradient {  // one Gaussian per lane
   F32x16 mean[3], quat[4], scale[3], mean2d[2];
 
-  // d loss / d 2D covariance: 1/2 C^-1 S C^-1 with S the second moments of W, and the antialias factor's part.
+  // d loss / d 2D covariance: 1/2 C^-1 S C^-1, where S holds the second moments of W, plus the part of the
+  // antialias factor.
   static void differentiate_covariance(const Projection& p, const F32x16 (&sum)[16], bool antialias, F32x16& gxx, F32x16& gxy,
                                        F32x16& gyy) {
     const F32x16 inv = broadcast(1.0f) / p.det, half = broadcast(0.5f), zero = broadcast(0.0f);
@@ -37,7 +39,8 @@ struct Chain {  // one Gaussian per lane
     gxy = half * fma(r0, b, r1 * c);
     gyy = half * fma(q0, b, q1 * c);
     if (!antialias) return;
-    // ln compensation = 1/2 (ln sharp - ln det), and the derivative of a determinant's logarithm is the inverse matrix.
+    // ln compensation = 1/2 (ln sharp - ln det); the derivative of the logarithm of a determinant is the inverse
+    // matrix.
     const Mask16 smooth = gt(p.sharp, p.det * broadcast(kMinCompensation2));
     const F32x16 g = keep(smooth, half * sum[kS]), one_sharp = broadcast(1.0f) / select(smooth, p.sharp, broadcast(1.0f));
     gxx = fma(g, fma(p.yy, one_sharp, zero - a), gxx);
@@ -55,7 +58,7 @@ struct Chain {  // one Gaussian per lane
     out[3] = two * (fma(w, c, fma(x, f, y * g)) - two * z * (d[0][0] + d[1][1]));
   }
 
-  Chain(const State& s, const Projection& p, const F32x16 (&q)[4], const F32x16 (&size)[3], const F32x16 (&sum)[16]) {
+  ProjectionGradient(const State& s, const Projection& p, const F32x16 (&q)[4], const F32x16 (&size)[3], const F32x16 (&sum)[16]) {
     const SeCamera& cam = s.camera;
     const F32x16 two = broadcast(2.0f), zero = broadcast(0.0f), inv = broadcast(1.0f) / p.det;
     const F32x16 gu = (p.xy * sum[kSy] - p.cyy * sum[kSx]) * inv, gv = (p.xy * sum[kSx] - p.cxx * sum[kSy]) * inv;
@@ -75,7 +78,7 @@ struct Chain {  // one Gaussian per lane
         d_t[i][k] = fma(d_a[i][0], rotation.r[k][0], fma(d_a[i][1], rotation.r[k][1], d_a[i][2] * rotation.r[k][2]));
     differentiate_quaternion(q, d_rotation, quat);
 
-    // t[0][k] = fx / z (R0k - tx R2k), t[1][k] = fy / z (R1k - ty R2k); u = fx x / z + cx; z is the depth.
+    // t[0][k] = fx / z (R0k - tx R2k), t[1][k] = fy / z (R1k - ty R2k); u = fx x / z + cx; the depth is z.
     const F32x16 fx = broadcast(cam.fx), fy = broadcast(cam.fy);
     F32x16 jx = zero, jy = zero, dtx = zero, dty = zero;
     for (int k = 0; k < 3; ++k) {
@@ -102,7 +105,7 @@ void differentiate_group(const State& s, const Inputs& in, const Gradients& out,
   uint32_t place = s.group_first.data()[i / 16];
   for (int k = 0; k < 16; ++k) sum[k] = drawn >> k & 1 ? sum_gradients(s, place++, rows) : broadcast(0.0f);
   transpose(sum);
-  for (const int k : {kSx, kSy}) sum[k] = sum[k] * broadcast(0.5f);  // they came in half pixels
+  for (const int k : {kSx, kSy}) sum[k] = sum[k] * broadcast(0.5f);  // from half pixels
   for (const int k : {kSxx, kSxy, kSyy}) sum[k] = sum[k] * broadcast(0.25f);
   F32x16 mean[3], quat[4], scale[3], opacity[1];
   load_columns(in.means + 3 * i, count, mean);
@@ -112,8 +115,8 @@ void differentiate_group(const State& s, const Inputs& in, const Gradients& out,
   Projection p;
   p.project_centre(s.camera, mean);
   p.project_shape(quat, scale);
-  const Chain chain(s, p, quat, scale, sum);
-  // Lanes that are not drawn may hold anything (a point behind the camera, NaN): they get 0.
+  const ProjectionGradient gradient(s, p, quat, scale, sum);
+  // Lanes that are not drawn may hold any value (a point behind the camera, NaN): set them to 0.
   alignas(64) float flags[16];
   for (int k = 0; k < 16; ++k) flags[k] = drawn >> k & 1 ? 1.0f : 0.0f;
   const Mask16 ok = gt(load(flags), broadcast(0.0f));
@@ -133,12 +136,12 @@ void differentiate_group(const State& s, const Inputs& in, const Gradients& out,
   struct C4 {
     F32x16 c[4];
   };
-  put(out.means + 3 * i, C3{{chain.mean[0], chain.mean[1], chain.mean[2]}});
-  put(out.quats + 4 * i, C4{{chain.quat[0], chain.quat[1], chain.quat[2], chain.quat[3]}});
-  put(out.scales + 3 * i, C3{{chain.scale[0], chain.scale[1], chain.scale[2]}});
+  put(out.means + 3 * i, C3{{gradient.mean[0], gradient.mean[1], gradient.mean[2]}});
+  put(out.quats + 4 * i, C4{{gradient.quat[0], gradient.quat[1], gradient.quat[2], gradient.quat[3]}});
+  put(out.scales + 3 * i, C3{{gradient.scale[0], gradient.scale[1], gradient.scale[2]}});
   put(out.opacities + i, C1{{sum[kS] / opacity[0]}});
   put(out.colors + 3 * i, C3{{sum[kRed], sum[kGreen], sum[kBlue]}});
-  put(out.mean2d + 2 * i, C2{{chain.mean2d[0], chain.mean2d[1]}});
+  put(out.mean2d + 2 * i, C2{{gradient.mean2d[0], gradient.mean2d[1]}});
 }
 
 }  // namespace

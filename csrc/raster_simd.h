@@ -1,13 +1,14 @@
-// The one vector type of the rasteriser: F32x16, sixteen floats, either the 4 x 4 pixels of a block or sixteen Gaussians; Mask16 is its
-// mask. Each instruction set implements the same functions (in one register, two, or four), so the algorithms are written once:
+// The vector type of the rasteriser. F32x16 is sixteen floats: the 4 x 4 pixels of a block or sixteen Gaussians;
+// Mask16 is its mask. Each instruction set implements the same functions (in one register, two or four), so that
+// the algorithms are written once:
 //   load store broadcast broadcast4 (four floats, repeated), + - * /, fma(a, b, c) = a b + c, fnma = c - a b, min max sqrt ceil floor,
-//   ge gt &, select(m, a, b), keep(m, a) = a or 0, mul_keep, min_keep, bits any, store_int (truncated),
-//   Exp2 (relative error below 4e-7; anything where p < -126), split_exponent, transpose (16 x 16),
-//   load_pairs(p, a, b): p[0][0] p[1][0] ... and p[0][1] p[1][1] ...
+//   ge gt &, select(m, a, b), keep(m, a) = a or 0, mul_keep, min_keep, bits any, store_int (truncates),
+//   Exp2 (relative error below 4e-7; undefined for p < -126), split_exponent, transpose (16 x 16),
+//   load_pairs(p, a, b): a = p[0][0] p[1][0] ..., b = p[0][1] p[1][1] ...
 #pragma once
 #include <cstdint>
 
-// F32x4 of the eight lanes of two vectors.
+// Select four of the eight lanes of two vectors.
 #if defined(__has_builtin)
 #if __has_builtin(__builtin_shufflevector)
 #define SE_SHUFFLE __builtin_shufflevector
@@ -33,7 +34,7 @@ inline F32x16 at_lane(int lane, float x) {
   return load(all);
 }
 
-// log2(a) for normal a > 0 (absolute error about one rounding of the result).
+// log2(a) for normal a > 0; the absolute error is about one rounding of the result.
 inline F32x16 log2(F32x16 a) {
   F32x16 m, e;
   split_exponent(a, m, e);

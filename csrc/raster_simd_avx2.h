@@ -1,4 +1,4 @@
-// Sixteen floats in two AVX2 registers; see raster_simd.h for what each function promises.
+// F32x16 in two AVX2 registers; raster_simd.h describes the functions.
 #pragma once
 #include <immintrin.h>
 
@@ -8,7 +8,7 @@
 
 namespace se {
 
-constexpr int kInterleaved = 1;  // there are too few registers for more
+constexpr int kInterleaved = 1;  // more would need too many registers
 
 struct F32x16 {
   __m256 lo, hi;
@@ -60,7 +60,8 @@ inline void store_int(int32_t* p, F32x16 a) {
   _mm256_storeu_si256(reinterpret_cast<__m256i*>(p + 8), _mm256_cvttps_epi32(a.hi));
 }
 
-// 2^p as a quintic on [-1/2, 1/2]; 1.5 * 2^23 puts the nearest integer in the low bits of a float's mantissa.
+// 2^p as a quintic on [-1/2, 1/2]. Adding 1.5 * 2^23 puts the nearest integer in the low bits of a float's
+// mantissa.
 struct Exp2 {
   static __m256 half(__m256 p) {
     const __m256 magic = _mm256_set1_ps(12582912.0f);
@@ -86,27 +87,27 @@ inline void split_exponent_half(__m256 a, __m256& m, __m256& e) {
   e = _mm256_cvtepi32_ps(k);
   m = _mm256_castsi256_ps(_mm256_sub_epi32(b, _mm256_slli_epi32(k, 23)));
 }
-// The first N of sixteen floats, the others 0.
+// Load the first N of sixteen floats; the others are 0.
 template <int N>
 inline F32x16 load_first(const float* p) {
   static_assert(N == 7);
   return {_mm256_blend_ps(_mm256_loadu_ps(p), _mm256_setzero_ps(), 0x80), _mm256_setzero_ps()};
 }
 
-// Sixteen floats, the first N of them taken as 0.
+// Load sixteen floats; the first N are 0.
 template <int N>
 inline F32x16 load_from(const float* p) {
   static_assert(N == 7);
   return {_mm256_blend_ps(_mm256_setzero_ps(), _mm256_loadu_ps(p), 0x80), _mm256_loadu_ps(p + 8)};
 }
 
-// First halves of a and b, then second halves.
+// Store the first halves of a and b, then the second halves.
 inline void store_halves(float* p, F32x16 a, F32x16 b) {
   _mm256_storeu_ps(p, a.lo), _mm256_storeu_ps(p + 8, b.lo);
   _mm256_storeu_ps(p + 16, a.hi), _mm256_storeu_ps(p + 24, b.hi);
 }
 
-// Sixteen rows of three floats as three columns.
+// Load sixteen rows of three floats as three columns.
 inline void load3(const float* p, F32x16& a, F32x16& b, F32x16& c) {
   alignas(64) float column[3][16];
   for (int i = 0; i < 16; ++i)
@@ -114,7 +115,7 @@ inline void load3(const float* p, F32x16& a, F32x16& b, F32x16& c) {
   a = load(column[0]), b = load(column[1]), c = load(column[2]);
 }
 
-// Columns of sixteen rows, one row after the other.
+// Turn columns of sixteen rows into consecutive rows.
 template <int N>
 inline void interleave(F32x16 (&r)[N]) {
   alignas(64) float column[N][16], row[16 * N];
@@ -149,12 +150,12 @@ inline void load_pairs(const float* const (&p)[16], F32x16& first, F32x16& secon
   half(8, first.hi, second.hi);
 }
 
-// Sixteen lanes are four quarters of four. Column<C>: lane C of each quarter in all its lanes.
+// Sixteen lanes are four quarters of four. column<C>: lane C of each quarter in all its lanes.
 template <int C>
 inline F32x16 column(F32x16 a) {
   return {_mm256_permute_ps(a.lo, C * 0x55), _mm256_permute_ps(a.hi, C * 0x55)};
 }
-// Each quarter of four values, as a 4 x 4 matrix.
+// Transpose each quarter of four values as a 4 x 4 matrix.
 inline void transpose4(F32x16 (&r)[4]) {
   const auto half = [](__m256& w, __m256& x, __m256& y, __m256& z) {
     const __m256 a = _mm256_unpacklo_ps(w, x), b = _mm256_unpackhi_ps(w, x), c = _mm256_unpacklo_ps(y, z), d = _mm256_unpackhi_ps(y, z);
@@ -172,7 +173,7 @@ inline void transpose_quarters(F32x16 (&r)[4]) {
   r[0] = {first(a.lo, b.lo), first(c.lo, d.lo)}, r[1] = {second(a.lo, b.lo), second(c.lo, d.lo)};
   r[2] = {first(a.hi, b.hi), first(c.hi, d.hi)}, r[3] = {second(a.hi, b.hi), second(c.hi, d.hi)};
 }
-// Quarter j of the result is the sum of value j's quarters.
+// Quarter j of the result is the sum of the quarters of value j.
 inline F32x16 sum_quarters(const F32x16 (&r)[4]) {
   const auto pair = [](F32x16 a, F32x16 b) {
     const __m256 x = _mm256_add_ps(a.lo, a.hi), y = _mm256_add_ps(b.lo, b.hi);

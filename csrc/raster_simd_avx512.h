@@ -1,4 +1,4 @@
-// Sixteen floats in one AVX-512 register; see raster_simd.h for what each function promises.
+// F32x16 in one AVX-512 register; raster_simd.h describes the functions.
 #pragma once
 #include <immintrin.h>
 
@@ -45,8 +45,9 @@ inline uint32_t bits(Mask16 m) { return m.m; }
 inline bool any(Mask16 m) { return m.m != 0; }
 inline void store_int(int32_t* p, F32x16 a) { _mm512_storeu_si512(p, _mm512_cvttps_epi32(a.v)); }
 
-// 2^p: nearest multiple of 1/16 from a table held in a register, the rest from a quadratic; 1.5 * 2^19 puts the multiple in the low bits
-// of a float's mantissa, and the table's entries are short of the exponent that those bits carry over.
+// 2^p: a table in a register for the nearest multiple of 1/16, and a quadratic for the rest. Adding 1.5 * 2^19
+// puts the multiple in the low bits of a float's mantissa. The entries of the table make up for the exponent
+// that these bits add.
 struct Exp2 {
   __m512 table;
   Exp2() {
@@ -58,7 +59,7 @@ struct Exp2 {
     }
     table = _mm512_load_ps(reinterpret_cast<const float*>(entry));
   }
-  // Several at a time, step by step: the processor then finds independent work next to each other.
+  // N values step by step, so that the processor finds independent instructions next to each other.
   template <int N>
   void operator()(F32x16 (&p)[N]) const {
     const __m512 magic = _mm512_set1_ps(786432.0f);  // 1.5 * 2^19
@@ -74,28 +75,28 @@ struct Exp2 {
     for (int k = 0; k < N; ++k) q[k] = _mm512_fmadd_ps(q[k], f[k], one);
     for (int k = 0; k < N; ++k) p[k].v = _mm512_mul_ps(_mm512_castsi512_ps(scale[k]), q[k]);
   }
-  static constexpr float kLinear = 0.69318771f, kQuadratic = 0.24022643f;  // least largest relative error on [-1/32, 1/32]
+  static constexpr float kLinear = 0.69318771f, kQuadratic = 0.24022643f;  // minimax on [-1/32, 1/32]
 };
 
-// The first N of sixteen floats, the others 0.
+// Load the first N of sixteen floats; the others are 0.
 template <int N>
 inline F32x16 load_first(const float* p) {
   return {_mm512_maskz_loadu_ps((1u << N) - 1, p)};
 }
 
-// Sixteen floats, the first N of them taken as 0.
+// Load sixteen floats; the first N are 0.
 template <int N>
 inline F32x16 load_from(const float* p) {
   return {_mm512_maskz_loadu_ps(0xffffu & ~((1u << N) - 1), p)};
 }
 
-// First halves of a and b, then second halves.
+// Store the first halves of a and b, then the second halves.
 inline void store_halves(float* p, F32x16 a, F32x16 b) {
   _mm512_storeu_ps(p, _mm512_shuffle_f32x4(a.v, b.v, 0x44));
   _mm512_storeu_ps(p + 16, _mm512_shuffle_f32x4(a.v, b.v, 0xee));
 }
 
-// Writes (first + lane) * Step of the mask's lanes to `to`, packed to the front of sixteen values.
+// Write (first + lane) * Step for each lane of the mask to the front of the sixteen values at `to`.
 template <int Step>
 struct Packing {
   __m512i lane = _mm512_mullo_epi32(_mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15), _mm512_set1_epi32(Step));
@@ -106,7 +107,8 @@ struct Packing {
   }
 };
 
-// Copies the places whose tiles have the bit to `to`, which needs room for n + 16, and returns their end; may read 16 beyond n.
+// Copy the places whose tiles have the bit to `to` and return their end. `to` needs room for n + 16; reads up to
+// 16 beyond n.
 struct Picking {
   uint32_t* operator()(uint32_t* to, const uint32_t* place, const uint16_t* tiles, uint32_t n, int bit) const {
     const __m256i wanted = _mm256_set1_epi16(static_cast<int16_t>(1 << bit));
@@ -123,7 +125,7 @@ struct Picking {
   }
 };
 
-// Sixteen rows of three floats as three columns.
+// Load sixteen rows of three floats as three columns.
 inline void load3(const float* p, F32x16& a, F32x16& b, F32x16& c) {
   const __m512 x = _mm512_loadu_ps(p), y = _mm512_loadu_ps(p + 16), z = _mm512_loadu_ps(p + 32);
   const auto column = [&](__m512i from_xy, __m512i from_z) {
@@ -137,7 +139,7 @@ inline void load3(const float* p, F32x16& a, F32x16& b, F32x16& c) {
                _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31));
 }
 
-// Two and three columns of sixteen rows, one row after the other.
+// Turn two or three columns of sixteen rows into consecutive rows.
 inline void interleave2(F32x16 (&r)[2]) {
   const __m512i low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
   const __m512 a = r[0].v, b = r[1].v;
@@ -179,12 +181,12 @@ inline void load_pairs(const float* const (&p)[16], F32x16& first, F32x16& secon
   second.v = _mm512_permutex2var_ps(a, _mm512_add_epi32(even, _mm512_set1_epi32(1)), b);
 }
 
-// A register is four quarters of four lanes. Column<C>: lane C of each quarter in all its lanes.
+// A register is four quarters of four lanes. column<C>: lane C of each quarter in all its lanes.
 template <int C>
 inline F32x16 column(F32x16 a) {
   return {_mm512_permute_ps(a.v, C * 0x55)};
 }
-// Each quarter of four registers, as a 4 x 4 matrix.
+// Transpose each quarter of four registers as a 4 x 4 matrix.
 inline void transpose4(F32x16 (&r)[4]) {
   const __m512 a = _mm512_unpacklo_ps(r[0].v, r[1].v), b = _mm512_unpackhi_ps(r[0].v, r[1].v);
   const __m512 c = _mm512_unpacklo_ps(r[2].v, r[3].v), d = _mm512_unpackhi_ps(r[2].v, r[3].v);
@@ -198,9 +200,9 @@ inline void transpose_quarters(F32x16 (&r)[4]) {
   r[0].v = _mm512_shuffle_f32x4(a, c, 0x88), r[1].v = _mm512_shuffle_f32x4(a, c, 0xdd);
   r[2].v = _mm512_shuffle_f32x4(b, d, 0x88), r[3].v = _mm512_shuffle_f32x4(b, d, 0xdd);
 }
-// Quarter j of the result is the sum of register j's quarters.
+// Quarter j of the result is the sum of the quarters of register j.
 inline F32x16 sum_quarters(const F32x16 (&r)[4]) {
-  const auto halves = [](__m512 a, __m512 b) {  // first half: of a, second: of b
+  const auto halves = [](__m512 a, __m512 b) {  // first half: of a, second half: of b
     return _mm512_add_ps(_mm512_mask_blend_ps(0xff00, a, b), _mm512_shuffle_f32x4(a, b, 0x4e));
   };
   const __m512 a = halves(r[0].v, r[1].v), b = halves(r[2].v, r[3].v);

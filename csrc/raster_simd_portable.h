@@ -1,4 +1,4 @@
-// Sixteen floats in four 16-byte vectors of the compiler (SSE2, NEON); see raster_simd.h for what each function promises.
+// F32x16 in four 16-byte vectors of the compiler (SSE2, NEON); raster_simd.h describes the functions.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -14,7 +14,7 @@ namespace se {
 typedef float F32x4 __attribute__((vector_size(16)));
 typedef int32_t I32x4 __attribute__((vector_size(16)));
 
-constexpr int kInterleaved = 1;  // there are too few registers for more
+constexpr int kInterleaved = 1;  // more would need too many registers
 
 struct F32x16 {
   F32x4 v[4];
@@ -96,7 +96,8 @@ inline void store_int(int32_t* p, F32x16 a) {
   for (int k = 0; k < 16; ++k) p[k] = static_cast<int32_t>(a.v[k / 4][k % 4]);
 }
 
-// 2^p as a quintic on [-1/2, 1/2]; 1.5 * 2^23 puts the nearest integer in the low bits of a float's mantissa.
+// 2^p as a quintic on [-1/2, 1/2]. Adding 1.5 * 2^23 puts the nearest integer in the low bits of a float's
+// mantissa.
 struct Exp2 {
   static F32x16 single(F32x16 p) {
     const F32x16 magic = broadcast(12582912.0f);
@@ -114,7 +115,7 @@ struct Exp2 {
   }
 };
 
-// The first N of sixteen floats, the others 0.
+// Load the first N of sixteen floats; the others are 0.
 template <int N>
 inline F32x16 load_first(const float* p) {
   float all[16] = {};
@@ -122,7 +123,7 @@ inline F32x16 load_first(const float* p) {
   return load(all);
 }
 
-// Sixteen floats, the first N of them taken as 0.
+// Load sixteen floats; the first N are 0.
 template <int N>
 inline F32x16 load_from(const float* p) {
   F32x16 r = load(p);
@@ -130,13 +131,13 @@ inline F32x16 load_from(const float* p) {
   return r;
 }
 
-// First halves of a and b, then second halves.
+// Store the first halves of a and b, then the second halves.
 inline void store_halves(float* p, F32x16 a, F32x16 b) {
   std::memcpy(p, &a.v[0], 32), std::memcpy(p + 8, &b.v[0], 32);
   std::memcpy(p + 16, &a.v[2], 32), std::memcpy(p + 24, &b.v[2], 32);
 }
 
-// Sixteen rows of three floats as three columns.
+// Load sixteen rows of three floats as three columns.
 inline void load3(const float* p, F32x16& a, F32x16& b, F32x16& c) {
   alignas(64) float column[3][16];
   for (int i = 0; i < 16; ++i)
@@ -144,7 +145,7 @@ inline void load3(const float* p, F32x16& a, F32x16& b, F32x16& c) {
   a = load(column[0]), b = load(column[1]), c = load(column[2]);
 }
 
-// Columns of sixteen rows, one row after the other.
+// Turn columns of sixteen rows into consecutive rows.
 template <int N>
 inline void interleave(F32x16 (&r)[N]) {
   alignas(64) float column[N][16], row[16 * N];
@@ -169,7 +170,7 @@ inline void load_pairs(const float* const (&p)[16], F32x16& first, F32x16& secon
   for (int k = 0; k < 16; ++k) first.v[k / 4][k % 4] = p[k][0], second.v[k / 4][k % 4] = p[k][1];
 }
 
-// Sixteen lanes are four quarters of four. Column<C>: lane C of each quarter in all its lanes.
+// Sixteen lanes are four quarters of four. column<C>: lane C of each quarter in all its lanes.
 template <int C>
 inline F32x16 column(F32x16 a) {
   SE_ALL(F32x16, (F32x4{a.v[i][C], a.v[i][C], a.v[i][C], a.v[i][C]}));
@@ -179,7 +180,7 @@ inline void transpose4(F32x4& w, F32x4& x, F32x4& y, F32x4& z) {
               d = SE_SHUFFLE(y, z, 2, 6, 3, 7);
   w = SE_SHUFFLE(a, c, 0, 1, 4, 5), x = SE_SHUFFLE(a, c, 2, 3, 6, 7), y = SE_SHUFFLE(b, d, 0, 1, 4, 5), z = SE_SHUFFLE(b, d, 2, 3, 6, 7);
 }
-// Each quarter of four values, as a 4 x 4 matrix.
+// Transpose each quarter of four values as a 4 x 4 matrix.
 inline void transpose4(F32x16 (&r)[4]) { SE_EACH transpose4(r[0].v[i], r[1].v[i], r[2].v[i], r[3].v[i]); }
 // Quarter q of value j becomes quarter j of value q.
 inline void transpose_quarters(F32x16 (&r)[4]) {
@@ -188,7 +189,7 @@ inline void transpose_quarters(F32x16 (&r)[4]) {
     for (int q = 0; q < 4; ++q) t[q].v[j] = r[j].v[q];
   for (int q = 0; q < 4; ++q) r[q] = t[q];
 }
-// Quarter j of the result is the sum of value j's quarters.
+// Quarter j of the result is the sum of the quarters of value j.
 inline F32x16 sum_quarters(const F32x16 (&a)[4]) { SE_ALL(F32x16, (a[i].v[0] + a[i].v[2]) + (a[i].v[1] + a[i].v[3])); }
 
 inline void transpose(F32x16 (&r)[16]) {

@@ -1,7 +1,9 @@
-// A tile's share of the work: the Gaussians of one batch laid out for blending, and which blocks each of them touches.
+// The work of one tile: the Gaussians of one batch laid out for blending, and the blocks that each of them
+// touches.
 //
-// Block b of a tile is 4 x 4 pixels, column b % 4, row b / 4; lane l of its F32x16 is the pixel in column l % 4, row l / 4. Coordinates are
-// relative to the tile's centre. Both directions of the blending run `alpha` on the same numbers, so they agree to the last bit.
+// A tile has 16 blocks of 4 x 4 pixels. Block b is in column b % 4 and row b / 4; lane l of its F32x16 is the
+// pixel in column l % 4 and row l / 4. Coordinates are relative to the centre of the tile. The forward and the
+// backward blending call compute_alphas with the same numbers, so they agree bit for bit.
 #pragma once
 #include <algorithm>
 #include <atomic>
@@ -16,32 +18,32 @@ namespace se::raster {
 struct Tile {
   int x, y;                  // in tiles
   float centre_x, centre_y;  // px
-  bool whole;                // inside the picture to its last pixel
+  bool whole;                // every pixel lies in the image
 };
 
-// One Gaussian of a batch, as the tile's blocks read it.
+// One Gaussian of a batch, as the blocks of the tile read it.
 struct alignas(64) Row {
-  float shape[2][2][8];        // by half of the tile: eight columns' heights, then their slopes, see raster.h
-  float l1, r, g, b, z, u, v;  // as in the record
-  float sums[16 - kSums];      // backward: what blocks have added up so far
+  float shape[2][2][8];        // per half of the tile: heights of eight columns, then their slopes, see raster.h
+  float l1, r, g, b, z, u, v;  // as in the Record
+  float sums[16 - kSums];      // backward: the sums over blocks so far
   const float* height(int block_column) const { return shape[block_column / 2][0] + block_column % 2 * 4; }
-  static constexpr int kSlope = 8;  // from a height to its slope
+  static constexpr int kSlope = 8;  // offset from a height to its slope
 };
 static_assert(sizeof(Row) == 192 && kSums == 7);
 
 constexpr int kGroups = kBatch / 16;
-using Touched = uint16_t[kGroups][16];  // for each group of sixteen Gaussians and each block one bit per Gaussian
+using Touched = uint16_t[kGroups][16];  // per group of sixteen Gaussians and per block, one bit per Gaussian
 
-// The Gaussians of a batch that touch one block, near to far, filled up to a multiple of 16.
+// The Gaussians of a batch that touch one block, near to far, padded to a multiple of 16.
 struct List {
-  uint16_t place[kBatch + 32];  // bytes from the batch's first row, divided by eight
-  int count;                    // without the filling
+  uint16_t place[kBatch + 32];  // offset from the batch's first row in units of eight bytes
+  int count;                    // without the padding
 };
 
 constexpr int kPlace = sizeof(Row) / 8;
 
 struct Batch {
-  Row rows[kBatch + 16];  // those beyond the end are Gaussians that draw nothing, which fill up lists
+  Row rows[kBatch + 16];  // the last 16 are Gaussians that draw nothing and pad lists
   List list;              // of the current block
   const Packing<kPlace> packing;
 
@@ -64,11 +66,11 @@ inline void Batch::fill_list(const Touched& touched, int block, int n) {
     packing.pack(list.place + count, touched[i / 16][block], i);
     count += __builtin_popcount(touched[i / 16][block]);
   }
-  packing.pack(list.place + count, 0xffff, kBatch);  // different ones: their sums need not wait for each other
+  packing.pack(list.place + count, 0xffff, kBatch);  // distinct rows, so that their sums do not wait for each other
   list.count = count;
 }
 
-// The order in which a tile's blocks are worked on: one half of the tile first, as only that half of each row is needed for it.
+// Processing order of the blocks of a tile: first one half of the tile, which needs only that half of each row.
 constexpr int kBlockOrder[16] = {0, 1, 4, 5, 8, 9, 12, 13, 2, 3, 6, 7, 10, 11, 14, 15};
 
 inline const float* lane_x() {
@@ -77,14 +79,14 @@ inline const float* lane_x() {
   return x;
 }
 
-// Row of each lane's pixel in block row 0..3, relative to the tile's centre.
+// Row of each lane's pixel in block row 0..3, relative to the centre of the tile.
 inline F32x16 block_y(int block_row) {
   alignas(64) static const float y[16] = {-7.5f, -7.5f, -7.5f, -7.5f, -6.5f, -6.5f, -6.5f, -6.5f,
                                           -5.5f, -5.5f, -5.5f, -5.5f, -4.5f, -4.5f, -4.5f, -4.5f};
   return load(y) + broadcast(4.0f * static_cast<float>(block_row));
 }
 
-// Fills the rows of the Gaussians that `any` names.
+// Fill the rows of the Gaussians whose bits are set in `any`.
 inline void Batch::load_rows(const Record* records, const uint32_t* from, const uint16_t (&any)[kGroups], int n, const Tile& tile) {
   const F32x16 columns = load(lane_x()) + broadcast(tile.centre_x), centre_y = broadcast(tile.centre_y);
   for (int first = 0; first < n; first += 16) {
@@ -99,8 +101,9 @@ inline void Batch::load_rows(const Record* records, const uint32_t* from, const 
   }
 }
 
-// Exact test of ellipse against block: the least distance over the box of its pixel centres lies on one of the two sides that face the
-// centre, and on a side it is where the ellipse is tangent to it, or at its end. Sixteen Gaussians per lane.
+// Exact test of ellipse against block. The smallest distance over the box of pixel centres lies on one of the
+// two sides that face the centre: where the ellipse is tangent to the side, or at its end. Sixteen Gaussians,
+// one per lane.
 inline void test_blocks(const Record* records, const uint32_t* from, int n, const Tile& tile, Touched& touched) {
   const F32x16 zero = broadcast(0.0f);
   for (int i = 0; i < n; i += 16) {
@@ -130,7 +133,7 @@ inline void test_blocks(const Record* records, const uint32_t* from, int n, cons
   }
 }
 
-// Which of a batch's Gaussians touch any of the blocks whose bits are set.
+// Find which Gaussians of a batch touch any of the blocks whose bits are set.
 inline void merge_blocks(const Touched& touched, uint32_t blocks, int n, uint16_t (&any)[kGroups]) {
   uint16_t use[16];
   for (int b = 0; b < 16; ++b) use[b] = blocks >> b & 1 ? 0xffff : 0;
@@ -141,7 +144,7 @@ inline void merge_blocks(const Touched& touched, uint32_t blocks, int n, uint16_
   }
 }
 
-// Alpha of four Gaussians at a block's pixels; 0 where it is below 1/255.
+// Compute the alpha of four Gaussians at the pixels of a block; 0 if below 1/255.
 inline void compute_alphas(const Row* const (&row)[4], int block_column, F32x16 y, const Exp2& exp2, F32x16 (&alpha)[4]) {
   constexpr int N = kInterleaved;
   const F32x16 limit = broadcast(kMinAlphaLog2), most = broadcast(kMaxAlpha);
@@ -156,7 +159,7 @@ inline void compute_alphas(const Row* const (&row)[4], int block_column, F32x16 
   }
 }
 
-// F32x4 pixels of three interleaved channels, apart and together again.
+// Split four pixels into three channels, and join them.
 typedef float F32x4 __attribute__((vector_size(16)));
 
 inline void split_rgb(const float* p, float* r, float* g, float* b) {
@@ -179,8 +182,8 @@ inline void join_rgb(float* p, const float* r, const float* g, const float* b) {
   std::memcpy(p, &x, 16), std::memcpy(p + 4, &y, 16), std::memcpy(p + 8, &z, 16);
 }
 
-// Calls whole(offset in the picture, place in block order) for four neighbours at a time where the tile lies inside the picture,
-// else one(...) for single pixels.
+// Call whole(offset in the image, index in block order) for each four horizontal neighbours inside the image,
+// and one(...) for single pixels at its edge.
 template <class Whole, class One>
 inline void for_each_pixel(const SeCamera& c, const Tile& tile, Whole&& whole, One&& one) {
   const int width = std::min(kTile, c.width - tile.x * kTile), height = std::min(kTile, c.height - tile.y * kTile);
@@ -193,7 +196,8 @@ inline void for_each_pixel(const SeCamera& c, const Tile& tile, Whole&& whole, O
   }
 }
 
-// [channels][16 blocks, 16 lanes] of a tile from a picture [H, W, channels]; 0 outside.
+// Load a tile of an image [H, W, channels] in block order, [channels][16 blocks, 16 lanes]; 0 outside of the
+// image.
 inline void load_tile(const float* picture, const SeCamera& c, const Tile& tile, float (&plane)[256]) {
   if (!tile.whole) std::memset(plane, 0, sizeof plane);
   for_each_pixel(
@@ -224,8 +228,9 @@ inline void store_tile(float* picture, const SeCamera& c, const Tile& tile, cons
       });
 }
 
-// Runs f(begin, end, worker) over all tiles. Each worker has its own part of the picture, since neighbours share Gaussians, and then helps
-// with the parts of others. Some tiles at a time, as they fetch each other's Gaussians ahead; few, as the last ones keep all waiting.
+// Call f(begin, end, worker) for all tiles. Each worker starts with its own part of the image, because
+// neighbours share Gaussians, and then helps with other parts. It takes several tiles at a time, which prefetch
+// each other's Gaussians, but only a few, because all workers wait for the last ones.
 template <class F>
 void distribute_tiles(const State& s, int threads, F&& f) {
   struct alignas(64) Part {
@@ -247,7 +252,8 @@ void distribute_tiles(const State& s, int threads, F&& f) {
   });
 }
 
-// One T per thread, made at its first use. (A plain thread_local object in a shared library is found anew at each access, in inner loops.)
+// One T per thread, created at its first use. (Accessing a plain thread_local object of a shared library looks
+// it up every time.)
 template <class T>
 T& thread_scratch() {
   thread_local const std::unique_ptr<T> own = std::make_unique<T>();
@@ -260,7 +266,7 @@ inline Tile tile_at(const State& s, int number) {
   return {x, y, static_cast<float>(x * kTile + kTile / 2), static_cast<float>(y * kTile + kTile / 2), whole};
 }
 
-// 1 for pixels inside the picture, 0 for the rest of a tile at the edge.
+// 1 for pixels inside the image, 0 for the rest of a tile at the edge.
 inline void mark_inside(const SeCamera& c, const Tile& tile, float (&one)[256]) {
   if (tile.whole) {
     std::fill(one, one + 256, 1.0f);

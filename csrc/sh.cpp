@@ -1,5 +1,6 @@
-// Colours of Gaussians from real spherical harmonics of degree 0 to 3, forward and backward; geometry/sh.py has the same in torch.
-// CHUNK Gaussians at a time, Gaussians along the lanes: their coefficients are laid across once, which costs less than sums over lanes.
+// Colours of Gaussians from real spherical harmonics of degree 0 to 3, forward and backward; geometry/sh.py has
+// the same in torch. Computed for CHUNK Gaussians at a time with Gaussians along the lanes: transposing the
+// coefficients once costs less than sums over lanes.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -11,17 +12,17 @@
 namespace se {
 namespace {
 
-constexpr int CHUNK = 64, MOST = 16;  // MOST: coefficients of a channel at degree 3
+constexpr int CHUNK = 64, MOST = 16;  // MOST: coefficients per channel at degree 3
 constexpr float C0 = 0.28209479177387814f, C1 = 0.4886025119029199f;
 constexpr float D0 = 1.0925484305920792f, D2 = 0.31539156525252005f, D4 = 0.5462742152960396f;  // D1 = D3 = -D0
 constexpr float E0 = -0.5900435899266435f, E1 = 2.890611442640554f, E2 = -0.4570457994644658f, E3 = 0.3731763325901154f,
                 E5 = 1.445305721320277f;  // E4 = E2, E6 = E0
 
-// What a call works on; see the exported functions.
+// The arguments of a call; see se_api.h.
 struct Harmonics {
   const float *means, *dc, *rest;
   const int64_t* rows;
-  int64_t width;  // coefficients of a channel in `rest`
+  int64_t width;  // coefficients per channel in `rest`
   int degree;
   const float* position;
 
@@ -29,7 +30,8 @@ struct Harmonics {
   int used() const { return (degree + 1) * (degree + 1); }
 };
 
-// One chunk: unit directions and the inverse of their length, the harmonics of each, and the coefficients across.
+// One chunk: unit directions and the inverse of their length, the basis functions, and the transposed
+// coefficients.
 struct Chunk {
   alignas(64) float x[CHUNK], y[CHUNK], z[CHUNK], inverse[CHUNK];
   alignas(64) float basis[MOST * CHUNK];
@@ -48,7 +50,7 @@ void gather(const Harmonics& h, int64_t begin, int64_t end, Chunk& c) {
     for (int k = 0; k < 3; ++k) c.coefficients[k * CHUNK + i] = dc[k];
     for (int k = 0; k < used; ++k) c.coefficients[(3 + k) * CHUNK + i] = rest[k];
   }
-  for (int i = n; i < round_up(n, LANES); ++i) {  // whole registers: what lies beyond is computed and thrown away
+  for (int i = n; i < round_up(n, LANES); ++i) {  // fill whole registers: these lanes are computed and discarded
     c.x[i] = c.y[i] = c.z[i] = 1.f;
     for (int k = 0; k < used + 3; ++k) c.coefficients[k * CHUNK + i] = 0.f;
   }
@@ -78,7 +80,7 @@ void evaluate_basis(int degree, int n, Chunk& c) {
   }
 }
 
-// Gradient of sum_j t_j basis_j with respect to the unit direction, for lanes at `i`; t [MOST].
+// Gradient of sum_j t_j basis_j with respect to the unit direction, for the lanes at `i`; t [MOST].
 void differentiate_direction(int degree, const Chunk& c, int i, const Vec* t, Vec* g) {
   const Vec x = load(c.x + i), y = load(c.y + i), z = load(c.z + i), c1 = broadcast(C1);
   g[0] = broadcast(0.f) - c1 * t[3], g[1] = broadcast(0.f) - c1 * t[1], g[2] = c1 * t[2];
@@ -109,7 +111,7 @@ void forward(const Harmonics& h, int64_t begin, int64_t end, float* out) {
       Vec sum = broadcast(0.f);
       for (int j = 0; j < used; ++j) sum = fma(load(c.basis + j * CHUNK + i), load(c.coefficients + (3 * j + k) * CHUNK + i), sum);
       sum = sum + broadcast(0.5f);
-      store(colour[k] + i, select_greater(broadcast(0.f), sum, broadcast(0.f), sum));  // a NaN stays one
+      store(colour[k] + i, select_greater(broadcast(0.f), sum, broadcast(0.f), sum));  // keeps NaN
     }
   for (int i = 0; i < n; ++i)
     for (int k = 0; k < 3; ++k) out[3 * (begin + i) + k] = colour[k][i];
@@ -134,7 +136,7 @@ void backward(const Harmonics& h, int64_t begin, int64_t end, const float* colou
       }
       differentiate_direction(h.degree, c, i, t, by);
       const Vec x = load(c.x + i), y = load(c.y + i), z = load(c.z + i), inverse = load(c.inverse + i);
-      const Vec along = fma(x, by[0], fma(y, by[1], z * by[2]));  // the part along the direction changes its length alone
+      const Vec along = fma(x, by[0], fma(y, by[1], z * by[2]));  // the component along the direction changes only its length
       store(d[0] + i, (by[0] - x * along) * inverse);
       store(d[1] + i, (by[1] - y * along) * inverse);
       store(d[2] + i, (by[2] - z * along) * inverse);
@@ -154,14 +156,12 @@ void backward(const Harmonics& h, int64_t begin, int64_t end, const float* colou
 }  // namespace
 }  // namespace se
 
-// means [A, 3]; dc [N, 3] and rest [N, width, 3], of which rows [A] (null: broadcast, A = N) belong to them; position [3] -> out [A, 3].
 SE_EXPORT void se_sh_forward(const float* means, const float* dc, const float* rest, const int64_t* rows, int64_t count, int64_t width,
                              int32_t degree, const float* position, float* out, int32_t threads) {
   const se::Harmonics h{means, dc, rest, rows, width, degree, position};
   se::parallel_for(count, se::CHUNK, threads, [&](int64_t begin, int64_t end, int) { se::forward(h, begin, end, out); });
 }
 
-// The same, with the colours [A, 3] that came out and their gradient -> gradients of means [A, 3], and, at `rows` only, of dc and rest.
 SE_EXPORT void se_sh_backward(const float* means, const float* dc, const float* rest, const int64_t* rows, const float* position,
                               const float* colours, const float* upstream, float* d_means, float* d_dc, float* d_rest, int64_t count,
                               int64_t width, int32_t degree, int32_t threads) {

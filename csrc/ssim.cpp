@@ -1,11 +1,12 @@
-// L1 + SSIM of two [H, W, 3] pictures and the gradient of their weighted sum, in one pass over bands of rows.
+// L1 + SSIM of two images [H, W, 3] and the gradient of their weighted sum, in one pass over bands of rows.
 //
-// SSIM with an 11 x 11 Gaussian window of sigma 1.5 and zero padding (Wang et al. 2004; the padding is 3DGS's), written in the sum
-// s = x + y - 1 and the difference d = x - y of the pixels, because 1 - S is then a sum of small positive parts and float32 loses nothing
-// of it where the pictures agree. With means ms, md and variances vs, vd of a window, and m = ms + 1:
+// SSIM uses an 11 x 11 Gaussian window of sigma 1.5 (Wang et al. 2004) and zero padding like 3DGS. It is
+// computed from the sum s = x + y - 1 and the difference d = x - y of the pixels: then 1 - S is a sum of small
+// positive parts, and float32 stays exact where the images agree. With the means ms, md and the variances vs, vd
+// of a window, and m = ms + 1:
 //   1 - S = p + q - p q,  p = md^2 / B1,  q = vd / B2,  B1 = (m^2 + md^2) / 2 + C1,  B2 = (vs + vd) / 2 + C2.
-// The second moments E[ss], E[dd] are the other two filtered maps. Gradient, G the same window (it is symmetric), a = (1 - p) / B2 and
-// b = (1 - q) / B1:
+// The second moments E[ss], E[dd] are the other two filtered maps. The gradient, with the same (symmetric)
+// window G, a = (1 - p) / B2 and b = (1 - q) / B1:
 //   dS/dx(pixel) = G * P + s (G * Q) - d (G * R),  Q = a q,  R = a (2 - q),  P = m b p - ms Q + md (R - b (2 - p)).
 #include <algorithm>
 #include <cmath>
@@ -22,7 +23,7 @@ namespace {
 using namespace se;
 
 constexpr int TAPS = 11, RADIUS = 5, BAND = 48;
-constexpr int EDGE = 3 * RADIUS;   // neighbours of one colour are 3 floats apart in an interleaved row
+constexpr int EDGE = 3 * RADIUS;   // neighbours of one channel are 3 floats apart in an interleaved row
 constexpr int MARGIN = EDGE + 16;  // room for a whole register beyond the last value
 constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
 
@@ -42,7 +43,7 @@ struct Picture {
   float* gradient;  // [H, W, 3] or null
 };
 
-// The scratch of one worker: rows of `length` floats with MARGIN on both sides.
+// Workspace of one worker: rows of `length` floats with MARGIN on both sides.
 class Scratch {
  public:
   explicit Scratch(int64_t row) : length_(row + 2 * MARGIN), data_((4 + 3 + 3 * TAPS + 2 * TAPS) * length_, 0.f) {}
@@ -62,7 +63,8 @@ class Band {
  public:
   Band(const Picture& p, Scratch& s) : p_(p), s_(s) {}
 
-  // Rows [begin, end): adds the sums of |x - y| and of 1 - S to sums[0], sums[1] and writes the gradient.
+  // Process rows [begin, end): add the sums of |x - y| and of 1 - S to sums[0] and sums[1] and write the
+  // gradient.
   void run(int64_t begin, int64_t end, double* sums) {
     const int64_t first = p_.gradient ? begin - RADIUS : begin, last = p_.gradient ? end + RADIUS : end;
     for (int64_t r = first - RADIUS; r < first + RADIUS; ++r) load_row(r);
@@ -83,7 +85,7 @@ class Band {
   }
 
  private:
-  // s and d of row r into the ring of rows; outside of the picture x = y = 0.
+  // Load s and d of row r into the ring of rows; outside of the image x = y = 0.
   void load_row(int64_t r) {
     const int slot = static_cast<int>((r % TAPS + TAPS) % TAPS);
     float *s = s_.pixels(0, slot), *d = s_.pixels(1, slot);
@@ -97,7 +99,8 @@ class Band {
     for (int64_t i = 0; i < p_.row; ++i) d[i] = x[i] - y[i];
   }
 
-  // The vertical half of the window at row r: ms, md, E[ss], E[dd], with the padding's values in the margins.
+  // Apply the vertical half of the window at row r: ms, md, E[ss], E[dd], with the values of the padding in the
+  // margins.
   void filter_columns(int64_t r) {
     const float *s[TAPS], *d[TAPS];
     for (int t = 0; t < TAPS; ++t) {
@@ -133,7 +136,7 @@ class Band {
     return a;
   }
 
-  // The horizontal half: 1 - S summed over the row, and P, Q, R.
+  // Apply the horizontal half of the window: return the row's sum of 1 - S and store P, Q, R.
   double compute_dissimilarity() {
     const float *m0 = s_.filtered(0), *m1 = s_.filtered(1), *m2 = s_.filtered(2), *m3 = s_.filtered(3);
     float *P = s_.partial(0), *Q = s_.partial(1), *R = s_.partial(2);
@@ -145,7 +148,7 @@ class Band {
       const Vec vd = filter_row(m3 + i, window_.w) - md * md, vs = filter_row(m2 + i, window_.w) - ms * ms;
       const Vec B1 = fma(half, fma(m, m, md * md), broadcast(C1)), B2 = fma(half, vs + vd, broadcast(C2));
       const Vec inverse = one / (B1 * B2), by1 = B2 * inverse, by2 = B1 * inverse;
-      const Vec p = md * md * by1, q = vd * by2, S = fma(p, one - q, q);  // 1 - S of the formula
+      const Vec p = md * md * by1, q = vd * by2, S = fma(p, one - q, q);  // S is 1 - S of the formula
       if (p_.gradient) {
         const Vec a = (one - p) * by2, b = (one - q) * by1, aq = a * q, r = a * (two - q);
         store(P + i, fma(m * b, p, fma(md, r - b * (two - p), broadcast(0.f) - ms * aq)));
@@ -163,7 +166,7 @@ class Band {
     return total + sum(sums);
   }
 
-  // The horizontal half of the window over P, Q, R of row r (zero outside of the picture), into the ring.
+  // Apply the horizontal half of the window to P, Q, R of row r (zero outside of the image), into the ring.
   void filter_partials(int64_t r) {
     for (int map = 0; map < 3; ++map) {
       float* row = s_.partial(map);
@@ -178,7 +181,8 @@ class Band {
     for (int map = 0; map < 3; ++map) std::fill_n(s_.ring(map, r), p_.row, 0.f);
   }
 
-  // The vertical half around row r, and the gradient of both terms there. Returns the row's sum of |x - y|.
+  // Apply the vertical half of the window around row r and write the gradient of both terms. Return the row's
+  // sum of |x - y|.
   double write_gradient(int64_t r) {
     const float* map[3][TAPS];
     for (int m = 0; m < 3; ++m)
@@ -229,8 +233,6 @@ class Band {
 
 }  // namespace
 
-// out[0] = mean |x - y|, out[1] = 1 - mean SSIM; gradient (may be null) = d (weight_l1 out[0] + weight_ssim out[1]) / dx.
-// Returns 1 where memory ran out.
 SE_EXPORT int32_t se_photometric_loss(const float* x, const float* y, int64_t H, int64_t W, float weight_l1, float weight_ssim, int threads,
                                       float* gradient, double* out) {
   return run_guarded([&] {

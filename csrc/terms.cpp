@@ -1,5 +1,5 @@
-// Two sums of the objective and their gradients, each one pass: volumes of Gaussians, and the opacity hinge. The gradients are rounded
-// as autograd's of the plain expressions are.
+// Two sums of the objective and their gradients, one pass each: volumes of Gaussians and the opacity hinge. The
+// gradients are rounded like autograd's.
 #include <algorithm>
 #include <cstdint>
 
@@ -14,10 +14,8 @@ inline double sum_lanes(const double* lanes) {
 }
 }  // namespace
 
-// How many partial sums a sum over `count` has; the caller adds them up in order, which is the same for every number of threads.
 SE_EXPORT int64_t se_sum_chunks(int64_t count) { return (count + kGrain - 1) / kGrain; }
 
-// sx sy sz of scales [M, 3].
 SE_EXPORT void se_volume_forward(const float* scales, int64_t count, double* partial, int32_t threads) {
   se::parallel_for(count, kGrain, threads, [&](int64_t begin, int64_t end, int) {
     double lanes[8] = {};
@@ -26,7 +24,6 @@ SE_EXPORT void se_volume_forward(const float* scales, int64_t count, double* par
   });
 }
 
-// gradient [M, 3] = upstream times that of the sum.
 SE_EXPORT void se_volume_backward(const float* scales, int64_t count, float upstream, float* gradient, int32_t threads) {
   se::parallel_for(count, kGrain, threads, [&](int64_t begin, int64_t end, int) {
     for (int64_t i = begin; i < end; ++i) {
@@ -38,7 +35,6 @@ SE_EXPORT void se_volume_backward(const float* scales, int64_t count, float upst
   });
 }
 
-// max(0, tau - raw) over `count` values.
 SE_EXPORT void se_hinge_forward(const float* raw, int64_t count, float tau, double* partial, int32_t threads) {
   se::parallel_for(count, kGrain, threads, [&](int64_t begin, int64_t end, int) {
     double lanes[8] = {};
