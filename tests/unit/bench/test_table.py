@@ -26,7 +26,7 @@ def no_library(monkeypatch):
 
 def test_without_the_library_the_rest_is_measured_and_what_is_missing_is_said(no_library, tmp_path):
     text, path = io.StringIO(), tmp_path / "b.json"
-    with pytest.warns(UserWarning, match="slow reference"):
+    with pytest.warns(UserWarning, match="reference"):
         assert run.run(0.5, 1, path, Console(file=text, width=200)) == 0
     printed = text.getvalue()
     assert "no compiled CPU library" in printed and "install a C++20 compiler" in printed and "pure-torch reference" in printed

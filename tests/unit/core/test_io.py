@@ -10,6 +10,7 @@ import pytest
 from scene_experts.core import io
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.io import locked, read_json, write_atomic, write_bytes, write_json
+from support.messages import naming
 
 
 def names(folder):
@@ -43,8 +44,7 @@ def test_a_failed_write_is_a_run_error_and_leaves_the_old_file(tmp_path, error):
         temporary.write_text("half")
         raise error
 
-    advice = "choose another folder" if error.errno == 13 else "free some space or choose"
-    with pytest.raises(RunError, match=f"cannot write .*{error.strerror or error}; {advice}"):
+    with pytest.raises(RunError, match=naming(path, "--out")):
         write_atomic(path, write)
     assert path.read_text() == "old" and names(tmp_path) == ["x"]
 
@@ -60,7 +60,7 @@ def test_a_full_disk(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
     try:
-        with pytest.raises(RunError, match=r"cannot write .*x: "):
+        with pytest.raises(RunError, match=naming("x")):
             write_bytes(tmp_path / "x", bytes(2000))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -69,7 +69,7 @@ def test_a_full_disk(tmp_path):
 
 def test_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(RunError, match="choose another folder with --out"):
+    with pytest.raises(RunError, match="--out"):
         write_bytes(tmp_path / "file" / "x", b"")
 
 
@@ -99,12 +99,12 @@ def test_json_of_other_tools(tmp_path):
 @pytest.mark.parametrize("data", [b"", b"{", b'{"a": 1', b"\xff\xfe\x00"])
 def test_unreadable_json(tmp_path, data):
     (tmp_path / "x.json").write_bytes(data)
-    with pytest.raises(InputError, match=r"expected a run configuration in JSON at .*x.json"):
+    with pytest.raises(InputError, match=naming("JSON", "x.json")):
         read_json(tmp_path / "x.json", "run configuration")
 
 
 def test_absent_json(tmp_path):
-    with pytest.raises(InputError, match=r"expected a run configuration at .*x.json, found no such file"):
+    with pytest.raises(InputError, match=naming("x.json")):
         read_json(tmp_path / "x.json", "run configuration")
 
 

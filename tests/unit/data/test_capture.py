@@ -18,6 +18,7 @@ from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap_model import read_model, write_model
 from scene_experts.data.summary import neighbour_distance, summarise
 from support.lenses import LENSES
+from support.messages import naming
 from support.synthetic import Synthetic, make_capture, picture
 
 
@@ -109,7 +110,7 @@ def test_image_folders_of_another_size(made: Synthetic, copy: Path) -> None:
         torch.testing.assert_close(half.views[0].camera.K[:2], full.views[0].camera.K[:2] / 2)
         assert any("another extension" in w for w in half.warnings)
     assert load(copy, resolution="inria:2").resolution == "inria:2"
-    with pytest.raises(InputError, match=r"images_4.*found images, images_2.*--resolution factor:N"):
+    with pytest.raises(InputError, match=naming("images_4", "images_2", "--resolution")):
         load(copy, resolution="inria:4")
 
 
@@ -146,7 +147,7 @@ def test_the_summary_is_json_and_true(made: Synthetic) -> None:
     assert capture.points is not None
     d = torch.cdist(capture.points.xyz, capture.points.xyz).fill_diagonal_(9e9).amin(1).median()
     assert said["median_neighbour_distance"] == pytest.approx(float(d), rel=1e-6)
-    assert any("2 test views" in w for w in said["warnings"]) and any("3 sizes" in w for w in said["warnings"])
+    assert any("2" in w and "test" in w for w in said["warnings"]) and any("3" in w and "size" in w for w in said["warnings"])
 
 
 def test_neighbour_distances_of_many_points_are_sampled() -> None:
@@ -187,19 +188,19 @@ def test_only_useless_points(copy: Path) -> None:
 
 
 def test_paths_that_are_no_captures(made: Synthetic, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="found nothing"):
+    with pytest.raises(InputError, match=naming(tmp_path)):
         load(tmp_path / "none")
-    with pytest.raises(InputError, match="found a file"):
+    with pytest.raises(InputError, match=naming("view_000.png")):
         load(made.folder / "images/view_000.png")
-    with pytest.raises(InputError, match=f"{tmp_path}.*sparse/0.*transforms_train.json.*transforms.json"):
+    with pytest.raises(InputError, match=naming(tmp_path, "sparse/0", "transforms_train.json")):
         load(tmp_path)
     shutil.copytree(made.folder / "images", tmp_path / "images")
-    with pytest.raises(InputError, match=r"10 photographs .*scene-experts capture "):
+    with pytest.raises(InputError, match=naming(10, "scene-experts capture")):
         load(tmp_path)
-    with pytest.raises(InputError, match=r"10 photographs .*images --out CAPTURE`"):
+    with pytest.raises(InputError, match=naming(10, "images --out CAPTURE")):
         load(tmp_path / "images")
-    with pytest.raises(InputError, match=f"reconstruction.*: {made.folder}$"):
+    with pytest.raises(InputError, match=naming(made.folder)):
         load(made.folder / "sparse/0")
     for part in ("images", "sparse"):
-        with pytest.raises(InputError, match=f"a part of one.*: {made.folder}$"):
+        with pytest.raises(InputError, match=naming(made.folder)):
             load(made.folder / part)

@@ -12,6 +12,7 @@ from PIL import Image
 from scene_experts.core.errors import InputError
 from scene_experts.data.images import Source, check_policy, decode, probe, target_size
 from scene_experts.data.lens import Lens, pinhole_of
+from support.messages import naming
 from support.synthetic import look_at, picture
 
 
@@ -163,5 +164,5 @@ def test_bad_files(tmp_path: Path) -> None:
             decode(made)
     made = source(tmp_path / "grown.png", noise(8, 8))
     Image.fromarray(noise(8, 9)).save(made.path)
-    with pytest.raises(InputError, match="8x8 px, found 9x8"):
+    with pytest.raises(InputError, match=naming("8x8", "9x8")):
         decode(made)

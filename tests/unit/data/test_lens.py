@@ -123,10 +123,10 @@ def test_centred_principal_point() -> None:
 @pytest.mark.parametrize(
     ("model", "params", "word"),
     [
-        ("EQUIRECTANGULAR", (1.0,), "camera model"),
-        ("PINHOLE", (1.0, 1.0, 1.0), "parameters"),
-        ("PINHOLE", (1.0, 1.0, float("nan"), 1.0), "finite"),
-        ("PINHOLE", (0.0, 1.0, 1.0, 1.0), "positive"),
+        ("EQUIRECTANGULAR", (1.0,), "EQUIRECTANGULAR"),
+        ("PINHOLE", (1.0, 1.0, 1.0), "PINHOLE"),
+        ("PINHOLE", (1.0, 1.0, float("nan"), 1.0), "nan"),
+        ("PINHOLE", (0.0, 1.0, 1.0, 1.0), "0.0"),
     ],
 )
 def test_bad_lenses(model: str, params: tuple[float, ...], word: str) -> None:

@@ -11,6 +11,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.evaluate import lpips, weights
 from scene_experts.evaluate.lpips import BACKBONES, SCALE, SHIFT, Lpips
 from support.lpips import random_tensors
+from support.messages import naming
 
 
 def definition(net: str, tensors: dict[str, Tensor], x: Tensor, y: Tensor) -> float:
@@ -58,9 +59,9 @@ def test_identical_pictures_are_at_distance_zero() -> None:
 
 def test_refuses() -> None:
     network = Lpips("alex", random_tensors("alex"))
-    with pytest.raises(InputError, match="at least 31 px"):
+    with pytest.raises(InputError, match="31"):
         network(torch.zeros(30, 60, 3), torch.zeros(30, 60, 3))
-    with pytest.raises(ValueError, match="one size"):
+    with pytest.raises(ValueError, match=naming(40, 41)):
         network(torch.zeros(40, 40, 3), torch.zeros(40, 41, 3))
     with pytest.raises(InputError, match="lin4"):
         Lpips("alex", {k: v for k, v in random_tensors("alex").items() if k != "lin4"})

@@ -62,9 +62,9 @@ def test_side_by_side(width: int) -> None:
 
 def test_unreadable_picture(tmp_path: Path) -> None:
     (tmp_path / "x.png").write_bytes(b"no picture")
-    with pytest.raises(InputError, match="evaluate again"):
+    with pytest.raises(InputError):
         pictures.read(tmp_path / "x.png")
-    with pytest.raises(InputError, match="evaluate again"):
+    with pytest.raises(InputError):
         pictures.read(tmp_path / "gone.png")
 
 

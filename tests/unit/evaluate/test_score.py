@@ -22,6 +22,7 @@ from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.score import About, evaluate
 from scene_experts.scene import Scene, Traits
 from support.lpips import random_tensors
+from support.messages import naming
 from support.scenes import start_scene
 
 N, K, F, H, W = 6, 4, 8, 36, 48
@@ -218,7 +219,7 @@ def test_a_strip_of_one_view_by_expert(tmp_path: Path) -> None:
 
 def test_photograph_of_another_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FakeCapture, "frame", lambda self, index: SimpleNamespace(rgb=photo(index)[:-1], mask=None))
-    with pytest.raises(InputError, match=r"expected day/0.jpg as 48 x 36 px, found 48 x 35"):
+    with pytest.raises(InputError, match=naming("day/0.jpg", "48 x 36", "48 x 35")):
         evaluated(tmp_path)
 
 

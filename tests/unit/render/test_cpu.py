@@ -14,6 +14,7 @@ from scene_experts.native import library as native
 from scene_experts.render import Rasterizer
 from scene_experts.render.cpu import CpuRasterizer
 from scene_experts.render.reference import ReferenceRasterizer
+from support.messages import naming
 
 pytestmark = pytest.mark.skipif(native.load() is None, reason=str(native.explain_missing()))
 LEVELS = [name for name in native.list_levels() if native.find(name)]
@@ -241,5 +242,5 @@ def test_forward_alone_draws_the_same_bits(threads: int) -> None:
 
 def test_wrong_shapes_are_refused() -> None:
     inputs, camera = make(m=10)
-    with pytest.raises(InputError, match="quats of shape"):
+    with pytest.raises(InputError, match=naming("quats", "(10, 4)", "(5, 4)")):
         CpuRasterizer()(Gaussians(inputs[0], inputs[1][:5], *inputs[2:], torch.arange(10)), camera, BACKGROUND)

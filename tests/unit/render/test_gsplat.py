@@ -152,7 +152,7 @@ def test_why_it_is_not_available(monkeypatch: pytest.MonkeyPatch) -> None:
     library.fully_fused_projection = lambda means: None  # type: ignore[method-assign,assignment]
     assert "1.5.3 or newer" in ask()
     monkeypatch.setattr(adapter, "available", ask)
-    with pytest.raises(InputError, match=r"1\.5\.3 or newer"):
+    with pytest.raises(InputError, match=r"1\.5\.3"):
         adapter.GsplatRasterizer()(single(make_scene(1)), make_camera(), BACKGROUND)
 
 

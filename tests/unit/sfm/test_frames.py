@@ -35,7 +35,7 @@ def test_the_sharp_frames_of_a_video_come_out_whole_and_in_order(tmp_path):
     pictures = [np.asarray(Image.open(tmp_path / "out" / name)).astype(float) for name in names]
     assert [p.shape for p in pictures] == [(64, 96, 3)] * 3
     assert np.allclose([p.mean() for p in pictures], [40, 120, 200], atol=6) and min(p.std() for p in pictures) > 8
-    assert ("looking for sharp frames", 9, 9) in said
+    assert (9, 9) in [step[1:] for step in said]
 
 
 def test_a_file_that_is_no_video_is_told(tmp_path):

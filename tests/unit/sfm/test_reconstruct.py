@@ -17,6 +17,7 @@ from scene_experts.data import load
 from scene_experts.sfm import reconstruct as run
 from scene_experts.sfm.reconstruct import LOG, NOTE, Options
 from scene_experts.sfm.work import NAME, PLACES
+from support.messages import naming
 from support.photos import fake_worker, write_black, write_photo
 from support.places import DEMO
 
@@ -98,10 +99,10 @@ def make(source, out, options=Options(), **more):  # noqa: B008
 
 def test_photographs_that_fit_nowhere_leave_the_reason_and_nothing_else(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "run_worker", fake_worker())
-    with pytest.raises(InputError, match="fit together"):
+    with pytest.raises(InputError, match=naming(tmp_path / "photos")):
         make(write_black(tmp_path / "photos"), tmp_path / "out")
     assert [p.name for p in (tmp_path / "out").iterdir()] == [NAME]
-    with pytest.raises(InputError, match=r"unfinished.*scene-experts capture PHOTOS"):
+    with pytest.raises(InputError, match="scene-experts capture"):
         load(tmp_path / "out")
 
 
@@ -117,8 +118,8 @@ def test_frames_of_a_video_are_taken_once(tmp_path, monkeypatch):
     monkeypatch.setattr(run.frames, "extract_frames", take)
     video = tmp_path / "walk.mp4"
     video.write_bytes(b"frames")
-    for count, message in [(5, "fit together"), (5, "fit together"), (4, "fit together"), (2, "at least 3 frames")]:
-        with pytest.raises(InputError, match=message):
+    for count, fact in [(5, ""), (5, ""), (4, ""), (2, 3)]:
+        with pytest.raises(InputError, match=naming(video, fact)):
             make(video, tmp_path / "out", Options(frames=count))
     assert taken == [5, 4, 2]
 
@@ -128,7 +129,7 @@ def test_the_same_request_finds_its_database_again_and_another_does_not(tmp_path
     source, kept = write_black(tmp_path / "photos"), tmp_path / "out" / NAME / "database" / "colmap.db"
 
     def ask(options=Options()):  # noqa: B008
-        with pytest.raises(InputError, match="fit together"):
+        with pytest.raises(InputError, match=naming(source)):
             make(source, tmp_path / "out", options)
 
     ask()
@@ -172,10 +173,10 @@ def test_what_is_somebody_s_is_not_touched(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "run_worker", fake_worker(**FOUND))
     out = tmp_path / "out"
     for inside in (f"{NAME}/done", "sparse/photos", "images/more"):
-        with pytest.raises(InputError, match="expected photographs outside"):
+        with pytest.raises(InputError, match=naming(out)):
             make(write_black(out / inside), out)
         assert len(list((out / inside).iterdir())) == 3
-    with pytest.raises(InputError, match="choose another --out"):
+    with pytest.raises(InputError, match="--out"):
         make(write_black(tmp_path / "photos"), tmp_path / "photos")
     (tmp_path / "old" / "sparse").mkdir(parents=True)
     for name in ("cameras", "images", "points3D"):
@@ -185,9 +186,9 @@ def test_what_is_somebody_s_is_not_touched(tmp_path, monkeypatch):
 
 
 def test_what_is_no_folder_and_no_video_is_told(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match=r"1\.jpg.*give its folder"):
+    with pytest.raises(InputError, match=naming("1.jpg")):
         make(write_photo(tmp_path / "1.jpg"), tmp_path / "out")
-    with pytest.raises(InputError, match="none, found nothing"):
+    with pytest.raises(InputError, match=naming(tmp_path / "none")):
         make(tmp_path / "none", tmp_path / "out")
     monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pycolmap.*scene-experts\[sfm\]"):
@@ -196,17 +197,17 @@ def test_what_is_no_folder_and_no_video_is_told(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("code", "error", "message"),
+    ("code", "error", "fact"),
     [
-        ("print('{\"step\": \"missing\", \"why\": \"no module\"}')", InputError, r"pycolmap .*no module.*scene-experts\[sfm\]"),
-        ("import os; print('{\"step\": \"features\"}', flush=True); os.abort()", RunError, "code -6.*nothing"),
-        ("import sys; sys.exit('E20261122 10:00 1 sqlite.h:9] disk is full')", RunError, "code 1: disk is full"),
+        ("print('{\"step\": \"missing\", \"why\": \"no module\"}')", InputError, "no module"),
+        ("import os; print('{\"step\": \"features\"}', flush=True); os.abort()", RunError, "-6"),
+        ("import sys; sys.exit('E20261122 10:00 1 sqlite.h:9] disk is full')", RunError, "disk is full"),
     ],
 )  # fmt: skip
-def test_a_worker_that_fails_is_told(tmp_path, monkeypatch, code, error, message):
+def test_a_worker_that_fails_is_told(tmp_path, monkeypatch, code, error, fact):
     (tmp_path / "worker.py").write_text(code)
     monkeypatch.setattr(run.worker, "__file__", str(tmp_path / "worker.py"))
-    with pytest.raises(error, match=message):
+    with pytest.raises(error, match=fact):
         run.run_worker({"threads": 1, "pairs": ["x" * 200] * 1000}, tmp_path / LOG, lambda _: None, lambda *_: None)
 
 

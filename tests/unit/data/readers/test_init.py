@@ -66,11 +66,11 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_an_unknown_kind_is_refused_and_known_once_registered(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not readers.is_capture(folder)
-    with pytest.raises(InputError, match="photographs without camera poses"):
+    with pytest.raises(InputError, match="scene-experts capture"):
         load(folder)
     monkeypatch.setattr(readers, "_registered", [])
     readers.register(PosesReader())
-    assert readers.is_capture(folder) and "poses.json (a test)" in str(readers.unrecognised_error(folder / "nowhere"))
+    assert readers.is_capture(folder) and "poses.json" in str(readers.unrecognised_error(folder / "nowhere"))
 
 
 @pytest.mark.usefixtures("registered")
