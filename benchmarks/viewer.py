@@ -80,7 +80,7 @@ def client(url: str, seconds: float, width: int, height: int, along: list[Pose])
 
 def poses(capture: Capture, count: int = 240) -> list[Pose]:
     """Along the captured cameras and back again, so that a client may go round and round."""
-    cameras = paths.make("views", capture, count).cameras
+    cameras = paths.make_path("views", capture, count).cameras
     out = []
     for camera in (*cameras, *reversed(cameras)):
         rotation = camera.world_to_cam[:3, :3].T.double()

@@ -46,11 +46,11 @@ def test_the_page_shows_our_own_render_and_follows_the_controls(serving, browser
     (client,) = serving.clients.values()
     scene, step = serving.current()
     camera = serving.camera(client)
-    picture = to_8bit(paint(scene, camera, step, DRAW, torch.tensor(serving.panel.background())))
+    picture = to_8bit(paint(scene, camera, step, DRAW, torch.tensor(serving.panel.read_background())))
     picture = np.asarray(Image.fromarray(picture).resize((960, 540), Image.Resampling.BILINEAR))
     error = ((shot[PART].astype(float) - picture[PART]) ** 2).mean()
     assert picture[PART].std() > 5 and 10 * np.log10(255**2 / error) > 22
-    serving.panel.mode.value = "experts"
+    serving.panel.show.value = "experts"
     page.wait_for_timeout(500)
     assert np.abs(settled(page, serving)[PART].astype(int) - shot[PART]).mean() > 3
 

@@ -83,10 +83,10 @@ def render(args: list[str]) -> int:
         route = path_of(command, capture)
         out = command.out or command.run / "renders" / f"{Path(command.path).stem}.mp4"
         if video.is_video(out):
-            video.writer()  # says what is missing before the first frame is drawn
+            video.import_ffmpeg()  # says what is missing before the first frame is drawn
             check_sizes(route)
         if command.save_path:
-            save = path_files.write_nerfstudio if command.save_path.name.endswith(".nerfstudio.json") else path_files.write
+            save = path_files.write_nerfstudio if command.save_path.name.endswith(".nerfstudio.json") else path_files.write_path
             save(command.save_path, route, capture.world)
         background = torch.tensor(capture.background, device=device)
         with Bar(Console(stderr=True)) as tell:
@@ -144,13 +144,13 @@ def path_of(command: RenderCommand, capture: Capture) -> CameraPath:
     """The path that the flags ask for. Raises InputError for one that is none."""
     size = size_of(command.size)
     if path_files.is_path_file(command.path):
-        model = paths.lens([v.camera for v in capture.views], size)
-        return path_files.read(Path(command.path), capture.world, model, size, command.fps)
+        model = paths.median_camera([v.camera for v in capture.views], size)
+        return path_files.read_path(Path(command.path), capture.world, model, size, command.fps)
     fps = command.fps or 24.0
     if command.path == "test":
         chosen = capture.test or capture.train
         return CameraPath(tuple(resized(capture.views[i].camera, size) for i in chosen), command.fps or 2.0)
-    return paths.make(command.path, capture, max(1, round(command.seconds * fps)), size, fps)
+    return paths.make_path(command.path, capture, max(1, round(command.seconds * fps)), size, fps)
 
 
 def resized(camera: Camera, size: tuple[int, int] | None) -> Camera:

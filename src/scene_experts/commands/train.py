@@ -32,7 +32,7 @@ from scene_experts.training.loop import Run
 from scene_experts.training.memory import reuse_freed
 from scene_experts.training.progress import Progress
 from scene_experts.view.live import Live
-from scene_experts.view.server import check_port, viser
+from scene_experts.view.server import check_port, import_viser
 
 FIRST = (
     "--data",
@@ -104,7 +104,7 @@ def train(args: list[str]) -> int:
     command = parse_train(args)
     if command.viewer:
         check_port(command.port)
-        viser()  # reports a missing package before anything is read
+        import_viser()  # reports a missing package before anything is read
     command = replace(command, data=run_folder.named(command.data))
     line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # the command that makes the whole run
     run = run_of(command, line)
@@ -212,7 +212,7 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
                     for warning in event.warnings:
                         print(warning, file=sys.stderr)
                 if live:
-                    live.event(event)
+                    live.follow(event)
         finally:
             if live:
                 live.close()

@@ -13,7 +13,7 @@ from scene_experts.commands import PROG
 from scene_experts.commands.shared import Device, Raster, backend
 from scene_experts.render import as_trained
 from scene_experts.training import run_folder
-from scene_experts.view.server import Viewer, check_port, viser
+from scene_experts.view.server import Viewer, check_port, import_viser
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class ViewCommand:
 def view(args: list[str]) -> int:
     command = parse(ViewCommand, Command(f"{PROG} view", ("--run",)), args)
     check_port(command.port)
-    viser()  # says what is missing before anything is read
+    import_viser()  # says what is missing before anything is read
     device, rasterize = backend(command.device, command.rasterizer, False, False)
     opened = run_folder.open_run(command.run, device, command.step)
     rasterize = as_trained(rasterize, opened.cfg.antialias)

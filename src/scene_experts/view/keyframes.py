@@ -1,4 +1,4 @@
-"""Keyframes set in the viewer: collected from where its user stands, joined smoothly, saved as a path that `render` draws."""
+"""The controls that make camera paths: keyframes are set where a user stands, played back, and saved for `render --path`."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ import torch
 
 from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
+from scene_experts.geometry.poses import interpolate_poses, make_pose, with_fov
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 from scene_experts.view import path_files
-from scene_experts.view.paths import CameraPath, interpolate, pose, with_fov
+from scene_experts.view.paths import CameraPath
 
-SIZE = (1280, 720)
+SIZE = (1280, 720)  # width and height of the saved path, px
 
 
 @dataclass
 class Keyframes:
-    """The folder of the panel that makes camera paths."""
+    """The controls of camera paths."""
 
     server: Any
     capture: Capture
-    folder: Path | None = None  # where paths are saved; None: they are only sent to the browser
+    folder: Path | None = None  # folder that paths are saved in; None: the working directory
     keys: list[Camera] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -34,7 +35,7 @@ class Keyframes:
         with gui.add_folder("Camera path", expand_by_default=False):
             self.words = gui.add_markdown("no keyframes")
             add, clear = gui.add_button("add keyframe"), gui.add_button("clear")
-            self.seconds = gui.add_number("seconds from one to the next", initial_value=2.0, min=0.1, max=60.0, step=0.1)
+            self.seconds = gui.add_number("seconds between keyframes", initial_value=2.0, min=0.1, max=60.0, step=0.1)
             self.loop = gui.add_checkbox("loop", initial_value=False)
             play, save = gui.add_button("play"), gui.add_button("save")
         add.on_click(lambda event: self.add(event.client))
@@ -43,49 +44,51 @@ class Keyframes:
         save.on_click(lambda event: self.save(event.client))
 
     def add(self, client: Any) -> None:
-        """Keep where a client stands."""
+        """Add the camera of a client as a keyframe."""
         if client is None:
             return
         seen = client.camera
         quat = torch.tensor(np.asarray(seen.wxyz), dtype=torch.float64)
         place = torch.tensor(np.asarray(seen.position), dtype=torch.float64)
-        model = replace(self.capture.views[0].camera, world_to_cam=pose(place, quat_to_matrix(quat / quat.norm())).float())
+        model = replace(self.capture.views[0].camera, world_to_cam=make_pose(place, quat_to_matrix(quat / quat.norm())).float())
         self.keys.append(with_fov(model, float(seen.fov), *SIZE))
         self.words.content = f"{len(self.keys)} keyframes"
 
     def clear(self) -> None:
+        """Remove all keyframes."""
         self.keys.clear()
         self.words.content = "no keyframes"
 
-    def path(self) -> CameraPath:
-        """The keyframes alone, one every so many seconds: `render` and `play` join them."""
+    def make_path(self) -> CameraPath:
+        """Return the keyframes as a path. `render` and `play` interpolate between them."""
         return CameraPath(tuple(self.keys), 1 / float(self.seconds.value))
 
     def save(self, client: Any) -> None:
-        """Write the path beside the run, and send it to the browser."""
+        """Write the path to a file and send it to the browser."""
         if not self.keys:
-            self.words.content = "no keyframes to save: stand somewhere and add one"
+            self.words.content = "no keyframes to save; add one first"
             return
         folder = self.folder or Path.cwd()
         path = folder / f"path_{time.strftime('%Y%m%d_%H%M%S')}.json"
-        path_files.write(path, self.path(), self.capture.world, loop=bool(self.loop.value), play_fps=24.0)
+        path_files.write_path(path, self.make_path(), self.capture.world, loop=bool(self.loop.value), play_fps=24.0)
         self.words.content = f"saved {path}"
         if client is not None:
             client.send_file_download(path.name, path.read_bytes())
 
     def play(self, client: Any) -> None:
-        """Move a client along the path."""
+        """Move a client along the path, in a thread of its own."""
         if client is None or len(self.keys) < 2:
             self.words.content = "add at least two keyframes to play"
             return
-        threading.Thread(target=self.run, args=(client,), daemon=True).start()
+        threading.Thread(target=self.move_client, args=(client,), daemon=True).start()
 
-    def run(self, client: Any, fps: float = 15.0) -> None:
+    def move_client(self, client: Any, fps: float = 15.0) -> None:
+        """Move a client along the path; returns at its end."""
         rotations = torch.stack([key.world_to_cam[:3, :3].T.double() for key in self.keys])
         places = torch.stack([key.position.double() for key in self.keys])
         gaps = len(self.keys) - (0 if self.loop.value else 1)
         frames = max(2, round(gaps * float(self.seconds.value) * fps))
-        for made in interpolate(places, rotations, frames, loop=bool(self.loop.value)):
+        for made in interpolate_poses(places, rotations, frames, loop=bool(self.loop.value)):
             rotation, place = made[:3, :3].T, -(made[:3, :3].T @ made[:3, 3])
             with client.atomic():
                 client.camera.wxyz = tuple(matrix_to_quat(rotation).tolist())

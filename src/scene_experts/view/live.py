@@ -1,4 +1,4 @@
-"""A training shown in a browser while it goes on: the viewer draws between two iterations, in the training's own thread."""
+"""Shows a training in a browser while it runs. The viewer draws between two iterations, in the training's own thread."""
 
 from __future__ import annotations
 
@@ -13,47 +13,51 @@ from scene_experts.render import Rasterizer
 from scene_experts.training.events import Event
 from scene_experts.view.server import Viewer
 
-SHARE = 0.12  # of a training's time that drawing may take
+SHARE = 0.12  # fraction of the training time that drawing may take
 
 
 @dataclass
 class Live:
-    """Shows a training as it goes: called between iterations, it draws within its share of the time and holds a training that is paused."""
+    """Draws between the iterations of a training, within its share of the time, and waits while the training is paused.
+
+    Call it with the training after each iteration (`Run.watch`).
+    """
 
     capture: Capture
     rasterize: Rasterizer
-    stopped: Callable[[], bool]  # whether the training has been told to stop
+    stopped: Callable[[], bool]  # returns whether the training was asked to stop
     port: int = 8080
     label: str = "training"
     paths: Path | None = None
-    ready: Callable[[str], None] = print  # told the address
+    ready: Callable[[str], None] = print  # called with the address
     viewer: Viewer | None = None
-    owed: float = 0.0  # seconds of training that must pass before drawing has only had its share
-    last: float = 0.0
+    owed: float = 0.0  # seconds of training until drawing is within its share again
+    last: float = 0.0  # time of the last call, monotonic seconds
 
     def __call__(self, training: Any) -> None:
         now = time.monotonic()
         if self.viewer is None:
             current = lambda: (training.scene, training.step)  # noqa: E731
             self.viewer = Viewer(self.capture, current, self.rasterize, port=self.port, label=self.label, paths=self.paths)
-            self.viewer.panel.train()
+            self.viewer.panel.add_training_controls()
             self.ready(self.viewer.url + (f" (port {self.port} is taken)" if self.viewer.moved else ""))
             self.last = now
         self.owed, self.last = max(0.0, self.owed - (now - self.last)), now
         if self.owed == 0.0 and self.viewer.due(now):
             self.owed = self.viewer.draw(budget=0.01) * (1 / SHARE - 1)
             self.last = time.monotonic()
-        while self.viewer.panel.paused() and not self.stopped():
+        while self.viewer.panel.is_paused() and not self.stopped():
             self.viewer.changed.wait(0.05)
             self.viewer.changed.clear()
             self.viewer.draw()
             self.last, self.owed = time.monotonic(), 0.0
 
-    def event(self, event: Event) -> None:
-        """Follow the training's events."""
+    def follow(self, event: Event) -> None:
+        """Pass an event of the training on to the page."""
         if self.viewer is not None:
-            self.viewer.panel.event(event)
+            self.viewer.panel.follow(event)
 
     def close(self) -> None:
+        """Stop the server, if it was started."""
         if self.viewer is not None:
             self.viewer.close()

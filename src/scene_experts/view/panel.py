@@ -1,4 +1,4 @@
-"""The controls beside the picture: what to show, whose experts, where to stand, crop, levels, paths, and the training's curves."""
+"""The controls beside the picture: what is shown, experts, views, crop, levels, camera paths, and the curves of a training."""
 
 from __future__ import annotations
 
@@ -14,19 +14,28 @@ from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
 from scene_experts.geometry.rotation import matrix_to_quat
 from scene_experts.scene import Scene
-from scene_experts.scene.anchors.mlp import ATTRIBUTES
 from scene_experts.training.events import Event, Finished, Stepped, Stopped
 from scene_experts.view.keyframes import Keyframes
-from scene_experts.view.paint import MODES, Look
-from scene_experts.view.paths import best_view
+from scene_experts.view.paint import Look, available_shows
+from scene_experts.view.paths import choose_best_view
 
 MOST_FRUSTA = 300
 MOST_POINTS = 200_000
-EVERY = 1.0  # seconds between changes of the curves
+STATUS_INTERVAL = 0.5  # seconds between updates of the status line
+CURVE_INTERVAL = 1.0  # seconds between updates of the curves
 
 
 class Panel:
-    """The page's controls; every method may be called from any thread."""
+    """The controls of the page. Every method may be called from any thread.
+
+    Args:
+        server: The viser server.
+        capture: The capture whose views are offered.
+        current: Returns the scene and the step at which it is drawn.
+        changed: Called when the picture must be drawn again.
+        go_to_view: Called with the index of a view to move all clients to.
+        paths: Folder that camera paths are saved in.
+    """
 
     def __init__(
         self,
@@ -34,119 +43,129 @@ class Panel:
         capture: Capture,
         current: Callable[[], tuple[Scene, int]],
         changed: Callable[[], None],
-        go: Callable[[int], None],
+        go_to_view: Callable[[int], None],
         paths: Path | None = None,
     ) -> None:
-        self.server, self.capture, self.current, self.changed, self.go = server, capture, current, changed, go
+        self.server, self.capture, self.current, self.changed, self.go_to_view = server, capture, current, changed, go_to_view
         self.curves: dict[str, list[float]] = {"step": [], "psnr": [], "loss": []}
-        self.said, self.followed, self.charts, self.pause = 0.0, 0.0, [], None
+        self.status_time, self.curve_time, self.charts, self.pause = 0.0, 0.0, [], None
         self.status = server.gui.add_markdown("")
-        scene, _ = current()
-        self.experts = scene.traits.experts
+        scene, step = current()
+        self.traits = scene.traits
         with server.gui.add_folder("Show"):
-            self.mode = self.on(server.gui.add_dropdown("what", options=self.modes(scene), initial_value="picture"))
-            self.size = self.on(server.gui.add_slider("height, px", min=120, max=1080, step=20, initial_value=720))
-            colour = tuple(round(255 * c) for c in capture.background)
-            self.colour = self.on(server.gui.add_rgb("background", initial_value=colour))
-        if self.experts:
-            self.expert_controls()
-        if count := scene.traits.levels:
-            self.level = self.on(server.gui.add_slider("finest level", min=0, max=count - 1, step=1, initial_value=count - 1))
-        else:
-            self.level = None
-        self.view_controls()
-        self.crop_controls(scene)
+            self.show = self.redraw_on_change(
+                server.gui.add_dropdown("what", options=available_shows(self.traits), initial_value="picture")
+            )
+            self.size = self.redraw_on_change(server.gui.add_slider("height, px", min=120, max=1080, step=20, initial_value=720))
+            color = tuple(round(255 * c) for c in capture.background)
+            self.color = self.redraw_on_change(server.gui.add_rgb("background", initial_value=color))
+        if self.traits.experts:
+            self.add_expert_controls(scene, step)
+        self.level = None
+        if finest := self.traits.levels - 1 if self.traits.levels else 0:
+            self.level = self.redraw_on_change(server.gui.add_slider("finest level", min=0, max=finest, step=1, initial_value=finest))
+        self.add_view_controls()
+        self.add_crop_controls(scene)
         self.keyframes = Keyframes(server, capture, paths)
 
-    def on(self, control: Any) -> Any:
-        """A control whose change redraws."""
+    def redraw_on_change(self, control: Any) -> Any:
+        """Return `control`, whose changes now cause a new picture."""
         control.on_update(lambda _: self.changed())
         return control
 
-    def modes(self, scene: Scene) -> tuple[str, ...]:
-        """What this scene can show."""
-        usable = {"experts": self.experts > 0, "entropy": self.experts > 0, "activation": scene.traits.activation}
-        return tuple(mode for mode in MODES if usable.get(mode, True))
-
-    def expert_controls(self) -> None:
-        gui = self.server.gui
+    def add_expert_controls(self, scene: Scene, step: int) -> None:
+        """Add a choice of the attribute and a switch for each expert."""
+        with torch.no_grad():
+            attributes = tuple(scene.routing(step, 1))
+        gui, numbers = self.server.gui, range(1, self.traits.experts + 1)
         with gui.add_folder("Experts"):
-            self.attribute = self.on(gui.add_dropdown("of", options=ATTRIBUTES, initial_value="color"))
-            self.switches = [self.on(gui.add_checkbox(f"expert {e + 1}", initial_value=True)) for e in range(self.experts)]
-            alone = gui.add_dropdown("alone", options=("all", *(str(e + 1) for e in range(self.experts))), initial_value="all")
+            self.attribute = self.redraw_on_change(gui.add_dropdown("of", options=attributes, initial_value=attributes[-1]))
+            self.switches = [self.redraw_on_change(gui.add_checkbox(f"expert {number}", initial_value=True)) for number in numbers]
+            alone = gui.add_dropdown("only", options=("all", *map(str, numbers)), initial_value="all")
 
             @alone.on_update
             def _(_: Any) -> None:
-                for e, switch in enumerate(self.switches):
-                    switch.value = alone.value in ("all", str(e + 1))
+                for number, switch in zip(numbers, self.switches):
+                    switch.value = alone.value in ("all", str(number))
                 self.changed()
 
-    def view_controls(self) -> None:
+    def add_view_controls(self) -> None:
+        """Add a choice of the views, the photograph over the picture, and switches for the cameras and rows."""
         gui, views = self.server.gui, self.capture.views
-        names = tuple(f"{'test  ' if i in set(self.capture.test) else 'train '} {view.name}" for i, view in enumerate(views))
+        test = set(self.capture.test)
+        names = tuple(f"{'test  ' if i in test else 'train '} {view.name}" for i, view in enumerate(views))
         with gui.add_folder("Views"):
-            chosen = gui.add_dropdown("view", options=names, initial_value=names[best_view(self.capture)])
-            chosen.on_update(lambda _: self.go(names.index(chosen.value)))
-            self.wipe = self.on(gui.add_slider("photograph", min=0.0, max=1.0, step=0.01, initial_value=0.0))
+            chosen = gui.add_dropdown("view", options=names, initial_value=names[choose_best_view(self.capture)])
+            chosen.on_update(lambda _: self.go_to_view(names.index(chosen.value)))
+            self.wipe = self.redraw_on_change(gui.add_slider("photograph", min=0.0, max=1.0, step=0.01, initial_value=0.0))
             frusta = gui.add_checkbox("cameras", initial_value=False)
-            anchors = gui.add_checkbox(self.current()[0].traits.rows, initial_value=False)
+            rows = gui.add_checkbox(self.traits.rows, initial_value=False)
         frusta.on_update(lambda _: self.show_frusta(frusta.value))
-        anchors.on_update(lambda _: self.show_anchors(anchors.value))
+        rows.on_update(lambda _: self.show_rows(rows.value))
         self.chosen, self.names = chosen, names
 
-    def crop_controls(self, scene: Scene) -> None:
+    def add_crop_controls(self, scene: Scene) -> None:
+        """Add a crop box. Its sliders span the central 99 % of the rows along each axis."""
         gui = self.server.gui
         xyz = scene.positions.cpu().float()
         low, high = (
             (torch.quantile(xyz[:: max(1, len(xyz) // 100_000)], q, dim=0) for q in (0.005, 0.995)) if len(xyz) else (xyz.new_zeros(3),) * 2
         )
         with gui.add_folder("Crop", expand_by_default=False):
-            self.crop = self.on(gui.add_checkbox("crop", initial_value=False))
+            self.crop = self.redraw_on_change(gui.add_checkbox("crop", initial_value=False))
             self.bounds = []
             for axis in range(3):
                 a, b = float(low[axis]), max(float(high[axis]), float(low[axis]) + 1e-3)
                 slider = gui.add_multi_slider("xyz"[axis], min=a, max=b, step=(b - a) / 200, initial_value=(a, b))
-                self.bounds.append(self.on(slider))
+                self.bounds.append(self.redraw_on_change(slider))
 
-    # --- what is asked for
+    # --- values of the controls
 
-    def look(self) -> Look:
-        only = None
-        if self.experts and not all(switch.value for switch in self.switches):
-            only = tuple(e for e, switch in enumerate(self.switches) if switch.value)
+    def read_look(self) -> Look:
+        """Return what the picture shows."""
+        only, attribute = None, "color"
+        if self.traits.experts:
+            attribute = self.attribute.value
+            if not all(switch.value for switch in self.switches):
+                only = tuple(e for e, switch in enumerate(self.switches) if switch.value)
         box = None
         if self.crop.value:
             ends = [sorted(map(float, bound.value)) for bound in self.bounds]
             box = ((ends[0][0], ends[1][0], ends[2][0]), (ends[0][1], ends[1][1], ends[2][1]))
-        attribute = self.attribute.value if self.experts else "color"
-        return Look(self.mode.value, attribute, only, box)  # type: ignore[arg-type]
+        return Look(self.show.value, attribute, only, box)
 
-    def background(self) -> tuple[float, float, float]:
-        r, g, b = self.colour.value
+    def read_background(self) -> tuple[float, float, float]:
+        """Return the background colour, RGB in [0, 1]."""
+        r, g, b = self.color.value
         return (r / 255, g / 255, b / 255)
 
-    def height(self) -> int:
+    def read_height(self) -> int:
+        """Return the largest height of a picture in px."""
         return int(self.size.value)
 
-    def photograph(self) -> float:
+    def read_wipe(self) -> float:
+        """Return the fraction of the picture that the photograph covers, in [0, 1]."""
         return float(self.wipe.value)
 
-    def finest(self) -> int | None:
-        """The finest level to draw; None for all of them."""
+    def read_finest(self) -> int | None:
+        """Return the finest level to draw, or None for all levels."""
         return None if self.level is None or self.level.value >= self.level.max else int(self.level.value)
 
     # --- what is shown beside the picture
 
-    def drawn(self, seconds: float, camera: Camera) -> None:
+    def report_picture(self, seconds: float, camera: Camera) -> None:
+        """Show the size and the time of a picture. During a training the status line shows the training instead."""
         now = time.monotonic()
-        if now - self.said > 0.5 and not self.charts:  # a training tells of itself
-            self.said = now
-            self.tell(f"{camera.width} x {camera.height} px, {1000 * seconds:.0f} ms")
+        if now - self.status_time > STATUS_INTERVAL and not self.charts:
+            self.status_time = now
+            self.show_status(f"{camera.width} x {camera.height} px, {1000 * seconds:.0f} ms")
 
-    def tell(self, text: str) -> None:
+    def show_status(self, text: str) -> None:
+        """Show a text (Markdown) at the top of the panel."""
         self.status.content = text
 
     def show_frusta(self, visible: bool) -> None:
+        """Show or hide the cameras of the capture (at most MOST_FRUSTA). A click on one moves the clients there."""
         chosen = np.linspace(0, len(self.capture.views) - 1, min(len(self.capture.views), MOST_FRUSTA)).round().astype(int)
         for i in sorted({int(i) for i in chosen}):
             name, view = f"/cameras/{i}", self.capture.views[i]
@@ -163,9 +182,10 @@ class Panel:
                 wxyz=matrix_to_quat(rotation).numpy(),
                 position=view.camera.position.numpy(),
             )
-            frustum.on_click(lambda _, i=i: self.go(i))
+            frustum.on_click(lambda _, i=i: self.go_to_view(i))
 
-    def show_anchors(self, visible: bool) -> None:
+    def show_rows(self, visible: bool) -> None:
+        """Show or hide the positions of the rows (at most MOST_POINTS) as points."""
         if not visible:
             self.server.scene.remove_by_name("/anchors")
             return
@@ -173,10 +193,10 @@ class Panel:
         xyz = xyz[:: max(1, -(-len(xyz) // MOST_POINTS))]
         self.server.scene.add_point_cloud("/anchors", xyz.numpy(), (230, 159, 0), point_size=0.002 * self.capture.extent)
 
-    # --- while it trains
+    # --- during a training
 
-    def train(self) -> None:
-        """Add the training's controls."""
+    def add_training_controls(self) -> None:
+        """Add a pause switch and the curves of a training."""
         from viser import uplot
 
         gui = self.server.gui
@@ -190,31 +210,31 @@ class Panel:
                 plot = gui.add_uplot((nothing, nothing), series, title=title, aspect=1.8, scales={"x": uplot.Scale(time=False, auto=True)})
                 self.charts.append((key, plot))
 
-    def paused(self) -> bool:
+    def is_paused(self) -> bool:
+        """Return whether the user paused the training."""
         return bool(self.pause is not None and self.pause.value)
 
-    def event(self, event: Event) -> None:
-        """Follow a training."""
+    def follow(self, event: Event) -> None:
+        """Update the curves and the status line from an event of the training."""
         match event:
             case Stepped():
                 self.curves["step"].append(float(event.step))
                 self.curves["psnr"].append(event.psnr)
                 self.curves["loss"].append(sum(event.terms.values()))
-                if time.monotonic() - self.followed > EVERY:
-                    self.followed = time.monotonic()
-                    self.redraw(event)
-                    self.changed()  # the scene has moved on
+                if time.monotonic() - self.curve_time > CURVE_INTERVAL:
+                    self.curve_time = time.monotonic()
+                    self.update_curves(event)
+                    self.changed()
             case Stopped() | Finished():
-                self.tell(f"training ended at iteration {event.step:,}")
+                self.show_status(f"training ended at iteration {event.step:,}")
                 self.changed()
             case _:
                 pass
 
-    def redraw(self, event: Stepped) -> None:
+    def update_curves(self, event: Stepped) -> None:
+        """Show the latest iteration in the status line and in the curves, which have at most about 500 points."""
         terms = " ".join(f"{name} {value:.4f}" for name, value in event.terms.items())
-        self.tell(
-            f"iteration {event.step:,}, {event.anchors:,} {self.current()[0].traits.rows}, {100 * event.active:.0f} % active\n\n{terms}"
-        )
-        step = max(1, len(self.curves["step"]) // 500)
+        self.show_status(f"iteration {event.step:,}, {event.anchors:,} {self.traits.rows}, {100 * event.active:.0f} % active\n\n{terms}")
+        every = max(1, len(self.curves["step"]) // 500)
         for key, plot in self.charts:
-            plot.data = (np.array(self.curves["step"][::step]), np.array(self.curves[key][::step]))
+            plot.data = (np.array(self.curves["step"][::every]), np.array(self.curves[key][::every]))

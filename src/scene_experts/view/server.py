@@ -1,7 +1,7 @@
-"""A page on one port: the scene drawn here by the fast rasteriser, sent as pictures to any browser (viser). No display or GPU needed.
+"""Serves a scene to browsers (viser). This process draws the pictures, so neither it nor the browser needs a display or a GPU.
 
-One thread draws, for all clients in turn: either the thread of `serve`, or the training's own between two iterations. A client that moves
-gets small pictures at once and the full one when it rests.
+One thread draws for all clients in turn: the thread that calls `serve`, or the training's thread between two iterations. A client
+gets small pictures while its camera moves and a full-size picture when it rests.
 """
 
 from __future__ import annotations
@@ -22,54 +22,59 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
 from scene_experts.evaluate.pictures import to_8bit
+from scene_experts.geometry.poses import make_pose, with_fov
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Draws, Scene
 from scene_experts.view.paint import paint
 from scene_experts.view.panel import Panel
-from scene_experts.view.paths import around, best_view, pose, with_fov
+from scene_experts.view.paths import analyse_cameras, choose_best_view
 
 log = logging.getLogger(__name__)
 
-REST = 0.15  # seconds without a movement after which the full picture is drawn
-GOAL = 1 / 25  # seconds that a picture may take while its client moves
-SMALLEST = 0.2  # of the full size
+REST = 0.15  # seconds without movement after which a full-size picture is drawn
+GOAL = 1 / 25  # seconds per picture while the client moves
+SMALLEST = 0.2  # smallest side of a picture while the client moves, as a fraction of the full size
 
 
-def viser() -> Any:
-    """The module that serves the page. Raises InputError with what to install where it is missing."""
+def import_viser() -> Any:
+    """Return the module viser. Raises InputError, which says what to install, if it is missing."""
     try:
         import viser as module
     except ImportError as error:
-        raise InputError("expected viser to show scenes in a browser, found none; pip install 'scene-experts[viewer]'") from error
+        raise InputError("showing scenes in a browser requires viser: pip install 'scene-experts[viewer]'") from error
     return module
 
 
 def check_port(port: int) -> None:
-    """Raises InputError for a number that is no port; 0 lets the system choose."""
+    """Raise InputError if a number is not a port. 0 lets the system choose one."""
     if not 0 <= port <= 65535:
-        raise InputError(f"expected --port between 0 and 65535, found {port}; choose another")
+        raise InputError(f"expected --port between 0 and 65535, found {port}; choose another port")
 
 
 @dataclass
 class Client:
-    """One browser: where it looks from, and what it was last sent."""
+    """A connected browser: its camera and what it was last sent."""
 
     handle: Any
-    moved: float = 0.0  # when its camera last changed (monotonic seconds)
-    wanted: bool = True  # whether something changed since its last picture
-    full: bool = False  # whether the last picture was of full size
-    seconds_a_pixel: float = 1e-7  # of drawing and sending, measured
-    at_view: int | None = None  # the captured view it stands at
-    arriving: float = 0.0  # until then its camera's messages are of being put there
+    moved: float = 0.0  # when its camera last moved, monotonic seconds
+    wanted: bool = True  # whether something has changed since its last picture
+    full: bool = False  # whether its last picture had the full size
+    seconds_a_pixel: float = 1e-7  # measured time to draw and send
+    at_view: int | None = None  # index of the view that it stands at
+    arriving: float = 0.0  # until then its camera messages are answers to being moved there
 
-    def moving(self, now: float) -> bool:
+    def is_moving(self, now: float) -> bool:
+        """Return whether its camera moved within the last REST seconds."""
         return now - self.moved < REST
 
 
 @dataclass
 class Viewer:
-    """Serves a scene. `current()` gives the scene and the step to draw it at, which change while it trains."""
+    """Serves a scene to browsers.
+
+    `current()` returns the scene and the step at which it is drawn. Both change during training.
+    """
 
     capture: Capture
     current: Callable[[], tuple[Scene, int]]
@@ -77,46 +82,48 @@ class Viewer:
     host: str = "127.0.0.1"
     port: int = 8080
     label: str = "scene-experts"
-    height: int = 1080  # px of a full picture, at most
-    paths: Path | None = None  # where camera paths are saved
-    draws: Draws | None = None  # the scene frozen, where it does not train
+    height: int = 1080  # largest height of a picture, px
+    paths: Path | None = None  # folder that camera paths are saved in
+    draws: Draws | None = None  # the frozen scene, if it is not being trained
     clients: dict[int, Client] = field(default_factory=dict)
     changed: threading.Event = field(default_factory=threading.Event)
 
     def __post_init__(self) -> None:
-        module = viser()
-        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # a browser that goes away is no fault of ours
+        module = import_viser()
+        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # a browser that disconnects is not an error
         warnings.filterwarnings("ignore", message=r"Queued an? \w+ on a closed connection")
         try:
             self.server = module.ViserServer(host=self.host, port=self.port, label=self.label, verbose=False)
         except OSError as error:
             raise RunError(f"cannot serve on {self.host}:{self.port}: {error.strerror or error}; choose another --port") from error
         self.lock = threading.Lock()
-        self.device = next(iter(self.current()[0].table.params.values())).device
-        seen = around(self.capture)
-        self.server.scene.set_up_direction(tuple(seen.up.tolist()))
-        self.centre, self.reach = seen.centre, float((seen.positions - seen.centre).norm(dim=1).median())
-        self.first = best_view(self.capture)  # where clients begin
-        self.panel = Panel(self.server, self.capture, self.current, self.touch, self.go, self.paths)
+        self.device = self.current()[0].positions.device
+        rig = analyse_cameras(self.capture)
+        self.server.scene.set_up_direction(tuple(rig.up.tolist()))
+        self.centre, self.reach = rig.centre, float((rig.positions - rig.centre).norm(dim=1).median())
+        self.first = choose_best_view(self.capture)  # where clients start
+        self.panel = Panel(self.server, self.capture, self.current, self.request_redraw, self.go_to_view, self.paths)
         self.server.on_client_connect(self.connect)
         self.server.on_client_disconnect(self.disconnect)
 
     @property
     def moved(self) -> bool:
-        """Whether the port that was asked for was taken, so that another is in use."""
+        """Whether the requested port was taken and another one is used."""
         return self.port != 0 and self.server.get_port() != self.port
 
     @property
     def url(self) -> str:
+        """Address of the page."""
         return f"http://{'localhost' if self.host in ('127.0.0.1', '0.0.0.0') else self.host}:{self.server.get_port()}"
 
     # --- clients
 
     def connect(self, handle: Any) -> None:
+        """Add a client and move it to the first view."""
         client = Client(handle)
         with self.lock:
             self.clients[handle.client_id] = client
-        self.go(self.first, [client])
+        self.go_to_view(self.first, [client])
 
         @handle.camera.on_update
         def _(_: Any) -> None:
@@ -127,18 +134,19 @@ class Viewer:
             self.changed.set()
 
     def disconnect(self, handle: Any) -> None:
+        """Remove a client."""
         with self.lock:
             self.clients.pop(handle.client_id, None)
 
-    def touch(self) -> None:
-        """Something that every client sees has changed."""
+    def request_redraw(self) -> None:
+        """Draw a new picture for every client."""
         with self.lock:
             for client in self.clients.values():
                 client.wanted, client.full = True, False
         self.changed.set()
 
-    def go(self, view: int, clients: list[Client] | None = None) -> None:
-        """Put clients (all by default) where a photograph was taken."""
+    def go_to_view(self, view: int, clients: list[Client] | None = None) -> None:
+        """Move clients (None: all) to the camera of a view."""
         camera = self.capture.views[view].camera
         rotation = camera.world_to_cam[:3, :3].T.double()
         place = camera.position.double()
@@ -158,62 +166,62 @@ class Viewer:
     # --- drawing
 
     def due(self, now: float) -> list[Client]:
-        """Clients to draw for: those that moved or whose scene changed, and those that came to rest with a small picture."""
+        """Return the clients that need a picture: something changed, or they rest and have only a small picture."""
         with self.lock:
-            return [c for c in self.clients.values() if c.wanted or (not c.full and not c.moving(now))]
+            return [c for c in self.clients.values() if c.wanted or (not c.full and not c.is_moving(now))]
 
     def draw(self, budget: float = float("inf")) -> float:
-        """Draw for every client that is due, within `budget` seconds (one picture may go over); returns the seconds it took."""
+        """Draw for every client that is due and return the seconds taken. The last picture may exceed `budget` seconds."""
         began = time.monotonic()
         for client in self.due(began):
             if time.monotonic() - began >= budget:
                 self.changed.set()
                 break
             try:
-                self.one(client, min(GOAL, max(budget, 0.004)))
-            except InputError as error:  # a look that this scene does not have
+                self.draw_client(client, min(GOAL, max(budget, 0.004)))
+            except InputError as error:  # the scene cannot show what was chosen
                 client.wanted, client.full = False, True
-                self.panel.tell(str(error))
-            except Exception as error:  # one client's trouble (it went away, it sent nonsense) is not the others'
+                self.panel.show_status(str(error))
+            except Exception as error:  # a client that fails (it disconnected, it sent nonsense) does not affect the others
                 client.wanted, client.full = False, True
                 log.debug("client %s: %r", client.handle.client_id, error, exc_info=error)
         return time.monotonic() - began
 
-    def one(self, client: Client, goal: float) -> None:
-        """Draw and send one picture."""
+    def draw_client(self, client: Client, goal: float) -> None:
+        """Draw and send one picture, within about `goal` seconds while the client moves."""
         began = time.monotonic()
-        moving = client.moving(began)
+        moving = client.is_moving(began)
         client.wanted = False
-        camera = self.camera(client)
+        camera = self.read_camera(client)
         full = camera.width * camera.height
         if moving:
             share = min(1.0, max(SMALLEST, (goal / (client.seconds_a_pixel * full)) ** 0.5))
             camera = with_fov(camera, camera.fov, max(16, round(camera.width * share)), max(16, round(camera.height * share)))
         scene, step = self.current()
-        picture = to_8bit(self.picture(client, scene, step, camera))
-        if client.handle.client_id not in self.clients:  # it went away meanwhile
+        picture = to_8bit(self.render_picture(client, scene, step, camera))
+        if client.handle.client_id not in self.clients:  # it disconnected meanwhile
             return
         client.handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=75 if moving else 95)
         client.full = not moving
         taken = (time.monotonic() - began) / (camera.width * camera.height)
         client.seconds_a_pixel += 0.5 * (taken - client.seconds_a_pixel)
-        self.panel.drawn(time.monotonic() - began, camera)
+        self.panel.report_picture(time.monotonic() - began, camera)
 
     @torch.no_grad()
-    def picture(self, client: Client, scene: Scene, step: int, camera: Camera) -> torch.Tensor:
-        """What the client is to see: the scene as the panel asks, the photograph over the left of it where it stands at a view."""
-        look, background = self.panel.look(), torch.tensor(self.panel.background(), device=self.device)
-        with scene.at_level(self.panel.finest()):  # meanwhile alone: a training's own scene must go on with all its levels
+    def render_picture(self, client: Client, scene: Scene, step: int, camera: Camera) -> torch.Tensor:
+        """Draw the picture [H, W, 3] of a client as the panel asks, with the photograph over its left part if it stands at a view."""
+        look, background = self.panel.read_look(), torch.tensor(self.panel.read_background(), device=self.device)
+        with scene.at_level(self.panel.read_finest()):  # only here: a scene in training keeps using all its levels
             picture = paint(scene, camera.to(self.device), step, self.rasterize, background, look, self.draws).cpu()
-        part = self.panel.photograph()
+        part = self.panel.read_wipe()
         if part > 0 and client.at_view is not None:
-            photo = self.photograph(client.at_view, camera)
+            photo = self.reproject_photograph(client.at_view, camera)
             cut = round(part * camera.width)
             picture[:, :cut] = photo[:, :cut]
         return picture
 
-    def photograph(self, view: int, camera: Camera) -> torch.Tensor:
-        """A photograph as `camera` would see it from the same place: each of its pixels looked up (outside: grey)."""
+    def reproject_photograph(self, view: int, camera: Camera) -> torch.Tensor:
+        """Resample the photograph of a view for `camera` at the same pose, [H, W, 3]. Pixels outside the photograph are grey."""
         frame, source = self.capture.frame(view), self.capture.views[view].camera
         rgb = frame.rgb.permute(2, 0, 1)[None].float() / 255
         y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
@@ -224,24 +232,24 @@ class Viewer:
         inside = (grid[0].abs() <= 1).all(-1)
         return torch.where(inside[..., None], found, 0.5)
 
-    def camera(self, client: Client) -> Camera:
-        """The client's camera in full size. Raises ValueError for one that is none (a broken or hostile message)."""
+    def read_camera(self, client: Client) -> Camera:
+        """Return the camera of a client at full size. Raises ValueError for invalid values (a broken or hostile message)."""
         seen = client.handle.camera
         quat, place = torch.tensor(np.asarray(seen.wxyz), dtype=torch.float64), torch.tensor(np.asarray(seen.position), dtype=torch.float64)
         fov, aspect = float(seen.fov), float(seen.aspect)
         fine = quat.shape == (4,) and place.shape == (3,) and bool(quat.isfinite().all()) and bool(place.isfinite().all())
         if not fine or float(quat.norm()) < 1e-6 or not 0.01 < fov < 3.1 or not 0.1 < aspect < 10:
-            raise ValueError("no camera")
-        height = max(16, min(self.height, int(getattr(seen, "image_height", 0) or self.height), self.panel.height()))
+            raise ValueError("invalid camera")
+        height = max(16, min(self.height, int(getattr(seen, "image_height", 0) or self.height), self.panel.read_height()))
         width = max(16, round(height * aspect))
         model = self.capture.views[0].camera
-        model = replace(model, world_to_cam=pose(place, quat_to_matrix(quat / quat.norm())).float())
+        model = replace(model, world_to_cam=make_pose(place, quat_to_matrix(quat / quat.norm())).float())
         return with_fov(model, fov, width, height)
 
-    # --- life
+    # --- serving
 
     def serve(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Draw whatever is asked for until `until()` (for ever by default); returns at Ctrl-C."""
+        """Draw until `until()` returns True or Ctrl-C is pressed."""
         try:
             while not until():
                 self.changed.wait(0.05)
@@ -251,4 +259,5 @@ class Viewer:
             pass
 
     def close(self) -> None:
+        """Stop the server."""
         self.server.stop()

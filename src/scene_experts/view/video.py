@@ -1,4 +1,4 @@
-"""Frames to disk: a folder of PNG files, or an mp4 through imageio's own ffmpeg; whole or not at all."""
+"""Writes frames to disk: a folder of PNG files, or a video with the ffmpeg that imageio installs."""
 
 from __future__ import annotations
 
@@ -17,26 +17,28 @@ VIDEO = (".mp4", ".mov", ".mkv", ".webm")
 
 
 def is_video(path: Path) -> bool:
+    """Return whether a path has the extension of a video."""
     return path.suffix.lower() in VIDEO
 
 
-def writer() -> Any:
-    """The module that encodes. Raises InputError with what to install where it is missing."""
+def import_ffmpeg() -> Any:
+    """Return the module imageio_ffmpeg. Raises InputError, which says what to install, if it is missing."""
     try:
         import imageio_ffmpeg
     except ImportError as error:
         raise InputError(
-            "expected imageio-ffmpeg to write videos, found none; pip install 'scene-experts[video]', or write PNG files (--out FOLDER)"
+            "writing videos requires imageio-ffmpeg: pip install 'scene-experts[video]', or write PNG files with --out FOLDER"
         ) from error
     return imageio_ffmpeg
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: int = 8) -> int:
-    """Encode 8-bit frames [H, W, 3] of one size as H.264 (VP9 for .webm), even sizes by repeating the last row or column; how many.
+    """Encode 8-bit frames [H, W, 3] of one size as H.264 (VP9 for .webm) and return their number.
 
-    quality: 1 to 10. Raises RunError when the encoder fails or the disk is full.
+    Odd sizes become even by repeating the last row or column. The file appears when it is complete.
+    quality: 1 to 10. Raises RunError if the encoder fails or the disk is full.
     """
-    ffmpeg, count = writer(), 0
+    ffmpeg, count = import_ffmpeg(), 0
 
     def encode(temporary: Path) -> None:
         nonlocal count
@@ -57,8 +59,8 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: i
         finally:
             if stream is not None:
                 stream.close()
-        if stream is not None and (whole := ffmpeg.count_frames_and_secs(str(temporary))[0]) != count:  # its exit code is not told
-            raise RuntimeError(f"{whole} of {count} frames arrived")
+        if stream is not None and (whole := ffmpeg.count_frames_and_secs(str(temporary))[0]) != count:  # its exit code is not available
+            raise RuntimeError(f"only {whole} of {count} frames were encoded")
 
     try:
         write_atomic(path, encode)
@@ -70,20 +72,21 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: i
 
 
 def write_pictures(folder: Path, frames: Iterable[np.ndarray]) -> int:
-    """Write frames as 00000.png, 00001.png, ... and how many into frames.json; those of an earlier and longer path go; how many.
+    """Write frames as 00000.png, 00001.png, ... and their number as frames.json, and return their number.
 
-    Raises InputError, before the first frame is drawn, for a folder that holds such pictures of somebody else.
+    Frames that an earlier call wrote into the folder are replaced. Raises InputError, before the first frame is drawn, if the
+    folder holds such pictures from elsewhere.
     """
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"expected a folder for pictures at {folder}, found a file; choose another --out")
-    earlier, note = [folder / f"{i:05d}.png" for i in range(_earlier(folder))], folder / NOTE
+        raise InputError(f"expected a folder for pictures, found the file {folder}; choose another --out")
+    earlier, note = [folder / f"{i:05d}.png" for i in range(_count_earlier(folder))], folder / NOTE
     foreign = set(folder.glob("[0-9][0-9][0-9][0-9][0-9].png")) - set(earlier)
     if foreign:
-        raise InputError(f"expected a folder whose pictures may be replaced at {folder}, found {min(foreign).name}; choose another --out")
+        raise InputError(f"{folder} holds {min(foreign).name}, which `render` did not write; choose another --out")
     count = 0
     for count, frame in enumerate(frames, 1):
         if count > len(earlier):
-            write_json(note, {"frames": count})  # first: a picture without a note would be taken for somebody else's
+            write_json(note, {"frames": count})  # first, because a picture without a note counts as foreign
         pictures.write(folder / f"{count - 1:05d}.png", frame)
     for old in earlier[count:]:
         old.unlink(missing_ok=True)
@@ -91,8 +94,8 @@ def write_pictures(folder: Path, frames: Iterable[np.ndarray]) -> int:
     return count
 
 
-def _earlier(folder: Path) -> int:
-    """How many pictures an earlier call left in `folder`."""
+def _count_earlier(folder: Path) -> int:
+    """Return the number of pictures that an earlier call wrote into `folder`."""
     try:
         found = read_json(folder / NOTE, "note of the frames")
     except InputError:

@@ -22,7 +22,7 @@ def test_keyframes_become_a_path_that_render_reads(viewer, capture, tmp_path):
     keys.save(None)
     (path,) = tmp_path.iterdir()
     assert json.loads(path.read_text())["fps"] == 24.0
-    made = path_files.read(path, capture.world, capture.views[0].camera)
+    made = path_files.read_path(path, capture.world, capture.views[0].camera)
     assert len(made) == 97 and made.fps == 24.0  # two gaps of two seconds, both ends
     assert np.allclose(made.cameras[48].position.numpy(), [1.0, 0, 0], atol=1e-4)
     sent = []
@@ -42,5 +42,5 @@ def test_playing_moves_the_client(viewer):
         keys.add(handle)
     keys.seconds.value = 0.1
     handle.camera.position = np.array([9.0, 9.0, 9.0])
-    keys.run(handle, fps=50.0)
+    keys.move_client(handle, fps=50.0)
     assert np.allclose(handle.camera.position, [1.0, 0, 0], atol=1e-5)

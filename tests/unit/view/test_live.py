@@ -24,7 +24,7 @@ def test_a_training_is_shown_within_its_share_and_held_while_paused(viewer, capt
     try:
         handle = joined(live.viewer)
         for _ in range(200):
-            live.viewer.touch()
+            live.viewer.request_redraw()
             live(training)
         assert 1 <= len(handle.pictures) < 200  # most iterations are left alone
         live.viewer.panel.pause.value = True  # type: ignore[union-attr]

@@ -6,7 +6,8 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
 from scene_experts.render import choose
-from scene_experts.view.paint import MODES, PALETTE, Look, paint, ramp, row_colours
+from scene_experts.scene import Traits
+from scene_experts.view.paint import PALETTE, SHOWS, Look, available_shows, color_ramp, color_rows, paint
 from support.scenes import CAMERA, start_scene
 
 BLACK = torch.zeros(3)
@@ -25,22 +26,22 @@ def test_the_plain_picture_is_the_render():
     assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK), image.clamp(0, 1))
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_a_frozen_scene_gives_the_same_picture(mode):
+@pytest.mark.parametrize("show", SHOWS)
+def test_a_frozen_scene_gives_the_same_picture(show):
     scene = start_scene("moe-gs")
     draws = scene.frozen(2000)
-    assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK, Look(mode), draws), paint(scene, CAMERA, 2000, DRAW, BLACK, Look(mode)))
+    assert torch.equal(paint(scene, CAMERA, 2000, DRAW, BLACK, Look(show), draws), paint(scene, CAMERA, 2000, DRAW, BLACK, Look(show)))
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_every_mode_gives_a_picture(mode):
-    picture = paint(start_scene("moe-gs"), CAMERA, 2000, DRAW, BLACK, Look(mode))
+@pytest.mark.parametrize("show", SHOWS)
+def test_every_mode_gives_a_picture(show):
+    picture = paint(start_scene("moe-gs"), CAMERA, 2000, DRAW, BLACK, Look(show))
     assert picture.shape == (32, 48, 3) and picture.min() >= 0 and picture.max() <= 1 and torch.isfinite(picture).all()
 
 
 def test_expert_colours_are_the_weighted_palette():
     made = decoded()
-    colours, routing = row_colours(made, Look("experts", "cov")), made.routing["cov"]
+    colours, routing = color_rows(made, Look("experts", "cov")), made.routing["cov"]
     assert routing.chosen is not None
     a, b = routing.chosen[0].tolist()
     w = torch.softmax(routing.gates[0, [a, b]].log(), 0)
@@ -50,9 +51,9 @@ def test_expert_colours_are_the_weighted_palette():
 
 def test_entropy_of_even_gates_is_light_and_activation_counts_slots():
     made = decoded()
-    assert torch.allclose(row_colours(made, Look("entropy"))[0], ramp(torch.tensor(1.0)), atol=0.02)  # a fresh router is nearly even
+    assert torch.allclose(color_rows(made, Look("entropy"))[0], color_ramp(torch.tensor(1.0)), atol=0.02)  # a fresh router is nearly even
     share = (made.raw_opacity[3] > 0).float().mean()
-    assert torch.allclose(row_colours(made, Look("activation"))[3], ramp(share))
+    assert torch.allclose(color_rows(made, Look("activation"))[3], color_ramp(share))
 
 
 def test_one_expert_alone_draws_less_and_all_together_the_whole():
@@ -68,6 +69,13 @@ def test_no_experts_no_expert_view():
     assert paint(start_scene("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("activation")).shape == (32, 48, 3)
 
 
+def test_what_can_be_shown_follows_the_traits_of_a_scene():
+    plain = ("picture", "depth", "alpha")
+    assert available_shows(Traits("x", "points")) == plain
+    assert available_shows(Traits("x", "points", activation=True)) == (*plain, "activation")
+    assert available_shows(start_scene("moe-gs").traits) == SHOWS
+
+
 def test_the_ramp_runs_dark_to_light():
-    light = ramp(torch.linspace(0, 1, 5)).sum(1)
+    light = color_ramp(torch.linspace(0, 1, 5)).sum(1)
     assert (light.diff() > 0).all()

@@ -8,8 +8,9 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.views import World
+from scene_experts.geometry.poses import look_at, with_fov
 from scene_experts.view import path_files
-from scene_experts.view.paths import CameraPath, look_at, with_fov
+from scene_experts.view.paths import CameraPath
 from support.messages import naming
 from support.scenes import CAMERA
 
@@ -26,11 +27,11 @@ def path(frames=5) -> CameraPath:
     return CameraPath(tuple(made), 10.0)
 
 
-@pytest.mark.parametrize("write", [path_files.write, path_files.write_nerfstudio])
+@pytest.mark.parametrize("write", [path_files.write_path, path_files.write_nerfstudio])
 def test_a_path_comes_back(write, tmp_path):
     made = path()
     write(tmp_path / "p.json", made, WORLD)
-    back = path_files.read(tmp_path / "p.json", WORLD, CAMERA)
+    back = path_files.read_path(tmp_path / "p.json", WORLD, CAMERA)
     assert len(back) == 5 and back.fps == 10.0
     for a, b in zip(made.cameras, back.cameras):
         assert torch.allclose(a.world_to_cam, b.world_to_cam, atol=1e-5) and torch.allclose(a.K, b.K, atol=1e-3)
@@ -39,7 +40,7 @@ def test_a_path_comes_back(write, tmp_path):
 
 def test_the_file_is_in_the_captures_frame_and_nerfstudios_axes_point_up_and_back(tmp_path):
     made = path(1)
-    path_files.write(tmp_path / "a.json", made, WORLD)
+    path_files.write_path(tmp_path / "a.json", made, WORLD)
     path_files.write_nerfstudio(tmp_path / "b.json", made, WORLD)
     ours = torch.tensor(json.loads((tmp_path / "a.json").read_text())["keyframes"][0]["camera_to_world"])
     theirs = torch.tensor(json.loads((tmp_path / "b.json").read_text())["camera_path"][0]["camera_to_world"]).reshape(4, 4)
@@ -49,17 +50,17 @@ def test_the_file_is_in_the_captures_frame_and_nerfstudios_axes_point_up_and_bac
 
 
 def test_between_keyframes_the_camera_moves_and_size_and_speed_can_be_others(tmp_path):
-    path_files.write(tmp_path / "p.json", path(3), World())
-    back = path_files.read(tmp_path / "p.json", World(), CAMERA, size=(32, 24), fps=40.0)
+    path_files.write_path(tmp_path / "p.json", path(3), World())
+    back = path_files.read_path(tmp_path / "p.json", World(), CAMERA, size=(32, 24), fps=40.0)
     assert len(back) == 9 and back.fps == 40.0 and (back.cameras[0].width, back.cameras[0].height) == (32, 24)
     assert math.degrees(back.cameras[2].fov) == pytest.approx(50.5, abs=1e-3)
-    path_files.write(tmp_path / "p.json", path(3), World(), loop=True)
-    assert len(path_files.read(tmp_path / "p.json", World(), CAMERA)) == 3
+    path_files.write_path(tmp_path / "p.json", path(3), World(), loop=True)
+    assert len(path_files.read_path(tmp_path / "p.json", World(), CAMERA)) == 3
 
 
 def test_the_way_back_of_a_loop_turns_the_field_of_view_back(tmp_path):
-    path_files.write(tmp_path / "p.json", path(3), World(), loop=True, play_fps=20.0)  # 50, 51, 52 degrees at 0, 0.1, 0.2 s
-    back = path_files.read(tmp_path / "p.json", World(), CAMERA)
+    path_files.write_path(tmp_path / "p.json", path(3), World(), loop=True, play_fps=20.0)  # 50, 51, 52 degrees at 0, 0.1, 0.2 s
+    back = path_files.read_path(tmp_path / "p.json", World(), CAMERA)
     assert [math.degrees(camera.fov) for camera in back.cameras] == pytest.approx([50, 50.5, 51, 51.5, 52, 51], abs=1e-3)
 
 
@@ -80,12 +81,12 @@ def test_the_way_back_of_a_loop_turns_the_field_of_view_back(tmp_path):
     ],
 )
 def test_damage_is_one_sentence(change, fact, tmp_path):
-    path_files.write(tmp_path / "p.json", path(3), World())
+    path_files.write_path(tmp_path / "p.json", path(3), World())
     value = json.loads((tmp_path / "p.json").read_text())
     change(value)
     (tmp_path / "p.json").write_text(json.dumps(value))
     with pytest.raises(InputError, match=naming("p.json", fact)):
-        path_files.read(tmp_path / "p.json", World(), CAMERA)
+        path_files.read_path(tmp_path / "p.json", World(), CAMERA)
 
 
 def test_nerfstudios_other_cameras_are_refused(tmp_path):
@@ -93,12 +94,12 @@ def test_nerfstudios_other_cameras_are_refused(tmp_path):
     value = json.loads((tmp_path / "p.json").read_text())
     (tmp_path / "p.json").write_text(json.dumps({**value, "camera_type": "fisheye"}))
     with pytest.raises(InputError, match="fisheye"):
-        path_files.read(tmp_path / "p.json", World(), CAMERA)
+        path_files.read_path(tmp_path / "p.json", World(), CAMERA)
     (tmp_path / "p.json").write_text(json.dumps({**value, "camera_path": []}))
     with pytest.raises(InputError, match="camera_path"):
-        path_files.read(tmp_path / "p.json", World(), CAMERA)
+        path_files.read_path(tmp_path / "p.json", World(), CAMERA)
     for wrong, fact in (({"fps": 0}, "fps"), ({"render_width": -5}, "-5")):
         (tmp_path / "p.json").write_text(json.dumps({**value, **wrong}))
         with pytest.raises(InputError, match=naming("p.json", fact)):
-            path_files.read(tmp_path / "p.json", World(), CAMERA)
+            path_files.read_path(tmp_path / "p.json", World(), CAMERA)
     assert path_files.is_path_file("x.json") and not path_files.is_path_file("orbit")

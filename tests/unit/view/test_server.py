@@ -8,7 +8,7 @@ import torch
 
 from scene_experts.evaluate.pictures import to_8bit
 from scene_experts.view.paint import paint
-from scene_experts.view.paths import best_view
+from scene_experts.view.paths import choose_best_view
 
 pytest.importorskip("viser")
 from scene_experts.view.server import Client, Viewer
@@ -18,10 +18,10 @@ from support.viewers import DRAW, Handle, joined
 def test_a_client_starts_at_the_best_held_out_view_and_gets_our_own_render(viewer, capture):
     handle = joined(viewer)
     viewer.draw()
-    (picture, how), camera = handle.pictures[-1], viewer.camera(viewer.clients[0])
+    (picture, how), camera = handle.pictures[-1], viewer.read_camera(viewer.clients[0])
     assert how["format"] == "jpeg" and picture.shape == (60, 90, 3)
-    first = capture.views[best_view(capture)].camera
-    assert viewer.panel.chosen.value == viewer.panel.names[best_view(capture)]
+    first = capture.views[choose_best_view(capture)].camera
+    assert viewer.panel.chosen.value == viewer.panel.names[choose_best_view(capture)]
     assert torch.allclose(camera.world_to_cam, first.world_to_cam, atol=1e-5)
     scene, step = viewer.current()
     assert np.array_equal(picture, to_8bit(paint(scene, camera, step, DRAW, torch.tensor(capture.background))))
@@ -44,30 +44,30 @@ def test_moving_gets_small_pictures_and_rest_the_full_one(viewer):
 def test_controls_change_the_picture(viewer):
     handle = joined(viewer)
     viewer.draw()
-    for control, value in ((viewer.panel.mode, "experts"), (viewer.panel.switches[0], False), (viewer.panel.crop, True)):
+    for control, value in ((viewer.panel.show, "experts"), (viewer.panel.switches[0], False), (viewer.panel.crop, True)):
         control.value = value
     viewer.panel.bounds[0].value = (viewer.panel.bounds[0].min, (viewer.panel.bounds[0].min + viewer.panel.bounds[0].max) / 2)
-    look = viewer.panel.look()
-    assert look.mode == "experts" and look.only == (1, 2, 3, 4) and look.box is not None and look.box[0][0] < look.box[1][0]
-    viewer.touch()
+    look = viewer.panel.read_look()
+    assert look.show == "experts" and look.only == (1, 2, 3, 4) and look.box is not None and look.box[0][0] < look.box[1][0]
+    viewer.request_redraw()
     viewer.draw()
     assert len(handle.pictures) == 2 and not np.array_equal(handle.pictures[0][0], handle.pictures[1][0])
 
 
 def test_the_photograph_is_wiped_over_the_render_at_its_view(viewer, capture):
     handle = joined(viewer)
-    view = best_view(capture)
+    view = choose_best_view(capture)
     camera = capture.views[view].camera
     handle.camera.aspect, handle.camera.image_height = camera.width / camera.height, camera.height
     viewer.panel.wipe.value = 1.0
-    viewer.touch()
+    viewer.request_redraw()
     viewer.draw()
     photo = capture.frame(view).rgb.float() / 255
-    assert torch.allclose(viewer.photograph(view, camera), photo, atol=2e-3)  # from its own camera it is itself
+    assert torch.allclose(viewer.reproject_photograph(view, camera), photo, atol=2e-3)  # from its own camera it is itself
     found = handle.pictures[-1][0]
-    assert np.array_equal(found, to_8bit(viewer.photograph(view, viewer.camera(viewer.clients[0]))))
+    assert np.array_equal(found, to_8bit(viewer.reproject_photograph(view, viewer.read_camera(viewer.clients[0]))))
     viewer.clients[0].at_view = None
-    viewer.touch()
+    viewer.request_redraw()
     viewer.draw()
     assert not np.array_equal(handle.pictures[-1][0], found)
 
@@ -76,11 +76,11 @@ def test_nonsense_from_one_client_is_not_the_others_trouble(viewer):
     bad, good = joined(viewer, 1), joined(viewer, 2)
     for wrong in (np.full(4, np.nan), np.zeros(4), np.zeros(3), "x"):
         bad.camera.wxyz = wrong
-        viewer.touch()
+        viewer.request_redraw()
         viewer.draw()
     assert bad.pictures == [] and len(good.pictures) == 4
     bad.camera.wxyz, bad.camera.fov = np.array([1.0, 0, 0, 0]), 99.0
-    viewer.touch()
+    viewer.request_redraw()
     viewer.draw()
     assert bad.pictures == []
 
@@ -112,4 +112,4 @@ def test_a_taken_port_is_told(viewer, capture):
 
 def test_clients_are_due_when_something_changed():
     client = Client(Handle())
-    assert client.wanted and not client.full and not client.moving(time.monotonic())
+    assert client.wanted and not client.full and not client.is_moving(time.monotonic())

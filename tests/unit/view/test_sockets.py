@@ -79,7 +79,7 @@ def test_malformed_messages_end_their_own_client_alone(serving):
             with socket(serving, camera=False) as bad:
                 bad.send(message)
                 time.sleep(0.05)
-        serving.touch()
+        serving.request_redraw()
         assert picture(good)
         assert len(serving.clients) == 1
     settled(serving)

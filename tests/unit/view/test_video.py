@@ -77,7 +77,7 @@ def test_without_an_encoder_the_error_says_what_to_install(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(InputError, match="video"):
-        video.writer()
+        video.import_ffmpeg()
 
 
 def test_which_names_are_videos(tmp_path):

@@ -14,8 +14,8 @@ from torch import Tensor
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera
 from scene_experts.data.views import Capture
+from scene_experts.geometry.poses import FREE, make_pose, slerp
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
-from scene_experts.view.paths import FREE, pose, slerp
 
 NEIGHBOURS = 8  # training views that a view may be joined with
 BEYOND = 0.1  # a free view lies in the triangle of three neighbours, made larger by so much
@@ -56,7 +56,7 @@ class Views:
         turned = slerp(self.quats[i], self.quats[j], _part(share[1], share[0]))
         turned = slerp(turned, self.quats[k], _part(share[2], share[0] + share[1]))
         first = self.cameras[i]
-        return replace(first, world_to_cam=pose(place, quat_to_matrix(turned)).to(first.world_to_cam.dtype))
+        return replace(first, world_to_cam=make_pose(place, quat_to_matrix(turned)).to(first.world_to_cam.dtype))
 
     def _three(self, generator: torch.Generator) -> tuple[int, list[int]]:
         """A training view and two of its neighbours; the view itself where it has too few."""

@@ -28,7 +28,7 @@ from scene_experts.files.formats.pack import Floats, damaged
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.formats.spz import decode_spz, spz_bytes
 from scene_experts.geometry.rotation import common_up
-from scene_experts.view.paths import best_view
+from scene_experts.view.paths import choose_best_view
 
 ASSETS = files("scene_experts.files.formats") / "assets"
 MARK = b'<meta name="generator" content="scene-experts">'
@@ -74,7 +74,7 @@ def capture_notes(capture: Capture, world: World, antialias: bool = False) -> di
     """
     entries = camera_entries(capture.views, world)
     return {
-        "camera": entries[best_view(capture)] if entries else None,
+        "camera": entries[choose_best_view(capture)] if entries else None,
         "cameras": entries,
         "background": list(capture.background),
         "antialias": antialias,

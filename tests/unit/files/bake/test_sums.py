@@ -11,9 +11,9 @@ from scene_experts.core.types import Camera, Decoded, Gaussians, Mode
 from scene_experts.files.bake import sums as bake_sums
 from scene_experts.files.bake.bake import explicit
 from scene_experts.files.bake.sums import add_up, contributions, fit_harmonics, hidden, solved
+from scene_experts.geometry.poses import look_at
 from scene_experts.geometry.sh import basis
 from scene_experts.render import choose
-from scene_experts.view.paths import look_at
 
 STEP = 3
 
