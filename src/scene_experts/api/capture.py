@@ -84,12 +84,12 @@ class Capture:
     @property
     def center(self) -> NDArray[np.float64]:
         """The point [3] that the training cameras look at: the nearest to all their optical axes."""
-        return self.loaded.world.to_input(paths.around(self.loaded).centre).numpy()
+        return self.loaded.world.to_input(paths.analyse_cameras(self.loaded).centre).numpy()
 
     @property
     def up(self) -> NDArray[np.float64]:
         """The unit vector [3] that points upwards in the training pictures, on average."""
-        return paths.around(self.loaded).up.numpy()
+        return paths.analyse_cameras(self.loaded).up.numpy()
 
     def photo(self, view: int | Camera) -> NDArray[np.float32]:
         """Return the photograph of a view, undistorted and at the resolution of its camera.
@@ -141,8 +141,8 @@ class Capture:
         Raises:
             InputError: `eye` and `target` are the same point, or a value is out of range.
         """
-        seen = paths.around(self.loaded)
-        model = paths.lens(seen.cameras, size)
+        seen = paths.analyse_cameras(self.loaded)
+        model = paths.median_camera(seen.cameras, size)
         aim = self.center if target is None else vector(target, "target")
         upward = self.up if up is None else vector(up, "up")
         angle = float(np.degrees(model.fov)) if fov is None else fov
@@ -162,7 +162,7 @@ class Capture:
         Raises:
             InputError: The kind is unknown, or there are no frames.
         """
-        made = paths.make(kind, self.loaded, frames, size)
+        made = paths.make_path(kind, self.loaded, frames, size)
         return [from_trained(camera, self.loaded.world) for camera in made.cameras]
 
     def with_seed(self, seed: int) -> Capture:

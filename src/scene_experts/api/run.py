@@ -36,7 +36,7 @@ from scene_experts.training import run_folder, state
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.state import Training
 from scene_experts.view import video
-from scene_experts.view.paint import MODES, Look, Show, paint
+from scene_experts.view.paint import SHOWS, Look, Show, paint
 
 Format = Literal["compact", "anchors", "ply", "compressed-ply", "splat", "spz", "sog", "glb", "html"]
 
@@ -151,8 +151,8 @@ class Run:
         Raises:
             InputError: `show` is unknown, or needs experts that the scene does not have.
         """
-        if show not in MODES:
-            raise InputError(f"expected show among {', '.join(MODES)}, found {show!r}; choose one of those")
+        if show not in SHOWS:
+            raise InputError(f"expected show among {', '.join(SHOWS)}, found {show!r}; choose one of those")
         view, background = self._view(camera)
         return numpy(paint(self.scene, view, self.step, self._rasterize, background, Look(show, attribute), self._frozen()))
 
