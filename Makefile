@@ -15,7 +15,7 @@ DEMO_FLAGS ?= --iterations $(DEMO_ITERATIONS) --loss.dssim 0.8
 # as the package sets it when it is imported before torch, which the benchmark scripts do not
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo view test lint bench env lpips clean
+.PHONY: demo view test lint record-errors record-flags bench env lpips clean
 
 env: $(STAMP)
 
@@ -48,6 +48,14 @@ test: $(STAMP)
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check src tests benchmarks tools
+
+record-errors: $(STAMP)
+	rm -f tests/golden/errors.json
+	SCENE_EXPERTS_RECORD=1 $(BIN)/python -m pytest tests/system/test_cli_bad_input.py
+
+record-flags: $(STAMP)
+	rm -f tests/golden/flags.json
+	SCENE_EXPERTS_RECORD=1 $(BIN)/python -m pytest tests/system/test_cli.py -k "flags_of_every or help_is"
 
 bench: $(STAMP)
 	$(BIN)/python benchmarks/raster.py

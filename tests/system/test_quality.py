@@ -1,10 +1,9 @@
 """Short real trainings on shipped data: the held-out score must not fall below what five seeds gave, and growth must improve the fit.
 
-The record is made by this file: SCENE_EXPERTS_RECORD=1 python -m pytest tests/test_quality.py
+Record the seeds anew: SCENE_EXPERTS_RECORD=1 python -m pytest tests/system/test_quality.py
 """
 
 import json
-import os
 import statistics
 from dataclasses import replace
 
@@ -19,11 +18,11 @@ from scene_experts.render import choose
 from scene_experts.training.config import Data, RunConfig
 from scene_experts.training.loop import Run, train
 from scene_experts.training.state import Training
-from support import places
+from support.golden import recorded
+from support.places import DEMO, GOLDEN
 from support.synthetic import make_capture
 
-GOLDEN = places.GOLDEN / "quality.json"
-BRIGHTON = places.DEMO / "brighton"
+BRIGHTON = DEMO / "brighton"
 
 
 @pytest.fixture(scope="module")
@@ -65,12 +64,8 @@ BOTH = [(recipe, name) for recipe in ("scaffold-gs", "moe-gs") for name in ("bri
 @pytest.mark.parametrize(("recipe", "name"), [*BOTH, ("3dgs", "coloured")])
 def test_held_out_psnr_stays_within_three_sigma_of_the_recorded_seeds(name, recipe, captures, monkeypatch):
     key = f"{recipe} on {name}"
-    if os.environ.get("SCENE_EXPERTS_RECORD"):
-        record = json.loads(GOLDEN.read_text()) if GOLDEN.exists() else {}
-        record[key] = [round(held_out(captures[name], recipe, seed, monkeypatch=monkeypatch), 4) for seed in range(5)]
-        GOLDEN.parent.mkdir(exist_ok=True)
-        GOLDEN.write_text(json.dumps(record, indent=1) + "\n")
-    seeds = json.loads(GOLDEN.read_text())[key]
+    by_seed = lambda: [round(held_out(captures[name], recipe, seed, monkeypatch=monkeypatch), 4) for seed in range(5)]  # noqa: E731
+    seeds = recorded("quality.json", key, by_seed)
     floor = statistics.mean(seeds) - 3 * statistics.stdev(seeds)
     assert held_out(captures[name], recipe, monkeypatch=monkeypatch) >= floor - 1e-3
 
@@ -85,7 +80,7 @@ def test_growth_pays(captures, monkeypatch):
 
 
 def test_levels_of_detail_cost_less_than_a_decibel(captures, monkeypatch):
-    seeds = json.loads(GOLDEN.read_text())["scaffold-gs on brighton"]
+    seeds = json.loads((GOLDEN / "quality.json").read_text())["scaffold-gs on brighton"]
     assert held_out(captures["brighton"], "octree-moe-gs", monkeypatch=monkeypatch) > statistics.mean(seeds) - 1.0
 
 

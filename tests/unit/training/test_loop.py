@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,8 +21,8 @@ from scene_experts.training.config import Data, RunConfig
 from scene_experts.training.events import Adjusted, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.loop import Run, iterate, rows_to_move, stepped, without_graph
 from scene_experts.training.state import Training
+from support.golden import recorded_text
 from support.messages import naming
-from support.places import GOLDEN
 from support.scenes import METHODS
 from support.synthetic import make_capture
 from support.trainings import assert_same, config, events, last_tensors
@@ -102,11 +101,8 @@ def test_losses_follow_the_golden_curve(recipe, tmp_path):
     folder = make_capture(tmp_path, views=8, size=(48, 32), points=400).folder
     seen = events(cfg, folder, rasterizer="reference", stop_at=until, log_every=5, dtype=torch.float64)
     curve = [sum(e.terms.values()) for e in seen if isinstance(e, Stepped)]
-    path = GOLDEN / f"{recipe}.json"
-    if os.environ.get("SCENE_EXPERTS_RECORD"):
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps([round(c, 8) for c in curve], indent=1) + "\n")
-    assert curve == pytest.approx(json.loads(path.read_text()), rel=1e-3)
+    golden = recorded_text(f"{recipe}.json", json.dumps([round(c, 8) for c in curve], indent=1) + "\n")
+    assert curve == pytest.approx(json.loads(golden), rel=1e-3)
 
 
 def test_anchor_cap_holds(folder):
