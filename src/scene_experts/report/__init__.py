@@ -1,1 +1,1 @@
-"""RUN/report.html: everything about a run, or about several beside each other, in one file that needs nothing else."""
+"""The web page of one run (RUN/report.html) or of several: one file that needs no other file and no network."""

@@ -1,4 +1,4 @@
-"""Line charts and share bars as inline SVG, small enough to read in a page's source."""
+"""Line charts and share bars as small inline SVG."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from html import escape
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#b8a800")
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP, RIGHT = 420, 230, 52, 30, 10, 20
-MOST = 400  # points of a line
+MOST = 400  # the most points of a line
 
 
 @dataclass(frozen=True)
@@ -21,18 +21,18 @@ class Line:
 
 
 def lines(title: str, series: Sequence[Line], unit: str = "", log: bool = False) -> str:
-    """A chart of several lines over the iterations; empty where no line has two finite points."""
+    """Draw several lines over the iterations; empty where no line has two finite points. `log`: a logarithmic y axis."""
     shown = []
     for line in series:
         points = [(x, y) for x, y in line.points if math.isfinite(x) and math.isfinite(y) and (y > 0 or not log)]
         if len(points) > 1:
-            shown.append(Line(line.name, thinned(points)))
+            shown.append(Line(line.name, thin_out(points)))
     if not shown:
         return ""
     xs = [x for line in shown for x, _ in line.points]
     ys = [math.log10(y) if log else y for line in shown for _, y in line.points]
     x0, x1 = min(xs), max(xs)
-    y0, y1 = padded(min(ys), max(ys))
+    y0, y1 = add_margin(min(ys), max(ys))
     to_x = lambda x: LEFT + (x - x0) / max(x1 - x0, 1e-12) * (WIDTH - LEFT - RIGHT)  # noqa: E731
     to_y = lambda y: HEIGHT - BOTTOM - (y - y0) / max(y1 - y0, 1e-12) * (HEIGHT - BOTTOM - TOP)  # noqa: E731
     parts = [f"<figure><figcaption>{escape(title)}{f', {escape(unit)}' if unit else ''}</figcaption>"]
@@ -56,12 +56,13 @@ def lines(title: str, series: Sequence[Line], unit: str = "", log: bool = False)
 
 
 def legend(names: Sequence[str]) -> str:
+    """Draw the names of lines beside their colours."""
     items = [f'<span><i style="background:{COLOURS[i % len(COLOURS)]}"></i>{escape(name)}</span>' for i, name in enumerate(names)]
     return f'<div class="legend">{"".join(items)}</div>'
 
 
 def bars(title: str, shares: Sequence[float]) -> str:
-    """One bar cut into shares (which sum to 1), each with its percentage."""
+    """Draw one bar, divided into shares that sum to 1, each with its percentage."""
     cells = []
     for i, share in enumerate(shares):
         style = f"width:{100 * share:.2f}%;background:{COLOURS[i % len(COLOURS)]}"
@@ -69,8 +70,8 @@ def bars(title: str, shares: Sequence[float]) -> str:
     return f'<div class="bar"><b>{escape(title)}</b><div>{"".join(cells)}</div></div>'
 
 
-def thinned(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """At most MOST points: means of as many equal stretches."""
+def thin_out(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Reduce a line to MOST points: the means of MOST equal stretches."""
     if len(points) <= MOST:
         return list(points)
     out = []
@@ -80,8 +81,8 @@ def thinned(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return out
 
 
-def smoothed(points: Sequence[tuple[float, float]], window: int = 15) -> list[tuple[float, float]]:
-    """A running mean: single views differ more than iterations do. Points that are not finite are left out."""
+def smooth(points: Sequence[tuple[float, float]], window: int = 15) -> list[tuple[float, float]]:
+    """Return the running mean over `window` points, without values that are not finite. It hides the differences between views."""
     points, out, total = [(x, y) for x, y in points if math.isfinite(y)], [], 0.0
     for i, (x, y) in enumerate(points):
         total += y - (points[i - window][1] if i >= window else 0.0)
@@ -89,13 +90,14 @@ def smoothed(points: Sequence[tuple[float, float]], window: int = 15) -> list[tu
     return out
 
 
-def padded(low: float, high: float) -> tuple[float, float]:
+def add_margin(low: float, high: float) -> tuple[float, float]:
+    """Widen a range by 5 % at both ends."""
     margin = 0.05 * (high - low) or max(abs(high), 1.0) * 0.05
     return low - margin, high + margin
 
 
 def ticks(low: float, high: float, count: int = 5) -> list[float]:
-    """Round numbers between two ends."""
+    """Return up to `count` + 1 round numbers between two ends."""
     span = max(high - low, 1e-12)
     step = 10 ** math.floor(math.log10(span / count))
     step *= next(m for m in (1, 2, 5, 10) if span / (step * m) <= count)
@@ -104,7 +106,7 @@ def ticks(low: float, high: float, count: int = 5) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Logarithms of round numbers between two logarithms: 1, 2, 5 a decade, or every so many decades where there are many."""
+    """Return logarithms of round numbers between two logarithms: 1, 2, 5 of each decade, or some of the decades where there are many."""
     decades = range(math.floor(low), math.ceil(high) + 1)
     every = max(1, math.ceil(len(decades) / 6))
     factors = (1, 2, 5) if len(decades) <= 4 else (1,)
@@ -113,6 +115,7 @@ def log_ticks(low: float, high: float) -> list[float]:
 
 
 def label(value: float) -> str:
+    """Format a number of an axis."""
     if abs(value) >= 1_000_000:
         return f"{value / 1e6:g}M"
     if 0 < abs(value) < 1e-3:

@@ -1,4 +1,4 @@
-"""Builds the page from run folders: figures, curves, held-out views with a slider, experts, configuration, the command that repeats it."""
+"""Build a web page from run folders: scores, held-out views with a slider, training curves, experts, configuration and command."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig, to_json
 
 NAME = "report.html"
-MOST_VIEWS = 8  # pictures are most of a page's bytes
-LONGEST, LONGEST_STRIP = 960, 1600  # px; larger pictures, and strips of several, are made smaller for the page
-QUALITY = 88  # of its JPEGs
+MOST_VIEWS = 8  # of a capture; pictures are most of a page's bytes
+LONGEST, LONGEST_STRIP = 960, 1600  # px; larger pictures and strips are scaled down
+QUALITY = 88  # of the JPEGs
 
 
 @dataclass(frozen=True)
 class Source:
-    """What the page says of one run."""
+    """What the page shows of one run. `metrics`: lines of metrics.jsonl; `per_view`: scores by the name of a view."""
 
     name: str
     path: Path
@@ -43,35 +43,38 @@ class Source:
 
 
 def write(runs: Sequence[Path], out: Path | None = None) -> Path:
-    """Write the page of evaluated runs; RUN/report.html by default for one. Raises InputError where one was not evaluated."""
+    """Write the page of evaluated runs and return its path, by default RUN/report.html for a single run.
+
+    Raises InputError where a run is not evaluated, and for several runs without `out`.
+    """
     if not runs:
         raise InputError("expected at least one run folder, found none; name the folders that `scene-experts train --out` wrote")
     if out is None and len(runs) > 1:
-        raise InputError("expected --out FILE.html for the page of several runs, found none; give one")
-    sources = named([source(run) for run in runs])
+        raise InputError("expected --out FILE.html for several runs, found none; give one")
+    sources = tell_apart([read_run(run) for run in runs])
     path = out or runs[0] / NAME
-    write_bytes(path, page(sources).encode())
+    write_bytes(path, build_page(sources).encode())
     return path
 
 
-def source(run: Path) -> Source:
-    """Reads a run folder."""
+def read_run(run: Path) -> Source:
+    """Read a run folder. Raises InputError where it is not evaluated or its scores by view are something else."""
     config, results = run_folder.read_config(run), load_results(run)
     path = run / "per_view.json"
     per_view = read_json(path, "scores by view") if path.is_file() else {}
     if not isinstance(per_view, dict) or not all(isinstance(v, dict) and isinstance(v.get("file"), str) for v in per_view.values()):
         raise InputError(f"expected scores by view in {path}, found something else; run `scene-experts eval {run}` again")
-    return Source(config.train.recipe, run, config, results, per_view, metrics(run / "metrics.jsonl"))
+    return Source(config.train.recipe, run, config, results, per_view, read_metrics(run / "metrics.jsonl"))
 
 
-def named(sources: list[Source]) -> list[Source]:
-    """With names that tell the runs apart."""
+def tell_apart(sources: list[Source]) -> list[Source]:
+    """Give runs of the same recipe different names."""
     names = told_apart([s.path for s in sources], [s.name for s in sources])
     return [replace(s, name=name) for s, name in zip(sources, names)]
 
 
-def metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a training's metrics that are whole."""
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Read the complete lines of a metrics file."""
     out = []
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else []:  # a power cut may leave anything
         try:
@@ -83,42 +86,44 @@ def metrics(path: Path) -> list[dict[str, Any]]:
     return out
 
 
-def page(sources: Sequence[Source]) -> str:
+def build_page(sources: Sequence[Source]) -> str:
+    """Return the page as HTML."""
     names, results = [s.name for s in sources], [s.results for s in sources]
     title = f"{', '.join(names)} on {', '.join(dict.fromkeys(str(r.get('capture', '?')) for r in results))}"
-    facts = [about(s.results) for s in sources]
-    said = facts[:1] if len(set(facts)) == 1 else [f"{name}: {fact}" for name, fact in zip(names, facts)]
-    groups = by_capture(sources)
-    views, pictures = every_capture(groups)
+    facts = [describe_scores(s.results) for s in sources]
+    subtitle = facts[:1] if len(set(facts)) == 1 else [f"{name}: {fact}" for name, fact in zip(names, facts)]
+    groups = group_by_capture(sources)
+    views, pictures = show_captures(groups)
     scores, other = table(names, results), unlike(names, results)
     parts = [
-        f"<h1>{escape(title)}</h1><p class='soft'>{'<br>'.join(map(escape, said))}</p>",
+        f"<h1>{escape(title)}</h1><p class='soft'>{'<br>'.join(map(escape, subtitle))}</p>",
         *(f"<p><b>{escape(line)}.</b></p>" for line in outdated(names, [s.path for s in sources], results)),
         f"<p><b>Do not compare these scores:</b> expected {escape(other[0])}.</p>" if other else "",
-        figures(replace(scores, best=frozenset()) if other else scores),
-        "<h2>Held-out views</h2><p class='soft'>Move over a picture, or drag the slider.</p>",
+        format_table(replace(scores, best=frozenset()) if other else scores),
+        "<h2>Held-out views</h2><p class='soft'>Move the pointer over a picture, or drag the slider.</p>",
         views,
         "<h2>Training</h2>",
-        f"<div class='charts'>{curves(sources)}</div>",
-        experts(sources),
+        f"<div class='charts'>{draw_curves(sources)}</div>",
+        show_experts(sources),
         "<h2>Scores by view</h2>",
-        *((f"<h3>{escape(capture)}</h3>" if len(groups) > 1 else "") + by_view(group) for capture, group in groups.items()),
-        "<h2>To repeat</h2>",
-        *(command(s) for s in sources),
+        *((f"<h3>{escape(capture)}</h3>" if len(groups) > 1 else "") + format_scores(group) for capture, group in groups.items()),
+        "<h2>Command and configuration</h2>",
+        *(show_command(s) for s in sources),
         f"<script>const pictures = {json.dumps(pictures)};</script>",
     ]
     template = Template(files("scene_experts.report").joinpath("page.html").read_text())
     return template.safe_substitute(title=escape(title), body="\n".join(parts))
 
 
-def about(r: dict[str, Any]) -> str:
-    """What was scored, of which training."""
+def describe_scores(r: dict[str, Any]) -> str:
+    """Name the scored views, the resolution and the iterations of the training."""
     whole = f" of {r['iterations']:,}" if r.get("step") and (r.get("iterations") or 0) > r["step"] else ""
     steps = f", {r['step']:,}{whole} iterations" if r.get("step") else ""
     return f"{r.get('view_count')} {r.get('views')} views ({r.get('split')}), {r.get('resolution')}{steps}"
 
 
-def figures(found: Table) -> str:
+def format_table(found: Table) -> str:
+    """Return a table as HTML, with its best cells marked and its notes below."""
     head = "".join(f"<th>{escape(t)}</th>" for t in found.titles)
     rows = []
     for i, row in enumerate(found.rows):
@@ -128,38 +133,38 @@ def figures(found: Table) -> str:
     return f"<div class='wide'><table><tr>{head}</tr>{''.join(rows)}</table></div>{notes}"
 
 
-def by_capture(sources: Sequence[Source]) -> dict[str, list[Source]]:
-    """The runs of each capture: only those have views in common."""
+def group_by_capture(sources: Sequence[Source]) -> dict[str, list[Source]]:
+    """Group runs by the name of their capture: only these can have views in common."""
     groups: dict[str, list[Source]] = {}
     for s in sources:
         groups.setdefault(str(s.results.get("capture", "?")), []).append(s)
     return groups
 
 
-def common(sources: Sequence[Source]) -> list[str]:
-    """Names of the views that all of them were scored on."""
+def find_common_views(sources: Sequence[Source]) -> list[str]:
+    """Return the names of the views that every run was scored on."""
     return [name for name in sources[0].per_view if all(name in s.per_view for s in sources)]
 
 
-def every_capture(groups: dict[str, list[Source]]) -> tuple[str, dict[str, str]]:
-    """The held-out views of each capture, and every picture that they can show as a data address by key."""
+def show_captures(groups: dict[str, list[Source]]) -> tuple[str, dict[str, str]]:
+    """Return the held-out views of each capture as HTML, and their pictures as data URLs by key."""
     pictures: dict[str, str] = {}
     parts = []
     for i, (capture, group) in enumerate(groups.items()):
-        views, shown = held_out(group, f"{i}.")
+        views, shown = show_views(group, f"{i}.")
         pictures |= shown
         if len(groups) > 1:
             parts.append(f"<h3>{escape(capture)}</h3>")
-        why = "no pictures in the run folder" if common(group) else "no view that all of these runs held out"
+        why = "no pictures in the run folder" if find_common_views(group) else "no view that all of these runs held out"
         parts.append(f"<div class='views'>{views}</div>" if views else f"<p>{why}</p>")
     return "\n".join(parts), pictures
 
 
-def held_out(sources: Sequence[Source], prefix: str) -> tuple[str, dict[str, str]]:
-    """The views of a capture with their sliders, and every picture they can show as a data address by key (from `prefix`)."""
+def show_views(sources: Sequence[Source], prefix: str) -> tuple[str, dict[str, str]]:
+    """Return up to MOST_VIEWS views with their sliders as HTML, and their pictures as data URLs by key. Keys start with `prefix`."""
     pictures: dict[str, str] = {}
     blocks = []
-    names = common(sources)
+    names = find_common_views(sources)
     step = max(1, -(-len(names) // MOST_VIEWS))
     for n, name in enumerate(names[::step]):
         options = [("photograph", sources[0].path / "test" / "gt" / sources[0].per_view[name]["file"])]
@@ -169,7 +174,7 @@ def held_out(sources: Sequence[Source], prefix: str) -> tuple[str, dict[str, str
         if len(present) < 2:
             continue
         for i, (_, path) in enumerate(present):
-            pictures[f"{prefix}{n}.{i}"] = encoded(path)
+            pictures[f"{prefix}{n}.{i}"] = encode_picture(path)
         scores = ", ".join(f"{s.name} {s.per_view[name]['psnr']:.2f} dB" for s in sources if "psnr" in s.per_view[name])
         pick = [
             "".join(
@@ -182,13 +187,13 @@ def held_out(sources: Sequence[Source], prefix: str) -> tuple[str, dict[str, str
             f"<div class='view'><div class='pick'><b>{escape(name)}</b><span class='soft'>{escape(scores)}</span>"
             f"<label>left <select>{pick[0]}</select></label><label>right <select>{pick[1]}</select></label></div>"
             f"<div class='stage'><img alt='left'><img class='over' alt='right'><span class='edge'></span></div>"
-            f"<input type='range' min='0' max='100' value='50' aria-label='where the pictures meet'></div>"
+            f"<input type='range' min='0' max='100' value='50' aria-label='boundary between the two pictures'></div>"
         )
     return "\n".join(blocks), pictures
 
 
-def encoded(path: Path, longest: int = LONGEST) -> str:
-    """A picture as a data address: JPEG, at most `longest` px. Raises InputError where it is unreadable."""
+def encode_picture(path: Path, longest: int = LONGEST) -> str:
+    """Return a picture as the data URL of a JPEG of at most `longest` px a side. Raises InputError where it is unreadable."""
     picture = Image.fromarray(read_picture(path))
     picture.thumbnail((longest, longest), Image.Resampling.LANCZOS)
     stream = io.BytesIO()
@@ -196,36 +201,39 @@ def encoded(path: Path, longest: int = LONGEST) -> str:
     return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
 
 
-def curves(sources: Sequence[Source]) -> str:
-    """Charts over the training: PSNR, losses, anchors, active share, visible anchors, speed."""
+def draw_curves(sources: Sequence[Source]) -> str:
+    """Draw charts over the iterations: PSNR, losses, anchors, Gaussians, active share, wall time."""
 
     def series(key: str, factor: float = 1.0, smooth: bool = True, anchored: bool = False) -> list[Line]:
         out = []
         for s in sources:
-            if anchored and s.results.get("activation_ratio") is None:  # explicit Gaussians: all are as they are
+            if anchored and s.results.get("activation_ratio") is None:  # explicit Gaussians have no active share
                 continue
             points = [(m["step"], m[key] * factor) for m in s.metrics if isinstance(m.get(key), (int, float)) and "psnr" in m]
-            out.append(Line(s.name, chart.smoothed(points) if smooth else points))
+            out.append(Line(s.name, chart.smooth(points) if smooth else points))
         return out
 
     parts = [chart.lines("PSNR of training views", series("psnr"), "dB")]
     terms = sorted({t for s in sources for m in s.metrics for t in m.get("terms", {})})
     for term in terms:
         lines = [
-            Line(s.name, chart.smoothed([(m["step"], m["terms"][term]) for m in s.metrics if term in m.get("terms", {})])) for s in sources
+            Line(s.name, chart.smooth([(m["step"], m["terms"][term]) for m in s.metrics if term in m.get("terms", {})])) for s in sources
         ]
         parts.append(chart.lines(f"loss: {term}", lines, "weighted, log", log=True))
     parts += [
         chart.lines("anchors", series("anchors", smooth=False)),
-        chart.lines("Gaussians drawn", series("gaussians")),
+        chart.lines("rendered Gaussians", series("gaussians")),
         chart.lines("active Gaussians", series("active", 100, anchored=True), "%"),
-        chart.lines("training time", series("seconds", 1 / 60, smooth=False), "minutes"),
+        chart.lines("wall time of the training", series("seconds", 1 / 60, smooth=False), "minutes"),
     ]
     return "".join(parts)
 
 
-def experts(sources: Sequence[Source]) -> str:
-    """How anchors are shared: bars at the end, a view by each expert's, lines over the training, gate entropy. Empty without experts."""
+def show_experts(sources: Sequence[Source]) -> str:
+    """Show the experts' shares at the end, one view by the anchors of each expert, and curves of shares and gate entropy.
+
+    Empty without experts.
+    """
     bars, charts = [], []
     for s in sources:
         for attribute, shares in (s.results.get("experts") or {}).items():
@@ -238,31 +246,33 @@ def experts(sources: Sequence[Source]) -> str:
             charts.append(chart.lines(f"{s.name}: share of {attribute}", lines, "%"))
         entropy = sorted({a for m in s.metrics for a in m.get("entropy", {})})
         lines = [Line(a, [(m["step"], m["entropy"][a]) for m in s.metrics if a in m.get("entropy", {})]) for a in entropy]
-        charts.append(chart.lines(f"{s.name}: gate entropy (1: all experts alike)", lines))
+        charts.append(chart.lines(f"{s.name}: gate entropy (1: equal gates)", lines))
     if not bars:
         return ""
-    alone = "".join(map(strips, sources))
-    note = "<p class='soft'>Share of the assignments of all anchors (of the gates, while dense); equal shares are perfect balance.</p>"
+    alone = "".join(map(show_strips, sources))
+    shown = "Share of each expert in the assignments of all anchors (in the gates while the mixture is dense)"
+    note = f"<p class='soft'>{shown}. Equal shares are perfect balance.</p>"
     return f"<h2>Experts</h2>{note}{''.join(bars)}{alone}<div class='charts'>{''.join(charts)}</div>"
 
 
-def strips(s: Source) -> str:
-    """A held-out view by the anchors of each expert: those of colour open, the other attributes' folded. Empty without such pictures."""
+def show_strips(s: Source) -> str:
+    """Show one held-out view by the anchors of each expert: colour open, other attributes folded. Empty without such pictures."""
     found = {a: s.path / "test" / "experts" / f"{a}.png" for a in s.results.get("experts") or {}}
     present = sorted((a for a, path in found.items() if path.is_file()), key=lambda a: a != "color")
     if not present:
         return ""
-    images = [f"<img class='strip' alt='{escape(a)} experts' src='{encoded(found[a], LONGEST_STRIP)}'>" for a in present]
+    images = [f"<img class='strip' alt='{escape(a)} experts' src='{encode_picture(found[a], LONGEST_STRIP)}'>" for a in present]
     folded = "".join(f"<details><summary>{escape(a)}</summary>{image}</details>" for a, image in zip(present[1:], images[1:]))
     k = s.results["experts"][present[0]].get("k")
-    how = f"routed to each expert, drawn alone; with Top-{k} every anchor is in {k} picture{'' if k == 1 else 's'}"
+    how = f"the anchors routed to each expert, rendered alone; Top-{k} puts every anchor in {k} picture{'' if k == 1 else 's'}"
     if k is None:
-        how = "whose largest gate is each expert's, drawn alone; the mixture is dense"
+        how = "the anchors where each expert's gate is the largest, rendered alone; the mixture is dense"
     view = escape(next(iter(s.per_view), "a held-out view"))
-    return f"<p><b>{escape(s.name)}</b>, {view}: <span class='soft'>the anchors {how}.</span></p>{images[0]}{folded}"
+    return f"<p><b>{escape(s.name)}</b>, {view}: <span class='soft'>{how}.</span></p>{images[0]}{folded}"
 
 
-def by_view(sources: Sequence[Source]) -> str:
+def format_scores(sources: Sequence[Source]) -> str:
+    """Return the table of scores by view as HTML."""
     rows = []
     for name in sources[0].per_view:
         cells = []
@@ -277,9 +287,9 @@ def by_view(sources: Sequence[Source]) -> str:
     return f"<div class='wide'><table><tr><th>view</th>{head}</tr>{''.join(rows)}</table></div>"
 
 
-def command(s: Source) -> str:
-    """The exact command, and everything the run was made of."""
-    line = s.config.command or "made by another program; see the configuration"
+def show_command(s: Source) -> str:
+    """Show the command that repeats a run, and its configuration."""
+    line = s.config.command or "This run was trained by another program."
     config = json.dumps(to_json(s.config), indent=1)
     return (
         f"<p><b>{escape(s.name)}</b></p><pre>{escape(line)}</pre>"

@@ -18,8 +18,8 @@ from scene_experts.report.chart import (
     label,
     lines,
     log_ticks,
-    smoothed,
-    thinned,
+    smooth,
+    thin_out,
     ticks,
 )
 
@@ -55,9 +55,9 @@ def test_names_are_escaped_and_a_legend_is_only_for_several():
 
 def test_thinning_keeps_means_and_smoothing_lags():
     many = [(float(i), float(i)) for i in range(4000)]
-    assert len(thinned(many)) == MOST and sum(y for _, y in thinned(many)) / MOST == pytest.approx(1999.5)
-    assert smoothed([(0, 0.0), (1, 2.0), (2, 4.0)], window=2) == [(0, 0.0), (1, 1.0), (2, 3.0)]
-    assert smoothed([(0, 0.0), (1, float("nan")), (2, 4.0)], window=2) == [(0, 0.0), (2, 2.0)]  # the rest of the line stays
+    assert len(thin_out(many)) == MOST and sum(y for _, y in thin_out(many)) / MOST == pytest.approx(1999.5)
+    assert smooth([(0, 0.0), (1, 2.0), (2, 4.0)], window=2) == [(0, 0.0), (1, 1.0), (2, 3.0)]
+    assert smooth([(0, 0.0), (1, float("nan")), (2, 4.0)], window=2) == [(0, 0.0), (2, 2.0)]  # the rest of the line stays
 
 
 def test_ticks_are_round():

@@ -52,7 +52,7 @@ def test_strips_of_each_experts_anchors(tmp_path):
     (folder / "test" / "experts" / "color.png").unlink()
     write_json(folder / "results.json", {**results, "experts": {"cov": {"mean_gate": [0.5, 0.3, 0.2], "k": None}}})
     dense = write([folder]).read_text()
-    assert list(strips(dense)) == ["cov"] and "the mixture is dense" in dense and "Top-" not in dense.partition("To repeat")[0]
+    assert list(strips(dense)) == ["cov"] and "the mixture is dense" in dense and "Top-" not in dense.partition("<h2>Command")[0]
 
 
 def test_several_runs_stand_beside_each_other(tmp_path):
