@@ -44,4 +44,4 @@ def words_of(place: str, value: Any) -> list[str]:
     if isinstance(value, bool):
         head, _, last = flag(place).removeprefix("--").rpartition(".")
         return [f"--{head}{'.' if head else ''}{'' if value else 'no-'}{last}"]
-    return [flag(place), *(map(str, value) if isinstance(value, tuple) else [str(value)])]
+    return [flag(place), *((map(str, value) if value else ["none"]) if isinstance(value, tuple) else [str(value)])]

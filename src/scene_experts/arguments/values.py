@@ -33,10 +33,11 @@ def count(kind: Any) -> tuple[int, int | None]:
 
 
 def convert(kind: Any, words: Sequence[str], name: str, example: str) -> Any:
-    """The value that words spell. Raises InputError, naming the option `name` and giving an `example` of what is right."""
+    """The value that words spell; "none" is None or an empty list. Raises InputError, naming the option `name` and giving an `example` of what is right."""
     inner, optional = without_none(kind)
-    if optional and len(words) == 1 and words[0] in NONE:
-        return None
+    many = count(inner)[1] is None
+    if (optional or many) and len(words) == 1 and words[0] in NONE:
+        return None if optional else ()
     if typing.get_origin(inner) is not tuple:
         return _one(inner, words[0], name, example)
     each = typing.get_args(inner)
@@ -92,7 +93,7 @@ def placeholder(kind: Any, name: str = "") -> str:
 def spelled(value: Any) -> str:
     """A value as one writes it on the command line."""
     if isinstance(value, tuple):
-        return " ".join(map(spelled, value))
+        return " ".join(map(spelled, value)) or NONE[0]
     return "none" if value is None else f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else str(value)
 
 

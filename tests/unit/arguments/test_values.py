@@ -24,6 +24,7 @@ TRIPLE = tuple[float, float, float]
         (Literal[1, 2], ["2"], 2),
         (tuple[int, ...], ["1", "2", "3"], (1, 2, 3)),
         (tuple[Literal["x", "y"], ...], ["y"], ("y",)),
+        (tuple[str, ...], ["none"], ()),
         (TRIPLE, ["0", "0.5", "1"], (0.0, 0.5, 1.0)),
         (TRIPLE | None, ["None"], None),
     ],
