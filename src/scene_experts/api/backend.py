@@ -8,11 +8,9 @@ from typing import Literal
 
 import torch
 
+from scene_experts.core.choices import Device, Raster
 from scene_experts.core.errors import InputError
 from scene_experts.render import Rasterizer, choose
-
-Device = Literal["auto", "cpu", "cuda"]
-Raster = Literal["auto", "reference", "cpu", "gsplat"]
 
 
 def backend(device: Device, raster: Raster, antialias: bool, deterministic: bool) -> tuple[str, Rasterizer]:

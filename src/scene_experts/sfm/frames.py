@@ -16,7 +16,6 @@ from scene_experts.core.io import write_atomic
 
 GRADING_WIDTH = 480  # px; frames are scaled to this width before their sharpness is measured
 JPEG_QUALITY = 95
-MOST_FRAMES = 5000  # more frame numbers do not fit into one ffmpeg command
 
 Progress = Callable[[str, int, int], None]  # name of the work, how much is done, how much there is
 

@@ -12,10 +12,10 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.io import read_json, write_json
@@ -24,6 +24,7 @@ from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
 from scene_experts.sfm import frames, photos, work, worker
 from scene_experts.sfm.masks import write_masks
+from scene_experts.sfm.options import Matching, Options
 from scene_experts.sfm.photos import Photo
 
 LOG, NOTE = "colmap.log", "capture.json"
@@ -31,26 +32,8 @@ INSTALL = "pip install 'scene-experts[sfm]'"
 MOST_EXHAUSTIVE = 300  # photographs that are all matched with each other: 44,850 pairs, about ten minutes on two cores
 NEIGHBOURS = 10  # following photographs that each photograph is matched with
 
-CameraModel = Literal[
-    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE"
-]
-Mapper = Literal["auto", "incremental", "global"]
-Matching = Literal["auto", "exhaustive", "sequential"]
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]  # name of the work, how much is done, how much there is
-
-
-@dataclass(frozen=True)
-class Options:
-    """Settings of a reconstruction."""
-
-    frames: int = 150  # frames to extract from a video
-    matching: Matching = "auto"
-    camera_model: CameraModel = "OPENCV"
-    mapper: Mapper = "auto"
-    max_side: int = 1600  # px; larger photographs are scaled down before features are extracted
-    threads: int = 0  # 0: all cores that this process may use
-    seed: int = 0
 
 
 def reconstruct(

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from scene_experts.arguments.option import Option
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.schedule import Rate
+from scene_experts.data.settings import Data as Data
 from scene_experts.scene.anchors.scene import Anchors, Rates
 from scene_experts.scene.anchors.select import Octree
 from scene_experts.scene.gaussians import Explicit, ExplicitRates
@@ -70,38 +71,6 @@ class Train:
         )
         growth = replace(self.growth.scaled(factor), max_anchors=self.max_anchors or self.growth.max_anchors)
         return replace(self, scene=self.scene.scaled(factor), loss=loss, growth=growth)
-
-
-@dataclass(frozen=True)
-class Data:
-    """Which capture, and how it is read."""
-
-    path: Annotated[Path, Option(name="data", short="-s", value="CAPTURE")]
-    """Folder of the capture: a COLMAP folder (images/, sparse/0/) or one with transforms*.json; or catalog:SCENE, fetched by `download`."""
-    images: str | None = None
-    """Image folder inside the capture, e.g. images_4."""
-    resolution: Annotated[str, Option(short="-r", value="POLICY")] = "auto"
-    """as-is, factor:N, longest:PX, cap1600, share:S (of what cap1600 gives), inria:N, or auto (cap1600)."""
-    split: str = "auto"
-    """mod8 (every 8th view is held out), mod:N, first:N, none, files, or auto: files where the capture brings its own split, else mod8."""
-    missing: Literal["error", "drop"] = "error"
-    """What to do about views whose photograph is absent."""
-    normalise: Literal["extent", "none"] = "extent"
-    """extent: train in a world scaled to camera extent 5 (undone in everything written); none: train in the capture's own units."""
-    init: Literal["points", "random"] = "points"
-    """Start from the capture's 3D points, or from random ones."""
-    max_views: int | None = None
-    """Use at most this many views, evenly spread."""
-    near: float | None = None
-    """Nearest depth that is drawn, in trained units; None: min(0.2, 0.02 R). 0.2 is what the reference code bases use in any unit."""
-    ignore_principal_point: bool = False
-    """Pretend the principal point is the image centre, as the reference code bases do (parity only)."""
-    background: tuple[float, float, float] | None = None
-    """RGB in [0, 1] behind the scene; None takes the capture kind's own (black; white for NeRF-synthetic)."""
-
-    def settings(self) -> dict[str, Any]:
-        """How the capture is read, as plain JSON; not where it lies."""
-        return {name: value for name, value in to_json(self).items() if name != "path"}
 
 
 @dataclass(frozen=True)

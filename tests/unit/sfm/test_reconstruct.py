@@ -13,9 +13,10 @@ import torch
 from PIL import Image
 
 from scene_experts.core.errors import InputError, RunError
-from scene_experts.data import load
+from scene_experts.data.capture import load
 from scene_experts.sfm import reconstruct as run
-from scene_experts.sfm.reconstruct import LOG, NOTE, Options
+from scene_experts.sfm.options import Options
+from scene_experts.sfm.reconstruct import LOG, NOTE
 from scene_experts.sfm.work import NAME, PLACES
 from support.messages import naming
 from support.photos import fake_worker, write_black, write_photo

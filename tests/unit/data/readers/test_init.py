@@ -13,7 +13,8 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Points
-from scene_experts.data import load, readers
+from scene_experts.data import readers
+from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers import PosedImage, RawCapture, ReadOptions
 from scene_experts.recipes import RECIPES

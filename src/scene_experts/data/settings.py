@@ -1,0 +1,47 @@
+"""Which capture is read, and how: the options that `train`, `info` and `import` share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from scene_experts.arguments.option import Option
+
+
+@dataclass(frozen=True)
+class Data:
+    """The capture and how it is read."""
+
+    path: Annotated[Path, Option(name="data", short="-s", value="CAPTURE")]
+    """Folder of the capture: a COLMAP folder (images/ and sparse/0/), a folder with transforms*.json, or catalog:SCENE for a scene that
+    `scene-experts download` has fetched."""
+    images: Annotated[str | None, Option(value="FOLDER")] = None
+    """Image folder inside the capture, for example images_4."""
+    resolution: Annotated[str, Option(short="-r", value="POLICY")] = "auto"
+    """Size of the training pictures: as-is, factor:N (sides divided by N), longest:PX, cap1600 (longest side at most 1600 px), share:S (a
+    share of what cap1600 gives), inria:N (as factor:N from the folder images_N) or auto (cap1600)."""
+    split: Annotated[str, Option(value="RULE")] = "auto"
+    """Which views are held out: mod8 (every 8th), mod:N (every Nth), first:N, none, files (as the capture's files say) or auto (files if
+    they say it, else mod8)."""
+    missing: Literal["error", "drop"] = "error"
+    """What to do if the photograph of a view is missing: stop, or drop the view."""
+    normalise: Literal["extent", "none"] = "extent"
+    """extent: scale the world to a camera extent of 5 for the training; every exported file is scaled back. none: train in the capture's
+    own units."""
+    init: Literal["points", "random"] = "points"
+    """Start from the capture's 3D points, or from random points."""
+    max_views: int | None = None
+    """Use at most this many views, evenly spread."""
+    near: float | None = None
+    """Nearest depth that is drawn, in trained units; by default min(0.2, 0.02 x scene radius). The reference implementations use 0.2 in any
+    unit."""
+    ignore_principal_point: bool = False
+    """Assume that the principal point is the centre of the picture, as the reference implementations do."""
+    background: tuple[float, float, float] | None = None
+    """Background colour, RGB in [0, 1]; by default that of the kind of capture (white for NeRF-synthetic, else black)."""
+
+    def settings(self) -> dict[str, Any]:
+        """How the capture is read, as plain JSON, without its path."""
+        values = {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items() if name != "path"}
+        return {"type": "Data", **values}

@@ -1,0 +1,44 @@
+"""Settings of a reconstruction: the options of `scene-experts capture`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from scene_experts.core.errors import InputError, expect_at_least
+
+MOST_FRAMES = 5000  # more frame numbers do not fit into one ffmpeg command
+CameraModel = Literal[
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE"
+]
+Mapper = Literal["auto", "incremental", "global"]
+Matching = Literal["auto", "exhaustive", "sequential"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings of the reconstruction."""
+
+    frames: int = 150
+    """Number of frames to extract from a video. The sharpest frame of each of this many equal segments is used."""
+    matching: Matching = "auto"
+    """Which photographs are matched: exhaustive matches all pairs, sequential matches neighbours in the order of their names (for a video or
+    a walk). auto: exhaustive for up to 300 photographs."""
+    camera_model: CameraModel = "OPENCV"
+    """COLMAP's lens model. Photographs of the same size, camera and focal length share one lens."""
+    mapper: Mapper = "auto"
+    """COLMAP's incremental mapper or the global mapper (GLOMAP). auto: incremental; if more than a tenth of the photographs get no pose,
+    both are run and the better result is kept."""
+    max_side: int = 1600
+    """Longest side in pixels at which features are extracted. The photographs themselves are not changed."""
+    threads: int = 0
+    """Number of threads; 0 uses all cores."""
+    seed: int = 0
+    """Seed of COLMAP's random choices."""
+
+    def check(self) -> None:
+        """Raises InputError, naming the option, for invalid settings."""
+        expect_at_least([("--frames", self.frames, 3), ("--max-side", self.max_side, 64)])
+        expect_at_least([("--threads", self.threads, 0), ("--seed", self.seed, 0)])
+        if self.frames > MOST_FRAMES:
+            raise InputError(f"expected --frames of at most {MOST_FRAMES:,}, found {self.frames:,}; 100 to 300 frames are enough")
