@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from scene_experts import cli
-from scene_experts.commands import view
 from scene_experts.training import run_folder
+from scene_experts.view import server
 from support.synthetic import make_capture
 
 TRAIN = ("train", "scaffold-gs", "--data", "box", "--out", "runs/one", "--iterations", "6", "--preview-every", "0", "--save-every", "3")
@@ -85,7 +85,7 @@ def test_view(moved, monkeypatch):
 
         def close(self) -> None: ...
 
-    monkeypatch.setattr(view, "Viewer", Page)
+    monkeypatch.setattr(server, "Viewer", Page)
     assert cli.main(["view", str(moved / "runs/one")]) == 0
     assert [Path(root).resolve() for root in seen] == [(moved / "box").resolve()]
 

@@ -33,7 +33,10 @@ def count(kind: Any) -> tuple[int, int | None]:
 
 
 def convert(kind: Any, words: Sequence[str], name: str, example: str) -> Any:
-    """The value that words spell; "none" is None or an empty list. Raises InputError, naming the option `name` and giving an `example` of what is right."""
+    """The value that words spell; "none" is None, or an empty list.
+
+    Raises InputError, naming the option `name` and giving an `example` of what is right.
+    """
     inner, optional = without_none(kind)
     many = count(inner)[1] is None
     if (optional or many) and len(words) == 1 and words[0] in NONE:

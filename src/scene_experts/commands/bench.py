@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
-
 from scene_experts.arguments.parse import Command, parse
-from scene_experts.bench.table import run
 from scene_experts.commands import PROG
 
 
@@ -25,5 +22,10 @@ class BenchCommand:
 
 
 def bench(args: list[str]) -> int:
+    """`scene-experts bench`."""
     command = parse(BenchCommand, Command(f"{PROG} bench"), args)
+    from rich.console import Console
+
+    from scene_experts.bench.table import run
+
     return run(command.seconds, command.threads, command.json, Console(highlight=False))

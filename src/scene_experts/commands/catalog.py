@@ -18,7 +18,6 @@ from scene_experts.commands import PROG
 from scene_experts.core.errors import InputError
 from scene_experts.data.fetch.catalog import COLLECTIONS, SCENES, Scene, select
 from scene_experts.data.fetch.obtain import captures_dir, is_present, obtain
-from scene_experts.training.config import Train, flag, flags_of
 
 SAY_EVERY = 15.0  # seconds between lines where there is no terminal
 
@@ -60,6 +59,8 @@ def flags(scene: Scene, to: Path | None) -> str:
     """How `train` is told to read a scene by the paper's protocol."""
     if to is None:
         return f"--data catalog:{scene.name}"
+    from scene_experts.training.config import Train, flags_of
+
     numbers = shlex.join(flags_of(Train(""), scene.collection.numbers))
     return f"--data {shlex.quote(str(to / scene.path))} --resolution {scene.resolution} --split {scene.split} --normalise none {numbers}"
 
@@ -103,6 +104,8 @@ def table(scenes: tuple[Scene, ...] | list[Scene], root: Path) -> Table:
 
 def described(scene: Scene, root: Path) -> list[str]:
     """Everything about a scene, and how to get it by hand."""
+    from scene_experts.training.config import flag
+
     c, a = scene.collection, scene.collection.archive
     numbers = " ".join(f"{flag(place)} {value}" for place, value in c.numbers)
     lines = [

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from rich.console import Console
-
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
-from scene_experts.commands.shared import Device, Raster, backend
+from scene_experts.core.choices import Device, Raster
 from scene_experts.evaluate.options import EvalOptions
 
 
@@ -36,11 +34,15 @@ class EvalCommand:
 
 
 def evaluate(args: list[str]) -> int:
+    command = parse(EvalCommand, Command(f"{PROG} eval", ("--run",)), args)
+
+    from rich.console import Console
+
+    from scene_experts.api.backend import backend
     from scene_experts.evaluate.command import evaluate_run
     from scene_experts.evaluate.tables import print_results
     from scene_experts.report import page
 
-    command = parse(EvalCommand, Command(f"{PROG} eval", ("--run",)), args)
     device, rasterize = backend(command.device, command.rasterizer, False, False)
     results = evaluate_run(command.run, device, rasterize, command.options, data=command.data, step=command.step)
     print_results(results, Console(highlight=False), command.run)
@@ -61,8 +63,11 @@ class CompareCommand:
 
 
 def compare(args: list[str]) -> int:
+    command = parse(CompareCommand, Command(f"{PROG} compare", ("--runs",)), args)
+
+    from rich.console import Console
+
     from scene_experts.evaluate.tables import compare_runs
 
-    command = parse(CompareCommand, Command(f"{PROG} compare", ("--runs",)), args)
     compare_runs(command.runs, command.format, command.mixed, Console(highlight=False))
     return 0

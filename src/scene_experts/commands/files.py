@@ -5,20 +5,16 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
-
-from rich.console import Console
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
-from scene_experts.commands.shared import backend
 from scene_experts.core.errors import InputError
-from scene_experts.render import Rasterizer
-from scene_experts.training.config import Data
-from scene_experts.training.memory import reuse_freed
-from scene_experts.training.progress import Bar
-from scene_experts.training.run_folder import named
+from scene_experts.data.settings import Data
+
+if TYPE_CHECKING:
+    from scene_experts.render import Rasterizer
 
 
 @dataclass(frozen=True)
@@ -54,9 +50,12 @@ class ExportCommand:
 
 
 def export(args: list[str]) -> int:
-    from scene_experts.files.export import export_run
-
     command = parse(ExportCommand, Command(f"{PROG} export", ("--run",)), args)
+
+    from scene_experts.api.backend import backend
+    from scene_experts.files.export import export_run
+    from scene_experts.training.memory import reuse_freed
+
     rasterize = backend("cpu", "auto", False, False)[1]
     reuse_freed()
     if command.format in ("anchors", "compact"):
@@ -79,9 +78,12 @@ def check_unused(command: ExportCommand) -> None:
 
 
 def _standard(command: ExportCommand, args: list[str], rasterize: Rasterizer) -> list[str]:
+    from rich.console import Console
+
     from scene_experts.files.bake.bake import Bake
     from scene_experts.files.bake.export import Options, export_standard
     from scene_experts.files.bake.refine import Refine
+    from scene_experts.training.progress import Bar
 
     how = Bake(command.sh_degree, command.max_gaussians, command.prune, Refine(command.refine))
     options = Options(how, command.frame, command.levels, command.measure, shlex.join([PROG, "export", *args]))
@@ -102,9 +104,11 @@ class ImportCommand:
 
 
 def import_(args: list[str]) -> int:
-    from scene_experts.files.export import import_result
-
     command = parse(ImportCommand, Command(f"{PROG} import", ("--source",)), args)
+
+    from scene_experts.files.export import import_result
+    from scene_experts.training.run_folder import named
+
     print(f"wrote {import_result(command.source, named(command.data), command.out, command.iteration)}")
     print(f"next: {shlex.join([PROG, 'eval', str(command.out)])}")
     return 0

@@ -1,21 +1,23 @@
-"""Commands that look and change nothing: info, doctor."""
+"""`scene-experts info` and `doctor`: commands that look and change nothing."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rich.console import Console
-
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
-from scene_experts.data.summary import print_summary
-from scene_experts.training import run_folder
-from scene_experts.training.config import Data
+from scene_experts.data.settings import Data
 
 
 def info(args: list[str]) -> int:
     about = "Show what a capture contains: views, picture sizes, cameras, points, split and warnings."
     data = parse(Data, Command(f"{PROG} info", ("--data",), about=about), args)
+
+    from rich.console import Console
+
+    from scene_experts.data.summary import print_summary
+    from scene_experts.training import run_folder
+
     print_summary(run_folder.load_capture(run_folder.named(data), look=True), Console(highlight=False))
     return 0
 
@@ -26,7 +28,10 @@ class DoctorCommand:
 
 
 def doctor(args: list[str]) -> int:
+    parse(DoctorCommand, Command(f"{PROG} doctor"), args)
+
+    from rich.console import Console
+
     from scene_experts.commands import doctor as checks
 
-    parse(DoctorCommand, Command(f"{PROG} doctor"), args)
     return checks.run(Console(highlight=False))

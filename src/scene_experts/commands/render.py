@@ -12,10 +12,11 @@ import numpy as np
 import torch
 from rich.console import Console
 
+from scene_experts.api.backend import backend
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
-from scene_experts.commands.shared import Device, Raster, backend
+from scene_experts.core.choices import Device, Raster
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture

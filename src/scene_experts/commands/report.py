@@ -9,7 +9,6 @@ from typing import Annotated
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
-from scene_experts.report import page
 
 
 @dataclass(frozen=True)
@@ -24,5 +23,7 @@ class ReportCommand:
 
 def report(args: list[str]) -> int:
     command = parse(ReportCommand, Command(f"{PROG} report", ("--runs",)), args)
+    from scene_experts.report import page
+
     print(f"wrote {page.write(command.runs, command.out)}")
     return 0

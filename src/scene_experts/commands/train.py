@@ -13,12 +13,13 @@ from typing import Annotated
 from rich.console import Console
 
 from scene_experts.api import recording
+from scene_experts.api.backend import backend
 from scene_experts.arguments.help import columns
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import HELP, HELP_ALL, Command, HelpAsked, parse
 from scene_experts.arguments.table import rows
 from scene_experts.commands import PROG
-from scene_experts.commands.shared import Device, Raster, backend
+from scene_experts.core.choices import Device, Raster
 from scene_experts.core.errors import InputError, few, nearest
 from scene_experts.core.signals import handled
 from scene_experts.data.capture import Capture

@@ -10,10 +10,7 @@ from typing import Annotated
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
-from scene_experts.commands.shared import Device, Raster, backend
-from scene_experts.render import as_trained
-from scene_experts.training import run_folder
-from scene_experts.view.server import Viewer, check_port, import_viser
+from scene_experts.core.choices import Device, Raster
 
 
 @dataclass(frozen=True)
@@ -35,6 +32,12 @@ class ViewCommand:
 
 def view(args: list[str]) -> int:
     command = parse(ViewCommand, Command(f"{PROG} view", ("--run",)), args)
+
+    from scene_experts.api.backend import backend
+    from scene_experts.render import as_trained
+    from scene_experts.training import run_folder
+    from scene_experts.view.server import Viewer, check_port, import_viser
+
     check_port(command.port)
     import_viser()  # says what is missing before anything is read
     device, rasterize = backend(command.device, command.rasterizer, False, False)

@@ -22,8 +22,8 @@ class Options:
     frames: int = 150
     """Number of frames to extract from a video. The sharpest frame of each of this many equal segments is used."""
     matching: Matching = "auto"
-    """Which photographs are matched: exhaustive matches all pairs, sequential matches neighbours in the order of their names (for a video or
-    a walk). auto: exhaustive for up to 300 photographs."""
+    """Which photographs are matched. exhaustive: all pairs. sequential: neighbours in the order of their names, as for a video or a walk.
+    auto: exhaustive for up to 300 photographs."""
     camera_model: CameraModel = "OPENCV"
     """COLMAP's lens model. Photographs of the same size, camera and focal length share one lens."""
     mapper: Mapper = "auto"

@@ -1,0 +1,13 @@
+"""How a capture is read, as plain JSON."""
+
+from pathlib import Path
+
+from scene_experts.data.settings import Data
+from scene_experts.training.config import to_json
+
+
+def test_settings_are_everything_but_the_path():
+    for data in (Data(Path("box")), Data(Path("box"), background=(0.0, 0.5, 1.0), max_views=3)):
+        whole = to_json(data)
+        whole.pop("path")
+        assert data.settings() == whole and list(data.settings()) == list(whole)
