@@ -29,15 +29,18 @@ def make_workloads(anchors: int, gaussians: int, width: int, height: int) -> dic
     from scene_experts.render.cpu import CpuRasterizer
 
     torch.set_num_threads(1)
+    make_work = getattr(step, "make_work", None) or step.work  # names of later and of earlier versions
+    make_picture = getattr(raster, "make_picture", None) or raster.picture  # type: ignore[attr-defined]
+    time_draw = getattr(raster, "time_draw", None) or raster.draw  # type: ignore[attr-defined]
 
     def time_step(work: Callable) -> Callable[[], Times]:
         return lambda: dict(zip(step.PARTS, work(time.thread_time), strict=True))
 
     def time_raster(draw: CpuRasterizer) -> Callable[[], Times]:
-        return lambda: dict(zip(("forward", "backward"), raster.draw(draw, scene, time.thread_time), strict=True))
+        return lambda: dict(zip(("forward", "backward"), time_draw(draw, scene, time.thread_time), strict=True))
 
-    scene = raster.picture(gaussians, width, height)
-    found = {f"step of {recipe}": time_step(step.work(recipe, anchors, width, height)) for recipe in RECIPES}
+    scene = make_picture(gaussians, width, height)
+    found = {f"step of {recipe}": time_step(make_work(recipe, anchors, width, height)) for recipe in RECIPES}
     found["raster"] = time_raster(CpuRasterizer(threads=1))
     found["raster, deterministic"] = time_raster(CpuRasterizer(threads=1, deterministic=True))
     return found

@@ -1,9 +1,9 @@
-"""The decode of an anchor scene, forward and backward: compiled against plain torch, one network against a mixture, in one process.
+"""Time the decode of an anchor scene, forward and backward: compiled and plain torch, one network and a mixture, in one process.
 
     OMP_NUM_THREADS=1 python benchmarks/decode.py [--anchors 20000]
 
-Every decoder gets the same anchors, directions and upstream gradients. Times are minima of interleaved runs, CPU time of this process
-(seconds of all its threads); the ratios are to one network per attribute in plain torch (Scaffold-GS as it is written) in the same run.
+Every decoder gets the same anchors, directions and upstream gradients. Times are minima of interleaved runs in CPU time of this process
+(all its threads). Ratios are to one network per attribute in plain torch (Scaffold-GS as published) in the same run.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 SPARSE = 1_000_000  # an iteration after the warm-up
 
 
-def scene(config: Anchors, anchors: int, seen: float) -> tuple[AnchorScene, torch.Tensor]:
-    """Random anchors with trained-looking features, and the rows that a camera sees."""
+def make_scene(config: Anchors, anchors: int, seen: float) -> tuple[AnchorScene, torch.Tensor]:
+    """Random anchors with features like trained ones, and the rows that a camera sees."""
     torch.manual_seed(0)
     total = int(anchors / seen)
     params = {
@@ -38,7 +38,7 @@ def scene(config: Anchors, anchors: int, seen: float) -> tuple[AnchorScene, torc
     return AnchorScene(config, Table(params, facts), 0.01, 5.0), rows
 
 
-def outputs(decoded: Decoded) -> list[torch.Tensor]:
+def list_outputs(decoded: Decoded) -> list[torch.Tensor]:
     g = decoded.gaussians
     raw = [] if decoded.raw_opacity is None else [decoded.raw_opacity]
     return [g.means, g.quats, g.scales, g.opacities, g.colors, *raw, *(r.gates for r in decoded.routing.values())]
@@ -46,7 +46,7 @@ def outputs(decoded: Decoded) -> list[torch.Tensor]:
 
 class Case:
     def __init__(self, config: Anchors, form: str, anchors: int, seen: float, camera: Camera) -> None:
-        self.scene, self.rows = scene(replace(config, decode=form), anchors, seen)  # type: ignore[arg-type]
+        self.scene, self.rows = make_scene(replace(config, decode=form), anchors, seen)  # type: ignore[arg-type]
         self.camera = camera
         self.upstream: list[torch.Tensor] = []
         self.forward = self.both = float("inf")
@@ -57,7 +57,7 @@ class Case:
         began = time.process_time()
         decoded = self.scene.decode(self.rows, self.camera, SPARSE)
         between = time.process_time()
-        values = outputs(decoded)
+        values = list_outputs(decoded)
         if not self.upstream:
             self.upstream = [torch.randn_like(v) for v in values]
             self.drawn = len(decoded.gaussians)
@@ -73,8 +73,8 @@ def main() -> None:
     parser.add_argument("--anchors", type=int, default=20_000)
     parser.add_argument("--seen", type=float, default=0.7, help="share of the table that the camera sees")
     parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--only", default="", help="run the cases whose name contains this")
-    parser.add_argument("--level", choices=native.LEVELS, help="which build of the library; the best of this processor by default")
+    parser.add_argument("--only", default="", help="run only the cases whose name contains this text")
+    parser.add_argument("--level", choices=native.LEVELS, help="instruction set of the library (default: the best of this processor)")
     args = parser.parse_args()
     if args.level:
         native.list_levels = lambda: (args.level,)

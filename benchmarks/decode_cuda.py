@@ -1,10 +1,10 @@
-"""The decode of an anchor scene on a GPU, forward and backward: Triton kernels against plain torch, in one process.
+"""Time the decode of an anchor scene on a GPU, forward and backward: Triton kernels and plain torch, in one process.
 
     python benchmarks/decode_cuda.py [--anchors 100000]
 
-Every decoder gets the same anchors, camera and upstream gradients. Times are medians of interleaved runs between CUDA events, the Triton
-form's compilation left out. `of the copy` is the bandwidth that the least traffic (every input read once, every output written once, per
-direction) would need in that time, over that of a plain device copy measured in the same run.
+Every decoder gets the same anchors, camera and upstream gradients. Times are medians of interleaved runs between CUDA events, without the
+compilation of the Triton kernels. `of the copy` is the bandwidth of the minimum traffic (every input read once and every output written
+once per direction) in that time, divided by the bandwidth of a plain device copy measured in the same run.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from scene_experts.scene.anchors.mlp import Plain
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 
 SPARSE = 1_000_000  # an iteration after the dense phase
-WARM_UP = 3  # first rounds that do not count: they compile
+WARM_UP = 3  # first rounds, which compile and do not count
 KINDS = {
     "one network": Anchors(decoder=Plain()),
     "Top-2 of 5": Anchors(decoder=Experts(num=5, top_k=2)),
@@ -33,11 +33,11 @@ KINDS = {
 GAUSSIAN = 4 * (3 + 4 + 3 + 1 + 3) + 8  # bytes of one drawn Gaussian with its source
 
 
-def least_bytes(total: int, anchors: int, drawn: int, F: int, K: int, experts: int) -> tuple[int, int]:
-    """The least traffic of forward and of backward, bytes: N rows of which A are seen, M Gaussians drawn; weights are not counted.
+def compute_least_bytes(total: int, anchors: int, drawn: int, F: int, K: int, experts: int) -> tuple[int, int]:
+    """Minimum traffic of the forward and of the backward pass in bytes: N rows of which A are visible, M Gaussians drawn, without weights.
 
-    Forward reads row, place, feature and log-scaling of each anchor and the offset of each Gaussian, and writes raw opacities, gates of
-    three attributes and the Gaussians. Backward reads those and their gradients, and writes the gradients of all N rows.
+    The forward pass reads row, position, feature and log-scaling of each anchor and the offset of each Gaussian, and writes raw opacities,
+    gates of three attributes and the Gaussians. The backward pass also reads their gradients, and writes the gradients of all N rows.
     """
     inputs = anchors * (8 + 12 + 4 * F + 24) + drawn * 12
     gates = 0 if experts == 1 else 3 * 4 * experts
@@ -48,7 +48,7 @@ def least_bytes(total: int, anchors: int, drawn: int, F: int, K: int, experts: i
 
 @dataclass
 class Case:
-    """One decoder of one kind, with its times in ms."""
+    """One decoder in one form, with its times in ms."""
 
     scene: AnchorScene
     rows: torch.Tensor
@@ -60,27 +60,27 @@ class Case:
     upstream: list[torch.Tensor] = field(default_factory=list)
 
     def run(self) -> None:
-        """One forward and one backward pass, timed."""
+        """Time one forward and one backward pass."""
         self.scene.zero_grad(set_to_none=True)
         self.scene.config = replace(self.scene.config, decode=self.form)  # type: ignore[arg-type]
         kept: list[list[torch.Tensor]] = []
-        self.forward.append(timed(lambda: kept.append(outputs(self.scene.decode(self.rows, self.camera, SPARSE)))))
+        self.forward.append(time_on_device(lambda: kept.append(list_outputs(self.scene.decode(self.rows, self.camera, SPARSE)))))
         values = kept[0]
         self.drawn = len(values[0])
         if not self.upstream:
             torch.manual_seed(1)
             self.upstream = [torch.randn_like(v) for v in values]
-        self.backward.append(timed(lambda: torch.autograd.backward(values, self.upstream)))
+        self.backward.append(time_on_device(lambda: torch.autograd.backward(values, self.upstream)))
 
 
-def outputs(decoded: Decoded) -> list[torch.Tensor]:
+def list_outputs(decoded: Decoded) -> list[torch.Tensor]:
     g = decoded.gaussians
     raw = [] if decoded.raw_opacity is None else [decoded.raw_opacity]
     return [g.means, g.quats, g.scales, g.opacities, g.colors, *raw, *(r.gates for r in decoded.routing.values())]
 
 
-def timed(work: Callable[[], object]) -> float:
-    """Milliseconds on the device."""
+def time_on_device(work: Callable[[], object]) -> float:
+    """Milliseconds of `work` on the device."""
     begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
     torch.cuda.synchronize()
     begin.record()
@@ -90,8 +90,8 @@ def timed(work: Callable[[], object]) -> float:
     return begin.elapsed_time(end)
 
 
-def scene(config: Anchors, total: int, device: str) -> AnchorScene:
-    """Random anchors with trained-looking features."""
+def make_scene(config: Anchors, total: int, device: str) -> AnchorScene:
+    """Random anchors with features like trained ones."""
     torch.manual_seed(0)
     params = {
         "feature": 0.5 * torch.randn(total, config.F),
@@ -102,15 +102,15 @@ def scene(config: Anchors, total: int, device: str) -> AnchorScene:
     return made.to(device)
 
 
-def copy_bandwidth(rounds: int) -> float:
-    """Bytes a second that a plain copy of 512 MiB reads and writes."""
+def measure_copy_bandwidth(rounds: int) -> float:
+    """Bytes per second that a plain copy of 512 MiB reads and writes."""
     source = torch.empty(2**27, device="cuda")
     to = torch.empty_like(source)
-    times = [timed(lambda: to.copy_(source)) for _ in range(rounds + WARM_UP)]
+    times = [time_on_device(lambda: to.copy_(source)) for _ in range(rounds + WARM_UP)]
     return 2 * 4 * 2**27 / (1e-3 * median(times[WARM_UP:]))
 
 
-def arguments() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--anchors", type=int, default=100_000, help="anchors that the camera sees")
     parser.add_argument("--seen", type=float, default=0.7, help="share of the table that it sees")
@@ -120,9 +120,9 @@ def arguments() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    args = arguments().parse_args()
+    args = make_parser().parse_args()
     if not torch.cuda.is_available() or triton_decode.available() is not None:
-        raise SystemExit(triton_decode.available() or "expected a CUDA device, found none; run this where there is one")
+        raise SystemExit(triton_decode.available() or "expected a CUDA device, found none; run this on a machine with one")
     triton_decode.PRECISION = args.precision
     pose = torch.eye(4)
     pose[2, 3] = 6.0
@@ -132,23 +132,23 @@ def main() -> None:
     cases: dict[tuple[str, str], Case] = {}
     for kind, config in KINDS.items():
         for form in ("composed", "native"):  # on CUDA "native" is Triton
-            cases[kind, form] = Case(scene(config, total, "cuda"), rows, camera, form)
+            cases[kind, form] = Case(make_scene(config, total, "cuda"), rows, camera, form)
     for case in (c for _ in range(args.rounds + WARM_UP) for c in cases.values()):
         case.run()
-    copy = copy_bandwidth(args.rounds)
+    copy = measure_copy_bandwidth(args.rounds)
     name = torch.cuda.get_device_name()
     print(f"{name}, {args.anchors} of {total} anchors, K = 10, F = 32, {args.precision}; a copy moves {copy / 1e9:.0f} GB/s")
-    print("\n".join(report(cases, total, args.anchors, copy)))
+    print("\n".join(format_report(cases, total, args.anchors, copy)))
 
 
-def report(cases: dict[tuple[str, str], Case], total: int, anchors: int, copy: float) -> list[str]:
-    """A line for each case; copy: bytes a second."""
+def format_report(cases: dict[tuple[str, str], Case], total: int, anchors: int, copy: float) -> list[str]:
+    """One line per case; copy: bytes per second."""
     lines = []
     for (kind, form), case in cases.items():
         forward, backward = median(case.forward[WARM_UP:]), median(case.backward[WARM_UP:])
         config, other = case.scene.config, cases[kind, "composed"]
         experts = config.decoder.num if isinstance(config.decoder, Experts) else 1
-        least = least_bytes(total, anchors, case.drawn, config.F, config.K, experts)
+        least = compute_least_bytes(total, anchors, case.drawn, config.F, config.K, experts)
         shares = [100 * b / (1e-3 * t) / copy for b, t in zip(least, (forward, backward))]
         ratio = (median(other.forward[WARM_UP:]) + median(other.backward[WARM_UP:])) / (forward + backward)
         lines.append(

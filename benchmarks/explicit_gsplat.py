@@ -1,4 +1,4 @@
-"""The peer of `train_cuda.py`: explicit Gaussians (Kerbl et al. 2023) of a fixed number, trained by the plainest loop over gsplat."""
+"""The peer of `train_cuda.py`: a fixed number of explicit Gaussians (Kerbl et al. 2023), trained by a minimal loop over gsplat."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from scene_experts.training.optim import Adam
 
 Draw = Callable[[dict[str, Tensor], Camera, int, Tensor], Tensor]
 RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "dc": 2.5e-3, "rest": 2.5e-3 / 20}  # 3DGS's
-DEGREE_EVERY = 1000  # iterations after which one more degree of the harmonics is used
+DEGREE_EVERY = 1000  # iterations between degrees of the harmonics
 
 
 def draw(p: dict[str, Tensor], camera: Camera, degree: int, background: Tensor) -> Tensor:
-    """The picture [H, W, 3] by gsplat's own one-call interface."""
+    """Render an image [H, W, 3] with gsplat's `rasterization`."""
     picture, _, _ = importlib.import_module("gsplat").rasterization(
         p["means"],
         p["quats"],  # normalised inside
@@ -45,8 +45,8 @@ def draw(p: dict[str, Tensor], camera: Camera, degree: int, background: Tensor) 
     return picture[0]
 
 
-def begin(capture: Capture, count: int) -> dict[str, Tensor]:
-    """`count` Gaussians around the capture's points: drawn from them, jittered by the distance to their neighbours where that repeats."""
+def initialise(capture: Capture, count: int) -> dict[str, Tensor]:
+    """Sample `count` Gaussians from the capture's points. Repeated points are jittered by the distance to their neighbours."""
     assert capture.points is not None
     g = torch.Generator().manual_seed(0)
     xyz, rgb = capture.points.xyz, capture.points.rgb.float() / 255
@@ -66,7 +66,7 @@ def begin(capture: Capture, count: int) -> dict[str, Tensor]:
 
 
 class Training:
-    """The whole state of the loop, to and from a folder of checkpoints."""
+    """The state of the loop, with checkpoints in a folder."""
 
     def __init__(self, capture: Capture, count: int, iterations: int, folder: Path, device: str, draw: Draw = draw) -> None:
         self.capture, self.count, self.iterations, self.folder, self.device, self.draw = capture, count, iterations, folder, device, draw
@@ -74,7 +74,7 @@ class Training:
         self.views = torch.Generator().manual_seed(0)
         self.queue: list[int] = []
         newest = checkpoint.latest(folder)
-        tensors, meta = checkpoint.load(newest) if newest else (begin(capture, count), {})
+        tensors, meta = checkpoint.load(newest) if newest else (initialise(capture, count), {})
         self.params = {name: tensors[name].to(device).requires_grad_() for name in RATES}
         self.optimizer = Adam([{"params": [p], "name": name, "lr": RATES[name]} for name, p in self.params.items()])
         if newest:
@@ -102,7 +102,7 @@ class Training:
         return self.step == self.iterations
 
     def iterate(self) -> None:
-        """One iteration: view, picture, loss, gradient, Adam."""
+        """One iteration: view, image, loss, gradient, Adam."""
         self.step += 1
         progress = self.step / self.iterations
         self.optimizer.param_groups[0]["lr"] = RATES["means"] * self.capture.extent * 0.01**progress
@@ -113,13 +113,13 @@ class Training:
         self.capture.images.prefetch(self.queue[:3])
         target = upload(frame.rgb, self.device, torch.float32).div_(255.0)
         mask = None if frame.mask is None else upload(frame.mask, self.device)
-        image = self.picture(self.capture.views[index].camera)
+        image = self.render(self.capture.views[index].camera)
         l1, dssim = photometric(image, target, 0.2, mask)
         (l1 + dssim).backward()
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
 
-    def picture(self, camera: Camera) -> Tensor:
+    def render(self, camera: Camera) -> Tensor:
         degree = min(3, self.step // max(1, round(DEGREE_EVERY * self.iterations / 30_000)))
         background = upload(torch.tensor(self.capture.background), self.device)
         return self.draw(self.params, camera.to(self.device), degree, background)

@@ -1,11 +1,11 @@
-"""Frames a second of trained scenes, decode and raster apart: every kind of decoder on a scene made in code, or runs of yours.
+"""Measure frames per second, decode and raster separately: every kind of decoder on a synthetic scene, or trained runs.
 
     OMP_NUM_THREADS=1 python benchmarks/fps.py [--anchors 40000] [--only moe-gs] [RUN ...]
 
-Made scenes: half of the anchors fill an 800x544 picture; networks are as initialised, so about half of the Gaussians are drawn. A frame is
-visibility filter, decode, rasterise. Times are minima of interleaved runs, processor time with one thread, wall time with more. Decodes:
-the training's own; the frozen scene's (routing kept); the same with the features' part of the first layers kept too. Runs: medians over
-their held-out views, as `scene-experts eval` measures them.
+Synthetic scenes: half of the anchors fill an 800x544 image; the networks are freshly initialised, so about half of the Gaussians are
+drawn. A frame is visibility filter, decode and rasterisation. Times are minima of interleaved runs, processor time with one thread and
+wall time with more. The script measures two decodes: that of the training ("own decode") and that of the frozen scene, which computes
+its routing once. Runs: medians over their held-out views, measured as in `scene-experts eval`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pathlib import Path
 
 import torch
 
-from scene_experts.bench.measure import Clock, Subject, clock_for, least
-from scene_experts.bench.step import AT, work
+from scene_experts.bench.measure import Clock, Subject, choose_clock, measure_minima
+from scene_experts.bench.step import AT, make_work
 from scene_experts.core.types import Mode
 from scene_experts.evaluate import timing
 from scene_experts.recipes import RECIPES
@@ -30,9 +30,9 @@ KINDS = (
 )
 
 
-def frames(recipe: str, anchors: int) -> tuple[Subject, int]:
-    """Draws the recipe's made scene once and times (own decode, frozen, raster); and how many Gaussians are drawn."""
-    made = work(recipe, anchors, 800, 544)
+def make_subject(recipe: str, anchors: int) -> tuple[Subject, int]:
+    """A function that draws the recipe's synthetic scene once and times (own decode, frozen, raster); and the number of Gaussians."""
+    made = make_work(recipe, anchors, 800, 544)
     scene, camera, rasterize = made.training.scene, made.camera, made.rasterize
     forms = (scene, scene.frozen(AT))
 
@@ -48,23 +48,23 @@ def frames(recipe: str, anchors: int) -> tuple[Subject, int]:
         rasterize(decoded.gaussians, camera, torch.zeros(3))
         return (*times, clock() - began)
 
-    return frame, made.drawn()
+    return frame, made.count_drawn()
 
 
-def made_scenes(anchors: int, only: str, seconds: float) -> None:
+def measure_synthetic(anchors: int, only: str, seconds: float) -> None:
     subjects, drawn = {}, {}
     for name in KINDS:
         if only in name and name in RECIPES:
-            subjects[name], drawn[name] = frames(name, anchors)
-    clock = clock_for(torch.get_num_threads())
-    print(f"{anchors} anchors, half of them seen, 800x544, {torch.get_num_threads()} thread(s); ms")
+            subjects[name], drawn[name] = make_subject(name, anchors)
+    clock = choose_clock(torch.get_num_threads())
+    print(f"{anchors} anchors, half of them visible, 800x544, {torch.get_num_threads()} thread(s); ms")
     print("| recipe | Gaussians | own decode | frozen | raster | FPS, frozen |\n|---|---|---|---|---|---|")
-    for name, (own, frozen, raster) in least(subjects, seconds * len(subjects), clock).items():
+    for name, (own, frozen, raster) in measure_minima(subjects, seconds * len(subjects), clock).items():
         parts = " | ".join(f"{1e3 * t:.1f}" for t in (own, frozen, raster))
         print(f"| {name} | {drawn[name]:,} | {parts} | {1 / (frozen + raster):.0f} |")
 
 
-def runs(folders: list[Path]) -> None:
+def measure_runs(folders: list[Path]) -> None:
     print("| run | own decode ms | frozen ms | raster ms | FPS, own decode | FPS, frozen |\n|---|---|---|---|---|---|")
     for folder in folders:
         run = open_run(folder)
@@ -78,15 +78,15 @@ def runs(folders: list[Path]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="*", type=Path, help="run folders; none: made scenes")
+    parser.add_argument("runs", nargs="*", type=Path, help="run folders; none: synthetic scenes")
     parser.add_argument("--anchors", type=int, default=40_000)
-    parser.add_argument("--only", default="", help="made scenes whose recipe contains this")
-    parser.add_argument("--seconds", type=float, default=2.0, help="per made scene")
+    parser.add_argument("--only", default="", help="only synthetic scenes whose recipe contains this text")
+    parser.add_argument("--seconds", type=float, default=2.0, help="per synthetic scene")
     args = parser.parse_args()
     if args.runs:
-        runs(args.runs)
+        measure_runs(args.runs)
     else:
-        made_scenes(args.anchors, args.only, args.seconds)
+        measure_synthetic(args.anchors, args.only, args.seconds)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Cost of graph points (SAGS) against their number: the graph anew, and one view's blend, hash grid and whole decode, forward + backward.
+"""Time graph points (SAGS) against their number: building the graph, and one view's blend, hash grid and decode, forward + backward.
 
 Usage: python benchmarks/graph.py [--points 30000 300000] [--repeat 3]
-Half of the points are seen. The peer of the compiled forms is their plain torch form. One thread, processor time, minima.
+Half of the points are visible. The compiled functions are compared with plain torch. One thread, processor time, minima.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from scene_experts.scene.graph.network import Graph, blended
 from scene_experts.scene.graph.scene import GraphPoints, GraphScene
 
 
-def make(points: int) -> GraphScene:
-    """Points on the wavy surfaces of a scene of extent 5, as structure from motion leaves them."""
+def make_scene(points: int) -> GraphScene:
+    """Points on the wavy surfaces of a scene of extent 5, distributed like those of structure from motion."""
     generator = torch.Generator().manual_seed(0)
     uv = torch.rand(points, 2, generator=generator) * 10 - 5
     z = torch.sin(uv[:, :1] * 2) * torch.cos(uv[:, 1:]) + 0.02 * torch.randn(points, 1, generator=generator)
@@ -32,8 +32,8 @@ def make(points: int) -> GraphScene:
     )
 
 
-def least(run: Callable[[], object], repeat: int) -> float:
-    """Milliseconds of processor time, the least of `repeat`."""
+def measure_minimum(run: Callable[[], object], repeat: int) -> float:
+    """Minimum of `repeat` runs, milliseconds of processor time."""
     found = []
     for _ in range(repeat):
         began = time.process_time()
@@ -42,11 +42,11 @@ def least(run: Callable[[], object], repeat: int) -> float:
     return min(found)
 
 
-def both(run: Callable[[], object], repeat: int) -> tuple[float, float]:
-    """The compiled form and the plain one."""
-    fast = least(run, repeat)
+def measure_both(run: Callable[[], object], repeat: int) -> tuple[float, float]:
+    """Measure the compiled function and plain torch."""
+    fast = measure_minimum(run, repeat)
     with mock.patch.object(native, "load", lambda level=None: None):
-        return fast, least(run, repeat)
+        return fast, measure_minimum(run, repeat)
 
 
 def main() -> None:
@@ -56,11 +56,11 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     camera = Camera(torch.eye(4), torch.tensor([[400.0, 0, 400], [0, 400, 272], [0, 0, 1]]), 800, 544, 0.2)
-    print("points    graph anew ms   blend ms (torch)   grid ms (torch)   whole decode ms (torch)   a point seen, us")
+    print("points    build graph ms   blend ms (torch)   grid ms (torch)   whole decode ms (torch)   us/visible point")
     for points in args.points:
-        scene = make(points)
+        scene = make_scene(points)
         rows = torch.randperm(points, generator=torch.Generator().manual_seed(1))[: points // 2].sort().values
-        anew = least(lambda: Graph.of(scene.table.facts["xyz"], 10), 1)  # noqa: B023
+        anew = measure_minimum(lambda: Graph.of(scene.table.facts["xyz"], 10), 1)  # noqa: B023
         found, weight = scene.graph().among(rows)
         xyz, feature = scene.table.facts["xyz"][rows], scene.table.params["feature"][rows].detach().requires_grad_()
 
@@ -74,7 +74,7 @@ def main() -> None:
             g = scene.decode(rows, camera).gaussians  # noqa: B023
             (g.means.sum() + g.scales.sum() + g.colors.sum() + g.opacities.sum() + g.quats.sum()).backward()
 
-        a, b, c = (both(run, args.repeat) for run in (blend, grid, decode))
+        a, b, c = (measure_both(run, args.repeat) for run in (blend, grid, decode))
         parts = [f"{fast:8.1f} ({slow:.1f})" for fast, slow in (a, b, c)]
         print(f"{points:7,} {anew:12.0f} {parts[0]:>20} {parts[1]:>18} {parts[2]:>24} {1000 * c[0] / len(rows):14.2f}", flush=True)
 

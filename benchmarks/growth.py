@@ -1,7 +1,8 @@
-"""Cost of density control against the number of anchors: one adjustment (grow and prune) and one view's statistics.
+"""Time density control against the number of anchors: one densification step (grow and prune) and the statistics of one view.
 
 Usage: python benchmarks/growth.py [--anchors 40000 400000 2000000] [--repeat 3] [--strong 0.03]
-Anchors fill a slab of the lattice; `strong` is the share of slots whose gradient founds candidates. One thread, processor time, minima.
+The anchors fill a slab of the lattice. `strong` is the share of slots whose gradient creates candidates.
+Times are minima of processor time on one thread.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from scene_experts.strategy.grow import GrowAnchors
 VOXEL, K, F = 0.01, 10, 32
 
 
-def make(anchors: int, strong: float) -> AnchorScene:
-    """`anchors` different cells at random in a slab that is half full, with the statistics of 100 iterations."""
+def make_scene(anchors: int, strong: float) -> AnchorScene:
+    """`anchors` distinct random cells in a half-full slab, with the statistics of 100 iterations."""
     generator = torch.Generator().manual_seed(0)
     side = max(4, round((2 * anchors * 16) ** (1 / 3)))
     cells = torch.randperm(side * side * max(1, side // 16), generator=generator)[:anchors]
@@ -43,8 +44,8 @@ def make(anchors: int, strong: float) -> AnchorScene:
     return scene
 
 
-def view(scene: AnchorScene) -> tuple[Decoded, Render]:
-    """What one view decodes and draws: every second anchor, half of its slots."""
+def make_view(scene: AnchorScene) -> tuple[Decoded, Render]:
+    """The decode and render of one view: every second anchor, half of its slots."""
     rows = torch.arange(0, len(scene.table), 2)
     raw = torch.randn(len(rows), K)
     keep = (raw > 0).view(-1).nonzero().squeeze(1)
@@ -63,12 +64,12 @@ def main() -> None:
     parser.add_argument("--strong", type=float, default=0.03)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    print("  anchors  adjustment  ns an anchor   founded   removed  statistics of a view  ns an anchor")
+    print("  anchors  densification  ns/anchor     grown    pruned  statistics of a view    ns/anchor")
     for anchors in args.anchors:
         adjusting = watching = float("inf")
         for _ in range(args.repeat):
-            scene = make(anchors, args.strong)
-            seen = view(scene)
+            scene = make_scene(anchors, args.strong)
+            seen = make_view(scene)
             began = time.thread_time()
             observe.observe(scene.table, *seen)
             middle = time.thread_time()

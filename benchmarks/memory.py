@@ -1,9 +1,10 @@
-"""Peak memory of a training above the level after import and image cache, beside what it cannot do without.
+"""Measure the peak memory of a training above the level after imports and image cache, compared with the memory that it must have.
 
 Usage: python benchmarks/memory.py [--capture demo/buddha] [--recipe moe-gs] [--anchors 400000] [--spread 0.02] [--iterations 60]
-The capture's points are multiplied by jitter to `anchors` rows, so that a short run has a large table. The run has adjustments
-(rows come and go) and writes checkpoints. Resident memory: its level after the images are decoded, and its highest since (VmHWM).
-Bytes needed: parameters + gradients + both moments, + the largest frame's buffers by `memory.frame_bytes` with its own number of tiles.
+The script copies the capture's points with jitter to `anchors` rows, so that a short run has a large table. The run includes
+densification (rows are added and removed) and checkpoints. Resident memory is measured after the images are decoded, and its peak since
+then (VmHWM). The bytes needed are parameters + gradients + both moments + the buffers of the largest frame (`memory.frame_bytes` with the
+actual number of tiles).
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ from scene_experts.training.loop import Run, iterate, train
 from scene_experts.training.state import Training
 
 
-def status(name: str) -> int:
-    """A line of /proc/self/status, bytes."""
+def read_status(name: str) -> int:
+    """A line of /proc/self/status, in bytes."""
     line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name))
     return 1024 * int(line.split()[1])
 
 
 class Watched:
-    """A rasteriser that counts the largest frame in bytes."""
+    """A rasteriser that records the largest frame in bytes."""
 
     def __init__(self, inner) -> None:
         self.inner, self.largest, self.text = inner, 0, ""
@@ -56,8 +57,8 @@ class Watched:
         return render
 
 
-def crowded(capture: Capture, anchors: int, spread: float) -> Capture:
-    """The capture with its points drawn `anchors` times, each with jitter of `spread` extents."""
+def multiply_points(capture: Capture, anchors: int, spread: float) -> Capture:
+    """The capture with `anchors` points sampled from its own, each with jitter of `spread` extents."""
     assert capture.points is not None
     generator = torch.Generator().manual_seed(0)
     at = torch.randint(len(capture.points.xyz), (anchors,), generator=generator)
@@ -71,12 +72,12 @@ def main() -> None:
     parser.add_argument("--capture", type=Path, default=Path("demo/buddha"))
     parser.add_argument("--recipe", default="moe-gs")
     parser.add_argument("--anchors", type=int, default=400_000)
-    parser.add_argument("--spread", type=float, default=0.02, help="jitter in extents: above 1 most rows are in no view")
+    parser.add_argument("--spread", type=float, default=0.02, help="jitter in extents; above 1 most rows are outside of every view")
     parser.add_argument("--iterations", type=int, default=60)
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    capture = crowded(load(args.capture), args.anchors, args.spread)
+    capture = multiply_points(load(args.capture), args.anchors, args.spread)
     for index in capture.train:
         capture.frame(index)
     rasterize = Watched(choose("auto", "cpu"))
@@ -86,23 +87,23 @@ def main() -> None:
         recipe, scene=replace(recipe.scene, voxel_size=1e-3), growth=growth, iterations=30_000, max_anchors=args.anchors * 11 // 10
     )
     warm_up(cfg, load(args.capture), rasterize)
-    Path("/proc/self/clear_refs").write_text("5")  # the highest level starts anew
-    level = status("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # reset the peak
+    level = read_status("VmRSS")
     print(f"{args.recipe} on {capture.name}, {args.threads} thread(s); level after import and images {level / 1e6:.0f} MB")
     with tempfile.TemporaryDirectory() as folder:
         run = Run(RunConfig(cfg, Data(args.capture), stop_at=args.iterations), out=Path(folder), save_every=args.iterations // 2)
         rows, peak = 0, level
         for event in train(cfg, run, capture, rasterize):  # type: ignore[arg-type]
-            if status("VmHWM") > peak:
-                peak = status("VmHWM")
+            if read_status("VmHWM") > peak:
+                peak = read_status("VmHWM")
                 print(f"  {(peak - level) / 1e6:8.1f} MB above it at {event}"[:150])
             rows = event.edit.anchors if isinstance(event, Adjusted) else rows
-    report(cfg, capture, rows, rasterize, status("VmHWM") - level)
+    print_report(cfg, capture, rows, rasterize, read_status("VmHWM") - level)
     capture.images.close()
 
 
 def warm_up(cfg, capture: Capture, rasterize: Watched) -> None:
-    """Two iterations on the capture as it is: libraries, threads and code are in memory afterwards."""
+    """Run two iterations on the unchanged capture, which loads libraries, threads and code into memory."""
     training = Training.start(replace(cfg, max_anchors=0), capture, "cpu")
     for _ in range(2):
         iterate(training, Run(RunConfig(cfg, Data(capture.root))), capture, rasterize)  # type: ignore[arg-type]
@@ -110,15 +111,15 @@ def warm_up(cfg, capture: Capture, rasterize: Watched) -> None:
     rasterize.largest = 0
 
 
-def report(cfg, capture: Capture, rows: int, rasterize: Watched, above: int) -> None:
-    """The parts and the ratio."""
+def print_report(cfg, capture: Capture, rows: int, rasterize: Watched, above: int) -> None:
+    """Print the parts and the ratio."""
     scene = Training.start(cfg, capture, "cpu").scene
     columns = sum(p[:1].numel() for p in scene.table.params.values()) * max(rows, len(scene.table))
     networks = sum(p.numel() for p in scene.network_tensors().values())
     state = 4 * 4 * (columns + networks)
     print(f"rows {max(rows, len(scene.table)):,}: parameters + gradients + moments {state / 1e6:.1f} MB")
     print(f"largest frame {rasterize.largest / 1e6:.1f} MB ({rasterize.text})")
-    print(f"peak above the level {above / 1e6:.1f} MB = {above / (state + rasterize.largest):.2f} of both (asked for: at most 1.5)")
+    print(f"peak above the level {above / 1e6:.1f} MB = {above / (state + rasterize.largest):.2f} of both (target <= 1.5)")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Recipes on captures, trained and scored one after the other: the table of docs/results.md.
+"""Train and score recipes on captures, one after the other, and print a table.
 
 Usage: python benchmarks/quality.py --captures DIR... [--recipes scaffold-gs moe-gs] [--iterations 7000] [--seeds 0] [--out runs/quality]
-Finished runs are not repeated and interrupted ones go on, so the command can be given again until the table is whole.
+Finished runs are not repeated and interrupted runs continue, so the command can be repeated until the table is complete.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pathlib import Path
 COLUMNS = (
     ("PSNR", lambda r: f"{r['psnr']:.2f}"),
     ("SSIM", lambda r: f"{r['ssim']:.3f}"),
-    ("LPIPS", lambda r: score(r, "lpips")),
-    ("LPIPS 3dgs", lambda r: score(r, "lpips_3dgs")),
+    ("LPIPS", lambda r: format_score(r, "lpips")),
+    ("LPIPS 3dgs", lambda r: format_score(r, "lpips_3dgs")),
     ("MB", lambda r: f"{r['size']['MB']:.1f}"),
     ("anchors", lambda r: f"{r['anchors']:,}"),
     ("active %", lambda r: "-" if r["activation_ratio"] is None else f"{100 * r['activation_ratio']:.1f}"),  # 3DGS has no such share
@@ -26,7 +26,7 @@ COLUMNS = (
 )
 
 
-def score(results: dict, name: str) -> str:
+def format_score(results: dict, name: str) -> str:
     return "-" if results.get(name) is None else f"{results[name]:.3f}"
 
 
@@ -35,8 +35,8 @@ def run(args: list[str]) -> None:
     subprocess.run([sys.executable, "-m", "scene_experts", *args], check=True)
 
 
-def one(capture: Path, recipe: str, seed: int, iterations: int, folder: Path, extra: list[str]) -> dict:
-    """The results of one run, made now if they are not there yet."""
+def run_one(capture: Path, recipe: str, seed: int, iterations: int, folder: Path, extra: list[str]) -> dict:
+    """The results of one run; trains and scores it if they do not exist."""
     results = folder / "results.json"
     if not results.exists():
         resume = ["--resume"] if (folder / "checkpoints").exists() else []
@@ -59,7 +59,7 @@ def main() -> None:
         for recipe in args.recipes:
             for seed in args.seeds:
                 name = recipe if len(args.seeds) == 1 else f"{recipe}-seed{seed}"
-                results = one(capture, recipe, seed, args.iterations, args.out / capture.name / name, extra)
+                results = run_one(capture, recipe, seed, args.iterations, args.out / capture.name / name, extra)
                 rows.append([capture.name, name, *(render(results) for _, render in COLUMNS)])
     heads = ["capture", "recipe", *(name for name, _ in COLUMNS)]
     print("\n| " + " | ".join(heads) + " |\n|" + "---|" * len(heads))

@@ -1,12 +1,12 @@
-"""Times the CPU rasteriser, forward + backward, against a scalar C++ peer and the pure-torch reference, on one scene.
+"""Time the CPU rasteriser, forward + backward, against a scalar C++ peer and the pure-torch reference, on one scene.
 
     python benchmarks/raster.py [--cloud garden.npz] [--cases 100000,800,544 ...] [--levels avx512 avx2]
     [--reference] [--threads 1] [--scaling]
 
-Times of one thread are processor time, the least of interleaved runs, so that a busy machine blurs them little; with more threads they are
-wall time. "cycles/pair" is core cycles (time x clock, the clock measured by a loop of dependent additions) per composited (pixel,
-Gaussian) pair, forward + backward; the peer counts the pairs. The peer is benchmarks/peer/raster_peer.cpp, compiled here with
--O3 -march=native. `--scaling` measures threads instead: see raster_threads.py.
+Times of one thread are processor time; with more threads they are wall time. All are minima of interleaved runs, so that a busy machine
+changes them little. "cycles/pair" is the number of core cycles (time x clock; a loop of dependent additions measures the clock) per
+composited (pixel, Gaussian) pair, forward + backward; the peer counts the pairs. The peer is benchmarks/peer/raster_peer.cpp, which this
+script compiles with -O3 -march=native. `--scaling` measures threads instead: see raster_threads.py.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 import raster_threads
-from raster_scene import read, scene, synthetic
+from raster_scene import make_cloud, make_scene, read_cloud
 from scene_experts.core.types import Camera, Gaussians
 from scene_experts.native import library as native
 from scene_experts.render import cpu
@@ -34,7 +34,7 @@ STAGES = ("project", "bin", "blend", "blend backward", "project backward")
 
 
 def compile_peer(folder: Path) -> ctypes.CDLL:
-    """The peer's shared library, built in `folder`."""
+    """Build the peer's shared library in `folder` and load it."""
     target = folder / "peer.so"
     source = [str(PEER / "raster_peer.cpp"), str(PEER / "clock.cpp")]
     flags = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC", f"-I{PEER.parents[1] / 'csrc'}"]
@@ -56,7 +56,7 @@ class Fast:
         self.counts = [0] * 3
 
     def __call__(self, g: Gaussians, camera: Camera, weights: Tensor, clock: Callable[[], float]) -> tuple[float, float, Tensor, Tensor]:
-        """Seconds forward, seconds backward, the picture, and the gradient of the means."""
+        """Seconds forward, seconds backward, the image, and the gradient of the means."""
         leaves = [t.clone().requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.colors)]
         start = clock()
         render = self.draw(Gaussians(*leaves, g.source), camera, torch.zeros(3))
@@ -80,7 +80,7 @@ class Peer:
         self.library, self.state, self.pairs = library, ctypes.c_void_p(library.peer_new()), 0
 
     def __call__(self, g: Gaussians, camera: Camera, weights: Tensor, clock: Callable[[], float]) -> tuple[float, float, Tensor, Tensor]:
-        """As Fast's."""
+        """As `Fast`."""
         args = cpu.convert_camera(camera)
         inputs = [g.means, g.quats, g.scales, g.opacities, g.colors]
         image, background = torch.empty((camera.height, camera.width, 3)), torch.zeros(3)
@@ -95,8 +95,8 @@ class Peer:
         return middle - start, end - middle, image, outputs[0]
 
 
-def reference(g: Gaussians, camera: Camera, weights: Tensor, clock: Callable[[], float]) -> tuple[float, float, Tensor, Tensor]:
-    """The tiled pure-torch reference in float32; as Fast's."""
+def time_reference(g: Gaussians, camera: Camera, weights: Tensor, clock: Callable[[], float]) -> tuple[float, float, Tensor, Tensor]:
+    """The tiled pure-torch reference in float32; as `Fast`."""
     leaves = [t.clone().requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.colors)]
     start = clock()
     render = ReferenceRasterizer()(Gaussians(*leaves, g.source), camera, torch.zeros(3))
@@ -105,16 +105,16 @@ def reference(g: Gaussians, camera: Camera, weights: Tensor, clock: Callable[[],
     return middle - start, clock() - middle, render.image.detach(), leaves[0].grad  # type: ignore[return-value]
 
 
-def run(case: tuple[int, int, int], args: argparse.Namespace, library: ctypes.CDLL) -> None:
-    """Measures and prints one case: Gaussians, width, height."""
-    g, camera = scene(read(args.cloud) if args.cloud else synthetic(), *case)
+def measure_case(case: tuple[int, int, int], args: argparse.Namespace, library: ctypes.CDLL) -> None:
+    """Measure and print one case: Gaussians, width, height."""
+    g, camera = make_scene(read_cloud(args.cloud) if args.cloud else make_cloud(), *case)
     weights = torch.rand((camera.height, camera.width, 3), generator=torch.Generator().manual_seed(0))
     clock = time.thread_time if args.threads == 1 else time.perf_counter
     fast = [Fast(level, args.threads) for level in args.levels] + [Fast(args.levels[0], args.threads, deterministic=True)]
     peer = Peer(library)
     subjects = [(f.name, f, args.repeat) for f in fast] + [(peer.name, peer, 3)]
     if args.reference:
-        subjects.append(("pure-torch tiles", reference, 1))
+        subjects.append(("pure-torch tiles", time_reference, 1))
     best: dict[str, list[float]] = {name: [float("inf")] * 2 for name, _, _ in subjects}
     results: dict[str, tuple[Tensor, Tensor]] = {}
     hz = 0.0
@@ -125,10 +125,10 @@ def run(case: tuple[int, int, int], args: argparse.Namespace, library: ctypes.CD
                 *seconds, image, gradient = subject(g, camera, weights, clock)
                 best[name] = [min(a, b) for a, b in zip(best[name], seconds, strict=True)]
                 results[name] = (image, gradient)
-    report(case, args, fast, peer, best, results, hz)
+    print_case(case, args, fast, peer, best, results, hz)
 
 
-def report(
+def print_case(
     case: tuple[int, int, int],
     args: argparse.Namespace,
     fast: list[Fast],
@@ -137,7 +137,7 @@ def report(
     results: dict[str, tuple[Tensor, Tensor]],
     hz: float,
 ) -> None:
-    """Prints the table of one case."""
+    """Print the table of one case."""
     first = fast[0]
     visible, tiles, blocks = first.counts
     size = f"{case[0]} Gaussians, {case[1]}x{case[2]}, {args.threads} thread(s), clock {hz / 1e9:.2f} GHz"
@@ -159,25 +159,25 @@ def report(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cloud", type=Path, help="npz of a point cloud (default: one made in code)")
+    parser.add_argument("--cloud", type=Path, help="npz of a point cloud (default: a synthetic one)")
     parser.add_argument("--cases", nargs="+", default=["100000,800,544", "500000,800,544"], help="Gaussians,width,height")
     parser.add_argument("--levels", nargs="+", default=[name for name in native.list_levels() if native.find(name)])
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeat", type=int, default=15)
     parser.add_argument("--reference", action="store_true", help="also time the pure-torch reference (a minute or more)")
-    parser.add_argument("--scaling", action="store_true", help="only: what a second thread brings, idle and busy (raster_threads.py)")
+    parser.add_argument("--scaling", action="store_true", help="measure the gain of a second thread instead (raster_threads.py)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     cases = [tuple(int(n) for n in case.split(",")) for case in args.cases]
     if args.scaling:
         for count, width, height in cases:
-            g, camera = scene(read(args.cloud) if args.cloud else synthetic(), count, width, height)
+            g, camera = make_scene(read_cloud(args.cloud) if args.cloud else make_cloud(), count, width, height)
             raster_threads.report(g, camera, max(2, args.threads), 4 * args.repeat)
         return
     with tempfile.TemporaryDirectory() as folder:
         library = compile_peer(Path(folder))
         for count, width, height in cases:
-            run((count, width, height), args, library)
+            measure_case((count, width, height), args, library)
 
 
 if __name__ == "__main__":

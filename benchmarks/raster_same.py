@@ -1,10 +1,10 @@
-"""Whether a change left the CPU rasteriser's results alone, to the last bit.
+"""Check that a change leaves the results of the CPU rasteriser bit-identical.
 
-    python benchmarks/raster_same.py record before.json     # at the commit before
-    python benchmarks/raster_same.py compare before.json    # with the change built; exit 1 where anything differs
+    python benchmarks/raster_same.py record before.json     # before the change
+    python benchmarks/raster_same.py compare before.json    # with the change built; exit status 1 if anything differs
 
-Hashes of the picture, alpha, depth, radii and all gradients in the deterministic mode, on this machine, for every instruction set it runs.
-Bits may differ between processors and compilers, so the file is of use on the machine that made it.
+It hashes the image, alpha, depth, radii and all gradients in the deterministic mode, for every instruction set that this machine runs.
+Bits may differ between processors and compilers, so the file is valid only on the machine that wrote it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 
-from raster_scene import scene, synthetic
+from raster_scene import make_cloud, make_scene
 from scene_experts.core.types import Gaussians
 from scene_experts.native import library as native
 from scene_experts.render.cpu import CpuRasterizer
@@ -26,9 +26,9 @@ CASES = ((20_000, 400, 301), (100_000, 800, 544))
 NAMES = ("image", "alpha", "depth", "radii", "mean2d", "means", "quats", "scales", "opacities", "colors")
 
 
-def hashes(case: tuple[int, int, int], level: str, antialias: bool, threads: int) -> dict[str, str]:
-    """One hash for each result."""
-    g, camera = scene(synthetic(), *case)
+def hash_case(case: tuple[int, int, int], level: str, antialias: bool, threads: int) -> dict[str, str]:
+    """Render one case and hash each result."""
+    g, camera = make_scene(make_cloud(), *case)
     leaves = [t.clone().requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.colors)]
     draw = CpuRasterizer(level=level, antialias=antialias, deterministic=True, threads=threads)
     render = draw(Gaussians(*leaves, g.source), camera, torch.tensor([0.2, 0.5, 0.9]))
@@ -39,11 +39,11 @@ def hashes(case: tuple[int, int, int], level: str, antialias: bool, threads: int
     return {name: hashlib.sha256(t.detach().numpy().tobytes()).hexdigest()[:16] for name, t in zip(NAMES, results, strict=True)}  # type: ignore[union-attr]
 
 
-def everything() -> dict[str, dict[str, str]]:
-    """Hashes of all cases."""
+def hash_all() -> dict[str, dict[str, str]]:
+    """Hash all cases."""
     levels = [name for name in native.list_levels() if native.find(name)]
     return {
-        f"{case[0]} {level} antialias={antialias}": hashes(case, level, antialias, threads=1 + antialias)
+        f"{case[0]} {level} antialias={antialias}": hash_case(case, level, antialias, threads=1 + antialias)
         for case in CASES
         for level in levels
         for antialias in (False, True)
@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument("file", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    found = everything()
+    found = hash_all()
     if args.what == "record":
         args.file.write_text(json.dumps(found, indent=1))
         return

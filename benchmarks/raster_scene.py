@@ -1,5 +1,5 @@
-"""The benchmark scene of the rasterisers: the package's own, which `scene-experts bench` draws too."""
+"""The benchmark scene of the rasterisers, which `scene-experts bench` uses too."""
 
-from scene_experts.bench.cloud import POINTS, Cloud, read, scene, synthetic
+from scene_experts.bench.cloud import POINTS, Cloud, make_cloud, make_scene, read_cloud
 
-__all__ = ["POINTS", "Cloud", "read", "scene", "synthetic"]
+__all__ = ["POINTS", "Cloud", "make_cloud", "make_scene", "read_cloud"]

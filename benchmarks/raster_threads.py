@@ -1,10 +1,10 @@
-"""How the rasteriser gains from a second thread: on idle cores, and where other processes hold every core.
+"""Measure how much the rasteriser gains from a second thread, on idle cores and while other processes occupy every core.
 
     python benchmarks/raster_threads.py [--cloud garden.npz] [--case 100000,800,544] [--threads 2] [--rounds 60]
 
-Idle: wall time of a loop of multiply-adds that waits for nothing, and of the rasteriser forward + backward, on 1 thread and on several,
-taken in turns, minima; both go through the same pool. The ratio of the two scalings is what the rasteriser itself loses. Busy: as many
-endless loops as there are cores run beside it; mean wall time of a frame on 1 thread and on several, taken in turns.
+Idle: wall time of a loop of independent multiply-adds, and of the rasteriser forward + backward, on one thread and on several; minima of
+interleaved runs. Both use the same thread pool, so the ratio of the two gains is the share that the rasteriser keeps. Busy: one endless
+loop per core runs at the same time; mean wall time of a frame on one thread and on several, interleaved.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from pathlib import Path
 
 import torch
 
-from raster_scene import read, scene, synthetic
+from raster_scene import make_cloud, make_scene, read_cloud
 from scene_experts.core.types import Camera, Gaussians
 from scene_experts.native import library as native
 from scene_experts.render.cpu import CpuRasterizer
 
-CHUNKS = 4096  # of multiply-adds: about as long as a frame
+CHUNKS = 4096  # of multiply-adds: as long as a frame, roughly
 
 
-def arithmetic(threads: int) -> Callable[[], None]:
-    """A loop that has nothing to wait for."""
+def make_arithmetic(threads: int) -> Callable[[], None]:
+    """A loop of independent multiply-adds."""
     library = native.require()
     return lambda: library.se_benchmark_multiply_adds(CHUNKS, threads)
 
 
-def raster(g: Gaussians, camera: Camera, threads: int) -> Callable[[], None]:
-    """One picture and its gradients."""
+def make_raster(g: Gaussians, camera: Camera, threads: int) -> Callable[[], None]:
+    """One image and its gradients."""
     draw = CpuRasterizer(threads=threads)
     weights = torch.rand((camera.height, camera.width, 3), generator=torch.Generator().manual_seed(0))
     leaves = [t.clone().requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.colors)]
@@ -46,8 +46,8 @@ def raster(g: Gaussians, camera: Camera, threads: int) -> Callable[[], None]:
     return run
 
 
-def times(runs: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[float]]:
-    """Wall seconds of each, taken in turns."""
+def measure(runs: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[float]]:
+    """Wall seconds of each run, interleaved."""
     taken: dict[str, list[float]] = {name: [] for name in runs}
     for turn in range(rounds + 2):
         for name, run in runs.items():
@@ -59,20 +59,20 @@ def times(runs: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[fl
 
 
 def spin() -> None:
-    """Holds a core, as long as the process that started it lives."""
+    """Occupy a core until the parent process ends."""
     parent = os.getppid()
     while os.getppid() == parent:
         sum(range(100_000))
 
 
-def busy(runs: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[float]]:
-    """As `times`, with an endless loop for every core beside it."""
+def measure_busy(runs: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[float]]:
+    """Like `measure`, while one endless loop per core runs."""
     others = [multiprocessing.get_context("spawn").Process(target=spin, daemon=True) for _ in range(os.cpu_count() or 1)]
     for other in others:
         other.start()
     try:
         time.sleep(1.0)
-        return times(runs, rounds)
+        return measure(runs, rounds)
     finally:
         for other in others:
             other.kill()
@@ -80,33 +80,33 @@ def busy(runs: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[flo
 
 
 def report(g: Gaussians, camera: Camera, threads: int, rounds: int) -> None:
-    """Measures and prints both."""
+    """Measure and print both."""
     several = f"{threads} threads"
     runs = {
-        "loop 1": arithmetic(1),
-        f"loop {several}": arithmetic(threads),
-        "raster 1": raster(g, camera, 1),
-        f"raster {several}": raster(g, camera, threads),
+        "loop 1": make_arithmetic(1),
+        f"loop {several}": make_arithmetic(threads),
+        "raster 1": make_raster(g, camera, 1),
+        f"raster {several}": make_raster(g, camera, threads),
     }
-    least = {name: min(taken) for name, taken in times(runs, rounds).items()}
+    least = {name: min(taken) for name, taken in measure(runs, rounds).items()}
     loop, drawn = least["loop 1"] / least[f"loop {several}"], least["raster 1"] / least[f"raster {several}"]
     print(f"idle, {several}: multiply-adds {loop:.3f}x, rasteriser {drawn:.3f}x one thread: {drawn / loop:.3f} of it")
     both = {name: run for name, run in runs.items() if name.startswith("raster")}
-    mean = {name: sum(taken) / len(taken) for name, taken in busy(both, rounds).items()}
+    mean = {name: sum(taken) / len(taken) for name, taken in measure_busy(both, rounds).items()}
     one, more = mean["raster 1"], mean[f"raster {several}"]
     print(f"busy, every core taken: one thread {1e3 * one:.1f} ms, {several} {1e3 * more:.1f} ms: {more / one:.2f} of its time")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cloud", type=Path, help="npz of a point cloud (default: one made in code)")
+    parser.add_argument("--cloud", type=Path, help="npz of a point cloud (default: a synthetic one)")
     parser.add_argument("--case", default="100000,800,544", help="Gaussians,width,height")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=60)
     args = parser.parse_args()
     torch.set_num_threads(1)
     count, width, height = (int(n) for n in args.case.split(","))
-    g, camera = scene(read(args.cloud) if args.cloud else synthetic(), count, width, height)
+    g, camera = make_scene(read_cloud(args.cloud) if args.cloud else make_cloud(), count, width, height)
     report(g, camera, args.threads, args.rounds)
 
 

@@ -1,9 +1,10 @@
-"""Cost against size: anchors, Gaussians, resolution, views. Time and peak memory of each part, as CSV and as plots (log, log).
+"""Measure cost against size (anchors, Gaussians, resolution, views): time and peak memory of each part, as CSV and log-log plots.
 
     python benchmarks/scale.py [--quick] [--axes anchors gaussians resolution views] [--out docs/figures]
 
-Each point runs in a process of its own (benchmarks/scale_points.py) on one thread; times are processor time, minima, so that other work on
-the machine blurs them little. Printed beside each part: its growth from the point before, as an exponent of the size (1 is linear).
+Each point runs in its own process (benchmarks/scale_points.py) on one thread. Times are minima of processor time, so that other work on
+the machine changes them little. For each part the script prints the growth from the previous point as an exponent of the size (1 is
+linear).
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from matplotlib import pyplot as plt
 
 from scene_experts.core.io import write_atomic, write_bytes
 
-Row = tuple[int, str, float | None, float | None]  # size, what, seconds, peak MiB above the imports
-SIZES: dict[str, tuple[list[int], list[int]]] = {  # whole, quick
+Row = tuple[int, str, float | None, float | None]  # size, part, seconds, peak MiB above the imports
+SIZES: dict[str, tuple[list[int], list[int]]] = {  # all, quick
     "anchors": ([10_000, 30_000, 100_000, 300_000, 1_000_000, 2_000_000], [10_000, 30_000, 100_000]),
     "gaussians": ([10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000, 10_000_000], [10_000, 30_000, 100_000]),
     "resolution": ([180, 360, 720, 1080, 2160], [180, 360, 720]),
@@ -40,36 +41,36 @@ LABELS = {
 }
 
 
-def pixels(height: int) -> int:
+def count_pixels(height: int) -> int:
     return height * (height * 16 // 9 // 2 * 2)
 
 
-def measure(axis: str, size: int) -> list[Row]:
-    """One point. A point that ends without an answer (no memory) is said and left out."""
+def measure_point(axis: str, size: int) -> list[Row]:
+    """Measure one point. If it fails (out of memory), print why and return no rows."""
     command = [sys.executable, str(Path(__file__).with_name("scale_points.py")), axis, str(size)]
     done = subprocess.run(command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False)
     if done.returncode:
         print(f"{axis} {size:,}: ended with {done.returncode}: {(done.stderr.strip().splitlines() or ['killed'])[-1]}")
         return []
-    x = pixels(size) if axis == "resolution" else size
+    x = count_pixels(size) if axis == "resolution" else size
     return [(x, what, seconds, None if peak is None else peak / 2**20) for what, seconds, peak in json.loads(done.stdout.splitlines()[-1])]
 
 
-def exponent(before: Row, row: Row, column: int) -> float | None:
-    """log(cost ratio) / log(size ratio) of two rows of one part."""
+def compute_exponent(before: Row, row: Row, column: int) -> float | None:
+    """log(cost ratio) / log(size ratio) of two rows of the same part."""
     a, b = before[column], row[column]
     if a is None or b is None or a <= 0 or b <= 0:  # type: ignore[operator]
         return None
     return math.log(b / a) / math.log(row[0] / before[0])  # type: ignore[operator]
 
 
-def report(axis: str, rows: list[Row]) -> None:
-    """A line for each part and size, with the exponents of time and memory."""
+def print_rows(axis: str, rows: list[Row]) -> None:
+    """Print one line per part and size, with the exponents of time and memory."""
     print(f"\n{LABELS[axis]}\n{'part':42}{'size':>12}{'ms':>12}{'exponent':>10}{'peak MiB':>10}{'exponent':>10}")
     for what in dict.fromkeys(row[1] for row in rows):
         before: Row | None = None
         for row in (r for r in rows if r[1] == what):
-            slopes = [None if before is None else exponent(before, row, column) for column in (2, 3)]
+            slopes = [None if before is None else compute_exponent(before, row, column) for column in (2, 3)]
             time, memory = ("" if s is None else f"{s:.2f}" for s in slopes)
             took = "" if row[2] is None else f"{1e3 * row[2]:.2f}"
             held = "" if row[3] is None else f"{row[3]:.0f}"
@@ -86,7 +87,7 @@ def write_csv(path: Path, rows: list[Row]) -> None:
 
 
 def plot(path: Path, axis: str, rows: list[Row]) -> None:
-    """Time on the left, memory on the right; the grey lines are linear."""
+    """Plot time on the left and memory on the right; the grey lines are linear."""
     figure, axes = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained")
     colours = {what: f"C{i % 10}" for i, what in enumerate(dict.fromkeys(row[1] for row in rows))}
     for ax, column, unit, factor in ((axes[0], 2, "milliseconds, one thread", 1e3), (axes[1], 3, "peak MiB above imports", 1.0)):
@@ -113,15 +114,15 @@ def plot(path: Path, axis: str, rows: list[Row]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--axes", nargs="+", choices=list(SIZES), default=list(SIZES))
-    parser.add_argument("--quick", action="store_true", help="small sizes alone, about a minute")
-    parser.add_argument("--most", type=int, help="leave out sizes above this")
+    parser.add_argument("--quick", action="store_true", help="only small sizes, about a minute")
+    parser.add_argument("--most", type=int, help="skip sizes above this")
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs" / "figures")
     args = parser.parse_args()
     for axis in args.axes:
         sizes = SIZES[axis][1 if args.quick else 0]
-        rows = [row for size in sizes if not args.most or size <= args.most for row in measure(axis, size)]
+        rows = [row for size in sizes if not args.most or size <= args.most for row in measure_point(axis, size)]
         if rows:
-            report(axis, rows)
+            print_rows(axis, rows)
             write_csv(args.out / f"scale_{axis}.csv", rows)
             plot(args.out / f"scale_{axis}.png", axis, rows)
     print(f"\nwrote {args.out}")

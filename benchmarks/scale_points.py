@@ -1,7 +1,7 @@
-"""What benchmarks/scale.py measures at one size: a function for each axis, each run in a process of its own.
+"""The measurements of benchmarks/scale.py at one size: one function per axis, each run in its own process.
 
-A row is (what, seconds, peak): the least processor time of one thread over a few runs, and the most resident memory while it ran, in bytes
-above the level after imports and a tiny training step, everything that was alive then counted in. Either may be None.
+A row is (part, seconds, peak): the minimum processor time of one thread over a few runs, and the peak resident memory during them, in
+bytes above the level after imports and a tiny training step; it includes everything alive at that time. Either may be None.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 
 from scene_experts.bench import cloud, raster, step
-from scene_experts.bench.measure import clock_for, least
+from scene_experts.bench.measure import choose_clock, measure_minima
 from scene_experts.core import checkpoint
 from scene_experts.core.types import Gaussians
 from scene_experts.data.capture import load
@@ -37,57 +37,57 @@ from scene_experts.training.state import Training, save
 
 Row = tuple[str, float | None, int | None]
 WIDTH, HEIGHT = 800, 544
-BUDGET = 1.5  # seconds for the runs of one part, at least two of them
+BUDGET = 1.5  # seconds for the runs of one part, which are at least two
 
 
-def memory(field: str) -> int:
-    """VmRSS (now) or VmHWM (the most since the last `forget_peak`) of this process, bytes."""
+def read_memory(field: str) -> int:
+    """VmRSS (current) or VmHWM (peak since the last `reset_peak`) of this process, in bytes."""
     line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(field))
     return 1024 * int(line.split()[1])
 
 
-def forget_peak() -> None:
-    """Start VmHWM anew at the memory held now."""
+def reset_peak() -> None:
+    """Reset VmHWM to the current memory."""
     Path("/proc/self/clear_refs").write_text("5")
 
 
 class Rows:
-    """Collects rows, above the level of memory at its making."""
+    """Collects rows; memory counts from the level at construction."""
 
     def __init__(self) -> None:
-        step.work(step.MIXTURE, 100, 64, 48)(clock_for(1))  # torch imports more at its first step
-        self.base = memory("VmRSS")
+        step.make_work(step.MIXTURE, 100, 64, 48)(choose_clock(1))  # torch imports more modules in the first step
+        self.base = read_memory("VmRSS")
         self.rows: list[Row] = []
 
     def add(self, what: str, run: Callable[[], object], again: bool = True) -> None:
-        """Time `run` (once where it changes what it works on) and note the peak."""
-        forget_peak()
+        """Time `run` (once if `again` is false, because it changes its input) and record the peak."""
+        reset_peak()
 
         def timed(clock: Callable[[], float]) -> tuple[float]:
             began = clock()
             run()
             return (clock() - began,)
 
-        seconds = least({what: timed}, BUDGET, clock_for(1), None if again else {what: 1})[what][0]
-        self.note(what, seconds)
+        seconds = measure_minima({what: timed}, BUDGET, choose_clock(1), None if again else {what: 1})[what][0]
+        self.record(what, seconds)
 
-    def note(self, what: str, seconds: float | None) -> None:
-        self.rows.append((what, seconds, memory("VmHWM") - self.base))
+    def record(self, what: str, seconds: float | None) -> None:
+        self.rows.append((what, seconds, read_memory("VmHWM") - self.base))
 
 
-def anchors(count: int) -> list[Row]:
-    """A moe-gs training of `count` anchors, half of them visible: its step by parts, an adjustment, saving, loading, export."""
+def measure_anchors(count: int) -> list[Row]:
+    """A moe-gs training of `count` anchors, half of them visible: parts of a step, densification, saving, loading, export."""
     rows = Rows()
     made: list[step.Work] = []
-    rows.add("start from points", lambda: made.append(step.work(step.MIXTURE, count, WIDTH, HEIGHT)), again=False)
+    rows.add("start from points", lambda: made.append(step.make_work(step.MIXTURE, count, WIDTH, HEIGHT)), again=False)
     work = made[0]
-    forget_peak()
-    parts = least({"step": work}, BUDGET, clock_for(1))["step"]
+    reset_peak()
+    parts = measure_minima({"step": work}, BUDGET, choose_clock(1))["step"]
     rows.rows += [(name, seconds, None) for name, seconds in zip(step.PARTS, parts, strict=True)]
-    rows.note("whole step", sum(parts))
+    rows.record("whole step", sum(parts))
     held = sum(p.numel() * p.element_size() for g in work.training.optimizer.param_groups for p in g["params"])
     rows.rows.append(("values, moments and gradients alone", None, 4 * held))
-    statistics(work.training)
+    set_statistics(work.training)
     growth, scene = work.training.cfg.growth, work.training.scene
     rows.add("adjustment", lambda: growth.update(scene, 1600, work.training.growth), again=False)  # type: ignore[arg-type]
     with tempfile.TemporaryDirectory() as name:
@@ -99,8 +99,8 @@ def anchors(count: int) -> list[Row]:
     return rows.rows
 
 
-def statistics(training: Training) -> None:
-    """Gradients and opacities after which about 1 % of the anchors found others and 2 % die."""
+def set_statistics(training: Training) -> None:
+    """Set gradients and opacities with which about 1 % of the anchors grow new ones and 2 % are pruned."""
     table, generator = training.scene.table, torch.Generator().manual_seed(1)
     observe.start(table, training.scene.K)
     draw = torch.rand(table.stats["grad"].shape, generator=generator)
@@ -116,16 +116,16 @@ def restore(training: Training, folder: Path) -> Training:
     return Training.restore(training.cfg, *checkpoint.load(path), "cpu")
 
 
-def gaussians(count: int) -> list[Row]:
+def measure_gaussians(count: int) -> list[Row]:
     """The rasteriser on `count` Gaussians that cover the same garden."""
     rows = Rows()
-    return draw(rows, covering(count), loss=False)
+    return measure_raster(rows, make_covering_scene(count), loss=False)
 
 
-def covering(count: int) -> raster.Picture:
-    """The benchmark scene with every Gaussian split into as many as needed, smaller so that they cover as much."""
+def make_covering_scene(count: int) -> raster.Picture:
+    """The benchmark scene with every Gaussian split into as many as needed; smaller ones, so that they cover the same area."""
     base = min(count, cloud.POINTS)
-    scene = raster.picture(base, WIDTH, HEIGHT)
+    scene = raster.make_picture(base, WIDTH, HEIGHT)
     if count <= base:
         return scene
     g, generator = scene.gaussians, torch.Generator().manual_seed(2)
@@ -136,18 +136,18 @@ def covering(count: int) -> raster.Picture:
     return replace(scene, gaussians=split)
 
 
-def resolution(height: int) -> list[Row]:
-    """100,000 Gaussians and the loss on pictures of 16:9."""
-    return draw(Rows(), raster.picture(100_000, height * 16 // 9 // 2 * 2, height), loss=True)
+def measure_resolution(height: int) -> list[Row]:
+    """100,000 Gaussians and the loss on 16:9 images."""
+    return measure_raster(Rows(), raster.make_picture(100_000, height * 16 // 9 // 2 * 2, height), loss=True)
 
 
-def draw(rows: Rows, scene: raster.Picture, loss: bool) -> list[Row]:
-    """Forward and backward of the rasteriser; L1 + SSIM where asked for."""
+def measure_raster(rows: Rows, scene: raster.Picture, loss: bool) -> list[Row]:
+    """Forward and backward pass of the rasteriser; with `loss` also L1 + SSIM."""
     rasterize = choose("auto", "cpu")
-    forget_peak()
-    parts = least({"draw": lambda clock: raster.draw(rasterize, scene, clock)}, BUDGET, clock_for(1))["draw"]
+    reset_peak()
+    parts = measure_minima({"draw": lambda clock: raster.time_draw(rasterize, scene, clock)}, BUDGET, choose_clock(1))["draw"]
     for name, seconds in zip(("raster forward", "raster backward"), parts, strict=True):
-        rows.note(name, seconds)
+        rows.record(name, seconds)
     with torch.no_grad():
         rows.add("raster, no gradient", lambda: rasterize(scene.gaussians, scene.camera, torch.zeros(3)))
     if loss:
@@ -160,8 +160,8 @@ def draw(rows: Rows, scene: raster.Picture, loss: bool) -> list[Row]:
     return rows.rows
 
 
-def views(count: int) -> list[Row]:
-    """A COLMAP capture of `count` photographs (640x424 JPEG) and a cache of 64 MiB: loading it, drawing views, one epoch of frames."""
+def measure_views(count: int) -> list[Row]:
+    """A COLMAP capture of `count` photographs (640x424 JPEG) and a cache of 64 MiB: loading, shuffling views, one epoch of frames."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_views(folder, count)
@@ -172,13 +172,13 @@ def views(count: int) -> list[Row]:
         training = Training(*_small(capture))
         rows.add("view queue, one epoch", lambda: [training.next_view(capture.train) for _ in capture.train], again=False)
         rows.rows = [(what, seconds, None) if what != "load capture" else (what, seconds, peak) for what, seconds, peak in rows.rows]
-        forget_peak()
-        began = time.process_time()  # the prefetching thread counts too
+        reset_peak()
+        began = time.process_time()  # includes the prefetching thread
         for _ in capture.train:
             index, following = training.next_view(capture.train)
             capture.images.prefetch(following)
             capture.frame(index)
-        rows.note("frames, one epoch", time.process_time() - began)
+        rows.record("frames, one epoch", time.process_time() - began)
         assert capture.images.used_bytes <= 64 << 20
         capture.images.close()
     return rows.rows
@@ -192,7 +192,7 @@ def _small(capture: object) -> tuple:
 
 
 def write_views(folder: Path, count: int) -> None:
-    """A ring of cameras around 20,000 points; eight different photographs under as many names as needed."""
+    """Write a ring of cameras around 20,000 points, with eight different photographs under `count` names."""
     rng = np.random.default_rng(0)
     (folder / "images").mkdir()
     smooth = rng.integers(0, 255, (8, 27, 40, 3), dtype=np.uint8)
@@ -211,7 +211,12 @@ def write_views(folder: Path, count: int) -> None:
     write_model(folder / "sparse" / "0", Model(cameras, tuple(posed), np.arange(1, len(xyz) + 1), xyz, rgb, np.full(len(xyz), 0.5)))
 
 
-AXES: dict[str, Callable[[int], list[Row]]] = {"anchors": anchors, "gaussians": gaussians, "resolution": resolution, "views": views}
+AXES: dict[str, Callable[[int], list[Row]]] = {
+    "anchors": measure_anchors,
+    "gaussians": measure_gaussians,
+    "resolution": measure_resolution,
+    "views": measure_views,
+}
 
 if __name__ == "__main__":
     torch.set_num_threads(1)

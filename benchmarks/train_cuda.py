@@ -1,11 +1,11 @@
-"""Training on a GPU: time, peak memory and frames a second of recipes, beside plain explicit Gaussians on gsplat of the same number.
+"""Measure training on a GPU: time, peak memory and frames per second of recipes, and of as many explicit Gaussians on gsplat.
 
     python benchmarks/train_cuda.py --data CAPTURE --out DIR --seconds 500     # again and again until it prints the table
 
-Works in slices: each call goes on where the last one stopped and ends after `--seconds` (saving included), so that it fits a machine that
-is lent for minutes. The peer comes last and gets as many Gaussians as the last recipe's scene has with positive opacity (mean over the
-held-out views), or `--count`. Time is that of iterations alone, with photographs read ahead, without compiling, saving and scoring.
-Peak memory is what torch's allocator held at most.
+The script works in slices: each call continues where the last one stopped and ends after `--seconds`, including saving, so that it can
+run on a machine that is available for minutes at a time. The peer comes last. It gets as many Gaussians as the scene of the last recipe
+has with positive opacity (mean over the held-out views), or `--count`. Time is that of iterations, with prefetched photographs and
+without compiling, saving and scoring. Peak memory is the peak of torch's allocator.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from scene_experts.training.loop import Run
 from scene_experts.training.state import Training, resume
 
 PEER = "gsplat, explicit"
-SPARE = 25.0  # seconds of a slice kept for saving
-SCORING = 30.0  # and what must be left to begin with the scores of a finished training
+SPARE = 25.0  # seconds of a slice reserved for saving
+SCORING = 30.0  # seconds that must remain to start scoring
 
 
-def arguments() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="a capture")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the runs and of results.json; kept between slices")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the runs and of results.json, kept between slices")
     parser.add_argument("--seconds", type=float, default=500.0, help="length of this slice")
     parser.add_argument("--recipes", nargs="+", default=["scaffold-gs", "moe-gs"], choices=list(RECIPES), metavar="RECIPE")
     parser.add_argument("--iterations", type=int, default=30_000)
@@ -54,21 +54,21 @@ def arguments() -> argparse.ArgumentParser:
     return parser
 
 
-def plan(recipes: Sequence[str], results: dict[str, Any]) -> list[str]:
-    """What is still to be done, in order: the recipes, then the peer, which needs their number of Gaussians."""
+def list_pending(recipes: Sequence[str], results: dict[str, Any]) -> list[str]:
+    """The trainings left to do, in order: the recipes, then the peer, which needs their number of Gaussians."""
     return [name for name in (*recipes, PEER) if not results.get(name, {}).get("done")]
 
 
 def main(argv: list[str] | None = None, draw: explicit_gsplat.Draw = explicit_gsplat.draw) -> int:
-    args = arguments().parse_args(argv)
+    args = make_parser().parse_args(argv)
     deadline = time.monotonic() + args.seconds - min(SPARE, args.seconds / 4)
     if args.device == "cuda" and not torch.cuda.is_available():
-        raise SystemExit("expected a CUDA device, found none; run this where there is one")
+        raise SystemExit("expected a CUDA device, found none; run this on a machine with one")
     args.out.mkdir(parents=True, exist_ok=True)
-    results = read(args)
+    results = read_results(args)
     capture = load(args.data, resolution=args.resolution)
     rasterize = choose("auto", args.device)
-    for name in plan(args.recipes, results):
+    for name in list_pending(args.recipes, results):
         if time.monotonic() > deadline:
             break
         result = results.setdefault(name, {"peak_bytes": 0})
@@ -77,19 +77,19 @@ def main(argv: list[str] | None = None, draw: explicit_gsplat.Draw = explicit_gs
             torch.cuda.reset_peak_memory_stats()
         if name == PEER:
             count = args.count or results[args.recipes[-1]]["gaussians"]
-            peer(capture, count, args, deadline, result, draw)
+            train_peer(capture, count, args, deadline, result, draw)
         else:
-            recipe(name, capture, rasterize, args, deadline, result)
-        write(args, results)
+            train_recipe(name, capture, rasterize, args, deadline, result)
+        write_results(args, results)
     capture.images.close()
-    print(table(results))
-    left = plan(args.recipes, results)
+    print(format_table(results))
+    left = list_pending(args.recipes, results)
     print(f"to do: {', '.join(left)}; run the same command again" if left else "all done")
     return 0
 
 
-def read(args: argparse.Namespace) -> dict[str, Any]:
-    """The results so far. Those of other settings are refused."""
+def read_results(args: argparse.Namespace) -> dict[str, Any]:
+    """Read the results so far. Exits if they have other settings."""
     path, settings = args.out / "results.json", {name: str(getattr(args, name)) for name in ("data", "iterations", "resolution", "device")}
     found = json.loads(path.read_text()) if path.is_file() else {"settings": settings}
     if found["settings"] != settings:
@@ -97,21 +97,23 @@ def read(args: argparse.Namespace) -> dict[str, Any]:
     return found
 
 
-def write(args: argparse.Namespace, results: dict[str, Any]) -> None:
+def write_results(args: argparse.Namespace, results: dict[str, Any]) -> None:
     write_atomic(args.out / "results.json", lambda path: path.write_text(json.dumps(results, indent=1)))
 
 
-def held(args: argparse.Namespace, result: dict[str, Any]) -> None:
-    """Count this slice's peak of memory in."""
+def record_peak(args: argparse.Namespace, result: dict[str, Any]) -> None:
+    """Add the peak memory of this slice to the result."""
     if args.device == "cuda":
         result["peak_bytes"] = max(result["peak_bytes"], torch.cuda.max_memory_allocated())
 
 
-def recipe(name: str, capture: Capture, rasterize: Rasterizer, args: argparse.Namespace, deadline: float, result: dict[str, Any]) -> None:
-    """Train on, and score the scene once it is finished."""
+def train_recipe(
+    name: str, capture: Capture, rasterize: Rasterizer, args: argparse.Namespace, deadline: float, result: dict[str, Any]
+) -> None:
+    """Continue a training, and score the scene when it is finished."""
     cfg: Train = replace(RECIPES[name][1], iterations=args.iterations)
     config = RunConfig(cfg, Data(args.data, resolution=args.resolution))
-    if args.device == "cuda":  # gsplat's and Triton's kernels are compiled before the clock runs: a few steps, dense and sparse
+    if args.device == "cuda":  # compile the kernels of gsplat and Triton before timing: a few steps, dense and sparse
         short = replace(cfg, iterations=20)
         for _ in training.train(short, Run(replace(config, train=short), device=args.device), capture, rasterize):
             pass
@@ -125,16 +127,16 @@ def recipe(name: str, capture: Capture, rasterize: Rasterizer, args: argparse.Na
                 run.stop.append("end of the slice")
         if isinstance(event, Finished):
             finished, result["step"], result["seconds"] = True, event.step, event.seconds
-    held(args, result)
+    record_peak(args, result)
     if finished and time.monotonic() < deadline + min(SPARE, args.seconds / 4) - min(SCORING, args.seconds / 8):
         done = resume(cfg.scaled(), args.out / name / "checkpoints", args.device)
         assert done is not None
-        result |= scored(done, capture, rasterize, args.device) | {"done": True}
+        result |= score(done, capture, rasterize, args.device) | {"done": True}
 
 
 @torch.no_grad()
-def scored(done: Training, capture: Capture, rasterize: Rasterizer, device: str) -> dict[str, Any]:
-    """PSNR over held-out views, frames a second, and the number of Gaussians with positive opacity."""
+def score(done: Training, capture: Capture, rasterize: Rasterizer, device: str) -> dict[str, Any]:
+    """PSNR over held-out views, frames per second, and the number of Gaussians with positive opacity."""
     scene, active, psnr = done.scene, [], []
     background = upload(torch.tensor(capture.background), device)
     for index in capture.test or capture.train:
@@ -142,30 +144,30 @@ def scored(done: Training, capture: Capture, rasterize: Rasterizer, device: str)
         decoded = scene(camera, done.step, Mode.DRAW, rasterize.visible)
         if decoded.raw_opacity is not None:
             active.append(float((decoded.raw_opacity > 0).float().mean()))
-        psnr.append(quality(rasterize(decoded.gaussians, camera, background).image, capture, index))
+        psnr.append(compute_psnr(rasterize(decoded.gaussians, camera, background).image, capture, index))
     cameras = [capture.views[i].camera.to(device) for i in capture.test or capture.train]
     speed = timing.measure(scene, cameras, done.step, rasterize, background)
     count = round(len(scene.table) * scene.K * (mean(active) if active else 1.0))
     return {"psnr": mean(psnr), "fps": speed.fps, "decode_ms": speed.decode_ms, "raster_ms": speed.raster_ms, "gaussians": count}
 
 
-def quality(image: torch.Tensor, capture: Capture, index: int) -> float:
-    """PSNR of a picture [H, W, 3] as an 8-bit file would have it."""
+def compute_psnr(image: torch.Tensor, capture: Capture, index: int) -> float:
+    """PSNR of an image [H, W, 3] rounded to 8 bits."""
     target = capture.frame(index).rgb.to(image.device, torch.float32)
     mse = float(((image.clamp(0, 1) * 255 + 0.5).floor() - target).square().mean()) / 255**2
     return -10 * math.log10(max(mse, 1e-10))
 
 
-def peer(
+def train_peer(
     capture: Capture, count: int, args: argparse.Namespace, deadline: float, result: dict[str, Any], draw: explicit_gsplat.Draw
 ) -> None:
-    """The same for explicit Gaussians."""
-    if args.device == "cuda":  # compiled before the clock runs
+    """Continue the training of explicit Gaussians, and score it when it is finished."""
+    if args.device == "cuda":  # compile before timing
         explicit_gsplat.Training(capture, 1000, 20, args.out / "unused", args.device, draw).iterate()
         torch.cuda.reset_peak_memory_stats()
     made = explicit_gsplat.Training(capture, count, args.iterations, args.out / "explicit", args.device, draw)
     finished = made.run(deadline)
-    held(args, result)
+    record_peak(args, result)
     result |= {"step": made.step, "seconds": made.seconds, "gaussians": count}
     if not finished:
         return
@@ -173,20 +175,20 @@ def peer(
     with torch.no_grad():
         views = list(capture.test or capture.train)
         for index in views:
-            psnr.append(quality(made.picture(capture.views[index].camera), capture, index))
+            psnr.append(compute_psnr(made.render(capture.views[index].camera), capture, index))
         for index in (views * math.ceil(37 / len(views)))[:37]:
             if args.device == "cuda":
                 torch.cuda.synchronize()
             began = time.perf_counter()
-            made.picture(capture.views[index].camera)
+            made.render(capture.views[index].camera)
             if args.device == "cuda":
                 torch.cuda.synchronize()
             times.append(time.perf_counter() - began)
     result |= {"psnr": mean(psnr), "fps": 1 / median(times[5:]), "done": True}
 
 
-def table(results: dict[str, Any]) -> str:
-    """One line for each training, ratios to the peer where it is done."""
+def format_table(results: dict[str, Any]) -> str:
+    """One line per training; ratios are to the peer, if it has run."""
     base = results.get(PEER, {})
     lines = [f"{'':20}{'steps':>8}{'time s':>10}{'ms/step':>9}{'of peer':>9}{'peak MiB':>10}{'FPS':>8}{'PSNR':>8}{'Gaussians':>11}"]
     for name, r in results.items():

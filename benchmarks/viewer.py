@@ -1,11 +1,11 @@
-"""The viewer's two promises: pictures a second that a moving client gets of a trained run, and what a client costs a training.
+"""Measure the viewer: frames per second that a moving client receives from a trained run, and the cost of a client to a training.
 
     python benchmarks/viewer.py RUN [--data CAPTURE] [--width 640 --height 360] [--seconds 8] [--spells 6]
 
-Served: a client in a process of its own speaks the page's protocol, sends sixty camera messages a second along the captured cameras and
-counts the pictures that arrive, each of the whole size asked for (the size that adapts is held at 1; it is then let go and counted again).
-Training: the run's recipe trains anew on its capture; from iteration 600 on, spells with a moving client and without alternate, and their
-iterations are compared, drawing included where a client is there.
+Serving: a client in its own process speaks the protocol of the page, sends sixty camera messages per second along the captured cameras,
+and counts the images that arrive. First the images keep their full size; then their size adapts, and the client counts again.
+Training: the recipe of the run trains again on its capture. From iteration 600 on, periods with and without a moving client alternate,
+and the script compares their iteration times, which include drawing for the client.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from scene_experts.view import paths, server
 from scene_experts.view.live import Live
 from scene_experts.view.server import Viewer
 
-Pose = tuple[list[float], list[float], list[float], float]  # rotation (w, x, y, z), place, a point ahead, vertical field of view in radians
-FIRST, SPELL = 600, 60  # iterations before the first spell, and of a spell
+Pose = tuple[list[float], list[float], list[float], float]  # rotation (w, x, y, z), position, a point ahead, vertical FOV in radians
+FIRST, SPELL = 600, 60  # iterations before the first period, and iterations per period
 
 
-def client(url: str, seconds: float, width: int, height: int, along: list[Pose]) -> None:
-    """Move for `seconds` and print the pictures that arrived after the first second, and their mean size in bytes."""
+def run_client(url: str, seconds: float, width: int, height: int, along: list[Pose]) -> None:
+    """Move for `seconds`; print the images per second after the first second, and their mean size in bytes."""
     import msgspec
     import viser
     import zstandard
@@ -78,8 +78,8 @@ def client(url: str, seconds: float, width: int, height: int, along: list[Pose])
     print(len(sizes) / seconds, statistics.mean(sizes) if sizes else 0.0, flush=True)
 
 
-def poses(capture: Capture, count: int = 240) -> list[Pose]:
-    """Along the captured cameras and back again, so that a client may go round and round."""
+def list_poses(capture: Capture, count: int = 240) -> list[Pose]:
+    """Poses along the captured cameras and back, as a closed loop."""
     cameras = paths.make_path("views", capture, count).cameras
     out = []
     for camera in (*cameras, *reversed(cameras)):
@@ -91,8 +91,8 @@ def poses(capture: Capture, count: int = 240) -> list[Pose]:
 
 
 def start_client(url: str, seconds: float, size: tuple[int, int], along: list[Pose]) -> subprocess.Popen[str]:
-    """A client at work in a process of its own, which prints what `client` prints."""
-    code = "import sys, json; sys.path.insert(0, sys.argv[1]); import viewer; viewer.client(sys.argv[2], *json.load(sys.stdin))"
+    """Start `run_client` in its own process."""
+    code = "import sys, json; sys.path.insert(0, sys.argv[1]); import viewer; viewer.run_client(sys.argv[2], *json.load(sys.stdin))"
     command = [sys.executable, "-c", code, str(Path(__file__).parent), url]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdin is not None
@@ -101,24 +101,24 @@ def start_client(url: str, seconds: float, size: tuple[int, int], along: list[Po
     return process
 
 
-def served(run: OpenRun, capture: Capture, rasterize: Rasterizer, seconds: float, size: tuple[int, int]) -> None:
+def measure_serving(run: OpenRun, capture: Capture, rasterize: Rasterizer, seconds: float, size: tuple[int, int]) -> None:
     viewer = Viewer(capture, lambda: (run.scene, run.step), rasterize, port=0, draws=run.scene.frozen(run.step))
-    along, smallest = poses(capture), server.SMALLEST
+    along, smallest = list_poses(capture), server.SMALLEST
     print(f"{len(run.scene.table):,} rows, {torch.get_num_threads()} thread(s), {size[0]}x{size[1]}")
     try:
-        for label, least in (("held at the whole size", 1.0), ("size that adapts", smallest)):
+        for label, least in (("full size", 1.0), ("adaptive size", smallest)):
             server.SMALLEST = least
             process = start_client(viewer.url, seconds, size, along)
             viewer.serve(lambda: process.poll() is not None)  # noqa: B023
             assert process.stdout is not None
             rate, weight = (float(word) for word in process.stdout.read().split())
-            print(f"{label}: {rate:.1f} pictures/s, {weight / 1e3:.0f} kB each")
+            print(f"{label}: {rate:.1f} images/s, {weight / 1e3:.0f} kB each")
     finally:
         server.SMALLEST = smallest
         viewer.close()
 
 
-def trained(run: OpenRun, capture: Capture, rasterize: Rasterizer, spells: int, size: tuple[int, int]) -> None:
+def measure_training(run: OpenRun, capture: Capture, rasterize: Rasterizer, spells: int, size: tuple[int, int]) -> None:
     live = Live(capture, rasterize, lambda: False, port=0, ready=lambda url: None)
     times: list[float] = []
 
@@ -139,7 +139,7 @@ def trained(run: OpenRun, capture: Capture, rasterize: Rasterizer, spells: int, 
 
     spell(FIRST)
     assert live.viewer is not None
-    along = poses(capture)
+    along = list_poses(capture)
     try:
         for _ in range(spells):
             took[False] += spell(SPELL)
@@ -162,11 +162,11 @@ def trained(run: OpenRun, capture: Capture, rasterize: Rasterizer, spells: int, 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
-    parser.add_argument("--data", type=Path, help="where the capture is now, if it moved")
+    parser.add_argument("--data", type=Path, help="path of the capture, if it has moved")
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=360)
     parser.add_argument("--seconds", type=float, default=8.0)
-    parser.add_argument("--spells", type=int, default=6, help="0 leaves the training out")
+    parser.add_argument("--spells", type=int, default=6, help="periods of the training; 0 skips it")
     args = parser.parse_args()
     run = run_folder.open_run(args.run, "cpu")
     data = run.config.data if args.data is None else replace(run.config.data, path=args.data)
@@ -174,9 +174,9 @@ def main() -> None:
     rasterize = replace(choose("auto", "cpu"), antialias=run.cfg.antialias)  # type: ignore[type-var]
     size = (args.width, args.height)
     try:
-        served(run, capture, rasterize, args.seconds, size)
+        measure_serving(run, capture, rasterize, args.seconds, size)
         if args.spells:
-            trained(run, capture, rasterize, args.spells, size)
+            measure_training(run, capture, rasterize, args.spells, size)
     finally:
         capture.images.close()
 

@@ -1,4 +1,4 @@
-"""The CUDA benchmarks' plan, arguments and resuming, on the CPU; what they measure needs a GPU."""
+"""Plan, arguments and resuming of the CUDA benchmarks, on the CPU."""
 
 import sys
 import time
@@ -21,7 +21,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 def draw(p, camera, degree, background):
-    """Stands for gsplat: the reference rasteriser, without harmonics."""
+    """The reference rasteriser in place of gsplat, without harmonics."""
     quats = torch.nn.functional.normalize(p["quats"], dim=1)
     colors = (0.28209479 * p["dc"][:, 0] + 0.5).clamp_min(0)
     g = Gaussians(p["means"], quats, p["scales"].exp(), p["opacities"].sigmoid(), colors, torch.arange(len(quats)))
@@ -30,8 +30,8 @@ def draw(p, camera, degree, background):
 
 def test_the_plan_ends_with_the_peer():
     recipes = ["scaffold-gs", "moe-gs"]
-    assert train_cuda.plan(recipes, {}) == [*recipes, train_cuda.PEER]
-    assert train_cuda.plan(recipes, {"scaffold-gs": {"done": True}, "moe-gs": {"step": 3}}) == ["moe-gs", train_cuda.PEER]
+    assert train_cuda.list_pending(recipes, {}) == [*recipes, train_cuda.PEER]
+    assert train_cuda.list_pending(recipes, {"scaffold-gs": {"done": True}, "moe-gs": {"step": 3}}) == ["moe-gs", train_cuda.PEER]
 
 
 def test_slices_until_the_table(folder, tmp_path, capsys):
@@ -45,7 +45,7 @@ def test_slices_until_the_table(folder, tmp_path, capsys):
         train_cuda.main([*line, "--iterations", "7"], draw)
 
 
-def test_the_peer_goes_on_where_it_stopped(folder, tmp_path):
+def test_the_peer_resumes(folder, tmp_path):
     from scene_experts.data.capture import load
 
     capture = load(folder)
@@ -58,7 +58,7 @@ def test_the_peer_goes_on_where_it_stopped(folder, tmp_path):
     again = explicit_gsplat.Training(capture, 60, 6, tmp_path / "parts", "cpu", draw)
     assert again.step == 3 and not again.run(time.monotonic() - 1) and again.run(time.monotonic() + 100)
     assert all(torch.equal(p, again.params[name]) for name, p in whole.params.items())
-    assert (whole.params["means"] != explicit_gsplat.begin(capture, 60)["means"]).any()
+    assert (whole.params["means"] != explicit_gsplat.initialise(capture, 60)["means"]).any()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device")
@@ -74,7 +74,7 @@ def test_the_least_traffic_is_counted_by_hand():
     # one anchor of two seen, one Gaussian drawn, F = 1, K = 2, one network
     forward = (8 + 12 + 4 + 24) + 12 + 2 * 4 + 64
     backward = (8 + 12 + 4 + 24) + 12 + 2 * (2 * 4 + 56) + 2 * 4 * (1 + 6 + 6)
-    assert decode_cuda.least_bytes(2, 1, 1, 1, 2, 1) == (forward, backward)
+    assert decode_cuda.compute_least_bytes(2, 1, 1, 1, 2, 1) == (forward, backward)
 
 
 def test_every_decoder_is_run_and_reported(monkeypatch):
@@ -87,8 +87,8 @@ def test_every_decoder_is_run_and_reported(monkeypatch):
     camera = Camera(torch.eye(4), torch.eye(3), 80, 54)
     for kind, config in decode_cuda.KINDS.items():
         for form in ("composed", "auto"):
-            case = cases[kind, form] = decode_cuda.Case(decode_cuda.scene(config, 60, "cpu"), rows, camera, form)
+            case = cases[kind, form] = decode_cuda.Case(decode_cuda.make_scene(config, 60, "cpu"), rows, camera, form)
             for _ in range(decode_cuda.WARM_UP + 1):
                 case.run()
-    lines = decode_cuda.report(cases, 60, 30, 1e6)
+    lines = decode_cuda.format_report(cases, 60, 30, 1e6)
     assert len(lines) == 6 and all("1.00x as fast" in line for line in lines)

@@ -1,1 +1,1 @@
-"""What this machine makes of the package: times, each beside a named peer, in about a minute (`scene-experts bench`)."""
+"""Measure the speed of this machine, each time against a named peer, in about a minute (`scene-experts bench`)."""

@@ -1,7 +1,7 @@
-"""The benchmark scene of the rasterisers: a point cloud turned into Gaussians of realistic sizes, drawn to any number.
+"""The benchmark scene of the rasterisers: a point cloud turned into any number of Gaussians of realistic sizes.
 
-From a structure-from-motion cloud in an .npz (means3d [P, 3], colors [P, 3] uint8, viewmats, Ks, width, height), or, without one, from a
-cloud made here that is shaped alike: a table with things on it, ground, hedges and a far background, seen from a camera beside it.
+The cloud comes from structure from motion in an .npz (means3d [P, 3], colors [P, 3] uint8, viewmats, Ks, width, height). Without a file, a
+similar one is synthesised: a table with objects, ground, hedges and a far background, seen from a camera beside the table.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import torch
 from scene_experts.core.types import Camera, Gaussians
 from scene_experts.geometry.neighbours import knn_d2
 
-POINTS = 138_766  # of the made cloud: as many as the garden's
+POINTS = 138_766  # of the synthetic cloud: as many as in the garden capture
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points and the camera they are seen from."""
+    """Points and a camera."""
 
     xyz: np.ndarray  # [P, 3] float64
     rgb: np.ndarray  # [P, 3] in [0, 1]
@@ -30,8 +30,8 @@ class Cloud:
     height: int
 
 
-def read(path: Path) -> Cloud:
-    """The cloud and first camera of an .npz file."""
+def read_cloud(path: Path) -> Cloud:
+    """Read the cloud and the first camera of an .npz file."""
     with np.load(path, allow_pickle=False) as data:
         return Cloud(
             data["means3d"].astype(np.float64),
@@ -43,8 +43,8 @@ def read(path: Path) -> Cloud:
         )
 
 
-def synthetic(seed: int = 0) -> Cloud:
-    """A garden-like cloud made in code, P = POINTS."""
+def make_cloud(seed: int = 0) -> Cloud:
+    """Synthesise a garden-like cloud of POINTS points."""
     rng = np.random.default_rng(seed)
     shares = np.array([0.3, 0.1, 0.25, 0.2, 0.15])
     table, things, ground, hedge, far = (int(n) for n in np.floor(shares * POINTS))
@@ -60,11 +60,11 @@ def synthetic(seed: int = 0) -> Cloud:
     ]
     xyz = np.concatenate(parts)
     K = np.array([[480.6, 0, 324.2], [0, 481.5, 210.1], [0, 0, 1]])
-    return Cloud(xyz, rng.random((POINTS, 3)), _look(np.array([1.6, 0.3, 0.9])), K, 648, 420)
+    return Cloud(xyz, rng.random((POINTS, 3)), _look_at(np.array([1.6, 0.3, 0.9])), K, 648, 420)
 
 
-def _look(eye: np.ndarray) -> np.ndarray:
-    """World to camera (x right, y down, z forward) from `eye` towards the origin, the world's z up."""
+def _look_at(eye: np.ndarray) -> np.ndarray:
+    """World to camera (x right, y down, z forward) from `eye` towards the origin, with the z axis of the world up."""
     forward = -eye / np.linalg.norm(eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -74,8 +74,8 @@ def _look(eye: np.ndarray) -> np.ndarray:
     return view
 
 
-def scene(cloud: Cloud, count: int, width: int, height: int, seed: int = 0) -> tuple[Gaussians, Camera]:
-    """`count` Gaussians drawn from the cloud (with jitter above its size) and its camera scaled to `width` x `height` px.
+def make_scene(cloud: Cloud, count: int, width: int, height: int, seed: int = 0) -> tuple[Gaussians, Camera]:
+    """Sample `count` Gaussians from the cloud (with jitter beyond its size) and scale its camera to `width` x `height` pixels.
 
     Scales are the RMS distance to 3 neighbours times exp(N(0, 0.5)) times (1, 1, 0.35); opacities 0.004 + 0.995 Beta(0.7, 0.9).
     """

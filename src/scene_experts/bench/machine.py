@@ -1,4 +1,4 @@
-"""The machine: its processor, and what it can do at most."""
+"""The machine: its processor and its peak rates."""
 
 from __future__ import annotations
 
@@ -9,37 +9,37 @@ from pathlib import Path
 import torch
 
 from scene_experts.bench import peer
-from scene_experts.bench.measure import Clock, clock_for, least
+from scene_experts.bench.measure import Clock, choose_clock, measure_minima
 from scene_experts.native import library as native
 
-CHUNKS = 100  # of the arithmetic loop, about a millisecond
+CHUNKS = 100  # of the arithmetic loop: about a millisecond
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What the figures are measured on. Rates are of one thread; None where the compiled libraries that measure them are absent."""
+    """The machine of the measurements. Rates are of one thread, and None without the compiled library that measures them."""
 
     processor: str
-    cores: int  # that this process may use
-    threads: int  # used where a figure says "all threads"
+    cores: int  # available to this process
+    threads: int  # that the figures of "all threads" use
     level: str | None  # instruction set of the compiled library in use
-    levels: tuple[str, ...]  # that this processor runs and that are installed
+    levels: tuple[str, ...]  # installed libraries that this processor runs
     torch: str
     clock_hz: float | None = None
-    multiply_adds: float | None = None  # of single floats, a second
-    copied: float | None = None  # bytes read and written a second by a large copy
+    multiply_adds: float | None = None  # of single floats per second
+    copied: float | None = None  # bytes read and written per second by a large copy
 
 
 def describe(threads: int) -> Machine:
-    """The machine without its rates."""
+    """Describe the machine, without its rates."""
     cores = native.count_cores()
     library = native.load()
     installed = tuple(level for level in native.list_levels() if native.find(level))
-    return Machine(processor(), cores, threads, getattr(library, "level", None), installed, torch.__version__)
+    return Machine(read_processor_name(), cores, threads, getattr(library, "level", None), installed, torch.__version__)
 
 
-def processor() -> str:
-    """The processor's name, as the system tells it."""
+def read_processor_name() -> str:
+    """Name of the processor as the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -48,10 +48,10 @@ def processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def multiply_adds(level: str | None, threads: int, seconds: float, clock: Clock | None = None) -> float | None:
-    """Multiply-adds of single floats a second by a native loop that waits for nothing; None where no library has it.
+def measure_multiply_adds(level: str | None, threads: int, seconds: float, clock: Clock | None = None) -> float | None:
+    """Multiply-adds of single floats per second in a native loop without dependencies; None without a compiled library.
 
-    clock: processor time for one thread and wall time for more, unless given.
+    clock: by default processor time for one thread and wall time for more.
     """
     library = native.load(level)
     if library is None:
@@ -64,20 +64,20 @@ def multiply_adds(level: str | None, threads: int, seconds: float, clock: Clock 
         done = library.se_benchmark_multiply_adds(CHUNKS * threads, threads)
         return (clock() - began,)
 
-    best = least({"loop": loop}, seconds, clock or clock_for(threads))["loop"][0]
+    best = measure_minima({"loop": loop}, seconds, clock or choose_clock(threads))["loop"][0]
     return done / best if best > 0 else None
 
 
-def clock_hz(level: str | None, seconds: float) -> float | None:
-    """Core cycles a second, the fastest seen; None without the peer's library."""
+def measure_clock(level: str | None, seconds: float) -> float | None:
+    """Largest number of core cycles per second measured; None without the peer's library."""
     found = peer.load(level)
     if found is None:
         return None
-    return 1 / least({"clock": lambda _: (1 / found.clock_hz(),)}, seconds, clock_for(1))["clock"][0]
+    return 1 / measure_minima({"clock": lambda _: (1 / found.clock_hz(),)}, seconds, choose_clock(1))["clock"][0]
 
 
-def copied(seconds: float) -> float:
-    """Bytes a second, read and written both counted, that one thread copies between arrays beyond the caches."""
+def measure_copy(seconds: float) -> float:
+    """Bytes per second that one thread reads and writes when it copies an array larger than the caches."""
     source = torch.ones(64 * 2**18)
     target = torch.empty_like(source)
 
@@ -86,4 +86,4 @@ def copied(seconds: float) -> float:
         target.copy_(source)
         return (clock() - began,)
 
-    return 2 * source.numel() * 4 / least({"copy": copy}, seconds, clock_for(1))["copy"][0]
+    return 2 * source.numel() * 4 / measure_minima({"copy": copy}, seconds, choose_clock(1))["copy"][0]

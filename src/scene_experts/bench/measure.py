@@ -1,4 +1,4 @@
-"""Times: the least of interleaved runs, so that other work on the machine blurs them little."""
+"""Measure times as minima of interleaved runs, so that other work on the machine changes them little."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class Figure:
     name: str
     value: float
     unit: str
-    peer: str = ""  # what the ratio is against; empty: it stands alone
-    ratio: float | None = None  # how many times faster than the peer, or a share where the unit says so
+    peer: str = ""  # what the ratio compares with; empty: nothing
+    ratio: float | None = None  # how many times faster than the peer
     note: str = ""
 
 
 @dataclass(frozen=True)
 class Missing:
-    """A figure that this machine cannot give, and why."""
+    """A figure that cannot be measured on this machine, and why."""
 
     group: str
     name: str
@@ -35,17 +35,18 @@ class Missing:
 Result = Figure | Missing
 
 
-def clock_for(threads: int) -> Clock:
-    """Processor time of this thread where it works alone, else wall time."""
+def choose_clock(threads: int) -> Clock:
+    """Processor time of this thread for one thread, else wall time."""
     return time.thread_time if threads == 1 else time.perf_counter
 
 
-def least(
+def measure_minima(
     subjects: Mapping[str, Subject], seconds: float, clock: Clock, runs: Mapping[str, int] | None = None
 ) -> dict[str, tuple[float, ...]]:
-    """The least seconds of each part of each subject, over rounds that take every subject in turn until `seconds` of wall time are over.
+    """Minimum seconds of each part of each subject, over rounds that run every subject once until `seconds` of wall time have passed.
 
-    runs: how often a slow subject runs at most; its time does not count. The others run at least twice: the first run meets cold memory.
+    runs: the largest number of runs of a slow subject; its time does not count. The others run at least twice, because the first run finds
+    cold memory.
     """
     best: dict[str, tuple[float, ...]] = {}
     spent, turn, limits = 0.0, 0, runs or {}

@@ -1,4 +1,4 @@
-"""Decode and loss on one thread, forward + backward, compiled beside plain torch."""
+"""Measure decode and loss on one thread, forward + backward, compiled and in plain torch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.bench.machine import Machine
-from scene_experts.bench.measure import Clock, Figure, Missing, Result, Subject, clock_for, least
+from scene_experts.bench.measure import Clock, Figure, Missing, Result, Subject, choose_clock, measure_minima
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded
 from scene_experts.native import library as native
@@ -23,8 +23,8 @@ SPARSE = 1_000_000  # an iteration after every warm-up
 ONE_IN_TORCH = "one network in torch"
 
 
-def anchor_scene(config: Anchors, anchors: int, seen: float = 0.5) -> tuple[AnchorScene, Tensor]:
-    """Random anchors with trained-looking features, and `anchors` rows of them, the share `seen`."""
+def make_scene(config: Anchors, anchors: int, seen: float = 0.5) -> tuple[AnchorScene, Tensor]:
+    """Random anchors with features like trained ones, and `anchors` rows of them in view, the share `seen`."""
     torch.manual_seed(0)
     total = round(anchors / seen)
     params = {
@@ -36,18 +36,18 @@ def anchor_scene(config: Anchors, anchors: int, seen: float = 0.5) -> tuple[Anch
     return AnchorScene(config, Table(params, facts), 0.01, 5.0), torch.randperm(total)[:anchors].sort().values
 
 
-def differentiable(decoded: Decoded) -> list[Tensor]:
-    """What a decode hands on and gradients come back for."""
+def list_outputs(decoded: Decoded) -> list[Tensor]:
+    """The outputs of a decode that receive gradients."""
     g = decoded.gaussians
     raw = [] if decoded.raw_opacity is None else [decoded.raw_opacity]
     return [g.means, g.quats, g.scales, g.opacities, g.colors, *raw, *(r.gates for r in decoded.routing.values())]
 
 
 class Decode:
-    """One decoder in one form; every run takes the same rows, camera and upstream gradients."""
+    """One decoder in one form. Every run takes the same rows, camera and upstream gradients."""
 
     def __init__(self, config: Anchors, form: str, anchors: int) -> None:
-        self.scene, self.rows = anchor_scene(replace(config, decode=form), anchors)  # type: ignore[arg-type]
+        self.scene, self.rows = make_scene(replace(config, decode=form), anchors)  # type: ignore[arg-type]
         pose = torch.eye(4)
         pose[2, 3] = 6.0
         self.camera = Camera(pose, torch.eye(3), 800, 544)
@@ -56,7 +56,7 @@ class Decode:
     def __call__(self, clock: Clock) -> tuple[float, float]:
         self.scene.zero_grad(set_to_none=True)
         began = clock()
-        values = differentiable(self.scene.decode(self.rows, self.camera, SPARSE))
+        values = list_outputs(self.scene.decode(self.rows, self.camera, SPARSE))
         forward = clock() - began
         self.upstream = self.upstream or [torch.randn_like(v) for v in values]
         began = clock()
@@ -64,41 +64,42 @@ class Decode:
         return forward, clock() - began
 
 
-def decode(anchors: int, machine: Machine, seconds: float) -> list[Result]:
-    """The paper's Top-2 of 5 and one network, compiled and in torch; ratios to one network in torch."""
+def measure_decode(anchors: int, machine: Machine, seconds: float) -> list[Result]:
+    """The paper's Top-2 of 5 and one network, each compiled and in torch. Ratios are to one network in torch."""
     one, top2 = Anchors(decoder=Plain()), Anchors(decoder=Experts(num=5, top_k=2))
     kinds = {ONE_IN_TORCH: (one, "composed"), "Top-2 of 5 in torch": (top2, "composed")}
     if machine.level is not None:
         kinds |= {f"one network, {machine.level}": (one, "native"), f"Top-2 of 5, {machine.level}": (top2, "native")}
     subjects: dict[str, Subject] = {name: Decode(*kind, anchors) for name, kind in kinds.items()}
-    both = {name: sum(parts) for name, parts in least(subjects, seconds, clock_for(1)).items()}
+    both = {name: sum(parts) for name, parts in measure_minima(subjects, seconds, choose_clock(1)).items()}
     note = f"{anchors:,} anchors"
     out: list[Result] = [Figure(DECODE, ONE_IN_TORCH, 1e3 * both[ONE_IN_TORCH], "ms", note=note)]
     out += [Figure(DECODE, n, 1e3 * s, "ms", ONE_IN_TORCH, both[ONE_IN_TORCH] / s) for n, s in both.items() if n != ONE_IN_TORCH]
     if machine.level is None:
         return [*out, Missing(DECODE, "compiled decode", "the compiled CPU library is not installed")]
     if machine.multiply_adds is not None:
-        bound = 3 * anchors * multiply_adds(top2, 2) / machine.multiply_adds  # backward multiplies twice for each forward one
+        # The backward pass has two multiplications for each one of the forward pass.
+        bound = 3 * anchors * count_multiply_adds(top2, 2) / machine.multiply_adds
         share = 100 * bound / both[f"Top-2 of 5, {machine.level}"]
         out.append(Figure(DECODE, "share of the arithmetic bound", share, "%", note=f"the experts' products alone: {1e3 * bound:.2f} ms"))
     return out
 
 
-def multiply_adds(config: Anchors, experts: int) -> int:
-    """Of one anchor's forward pass through `experts` networks for each attribute."""
+def count_multiply_adds(config: Anchors, experts: int) -> int:
+    """Multiply-adds of one anchor's forward pass through `experts` networks per attribute."""
     inputs = config.F + 3
     return experts * sum(config.hidden * (inputs + config.K * CHANNELS[attribute]) for attribute in ATTRIBUTES)
 
 
-def loss(width: int, height: int, machine: Machine, seconds: float) -> list[Result]:
-    """L1 + SSIM with its gradient: one compiled call beside plain torch."""
+def measure_loss(width: int, height: int, machine: Machine, seconds: float) -> list[Result]:
+    """L1 + SSIM with its gradient, in one compiled call and in plain torch."""
     torch.manual_seed(0)
     target = torch.rand(height, width, 3)
     image = (target + 0.05 * torch.randn_like(target)).clamp(0, 1)
-    subjects: dict[str, Subject] = {"in torch": partial(_gradient, False, image, target)}
+    subjects: dict[str, Subject] = {"in torch": partial(_time_gradient, False, image, target)}
     if machine.level is not None:
-        subjects[f"fused, {machine.level}"] = partial(_gradient, True, image, target)
-    best = least(subjects, seconds, clock_for(1), {"in torch": 8})
+        subjects[f"fused, {machine.level}"] = partial(_time_gradient, True, image, target)
+    best = measure_minima(subjects, seconds, choose_clock(1), {"in torch": 8})
     plain, note = best.pop("in torch")[0], f"L1 + SSIM with its gradient, {width}x{height}"
     out: list[Result] = [Figure(LOSS, "in torch", 1e3 * plain, "ms", note=note)]
     out += [Figure(LOSS, name, 1e3 * s, "ms", "in torch", plain / s) for name, (s,) in best.items()]
@@ -106,7 +107,7 @@ def loss(width: int, height: int, machine: Machine, seconds: float) -> list[Resu
     return out if native.load() is not None else [*out, missing]
 
 
-def _gradient(fused: bool, image: Tensor, target: Tensor, clock: Clock) -> tuple[float]:
+def _time_gradient(fused: bool, image: Tensor, target: Tensor, clock: Clock) -> tuple[float]:
     leaf = image.clone().requires_grad_()
     began = clock()
     if fused:

@@ -1,4 +1,7 @@
-"""The scalar peer: the per-pixel algorithm of 3DGS (Kerbl et al. 2023) as it is published, in plain C++ on one thread."""
+"""The scalar peer: the per-pixel algorithm of 3DGS (Kerbl et al. 2023) as published, in plain C++ on one thread.
+
+Its source is benchmarks/peer. Editable installs of a checkout build it; wheels do not contain it.
+"""
 
 from __future__ import annotations
 
@@ -17,21 +20,21 @@ NAME = "scalar C++ peer"
 WHY_NOT = "the scalar C++ peer is not part of a normal install: run `pip install -e .` in a checkout to build it"
 
 
-def path(level: str) -> Path | None:
-    """Where the peer with the flags of the library for `level` is installed, or None."""
+def find(level: str) -> Path | None:
+    """Path of the peer compiled with the flags of the library for `level`, or None."""
     beside = native.find(level)
     candidate = beside.with_name(beside.name.replace("se_", "peer_", 1)) if beside else None
     return candidate if candidate is not None and candidate.is_file() else None
 
 
 def load(level: str | None) -> Peer | None:
-    """The peer compiled for the same instruction set as the library at `level` (None: there is no library), or None."""
-    where = path(level) if level else None
+    """Load the peer compiled for the instruction set `level` (None: no library), or return None."""
+    where = find(level) if level else None
     return Peer(ctypes.CDLL(str(where))) if where else None
 
 
 class Peer:
-    """Draws and differentiates with the scalar code; keeps the state of its last picture."""
+    """Renders and differentiates with the scalar code; keeps the state of its last image."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
         library.peer_new.restype = ctypes.c_void_p
@@ -45,17 +48,17 @@ class Peer:
 
     @property
     def pairs(self) -> int:
-        """The (pixel, Gaussian) pairs blended into the last picture."""
+        """Number of (pixel, Gaussian) pairs blended into the last image."""
         return self._library.peer_composited(self._state)
 
     def clock_hz(self) -> float:
-        """Core cycles a second, from a loop of dependent additions."""
+        """Core cycles per second, measured by a loop of dependent additions."""
         return self._library.peer_clock_hz()
 
     def draw(self, g: Gaussians, camera: Camera, upstream: Tensor, clock: Clock) -> tuple[float, float, Tensor, Tensor]:
-        """Seconds forward, seconds backward, the picture [H, W, 3] over black, and the gradient of the means [M, 3].
+        """Seconds forward, seconds backward, the image [H, W, 3] over black, and the gradient of the means [M, 3].
 
-        upstream: gradient of the loss in the picture, [H, W, 3].
+        upstream: gradient of the loss with respect to the image, [H, W, 3].
         """
         args = convert_camera(camera)
         inputs = [g.means, g.quats, g.scales, g.opacities, g.colors]

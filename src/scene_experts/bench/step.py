@@ -1,4 +1,4 @@
-"""A whole training step on a scene made in code, part by part, and how all of it scales with threads."""
+"""Measure a whole training step on a synthetic scene, part by part, and how it scales with threads."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from scene_experts.bench import raster
-from scene_experts.bench.machine import Machine, multiply_adds
-from scene_experts.bench.measure import Clock, Figure, Missing, Result, Subject, clock_for, least
+from scene_experts.bench.machine import Machine, measure_multiply_adds
+from scene_experts.bench.measure import Clock, Figure, Missing, Result, Subject, choose_clock, measure_minima
 from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer, choose
@@ -24,13 +24,13 @@ from scene_experts.training.state import Training
 
 MIXTURE, BASELINE = "moe-gs", "scaffold-gs"
 GROUP, THREADS = "whole step", "threads"
-AT = 2000  # the iteration that is measured: after the warm-up of the experts, statistics on
+AT = 2000  # the iteration measured: after the warm-up of the experts, with density statistics
 PARTS = ("cull + decode", "raster", "loss", "backward", "statistics", "adam")
 
 
 @dataclass(frozen=True)
 class Work:
-    """A training in the middle of its schedule, and the view it is at."""
+    """A training in the middle of its schedule, and one view."""
 
     training: Training
     camera: Camera
@@ -38,7 +38,7 @@ class Work:
     target: Tensor  # [H, W, 3]
 
     def __call__(self, clock: Clock) -> tuple[float, ...]:
-        """One step; returns the seconds of PARTS. The scene is put back, so every step is the same."""
+        """Run one step and return the seconds of PARTS. The scene is restored, so every step is the same."""
         training, scene = self.training, self.training.scene
         before = {k: v.detach().clone() for k, v in self._values().items()}
         times = [clock()]
@@ -61,7 +61,7 @@ class Work:
         return tuple(b - a for a, b in pairwise(times))
 
     def _values(self) -> dict[str, Tensor]:
-        """What an optimiser moves: columns of the anchors and networks."""
+        """The tensors that the optimiser updates: columns of the anchors, and networks."""
         scene = self.training.scene
         return {f"column {k}": v for k, v in scene.table.params.items()} | scene.network_tensors()
 
@@ -71,15 +71,15 @@ class Work:
             value.copy_(before[name])
 
     @torch.no_grad()
-    def drawn(self) -> int:
-        """Gaussians that the view shows."""
+    def count_drawn(self) -> int:
+        """Number of Gaussians in the view."""
         return len(self.training.scene(self.camera, AT, Mode.DRAW, self.rasterize.visible).gaussians)
 
 
-def work(recipe: str, anchors: int, width: int, height: int, rasterize: Rasterizer | None = None, seen: float = 0.5) -> Work:
-    """Random anchors, the share `seen` of them filling the picture of one camera, the rest behind it.
+def make_work(recipe: str, anchors: int, width: int, height: int, rasterize: Rasterizer | None = None, seen: float = 0.5) -> Work:
+    """A step on random anchors: the share `seen` of them fills the image of one camera, the rest lies behind it.
 
-    Networks are as initialised; features are random, so that anchors choose different experts.
+    The networks are freshly initialised. The features are random, so that anchors choose different experts.
     """
     torch.manual_seed(0)
     cfg = RECIPES[recipe][1]
@@ -97,8 +97,8 @@ def work(recipe: str, anchors: int, width: int, height: int, rasterize: Rasteriz
 
 
 @torch.no_grad()
-def alike(mixture: Work, base: Work) -> None:
-    """Give a mixture the anchors of a baseline and its networks as every expert: both then draw the same Gaussians, but for rounding."""
+def copy_networks(mixture: Work, base: Work) -> None:
+    """Copy a baseline's anchors to a mixture, and its networks to every expert. Both then draw the same Gaussians except for rounding."""
     for name, value in mixture.training.scene.table.params.items():
         value.copy_(base.training.scene.table.params[name])
     networks = base.training.scene.network_tensors()
@@ -107,15 +107,15 @@ def alike(mixture: Work, base: Work) -> None:
             value.copy_(networks[name].expand_as(value))
 
 
-def figures(anchors: int, width: int, height: int, machine: Machine, seconds: float) -> list[Result]:
-    """The parts of a step of the mixture, the whole of it beside one of the baseline, and Adam beside the memory it must move."""
-    mixture, base = (work(recipe, anchors, width, height) for recipe in (MIXTURE, BASELINE))
-    alike(mixture, base)
+def measure(anchors: int, width: int, height: int, machine: Machine, seconds: float) -> list[Result]:
+    """The parts of a step of the mixture, the whole step compared with the baseline, and Adam compared with the memory it must move."""
+    mixture, base = (make_work(recipe, anchors, width, height) for recipe in (MIXTURE, BASELINE))
+    copy_networks(mixture, base)
     subjects: dict[str, Subject] = {MIXTURE: mixture, BASELINE: base}
-    with torch_threads(1):
-        best = least(subjects, seconds, clock_for(1))
+    with use_threads(1):
+        best = measure_minima(subjects, seconds, choose_clock(1))
     group = f"{GROUP} of {MIXTURE}, one thread"
-    note = f"{round(anchors / 2):,} visible of {anchors:,} anchors, {mixture.drawn():,} Gaussians, {width}x{height}"
+    note = f"{round(anchors / 2):,} visible of {anchors:,} anchors, {mixture.count_drawn():,} Gaussians, {width}x{height}"
     out: list[Result] = [Figure(group, part, 1e3 * s, "ms") for part, s in zip(PARTS, best[MIXTURE], strict=True)]
     total, plain = sum(best[MIXTURE]), sum(best[BASELINE])
     out.append(Figure(group, "whole step", 1e3 * total, "ms", f"one of {BASELINE}, same anchors and Gaussians", plain / total, note))
@@ -126,48 +126,45 @@ def figures(anchors: int, width: int, height: int, machine: Machine, seconds: fl
     return out
 
 
-def scaling(scene: raster.Picture, machine: Machine, seconds: float) -> list[Result]:
-    """What all threads gain over one: a pure arithmetic loop, the rasteriser, a whole step. Wall time."""
+def measure_scaling(scene: raster.Picture, machine: Machine, seconds: float) -> list[Result]:
+    """Gain of all threads over one in a pure arithmetic loop, the rasteriser and a whole step. Wall time."""
     if machine.threads < 2:
-        return [Missing(THREADS, "gain of threads", "one core or one thread: run with --threads 2 or more where there are cores")]
+        return [Missing(THREADS, "gain of threads", "there is only one core or thread: run with --threads 2 or more")]
     if machine.level is None:
         return [Missing(THREADS, "gain of threads", "the compiled CPU library is not installed")]
-    n, wall = machine.threads, clock_for(machine.threads)
-    step = work(MIXTURE, len(scene.gaussians) * 2 // 5, scene.camera.width, scene.camera.height)
+    n, wall = machine.threads, choose_clock(machine.threads)
+    step = make_work(MIXTURE, len(scene.gaussians) * 2 // 5, scene.camera.width, scene.camera.height)
 
     def stepped(threads: int, clock: Clock) -> tuple[float, ...]:
-        with torch_threads(threads):
+        with use_threads(threads):
             return step(clock)
 
     subjects: dict[str, Subject] = {}
     for threads in (1, n):
         rasterize = CpuRasterizer(level=machine.level, threads=threads)
-        subjects[f"rasteriser {threads}"] = partial(raster.draw, rasterize, scene)
+        subjects[f"rasteriser {threads}"] = partial(raster.time_draw, rasterize, scene)
         subjects[f"step {threads}"] = partial(stepped, threads)
-        subjects[f"arithmetic {threads}"] = partial(_arithmetic, machine.level, threads)
-    best = {name: sum(parts) for name, parts in least(subjects, seconds, wall).items()}
+        subjects[f"arithmetic {threads}"] = partial(_time_arithmetic, machine.level, threads)
+    best = {name: sum(parts) for name, parts in measure_minima(subjects, seconds, wall).items()}
     group, out = f"gain of {n} threads over one (wall time)", []
     for name in ("arithmetic", "rasteriser", "step"):
-        gain = best[f"{name} 1"] / best[f"{name} {n}"] if best[f"{name} {n}"] else None
-        if gain is None:
-            out.append(Missing(group, "pure arithmetic", "this build of the library has no arithmetic loop"))
-            continue
-        known = best["arithmetic 1"] > 0 and name != "arithmetic"
-        against = gain * best[f"arithmetic {n}"] / best["arithmetic 1"] if known else None
+        gain = best[f"{name} 1"] / best[f"{name} {n}"]
+        against = gain * best[f"arithmetic {n}"] / best["arithmetic 1"] if name != "arithmetic" else None
         label = {"arithmetic": "pure arithmetic", "step": f"whole step of {MIXTURE}"}.get(name, name)
-        out.append(Figure(group, label, gain, "x", "pure arithmetic" if known else "", against))
+        out.append(Figure(group, label, gain, "x", "" if against is None else "pure arithmetic", against))
     return out
 
 
-def _arithmetic(level: str, threads: int, clock: Clock) -> tuple[float]:
-    """Seconds of 10^9 multiply-adds; 0 where the library has no such loop."""
-    rate = multiply_adds(level, threads, 0.0, clock)
-    return (1e9 / rate if rate else 0.0,)
+def _time_arithmetic(level: str, threads: int, clock: Clock) -> tuple[float]:
+    """Seconds of 10^9 multiply-adds."""
+    rate = measure_multiply_adds(level, threads, 0.0, clock)
+    assert rate is not None
+    return (1e9 / rate,)
 
 
 @contextmanager
-def torch_threads(threads: int) -> Iterator[None]:
-    """Torch's own setting, which native code follows, put back afterwards."""
+def use_threads(threads: int) -> Iterator[None]:
+    """Set torch's number of threads, which native code follows, and restore it afterwards."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:

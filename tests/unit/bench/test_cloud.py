@@ -11,18 +11,18 @@ from scene_experts.bench import cloud
 
 @pytest.fixture(scope="module")
 def made():
-    return cloud.synthetic()
+    return cloud.make_cloud()
 
 
 @pytest.mark.parametrize("count", [1_000, 4_000])
 def test_any_number_of_gaussians(made, count):
     made = replace(made, xyz=made.xyz[::50], rgb=made.rgb[::50])  # 2,776 points: fewer and more than that
-    g, camera = cloud.scene(made, count, 200, 130)
+    g, camera = cloud.make_scene(made, count, 200, 130)
     assert len(g) == count and (camera.width, camera.height) == (200, 130)
     assert all(torch.isfinite(t).all() for t in (g.means, g.quats, g.scales, g.opacities, g.colors))
     assert (g.scales > 0).all() and g.opacities.min() > 0 and g.opacities.max() < 1
     torch.testing.assert_close(g.quats.norm(dim=1), torch.ones(count))
-    again, _ = cloud.scene(made, count, 200, 130)
+    again, _ = cloud.make_scene(made, count, 200, 130)
     assert torch.equal(g.means, again.means)
 
 

@@ -1,6 +1,6 @@
 """Interleaved minima."""
 
-from scene_experts.bench.measure import clock_for, least
+from scene_experts.bench.measure import choose_clock, measure_minima
 
 
 def test_least_takes_the_least_of_each_part_and_holds_slow_subjects_back():
@@ -14,18 +14,18 @@ def test_least_takes_the_least_of_each_part_and_holds_slow_subjects_back():
 
         return run
 
-    best = least({name: subject(name) for name in parts}, 0.02, clock_for(1), {"slow": 1})
+    best = measure_minima({name: subject(name) for name in parts}, 0.02, choose_clock(1), {"slow": 1})
     assert seen["slow"] == 1 and seen["quick"] >= 3
     assert best == {"quick": (3.0, 0.5), "slow": (9.0,)}
 
 
 def test_everything_runs_twice_whatever_the_budget():
     seen = []
-    least({"a": lambda clock: (float(len(seen)), seen.append(1))[:1]}, 0.0, clock_for(2))
+    measure_minima({"a": lambda clock: (float(len(seen)), seen.append(1))[:1]}, 0.0, choose_clock(2))
     assert len(seen) == 2
 
 
 def test_slow_subjects_alone_come_to_an_end():
     seen = []
-    least({"a": lambda clock: (float(len(seen)), seen.append(1))[:1]}, 5.0, clock_for(2), {"a": 3})
+    measure_minima({"a": lambda clock: (float(len(seen)), seen.append(1))[:1]}, 5.0, choose_clock(2), {"a": 3})
     assert len(seen) == 3

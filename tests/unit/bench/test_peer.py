@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from scene_experts.bench import peer, raster
-from scene_experts.bench.measure import clock_for
+from scene_experts.bench.measure import choose_clock
 from scene_experts.core.types import Gaussians
 from scene_experts.native import library as native
 from scene_experts.render.reference import ReferenceRasterizer
@@ -15,8 +15,8 @@ def test_the_peer_is_a_rasteriser(level):
     found = peer.load(level) if level in native.list_levels() else None
     if found is None:
         pytest.skip("not installed")
-    scene = raster.picture(300, 48, 32)
-    forward, backward, image, gradient = found.draw(scene.gaussians, scene.camera, scene.upstream, clock_for(1))
+    scene = raster.make_picture(300, 48, 32)
+    forward, backward, image, gradient = found.draw(scene.gaussians, scene.camera, scene.upstream, choose_clock(1))
     g = scene.gaussians
     means = g.means.clone().requires_grad_()
     leaves = Gaussians(means, g.quats, g.scales, g.opacities, g.colors, g.source)

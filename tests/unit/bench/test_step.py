@@ -5,42 +5,42 @@ from dataclasses import replace
 import torch
 
 from scene_experts.bench import machine, raster, step
-from scene_experts.bench.measure import Missing, clock_for
+from scene_experts.bench.measure import Missing, choose_clock
 from scene_experts.core.types import Mode
 
 
 def test_half_of_the_anchors_are_seen_and_a_step_leaves_the_networks_as_they_were():
-    work = step.work(step.MIXTURE, 200, 64, 48)
+    work = step.make_work(step.MIXTURE, 200, 64, 48)
     before = {k: v.detach().clone() for k, v in work.training.scene.network_tensors().items()}
-    times = work(clock_for(2))
+    times = work(choose_clock(2))
     assert len(times) == len(step.PARTS) and min(times) >= 0
     assert all(torch.equal(v, before[k]) for k, v in work.training.scene.network_tensors().items())
     assert work.training.optimizer.state and work.training.scene.table.stats["visits"].sum() == 100
-    assert work.drawn() > 100
+    assert work.count_drawn() > 100
 
 
 def test_a_mixture_alike_draws_the_same_gaussians():
-    mixture, base = (step.work(recipe, 300, 64, 48) for recipe in (step.MIXTURE, step.BASELINE))
-    step.alike(mixture, base)
+    mixture, base = (step.make_work(recipe, 300, 64, 48) for recipe in (step.MIXTURE, step.BASELINE))
+    step.copy_networks(mixture, base)
     for made in (mixture, base):
-        made(clock_for(2))  # and a step changes nothing of it
+        made(choose_clock(2))  # and a step changes nothing of it
     a, b = (w.training.scene(w.camera, step.AT, Mode.DRAW, w.rasterize.visible) for w in (mixture, base))
-    assert torch.allclose(a.raw_opacity, b.raw_opacity, atol=1e-5) and abs(mixture.drawn() - base.drawn()) <= 2
+    assert torch.allclose(a.raw_opacity, b.raw_opacity, atol=1e-5) and abs(mixture.count_drawn() - base.count_drawn()) <= 2
     sure = (b.raw_opacity.abs() > 1e-4).all() and len(a.gaussians) == len(b.gaussians)
     assert not sure or torch.allclose(a.gaussians.colors, b.gaussians.colors, atol=1e-4)
 
 
 def test_figures_of_a_step():
     here = replace(machine.describe(1), copied=1e9)
-    found = {f.name: f for f in step.figures(100, 48, 32, here, 0.0)}
+    found = {f.name: f for f in step.measure(100, 48, 32, here, 0.0)}
     whole = found["whole step"]
     assert whole.ratio > 0 and step.BASELINE in whole.peer
     assert sum(found[part].value for part in step.PARTS) <= whole.value * 1.001
 
 
 def test_gain_of_threads():
-    scene = raster.picture(200, 48, 32)
-    assert isinstance(step.scaling(scene, machine.describe(1), 0.0)[0], Missing)
+    scene = raster.make_picture(200, 48, 32)
+    assert isinstance(step.measure_scaling(scene, machine.describe(1), 0.0)[0], Missing)
     threads = torch.get_num_threads()
-    found = step.scaling(scene, machine.describe(2), 0.0)
+    found = step.measure_scaling(scene, machine.describe(2), 0.0)
     assert all(isinstance(f, Missing) or f.value > 0 for f in found) and torch.get_num_threads() == threads

@@ -6,14 +6,14 @@ import json
 import pytest
 from rich.console import Console
 
-from scene_experts.bench import table as run
+from scene_experts.bench import table
 from scene_experts.bench.measure import Figure, Missing
 from scene_experts.native import library as native
 
 
 def test_sizes_shrink_with_the_budget():
-    assert run.size_for(60) == run.FULL == run.Size(100_000, 800, 544, 40_000)
-    assert run.size_for(10) == run.MEDIUM and run.size_for(1) == run.SMALL
+    assert table.choose_size(60) == table.FULL == table.Size(100_000, 800, 544, 40_000)
+    assert table.choose_size(10) == table.MEDIUM and table.choose_size(1) == table.SMALL
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def no_library(monkeypatch):
 def test_without_the_library_the_rest_is_measured_and_what_is_missing_is_said(no_library, tmp_path):
     text, path = io.StringIO(), tmp_path / "b.json"
     with pytest.warns(UserWarning, match="reference"):
-        assert run.run(0.5, 1, path, Console(file=text, width=200)) == 0
+        assert table.run(0.5, 1, path, Console(file=text, width=200)) == 0
     printed = text.getvalue()
     assert "no compiled CPU library" in printed and "install a C++20 compiler" in printed and "pure-torch reference" in printed
     found = json.loads(path.read_text())
@@ -38,9 +38,9 @@ def test_without_the_library_the_rest_is_measured_and_what_is_missing_is_said(no
 
 def test_the_table_names_the_peer_of_every_ratio():
     text = io.StringIO()
-    machine = run.describe(1)
+    machine = table.describe(1)
     results = [Figure("parts", "fast", 2.0, "ms", "slow one", 12.5), Missing("parts", "other", "not here")]
-    run.show(machine, run.SMALL, results, Console(file=text, width=160))
+    table.print_table(machine, table.SMALL, results, Console(file=text, width=160))
     assert "12.5 x slow one" in text.getvalue() and "not here" in text.getvalue()
-    plain = run.as_json(machine, run.SMALL, results, 1.0)
+    plain = table.convert_to_json(machine, table.SMALL, results, 1.0)
     assert plain["figures"][0]["ratio"] == 12.5 and plain["missing"][0]["why"] == "not here" and json.dumps(plain, allow_nan=False)
