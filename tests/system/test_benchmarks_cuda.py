@@ -82,7 +82,7 @@ def test_every_decoder_is_run_and_reported(monkeypatch):
         work()
         return 2.0
 
-    monkeypatch.setattr(decode_cuda, "timed", timed)
+    monkeypatch.setattr(decode_cuda, "time_on_device", timed)
     rows, cases = torch.arange(0, 60, 2), {}
     camera = Camera(torch.eye(4), torch.eye(3), 80, 54)
     for kind, config in decode_cuda.KINDS.items():
