@@ -71,7 +71,7 @@ def measure_runs(folders: list[Path]) -> None:
         capture = load_capture(run.config.data, run.cfg.seed)
         cameras = [capture.views[i].camera for i in capture.test or capture.train]
         background = torch.tensor(capture.background)
-        s = timing.measure(run.scene, cameras, run.step, choose("auto", "cpu"), background)
+        s = timing.measure_speed(run.scene, cameras, run.step, choose("auto", "cpu"), background)
         values = f"{s.ordinary_decode_ms:.1f} | {s.decode_ms:.1f} | {s.raster_ms:.1f} | {s.ordinary_fps:.1f} | {s.fps:.1f}"
         print(f"| {folder.name} | {values} |")
 

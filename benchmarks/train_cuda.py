@@ -146,7 +146,7 @@ def score(done: Training, capture: Capture, rasterize: Rasterizer, device: str) 
             active.append(float((decoded.raw_opacity > 0).float().mean()))
         psnr.append(compute_psnr(rasterize(decoded.gaussians, camera, background).image, capture, index))
     cameras = [capture.views[i].camera.to(device) for i in capture.test or capture.train]
-    speed = timing.measure(scene, cameras, done.step, rasterize, background)
+    speed = timing.measure_speed(scene, cameras, done.step, rasterize, background)
     count = round(len(scene.table) * scene.K * (mean(active) if active else 1.0))
     return {"psnr": mean(psnr), "fps": speed.fps, "decode_ms": speed.decode_ms, "raster_ms": speed.raster_ms, "gaussians": count}
 

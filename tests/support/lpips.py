@@ -11,20 +11,22 @@ import torch
 from torch import Tensor
 
 from scene_experts.evaluate import weights
-from scene_experts.evaluate.lpips import BACKBONES, shapes
+from scene_experts.evaluate.lpips import BACKBONES, tensor_shapes
 
 
 def random_tensors(net: str, seed: int = 0) -> dict[str, Tensor]:
     """Random weights of the right shapes that keep the activations near 1."""
     gen = torch.Generator().manual_seed(seed)
     out = {}
-    for name, shape in shapes(net).items():
+    for name, shape in tensor_shapes(net).items():
         value = torch.randn(shape, generator=gen)
         out[name] = value * (2 / value[0].numel()) ** 0.5 if name.endswith("weight") else value.abs() if name[:3] == "lin" else 0.1 * value
     return out
 
 
-TENSORS = {name: torch.randn(shape, generator=torch.Generator().manual_seed(i)) for i, (name, shape) in enumerate(shapes("alex").items())}
+TENSORS = {
+    name: torch.randn(shape, generator=torch.Generator().manual_seed(i)) for i, (name, shape) in enumerate(tensor_shapes("alex").items())
+}
 
 
 def publish(monkeypatch: pytest.MonkeyPatch, table: dict[str, tuple[str, str]], path: Path) -> None:
@@ -54,7 +56,7 @@ def write_torch(folder: Path, tensors: dict[str, Tensor] = TENSORS) -> tuple[Pat
     places = [0, 3, 6, 8, 10]
     state = {f"features.{places[i]}.{kind}": tensors[f"conv{i}.{kind}"] for i in range(5) for kind in ("weight", "bias")}
     state["classifier.1.weight"] = torch.zeros(3, 3)
-    backbone, linear = folder / weights.BACKBONE["alex"][0], folder / "alex.pth"
+    backbone, linear = folder / weights.BACKBONE_FILES["alex"][0], folder / "alex.pth"
     torch.save(state, backbone)
     torch.save({f"lin{i}.model.1.weight": tensors[f"lin{i}"].reshape(1, -1, 1, 1) for i in range(len(BACKBONES["alex"]))}, linear)
     return backbone, linear

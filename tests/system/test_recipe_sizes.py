@@ -6,7 +6,7 @@ Linear(in, 32) - ReLU - Linear(32, out) has 33 out + 32 (in + 1) parameters: wit
 
 import pytest
 
-from scene_experts.evaluate.score import sizes
+from scene_experts.evaluate.results import describe_size
 from scene_experts.recipes import RECIPES
 from support.scenes import start_scene
 
@@ -43,7 +43,7 @@ def test_every_recipe_is_counted():
 def test_parameters_and_bytes(recipe):
     scene = start_scene(recipe)
     assert sum(tensor.numel() for tensor in scene.network_tensors().values()) == (PARAMETERS | EXTRA)[recipe]
-    found = sizes(scene)
+    found = describe_size(scene)
     assert found["network_bytes"] == 4 * (PARAMETERS | EXTRA)[recipe]
     assert found["ply_bytes"] == BYTES.get(recipe, 316) * len(scene.table)
     assert found["MB"] == (found["ply_bytes"] + found["network_bytes"]) / 1e6

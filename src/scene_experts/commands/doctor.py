@@ -149,7 +149,7 @@ def memory() -> Check:
 def lpips() -> Check:
     from scene_experts.evaluate import weights
 
-    reasons = {net: reason for net in ("vgg", "alex") if (reason := weights.why_absent(net))}
+    reasons = {net: reason for net in ("vgg", "alex") if (reason := weights.explain_missing(net))}
     if not reasons:
         return Check("LPIPS weights", True, f"found for VGG and AlexNet (kept in {weights.cache_dir()})")
     why = "; ".join(reason.removesuffix(f": {weights.HOW}") for reason in reasons.values())

@@ -20,7 +20,7 @@ from scene_experts.core.choices import Device, Raster
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
-from scene_experts.evaluate.pictures import strip, to_8bit
+from scene_experts.evaluate.pictures import join_pictures, to_8bit
 from scene_experts.render import as_trained
 from scene_experts.training import run_folder
 from scene_experts.training.progress import Bar
@@ -137,7 +137,7 @@ def drawn(
             draw = as_trained(rasterize, run.cfg.antialias)
             looks = [Look(mode, command.attribute, only) for mode in command.show]
             tiles += [paint(run.scene, camera, run.step, draw, background, look, draws) for look in looks]
-        yield to_8bit(strip(tiles) if len(tiles) > 1 else tiles[0])
+        yield to_8bit(join_pictures(tiles) if len(tiles) > 1 else tiles[0])
         tell("rendering", i + 1, len(cameras))
 
 

@@ -8,7 +8,8 @@ from typing import Any
 from rich.console import Console
 
 from scene_experts.evaluate.options import EvalOptions
-from scene_experts.evaluate.score import About, evaluate
+from scene_experts.evaluate.results import About
+from scene_experts.evaluate.score import evaluate
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.training import run_folder
 from scene_experts.training.progress import Bar

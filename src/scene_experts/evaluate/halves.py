@@ -1,7 +1,7 @@
-"""Appearance codes of held-out views, found on the left half of each photograph; only the right half is then scored.
+"""Fits the appearance codes of held-out views to the left half of each photograph. Only the right half is then scored.
 
-The protocol of NeRF in the Wild (Martin-Brualla et al. 2021, section 4), for captures whose light changes from view to view: what a
-photograph's exposure was can only be known from the photograph, and no pixel serves both purposes.
+This is the protocol of NeRF in the Wild (Martin-Brualla et al. 2021, section 4) for captures whose light changes between views:
+the exposure of a photograph is known only from the photograph, and no pixel is used both to fit and to score.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ if TYPE_CHECKING:
     from scene_experts.render import Rasterizer
     from scene_experts.scene import Scene
 
-STEPS, RATE = 60, 0.1  # of Adam, from the mean of all codes; the rate falls linearly to 0
+STEPS, RATE = 60, 0.1  # steps and learning rate of Adam; the rate decreases linearly to 0
 
 
-def codes_of(scene: Scene) -> Codes:
-    """The scene's appearance codes. Raises InputError where it has none."""
+def require_codes(scene: Scene) -> Codes:
+    """Return the appearance codes of a scene. Raises InputError if it has none."""
     codes = scene.codes
     if codes is None:
         raise InputError("expected a scene with appearance codes for --appearance half, found none; train with --scene.appearance 32")
     return codes
 
 
-def left(height: int, width: int, device: torch.device | str = "cpu") -> Tensor:
-    """[H, W], 1 on the left half (the middle column of an odd width is right)."""
+def left_half(height: int, width: int, device: torch.device | str = "cpu") -> Tensor:
+    """Return a mask [H, W] that is 1 on the left half. The middle column of an odd width belongs to the right half."""
     return (torch.arange(width, device=device) < width // 2).float().expand(height, width)
 
 
-def right_mask(mask: Tensor | None, height: int, width: int) -> Tensor:
-    """What is scored: the right half of what counts [H, W]."""
-    half = 1.0 - left(height, width)
+def right_half(mask: Tensor | None, height: int, width: int) -> Tensor:
+    """Return the right half of `mask` [H, W] (None: every pixel counts), the pixels that are scored."""
+    half = 1.0 - left_half(height, width)
     return half if mask is None else half * mask
 
 
-def fit(
+def fit_codes(
     scene: Scene,
     capture: Capture,
     rasterize: Rasterizer,
@@ -52,20 +52,28 @@ def fit(
     background: Tensor,
     tell: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Find the code of each of the views `chosen` and put it into the scene's codes; nothing else of the scene changes."""
-    codes = codes_of(scene)
+    """Fit the code of each of the views `chosen` and store it in the scene's codes. Nothing else in the scene changes.
+
+    tell: Called with the number of views that are done and the number of views.
+    """
+    codes = require_codes(scene)
     for n, index in enumerate(chosen):
         camera, frame = capture.views[index].camera.to(background.device), capture.frame(index)
-        counts = left(camera.height, camera.width) * (1.0 if frame.mask is None else frame.mask)
+        counts = left_half(camera.height, camera.width) * (1.0 if frame.mask is None else frame.mask)
         photo = (frame.rgb.float() / 255).to(background.device)
-        codes.fitted[camera.id] = fitted(scene, codes, rasterize, camera, photo, counts.to(background.device), step, background)
+        codes.fitted[camera.id] = fit_code(scene, codes, rasterize, camera, photo, counts.to(background.device), step, background)
         tell(n + 1, len(chosen))
 
 
-def fitted(
+def fit_code(
     scene: Scene, codes: Codes, rasterize: Rasterizer, camera: Camera, photo: Tensor, counts: Tensor, step: int, background: Tensor
 ) -> Tensor:
-    """The code [dim] under which the counted pixels [H, W] of the photograph [H, W, 3] are met best in L1; the best one seen."""
+    """Return the code [dim] with the least L1 error over the counted pixels, starting from the mean of all codes.
+
+    Args:
+        photo: Photograph [H, W, 3] in [0, 1].
+        counts: Weights [H, W] in [0, 1] of the pixels.
+    """
     code = codes.table.detach().mean(dim=0).requires_grad_()
     optimizer = torch.optim.Adam([code])
     best, least = code.detach().clone(), float("inf")
@@ -77,7 +85,7 @@ def fitted(
         if loss.item() < least:
             best, least = code.detach().clone(), loss.item()
         if not loss.requires_grad:
-            break  # nothing is seen
+            break  # nothing is visible
         (code.grad,) = torch.autograd.grad(loss, [code])
         optimizer.param_groups[0]["lr"] = RATE * (1 - i / STEPS)
         optimizer.step()

@@ -1,7 +1,7 @@
-"""Scores of a rendered picture against its photograph, from 8-bit values, each under a name that says which variant it is.
+"""Scores of a rendered picture against its photograph: PSNR, SSIM, LPIPS, sharpness. Each name stands for one exact variant.
 
-Pictures are [H, W, 3] float RGB in [0, 1], masks [H, W] in [0, 1] (1 counts). With a mask, a score is over the counted pixels alone: the
-rest of the render is replaced by the photograph, and what dissimilarity is left is divided by the counted area instead of the whole.
+Pictures are [H, W, 3] float RGB in [0, 1] with 8-bit values, masks [H, W] in [0, 1] (1 = the pixel counts). With a mask, only
+counted pixels are scored: the photograph replaces the rest of the render, and the dissimilarity is divided by the counted area.
 """
 
 from __future__ import annotations
@@ -16,36 +16,37 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
-from scene_experts.evaluate import download, weights
+from scene_experts.core.progress import ByteProgress
+from scene_experts.evaluate import weights
 from scene_experts.evaluate.lpips import Lpips
 from scene_experts.training import losses
 
 VARIANTS = {
-    "psnr": "PSNR in dB per view over all pixels and channels of the 8-bit pictures, 100 at most; mean over views",
+    "psnr": "PSNR in dB per view over all pixels and channels of the 8-bit pictures, at most 100; mean over views",
     "ssim": "SSIM, 11 x 11 Gaussian window of sigma 1.5, zero padding, mean over pixels and channels (3DGS's variant)",
     "lpips": "LPIPS v0.1, VGG16, pictures in [-1, 1] as the network was trained on",
-    "lpips_3dgs": "LPIPS v0.1, VGG16, pictures in [0, 1] as 3DGS, Scaffold-GS and their descendants publish it; compare papers by this",
+    "lpips_3dgs": "LPIPS v0.1, VGG16, pictures in [0, 1] as 3DGS, Scaffold-GS and their descendants publish it; for comparison with papers",
     "lpips_alex": "LPIPS v0.1, AlexNet, pictures in [-1, 1]",
 }
-BACKBONE = {"lpips": "vgg", "lpips_3dgs": "vgg", "lpips_alex": "alex"}
-LEAST_MSE = 1e-10  # identical pictures score 100 dB instead of infinity, which JSON cannot hold
+NETWORKS = {"lpips": "vgg", "lpips_3dgs": "vgg", "lpips_alex": "alex"}
+LEAST_MSE = 1e-10  # identical pictures score 100 dB instead of infinity, which JSON cannot represent
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """20 log10(1 / sqrt(MSE)) in dB, at most 100."""
+    """Return 20 log10(1 / sqrt(MSE)) in dB, at most 100."""
     squared = (image.double() - target.double()).square()
     mse = squared.mean() if mask is None else (squared * mask.double()[..., None]).sum() / (3 * mask.double().sum())
     return -10.0 * math.log10(max(float(mse), LEAST_MSE))
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Structural similarity (3DGS's variant), 1 for identical pictures."""
-    filled, area = _filled(image, target, mask)
+    """Return the structural similarity (3DGS's variant), 1 for identical pictures."""
+    filled, area = _fill_masked(image, target, mask)
     return 1.0 - (1.0 - float(losses.ssim(filled, target))) / area
 
 
 def sharpness(image: Tensor, mask: Tensor | None = None) -> float:
-    """Mean length of the brightness gradient (forward differences, per pixel): a blurred copy of a picture has less of it."""
+    """Return the mean norm of the brightness gradient (forward differences per pixel). Blur lowers it."""
     gray = image.mean(dim=2)
     dx, dy = gray[:-1, 1:] - gray[:-1, :-1], gray[1:, :-1] - gray[:-1, :-1]
     length = (dx.square() + dy.square()).sqrt()
@@ -55,8 +56,8 @@ def sharpness(image: Tensor, mask: Tensor | None = None) -> float:
     return float((length * weight).sum() / weight.sum().clamp_min(1e-12))
 
 
-def _filled(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, float]:
-    """The render with the photograph where nothing counts, and the share of the picture that counts."""
+def _fill_masked(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, float]:
+    """Return the render with the photograph where pixels do not count, and the fraction of the picture that counts."""
     if mask is None:
         return image, 1.0
     return torch.lerp(target, image, mask[..., None]), float(mask.mean())
@@ -64,11 +65,11 @@ def _filled(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor,
 
 @dataclass(frozen=True)
 class Perceptual:
-    """The LPIPS variants whose weights are here, and why the others are absent."""
+    """The LPIPS variants whose weights are on this machine, and why others are absent."""
 
     networks: dict[str, Lpips] = field(default_factory=dict)  # by backbone
-    sources: dict[str, str] = field(default_factory=dict)  # by backbone: where its weights came from
-    absent: dict[str, str] = field(default_factory=dict)  # by metric: one sentence with the command that fixes it
+    sources: dict[str, str] = field(default_factory=dict)  # by backbone: source of its weights
+    absent: dict[str, str] = field(default_factory=dict)  # by metric: a sentence with the command that gets it
 
     @classmethod
     def find(
@@ -76,30 +77,41 @@ class Perceptual:
         explicit: Path | None = None,
         device: torch.device | str = "cpu",
         fetch: bool = False,
-        progress: download.Progress | None = None,
+        progress: ByteProgress | None = None,
     ) -> Perceptual:
-        """Load what this machine has; `fetch` downloads the rest first. Raises InputError when `explicit` names no weights."""
+        """Load the weights on this machine.
+
+        Args:
+            explicit: File or folder of the weights.
+            device: Device of the networks.
+            fetch: Download missing weights.
+            progress: Called with the bytes so far and in total during a download.
+
+        Raises:
+            InputError: if `explicit` contains no weights.
+            RunError: if a download fails.
+        """
         networks, sources, absent = {}, {}, {}
-        for net in dict.fromkeys(BACKBONE.values()):
-            if fetch and weights.why_absent(net, explicit):
-                download.lpips(net, progress=progress)
+        for net in dict.fromkeys(NETWORKS.values()):
+            if fetch and weights.explain_missing(net, explicit):
+                weights.download(net, progress=progress)
             try:
                 tensors, sources[net] = weights.load(net, explicit)
                 networks[net] = Lpips(net, tensors).to(device)
             except weights.Missing as error:
-                absent |= {metric: str(error) for metric, backbone in BACKBONE.items() if backbone == net}
+                absent |= {metric: str(error) for metric, backbone in NETWORKS.items() if backbone == net}
         return cls(networks, sources, absent)
 
     @classmethod
     def off(cls) -> Perceptual:
-        """None of them, because nobody asked."""
-        return cls(absent=dict.fromkeys(BACKBONE, "not asked for: evaluate again without --no-lpips"))
+        """Return a value without networks, for an evaluation without LPIPS."""
+        return cls(absent=dict.fromkeys(NETWORKS, "not computed: evaluate again without --no-lpips"))
 
     def __call__(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> dict[str, float]:
-        """The variants that can be scored, by name; `absent` gains those that this size of picture rules out."""
-        filled, area = _filled(image, target, mask)
+        """Return the scores of the available variants by name. Variants that this picture is too small for are added to `absent`."""
+        filled, area = _fill_masked(image, target, mask)
         out: dict[str, float] = {}
-        for metric, backbone in BACKBONE.items():
+        for metric, backbone in NETWORKS.items():
             network = self.networks.get(backbone)
             if network is None or metric in self.absent:
                 continue
@@ -112,7 +124,7 @@ class Perceptual:
 
 
 def score(image: Tensor, target: Tensor, mask: Tensor | None, perceptual: Perceptual) -> dict[str, float]:
-    """Every score of one view, and the sharpness of render and photograph."""
+    """Return every score of one view by name, with the sharpness of the render and of the photograph."""
     with _full_precision():
         return {
             "psnr": psnr(image, target, mask),
@@ -125,7 +137,7 @@ def score(image: Tensor, target: Tensor, mask: Tensor | None, perceptual: Percep
 
 @contextmanager
 def _full_precision() -> Iterator[None]:
-    """Convolutions in float32 on CUDA too: cuDNN rounds their inputs to 10 bits (TF32) by default, which moves SSIM and LPIPS."""
+    """Compute convolutions in float32 on CUDA. By default cuDNN rounds inputs to 10 bits (TF32), which changes SSIM and LPIPS."""
     before = torch.backends.cudnn.allow_tf32
     torch.backends.cudnn.allow_tf32 = False
     try:

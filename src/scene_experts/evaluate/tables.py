@@ -1,4 +1,4 @@
-"""Tables of several results beside each other, and beside the paper's numbers: for terminals, Markdown and CSV."""
+"""Tables of the results of several runs, and of the paper's numbers, for terminals, in Markdown and in CSV."""
 
 from __future__ import annotations
 
@@ -12,69 +12,60 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
+from rich import table as rich_table
 from rich.console import Console
-from rich.table import Table as RichTable
 from rich.text import Text
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.io import read_json
+from scene_experts.evaluate.results import check_protocol, find_outdated, load_results
 
 Format = Literal["table", "markdown", "csv"]
-PROTOCOL = {  # what must be equal before scores may be compared: key in results.json, name, option that sets it
-    "capture": ("capture", "--data"),
-    "resolution": ("resolution", "--resolution"),
-    "mean_pixels": ("picture size", "--resolution"),
-    "split": ("split", "--split"),
-    "views": ("views", "--views"),
-    "view_count": ("number of views", "--max-views"),
-    "appearance": ("appearance codes", "--appearance"),
-    "masked": ("use of masks", "--data"),
-}
-UNSAID = {"appearance": "rule"}  # what a results file without the key means
 
 
 @dataclass(frozen=True)
-class Column:
-    """One figure of a results file. `best`: which end is better, 0 where neither is."""
+class ResultColumn:
+    """A value of a results file that is one column of a table."""
 
     title: str
-    path: tuple[str, ...]
-    digits: int = 0
+    path: tuple[str, ...]  # keys in results.json
+    digits: int = 0  # after the decimal point
     factor: float = 1.0
-    best: int = 0
-    counted: bool = False  # 0 says that nobody counted: a file of another program knows nothing of its training
+    best: int = 0  # 1: larger is better; -1: smaller is better; 0: neither
+    counted: bool = False  # 0 means unknown, e.g. for a file of another program
 
     def value(self, results: dict[str, Any]) -> float | None:
+        """Return the value in `results`, or None if it is absent."""
         found: Any = results
         for key in self.path:
             found = found.get(key) if isinstance(found, dict) else None
         return None if found is None or (self.counted and not found) else float(found) * self.factor
 
     def text(self, value: float | None) -> str:
+        """Format a value; "-" stands for an absent one."""
         return "-" if value is None else f"{value:,.{self.digits}f}"
 
 
 COLUMNS = (
-    Column("PSNR", ("psnr",), 2, best=1),
-    Column("SSIM", ("ssim",), 3, best=1),
-    Column("LPIPS", ("lpips",), 3, best=-1),
-    Column("LPIPS (3DGS)", ("lpips_3dgs",), 3, best=-1),
-    Column("LPIPS (Alex)", ("lpips_alex",), 3, best=-1),
-    Column("MB", ("size", "MB"), 1, best=-1),
-    Column("anchors", ("anchors",)),
-    Column("active %", ("activation_ratio",), 1, 100.0),
-    Column("sharpness", ("sharpness", "ratio"), 2),
-    Column("FPS", ("fps", "fps"), 1, best=1),
-    Column("iterations", ("step",), counted=True),
-    Column("of schedule", ("iterations",), counted=True),  # the schedule's length: with fewer steps a training was cut off, not short
-    Column("train s", ("train_seconds",), counted=True),
-    Column("CPU s", ("cpu_seconds",), counted=True),
+    ResultColumn("PSNR", ("psnr",), 2, best=1),
+    ResultColumn("SSIM", ("ssim",), 3, best=1),
+    ResultColumn("LPIPS", ("lpips",), 3, best=-1),
+    ResultColumn("LPIPS (3DGS)", ("lpips_3dgs",), 3, best=-1),
+    ResultColumn("LPIPS (Alex)", ("lpips_alex",), 3, best=-1),
+    ResultColumn("MB", ("size", "MB"), 1, best=-1),
+    ResultColumn("anchors", ("anchors",)),
+    ResultColumn("active %", ("activation_ratio",), 1, 100.0),
+    ResultColumn("sharpness", ("sharpness", "ratio"), 2),
+    ResultColumn("FPS", ("fps", "fps"), 1, best=1),
+    ResultColumn("iterations", ("step",), counted=True),
+    ResultColumn("of schedule", ("iterations",), counted=True),  # length of the schedule; fewer iterations mean an interrupted training
+    ResultColumn("train s", ("train_seconds",), counted=True),
+    ResultColumn("CPU s", ("cpu_seconds",), counted=True),
 )
 
 
 @dataclass(frozen=True)
-class Table:
-    """Cells as text, with the best of each column known by (row, column)."""
+class ResultTable:
+    """A table of text. `best` holds the (row, column) of the best cells of each column."""
 
     titles: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -82,50 +73,8 @@ class Table:
     notes: tuple[str, ...] = ()
 
 
-def load_results(run: Path, views: str = "test") -> dict[str, Any]:
-    """results.json of a run folder. Raises InputError where the run was not evaluated."""
-    path = run / ("results.json" if views == "test" else f"results_{views}.json")
-    if run.is_file():
-        path = run
-    if not path.is_file():
-        raise InputError(f"expected an evaluated run with {path.name} in {run}, found none; run `scene-experts eval {run}` first")
-    results = read_json(path, "results file")
-    if not isinstance(results, dict) or not isinstance(results.get("psnr"), (int, float)):
-        raise InputError(f"expected results of `scene-experts eval` in {path}, found something else; evaluate the run again")
-    return results
-
-
-def outdated(names: Sequence[str], runs: Sequence[Path], results: Sequence[dict[str, Any]]) -> list[str]:
-    """In a sentence each: the runs that were trained on after they were scored."""
-    out = []
-    for name, run, found in zip(names, runs, results):
-        newest = max((int(p.stem[5:]) for p in (run / "checkpoints").glob("ckpt_*.safetensors") if p.stem[5:].isdigit()), default=0)
-        if newest > (found.get("step") or newest):
-            out.append(f"{name} was scored at iteration {found['step']:,} and is at {newest:,} now: run `scene-experts eval {run}` again")
-    return out
-
-
-def unlike(names: Sequence[str], results: Sequence[dict[str, Any]]) -> tuple[str, str] | None:
-    """The first difference in what was scored, in words, and the option that sets it; None where scores may be compared."""
-    for name, other in zip(names[1:], results[1:]):
-        for key, (what, option) in PROTOCOL.items():
-            ours, theirs = (r.get(key, UNSAID.get(key)) for r in (results[0], other))
-            if ours != theirs:
-                return f"the same {what}, found {ours} in {names[0]} and {theirs} in {name}", option
-    return None
-
-
-def check_protocol(names: Sequence[str], results: Sequence[dict[str, Any]]) -> None:
-    """Raises InputError naming the first difference in what was scored: resolution alone moves PSNR by up to half a dB."""
-    if found := unlike(names, results):
-        raise InputError(
-            f"expected runs with {found[0]}; repeat one with the other's {found[1]}, "
-            f"or add --mixed to see them beside each other all the same"
-        )
-
-
-def table(names: Sequence[str], results: Sequence[dict[str, Any]], columns: Sequence[Column] = COLUMNS) -> Table:
-    """One row per result. A column that no result has is left out; what is absent is "-" with its reason in the notes."""
+def make_table(names: Sequence[str], results: Sequence[dict[str, Any]], columns: Sequence[ResultColumn] = COLUMNS) -> ResultTable:
+    """Make a table with one row per result. Columns without values are omitted; notes explain absent scores."""
     values = [[column.value(result) for column in columns] for result in results]
     used = [j for j in range(len(columns)) if any(row[j] is not None for row in values)]
     best: set[tuple[int, int]] = set()
@@ -135,18 +84,18 @@ def table(names: Sequence[str], results: Sequence[dict[str, Any]], columns: Sequ
             winner = max(texts, key=lambda i: columns[j].best * (values[i][j] or 0.0))
             best |= {(i, place + 1) for i, text in texts.items() if text == texts[winner]}
     rows = tuple((name, *(columns[j].text(row[j]) for j in used)) for name, row in zip(names, values))
-    titles = tuple(columns[j].title if columns[j].path != ("anchors",) else _counted_as(results) for j in used)
-    return Table(("run", *titles), rows, frozenset(best), _notes(names, results))
+    titles = tuple(columns[j].title if columns[j].path != ("anchors",) else _name_scene_rows(results) for j in used)
+    return ResultTable(("run", *titles), rows, frozenset(best), _explain_absent(names, results))
 
 
-def _counted_as(results: Sequence[dict[str, Any]]) -> str:
-    """What the rows of the scenes are: explicit scenes (which have no share of active Gaussians) hold Gaussians themselves."""
+def _name_scene_rows(results: Sequence[dict[str, Any]]) -> str:
+    """Return what the rows of the scenes are called. Results without an activation ratio belong to explicit Gaussians."""
     explicit = {result.get("activation_ratio") is None for result in results if result.get("anchors") is not None}
     return "Gaussians" if explicit == {True} else "anchors" if explicit == {False} else "anchors or Gaussians"
 
 
-def _notes(names: Sequence[str], results: Sequence[dict[str, Any]]) -> tuple[str, ...]:
-    """Why scores are absent, each reason once with the scores it explains."""
+def _explain_absent(names: Sequence[str], results: Sequence[dict[str, Any]]) -> tuple[str, ...]:
+    """Return a note for each reason why scores are absent, with the scores that it explains."""
     reasons: dict[str, list[str]] = {}
     for result in results:
         for metric, reason in (result.get("absent") or {}).items():
@@ -157,16 +106,16 @@ def _notes(names: Sequence[str], results: Sequence[dict[str, Any]]) -> tuple[str
     return tuple(f"{', '.join(metrics)}{where[reason]} absent: {reason}" for reason, metrics in reasons.items())
 
 
-def to_markdown(table: Table) -> str:
-    """A Markdown table, the best of each column bold, notes below."""
+def to_markdown(table: ResultTable) -> str:
+    """Return a Markdown table with the best of each column in bold and the notes below."""
     rows = [[f"**{cell}**" if (i, j) in table.best else cell for j, cell in enumerate(row)] for i, row in enumerate(table.rows)]
     lines = ["| " + " | ".join(table.titles) + " |", "|---|" + "---:|" * (len(table.titles) - 1)]
     lines += ["| " + " | ".join(row) + " |" for row in rows]
     return "\n".join(lines + ["", *table.notes] if table.notes else lines) + "\n"
 
 
-def to_csv(table: Table) -> str:
-    """Comma-separated values with a header; absent values are empty."""
+def to_csv(table: ResultTable) -> str:
+    """Return comma-separated values with a header. Absent values are empty."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(table.titles)
@@ -174,17 +123,22 @@ def to_csv(table: Table) -> str:
     return out.getvalue()
 
 
-def to_rich(table: Table, width: int) -> RichTable:
-    """For a terminal `width` characters wide, the best of each column bold. Where that is too narrow, runs are columns; no cell is cut."""
-    turned = Table(
+def to_rich(table: ResultTable, width: int) -> rich_table.Table:
+    """Return a table for a terminal of `width` characters with the best of each column in bold.
+
+    If it is too wide, runs become columns. No cell is truncated.
+    """
+    turned = ResultTable(
         (table.titles[0], *(row[0] for row in table.rows)),
         tuple(zip(table.titles[1:], *(row[1:] for row in table.rows))),
         frozenset((j - 1, i + 1) for i, j in table.best),
     )
-    if _width(table) > width and _width(turned) < _width(table):
+    if _measure_width(table) > width and _measure_width(turned) < _measure_width(table):
         table = turned
-    fixed = _width(table) if _width(table) > width else None  # lines longer than the terminal rather than cells with "..."
-    drawn = RichTable(box=None, pad_edge=False, header_style="bold", width=fixed)
+    fixed = (
+        _measure_width(table) if _measure_width(table) > width else None
+    )  # lines may be longer than the terminal; cells are not truncated
+    drawn = rich_table.Table(box=None, pad_edge=False, header_style="bold", width=fixed)
     for j, name in enumerate(table.titles):
         drawn.add_column(name, justify="left" if j == 0 else "right", no_wrap=True)
     for i, row in enumerate(table.rows):
@@ -192,43 +146,43 @@ def to_rich(table: Table, width: int) -> RichTable:
     return drawn
 
 
-def _width(table: Table) -> int:
-    """Characters of the longest line: the widest cell of each column, two blanks between columns."""
+def _measure_width(table: ResultTable) -> int:
+    """Return the length of the longest line in characters, with two blanks between columns."""
     return sum(max(map(len, column)) + 2 for column in zip(table.titles, *table.rows)) - 2
 
 
-def row_names(runs: Sequence[Path], results: Sequence[dict[str, Any]]) -> list[str]:
-    """Names by which a reader tells runs apart (`told_apart`), the recipes taken from their results."""
-    return told_apart(runs, [str(result.get("recipe") or run.name) for run, result in zip(runs, results)])
+def name_runs(runs: Sequence[Path], results: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a distinct name for each run from the recipe in its results, see `distinguish_runs`."""
+    return distinguish_runs(runs, [str(result.get("recipe") or run.name) for run, result in zip(runs, results)])
 
 
-def told_apart(runs: Sequence[Path], recipes: Sequence[str]) -> list[str]:
-    """The recipe where it tells the runs apart, else the run folder's name with it, or the whole path where those are equal too."""
+def distinguish_runs(runs: Sequence[Path], recipes: Sequence[str]) -> list[str]:
+    """Return a distinct name for each run: the recipe, or the name of the run folder with it, or the whole path with it."""
     for names in (list(recipes), [f"{run.resolve().name} ({recipe})" for run, recipe in zip(runs, recipes)]):
         if len(set(names)) == len(names):
             return names
     return [f"{run} ({recipe})" for run, recipe in zip(runs, recipes)]
 
 
-def compare_runs(runs: Sequence[Path], format: Format, mixed: bool, console: Console, paper: str | None = None) -> Table:
-    """Print one table of several evaluated runs, and of the paper's numbers for the data set `paper` below them.
+def compare_runs(runs: Sequence[Path], format: Format, mixed: bool, console: Console, paper: str | None = None) -> ResultTable:
+    """Print a table of evaluated runs, followed by the paper's numbers for the data set `paper`, and return it.
 
-    Raises InputError where they were scored on different captures, resolutions or splits, unless `mixed`.
+    Raises InputError if the runs were scored on different captures, resolutions or splits, unless `mixed` is set.
     """
     if not runs:
-        raise InputError("expected at least one run folder, found none; name the folders that `scene-experts train --out` wrote")
+        raise InputError("expected at least one run folder, found none; give the folders that `scene-experts train --out` wrote")
     results = [load_results(Path(run)) for run in runs]
-    names = row_names([Path(run) for run in runs], results)
+    names = name_runs([Path(run) for run in runs], results)
     if not mixed:
         check_protocol(names, results)
     else:
         names = [f"{name} on {result.get('capture')}, {result.get('resolution')}" for name, result in zip(names, results)]
     published = paper_results(paper) if paper else {}
-    made = table([*names, *published], [*results, *published.values()])
-    made = replace(made, notes=(*made.notes, *outdated(names, [Path(run) for run in runs], results)))
+    made = make_table([*names, *published], [*results, *published.values()])
+    made = replace(made, notes=(*made.notes, *find_outdated(names, [Path(run) for run in runs], results)))
     if format == "table":
         if not mixed:
-            console.print(_title(results[0]), markup=False, soft_wrap=True)
+            console.print(_describe_protocol(results[0]), markup=False, soft_wrap=True)
         console.print(to_rich(made, console.width), crop=False)
         for note in made.notes:
             console.print(note, markup=False, soft_wrap=True)
@@ -238,15 +192,15 @@ def compare_runs(runs: Sequence[Path], format: Format, mixed: bool, console: Con
 
 
 def print_results(results: dict[str, Any], console: Console, run: Path) -> None:
-    """Print what an evaluation found and where its pictures are."""
+    """Print the results of an evaluation and where its pictures are."""
 
     def say(line: str) -> None:
         console.print(line, markup=False, soft_wrap=True)
 
     half = "_half" if results.get("appearance") == "half" else ""
     suffix = half or ("" if results["views"] == "test" else f"_{results['views']}")
-    made = table([str(results.get("recipe") or run.name)], [results])
-    say(_title(results))
+    made = make_table([str(results.get("recipe") or run.name)], [results])
+    say(_describe_protocol(results))
     console.print(to_rich(made, console.width), crop=False)
     for note in made.notes:
         say(note)
@@ -258,31 +212,31 @@ def print_results(results: dict[str, Any], console: Console, run: Path) -> None:
     say(f"wrote {run / f'results{suffix}.json'} and pictures in {run / (results['views'] + half) / 'side_by_side'}")
 
 
-def _title(results: dict[str, Any]) -> str:
-    """What the scores of a table are of."""
+def _describe_protocol(results: dict[str, Any]) -> str:
+    """Return what was scored, in words."""
     part = "right halves of " if results.get("appearance") == "half" else ""
     return f"{results['capture']}: {part}{results['view_count']} {results['views']} views ({results['split']}), {results['resolution']}"
 
 
 @cache
-def paper() -> dict[str, Any]:
-    """The MoE-GS paper's tables as data (paper.yaml)."""
+def load_paper() -> dict[str, Any]:
+    """Return the tables of the MoE-GS paper as data (paper.yaml)."""
     return yaml.safe_load(files("scene_experts.evaluate").joinpath("paper.yaml").read_text())
 
 
 def paper_results(dataset: str) -> dict[str, dict[str, Any]]:
-    """The paper's rows for a data set of its tables 1 and 2, by "<method> (paper)", shaped like results.json.
+    """Return the paper's results for a data set of its tables 1 and 2, by "<method> (paper)" and shaped like results.json.
 
-    Its LPIPS is in the convention of 3DGS and stands under lpips_3dgs. Raises InputError for a data set it has no table of.
+    Its LPIPS follows the convention of 3DGS and is `lpips_3dgs`. Raises InputError for a data set without a table.
     """
-    tables = {**_datasets("table1"), **_datasets("table2")}
+    tables = {**_select_datasets("table1"), **_select_datasets("table2")}
     if dataset not in tables:
-        raise InputError(f"expected a data set of the paper ({', '.join(tables)}), found {dataset}; name one of those")
+        raise InputError(f"expected a data set of the paper ({', '.join(tables)}), found {dataset}; choose one of those")
     out = {}
     for method, (psnr, ssim, lpips, megabytes) in tables[dataset].items():
         out[f"{method} (paper)"] = {"psnr": psnr, "ssim": ssim, "lpips_3dgs": lpips, "size": {"MB": megabytes}}
     return out
 
 
-def _datasets(name: str) -> dict[str, dict[str, list[float]]]:
-    return {dataset: rows for dataset, rows in paper()[name].items() if dataset != "columns"}
+def _select_datasets(name: str) -> dict[str, dict[str, list[float]]]:
+    return {dataset: rows for dataset, rows in load_paper()[name].items() if dataset != "columns"}

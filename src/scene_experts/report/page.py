@@ -17,8 +17,9 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json, write_bytes
-from scene_experts.evaluate.pictures import read as read_picture
-from scene_experts.evaluate.tables import Table, load_results, outdated, table, told_apart, unlike
+from scene_experts.evaluate.pictures import read_picture
+from scene_experts.evaluate.results import find_difference, find_outdated, load_results
+from scene_experts.evaluate.tables import ResultTable, distinguish_runs, make_table
 from scene_experts.report import chart
 from scene_experts.report.chart import Line
 from scene_experts.training import run_folder
@@ -69,7 +70,7 @@ def read_run(run: Path) -> Source:
 
 def tell_apart(sources: list[Source]) -> list[Source]:
     """Give runs of the same recipe different names."""
-    names = told_apart([s.path for s in sources], [s.name for s in sources])
+    names = distinguish_runs([s.path for s in sources], [s.name for s in sources])
     return [replace(s, name=name) for s, name in zip(sources, names)]
 
 
@@ -94,10 +95,10 @@ def build_page(sources: Sequence[Source]) -> str:
     subtitle = facts[:1] if len(set(facts)) == 1 else [f"{name}: {fact}" for name, fact in zip(names, facts)]
     groups = group_by_capture(sources)
     views, pictures = show_captures(groups)
-    scores, other = table(names, results), unlike(names, results)
+    scores, other = make_table(names, results), find_difference(names, results)
     parts = [
         f"<h1>{escape(title)}</h1><p class='soft'>{'<br>'.join(map(escape, subtitle))}</p>",
-        *(f"<p><b>{escape(line)}.</b></p>" for line in outdated(names, [s.path for s in sources], results)),
+        *(f"<p><b>{escape(line)}.</b></p>" for line in find_outdated(names, [s.path for s in sources], results)),
         f"<p><b>Do not compare these scores:</b> expected {escape(other[0])}.</p>" if other else "",
         format_table(replace(scores, best=frozenset()) if other else scores),
         "<h2>Held-out views</h2><p class='soft'>Move the pointer over a picture, or drag the slider.</p>",
@@ -122,7 +123,7 @@ def describe_scores(r: dict[str, Any]) -> str:
     return f"{r.get('view_count')} {r.get('views')} views ({r.get('split')}), {r.get('resolution')}{steps}"
 
 
-def format_table(found: Table) -> str:
+def format_table(found: ResultTable) -> str:
     """Return a table as HTML, with its best cells marked and its notes below."""
     head = "".join(f"<th>{escape(t)}</th>" for t in found.titles)
     rows = []

@@ -9,8 +9,9 @@ from pathlib import Path
 import torch
 
 from scene_experts.core.io import write_bytes
-from scene_experts.evaluate import expert_pictures, pictures
-from scene_experts.evaluate.tables import Table
+from scene_experts.evaluate import pictures
+from scene_experts.evaluate.experts import draw_expert_strip
+from scene_experts.evaluate.tables import ResultTable
 from scene_experts.render import choose
 from scene_experts.reproduce import claims, figures, store, tables
 from scene_experts.reproduce.experiments import Experiment
@@ -67,7 +68,7 @@ def caveat(records: Sequence[Record]) -> list[str]:
 
 def write_tables(out: Path, experiment: Experiment, scenes: Sequence[Scene], records: Sequence[Record]) -> list[Path]:
     """Write an experiment's tables: means for each data set, and the first column scene by scene."""
-    made: dict[str, Table] = {}
+    made: dict[str, ResultTable] = {}
     datasets = list(dict.fromkeys(s.dataset for s in scenes if s.dataset == OWN or s.dataset in experiment.datasets))
     for dataset in datasets:
         allowed = None if dataset == OWN else experiment.scenes_of(dataset)
@@ -123,11 +124,11 @@ def draw_experts(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
         index = (capture.test or capture.train)[0]
         rasterize = choose("auto", "cpu", antialias=opened.cfg.antialias)
         background = torch.tensor(capture.background)
-        sheet = expert_pictures.strip(opened.scene, capture.views[index].camera, opened.step, rasterize, background, attribute)
+        sheet = draw_expert_strip(opened.scene, capture.views[index].camera, opened.step, rasterize, background, attribute)
     finally:
         capture.images.close()
     path = strip_path(out, spec.scene.name)
-    pictures.write(path, sheet)
+    pictures.write_picture(path, sheet)
     figures.wrap_in_svg(path)
     return path
 

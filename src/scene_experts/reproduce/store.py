@@ -16,7 +16,7 @@ from typing import Any
 
 from scene_experts.core.errors import InputError, few
 from scene_experts.core.io import read_json, write_bytes
-from scene_experts.evaluate.tables import load_results
+from scene_experts.evaluate.results import load_results
 from scene_experts.reproduce.columns import columns, length, rows, text
 from scene_experts.reproduce.plan import Spec, identity
 from scene_experts.training.config import RunConfig, from_json, to_json

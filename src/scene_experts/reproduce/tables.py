@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from scene_experts.evaluate.tables import Table, paper, to_markdown
+from scene_experts.evaluate.tables import ResultTable, load_paper, to_markdown
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN
 from scene_experts.reproduce.statistics import Mean, clock_of, complete_seeds, mean
@@ -45,7 +45,7 @@ def cases(records: Sequence[Record]) -> set[tuple[str, int]]:
     return {(r.scene, r.seed) for r in records}
 
 
-def by_dataset(experiment: Experiment, records: Sequence[Record], dataset: str, scenes: Sequence[str]) -> Table:
+def by_dataset(experiment: Experiment, records: Sequence[Record], dataset: str, scenes: Sequence[str]) -> ResultTable:
     """Make the table with one row per method and means over `scenes`: our columns, then the paper's where it has this data set."""
     found = rows_of(experiment, records, scenes)
     theirs = paper_numbers(experiment, dataset)
@@ -67,7 +67,7 @@ def by_dataset(experiment: Experiment, records: Sequence[Record], dataset: str, 
             )
         rows.append((name, *cells))
     said = notes(found) + (time_notes(together) if {"train_seconds", "cpu_seconds"} & set(columns) else ())
-    return Table(tuple(titles), tuple(rows), best(values, columns), said)
+    return ResultTable(tuple(titles), tuple(rows), best(values, columns), said)
 
 
 def columns_of(experiment: Experiment, records: Sequence[Record]) -> list[str]:
@@ -76,7 +76,7 @@ def columns_of(experiment: Experiment, records: Sequence[Record]) -> list[str]:
     return own + [c for c in experiment.added if records and all(r.value(c) is not None for r in records)]
 
 
-def by_scene(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str]) -> Table:
+def by_scene(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str]) -> ResultTable:
     """Make the table of the experiment's first column (PSNR as a rule), one row per method and one column per scene."""
     found, column = rows_of(experiment, records, scenes), experiment.columns[0]
     rows, values = [], []
@@ -87,10 +87,10 @@ def by_scene(experiment: Experiment, records: Sequence[Record], scenes: Sequence
         fair = [{r.seed for r in some} == every[scene] for some, scene in zip(here, scenes)]
         values.append([m.value if m and f else None for m, f in zip(means, fair)])
         rows.append((name, *(text(m, column) for m in means)))
-    return Table((COLUMNS[column].title, *scenes), tuple(rows), best(values, [column] * len(scenes)))
+    return ResultTable((COLUMNS[column].title, *scenes), tuple(rows), best(values, [column] * len(scenes)))
 
 
-def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str) -> Table | None:
+def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str) -> ResultTable | None:
     """Make the table of each expert's share of all N anchors at the end of the training, in %: of the N k assignments, then of the anchors.
 
     Uses the first seed. None where no row has experts on this scene.
@@ -106,14 +106,14 @@ def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str)
         return None
     experts = range(1, len(rows[0]) // 2)
     titles = ("", *(f"expert {e}" for e in experts), *(f"expert {e}, of anchors" for e in experts), "gate entropy")
-    return Table(titles, tuple(rows))
+    return ResultTable(titles, tuple(rows))
 
 
 def paper_numbers(experiment: Experiment, dataset: str) -> dict[str, list[float]]:
     """Return the paper's numbers of a data set by row; empty where it has none."""
     if experiment.paper is None or dataset == OWN:
         return {}
-    section = paper()[experiment.paper]
+    section = load_paper()[experiment.paper]
     if "columns" in section:
         return section.get(dataset, {})
     return {name: [numbers[dataset]] for name, numbers in section.items() if dataset in numbers}
@@ -188,7 +188,7 @@ def densifications(train: Train) -> int:
     return train.scaled().growth.adjust.count(train.iterations)
 
 
-def to_latex(table: Table, caption: str) -> str:
+def to_latex(table: ResultTable, caption: str) -> str:
     """Format a booktabs table with the best cell of each column in bold."""
     rows = [
         [rf"\textbf{{{escape(c)}}}" if (i, j) in table.best else escape(c) for j, c in enumerate(row)] for i, row in enumerate(table.rows)
@@ -207,7 +207,7 @@ def escape(cell: str) -> str:
     return cell
 
 
-def to_csv(tables: dict[str, Table]) -> str:
+def to_csv(tables: dict[str, ResultTable]) -> str:
     """Format one line per cell: table, row, column, value, spread over seeds. Empty cells are left out."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -221,7 +221,7 @@ def to_csv(tables: dict[str, Table]) -> str:
     return out.getvalue()
 
 
-def write_all(title: str, tables: dict[str, Table]) -> dict[str, str]:
+def write_all(title: str, tables: dict[str, ResultTable]) -> dict[str, str]:
     """Return the text of the files of an experiment by suffix: md, csv and tex, each with all its tables."""
     markdown = f"# {title}\n\n" + "\n".join(f"## {name}\n\n{to_markdown(table)}" for name, table in tables.items())
     return {

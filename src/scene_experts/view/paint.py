@@ -10,7 +10,7 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Decoded, Mode, Render
-from scene_experts.evaluate.expert_pictures import chosen_by, keep
+from scene_experts.evaluate.experts import assign_gaussians, select_gaussians
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Draws, Scene, Traits
 
@@ -63,13 +63,13 @@ def paint(
     decoded = (scene if draws is None or routed else draws)(camera, step, Mode.DRAW, rasterize.visible)
     gaussians = decoded.gaussians
     if look.only is not None:
-        mine = chosen_by(require_routing(decoded, look.attribute), look.attribute, scene.K)
+        mine = assign_gaussians(require_routing(decoded, look.attribute), look.attribute, scene.K)
         wanted = [e for e in look.only if 0 <= e < mine.shape[1]]
         mask = mine[:, wanted].any(1)
-        gaussians = keep(gaussians, mask)
+        gaussians = select_gaussians(gaussians, mask)
     if look.box is not None:
         low, high = (gaussians.means.new_tensor(corner) for corner in look.box)
-        gaussians = keep(gaussians, ((gaussians.means >= low) & (gaussians.means <= high)).all(1))
+        gaussians = select_gaussians(gaussians, ((gaussians.means >= low) & (gaussians.means <= high)).all(1))
     if look.show in ("experts", "entropy", "activation"):
         colours = color_rows(decoded, look)
         place = torch.searchsorted(decoded.rows, torch.div(gaussians.source, scene.K, rounding_mode="floor"))

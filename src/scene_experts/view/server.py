@@ -97,7 +97,7 @@ class Viewer:
         except OSError as error:
             raise RunError(f"cannot serve on {self.host}:{self.port}: {error.strerror or error}; choose another --port") from error
         self.lock = threading.Lock()
-        self.device = self.current()[0].positions.device
+        self.device = self.current()[0].table.device
         rig = analyse_cameras(self.capture)
         self.server.scene.set_up_direction(tuple(rig.up.tolist()))
         self.centre, self.reach = rig.centre, float((rig.positions - rig.centre).norm(dim=1).median())

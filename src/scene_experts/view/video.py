@@ -87,7 +87,7 @@ def write_pictures(folder: Path, frames: Iterable[np.ndarray]) -> int:
     for count, frame in enumerate(frames, 1):
         if count > len(earlier):
             write_json(note, {"frames": count})  # first, because a picture without a note counts as foreign
-        pictures.write(folder / f"{count - 1:05d}.png", frame)
+        pictures.write_picture(folder / f"{count - 1:05d}.png", frame)
     for old in earlier[count:]:
         old.unlink(missing_ok=True)
     write_json(note, {"frames": count})

@@ -27,11 +27,11 @@ def test_pictures_beside_each_other_and_the_path_as_a_file(run, tmp_path, capsys
     args = ["render", str(run), "--out", str(tmp_path / "frames"), "--size", "48x32", "--fps", "4", "--seconds", "1", "--path", "orbit"]
     assert cli.main([*args, "--show", "picture", "experts", "--save-path", str(tmp_path / "p.json")]) == 0
     assert "4 frames" in capsys.readouterr().out
-    assert pictures.read(tmp_path / "frames" / "00003.png").shape == (32, 2 * 48 + 4, 3)
+    assert pictures.read_picture(tmp_path / "frames" / "00003.png").shape == (32, 2 * 48 + 4, 3)
     assert len(json.loads((tmp_path / "p.json").read_text())["keyframes"]) == 4
     again = ["render", str(run), "--out", str(tmp_path / "again"), "--path", str(tmp_path / "p.json"), "--show", "picture"]
     assert cli.main(again) == 0
-    first, second = (pictures.read(tmp_path / name / "00002.png")[:, :48].astype(int) for name in ("frames", "again"))
+    first, second = (pictures.read_picture(tmp_path / name / "00002.png")[:, :48].astype(int) for name in ("frames", "again"))
     assert abs(first - second).mean() < 1
 
 
@@ -39,7 +39,7 @@ def test_views_of_several_sizes_are_no_video(run, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     args = ["render", str(run), "--path", "test", "--out"]
     assert cli.main([*args, str(tmp_path / "frames")]) == 0
-    assert len({pictures.read(path).shape for path in (tmp_path / "frames").glob("*.png")}) == 2
+    assert len({pictures.read_picture(path).shape for path in (tmp_path / "frames").glob("*.png")}) == 2
     assert cli.main([*args, str(tmp_path / "x.mp4")]) == 2 and not (tmp_path / "x.mp4").exists()
     assert cli.main([*args, str(tmp_path / "x.mp4"), "--size", "48x32"]) == 0 and (tmp_path / "x.mp4").stat().st_size > 0
 

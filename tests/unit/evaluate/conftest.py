@@ -17,5 +17,5 @@ def no_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "cache"))
     monkeypatch.setattr(weights, "cache_dir", lambda: tmp_path / "cache" / "scene-experts")
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
-    monkeypatch.setattr(weights, "package_folders", lambda package, *parts: [])
+    monkeypatch.setattr(weights, "find_package_folders", lambda package, *parts: [])
     monkeypatch.delenv(weights.VARIABLE, raising=False)

@@ -36,11 +36,11 @@ def started(capture, appearance=8):
 
 def test_halves_share_no_pixel():
     for width in (6, 7):
-        left, right = halves.left(4, width), halves.right_mask(None, 4, width)
+        left, right = halves.left_half(4, width), halves.right_half(None, 4, width)
         assert torch.equal(left + right, torch.ones(4, width)) and left[0].sum() == width // 2
     mask = torch.zeros(4, 6)
     mask[:, 2:4] = 1
-    assert halves.right_mask(mask, 4, 6).sum() == 4
+    assert halves.right_half(mask, 4, 6).sum() == 4
 
 
 def test_the_code_is_found_on_the_left_half_alone(capture):
@@ -50,11 +50,11 @@ def test_the_code_is_found_on_the_left_half_alone(capture):
     scene.codes.fitted[camera.id] = code
     with torch.no_grad():
         photo = draw(scene(camera, STEP, Mode.DRAW, draw.visible).gaussians, camera, black).image.clamp(0, 1)
-    left = halves.left(camera.height, camera.width)
+    left = halves.left_half(camera.height, camera.width)
     misled = photo.clone()
     misled[:, camera.width // 2 :] = torch.rand_like(misled[:, camera.width // 2 :])  # what is not counted does not matter
     before = {name: p.detach().clone() for name, p in scene.named_parameters()}
-    found = halves.fitted(scene, scene.codes, draw, camera, misled, left, STEP, black)
+    found = halves.fit_code(scene, scene.codes, draw, camera, misled, left, STEP, black)
     errors = {}
     for name, value in (("mean", scene.codes.table.detach().mean(0)), ("found", found)):
         scene.codes.fitted[camera.id] = value

@@ -67,7 +67,7 @@ def test_refuses() -> None:
         Lpips("alex", {k: v for k, v in random_tensors("alex").items() if k != "lin4"})
 
 
-@pytest.mark.skipif(weights.why_absent("vgg") is not None, reason="no VGG weights on this machine")
+@pytest.mark.skipif(weights.explain_missing("vgg") is not None, reason="no VGG weights on this machine")
 def test_documented_values() -> None:
     """torchmetrics 0.x documented two values for VGG: pictures as drawn, and the same rescaled to [-1, 1].
 

@@ -82,7 +82,7 @@ def test_each_variant_gets_its_own_input() -> None:
     assert found["lpips"] == networks["vgg"](2 * image - 1, 2 * target - 1)
     assert found["lpips_3dgs"] == networks["vgg"](image, target)
     assert found["lpips_alex"] == networks["alex"](2 * image - 1, 2 * target - 1)
-    assert found.keys() == metrics.BACKBONE.keys() < metrics.VARIANTS.keys()
+    assert found.keys() == metrics.NETWORKS.keys() < metrics.VARIANTS.keys()
 
 
 def test_without_weights_the_reason_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,8 +100,8 @@ def test_without_weights_the_reason_is_kept(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_download_is_for_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     fetched: list[str] = []
-    monkeypatch.setattr(weights, "why_absent", lambda net, explicit=None: None if net == "vgg" or fetched else "absent")
-    monkeypatch.setattr(metrics.download, "lpips", lambda net, progress=None: fetched.append(net))
+    monkeypatch.setattr(weights, "explain_missing", lambda net, explicit=None: None if net == "vgg" or fetched else "absent")
+    monkeypatch.setattr(weights, "download", lambda net, progress=None: fetched.append(net))
     monkeypatch.setattr(weights, "load", lambda net, explicit=None: (random_tensors(net), "here"))
     assert not Perceptual.find(fetch=True).absent and fetched == ["alex"]
 

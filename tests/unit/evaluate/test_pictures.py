@@ -21,22 +21,22 @@ def test_rounding_is_that_of_the_protocol() -> None:
 def test_8_bit_pictures_survive_a_round_trip(tmp_path: Path) -> None:
     pixels = np.arange(256, dtype=np.uint8).reshape(16, 16)
     image = np.stack([pixels, pixels.T, 255 - pixels], axis=-1)
-    pictures.write(tmp_path / "a" / "b.png", image)
-    assert np.array_equal(pictures.read(tmp_path / "a" / "b.png"), image)
+    pictures.write_picture(tmp_path / "a" / "b.png", image)
+    assert np.array_equal(pictures.read_picture(tmp_path / "a" / "b.png"), image)
     assert np.array_equal(pictures.to_8bit(pictures.from_8bit(image)), image)
-    pictures.write(tmp_path / "mask.png", pixels)
-    assert np.array_equal(pictures.read(tmp_path / "mask.png", "L"), pixels)
+    pictures.write_picture(tmp_path / "mask.png", pixels)
+    assert np.array_equal(pictures.read_picture(tmp_path / "mask.png", "L"), pixels)
 
 
 def test_names_stay_apart() -> None:
-    found = pictures.file_names(["b/1.jpg", "a/1.jpg", "x.1.jpg", "x.2.jpg", "y.jpg", "Y.png"])
+    found = pictures.make_file_names(["b/1.jpg", "a/1.jpg", "x.1.jpg", "x.2.jpg", "y.jpg", "Y.png"])
     assert found["b/1.jpg"] == "b/1.png" and found["a/1.jpg"] == "a/1.png"
     assert found["x.1.jpg"] == "x.1.png" and found["x.2.jpg"] == "x.2.png"
     assert found["y.jpg"] == "y.jpg.png" and found["Y.png"] == "Y.png.png"
 
 
 def test_heat_rises_from_black_to_white() -> None:
-    colours = pictures.heat(np.linspace(0, 2 * pictures.WORST, 101)[None])[0].astype(int)
+    colours = pictures.color_errors(np.linspace(0, 2 * pictures.WORST, 101)[None])[0].astype(int)
     assert colours[0].tolist() == [0, 0, 0] and colours[50].tolist() == colours[100].tolist() == list(pictures.HEAT[-1])
     brightness = colours[:51] @ np.array([0.299, 0.587, 0.114])
     assert (np.diff(brightness) >= 0).all()
@@ -46,14 +46,14 @@ def test_errors_count_only_where_the_mask_does() -> None:
     photo, render = np.zeros((4, 6, 3), np.uint8), np.full((4, 6, 3), 64, np.uint8)
     mask = np.zeros((4, 6), np.uint8)
     mask[:, :3] = 255
-    drawn = pictures.error_map(render, photo, mask)
+    drawn = pictures.draw_error_map(render, photo, mask)
     assert drawn[:, 3:].max() == 0 and drawn[:, :3].min() > 200
 
 
 @pytest.mark.parametrize("width", [3, 60, 300])
 def test_side_by_side(width: int) -> None:
     photo, render = np.full((20, width, 3), 10, np.uint8), np.full((20, width, 3), 200, np.uint8)
-    sheet = pictures.side_by_side(photo, render, render, ("photograph", "render", "error"))
+    sheet = pictures.compose_comparison(photo, render, render, ("photograph", "render", "error"))
     assert sheet.shape == (20 + pictures.BAR, 3 * width + 2 * pictures.GAP, 3)
     top, second = pictures.BAR, width + pictures.GAP
     assert np.array_equal(sheet[top:, :width], photo) and np.array_equal(sheet[top:, second : second + width], render)
@@ -63,28 +63,28 @@ def test_side_by_side(width: int) -> None:
 def test_unreadable_picture(tmp_path: Path) -> None:
     (tmp_path / "x.png").write_bytes(b"no picture")
     with pytest.raises(InputError):
-        pictures.read(tmp_path / "x.png")
+        pictures.read_picture(tmp_path / "x.png")
     with pytest.raises(InputError):
-        pictures.read(tmp_path / "gone.png")
+        pictures.read_picture(tmp_path / "gone.png")
 
 
 def test_clear_leaves_other_files(tmp_path: Path) -> None:
     for kind in ("renders", "experts"):
-        pictures.write(tmp_path / kind / "old.png", np.zeros((2, 2), np.uint8))
+        pictures.write_picture(tmp_path / kind / "old.png", np.zeros((2, 2), np.uint8))
     (tmp_path / "mine.txt").write_text("keep")
-    pictures.clear(tmp_path)
+    pictures.remove_pictures(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
 def test_a_strip_has_a_white_gap():
     left, right = torch.zeros(5, 7, 3), torch.full((5, 6, 3), 0.5)
-    made = pictures.strip([left, right], gap=2)
+    made = pictures.join_pictures([left, right], gap=2)
     assert made.shape == (5, 15, 3) and (made[:, 7:9] == 1).all() and (made[:, 9:] == 0.5).all()
 
 
 def test_captions_of_a_wide_row_grow_with_it():
     part = np.zeros((20, 400, 3), np.uint8)
-    narrow, wide = (pictures.row([part] * n, ["expert 1"] * n) for n in (3, 6))
+    narrow, wide = (pictures.compose_row([part] * n, ["expert 1"] * n) for n in (3, 6))
     assert narrow.shape[0] == pictures.BAR + 20 and wide.shape[0] == 2 * pictures.BAR + 20
     ink = [np.flatnonzero((sheet[:-20, :400] < 128).any(axis=(1, 2))) for sheet in (narrow, wide)]
     assert np.ptp(ink[1]) > 1.6 * np.ptp(ink[0]) > 0
@@ -92,5 +92,5 @@ def test_captions_of_a_wide_row_grow_with_it():
 
 def test_narrowed_keeps_what_is_narrow_enough():
     part = np.full((30, 60, 3), 7, np.uint8)
-    assert pictures.narrowed(part, 60) is part
-    assert pictures.narrowed(part, 20).shape == (10, 20, 3) and (pictures.narrowed(part, 20) == 7).all()
+    assert pictures.limit_width(part, 60) is part
+    assert pictures.limit_width(part, 20).shape == (10, 20, 3) and (pictures.limit_width(part, 20) == 7).all()

@@ -17,13 +17,12 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Render, Routing
 from scene_experts.evaluate import metrics, pictures, weights
-from scene_experts.evaluate import score as run
 from scene_experts.evaluate.options import EvalOptions
-from scene_experts.evaluate.score import About, evaluate
+from scene_experts.evaluate.results import About
+from scene_experts.evaluate.score import evaluate
 from scene_experts.scene import Scene, Traits
 from support.lpips import random_tensors
 from support.messages import naming
-from support.scenes import start_scene
 
 N, K, F, H, W = 6, 4, 8, 36, 48
 
@@ -127,7 +126,7 @@ def test_files_and_figures(tmp_path: Path) -> None:
         assert sorted(p.relative_to(tmp_path).as_posix() for p in (tmp_path / "test" / kind).rglob("*.png")) == [
             f"test/{kind}/day/{i}.png" for i in (0, 2)
         ]
-    assert np.array_equal(pictures.read(tmp_path / "test" / "gt" / "day" / "2.png"), photo(2).numpy())
+    assert np.array_equal(pictures.read_picture(tmp_path / "test" / "gt" / "day" / "2.png"), photo(2).numpy())
     assert json.loads((tmp_path / "results.json").read_text()) == results
     per_view = json.loads((tmp_path / "per_view.json").read_text())
     assert list(per_view) == ["day/0.jpg", "day/2.jpg"]
@@ -147,19 +146,10 @@ def test_scores_are_those_of_the_8_bit_files(tmp_path: Path) -> None:
     assert evaluated(tmp_path, rasterize=FakeRasterizer(0.3 / 255))["psnr"] == 100.0
     results = evaluated(tmp_path, rasterize=FakeRasterizer(0.1))
     files = [tmp_path / "test" / "renders" / "day" / "0.png", tmp_path / "test" / "gt" / "day" / "0.png"]
-    a, b = (pictures.read(file).astype(np.float64) / 255 for file in files)
+    a, b = (pictures.read_picture(file).astype(np.float64) / 255 for file in files)
     per_view = json.loads((tmp_path / "per_view.json").read_text())
     assert per_view["day/0.jpg"]["psnr"] == pytest.approx(-10 * np.log10(np.mean((a - b) ** 2)), abs=1e-4)
     assert results["psnr"] == pytest.approx(20 * np.log10(255 / 26), abs=1e-4)  # 25.5 off, rounded up everywhere
-
-
-@pytest.mark.parametrize(("recipe", "row"), [("scaffold-gs", 316), ("3dgs", 248)])
-def test_sizes_are_those_of_the_published_layouts(recipe: str, row: int) -> None:
-    scene = start_scene(recipe)
-    size, networks = run.sizes(scene), sum(4 * t.numel() for t in scene.network_tensors().values())
-    assert size["ply_bytes"] == row * len(scene.table) and size["network_bytes"] == networks
-    assert size["total_bytes"] == row * len(scene.table) + networks
-    assert size["MB"] == size["total_bytes"] / 1e6 and size["MiB"] == size["total_bytes"] / 2**20
 
 
 def test_absent_lpips_is_null_with_its_reason(tmp_path: Path) -> None:
@@ -174,7 +164,7 @@ def test_masks_are_respected(tmp_path: Path) -> None:
     mask[:, :20] = 1.0
     results = evaluated(tmp_path, FakeCapture(mask=mask), FakeRasterizer(0.3, slice(20, None)))  # wrong only where nothing counts
     assert results["psnr"] == 100.0 and results["ssim"] == pytest.approx(1) and results["masked"]
-    assert (pictures.read(tmp_path / "test" / "errors" / "day" / "0.png") == 0).all()
+    assert (pictures.read_picture(tmp_path / "test" / "errors" / "day" / "0.png") == 0).all()
     assert evaluated(tmp_path, FakeCapture(mask=mask), FakeRasterizer(0.3))["psnr"] < 20
     with pytest.raises(InputError, match="masks"):
         evaluated(tmp_path, FakeCapture(mask=torch.zeros(H, W)))
@@ -205,11 +195,11 @@ def test_a_strip_of_one_view_by_expert(tmp_path: Path) -> None:
     evaluated(tmp_path, lpips=False)
     folder = tmp_path / "test" / "experts"
     assert [p.name for p in folder.iterdir()] == ["color.png"]
-    sheet, drawn = pictures.read(folder / "color.png"), pictures.read(tmp_path / "test" / "renders" / "day" / "0.png")
+    sheet, drawn = pictures.read_picture(folder / "color.png"), pictures.read_picture(tmp_path / "test" / "renders" / "day" / "0.png")
     assert sheet.shape == (pictures.BAR + H, 3 * W + 2 * pictures.GAP, 3)
     for i in range(3):  # the rasteriser draws the first view whatever it is given
         assert np.array_equal(sheet[pictures.BAR :, i * (W + pictures.GAP) :][:, :W], drawn)
-    pictures.write(folder / "opacity.png", drawn)  # as an evaluation of another scene left it
+    pictures.write_picture(folder / "opacity.png", drawn)  # as an evaluation of another scene left it
     evaluated(tmp_path, lpips=False)
     evaluated(tmp_path, lpips=False, views="train")
     assert [p.name for p in folder.iterdir()] == ["color.png"] and (tmp_path / "train" / "experts" / "color.png").is_file()
@@ -228,4 +218,4 @@ def test_lpips_where_there_are_weights(tmp_path: Path, monkeypatch: pytest.Monke
     results = evaluated(tmp_path)
     assert results["lpips"] > 0 and results["lpips_3dgs"] > 0 and results["lpips_alex"] > 0 and not results["absent"]
     assert results["lpips_weights"] == {"vgg": "vgg from here", "alex": "alex from here"}
-    assert metrics.BACKBONE.keys() <= json.loads((tmp_path / "per_view.json").read_text())["day/0.jpg"].keys()
+    assert metrics.NETWORKS.keys() <= json.loads((tmp_path / "per_view.json").read_text())["day/0.jpg"].keys()

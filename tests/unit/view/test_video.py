@@ -19,7 +19,7 @@ def test_pictures_are_the_frames_and_those_of_a_longer_path_go(tmp_path):
     (tmp_path / "mine.png").write_bytes(b"kept")
     assert video.write_pictures(tmp_path, frames(3)) == 3
     assert sorted(p.name for p in tmp_path.iterdir()) == ["00000.png", "00001.png", "00002.png", "frames.json", "mine.png"]
-    assert np.array_equal(pictures.read(tmp_path / "00002.png"), frames(3)[2])
+    assert np.array_equal(pictures.read_picture(tmp_path / "00002.png"), frames(3)[2])
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="--out"):
         video.write_pictures(tmp_path / "file", frames(1))

@@ -8,7 +8,7 @@ from scene_experts.core.checkpoint import read_tensors
 from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.core.types import Mode
-from scene_experts.evaluate.score import sizes
+from scene_experts.evaluate.results import describe_size
 from scene_experts.files.export import export_run
 from scene_experts.files.graph import write as graph_points
 from scene_experts.files.ply import read_vertices
@@ -25,9 +25,9 @@ def test_a_row_takes_196_bytes_in_the_layout_of_sags(made):
     assert list(columns) == [*names, *(f"scale_{i}" for i in range(6)), *(f"rot_{i}" for i in range(4))]
     assert sum(c.dtype.itemsize for c in columns.values()) == 196 and all(c.dtype == np.float32 for c in columns.values())
     scene = run_folder.open_run(run).scene
-    assert sizes(scene)["ply_bytes"] == 196 * len(columns["x"]) and float(columns["opacity"][0]) == pytest.approx(-2.1972246)
+    assert describe_size(scene)["ply_bytes"] == 196 * len(columns["x"]) and float(columns["opacity"][0]) == pytest.approx(-2.1972246)
     networks = 4256 + 4320 + 4448 + 6336 + 192 + scene.grid.table.numel()
-    assert sizes(scene)["network_bytes"] == 4 * networks
+    assert describe_size(scene)["network_bytes"] == 4 * networks
 
 
 def test_the_files_alone_give_the_same_picture_in_the_capture_s_own_frame(made):

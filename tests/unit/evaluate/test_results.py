@@ -1,0 +1,46 @@
+"""What results.json states, and when two of them may be compared."""
+
+from __future__ import annotations
+
+import pytest
+
+from scene_experts.core.errors import InputError
+from scene_experts.evaluate.metrics import Perceptual
+from scene_experts.evaluate.results import check_protocol, describe_scores, describe_size, find_difference, find_outdated
+from support.messages import naming
+from support.scenes import start_scene
+
+
+@pytest.mark.parametrize(("recipe", "row"), [("scaffold-gs", 316), ("3dgs", 248)])
+def test_sizes_are_those_of_the_published_layouts(recipe: str, row: int) -> None:
+    scene = start_scene(recipe)
+    size, networks = describe_size(scene), sum(4 * t.numel() for t in scene.network_tensors().values())
+    assert size["ply_bytes"] == row * len(scene.table) and size["network_bytes"] == networks
+    assert size["total_bytes"] == row * len(scene.table) + networks
+    assert size["MB"] == size["total_bytes"] / 1e6 and size["MiB"] == size["total_bytes"] / 2**20
+
+
+def test_what_was_trained_on_after_it_was_scored_is_said(tmp_path):
+    for step in (231, 400):
+        (tmp_path / "checkpoints").mkdir(exist_ok=True)
+        (tmp_path / "checkpoints" / f"ckpt_{step:06d}.safetensors").touch()
+    found = find_outdated(["moe-gs", "other"], [tmp_path, tmp_path / "none"], [{"step": 231}, {"step": 5}])
+    assert len(found) == 1 and all(fact in found[0] for fact in ("moe-gs", "231", "400", f"eval {tmp_path}"))
+    assert find_outdated(["moe-gs"], [tmp_path], [{"step": 400}]) == find_outdated(["moe-gs"], [tmp_path], [{}]) == []
+
+
+def test_means_are_over_the_views_that_have_a_score():
+    view = {"psnr": 20.0, "ssim": 0.5, "masked": False, "sharpness": 0.1, "sharpness_photo": 0.2}
+    found = describe_scores({"a": view, "b": {**view, "psnr": 30.0}, "hidden": {}}, Perceptual.off())
+    assert found["psnr"] == 25.0 and found["sharpness"]["ratio"] == 0.5 and not found["masked"]
+    assert found["lpips"] is None and "--no-lpips" in found["absent"]["lpips"]
+    with pytest.raises(InputError, match="masks"):
+        describe_scores({"hidden": {}}, Perceptual.off())
+
+
+def test_the_first_difference_in_the_protocol_is_named():
+    one, two = {"split": "mod8", "view_count": 9}, {"split": "mod4", "view_count": 9}
+    assert find_difference(["a", "b"], [one, {**one, "appearance": "rule"}]) is None
+    assert find_difference(["a", "b"], [one, two]) == ("the same split, found mod8 in a and mod4 in b", "--split")
+    with pytest.raises(InputError, match=naming("--split", "--mixed")):
+        check_protocol(["a", "b"], [one, two])
