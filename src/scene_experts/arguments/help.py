@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import textwrap
 from collections.abc import Sequence
+from dataclasses import fields
 
 from scene_experts.arguments import docs
 from scene_experts.arguments.table import Row
@@ -74,11 +75,11 @@ def groups(kind: type, shown: Sequence[Row]) -> list[tuple[str, list[Row]]]:
     """Rows under their headings: the dataclass that declares them, or, of a small one, the dataclass around it."""
     out: dict[tuple[str, type | None], list[Row]] = {}
     for row in shown:
-        out.setdefault(_group(row, shown), []).append(row)
+        out.setdefault(_group(row), []).append(row)
     titles = []
-    for (prefix, owner), rows in out.items():
-        text = docs.title(owner) if owner and owner is not kind else ""
-        titles.append((f"{prefix.removesuffix('.')}: {text}" if prefix and text else prefix.removesuffix(".") or text or "Options", rows))
+    for (prefix, owner), rows in sorted(out.items(), key=lambda item: bool(item[0][0])):  # parts of the value come last
+        name, text = prefix.removesuffix("."), docs.title(owner) if owner and owner is not kind else ""
+        titles.append((f"{name}: {text}" if name and text else name or text or "Options", rows))
     return titles
 
 
@@ -87,12 +88,15 @@ def _prefix(row: Row) -> str:
     return before + dot
 
 
-def _group(row: Row, shown: Sequence[Row]) -> tuple[str, type | None]:
-    prefix, owner = _prefix(row), row.owner
-    if prefix and len([each for each in shown if _prefix(each) == prefix]) <= SMALL and "." in prefix[:-1]:
-        prefix = prefix[:-1].rpartition(".")[0] + "."
-        owner = next((each.owner for each in shown if _prefix(each) == prefix), None)
-    return prefix, owner
+def _is_small(row: Row) -> bool:
+    """Whether the dataclass of a row is too small for a heading of its own."""
+    return "." in _prefix(row)[:-1] and len(fields(row.owner)) <= SMALL
+
+
+def _group(row: Row) -> tuple[str, type | None]:
+    if row.within and _is_small(row):
+        return _prefix(row)[:-1].rpartition(".")[0] + ".", row.within[0]
+    return _prefix(row), row.owner
 
 
 def group(title: str, rows: Sequence[Row], width: int) -> str:
@@ -117,6 +121,9 @@ def columns(left: str, text: str, width: int | None = None) -> list[str]:
 def described(row: Row) -> str:
     """What an option does, and its default where the text does not say it."""
     text = docs.of_field(row.owner, row.place[-1])
+    if text and row.within and _is_small(row):
+        above = docs.of_field(*row.within).partition(". ")[0].removesuffix(".")
+        text = f"{above}: {text[0].lower()}{text[1:]}" if above else text
     if stands_for(row) == "NAME":
         text = f"{text} One of {known(row.kind)}.".strip()
     plain = row.required or row.default is None or row.default is False or row.default == ()

@@ -30,6 +30,8 @@ class Row:
     option: Option
     owner: type
     """The dataclass that declares the field."""
+    within: tuple[type, str] | None = None
+    """The dataclass and field that hold the owner; None at the root."""
 
     @property
     def required(self) -> bool:
@@ -54,10 +56,10 @@ def rows(kind: type, defaults: Mapping[str, Any]) -> list[Row]:
     defaults: values by dotted place ("data.split") that replace those of the fields. A field that may hold one of several dataclasses
     has the options of its default's class.
     """
-    return _rows(kind, MISSING, "", (), defaults)
+    return _rows(kind, MISSING, "", (), defaults, None)
 
 
-def _rows(kind: type, value: Any, prefix: str, place: Place, defaults: Mapping[str, Any]) -> list[Row]:
+def _rows(kind: type, value: Any, prefix: str, place: Place, defaults: Mapping[str, Any], within: tuple[type, str] | None) -> list[Row]:
     out: list[Row] = []
     for field in fields(kind):
         option, inner = _annotation(kind, field.name)
@@ -68,9 +70,9 @@ def _rows(kind: type, value: Any, prefix: str, place: Place, defaults: Mapping[s
         if option.hidden or not field.init or (part is None and _may_be_dataclass(inner)):
             continue
         if part is not None:
-            out += _rows(part, default, f"{prefix}{name}." if name else prefix, here, defaults)
+            out += _rows(part, default, f"{prefix}{name}." if name else prefix, here, defaults, (kind, field.name))
         else:
-            out.append(Row(f"--{prefix}{name}", here, inner, default, option, kind))
+            out.append(Row(f"--{prefix}{name}", here, inner, default, option, kind, within))
     return out
 
 

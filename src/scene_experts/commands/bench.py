@@ -11,14 +11,14 @@ from scene_experts.commands import PROG
 
 @dataclass(frozen=True)
 class BenchCommand:
-    """Print this machine's figures: rasteriser, decode, loss, a whole training step and the gain of threads, each beside a named peer."""
+    """Measure the speed of this machine: rasteriser, decoding, loss, a training step and multithreading, each next to a named peer."""
 
     seconds: float = 60.0
-    """How long to measure, about. Below 30 the measured scenes are smaller."""
+    """Approximate duration in seconds. Below 30, smaller scenes are measured."""
     threads: int | None = None
-    """Threads whose gain over one is measured; torch's own setting by default."""
+    """Number of threads to compare with one thread; by default PyTorch's setting."""
     json: Path | None = None
-    """File to write the figures to, too."""
+    """Also write the measurements to this file."""
 
 
 def bench(args: list[str]) -> int:

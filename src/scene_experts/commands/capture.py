@@ -19,19 +19,19 @@ FEW = 0.9  # a smaller share of photographs with a pose is worth a word of advic
 
 @dataclass(frozen=True)
 class CaptureCommand:
-    """Find poses and points of photographs, or of a video's sharpest frames (COLMAP, in a process of its own): what `train` needs.
+    """Find camera poses and 3D points for photographs or a video with COLMAP, and write a capture for `train`.
 
-    `capture PHOTOS --out CAPTURE` copies the photographs into CAPTURE/images: blanks in names become _, those that EXIF turns are written
-    upright. The same command goes on where it was stopped.
+    The photographs are copied to CAPTURE/images. Spaces in their names become underscores, and rotated photographs are written upright.
+    Repeat the command to continue an interrupted reconstruction.
     """
 
     photos: Annotated[Path, Option(value="PHOTOS")]
-    """Folder of photographs (JPEG, PNG, ...; subfolders too), or a video. CAPTURE/images itself stays as it is."""
+    """Folder of photographs (JPEG, PNG and others, also in subfolders), or a video. CAPTURE/images is used in place."""
     out: Annotated[Path, Option(value="CAPTURE")]
-    """Folder of the capture: OUT/images, OUT/sparse/0, OUT/capture.json."""
+    """Folder of the capture to write: images/, sparse/0/ and capture.json."""
     options: Annotated[Options, Option(name="")] = Options()
     overwrite: bool = False
-    """Replace the poses that are there, once new ones are whole, and the images that an earlier `capture` copied."""
+    """Replace existing poses and copied photographs once the new reconstruction is complete."""
 
 
 def capture(args: list[str]) -> int:

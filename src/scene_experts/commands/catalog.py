@@ -24,18 +24,19 @@ SAY_EVERY = 15.0  # seconds between lines where there is no terminal
 
 @dataclass(frozen=True)
 class DownloadCommand:
-    """Fetch scenes of the paper from their owners: continued where it stopped, checked, unpacked."""
+    """Download scenes of the paper from their owners, verify and unpack them. Repeat the command to continue a download."""
 
     scenes: Annotated[tuple[str, ...], Option(value="SCENE")] = ()
-    """Scenes (bonsai), data sets (mipnerf360, tandt, db, bungeenerf) or all. A data set's archive is fetched whole, once."""
+    """Scenes (such as bonsai), data sets (mipnerf360, tandt, db, bungeenerf) or all. The archive of a data set is downloaded once, as a
+    whole."""
     to: Path | None = None
-    """Folder to put them in; by default $SCENE_EXPERTS_CAPTURES, else this user's cache folder."""
+    """Folder for the scenes; by default $SCENE_EXPERTS_CAPTURES, or the cache folder of the user."""
     mirror: Annotated[tuple[str, ...], Option(value="URL", repeat=True)] = ()
-    """Address of a folder that holds the archives, tried before the owners' own. May be given several times."""
+    """Address of a folder with the archives, tried before those of the owners. Can be repeated."""
     keep_archives: bool = True
-    """Leave the archives in place for their other scenes."""
+    """Keep the downloaded archives for their other scenes."""
     list: bool = False
-    """Only list the catalog."""
+    """List the scenes and download nothing."""
 
 
 def download(args: list[str]) -> int:
@@ -67,12 +68,12 @@ def flags(scene: Scene, to: Path | None) -> str:
 
 @dataclass(frozen=True)
 class CatalogCommand:
-    """What the catalog knows of the paper's scenes: sources, sizes, licences, protocol, what is on this machine."""
+    """List the paper's scenes: sources, sizes, licences, evaluation protocol, and which are on this machine."""
 
     scenes: Annotated[tuple[str, ...], Option(value="SCENE")] = ()
-    """Scenes or data sets to say everything about; none: one table of all."""
+    """Scenes or data sets to describe in detail; by default a table of all."""
     to: Path | None = None
-    """Folder of the captures, as for `download`."""
+    """Folder of the scenes, as for `download`."""
 
 
 def catalog(args: list[str]) -> int:

@@ -53,13 +53,14 @@ def evaluate(args: list[str]) -> int:
 
 @dataclass(frozen=True)
 class CompareCommand:
-    """One table of several evaluated runs."""
+    """Show the scores of several evaluated runs in one table."""
 
     runs: Annotated[tuple[Path, ...], Option(value="RUN")]
-    """Run folders."""
+    """Run folders, evaluated with `eval`."""
     format: Literal["table", "markdown", "csv"] = "table"
+    """Format of the table."""
     mixed: bool = False
-    """Compare runs of different captures, resolutions or splits all the same."""
+    """Allow runs of different captures, resolutions or splits in one table."""
 
 
 def compare(args: list[str]) -> int:

@@ -13,12 +13,12 @@ from scene_experts.commands import PROG
 
 @dataclass(frozen=True)
 class ReportCommand:
-    """Write one self-contained HTML page of evaluated runs: figures, curves, views with a slider, experts, commands."""
+    """Write one self-contained HTML page about evaluated runs: scores, curves, views with a slider, experts and commands."""
 
     runs: Annotated[tuple[Path, ...], Option(value="RUN")]
-    """Run folders; several are set beside each other."""
+    """Run folders. Several runs are shown side by side."""
     out: Path | None = None
-    """File to write; RUN/report.html by default for one run."""
+    """File to write; by default RUN/report.html for one run."""
 
 
 def report(args: list[str]) -> int:

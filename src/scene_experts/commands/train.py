@@ -71,34 +71,36 @@ EXAMPLES = (
 
 @dataclass(frozen=True)
 class TrainCommand:
-    """Train a scene."""
+    """The run."""
 
     data: Annotated[Data, Option(name="")]
     out: Annotated[Path, Option(short="-m", value="RUN")]
     """Run folder to write."""
     cfg: Annotated[Train, Option(name="")]
     overwrite: bool = False
-    """Begin anew in a run folder that holds an earlier run, whose checkpoints are removed."""
+    """Replace the run in the folder: its checkpoints and results are deleted."""
     resume: bool = False
-    """Go on from the run's newest whole checkpoint."""
+    """Continue from the newest intact checkpoint of the run."""
     stop_at: int | None = None
-    """Stop at this iteration of the unchanged schedule (--iterations rescales it instead)."""
+    """Stop at this iteration and leave the schedule as it is; --iterations rescales the schedule."""
     deterministic: bool = False
-    """Bit-identical results on one machine, resumed or not; a little slower."""
+    """Give bit-identical results on the same machine, also after --resume. Slightly slower."""
     device: Device = "auto"
+    """Device to train on. auto: CUDA if available."""
     rasterizer: Raster = "auto"
+    """Rasteriser. auto: the fastest that works on the device."""
     save_every: int = 5000
     """Iterations between checkpoints."""
     preview_every: int = 1000
-    """Iterations between pictures of a held-out view in RUN/previews; 0 for none."""
+    """Iterations between previews of a held-out view in RUN/previews; 0 means none."""
     max_memory: float = 0.0
-    """GiB of resident memory at which growth stops; 0 for no cap."""
+    """Stop densification at this resident memory in GiB; 0 means no limit."""
     viewer: bool = False
-    """Show the training in a browser while it runs (pip install 'scene-experts[viewer]')."""
+    """Show the training in a browser while it runs (needs `pip install 'scene-experts[viewer]'`)."""
     port: int = 8080
-    """Port of the viewer, on this machine alone."""
+    """Port of the viewer. It only accepts connections from this machine."""
     tensorboard: bool = False
-    """Write RUN/tensorboard too (pip install 'scene-experts[tensorboard]')."""
+    """Also write RUN/tensorboard (needs `pip install 'scene-experts[tensorboard]'`)."""
 
 
 def train(args: list[str]) -> int:

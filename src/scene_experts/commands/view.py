@@ -15,19 +15,22 @@ from scene_experts.core.choices import Device, Raster
 
 @dataclass(frozen=True)
 class ViewCommand:
-    """Look at a run in a browser; the scene is drawn here, so the browser needs no GPU."""
+    """Show a run in a browser. The pictures are rendered on this machine, so the browser needs no GPU."""
 
     run: Annotated[Path, Option(value="RUN")]
     """Run folder."""
     port: int = 8080
+    """Port to listen on."""
     host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 lets other machines in (there is no password)."""
+    """Address to listen on. 0.0.0.0 accepts other machines, without a password."""
     data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
-    """Where the capture is now, if it moved."""
+    """Folder of the capture, if it has moved."""
     step: int | None = None
-    """Checkpoint to show; the newest by default."""
+    """Iteration of the checkpoint to show; by default the newest."""
     device: Device = "auto"
+    """Device to render on. auto: CUDA if available."""
     rasterizer: Raster = "auto"
+    """Rasteriser. auto: the fastest that works on the device."""
 
 
 def view(args: list[str]) -> int:
@@ -39,7 +42,7 @@ def view(args: list[str]) -> int:
     from scene_experts.view.server import Viewer, check_port, import_viser
 
     check_port(command.port)
-    import_viser()  # says what is missing before anything is read
+    import_viser()  # reports a missing package before anything is read
     device, rasterize = backend(command.device, command.rasterizer, False, False)
     opened = run_folder.open_run(command.run, device, command.step)
     rasterize = as_trained(rasterize, opened.cfg.antialias)
@@ -56,8 +59,8 @@ def view(args: list[str]) -> int:
         draws=opened.scene.frozen(opened.step),
     )
     if viewer.moved:
-        print(f"warning: port {command.port} is taken, this scene is on another", file=sys.stderr)
-    print(f"{label}: {viewer.url} (Ctrl-C ends it)", flush=True)
+        print(f"warning: port {command.port} is taken, the scene is shown on another", file=sys.stderr)
+    print(f"{label}: {viewer.url} (Ctrl-C to stop)", flush=True)
     try:
         viewer.serve()
     finally:

@@ -31,6 +31,7 @@ class Scene:
     wide: bool = True
     """Make it wide."""
     rate: Rate = Rate()
+    """Rate of learning."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,7 @@ def test_all_options_in_groups(monkeypatch):
     assert "--seed N" in text and "(default: 0)" in text
     assert "\nscene: What the scene is made of:\n" in text
     assert "--scene.wide, --scene.no-wide" in text and "(default: on)" in text
+    assert "Rate of learning: rate at the start." in " ".join(text.split())
     assert text.index("--scene.rate.first") > text.index("\nscene:") and "scene.rate:" not in text  # too small for a group of its own
 
 
