@@ -1,6 +1,6 @@
-"""How flat a point cloud is around each point, and points put between those of flat regions (Ververas et al., SAGS, ECCV 2024).
+"""Curvature of a point cloud, and midpoints that make its flat regions denser (Ververas et al., SAGS, ECCV 2024).
 
-Structure from motion finds few points on plain surfaces; midpoints between neighbours fill them, most where the surface is flattest.
+Structure from motion finds few points on untextured surfaces. Midpoints between neighbours fill them, most densely in flat regions.
 """
 
 from __future__ import annotations
@@ -8,18 +8,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from scene_experts.geometry.neighbours import nearest
+from scene_experts.geometry.neighbours import find_neighbours
 
-_CHUNK = 1 << 16  # neighbourhoods decomposed at a time, bounds the memory
+_CHUNK = 1 << 16  # neighbourhoods decomposed at a time, which limits the memory
 
 
 def curvature(points: Tensor, k: int = 10) -> Tensor:
-    """Smallest singular value over the sum of the three, of each point's centred neighbourhood; [P] float64 in [0, 1/3].
+    """Curvature [P] float64 in [0, 1/3] of points [P, 3]: smallest singular value of the centred neighbourhood / sum of all three.
 
-    points [P, 3]; the neighbourhood is the point and its k - 1 nearest others. 0 is a plane (or a line, or one place).
+    A neighbourhood is a point and its k - 1 nearest neighbours. The curvature of a plane, a line or coincident points is 0.
     """
     xyz = points.detach().to(torch.float64)
-    _, index = nearest(xyz, k - 1)
+    _, index = find_neighbours(xyz, k - 1)
     index = torch.cat([torch.arange(len(xyz), device=xyz.device)[:, None], index], dim=1)
     out = xyz.new_zeros(len(xyz))
     for part in torch.arange(len(xyz), device=xyz.device).split(_CHUNK):
@@ -30,20 +30,21 @@ def curvature(points: Tensor, k: int = 10) -> Tensor:
     return out
 
 
-def flatter(curvatures: Tensor, sigmas: float = 1.0) -> Tensor:
-    """Which points [P] bool have a curvature more than `sigmas` standard deviations below the mean; none where all are equal."""
+def find_flat(curvatures: Tensor, sigmas: float = 1.0) -> Tensor:
+    """Mask [P] bool of the points whose curvature is more than `sigmas` standard deviations below the mean."""
     if len(curvatures) < 2:
         return torch.zeros_like(curvatures, dtype=torch.bool)
     return curvatures - curvatures.mean() < -sigmas * curvatures.std()
 
 
-def pairs_to_halve(points: Tensor, flat: Tensor, low: int, high: int) -> Tensor:
-    """Unordered pairs [M, 2] int64 (first <= second) of points [P, 3] whose midpoints make the denser cloud; each pair once.
+def find_midpoint_pairs(points: Tensor, flat: Tensor, low: int, high: int) -> Tensor:
+    """Unordered pairs [M, 2] int64 (first <= second) of points [P, 3] whose midpoints are the denser cloud; each pair once.
 
-    Every point with itself; a `flat` one [P] with its `low` nearest, itself among them; any other with its `high` nearest others.
+    Each point pairs with itself. A point in `flat` [P] also pairs with its `low` - 1 nearest neighbours, any other point with its `high`
+    nearest neighbours.
     """
     n = len(points)
-    _, index = nearest(points, max(low - 1, high))
+    _, index = find_neighbours(points, max(low - 1, high))
     rank = torch.arange(index.shape[1], device=points.device)
     wanted = rank < torch.where(flat, low - 1, high)[:, None]  # [P, k]
     me, place = wanted.nonzero().unbind(1)

@@ -1,8 +1,8 @@
-"""Exact nearest neighbours without a tree library: initial sizes of anchors and Gaussians, and graphs over points.
+"""Exact nearest neighbours in torch, for the initial sizes of anchors and Gaussians and for graphs over points.
 
-Points are split at medians into equal leaves. Each leaf then meets the other leaves in the order of the distance between boxes, and stops
-when no box is nearer than the worst neighbour any of its points has; whole branches of the tree are passed over first. Every step works on
-many leaves at once.
+Points are split at medians into leaves of equal size. Each leaf then visits the other leaves in the order of the distance between their
+boxes, and stops when no box is nearer than the worst neighbour of any of its points. Whole branches of the tree are skipped first. Every
+step processes many leaves at once.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_LEAF = 64  # points in a leaf, 64 to 128; smaller leaves mean fewer distances but more boxes (measured: 24 is twice as slow at 200k)
-_PAIRS = 1 << 22  # distances held at a time, bounds the memory
-_BRANCHES = 32  # of the tree that a leaf looks into, about
+_LEAF = 64  # points in a leaf, 64 to 128; smaller leaves need fewer distances but more boxes (24 is twice as slow at 200k points)
+_PAIRS = 1 << 22  # distances computed at a time, which limits the memory
+_BRANCHES = 32  # estimated number of branches that a leaf visits
 
 
 class _Leaves(NamedTuple):
     xyz: Tensor  # [3, L, S] float64
     names: Tensor  # [L, S] index of each entry's point
-    real: Tensor  # [L, S] bool; the rest repeat points to fill the leaves up
+    real: Tensor  # [L, S] bool; the other entries repeat points to fill the leaves
 
 
-def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Squared distances [P, k'] (ascending) and indices [P, k'] of the k' = min(k, P - 1) nearest other points of each of `points` [P, 3].
+def find_neighbours(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Squared distances [P, k'] (ascending) and indices [P, k'] of the k' = min(k, P - 1) nearest neighbours of `points` [P, 3].
 
-    "Other" means another index: an exact duplicate counts, with distance 0. Distances are float64 and exact to rounding.
+    A neighbour is a point with another index, so a duplicate is a neighbour at distance 0. Distances are float64, exact to rounding.
     """
     n = points.shape[0]
     k = max(0, min(k, n - 1))
     if k == 0:
         return points.new_zeros((n, 0), dtype=torch.float64), torch.zeros((n, 0), dtype=torch.int64, device=points.device)
     xyz = points.detach().to(torch.float64)
-    leaves, real = _split(xyz, max(_LEAF, k + 1))  # a leaf alone can fill a list
+    leaves, real = _split(xyz, max(_LEAF, k + 1))  # one leaf has enough points for a list
     best, ids = _search(_Leaves(xyz[leaves].permute(2, 0, 1).contiguous(), leaves, real), k)
     d2, index = best.new_empty((n, k)), ids.new_empty((n, k))
     d2[leaves[real]], index[leaves[real]] = best[real], ids[real]
@@ -42,48 +42,48 @@ def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 def knn_d2(points: Tensor) -> Tensor:
-    """Mean squared distance [P] to the 3 nearest other points, float64, squared world units.
+    """Mean squared distance [P] float64 to the 3 nearest neighbours of points [P, 3], in squared world units.
 
-    With 2 or 3 points the mean is over those there are; a lone point gives 0. Coincident points give 0, so callers clamp from below
-    (3DGS and Scaffold-GS: at 1e-7) before the logarithm.
+    With 2 or 3 points the mean is over the neighbours that exist; a single point gives 0. Coincident points give 0 too, so callers clamp
+    the result (3DGS and Scaffold-GS: to at least 1e-7) before the logarithm.
     """
-    d2, _ = nearest(points, 3)
+    d2, _ = find_neighbours(points, 3)
     return d2.mean(1) if d2.shape[1] else d2.new_zeros(points.shape[0])
 
 
 def median_neighbour_distance(points: Tensor) -> float:
-    """Median distance to the nearest other point, world units; 0 for fewer than 2 points."""
-    d2, _ = nearest(points, 1)
+    """Median distance to the nearest neighbour in world units; 0 for fewer than 2 points."""
+    d2, _ = find_neighbours(points, 1)
     return float(d2.median().sqrt()) if d2.numel() else 0.0
 
 
 def _split(xyz: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Indices [L, S] of equal leaves, and which entries are real: the rest repeat points to fill the leaves up."""
+    """Indices [L, S] of leaves of equal size, and which entries are real; the others repeat points to fill the leaves."""
     n = xyz.shape[0]
     levels = max(0, math.floor(math.log2(max(1.0, n / size))))
     count = 1 << levels
     each = -(-n // count)
     fill = count * each - n
-    extra = torch.arange(fill, device=xyz.device) * n // max(fill, 1)  # spread evenly, so that no leaf is all repeats
+    extra = torch.arange(fill, device=xyz.device) * n // max(fill, 1)  # spread evenly, so that no leaf consists of repeats
     order = torch.cat([torch.arange(n, device=xyz.device), extra]).view(1, -1)
     real = (torch.arange(n + fill, device=xyz.device) < n).view(1, -1)
     for _ in range(levels):
         coords = xyz[order]  # [G, S, 3]
         axis = (coords.amax(1) - coords.amin(1)).argmax(1)  # the longest side of each group
         key = coords.gather(2, axis.view(-1, 1, 1).expand(-1, coords.shape[1], 1)).squeeze(2)
-        by = key.argsort(dim=1, stable=True)  # points on a lattice share coordinates; which of them go where must not depend on the machine
+        by = key.argsort(dim=1, stable=True)  # stable: points on a lattice share coordinates, and the split must not depend on the machine
         half = (2 * order.shape[0], order.shape[1] // 2)
         order, real = order.gather(1, by).view(half), real.gather(1, by).view(half)
     return order, real
 
 
 def _search(tree: _Leaves, k: int) -> tuple[Tensor, Tensor]:
-    """The k best of every leaf entry, [L, S, k] squared distances and indices."""
+    """Squared distances and indices [L, S, k] of the k nearest neighbours of every leaf entry."""
     count, size = tree.names.shape
     best = tree.xyz.new_full((count, size, k), math.inf)
     ids = torch.full((count, size, k), -1, dtype=torch.int64, device=best.device)
     low, high = tree.xyz.amin(2), tree.xyz.amax(2)  # [3, L]
-    group = 1 << max(0, count.bit_length() // 2 - 2)  # a quarter of sqrt(L) leaves in a row are a branch of the tree
+    group = 1 << max(0, count.bit_length() // 2 - 2)  # leaves per branch of the tree: a quarter of sqrt(L)
     branch_low, branch_high = low.view(3, -1, group).amin(2), high.view(3, -1, group).amax(2)
     chunk = min(512, max(1, _PAIRS // (count // group + _BRANCHES * group)))
     for start in range(0, count, chunk):
@@ -98,18 +98,18 @@ def _search(tree: _Leaves, k: int) -> tuple[Tensor, Tensor]:
         near = ((gap < worst[mine]) & (own[mine] != other)).nonzero().squeeze(1)
         mine, other, gap = mine[near], other[near], gap[near]
         by = gap.argsort(stable=True)
-        by = by[mine[by].argsort(stable=True)]  # each leaf's others from near to far
+        by = by[mine[by].argsort(stable=True)]  # the other leaves of each leaf from near to far
         mine, other = mine[by], other[by]
         met = torch.bincount(mine, minlength=len(own))
         rank = torch.arange(len(mine), device=best.device) - (met.cumsum(0) - met)[mine]
         by = rank.argsort(stable=True)
-        for pairs in by.split(torch.bincount(rank).tolist()):  # in one round a leaf occurs once at most
+        for pairs in by.split(torch.bincount(rank).tolist()):  # a leaf occurs at most once per round
             _meet(tree, own[mine[pairs]], other[pairs], best, ids)
     return best, ids
 
 
 def _box_gap(low: Tensor, high: Tensor, low_other: Tensor, high_other: Tensor) -> Tensor:
-    """Squared distances between boxes whose corners are given axis by axis, [3, ...]."""
+    """Squared distances between boxes with corners [3, ...], axis by axis."""
     total = torch.zeros(())
     for axis in range(3):
         gap = torch.maximum(low_other[axis] - high[axis], low[axis] - high_other[axis]).clamp_min_(0)
@@ -118,7 +118,7 @@ def _box_gap(low: Tensor, high: Tensor, low_other: Tensor, high_other: Tensor) -
 
 
 def _meet(tree: _Leaves, mine: Tensor, other: Tensor, best: Tensor, ids: Tensor) -> None:
-    """Offers the points of leaf other[i] to the lists of leaf mine[i]; changes `best` and `ids`."""
+    """Merge the points of leaf other[i] into the lists of leaf mine[i]; changes `best` and `ids`."""
     k = best.shape[2]
     theirs = tree.xyz[:, other]  # [3, c, S]
     points = tree.xyz[:, mine]

@@ -7,15 +7,14 @@ from torch import Tensor
 
 
 def normalise_quats(quats: Tensor, eps: float = 1e-12) -> Tensor:
-    """Quaternions of unit length, [..., 4]; one shorter than `eps` is divided by `eps`, so that zero stays zero and nothing is NaN."""
+    """Normalise quaternions [..., 4]. Shorter ones than `eps` are divided by `eps`, so zero stays zero and there is no NaN."""
     return quats / quats.norm(dim=-1, keepdim=True).clamp_min(eps)
 
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of unit quaternions [..., 4].
 
-    The quaternions are used as they are: the caller normalises them, and gradients are with respect to what was passed.
-    The zero quaternion gives the identity.
+    The caller normalises the quaternions; gradients are with respect to the values passed. The zero quaternion gives the identity.
     """
     w, x, y, z = quats.unbind(-1)
     rows = [
@@ -29,14 +28,14 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 def matrix_to_quat(matrices: Tensor) -> Tensor:
     """Unit quaternions [..., 4] with w >= 0 of rotation matrices [..., 3, 3].
 
-    Each component's square follows from the diagonal; the signs come from the off-diagonal sums, divided by the largest component, so
-    that no small number is divided by.
+    The squares of the components follow from the diagonal. The signs follow from the off-diagonal sums divided by the largest component,
+    so no divisor is small.
     """
     m = matrices
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]  # 4wx, 4wy, 4wz
     xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]  # 4xy, 4xz, 4yz
-    # The outer product 4 q q^T, row by row: any row is the quaternion times four times one of its components.
+    # The outer product 4 q q^T: each row is the quaternion times four times one of its components.
     outer = torch.stack(
         [
             torch.stack([1 + xx + yy + zz, wx, wy, wz], -1),
@@ -58,20 +57,21 @@ def covariance(quats: Tensor, scales: Tensor) -> Tensor:
     return half @ half.transpose(-1, -2)
 
 
-def common_up(rotations: Tensor) -> Tensor:
-    """The way up [3] (unit) that cameras share, from their camera-to-world rotations [V, 3, 3] (x right, y down).
+def estimate_up(rotations: Tensor) -> Tensor:
+    """Unit up direction [3] of the world, from camera-to-world rotations [V, 3, 3] (x right, y down).
 
-    The mean of the cameras' ups leans where some photographs lie on their side (portraits stored unturned) or look down from one side
-    more often. So from there: the direction to which every camera's more level axis, right or up, is most at a right angle.
+    The mean of the cameras' up axes is biased if some photographs lie on their side (portraits stored without rotation) or if the cameras
+    look down from one side more often. This function starts from the mean and finds the direction that is most orthogonal to the more
+    level axis, right or up, of each camera.
     """
     right, ups = rotations[:, :, 0].double(), -rotations[:, :, 1].double()
     mean = ups.mean(0)
     mean = mean / mean.norm().clamp_min(1e-12)
     up = mean
     off = torch.eye(3, dtype=torch.float64, device=up.device) - mean[:, None] * mean
-    for _ in range(5):  # until each camera's level axis is known
+    for _ in range(5):  # until the level axis of each camera is known
         level = torch.where(((right @ up).abs() < (ups @ up).abs())[:, None], right, ups)
-        # with cameras that all look one way only one axis is ruled out: the last term keeps to the mean
+        # cameras that all look one way exclude only one axis; the last term then stays near the mean
         up = torch.linalg.eigh(level.T @ level / len(level) + 0.02 * off)[1][:, 0]
         up = up if float(up @ mean) >= 0 else -up
     return up

@@ -1,4 +1,4 @@
-"""Real spherical harmonics to degree 3, as 3DGS stores colours: sh [..., (degree + 1)^2, 3], the constant (DC) first."""
+"""Real spherical harmonics up to degree 3 in the layout of 3DGS: sh [..., (degree + 1)^2, 3], the constant (DC) first."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ MAX_DEGREE = 3
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """The harmonics [..., (degree + 1)^2] of unit directions [..., 3], in the order and with the signs of the 3DGS files."""
+    """Values [..., (degree + 1)^2] of the harmonics at unit directions [..., 3], in the order and with the signs of 3DGS files."""
     if not 0 <= degree <= MAX_DEGREE:
-        raise ValueError(f"spherical harmonics are defined here for degrees 0 to {MAX_DEGREE}, not {degree}")
+        raise ValueError(f"expected a degree from 0 to {MAX_DEGREE}, found {degree}")
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     terms = [torch.full_like(x, C0)]
@@ -47,18 +47,18 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def sh_to_rgb(sh: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """Colours max(0, sum + 0.5), [..., 3], seen along `directions` [..., 3] (need not be unit: Gaussian centre minus camera centre).
+    """Colours max(0, sum + 0.5), [..., 3], along `directions` [..., 3] (Gaussian centre minus camera centre, of any length).
 
-    `sh` [..., C, 3] may hold more coefficients than `degree` uses. The gradient is zero where the colour was cut at 0.
+    `sh` [..., C, 3] may hold more coefficients than `degree` uses. The gradient is zero where the colour is clamped to 0.
     """
     count = (degree + 1) ** 2
     if sh.shape[-2] < count:
-        raise ValueError(f"degree {degree} needs {count} coefficients a channel, found {sh.shape[-2]}")
+        raise ValueError(f"expected at least {count} coefficients per channel for degree {degree}, found {sh.shape[-2]}")
     unit = directions / directions.norm(dim=-1, keepdim=True).clamp_min(1e-12)
     value = (basis(unit, degree)[..., None] * sh[..., :count, :]).sum(-2) + 0.5
     return value.clamp_min(0.0)
 
 
 def rgb_to_dc(rgb: Tensor) -> Tensor:
-    """The constant coefficient that shows as `rgb` when all others are zero."""
+    """The constant coefficient whose colour is `rgb` if all others are zero."""
     return (rgb - 0.5) / C0

@@ -1,4 +1,4 @@
-"""Colours of Gaussians from their spherical harmonics, with gradients: natively on the CPU, else the torch form of `sh.py`, the oracle.
+"""Colours of Gaussians from spherical harmonics, with gradients: in the compiled library on the CPU, else in torch.
 
 Gradients reach the harmonics and, through the viewing direction, the positions (as in 3DGS).
 """
@@ -14,22 +14,22 @@ from scene_experts.geometry.sh import MAX_DEGREE, sh_to_rgb
 from scene_experts.native import library as native
 
 
-def sh_colors(means: Tensor, dc: Tensor, rest: Tensor, rows: Tensor | None, position: Tensor, degree: int) -> Tensor:
+def compute_sh_colors(means: Tensor, dc: Tensor, rest: Tensor, rows: Tensor | None, position: Tensor, degree: int) -> Tensor:
     """Colours max(0, harmonics + 0.5), [A, 3], of Gaussians seen from `position` [3].
 
-    means [A, 3] world; dc [N, 3] and rest [N, C - 1, 3] are the harmonics of a table, of which `rows` [A] int64 (each at most once; None:
-    A = N, all in order) belong to `means`. `rest` may hold more than `degree` (0 to 3) uses; the gradient of those is zero, not absent.
+    means [A, 3] world; dc [N, 3] and rest [N, C - 1, 3] are the harmonics of a table, whose `rows` [A] int64 (each at most once; None: all
+    N in order) belong to `means`. `rest` may hold more coefficients than `degree` (0 to 3) uses; their gradient is zero.
     """
     if not 0 <= degree <= MAX_DEGREE or rest.shape[1] < (degree + 1) ** 2 - 1:
-        raise ValueError(f"expected a degree of 0 to {MAX_DEGREE} that {rest.shape[1] + 1} coefficients hold, found {degree}")
+        raise ValueError(f"expected a degree from 0 to {MAX_DEGREE} that fits {rest.shape[1] + 1} coefficients, found {degree}")
     fits = all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in (means, dc, rest))
     if fits and not position.requires_grad and native.load() is not None:
         return _Colors.apply(means, dc, rest, rows, position, degree)  # type: ignore[return-value]
-    return by_torch(means, dc, rest, rows, position, degree)
+    return compute_in_torch(means, dc, rest, rows, position, degree)
 
 
-def by_torch(means: Tensor, dc: Tensor, rest: Tensor, rows: Tensor | None, position: Tensor, degree: int) -> Tensor:
-    """The same in plain torch, for any device and dtype."""
+def compute_in_torch(means: Tensor, dc: Tensor, rest: Tensor, rows: Tensor | None, position: Tensor, degree: int) -> Tensor:
+    """The same as `compute_sh_colors` in plain torch, for any device and dtype."""
     sh = torch.cat([dc[:, None], rest], dim=1)
     return sh_to_rgb(sh if rows is None else sh.index_select(0, rows), means - position.to(means), degree)
 

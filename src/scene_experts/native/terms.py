@@ -1,4 +1,4 @@
-"""Sums of the objective over Gaussians and opacities, natively: one pass forward, one backward, autograd's own gradient to the bit."""
+"""Two sums of the objective in the compiled library: volumes of Gaussians and the opacity hinge. Gradients equal autograd's bit for bit."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ def covers(values: Tensor) -> bool:
     return values.device.type == "cpu" and values.dtype == torch.float32 and native.load() is not None
 
 
-def volume_sum(scales: Tensor) -> Tensor:
+def sum_volumes(scales: Tensor) -> Tensor:
     """Sum of sx sy sz over scales [M, 3], []."""
     return _Volume.apply(scales)
 
 
-def hinge_sum(raw: Tensor, tau: float) -> Tensor:
+def sum_hinge(raw: Tensor, tau: float) -> Tensor:
     """Sum of max(0, tau - raw) over `raw` of any shape, []."""
     return _Hinge.apply(raw, tau)
 
@@ -30,7 +30,7 @@ class _Volume(torch.autograd.Function):
     def forward(ctx: Any, scales: Tensor) -> Tensor:
         scales = scales.detach().contiguous()
         ctx.save_for_backward(scales)
-        partial = _partial(len(scales))
+        partial = _allocate_partial(len(scales))
         native.require().se_volume_forward(native.pointer(scales), len(scales), native.pointer(partial), native.count_threads())
         return partial.sum().float()
 
@@ -49,7 +49,7 @@ class _Hinge(torch.autograd.Function):
     def forward(ctx: Any, raw: Tensor, tau: float) -> Tensor:
         raw, ctx.tau = raw.detach().contiguous(), tau
         ctx.save_for_backward(raw)
-        partial = _partial(raw.numel())
+        partial = _allocate_partial(raw.numel())
         native.require().se_hinge_forward(native.pointer(raw), raw.numel(), tau, native.pointer(partial), native.count_threads())
         return partial.sum().float()
 
@@ -63,6 +63,6 @@ class _Hinge(torch.autograd.Function):
         return gradient, None
 
 
-def _partial(count: int) -> Tensor:
-    """Room for the partial sums over `count` values."""
+def _allocate_partial(count: int) -> Tensor:
+    """Memory for the partial sums over `count` values."""
     return torch.empty(native.require().se_sum_chunks(count), dtype=torch.float64)

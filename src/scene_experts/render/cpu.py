@@ -1,8 +1,7 @@
-"""The fast CPU rasteriser: the picture that reference.py defines, and all its gradients, from the compiled library (csrc/raster*).
+"""The fast CPU rasteriser: the image that reference.py defines and all its gradients, computed by the compiled library (csrc/raster*).
 
-Float32 on the CPU. The quaternions are used as passed (not normalised here), as in the reference.
-Two correct rasterisers may differ by up to 4e-3 in single pixels, where an alpha lies within rounding of 1/255 or a transmittance within
-rounding of its stop; compare means and quantiles.
+It works in float32 and, like the reference, does not normalise quaternions. Two correct rasterisers may differ by up to 4e-3 in single
+pixels whose alpha is within rounding of 1/255 or whose transmittance is within rounding of the stop, so compare means and quantiles.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from scene_experts.native.api import SeCamera, SeRasterBackward, SeRasterForward
 
 @dataclass(frozen=True)
 class CpuRasterizer:
-    """Draws Gaussians on the CPU with the compiled library.
+    """Renders Gaussians on the CPU with the compiled library.
 
-    `deterministic`: gradients are bit-identical from run to run and for any number of threads, on one machine and instruction set (pictures
-    always are). `level`: the instruction set, one of `native.LEVELS` (None: the best here). `threads`: None is torch's own setting.
-    Raises InputError where the library cannot be loaded.
+    `deterministic`: gradients are bit-identical from run to run and for any number of threads, on one machine and instruction set (images
+    always are). `level`: the instruction set, one of `native.LEVELS` (None: the best of this processor). `threads`: None for torch's
+    setting. Raises InputError if the library cannot be loaded.
     """
 
     antialias: bool = False
@@ -41,7 +40,7 @@ class CpuRasterizer:
             raise InputError(f"{why}; or choose the slow rasteriser `reference`")
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
-        """Draws M Gaussians over `background` [3]; see `types.Render`. A later backward pass overwrites `mean2d_grad`."""
+        """Render M Gaussians over `background` [3]; see `types.Render`. The backward pass overwrites `mean2d_grad`."""
         inputs = (g.means, g.quats, g.scales, g.opacities, g.colors)
         _check(inputs)
         mean2d_grad = torch.zeros((len(g), 2))
@@ -50,20 +49,20 @@ class CpuRasterizer:
 
     @torch.no_grad()
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
-        """Whether round-axis Gaussians at `means` [A, 3] with `scales` [A, 3] would be drawn (radius > 0), [A] bool (Scaffold-GS)."""
-        means, scales = _plain(means), _plain(scales)
+        """Mask [A] bool of the unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] that have a radius > 0 (Scaffold-GS)."""
+        means, scales = _convert(means), _convert(scales)
         out = torch.empty(len(means), dtype=torch.bool)
         where = [native.pointer(t) for t in (means, scales, out)]
         library = native.require(self.level)
-        library.se_raster_find_visible(ctypes.byref(convert_camera(camera)), *where[:2], len(means), where[2], self._threads())
+        library.se_raster_find_visible(ctypes.byref(convert_camera(camera)), *where[:2], len(means), where[2], self._count_threads())
         return out
 
-    def _threads(self) -> int:
+    def _count_threads(self) -> int:
         return max(1, self.threads if self.threads is not None else native.count_threads())
 
 
-class _Kept:
-    """Memory of the library that one picture's backward pass needs; given back when the graph is gone, whether backward ran or not."""
+class _State:
+    """Memory of the library for the backward pass of one image; released with the graph, whether the backward pass ran or not."""
 
     def __init__(self, library: ctypes.CDLL, address: int) -> None:
         self.library, self.address = library, address
@@ -75,13 +74,13 @@ class _Kept:
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means, quats, scales, opacities, colors, background, how: CpuRasterizer, camera: Camera, mean2d_grad):
-        plain = [_plain(t) for t in (means, quats, scales, opacities, colors, background)]
+        plain = [_convert(t) for t in (means, quats, scales, opacities, colors, background)]
         size = (camera.height, camera.width)
         image, alpha, depth = torch.empty((*size, 3)), torch.empty(size), torch.empty(size)
         radii = torch.empty(len(means), dtype=torch.int32)
         library = native.require(how.level)
         where = [t.data_ptr() for t in (*plain, image, alpha, depth, radii)]
-        args = SeRasterForward(convert_camera(camera), how.antialias, how._threads(), len(means), *where)
+        args = SeRasterForward(convert_camera(camera), how.antialias, how._count_threads(), len(means), *where)
         state = ctypes.c_void_p()
         keep = any(ctx.needs_input_grad)
         code = library.se_raster_forward(ctypes.byref(args), ctypes.byref(state) if keep else None)
@@ -89,7 +88,7 @@ class _Draw(torch.autograd.Function):
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
         if keep:
-            ctx.state = _Kept(library, state.value or 0)
+            ctx.state = _State(library, state.value or 0)
             ctx.how, ctx.mean2d_grad = how, mean2d_grad
             ctx.save_for_backward(*plain)
         return image, alpha, depth, radii
@@ -98,18 +97,18 @@ class _Draw(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor | None):  # pyright: ignore[reportIncompatibleMethodOverride]
         plain = ctx.saved_tensors
-        up = [None if g is None else _plain(g) for g in grad_outputs[:3]]  # of image, alpha, depth; None: zero
+        up = [None if g is None else _convert(g) for g in grad_outputs[:3]]  # of image, alpha, depth; None: zero
         outputs = [torch.empty_like(t) for t in plain[:5]] + [ctx.mean2d_grad, torch.empty(3)]
         how: CpuRasterizer = ctx.how
         where = [None if t is None else t.data_ptr() for t in (*plain, *up, *outputs)]
-        args = SeRasterBackward(how.deterministic, how._threads(), *where)
+        args = SeRasterBackward(how.deterministic, how._count_threads(), *where)
         code = ctx.state.library.se_raster_backward(ctypes.c_void_p(ctx.state.address), ctypes.byref(args))
-        native.check(code, "the backward pass of the picture")
+        native.check(code, "the backward pass of the image")
         return *outputs[:5], outputs[6], None, None, None
 
 
 def convert_camera(camera: Camera) -> SeCamera:
-    """`camera` as the library takes it."""
+    """Convert `camera` to the structure of the library."""
     rows = [value for row in camera.world_to_cam.tolist()[:3] for value in row]
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     return SeCamera((ctypes.c_float * 12)(*rows), fx, fy, cx, cy, camera.near, camera.width, camera.height)
@@ -121,10 +120,10 @@ def _check(inputs: tuple[Tensor, ...]) -> None:
         expected = (count,) if width is None else (count, width)
         if tensor.shape != expected or not tensor.is_cpu:
             found = f"{tuple(tensor.shape)} on {tensor.device}"
-            raise InputError(f"the CPU rasteriser needs {name} of shape {expected} on the CPU, not {found}")
+            raise InputError(f"expected {name} of shape {expected} on the CPU, found {found}")
 
 
-def _plain(tensor: Tensor) -> Tensor:
+def _convert(tensor: Tensor) -> Tensor:
     if tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous():
-        return tensor  # nearly always; every call of torch costs microseconds in which other threads wait
+        return tensor  # the usual case; every torch call costs microseconds in which other threads wait
     return tensor.detach().to(device="cpu", dtype=torch.float32).contiguous()

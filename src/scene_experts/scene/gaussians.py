@@ -21,7 +21,7 @@ from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.sh import MAX_DEGREE, rgb_to_dc
-from scene_experts.geometry.sh_colors import sh_colors
+from scene_experts.geometry.sh_colors import compute_sh_colors
 from scene_experts.scene import Cull, Scene, Traits
 
 COLUMNS = ("means", "log_scales", "quats", "raw_opacity", "sh_dc", "sh_rest")
@@ -132,7 +132,7 @@ class GaussianScene(Scene):
             quats=functional.normalize(p["quats"].index_select(0, rows), dim=1, eps=_EPS),
             scales=p["log_scales"].index_select(0, rows).exp(),
             opacities=p["raw_opacity"].index_select(0, rows).sigmoid(),
-            colors=sh_colors(means, p["sh_dc"], p["sh_rest"], rows, camera.position.to(means), self.degree(step)),
+            colors=compute_sh_colors(means, p["sh_dc"], p["sh_rest"], rows, camera.position.to(means), self.degree(step)),
             source=rows,
         )
         return Decoded(gaussians, rows, None, {})

@@ -201,7 +201,7 @@ def hinge_opacities(decoded: Decoded, render: Render, w: Weights) -> Tensor:
 def volume(scales: Tensor) -> Tensor:
     """Mean of sx sy sz over Gaussians [M, 3], []: Scaffold-GS's volume regulariser."""
     if native_terms.covers(scales):
-        return native_terms.volume_sum(scales) / max(len(scales), 1)
+        return native_terms.sum_volumes(scales) / max(len(scales), 1)
     x, y, z = scales.unbind(1)
     return (x * y * z).sum() / max(len(scales), 1)
 
@@ -209,7 +209,7 @@ def volume(scales: Tensor) -> Tensor:
 def opacity_hinge(raw_opacity: Tensor, tau: float = 0.0) -> Tensor:
     """Mean of max(0, tau - sigma) over all K Gaussians of the decoded anchors, drawn or not (eq. 8); raw_opacity [A, K]."""
     if native_terms.covers(raw_opacity):
-        return native_terms.hinge_sum(raw_opacity, tau) / max(raw_opacity.numel(), 1)
+        return native_terms.sum_hinge(raw_opacity, tau) / max(raw_opacity.numel(), 1)
     return functional.relu(tau - raw_opacity).sum() / max(raw_opacity.numel(), 1)
 
 

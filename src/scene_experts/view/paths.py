@@ -13,7 +13,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera
 from scene_experts.data.views import Capture
 from scene_experts.geometry.poses import interpolate_poses, look_at, normalise, with_fov
-from scene_experts.geometry.rotation import common_up
+from scene_experts.geometry.rotation import estimate_up
 
 NAMES = ("auto", "orbit", "spiral", "views")
 FACING = 0.7  # if the mean of the unit viewing directions is longer, the capture faces one way and an orbit would go behind the scene
@@ -54,7 +54,7 @@ def analyse_cameras(capture: Capture) -> CameraRig:
     poses = torch.stack([c.world_to_cam.double() for c in cameras])
     rotations = poses[:, :3, :3].transpose(1, 2)
     positions = -(rotations @ poses[:, :3, 3:]).squeeze(2)
-    up = common_up(rotations)
+    up = estimate_up(rotations)
     forward = rotations[:, :, 2]
     # the point with the least sum of squared distances to all axes: sum (I - d d^T) (p - c) = 0; parallel axes leave the depth open
     across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from scene_experts.geometry.curvature import curvature, flatter, pairs_to_halve
+from scene_experts.geometry.curvature import curvature, find_flat, find_midpoint_pairs
 
 
 def random(n: int, d: int = 3) -> torch.Tensor:
@@ -39,15 +39,15 @@ def test_a_sphere_curves_more_the_smaller_it_is():
 def test_few_points_and_points_in_one_place(n):
     found = curvature(random(n))
     assert found.shape == (n,) and bool(torch.isfinite(found).all())
-    assert not bool(flatter(curvature(torch.ones(n, 3))).any())
-    assert len(pairs_to_halve(random(n), torch.ones(n, dtype=torch.bool), 10, 5)) == n * (n + 1) // 2
+    assert not bool(find_flat(curvature(torch.ones(n, 3))).any())
+    assert len(find_midpoint_pairs(random(n), torch.ones(n, dtype=torch.bool), 10, 5)) == n * (n + 1) // 2
 
 
 def test_flatter_is_a_z_score():
     values = torch.tensor([0.0, 0.1, 0.1, 0.1, 0.1, 0.2], dtype=torch.float64)
-    assert flatter(values).tolist() == [True] + [False] * 5
-    assert flatter(values * 3 + 5).tolist() == [True] + [False] * 5
-    assert not bool(flatter(values, 3.0).any())
+    assert find_flat(values).tolist() == [True] + [False] * 5
+    assert find_flat(values * 3 + 5).tolist() == [True] + [False] * 5
+    assert not bool(find_flat(values, 3.0).any())
 
 
 @pytest.mark.parametrize(("low", "high"), [(10, 5), (10, 2), (4, 8), (1, 0)])
@@ -59,5 +59,5 @@ def test_pairs_are_those_of_the_slow_rule(low, high):
     for i in range(60):
         near = order[i, :low] if flat[i] else order[i, 1 : high + 1]
         wanted |= {(min(i, int(j)), max(i, int(j))) for j in near}
-    found = pairs_to_halve(points, flat, low, high)
+    found = find_midpoint_pairs(points, flat, low, high)
     assert len(found) == len(wanted) and {(int(a), int(b)) for a, b in found} == wanted

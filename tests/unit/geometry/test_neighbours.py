@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from scene_experts.geometry.neighbours import knn_d2, median_neighbour_distance, nearest
+from scene_experts.geometry.neighbours import find_neighbours, knn_d2, median_neighbour_distance
 
 
 def cloud(kind: str, n: int = 1500) -> torch.Tensor:
@@ -30,7 +30,7 @@ def brute(points: torch.Tensor, k: int) -> torch.Tensor:
 @pytest.mark.parametrize("k", [1, 3, 10])
 def test_same_as_all_pairs(kind: str, k: int) -> None:
     points = cloud(kind)
-    d2, index = nearest(points, k)
+    d2, index = find_neighbours(points, k)
     torch.testing.assert_close(d2, brute(points, k), rtol=1e-12, atol=0)
     torch.testing.assert_close((points[index] - points[:, None]).square().sum(-1), d2, rtol=1e-12, atol=0)
     assert (index != torch.arange(len(points))[:, None]).all()

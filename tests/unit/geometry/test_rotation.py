@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from scene_experts.geometry.rotation import common_up, covariance, matrix_to_quat, normalise_quats, quat_to_matrix
+from scene_experts.geometry.rotation import covariance, estimate_up, matrix_to_quat, normalise_quats, quat_to_matrix
 
 
 def quats(n: int) -> torch.Tensor:
@@ -69,14 +69,14 @@ def ring(roll: list[float], pitch: float = 0.5) -> torch.Tensor:
 def test_the_common_up_is_that_of_the_upright_photographs_whatever_lies_on_its_side() -> None:
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     quarter = torch.pi / 2
-    torch.testing.assert_close(common_up(ring([0.0] * 9)), up)
+    torch.testing.assert_close(estimate_up(ring([0.0] * 9)), up)
     for roll in ([0.0] * 4 + [quarter] * 5, [0.0, quarter, quarter, 0.0, 0.0, quarter, quarter, quarter, 0.0, 0.0, quarter]):
         rotations = ring(roll)
         mean = torch.nn.functional.normalize(-rotations[:, :, 1].mean(0), dim=0)
-        assert float(common_up(rotations) @ up) > 0.995 > float(mean @ up)
+        assert float(estimate_up(rotations) @ up) > 0.995 > float(mean @ up)
 
 
 def test_the_common_up_of_cameras_that_look_one_way_is_their_mean() -> None:
     one = ring([0.0])
-    torch.testing.assert_close(common_up(one), -one[0, :, 1])
-    torch.testing.assert_close(common_up(one.expand(5, 3, 3)), -one[0, :, 1])
+    torch.testing.assert_close(estimate_up(one), -one[0, :, 1])
+    torch.testing.assert_close(estimate_up(one.expand(5, 3, 3)), -one[0, :, 1])

@@ -54,11 +54,11 @@ def test_a_cell_beyond_21_bits_is_refused(value: int) -> None:
 
 def test_unique_cells_as_numpy() -> None:
     cells = random_cells(500, 3)
-    unique, inverse = voxel.unique_cells(cells)
+    unique, inverse = voxel.find_unique_cells(cells)
     expected, back = np.unique(cells.numpy(), axis=0, return_inverse=True)
     assert (unique.numpy() == expected).all() and (inverse.numpy() == back.reshape(-1)).all()
     assert torch.equal(unique[inverse], cells)
-    empty, none = voxel.unique_cells(torch.zeros(0, 3, dtype=torch.int64))
+    empty, none = voxel.find_unique_cells(torch.zeros(0, 3, dtype=torch.int64))
     assert empty.shape == (0, 3) and none.shape == (0,)
 
 
@@ -94,35 +94,35 @@ def test_scatter_max_is_by_element_and_keeps_negative_maxima() -> None:
 def test_automatic_size_on_a_grid() -> None:
     axis = torch.arange(10, dtype=torch.float64) * 0.1
     grid = torch.cartesian_prod(axis, axis, axis)
-    assert voxel.auto_voxel(grid) == pytest.approx(0.01)  # the squared spacing, as Scaffold-GS
-    assert voxel.auto_voxel(grid, "median_nn") == pytest.approx(0.1)
-    assert voxel.auto_voxel(grid, "median_nn", factor=0.5) == pytest.approx(0.05)
+    assert voxel.estimate_voxel_size(grid) == pytest.approx(0.01)  # the squared spacing, as Scaffold-GS
+    assert voxel.estimate_voxel_size(grid, "median_nn") == pytest.approx(0.1)
+    assert voxel.estimate_voxel_size(grid, "median_nn", factor=0.5) == pytest.approx(0.05)
 
 
 def test_automatic_size_takes_the_half_smallest() -> None:
     points = torch.randn(201, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     d2 = (points[:, None] - points[None]).square().sum(-1).fill_diagonal_(float("inf"))
     mean3 = d2.sort(dim=1).values[:, :3].mean(1).sort().values
-    assert voxel.auto_voxel(points) == pytest.approx(mean3[int(0.5 * 201) - 1].item())
+    assert voxel.estimate_voxel_size(points) == pytest.approx(mean3[int(0.5 * 201) - 1].item())
 
 
 def test_automatic_size_with_coincident_points() -> None:
     points = torch.zeros(40, 3, dtype=torch.float64)
     with pytest.raises(InputError, match=naming("--scene.voxel-size")):
-        voxel.auto_voxel(points)
+        voxel.estimate_voxel_size(points)
     points[:4, 0] = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64)
-    assert voxel.auto_voxel(points) > 0
+    assert voxel.estimate_voxel_size(points) > 0
 
 
 def test_the_rules_for_a_voxel():
     grid = torch.cartesian_prod(*[torch.arange(6.0, dtype=torch.float64)] * 3) * 0.2
-    assert voxel.voxel_size(grid, "median_nn") == pytest.approx(0.2)
-    assert voxel.voxel_size(grid, "squared_median") == pytest.approx(0.04)
-    assert voxel.voxel_size(grid, "neighbours") == pytest.approx(0.05)
+    assert voxel.choose_voxel_size(grid, "median_nn") == pytest.approx(0.2)
+    assert voxel.choose_voxel_size(grid, "squared_median") == pytest.approx(0.04)
+    assert voxel.choose_voxel_size(grid, "neighbours") == pytest.approx(0.05)
 
 
 def test_coinciding_points_still_have_a_voxel_size():
     spread = torch.rand(10, 3, dtype=torch.float64)
-    assert voxel.voxel_size(torch.cat([spread] + [spread[:1]] * 30), "neighbours") > 0
+    assert voxel.choose_voxel_size(torch.cat([spread] + [spread[:1]] * 30), "neighbours") > 0
     with pytest.raises(InputError, match=naming("--scene.voxel-size")):
-        voxel.voxel_size(spread[:1].repeat(5, 1), "neighbours")
+        voxel.choose_voxel_size(spread[:1].repeat(5, 1), "neighbours")

@@ -16,7 +16,7 @@ def test_volume(count, threads):
     scales = torch.rand(count, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
-    value = 0.01 * (native_terms.volume_sum(scales) / max(count, 1))
+    value = 0.01 * (native_terms.sum_volumes(scales) / max(count, 1))
     value.backward()
     torch.set_num_threads(before)
     plain = scales.detach().clone().requires_grad_()
@@ -33,7 +33,7 @@ def test_hinge(shape, tau):
     raw = torch.randn(shape, generator=torch.Generator().manual_seed(1))
     raw.view(-1)[:1] = tau  # on the corner: no gradient
     raw.requires_grad_()
-    value = 0.7 * (native_terms.hinge_sum(raw, tau) / max(raw.numel(), 1))
+    value = 0.7 * (native_terms.sum_hinge(raw, tau) / max(raw.numel(), 1))
     value.backward()
     plain = raw.detach().clone().requires_grad_()
     (0.7 * (functional.relu(tau - plain).sum() / max(raw.numel(), 1))).backward()

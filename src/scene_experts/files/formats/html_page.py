@@ -27,7 +27,7 @@ from scene_experts.files.cameras import camera_entries
 from scene_experts.files.formats.pack import Floats, damaged
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.formats.spz import decode_spz, spz_bytes
-from scene_experts.geometry.rotation import common_up
+from scene_experts.geometry.rotation import estimate_up
 from scene_experts.view.paths import choose_best_view
 
 ASSETS = files("scene_experts.files.formats") / "assets"
@@ -87,7 +87,7 @@ def page_settings(splats: Splats, note: Mapping[str, Any]) -> dict[str, Any]:
     poses = [_pose(entry) for entry in note.get("cameras") or []]
     first = _pose(note["camera"]) if note.get("camera") else poses[0] if poses else _from_outside(means)
     poses = poses or [first]
-    up = common_up(torch.tensor([pose["rotation"] for pose in poses], dtype=torch.float64))
+    up = estimate_up(torch.tensor([pose["rotation"] for pose in poses], dtype=torch.float64))
     distance = _distance(means, first)
     return {
         "count": len(splats),

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.types import Camera
-from scene_experts.geometry.voxel import AXIS_LIMIT, to_lattice, unique_cells
+from scene_experts.geometry.voxel import AXIS_LIMIT, find_unique_cells, to_lattice
 
 log = logging.getLogger(__name__)
 LevelRule = Literal["round", "floor", "ceil", "blend"]
@@ -140,6 +140,6 @@ def within_reach(count: int, edge: float, cube_edge: float, fork: int) -> int:
 
 def occupied(levels: Levels, points: Tensor) -> tuple[Tensor, Tensor]:
     """Cells [n, 3] and levels [n] of every level's occupied cells, coarse to fine."""
-    per_level = [unique_cells(levels.cells(points, level))[0] for level in range(levels.count)]
+    per_level = [find_unique_cells(levels.cells(points, level))[0] for level in range(levels.count)]
     level = torch.cat([torch.full((len(cells),), i) for i, cells in enumerate(per_level)])
     return torch.cat(per_level), level

@@ -23,7 +23,7 @@ from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points, Routing
 from scene_experts.geometry.neighbours import knn_d2
-from scene_experts.geometry.voxel import VoxelChoice, voxel_size
+from scene_experts.geometry.voxel import VoxelChoice, choose_voxel_size
 from scene_experts.native import library as native
 from scene_experts.scene import Cull, Draws, Scene, Traits
 from scene_experts.scene.anchors import native_decode, triton_decode
@@ -145,7 +145,7 @@ class AnchorScene(Scene):
         """One anchor per occupied voxel of the point cloud (of each level). Raises InputError when there are no points."""
         if len(points.xyz) == 0:
             raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
-        voxel = config.voxel_size or voxel_size(points.xyz, config.voxel_rule)
+        voxel = config.voxel_size or choose_voxel_size(points.xyz, config.voxel_rule)
         facts, voxel, select = config.select.begin(points.xyz, voxel, cameras)
         chosen = config.voxel_size or config.voxel_rule != "neighbours"
         if chosen and isinstance(select, AllAnchors) and len(facts["xyz"]) > NEARLY_ALL * len(points.xyz):

@@ -15,7 +15,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Mode
-from scene_experts.geometry.voxel import to_lattice, unique_cells
+from scene_experts.geometry.voxel import find_unique_cells, to_lattice
 from scene_experts.scene.anchors import levels as lattices
 from scene_experts.scene.anchors.levels import LevelRule, Levels, blended, whole
 
@@ -74,7 +74,7 @@ class AllAnchors:
 
     def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
         """One anchor per occupied voxel of points [P, 3]: facts of the rows, the finest cell's edge, the selector."""
-        cells, _ = unique_cells(to_lattice(points, voxel))
+        cells, _ = find_unique_cells(to_lattice(points, voxel))
         return self.places(cells, voxel, 0), voxel, self
 
     def restored(self, meta: dict[str, Any]) -> Selector:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scene_experts.geometry.neighbours import nearest
+from scene_experts.geometry.neighbours import find_neighbours
 from scene_experts.native import library as native
 
 NEAREST = 1e-8  # points in one place count as so far apart
@@ -27,7 +27,7 @@ class Graph:
     @classmethod
     def of(cls, xyz: Tensor, k: int) -> Graph:
         """The exact graph of points [N, 3] with their k - 1 nearest others; found from the places alone, so twice the same."""
-        d2, others = nearest(xyz, k - 1)
+        d2, others = find_neighbours(xyz, k - 1)
         me = torch.arange(len(xyz), device=xyz.device)[:, None]
         close = 1 / d2.sqrt().clamp_min(NEAREST)
         return cls(torch.cat([me, others], dim=1), torch.cat([d2.new_zeros(len(xyz), 1), close], dim=1).to(xyz.dtype))

@@ -21,9 +21,9 @@ from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
-from scene_experts.geometry.curvature import curvature, flatter, pairs_to_halve
+from scene_experts.geometry.curvature import curvature, find_flat, find_midpoint_pairs
 from scene_experts.geometry.neighbours import knn_d2
-from scene_experts.geometry.voxel import VoxelChoice, coarsen, to_lattice, unique_cells, voxel_size
+from scene_experts.geometry.voxel import VoxelChoice, choose_voxel_size, coarsen, find_unique_cells, to_lattice
 from scene_experts.scene import Cull, Scene, Traits
 from scene_experts.scene.anchors.mlp import CHANNELS
 from scene_experts.scene.anchors.scene import EPS
@@ -65,10 +65,10 @@ class GraphPoints:
         """The occupied voxels of the point cloud and the midpoints between them. Raises InputError when there are no points."""
         if len(points.xyz) == 0:
             raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
-        voxel = self.voxel_size or voxel_size(points.xyz, self.voxel_rule)
-        cells, _ = unique_cells(to_lattice(points.xyz, voxel))
-        flat = flatter(curvature(cells.double(), self.neighbours), self.flat_sigmas)
-        twice = cells[pairs_to_halve(cells.double(), flat, self.low, self.high)].sum(1)  # in half voxels
+        voxel = self.voxel_size or choose_voxel_size(points.xyz, self.voxel_rule)
+        cells, _ = find_unique_cells(to_lattice(points.xyz, voxel))
+        flat = find_flat(curvature(cells.double(), self.neighbours), self.flat_sigmas)
+        twice = cells[find_midpoint_pairs(cells.double(), flat, self.low, self.high)].sum(1)  # in half voxels
         xyz = (twice.double() * (voxel / HALF)).float()
         scale = knn_d2(xyz.double()).clamp_min(1e-7).sqrt().log().float()
         params = {"feature": torch.zeros(len(xyz), self.F), "log_scaling": scale[:, None].repeat(1, 6)}

@@ -7,7 +7,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode, Points
-from scene_experts.geometry.curvature import curvature, flatter
+from scene_experts.geometry.curvature import curvature, find_flat
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.graph.hash_grid import HashGrid
@@ -37,7 +37,7 @@ def test_rates_of_sags():
 def test_the_cloud_starts_as_the_midpoints_of_pairs_on_the_lattice():
     voxel, config = 0.05, GraphPoints(voxel_size=0.05)
     cells = torch.unique(torch.round(cloud().xyz / voxel).long(), dim=0)
-    flat = flatter(curvature(cells.double(), 10))
+    flat = find_flat(curvature(cells.double(), 10))
     assert 0 < int(flat.sum()) < len(cells)
     distance = torch.cdist(cells.double(), cells.double(), compute_mode="donot_use_mm_for_euclid_dist")
     scene = config.start(cloud(), 5.0)
