@@ -16,7 +16,7 @@ from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
 from scene_experts.core.errors import InputError
-from scene_experts.data.fetch.catalog import COLLECTIONS, SCENES, Scene, select
+from scene_experts.data.fetch.catalog import COLLECTIONS, SCENES, CatalogScene, select
 from scene_experts.data.fetch.obtain import captures_dir, is_present, obtain
 
 SAY_EVERY = 15.0  # seconds between lines where there is no terminal
@@ -56,7 +56,7 @@ def download(args: list[str]) -> int:
     return 0
 
 
-def flags(scene: Scene, to: Path | None) -> str:
+def flags(scene: CatalogScene, to: Path | None) -> str:
     """How `train` is told to read a scene by the paper's protocol."""
     if to is None:
         return f"--data catalog:{scene.name}"
@@ -91,7 +91,7 @@ def catalog(args: list[str]) -> int:
     return 0
 
 
-def table(scenes: tuple[Scene, ...] | list[Scene], root: Path) -> Table:
+def table(scenes: tuple[CatalogScene, ...] | list[CatalogScene], root: Path) -> Table:
     """One row a scene."""
     out = Table(box=None, pad_edge=False)
     for name in ("scene", "data set", "archive", "views", "resolution", "split", "here"):
@@ -103,7 +103,7 @@ def table(scenes: tuple[Scene, ...] | list[Scene], root: Path) -> Table:
     return out
 
 
-def described(scene: Scene, root: Path) -> list[str]:
+def described(scene: CatalogScene, root: Path) -> list[str]:
     """Everything about a scene, and how to get it by hand."""
     from scene_experts.training.config import flag
 

@@ -113,7 +113,7 @@ def gsplat() -> Check:
     try:
         from scene_experts.render import gsplat as adapter
 
-        reason = adapter.available()
+        reason = adapter.explain_missing()
     except Exception as error:  # a broken compiled extension may raise anything when imported
         reason = f"{type(error).__name__}: {error}"
     found = version if reason is None else f"{version}: {reason}"

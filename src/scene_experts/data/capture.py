@@ -13,7 +13,7 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera
 from scene_experts.data import prepare
-from scene_experts.data.images import Source, check_policy, probe
+from scene_experts.data.images import FrameSource, check_policy, probe
 from scene_experts.data.lens import Lens, centre_principal_point, pinhole_of
 from scene_experts.data.match import to_relative_name
 from scene_experts.data.readers import PosedImage, RawCapture, ReadOptions, find_reader, unrecognised_error
@@ -117,7 +117,7 @@ def _assemble(root: Path, kind: str, raw: RawCapture, centred: bool, background:
         K = torch.tensor([[flat.fx, 0, flat.cx], [0, flat.fy, flat.cy], [0, 0, 1]], dtype=torch.float64)
         camera = Camera(torch.from_numpy(image.world_to_cam), K, flat.width, flat.height, id=i)
         views.append(View(image.name, camera, image.path))
-        sources.append(Source(image.path, lens, (flat.width, flat.height), image.mask, turn, raw.alpha_over))
+        sources.append(FrameSource(image.path, lens, (flat.width, flat.height), image.mask, turn, raw.alpha_over))
     train, test = (tuple(i for i, image in enumerate(posed) if image.test == held) for held in (False, True))
     return Capture(
         name=root.resolve().name,

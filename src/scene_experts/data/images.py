@@ -25,7 +25,7 @@ _ORIENTATION = 0x0112  # EXIF tag; 5 to 8 swap the axes
 
 
 @dataclass(frozen=True)
-class Source:
+class FrameSource:
     """The file of a frame and the steps that turn it into pixels."""
 
     path: Path
@@ -107,7 +107,7 @@ def check_policy(policy: str) -> str:
     return policy
 
 
-def decode(source: Source) -> tuple[Tensor, Tensor | None]:
+def decode(source: FrameSource) -> tuple[Tensor, Tensor | None]:
     """Return the frame of `source`: rgb [H, W, 3] uint8 and its mask [H, W] uint8 (255 = counts), or None if every pixel counts.
 
     The photograph is undistorted at the resolution of its file, resized with Pillow's antialiased bicubic filter as in the
@@ -153,7 +153,7 @@ def _resize_mask(mask: Image.Image, size: Size) -> Image.Image:
     return mask if mask.size == size else mask.resize(size, Image.Resampling.BOX)
 
 
-def _load_pixels(source: Source) -> Image.Image:
+def _load_pixels(source: FrameSource) -> Image.Image:
     """Load the photograph as 8-bit L, RGB or RGBA, rotated if `source.turn`."""
     with _open(source.path) as image:
         try:
@@ -179,7 +179,7 @@ def to_8_bit(image: Image.Image) -> Image.Image:
     return image.convert("RGBA" if "transparency" in image.info or image.mode in ("LA", "PA", "La", "RGBa") else "RGB")
 
 
-def _load_mask(source: Source) -> Image.Image | None:
+def _load_mask(source: FrameSource) -> Image.Image | None:
     """Load the mask file as L, at its own size.
 
     If the photograph was rotated and the mask was not, the mask is rotated by its own EXIF orientation or by the photograph's.

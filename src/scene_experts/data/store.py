@@ -15,7 +15,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from scene_experts.data.images import Source, decode
+from scene_experts.data.images import FrameSource, decode
 
 Decoded = tuple[Tensor, Tensor | None]  # rgb [H, W, 3] uint8, mask [H, W] uint8 or None
 
@@ -56,7 +56,7 @@ def _read_numbers(path: Path | str) -> dict[str, int]:
 class _Cache:
     """The state that the thread shares. It is separate from ImageStore so that the thread does not keep the store alive."""
 
-    def __init__(self, sources: tuple[Source, ...], budget: int) -> None:
+    def __init__(self, sources: tuple[FrameSource, ...], budget: int) -> None:
         self.sources, self.budget, self.used = sources, budget, 0
         self.frames: OrderedDict[int, Decoded] = OrderedDict()  # least recently used first
         self.wanted: deque[int] = deque()
@@ -143,7 +143,7 @@ class ImageStore:
         cache_bytes: Memory for decoded frames. None is a third of `available_bytes()`, or of 4 GiB if that is unknown.
     """
 
-    def __init__(self, sources: Iterable[Source], cache_bytes: int | None = None) -> None:
+    def __init__(self, sources: Iterable[FrameSource], cache_bytes: int | None = None) -> None:
         self.sources = tuple(sources)
         if cache_bytes is None:
             free = available_bytes()

@@ -77,9 +77,9 @@ def as_trained(rasterize: Rasterizer, antialias: bool) -> Rasterizer:
 
 def _best(device: torch.device) -> str:
     if device.type == "cuda":
-        from scene_experts.render.gsplat import available
+        from scene_experts.render.gsplat import explain_missing
 
-        reason = available()
+        reason = explain_missing()
         if reason is None:
             return "gsplat"
         _warn(reason)

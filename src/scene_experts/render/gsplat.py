@@ -1,11 +1,14 @@
-"""Drawing on CUDA with gsplat (Apache-2.0), called so that its pictures and gradients mean what `reference` defines.
+"""Draws on CUDA with gsplat (Apache-2.0), adapted to the pictures and gradients that `reference` defines.
 
-What the adapter settles: near plane and blur are the reference's; `radii` are the 3 sigma rule whatever extent gsplat bins with (from
-1.5 on less for faint Gaussians, and none below opacity 1/255); what has no radius is not drawn; depth is one more colour channel over a
-background of 0; the gradient of the 2D mean is turned from pixels to NDC; the antialias factor is floored at 0.005.
-What stays different with gsplat 1.5.3: alpha is clamped at 0.999 instead of 0.99 (from 1.6 on: 0.99); a pixel stops at T <= 1e-4 instead of
-below 1e-4; quaternions are normalised inside, so their gradient has no part along the quaternion; sums on the GPU vary in the last bits.
-gsplat is imported at the first use; without a prebuilt wheel that compiles its CUDA code, which takes minutes once.
+The adapter uses the near plane and blur of the reference. `radii` follow the 3 sigma rule, and Gaussians without a radius are not drawn,
+whatever extent gsplat sorts with (since 1.5 it is smaller for faint Gaussians and empty below opacity 1/255). Depth is a fourth colour
+channel over a background of 0. The gradient of the 2D mean is converted from px to NDC. The antialiasing factor is at least 0.005.
+
+These differences remain with gsplat 1.5.3: alpha is clamped at 0.999 instead of 0.99 (since 1.6 at 0.99). A pixel stops at T <= 1e-4
+instead of T < 1e-4. Quaternions are normalised inside, so their gradient has no component along the quaternion. Sums on the GPU are not
+deterministic in the last bits.
+
+gsplat is imported on first use. Without a prebuilt wheel it then compiles its CUDA code once, which takes minutes.
 """
 
 from __future__ import annotations
@@ -21,23 +24,23 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Gaussians, Render
-from scene_experts.render.reference import BLUR, MIN_COMPENSATION, TILE, ReferenceRasterizer, project, visible, watch_mean2d
+from scene_experts.render.reference import BLUR, MIN_COMPENSATION, TILE, ReferenceRasterizer, project, record_mean2d_grad, visible
 
 
 @functools.cache
-def available() -> str | None:
-    """None where gsplat can draw; else one sentence that says why not and what to do."""
+def explain_missing() -> str | None:
+    """Return None if gsplat can draw, otherwise a sentence that says why not and what to do."""
     if not torch.cuda.is_available():
-        return "gsplat needs a CUDA device and a CUDA build of torch, and torch finds none: use the cpu rasteriser"
+        return "gsplat needs a CUDA device and a CUDA build of torch, and torch finds none: use the rasteriser cpu"
     try:
         module = importlib.import_module("gsplat")
         backend = importlib.import_module("gsplat.cuda._backend")
-    except Exception as error:  # a broken CUDA toolkit raises almost anything while gsplat compiles
+    except Exception as error:  # a broken CUDA toolkit raises almost any exception while gsplat compiles
         reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
         return f"gsplat cannot be imported ({reason[0]}): install it with `pip install scene-experts[cuda]`, or use another rasteriser"
     if "opacities" not in inspect.signature(module.fully_fused_projection).parameters:
         found = getattr(module, "__version__", "an older one")
-        return f"gsplat 1.5.3 or newer is needed, found {found}: run `pip install -U gsplat`"
+        return f"gsplat 1.5.3 or newer is required, found {found}: run `pip install -U gsplat`"
     if getattr(backend, "_C", module) is None:
         return "gsplat is installed without its CUDA code: install the CUDA toolkit (nvcc) or a prebuilt gsplat wheel"
     return None
@@ -51,8 +54,8 @@ class GsplatRasterizer:
     name: str = field(default="gsplat", init=False)
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
-        """Draws M Gaussians over `background` [3]; see `types.Render`. InputError where gsplat cannot run."""
-        library = _library()
+        """Draw M Gaussians over `background` [3], see `types.Render`. Raises InputError if gsplat cannot run."""
+        library = _import_gsplat()
         if len(g) == 0:
             return ReferenceRasterizer()(g, camera, background)
         camera = camera.to(g.means.device, torch.float32)
@@ -71,24 +74,25 @@ class GsplatRasterizer:
             near_plane=camera.near,
             calc_compensations=self.antialias,
             opacities=g.opacities.detach(),
-        )  # [1, M, 2], [1, M, 2], [1, M], [1, M, 3], [1, M]; for one view
+        )  # [1, M, 2], [1, M, 2], [1, M], [1, M, 3], [1, M] for one view
         extents = extents * (radii > 0)[None, :, None].to(extents)
         opacities = g.opacities[None]
         if self.antialias:
             opacities = opacities * compensations.clamp_min(MIN_COMPENSATION)
         mean2d = means2d[0]
-        grad = watch_mean2d(mean2d, (g.scales, g.quats, g.opacities, g.colors), camera, len(g), slice(None))
+        grad = record_mean2d_grad(mean2d, (g.scales, g.quats, g.opacities, g.colors), camera, len(g), slice(None))
         colors = torch.cat([g.colors, depths[0, :, None]], dim=1)[None]  # [1, M, 4]
         picture, alpha = _rasterize(library, mean2d[None], conics, colors, opacities, extents, depths, camera, background)
         return Render(picture[..., :3], alpha, picture[..., 3], radii, grad)
 
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
-        """Whether Gaussians with unrotated axes at `means` [A, 3] with `scales` [A, 3] would be drawn (radius > 0), [A] bool."""
+        """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] are drawn (radius > 0)."""
         return visible(means, scales, camera)
 
 
-def _library() -> ModuleType:
-    reason = available()
+def _import_gsplat() -> ModuleType:
+    """Return the module gsplat. Raises InputError if it cannot draw."""
+    reason = explain_missing()
     if reason is not None:
         raise InputError(reason)
     return importlib.import_module("gsplat")
@@ -105,11 +109,11 @@ def _rasterize(
     camera: Camera,
     background: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Sorts into tiles and blends one view: the picture [H, W, 4] (colour and depth) and alpha [H, W]."""
+    """Sort into tiles and blend one view. Returns the picture [H, W, 4] (colour and depth) and alpha [H, W]."""
     across, down = -(-camera.width // TILE), -(-camera.height // TILE)
     _, keys, order = library.isect_tiles(means2d, extents, depths, TILE, across, down)
     offsets = library.isect_offset_encode(keys, 1, across, down).reshape(1, down, across)
-    behind = torch.cat([background.to(colors), colors.new_zeros(1)])[None]  # nothing behind the scene has depth
+    behind = torch.cat([background.to(colors), colors.new_zeros(1)])[None]  # the background has depth 0
     picture, alpha = library.rasterize_to_pixels(
         means2d, conics, colors, opacities, camera.width, camera.height, TILE, offsets, order, backgrounds=behind
     )

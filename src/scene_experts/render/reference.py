@@ -1,26 +1,29 @@
-"""The rasteriser in plain torch: slow, differentiable by autograd on any device and in any precision; the others are tested against it.
+"""The rasteriser in plain torch. It defines the picture, and the other rasterisers are tested against it.
+
+It is slow, but autograd differentiates it on any device and in any precision.
 
 Per Gaussian (EWA splatting as in 3DGS, with the true principal point as in gsplat):
-    view      p = R mean + t; drawn only if p.z > near.
-    centre    u = fx p.x / p.z + cx, v likewise; the centre of pixel (i, j) is (i + 0.5, j + 0.5).
+    view      p = R mean + t. The Gaussian is drawn only if p.z > near.
+    centre    u = fx p.x / p.z + cx, and v likewise. The centre of pixel (i, j) is (i + 0.5, j + 0.5).
     Jacobian  J = [[fx / z, 0, -fx tx / z^2], [0, fy / z, -fy ty / z^2]], where tx = z clamp(p.x / z, -cx / fx - m, (W - cx) / fx + m) with
-              m = 0.3 W / (2 fx): 1.3 tan(fov / 2) either side of a centred axis; ty likewise. Outside the limits p.x has no gradient
-              through J, and z has that of tx = z limit.
-    2D cov    C = J R Sigma R^T J^T + 0.3 I, Sigma from the quaternions as passed (not normalised here). det C <= 0: not drawn.
-    antialias (off by default) opacity *= sqrt(max(0.005^2, det(C - 0.3 I) / det C)); no gradient through the ratio where it is floored.
-              gsplat has this floor from 1.6 on; 1.5.3 floors at 0.
-    radius    r = ceil(3 sqrt(lambda)), lambda = mid + sqrt(max(0.1, mid^2 - det C)), mid = trace / 2. It is not drawn, and its radius
-              is 0, if the square [u - r, u + r] x [v - r, v + r] meets no 16 x 16 tile of the picture: if u + r <= 0 or
-              u - r >= 16 ceil(W / 16), or v likewise.
-Per pixel, by depth z (ties by index), over all drawn Gaussians:
-    power = -1/2 (a dx^2 + c dy^2) - b dx dy with the conic (a, b, c) = C^-1; skipped if power > 0.
-    alpha = min(0.99, opacity exp(power)); skipped if alpha < 1/255.
-    If T (1 - alpha) < 1e-4 the pixel stops, and this Gaussian is not blended. Else colour += T alpha c, depth += T alpha z, T *= 1 - alpha.
-    Output: colour + T background, 1 - T, depth.
+              m = 0.3 W / (2 fx), i.e. 1.3 tan(fov / 2) on either side of a centred axis; ty likewise. Outside these limits p.x
+              has no gradient through J, and z has the gradient of tx = z limit.
+    2D cov    C = J R Sigma R^T J^T + 0.3 I, with Sigma from the quaternions as passed (they are not normalised here). A Gaussian
+              with det C <= 0 is not drawn.
+    antialias (off by default) opacity *= sqrt(max(0.005^2, det(C - 0.3 I) / det C)). The ratio has no gradient at the floor.
+              gsplat has this floor since 1.6; in 1.5.3 the floor is 0.
+    radius    r = ceil(3 sqrt(lambda)), lambda = mid + sqrt(max(0.1, mid^2 - det C)), mid = trace / 2. The Gaussian is not drawn,
+              and its radius is 0, if the square [u - r, u + r] x [v - r, v + r] overlaps no 16 x 16 tile of the picture, i.e. if
+              u + r <= 0 or u - r >= 16 ceil(W / 16), or likewise for v.
+Per pixel, for all drawn Gaussians in order of depth z (then of index):
+    power = -1/2 (a dx^2 + c dy^2) - b dx dy with the conic (a, b, c) = C^-1. The Gaussian is skipped if power > 0.
+    alpha = min(0.99, opacity exp(power)). The Gaussian is skipped if alpha < 1/255.
+    If T (1 - alpha) < 1e-4, the pixel stops without this Gaussian. Otherwise colour += T alpha c, depth += T alpha z, T *= 1 - alpha.
+    The output is colour + T background, 1 - T, and depth.
 
-Different from the original CUDA code of 3DGS: a drawn Gaussian reaches every pixel where its alpha is at least 1/255 (there: only the tiles
-of its 3 sigma square, which cuts off alphas up to 0.011), and the gradient is the true one, zero where alpha is clamped to 0.99 (there it
-passes: `clamp_gradient`).
+Two things differ from the original CUDA code of 3DGS. A drawn Gaussian reaches every pixel where its alpha is at least 1/255; there it
+reaches only the tiles of its 3 sigma square, which cuts off alphas up to 0.011. The gradient is exact, i.e. zero where alpha is clamped
+to 0.99; there it passes the clamp (see `clamp_gradient`).
 """
 
 from __future__ import annotations
@@ -41,27 +44,29 @@ MAX_ALPHA = 0.99
 MIN_ALPHA = 1 / 255
 MIN_TRANSMITTANCE = 1e-4
 MIN_COMPENSATION = 0.005
-TILE = 16  # px; the radius rule is in these tiles whatever tile the picture is made in
-_CHECKPOINT = 1 << 24  # (pixel, Gaussian) pairs above which tiles are computed again in backward instead of kept
+TILE = 16  # px; the radius rule uses these tiles, whatever tile size the picture is drawn with
+_CHECKPOINT = 1 << 24  # (pixel, Gaussian) pairs; above, tiles are recomputed in the backward pass instead of kept in memory
 
 
 class Projected(NamedTuple):
-    """Gaussians as ellipses in the picture."""
+    """Gaussians projected to ellipses in the picture."""
 
     mean2d: Tensor  # [M, 2] px
     depth: Tensor  # [M] world units along z
-    cov2d: Tensor  # [M, 3] px^2: xx, xy, yy, blur included
-    conic: Tensor  # [M, 3]: the inverse, xx, xy, yy
-    compensation: Tensor  # [M] antialias factor of the opacity
+    cov2d: Tensor  # [M, 3] px^2: xx, xy, yy, including the blur
+    conic: Tensor  # [M, 3] inverse of cov2d: xx, xy, yy
+    compensation: Tensor  # [M] factor of the opacity for antialiasing
     radii: Tensor  # [M] int32 px
 
 
 @dataclass(frozen=True)
 class ReferenceRasterizer:
-    """The definition of the picture, in plain torch.
+    """Draws with plain torch.
 
-    `clamp_gradient` lets the gradient of opacity and shape pass where alpha is cut at 0.99, as the original CUDA code does.
-    `tile` is the edge in pixels of the blocks the picture is made in (None: all at once); it changes speed and memory, not the picture.
+    Args:
+        antialias: Multiply opacities by the compensation of the blur (Mip-Splatting).
+        clamp_gradient: Pass the gradient of opacity and shape through the clamp of alpha at 0.99, as the original CUDA code does.
+        tile: Edge in px of the blocks that the picture is drawn in (None: one block). It affects speed and memory only.
     """
 
     antialias: bool = False
@@ -70,33 +75,33 @@ class ReferenceRasterizer:
     name: str = field(default="reference", init=False)
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
-        """Draws M Gaussians over `background` [3]; see `types.Render`. A later backward pass overwrites `mean2d_grad`."""
+        """Draw M Gaussians over `background` [3], see `types.Render`. A backward pass overwrites `mean2d_grad`."""
         projected = project(g.means, g.quats, g.scales, camera)
         ids = torch.where(projected.radii > 0)[0]
         ids = ids[projected.depth.detach()[ids].argsort(stable=True)]  # near to far
         mean2d, opacity = projected.mean2d[ids], g.opacities[ids]
         if self.antialias:
             opacity = opacity * projected.compensation[ids]
-        grad = watch_mean2d(mean2d, (g.scales, g.quats, g.opacities, g.colors), camera, len(g), ids)
+        grad = record_mean2d_grad(mean2d, (g.scales, g.quats, g.opacities, g.colors), camera, len(g), ids)
         columns = [mean2d, projected.conic[ids], opacity[:, None], g.colors[ids], projected.depth[ids, None]]
-        reach = _reach(mean2d, projected.cov2d[ids], opacity)
-        out = self._picture(torch.cat(columns, dim=1), reach, camera)
+        reach = _compute_reach(mean2d, projected.cov2d[ids], opacity)
+        out = self._draw_blocks(torch.cat(columns, dim=1), reach, camera)
         color, depth, transmittance = out[..., :3], out[..., 3], out[..., 4]
         image = color + transmittance[..., None] * background.to(color)
         return Render(image, 1 - transmittance, depth, projected.radii, grad)
 
     @torch.no_grad()
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
-        """Whether round-axis Gaussians at `means` [A, 3] with `scales` [A, 3] would be drawn (radius > 0), [A] bool (Scaffold-GS)."""
+        """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] are drawn (radius > 0)."""
         return visible(means, scales, camera)
 
-    def _picture(self, splats: Tensor, reach: Tensor, camera: Camera) -> Tensor:
-        """Colour, depth and final transmittance [H, W, 5] of splats [V, 10] sorted near to far."""
+    def _draw_blocks(self, splats: Tensor, reach: Tensor, camera: Camera) -> Tensor:
+        """Return colour, depth and final transmittance [H, W, 5] of splats [V, 10] that are sorted from near to far."""
         height, width = camera.height, camera.width
         block = (height, width) if self.tile is None or not len(splats) else (self.tile, self.tile)
         down, across = -(-height // block[0]), -(-width // block[1])
-        entries, counts = _bin(reach, block, down, across)
-        lists = splats[entries].split(counts)  # one gather for all, so that backward is one scatter
+        entries, counts = _sort_into_blocks(reach, block, down, across)
+        lists = splats[entries].split(counts)  # one gather for all, so that the backward pass is one scatter
         pairs = len(entries) * block[0] * block[1]
         recompute = torch.is_grad_enabled() and splats.requires_grad and pairs > _CHECKPOINT
         blank = splats.new_tensor([0.0, 0.0, 0.0, 0.0, 1.0]).expand(block[0] * block[1], 5)
@@ -106,7 +111,7 @@ class ReferenceRasterizer:
                 tiles.append(blank)
                 continue
             corner = (number // across * block[0], number % across * block[1])
-            pixels = _centres(corner, block, splats)
+            pixels = _pixel_centres(corner, block, splats)
             if recompute:
                 tiles.append(checkpoint(_blend, part, pixels, self.clamp_gradient, use_reentrant=False))
             else:
@@ -116,12 +121,12 @@ class ReferenceRasterizer:
 
 
 def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Projected:
-    """Steps view to radius of the module's definition, for M Gaussians; what is not drawn has harmless finite values and radius 0."""
+    """Compute the steps from view to radius for M Gaussians. Those that are not drawn have finite values and radius 0."""
     camera = camera.to(means.device, means.dtype)
     rotation, shift = camera.world_to_cam[:3, :3], camera.world_to_cam[:3, 3]
     view = means @ rotation.T + shift
     front = view[:, 2] > camera.near
-    x, y, z = (torch.where(front, view[:, i], instead) for i, instead in enumerate((0.0, 0.0, 1.0)))  # no division by 0 behind the camera
+    x, y, z = (torch.where(front, view[:, i], instead) for i, instead in enumerate((0.0, 0.0, 1.0)))  # no division by 0
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     mean2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
 
@@ -140,20 +145,23 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
     det = torch.where(drawn, det, torch.ones_like(det))
     conic = torch.stack([yy / det, -xy / det, xx / det], dim=1)
     compensation = (sharp / det).clamp_min(MIN_COMPENSATION**2).sqrt()
-    radii = _radii(mean2d.detach(), xx.detach(), yy.detach(), det.detach(), drawn, camera)
+    radii = _compute_radii(mean2d.detach(), xx.detach(), yy.detach(), det.detach(), drawn, camera)
     return Projected(mean2d, view[:, 2], torch.stack([xx, xy, yy], dim=1), conic, compensation, radii)
 
 
 @torch.no_grad()
 def visible(means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
-    """Whether a Gaussian with unrotated axes at each of `means` [A, 3] with `scales` [A, 3] has a radius greater than 0, [A] bool."""
+    """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] have a radius above 0 (Scaffold-GS)."""
     quats = torch.zeros((len(means), 4), dtype=means.dtype, device=means.device)
     quats[:, 0] = 1
     return project(means, quats, scales, camera).radii > 0
 
 
-def watch_mean2d(mean2d: Tensor, others: tuple[Tensor, ...], camera: Camera, total: int, ids: Tensor | slice) -> Tensor:
-    """A buffer [total, 2] of zeros; backward writes d loss / d mean in NDC (pixel gradient times W/2, H/2) of `mean2d` to rows `ids`."""
+def record_mean2d_grad(mean2d: Tensor, others: tuple[Tensor, ...], camera: Camera, total: int, ids: Tensor | slice) -> Tensor:
+    """Return a buffer [total, 2] of zeros. The backward pass writes d loss / d `mean2d` in NDC to its rows `ids`.
+
+    The gradient in NDC is the gradient in px times (W/2, H/2).
+    """
     buffer = mean2d.new_zeros((total, 2))
     if not torch.is_grad_enabled():
         return buffer
@@ -162,9 +170,9 @@ def watch_mean2d(mean2d: Tensor, others: tuple[Tensor, ...], camera: Camera, tot
     if mean2d.requires_grad:
 
         def store(gradient: Tensor | None) -> None:
-            if gradient is None:  # autograd knows it to be zero
+            if gradient is None:  # autograd found it to be zero
                 buffer[ids] = 0.0
-            else:  # column by column: a tensor made of the two numbers would have to wait for a GPU
+            else:  # column by column: building a tensor from the two numbers would synchronise with a GPU
                 x, y = gradient.detach().unbind(1)
                 buffer[ids] = torch.stack([x * (camera.width / 2), y * (camera.height / 2)], dim=1)
 
@@ -172,8 +180,8 @@ def watch_mean2d(mean2d: Tensor, others: tuple[Tensor, ...], camera: Camera, tot
     return buffer
 
 
-def _radii(mean2d: Tensor, xx: Tensor, yy: Tensor, det: Tensor, drawn: Tensor, camera: Camera) -> Tensor:
-    """The 3 sigma radius [M] int32, 0 for what is not drawn."""
+def _compute_radii(mean2d: Tensor, xx: Tensor, yy: Tensor, det: Tensor, drawn: Tensor, camera: Camera) -> Tensor:
+    """Return the 3 sigma radius [M] int32 in px, 0 for Gaussians that are not drawn."""
     mid = (xx + yy) / 2
     radius = (3 * (mid + (mid**2 - det).clamp_min(0.1).sqrt()).sqrt()).ceil()
     for centre, side in zip(mean2d.unbind(1), (camera.width, camera.height)):
@@ -183,17 +191,23 @@ def _radii(mean2d: Tensor, xx: Tensor, yy: Tensor, det: Tensor, drawn: Tensor, c
 
 
 @torch.no_grad()
-def _reach(mean2d: Tensor, cov2d: Tensor, opacity: Tensor) -> Tensor:
-    """The box [V, 4] (left, top, right, bottom, px) outside which alpha < 1/255; empty (right < left) if it is so everywhere."""
+def _compute_reach(mean2d: Tensor, cov2d: Tensor, opacity: Tensor) -> Tensor:
+    """Return the box [V, 4] (left, top, right, bottom in px) outside which alpha < 1/255.
+
+    The box is empty (right < left) if alpha is below 1/255 everywhere.
+    """
     log = torch.log(opacity / MIN_ALPHA)
-    extent = (2 * log.clamp_min(0)).sqrt()[:, None] * cov2d[:, [0, 2]].sqrt() * 1.001 + 0.01  # a little more than needed, for rounding
+    extent = (2 * log.clamp_min(0)).sqrt()[:, None] * cov2d[:, [0, 2]].sqrt() * 1.001 + 0.01  # slightly enlarged against rounding
     extent = torch.where(log[:, None] >= -1e-3, extent, torch.full_like(extent, -math.inf))
     return torch.cat([mean2d - extent, mean2d + extent], dim=1)
 
 
 @torch.no_grad()
-def _bin(reach: Tensor, block: tuple[int, int], down: int, across: int) -> tuple[Tensor, list[int]]:
-    """For each block in row order its splats in the given order: their indices [B], one block after the other, and how many each has."""
+def _sort_into_blocks(reach: Tensor, block: tuple[int, int], down: int, across: int) -> tuple[Tensor, list[int]]:
+    """Sort splats into blocks. Returns their indices [B], block after block in row order, and the number in each block.
+
+    Within a block the splats keep their order.
+    """
     size = reach.new_tensor([block[1], block[0]])
     most = reach.new_tensor([across, down])
     first = (reach[:, :2] / size).floor().maximum(torch.zeros_like(most)).minimum(most).long()
@@ -207,12 +221,12 @@ def _bin(reach: Tensor, block: tuple[int, int], down: int, across: int) -> tuple
     row = first[splat, 1] + torch.div(local, columns, rounding_mode="floor")
     column = first[splat, 0] + local % columns
     number = row * across + column
-    order = number.argsort(stable=True)  # keeps near to far within a block
+    order = number.argsort(stable=True)  # keeps the order from near to far within a block
     return splat[order], torch.bincount(number, minlength=down * across).tolist()
 
 
-def _centres(corner: tuple[int, int], block: tuple[int, int], like: Tensor) -> Tensor:
-    """Pixel centres [P, 2] (x, y) of a block whose first pixel is `corner` (row, column)."""
+def _pixel_centres(corner: tuple[int, int], block: tuple[int, int], like: Tensor) -> Tensor:
+    """Return the pixel centres [P, 2] (x, y) of a block whose first pixel is `corner` (row, column)."""
     rows = torch.arange(block[0], device=like.device, dtype=like.dtype) + (corner[0] + 0.5)
     columns = torch.arange(block[1], device=like.device, dtype=like.dtype) + (corner[1] + 0.5)
     y, x = torch.meshgrid(rows, columns, indexing="ij")
@@ -220,7 +234,7 @@ def _centres(corner: tuple[int, int], block: tuple[int, int], like: Tensor) -> T
 
 
 def _blend(splats: Tensor, pixels: Tensor, clamp_gradient: bool) -> Tensor:
-    """Front-to-back blending of splats [S, 10], sorted, at pixels [P, 2]: colour, depth, final transmittance [P, 5]."""
+    """Blend sorted splats [S, 10] front to back at pixels [P, 2]. Returns colour, depth and final transmittance [P, 5]."""
     u, v, a, b, c, opacity = splats[:, :6].unbind(1)
     dx, dy = u - pixels[:, :1], v - pixels[:, 1:]  # [P, S]
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
@@ -229,7 +243,7 @@ def _blend(splats: Tensor, pixels: Tensor, clamp_gradient: bool) -> Tensor:
     if clamp_gradient:
         alpha = raw + (alpha - raw).detach()
     alpha = torch.where((power <= 0) & (alpha >= MIN_ALPHA), alpha, torch.zeros_like(alpha))
-    after = (1 - alpha.detach()).cumprod(1)  # transmittance behind each splat; it only falls, so the stop cuts off a tail
+    after = (1 - alpha.detach()).cumprod(1)  # transmittance behind each splat; it decreases, so the stop cuts off a tail
     kept = torch.where(after >= MIN_TRANSMITTANCE, alpha, torch.zeros_like(alpha))
     through = (1 - kept).cumprod(1)
     before = torch.cat([torch.ones_like(pixels[:, :1]), through], dim=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,10 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_atomic
+from scene_experts.core.progress import Progress
 
 GRADING_WIDTH = 480  # px; frames are scaled to this width before their sharpness is measured
 JPEG_QUALITY = 95
-
-Progress = Callable[[str, int, int], None]  # name of the work, how much is done, how much there is
 
 
 def extract_frames(video: Path, folder: Path, count: int, progress: Progress) -> list[str]:

@@ -19,6 +19,7 @@ from typing import Any
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.io import read_json, write_json
+from scene_experts.core.progress import Progress
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
@@ -33,7 +34,6 @@ MOST_EXHAUSTIVE = 300  # photographs that are all matched with each other: 44,85
 NEIGHBOURS = 10  # following photographs that each photograph is matched with
 
 Say = Callable[[str], None]
-Progress = Callable[[str, int, int], None]  # name of the work, how much is done, how much there is
 
 
 def reconstruct(

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.images import Source, check_policy, decode, probe, target_size
+from scene_experts.data.images import FrameSource, check_policy, decode, probe, target_size
 from scene_experts.data.lens import Lens, pinhole_of
 from support.messages import naming
 from support.synthetic import look_at, picture
@@ -24,10 +24,10 @@ def noise(height: int, width: int, channels: int = 3, seed: int = 0) -> np.ndarr
     return np.random.default_rng(seed).integers(0, 256, (height, width, channels)).astype(np.uint8)
 
 
-def source(path: Path, pixels: np.ndarray, **options: object) -> Source:
+def source(path: Path, pixels: np.ndarray, **options: object) -> FrameSource:
     Image.fromarray(pixels.squeeze()).save(path)
     h, w = pixels.shape[:2]
-    return Source(path, pinhole(w, h), **({"size": (w, h)} | options))  # type: ignore[arg-type]
+    return FrameSource(path, pinhole(w, h), **({"size": (w, h)} | options))  # type: ignore[arg-type]
 
 
 def test_pixels_come_through_untouched(tmp_path: Path) -> None:
@@ -42,7 +42,7 @@ def test_grey_and_16_bit_become_rgb(tmp_path: Path) -> None:
     rgb, _ = decode(source(tmp_path / "g.png", grey))
     np.testing.assert_array_equal(rgb, np.repeat(grey, 3, 2))
     Image.fromarray(grey[..., 0].astype(np.uint16) * 257).save(tmp_path / "d.png")
-    rgb, _ = decode(Source(tmp_path / "d.png", pinhole(7, 5), (7, 5)))
+    rgb, _ = decode(FrameSource(tmp_path / "d.png", pinhole(7, 5), (7, 5)))
     np.testing.assert_array_equal(rgb, np.repeat(grey, 3, 2))
 
 
@@ -51,7 +51,7 @@ def test_palette_with_transparency_becomes_a_mask(tmp_path: Path) -> None:
     image.putpalette([200, 10, 20, 0, 255, 0])
     image.putpixel((1, 1), 1)
     image.save(tmp_path / "p.png", transparency=1)
-    rgb, mask = decode(Source(tmp_path / "p.png", pinhole(4, 3), (4, 3)))
+    rgb, mask = decode(FrameSource(tmp_path / "p.png", pinhole(4, 3), (4, 3)))
     assert rgb[0, 0].tolist() == [200, 10, 20]
     assert mask is not None and mask[1, 1] == 0 and mask.sum() == 255 * 11
 
@@ -97,15 +97,15 @@ def test_exif_is_applied_only_when_asked(tmp_path: Path) -> None:
     exif[0x0112] = 6
     Image.fromarray(pixels).save(tmp_path / "a.png", exif=exif)
     assert probe(tmp_path / "a.png") == ((16, 10), (10, 16))
-    rgb, _ = decode(Source(tmp_path / "a.png", pinhole(16, 10), (16, 10)))
+    rgb, _ = decode(FrameSource(tmp_path / "a.png", pinhole(16, 10), (16, 10)))
     np.testing.assert_array_equal(rgb, pixels)
-    rgb, _ = decode(Source(tmp_path / "a.png", pinhole(10, 16), (10, 16), turn=True))
+    rgb, _ = decode(FrameSource(tmp_path / "a.png", pinhole(10, 16), (10, 16), turn=True))
     np.testing.assert_array_equal(rgb, np.rot90(pixels, -1))
     stencil = np.zeros((10, 16), np.uint8)
     stencil[:3] = 255
     for mask in (stencil, np.ascontiguousarray(np.rot90(stencil, -1))):  # made of the stored pixels, or of the turned ones
         Image.fromarray(mask).save(tmp_path / "m.png")
-        found = decode(Source(tmp_path / "a.png", pinhole(10, 16), (10, 16), mask=tmp_path / "m.png", turn=True))[1]
+        found = decode(FrameSource(tmp_path / "a.png", pinhole(10, 16), (10, 16), mask=tmp_path / "m.png", turn=True))[1]
         np.testing.assert_array_equal(found, np.rot90(stencil, -1))
 
 
@@ -122,7 +122,7 @@ def test_undistorted_photograph_is_the_pinhole_picture(tmp_path: Path, lens: Len
     pose = look_at(np.array([2.6, 1.9, 2.2]), np.array([0.0, 0.0, 0.2]))
     Image.fromarray(np.rint(255 * picture(lens, pose, 1.0, (0, 0, 0))).astype(np.uint8)).save(tmp_path / "a.png")
     flat = pinhole_of(lens)
-    rgb, _ = decode(Source(tmp_path / "a.png", lens, (flat.width, flat.height)))
+    rgb, _ = decode(FrameSource(tmp_path / "a.png", lens, (flat.width, flat.height)))
     truth = picture(flat, pose, 1.0, (0, 0, 0))
     error = np.abs(rgb.numpy() / 255 - truth)
     assert np.median(error) < 0.004 and error.mean() < 0.02  # edges of objects are blurred a little by the second sampling

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.images import Source, decode
+from scene_experts.data.images import FrameSource, decode
 from scene_experts.data.lens import MODELS, Lens, centre_principal_point, pinhole_of
 from support.lenses import IDS, LENSES
 
@@ -79,7 +79,7 @@ def test_undistorted_camera_and_picture_equal_pycolmap(oracle: tuple[Path, np.nd
     assert (flat.width, flat.height) == (width, height)
     theirs = params if len(params) == 4 else [params[0], *params]
     np.testing.assert_allclose(flat.params, theirs, rtol=1e-9)
-    rgb, mask = decode(Source(folder / "photo.png", LENSES[index], (flat.width, flat.height)))
+    rgb, mask = decode(FrameSource(folder / "photo.png", LENSES[index], (flat.width, flat.height)))
     difference = np.abs(rgb.numpy().astype(int) - np.load(folder / f"flat_{index}.npy").astype(int))
     inner = difference[2:-2, 2:-2]  # at the very edge pycolmap writes black where we continue the border
     assert inner.max() <= 1

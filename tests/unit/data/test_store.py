@@ -17,7 +17,7 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.data import store as module
-from scene_experts.data.images import Source, decode
+from scene_experts.data.images import FrameSource, decode
 from scene_experts.data.lens import Lens
 from scene_experts.data.store import ImageStore, available_bytes
 from support.messages import naming
@@ -26,12 +26,12 @@ W, H = 20, 10
 FRAME = W * H * 3
 
 
-def sources(folder: Path, count: int) -> list[Source]:
+def sources(folder: Path, count: int) -> list[FrameSource]:
     out = []
     for i in range(count):
         path = folder / f"{i}.png"
         Image.fromarray(np.random.default_rng(i).integers(0, 256, (H, W, 3)).astype(np.uint8)).save(path)
-        out.append(Source(path, Lens("PINHOLE", W, H, (9.0, 9.0, 10.0, 5.0)), (W, H)))
+        out.append(FrameSource(path, Lens("PINHOLE", W, H, (9.0, 9.0, 10.0, 5.0)), (W, H)))
     return out
 
 
@@ -141,11 +141,11 @@ def test_exit_while_busy_is_quiet_and_quick(tmp_path: Path) -> None:
         Image.fromarray(np.random.default_rng(i).integers(0, 256, (300, 300, 3)).astype(np.uint8)).save(tmp_path / f"{i}.png")
     code = f"""
 from pathlib import Path
-from scene_experts.data.images import Source, decode
+from scene_experts.data.images import FrameSource, decode
 from scene_experts.data.lens import Lens
 from scene_experts.data.store import ImageStore
 lens = Lens("PINHOLE", 300, 300, (200.0, 200.0, 150.0, 150.0))
-store = ImageStore([Source(Path({str(tmp_path)!r}) / f"{{i}}.png", lens, (300, 300)) for i in range(40)], 1 << 30)
+store = ImageStore([FrameSource(Path({str(tmp_path)!r}) / f"{{i}}.png", lens, (300, 300)) for i in range(40)], 1 << 30)
 store.prefetch(range(40))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

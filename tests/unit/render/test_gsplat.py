@@ -11,7 +11,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.render import gsplat as adapter
-from scene_experts.render.reference import ReferenceRasterizer, _blend, _centres, project
+from scene_experts.render.reference import ReferenceRasterizer, _blend, _pixel_centres, project
 from support.gaussians import make_camera, make_scene
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
@@ -90,7 +90,7 @@ class FakeGsplat(ModuleType):
         assert isect_offsets.shape == (1, -(-image_height // tile_size), -(-image_width // tile_size))
         assert backgrounds is not None and backgrounds.shape == (1, colors.shape[2]) and opacities.shape == colors.shape[:2]
         splats = torch.cat([means2d[0], conics[0], opacities[0, :, None], colors[0]], dim=1)[flatten_ids]
-        out = _blend(splats, _centres((0, 0), (image_height, image_width), splats), False)
+        out = _blend(splats, _pixel_centres((0, 0), (image_height, image_width), splats), False)
         out = out.view(1, image_height, image_width, 5)
         return out[..., :4] + out[..., 4:] * backgrounds[:, None, None], 1 - out[..., 4:]
 
@@ -99,7 +99,7 @@ class FakeGsplat(ModuleType):
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeGsplat:
     module = FakeGsplat()
     monkeypatch.setitem(sys.modules, "gsplat", module)
-    monkeypatch.setattr(adapter, "available", lambda: None)
+    monkeypatch.setattr(adapter, "explain_missing", lambda: None)
     return module
 
 
@@ -137,7 +137,7 @@ def test_no_gaussians(fake: FakeGsplat) -> None:
 
 
 def test_why_it_is_not_available(monkeypatch: pytest.MonkeyPatch) -> None:
-    ask = adapter.available.__wrapped__
+    ask = adapter.explain_missing.__wrapped__
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert "CUDA device" in ask()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -151,7 +151,7 @@ def test_why_it_is_not_available(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "nvcc" in ask()
     library.fully_fused_projection = lambda means: None  # type: ignore[method-assign,assignment]
     assert "1.5.3 or newer" in ask()
-    monkeypatch.setattr(adapter, "available", ask)
+    monkeypatch.setattr(adapter, "explain_missing", ask)
     with pytest.raises(InputError, match=r"1\.5\.3"):
         adapter.GsplatRasterizer()(single(make_scene(1)), make_camera(), BACKGROUND)
 
@@ -184,7 +184,7 @@ def test_projection_is_that_of_gsplat_s_own_torch_reference() -> None:
 
 @pytest.fixture(scope="module")
 def real() -> None:
-    reason = adapter.available()  # here, not at import: gsplat may have to compile
+    reason = adapter.explain_missing()  # here, not at import: gsplat may have to compile
     if reason is not None:
         pytest.skip(reason)
 

@@ -18,7 +18,7 @@ from typing import IO, Literal
 
 from scene_experts.core.errors import RunError
 from scene_experts.core.io import new_file_mode
-from scene_experts.data.fetch.download import Progress
+from scene_experts.core.progress import ByteProgress
 
 MOST_BYTES = 64 << 30  # per scene; the largest in the catalog has about 3 GB
 MOST_FILES = 100_000
@@ -78,7 +78,7 @@ def _from_tar(opened: tarfile.TarFile, info: tarfile.TarInfo) -> Member:
     return Member(info.name, info.size, "folder" if info.isdir() else "file" if info.isreg() else "other", content)
 
 
-def extract(archive: Path, scene: str, into: Path, inside: Sequence[str] = (), progress: Progress | None = None) -> Extracted:
+def extract(archive: Path, scene: str, into: Path, inside: Sequence[str] = (), progress: ByteProgress | None = None) -> Extracted:
     """Write the files of `scene` to the folder `into`. The folder appears when it is complete.
 
     Args:
@@ -114,7 +114,7 @@ def extract(archive: Path, scene: str, into: Path, inside: Sequence[str] = (), p
     return Extracted("/".join(prefix), len(wanted), total)
 
 
-def _copy(source: IO[bytes], stream: IO[bytes], member: Member, done: int, total: int, progress: Progress | None) -> int:
+def _copy(source: IO[bytes], stream: IO[bytes], member: Member, done: int, total: int, progress: ByteProgress | None) -> int:
     """Copy one entry, at most as many bytes as it declares. Reading a zip entry verifies its checksum."""
     left = member.bytes
     while block := source.read(min(1 << 20, left + 1)):

@@ -42,7 +42,7 @@ class Collection:
 
 
 @dataclass(frozen=True)
-class Scene:
+class CatalogScene:
     """A scene and its protocol in the paper: image sizes and held-out views as in 3DGS (Kerbl et al. 2023)."""
 
     name: str
@@ -130,23 +130,23 @@ _OUTDOOR = {"bicycle": 194, "garden": None, "stump": None}  # images_4, as 3DGS 
 _INDOOR = {"bonsai": 292, "counter": None, "kitchen": 279, "room": None}  # images_2
 _CITIES = ("amsterdam", "bilbao", "hollywood", "pompidou", "quebec", "rome")
 
-SCENES: tuple[Scene, ...] = (
-    *(Scene(name, MIPNERF360, (name, f"360_v2/{name}"), "inria:4", views=views, also=_CAP) for name, views in _OUTDOOR.items()),
-    *(Scene(name, MIPNERF360, (name, f"360_v2/{name}"), "inria:2", views=views, also=_CAP) for name, views in _INDOOR.items()),
-    *(Scene(name, TANDT, (f"tandt/{name}",), "as-is", views=views) for name, views in (("truck", 251), ("train", 301))),
-    *(Scene(name, DEEP_BLENDING, (f"db/{name}",), "as-is", views=views) for name, views in (("drjohnson", 263), ("playroom", 225))),
-    *(Scene(name, BUNGEENERF, (f"bungeenerf/{name}", name), "as-is", also=_LOD) for name in _CITIES),
+SCENES: tuple[CatalogScene, ...] = (
+    *(CatalogScene(name, MIPNERF360, (name, f"360_v2/{name}"), "inria:4", views=views, also=_CAP) for name, views in _OUTDOOR.items()),
+    *(CatalogScene(name, MIPNERF360, (name, f"360_v2/{name}"), "inria:2", views=views, also=_CAP) for name, views in _INDOOR.items()),
+    *(CatalogScene(name, TANDT, (f"tandt/{name}",), "as-is", views=views) for name, views in (("truck", 251), ("train", 301))),
+    *(CatalogScene(name, DEEP_BLENDING, (f"db/{name}",), "as-is", views=views) for name, views in (("drjohnson", 263), ("playroom", 225))),
+    *(CatalogScene(name, BUNGEENERF, (f"bungeenerf/{name}", name), "as-is", also=_LOD) for name in _CITIES),
 )
 COLLECTIONS = (MIPNERF360, TANDT, DEEP_BLENDING, BUNGEENERF)
 
 
-def select(words: Sequence[str]) -> list[Scene]:
+def select(words: Sequence[str]) -> list[CatalogScene]:
     """Return the scenes that `words` name, each once and in catalog order.
 
     A word names a scene ("bonsai", "mipnerf360/bonsai"), a data set ("tandt") or everything ("all").
     Raises InputError for any other word and suggests the nearest names.
     """
-    chosen: list[Scene] = []
+    chosen: list[CatalogScene] = []
     for word in words:
         name = word.removeprefix(PREFIX).strip("/").lower()
         found = [s for s in SCENES if name in (s.name, s.path, s.collection.key, "all")]
@@ -159,7 +159,7 @@ def select(words: Sequence[str]) -> list[Scene]:
     return [scene for scene in SCENES if scene in chosen]
 
 
-def one(word: str) -> Scene:
+def one(word: str) -> CatalogScene:
     """Return the scene that `word` names. Raises InputError if it names none or several."""
     found = select([word])
     if len(found) != 1:
@@ -167,5 +167,5 @@ def one(word: str) -> Scene:
     return found[0]
 
 
-def _names(scenes: Sequence[Scene]) -> str:
+def _names(scenes: Sequence[CatalogScene]) -> str:
     return ", ".join(scene.name for scene in scenes)

@@ -19,8 +19,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.progress import ByteProgress
 
-Progress = Callable[[int, int], None]  # bytes so far, bytes in all (0: unknown)
 Say = Callable[[str], None]
 TRIES = 4  # attempts without progress at one address before the next address is tried
 PATIENCE = 1.0  # seconds before the second attempt; doubles with each attempt
@@ -68,7 +68,7 @@ def fetch(
     digest: str | None = None,
     *,
     size: int | None = None,
-    progress: Progress | None = None,
+    progress: ByteProgress | None = None,
     say: Say | None = None,
     advice: str = "",
 ) -> Fetched:
@@ -113,7 +113,7 @@ def _move_into_place(part: Path, path: Path, url: str, found: str) -> Fetched:
     return Fetched(url, path.stat().st_size, found)
 
 
-def _download(url: str, part: Path, digest: str | None, size: int | None, progress: Progress | None) -> str:
+def _download(url: str, part: Path, digest: str | None, size: int | None, progress: ByteProgress | None) -> str:
     """Complete `part` from one address and return its SHA-256. Raises _Refused if that fails."""
     tries = 0
     while True:
@@ -153,7 +153,7 @@ def _verify(part: Path, begun: _Partial, digest: str | None, size: int | None) -
     return found
 
 
-def _continue(url: str, part: Path, known: bool, size: int | None, progress: Progress | None) -> _Partial:
+def _continue(url: str, part: Path, known: bool, size: int | None, progress: ByteProgress | None) -> _Partial:
     """Append the missing bytes of `url` to `part`, or start over if the server sends the whole file.
 
     known: Whether the checksum is known. Then a part from another address is resumed, too, because the checksum is verified at the end.
@@ -190,7 +190,7 @@ def _continue(url: str, part: Path, known: bool, size: int | None, progress: Pro
     return begun
 
 
-def _append(answer: http.client.HTTPResponse, part: Path, have: int, total: int, progress: Progress | None) -> int:
+def _append(answer: http.client.HTTPResponse, part: Path, have: int, total: int, progress: ByteProgress | None) -> int:
     with part.open("ab" if have else "wb") as stream:
         while block := answer.read(1 << 20):
             stream.write(block)

@@ -8,18 +8,18 @@ ROOT/mipnerf360/bonsai/              a scene: images/, sparse/0/, and source.jso
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.io import cache_dir, read_json, write_json
+from scene_experts.core.progress import Progress
 from scene_experts.data.fetch.archive import extract
-from scene_experts.data.fetch.catalog import PREFIX, Archive, Scene, one
+from scene_experts.data.fetch.catalog import PREFIX, Archive, CatalogScene, one
 from scene_experts.data.fetch.download import Say, check_web_address, fetch, sha256
 
 VARIABLE = "SCENE_EXPERTS_CAPTURES"
-Progress = Callable[[str, int, int], None]  # name of the work, bytes so far, bytes in total (0: unknown)
 
 
 def captures_dir() -> Path:
@@ -27,7 +27,7 @@ def captures_dir() -> Path:
     return Path(os.environ.get(VARIABLE) or cache_dir() / "captures")
 
 
-def is_present(root: Path, scene: Scene) -> bool:
+def is_present(root: Path, scene: CatalogScene) -> bool:
     """Return whether the scene is in `root`, downloaded or copied there by hand."""
     return all((root / scene.path / name).is_dir() for name in ("images", "sparse"))
 
@@ -50,7 +50,7 @@ def resolve(path: Path, resolution: str, split: str) -> tuple[Path, str, str]:
 
 
 def obtain(
-    scenes: Sequence[Scene],
+    scenes: Sequence[CatalogScene],
     root: Path,
     *,
     mirrors: Sequence[str] = (),
@@ -86,7 +86,7 @@ def obtain(
             path.unlink()
 
 
-def _unpack(scene: Scene, archive: Path, digest: str, root: Path, say: Say, progress: Progress | None) -> None:
+def _unpack(scene: CatalogScene, archive: Path, digest: str, root: Path, say: Say, progress: Progress | None) -> None:
     into = root / scene.path
     if into.exists():
         raise RunError(f"expected images and sparse in {into}, found a folder without them; move it away and run the command again")

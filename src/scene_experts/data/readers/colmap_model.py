@@ -81,20 +81,22 @@ def read_model(folder: Path, observations: bool = False) -> Model:
     Raises InputError if a file is missing, truncated or malformed, if there are no cameras or images, and if an image has a
     pose that is not finite or an unknown camera.
     """
-    cameras_file, images_file, points_file = (_pick(folder, name) for name in ("cameras", "images", "points3D"))
+    cameras_file, images_file, points_file = (_pick_file(folder, name) for name in ("cameras", "images", "points3D"))
     for name, found in (("cameras", cameras_file), ("images", images_file)):
         if found is None:
             raise InputError(f"expected {name}.bin or {name}.txt in {folder}, found neither; copy the whole reconstruction there")
     assert cameras_file is not None and images_file is not None
-    cameras = dict(_cameras_bin(cameras_file) if cameras_file.suffix == ".bin" else _cameras_txt(cameras_file))
+    cameras = dict(_read_cameras_bin(cameras_file) if cameras_file.suffix == ".bin" else _read_cameras_txt(cameras_file))
     if not cameras:
         raise InputError(f"expected at least one camera in {cameras_file}, found none; reconstruct the capture again")
-    rows = list(_images_bin(images_file, observations) if images_file.suffix == ".bin" else _images_txt(images_file, observations))
+    rows = list(
+        _read_images_bin(images_file, observations) if images_file.suffix == ".bin" else _read_images_txt(images_file, observations)
+    )
     images = tuple(image for image, _ in rows)
     _check_images(images, cameras, images_file)
     points = np.empty(0, _POINT)
     if points_file is not None:
-        points = _points_bin(points_file) if points_file.suffix == ".bin" else _points_txt(points_file)
+        points = _read_points_bin(points_file) if points_file.suffix == ".bin" else _read_points_txt(points_file)
     return Model(
         cameras,
         images,
@@ -106,7 +108,7 @@ def read_model(folder: Path, observations: bool = False) -> Model:
     )
 
 
-def _pick(folder: Path, name: str) -> Path | None:
+def _pick_file(folder: Path, name: str) -> Path | None:
     return next((path for kind in ("bin", "txt") if (path := folder / f"{name}.{kind}").is_file()), None)
 
 
@@ -159,7 +161,7 @@ class _Bytes:
         return start
 
 
-def _cameras_bin(path: Path) -> Iterator[tuple[int, Lens]]:
+def _read_cameras_bin(path: Path) -> Iterator[tuple[int, Lens]]:
     file = _Bytes(path, 24)
     for _ in range(file.count):
         key, model, width, height = file.take("<iiQQ")
@@ -169,17 +171,17 @@ def _cameras_bin(path: Path) -> Iterator[tuple[int, Lens]]:
                 f"convert the reconstruction to one of those"
             )
         name = _NAMES[model]
-        yield key, _lens(path, key, name, width, height, file.take(f"<{len(MODELS[name])}d"))
+        yield key, _make_lens(path, key, name, width, height, file.take(f"<{len(MODELS[name])}d"))
 
 
-def _lens(path: Path, key: int, model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
+def _make_lens(path: Path, key: int, model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
     try:
         return Lens(model, width, height, params)
     except InputError as error:
         raise InputError(f"camera {key} of {path}: {error}") from None
 
 
-def _images_bin(path: Path, observations: bool) -> Iterator[tuple[ColmapImage, NDArray | None]]:
+def _read_images_bin(path: Path, observations: bool) -> Iterator[tuple[ColmapImage, NDArray | None]]:
     file = _Bytes(path, 73)
     for _ in range(file.count):
         key, qw, qx, qy, qz, tx, ty, tz, camera = file.take("<i7di")
@@ -190,7 +192,7 @@ def _images_bin(path: Path, observations: bool) -> Iterator[tuple[ColmapImage, N
         yield ColmapImage(key, name, (qw, qx, qy, qz), (tx, ty, tz), camera), seen
 
 
-def _points_bin(path: Path) -> NDArray:
+def _read_points_bin(path: Path) -> NDArray:
     file = _Bytes(path, _POINT.itemsize)
     data, at, size, length = file.data, file.at, _POINT.itemsize, struct.Struct("<Q").unpack_from
     heads: list[bytes] = []
@@ -205,30 +207,30 @@ def _points_bin(path: Path) -> NDArray:
     return np.frombuffer(b"".join(heads), _POINT)
 
 
-def _lines(path: Path) -> list[str]:
+def _read_lines(path: Path) -> list[str]:
     try:
         return [line for line in path.read_text("utf-8", "surrogateescape").split("\n") if not line.startswith("#")]
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; check its permissions") from error
 
 
-def _bad_line(path: Path, line: str) -> InputError:
+def _bad_line_error(path: Path, line: str) -> InputError:
     return InputError(f"expected a line of a COLMAP {path.name} in {path}, found {line[:60]!r}; restore the file")
 
 
-def _cameras_txt(path: Path) -> Iterator[tuple[int, Lens]]:
-    for line in filter(str.strip, _lines(path)):
+def _read_cameras_txt(path: Path) -> Iterator[tuple[int, Lens]]:
+    for line in filter(str.strip, _read_lines(path)):
         parts = line.split()
         try:
             key, model, width, height = int(parts[0]), parts[1], int(parts[2]), int(parts[3])
             params = tuple(float(p) for p in parts[4:])
         except (ValueError, IndexError):
-            raise _bad_line(path, line) from None
-        yield key, _lens(path, key, model, width, height, params)
+            raise _bad_line_error(path, line) from None
+        yield key, _make_lens(path, key, model, width, height, params)
 
 
-def _images_txt(path: Path, observations: bool) -> Iterator[tuple[ColmapImage, NDArray | None]]:
-    lines = _lines(path)
+def _read_images_txt(path: Path, observations: bool) -> Iterator[tuple[ColmapImage, NDArray | None]]:
+    lines = _read_lines(path)
     while lines and not lines[-1].strip():
         lines.pop()
     for i in range(0, len(lines), 2):  # two lines per image; the second lists its observations and may be empty
@@ -236,25 +238,25 @@ def _images_txt(path: Path, observations: bool) -> Iterator[tuple[ColmapImage, N
         try:
             q, t = [float(p) for p in parts[1:5]], [float(p) for p in parts[5:8]]
             image = ColmapImage(int(parts[0]), parts[9].strip(), (q[0], q[1], q[2], q[3]), (t[0], t[1], t[2]), int(parts[8]))
-            seen = _seen(lines[i + 1] if i + 1 < len(lines) else "") if observations else None
+            seen = _parse_observations(lines[i + 1] if i + 1 < len(lines) else "") if observations else None
         except (ValueError, IndexError):
-            raise _bad_line(path, lines[i]) from None
+            raise _bad_line_error(path, lines[i]) from None
         yield image, seen
 
 
-def _seen(line: str) -> NDArray:
+def _parse_observations(line: str) -> NDArray:
     numbers = np.array(line.split(), dtype=np.float64).reshape(-1, 3)
     out = np.empty(len(numbers), _OBSERVATION)
     out["xy"], out["point"] = numbers[:, :2], numbers[:, 2]
     return out
 
 
-def _points_txt(path: Path) -> NDArray:
-    rows = [line.split(maxsplit=8)[:8] for line in _lines(path) if line.strip()]
+def _read_points_txt(path: Path) -> NDArray:
+    rows = [line.split(maxsplit=8)[:8] for line in _read_lines(path) if line.strip()]
     try:
         numbers = np.array([[float(x) for x in row] for row in rows], dtype=np.float64).reshape(len(rows), 8)
     except ValueError:
-        raise _bad_line(path, next((" ".join(row) for row in rows if len(row) < 8), " ".join(rows[0]))) from None
+        raise _bad_line_error(path, next((" ".join(row) for row in rows if len(row) < 8), " ".join(rows[0]))) from None
     out = np.empty(len(rows), _POINT)
     out["id"], out["xyz"], out["rgb"], out["error"], out["length"] = numbers[:, 0], numbers[:, 1:4], numbers[:, 4:7], numbers[:, 7], 0
     return out

@@ -12,7 +12,7 @@ import pytest
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.data.fetch import download, obtain
-from scene_experts.data.fetch.catalog import Archive, Collection, Scene
+from scene_experts.data.fetch.catalog import Archive, CatalogScene, Collection
 from support.archives import in_folder, read_tree, write_zip
 from support.messages import naming
 from support.web import Server, serving
@@ -30,13 +30,13 @@ def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
         yield running
 
 
-def scenes(server: Server, **facts: object) -> list[Scene]:
+def scenes(server: Server, **facts: object) -> list[CatalogScene]:
     archive = replace(Archive("both.zip", (f"{server.url}/both.zip",), "https://owner/page", "1 kB"), **facts)  # type: ignore[arg-type]
     collection = Collection("pair", "Pair", archive, "not stated", "Somebody, 2020")
-    return [Scene(name, collection, (f"both/{name}",), "as-is", views=2) for name in ("truck", "train")]
+    return [CatalogScene(name, collection, (f"both/{name}",), "as-is", views=2) for name in ("truck", "train")]
 
 
-def get(wanted: list[Scene], root: Path, **options: object) -> list[str]:
+def get(wanted: list[CatalogScene], root: Path, **options: object) -> list[str]:
     said: list[str] = []
     obtain.obtain(wanted, root, say=said.append, **options)  # type: ignore[arg-type]
     return said
