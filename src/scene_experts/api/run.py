@@ -36,7 +36,8 @@ from scene_experts.training import run_folder, state
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.state import Training
 from scene_experts.view import video
-from scene_experts.view.paint import SHOWS, Look, Show, paint
+from scene_experts.view.paint import Look, paint
+from scene_experts.view.show import SHOWS, Show
 
 Format = Literal["compact", "anchors", "ply", "compressed-ply", "splat", "spz", "sog", "glb", "html"]
 

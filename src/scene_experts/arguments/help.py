@@ -9,8 +9,7 @@ from dataclasses import fields
 
 from scene_experts.arguments import docs
 from scene_experts.arguments.table import Row
-from scene_experts.arguments.values import described as known
-from scene_experts.arguments.values import placeholder, spelled
+from scene_experts.arguments.values import listed, placeholder, spelled
 
 INDENT = 2
 COLUMN = 26  # where the text beside an option begins
@@ -124,8 +123,8 @@ def described(row: Row) -> str:
     if text and row.within and _is_small(row):
         above = docs.of_field(*row.within).partition(". ")[0].removesuffix(".")
         text = f"{above}: {text[0].lower()}{text[1:]}" if above else text
-    if stands_for(row) == "NAME":
-        text = f"{text} One of {known(row.kind)}.".strip()
+    if choices := listed(row.kind):
+        text = f"{text} One of {choices}.".strip()
     plain = row.required or row.default is None or row.default is False or row.default == ()
     if plain or "default" in text:
         return text

@@ -76,6 +76,14 @@ def described(kind: Any) -> str:
     return WORDS[inner][0]
 
 
+def listed(kind: Any) -> str:
+    """The choices of a type whose placeholder does not show them: "a, b or c"; else empty."""
+    inner, _ = without_none(kind)
+    if typing.get_origin(inner) is tuple:
+        inner = typing.get_args(inner)[0]
+    return described(inner) if typing.get_origin(inner) is Literal and placeholder(inner) == "NAME" else ""
+
+
 def placeholder(kind: Any, name: str = "") -> str:
     """What stands for the value in the help: "N", "auto|cpu|cuda", "N ...". name: in place of the type's own."""
     inner, _ = without_none(kind)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -13,9 +12,8 @@ from scene_experts.core.types import Camera, Decoded, Mode, Render
 from scene_experts.evaluate.experts import assign_gaussians, select_gaussians
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Draws, Scene, Traits
+from scene_experts.view.show import SHOWS, Show
 
-Show = Literal["picture", "depth", "alpha", "experts", "entropy", "activation"]
-SHOWS: tuple[Show, ...] = get_args(Show)
 PALETTE = (  # colours that colour-blind readers can distinguish (Okabe and Ito), then darker ones
     (0.00, 0.45, 0.70), (0.84, 0.37, 0.00), (0.00, 0.62, 0.45), (0.80, 0.47, 0.65), (0.90, 0.62, 0.00), (0.34, 0.71, 0.91),
     (0.94, 0.89, 0.26), (0.50, 0.50, 0.50), (0.00, 0.27, 0.42), (0.50, 0.22, 0.00), (0.00, 0.37, 0.27), (0.48, 0.28, 0.39),

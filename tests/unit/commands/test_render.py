@@ -3,13 +3,9 @@
 import json
 
 import pytest
-import torch
 
 from scene_experts import cli
-from scene_experts.commands.render import resized, size_of
-from scene_experts.core.errors import InputError
 from scene_experts.evaluate import pictures
-from support.scenes import CAMERA
 from support.synthetic import make_capture
 
 
@@ -65,12 +61,3 @@ def test_flags_that_no_video_can_have(run, tmp_path, capsys):
     ):
         assert cli.main(["render", str(run), *wrong]) == 2
         assert fact in capsys.readouterr().err
-
-
-def test_sizes():
-    assert size_of("640x360") == (640, 360) and size_of(None) is None
-    for wrong in ("640", "640x", "0x10", "1x99999", "-5x5"):
-        with pytest.raises(InputError, match="--size"):
-            size_of(wrong)
-    assert resized(CAMERA, (96, 32)).fx == pytest.approx(2 * CAMERA.fx) and resized(CAMERA, None) is CAMERA
-    assert torch.allclose(resized(CAMERA, (96, 64)).K[:2], CAMERA.K[:2] * 2)

@@ -7,7 +7,8 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
 from scene_experts.render import choose
 from scene_experts.scene import Traits
-from scene_experts.view.paint import PALETTE, SHOWS, Look, available_shows, color_ramp, color_rows, paint
+from scene_experts.view.paint import PALETTE, Look, available_shows, color_ramp, color_rows, paint
+from scene_experts.view.show import SHOWS
 from support.scenes import CAMERA, start_scene
 
 BLACK = torch.zeros(3)
