@@ -33,7 +33,7 @@ def train(run: loop.Run, capture: Capture, rasterize: Rasterizer, *, overwrite: 
         yield from loop.train(run.config.train, run, capture, rasterize)
         return
     finished, complete = None, False
-    with ExitStack() as folder, Recorder(run.out, tensorboard, capture) as record:
+    with ExitStack() as folder, Recorder(run.out, tensorboard) as record:
         for event in loop.train(run.config.train, run, capture, rasterize):
             if isinstance(event, Started):  # the training can start: from here on the folder may change
                 complete = event.step == event.total and is_exported(run.out, event.step)

@@ -15,11 +15,11 @@ class Data:
 
     path: Annotated[Path, Option(name="data", short="-s", value="CAPTURE")]
     """Folder of the capture: a COLMAP folder (images/ and sparse/0/), a folder with transforms*.json, or catalog:SCENE for a scene that
-    `scene-experts download` has fetched."""
+    `scene-experts download` downloaded."""
     images: Annotated[str | None, Option(value="FOLDER")] = None
     """Image folder inside the capture, for example images_4."""
     resolution: Annotated[str, Option(short="-r", value="POLICY")] = "auto"
-    """Size of the training pictures: as-is, factor:N (sides divided by N), longest:PX, cap1600 (longest side at most 1600 px), share:S (a
+    """Size of the training pictures: as-is, factor:N (sides divided by N), longest:PX, cap1600 (width at most 1600 px), share:S (a
     share of what cap1600 gives), inria:N (as factor:N from the folder images_N) or auto (cap1600)."""
     split: Annotated[str, Option(value="RULE")] = "auto"
     """Which views are held out: mod8 (every 8th), mod:N (every Nth), first:N, none, files (as the capture's files say) or auto (files if

@@ -1,4 +1,4 @@
-"""What a training leaves on disk besides checkpoints: metrics.jsonl, previews and, when asked, TensorBoard files."""
+"""Writes what a training leaves on disk besides checkpoints: metrics.jsonl, previews and, if requested, TensorBoard files."""
 
 from __future__ import annotations
 
@@ -11,23 +11,27 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.io import write_atomic
-from scene_experts.data.capture import Capture
 from scene_experts.training.events import Adjusted, Event, Previewed, Started, Stepped
 
 
 class Recorder:
-    """Writes training events into a run folder. Use as a context manager; call it with each event."""
+    """Writes training events into a run folder. Use it as a context manager and call it with each event.
 
-    def __init__(self, out: Path, tensorboard: bool, capture: Capture) -> None:
-        self.out, self.capture = out, capture
+    Args:
+        out: The run folder.
+        tensorboard: Also write TensorBoard files. Raises InputError if TensorBoard is not installed.
+    """
+
+    def __init__(self, out: Path, tensorboard: bool) -> None:
+        self.out = out
         self.path = out / "metrics.jsonl"
-        self.writer: Any = None  # makes the board when the run starts, so that one that cannot start leaves nothing behind
+        self.writer: Any = None  # class of the board, which is created when the training starts, so that a failed start leaves no files
         self.board: Any = None
         if tensorboard:
             try:
                 from torch.utils.tensorboard import SummaryWriter
             except ImportError as error:
-                raise InputError("expected TensorBoard for --tensorboard, found none; pip install 'scene-experts[tensorboard]'") from error
+                raise InputError("--tensorboard requires TensorBoard: pip install 'scene-experts[tensorboard]'") from error
             self.writer = SummaryWriter
 
     def __enter__(self) -> Recorder:
@@ -44,30 +48,34 @@ class Recorder:
                 if self.writer:
                     self.board = self.writer(str(self.out / "tensorboard"))
             case Stepped():
-                self.line({**asdict(event)})
+                self.write_line(asdict(event))
                 if self.board:
-                    self.scalars(event)
+                    self.write_scalars(event)
             case Adjusted():
-                self.line({"step": event.step, "grown": event.edit.grown, "pruned": event.edit.pruned, "anchors": event.edit.anchors})
+                self.write_line({"step": event.step, "grown": event.edit.grown, "pruned": event.edit.pruned, "anchors": event.edit.anchors})
             case Previewed():
                 picture = Image.fromarray((event.picture * 255 + 0.5).byte().numpy())
                 path = self.out / "previews" / f"{event.step:06d}.png"
                 write_atomic(path, lambda temporary: picture.save(temporary, format="PNG"))
 
     def truncate(self, step: int) -> None:
-        """Drop lines beyond `step`: a resumed run writes them again."""
-        lines = self.path.read_text(errors="replace").splitlines() if self.path.exists() else []  # a power cut may leave anything
-        kept = [line for line in lines if _step(line) <= step] if step else []
+        """Remove the lines after `step`, which a resumed run writes again."""
+        lines = (
+            self.path.read_text(errors="replace").splitlines() if self.path.exists() else []
+        )  # a power failure may leave arbitrary bytes
+        kept = [line for line in lines if _read_step(line) <= step] if step else []
         write_atomic(self.path, lambda temporary: temporary.write_text("".join(line + "\n" for line in kept)))
 
-    def line(self, value: dict[str, Any]) -> None:
+    def write_line(self, value: dict[str, Any]) -> None:
+        """Append a line of JSON to metrics.jsonl. Raises RunError if the file cannot be written."""
         try:
             with self.path.open("a") as stream:
                 stream.write(json.dumps(value) + "\n")
         except OSError as error:
-            raise RunError(f"cannot write {self.path}: {error.strerror}; free some space and go on with --resume") from error
+            raise RunError(f"cannot write {self.path}: {error.strerror}; free some space and continue with --resume") from error
 
-    def scalars(self, event: Stepped) -> None:
+    def write_scalars(self, event: Stepped) -> None:
+        """Write the values of an iteration to TensorBoard."""
         values = {f"loss/{k}": v for k, v in event.terms.items()}
         values |= {
             "psnr/train": event.psnr,
@@ -80,8 +88,8 @@ class Recorder:
             self.board.add_scalar(name, value, event.step)
 
 
-def _step(line: str) -> float:
-    """The iteration of a metrics line; infinity where the line was cut off."""
+def _read_step(line: str) -> float:
+    """Return the iteration of a line, or infinity for an incomplete line."""
     try:
         return float(json.loads(line)["step"])
     except (ValueError, KeyError, TypeError):

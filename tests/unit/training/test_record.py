@@ -20,7 +20,7 @@ def lines(folder):
 
 
 def test_metrics_previews_and_what_a_resumed_run_writes_again(tmp_path):
-    with Recorder(tmp_path, False, None) as record:
+    with Recorder(tmp_path, False) as record:
         record(Started(0, 30, 10))
         for i in (10, 20, 30):
             record(step(i))
@@ -30,23 +30,23 @@ def test_metrics_previews_and_what_a_resumed_run_writes_again(tmp_path):
     assert Image.open(tmp_path / "previews" / "000030.png").getpixel((0, 0)) == (0, 128, 255)
     with (tmp_path / "metrics.jsonl").open("ab") as stream:
         stream.write(b'{"step": 31, "cut o\n\0\xff\xfe')  # killed while writing, and what a power cut leaves
-    with Recorder(tmp_path, False, None) as record:
+    with Recorder(tmp_path, False) as record:
         record(Started(20, 30, 10))
         record(step(30))
     assert [v["step"] for v in lines(tmp_path)] == [10, 20, 30]
-    with Recorder(tmp_path, False, None) as record:
+    with Recorder(tmp_path, False) as record:
         record(Started(0, 30, 10))
     assert lines(tmp_path) == []
 
 
 def test_tensorboard_files_appear_when_asked(tmp_path):
     pytest.importorskip("tensorboard")
-    with Recorder(tmp_path, True, None) as record:
+    with Recorder(tmp_path, True) as record:
         record(Started(0, 30, 10))
         record(step(10))
     assert list((tmp_path / "tensorboard").glob("events.out.*"))
 
 
 def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path):
-    with Recorder(tmp_path / "no" / "folder", False, None) as record, pytest.raises(RunError, match=naming("metrics.jsonl")):
+    with Recorder(tmp_path / "no" / "folder", False) as record, pytest.raises(RunError, match=naming("metrics.jsonl")):
         record(step(1))
