@@ -1,12 +1,21 @@
-# make demo   train Scaffold-GS and MoE-GS on the shipped capture, score both, print one table (minutes on two CPU cores)
-# make view   the demo's MoE-GS scene in a browser
-# make test   the test suite
-# Both build a virtual environment in .venv first; an importable torch of PYTHON is used as it is, otherwise the pinned CPU one is installed.
+# make demo       train Scaffold-GS and MoE-GS on the shipped capture, score both, print one table (minutes on two CPU cores)
+# make view       the demo's MoE-GS scene in a browser
+# make test       all tests, one process per core
+# make test-fast  the tests that are not marked `slow`: at least one of every test file, within 180 CPU seconds
+# make lint       ruff (rules and format) and pyright
+# make bench      the benchmarks that need no GPU
+# make record-errors, make record-flags   record the command line's error sentences or its flags anew in tests/golden
+# Every target builds a virtual environment in .venv first. An importable torch of PYTHON is used as it is; otherwise the pinned CPU
+# version is installed. WORKERS sets the number of test processes (0: none beside pytest's own).
+# Other selections of tests: .venv/bin/python -m pytest -m system (or slow, foreign, gpu; see pyproject.toml), or pytest tests/unit/render.
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.ready
 SE     := $(BIN)/scene-experts
+# worksteal keeps the tests of one file together, so that they share its fixtures
+WORKERS ?= auto
+PARALLEL := -n $(WORKERS) --dist worksteal
 DEMO_ITERATIONS ?= 4000
 DEMO_OUT ?= runs/demo
 # Short of iterations, structure pays more than brightness: a larger weight of 1 - SSIM gives a sharper picture at the same PSNR.
@@ -15,7 +24,7 @@ DEMO_FLAGS ?= --iterations $(DEMO_ITERATIONS) --loss.dssim 0.8
 # as the package sets it when it is imported before torch, which the benchmark scripts do not
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo view test lint record-errors record-flags bench env lpips clean
+.PHONY: demo view test test-fast lint record-errors record-flags bench env lpips clean
 
 env: $(STAMP)
 
@@ -43,11 +52,15 @@ view: $(STAMP)
 	$(SE) view $(DEMO_OUT)/moe-gs
 
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL)
+
+test-fast: $(STAMP)
+	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
-	$(BIN)/ruff format --check src tests benchmarks tools
+	$(BIN)/ruff format --check $(wildcard src tests benchmarks tools examples)
+	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
 record-errors: $(STAMP)
 	rm -f tests/golden/errors.json

@@ -1,6 +1,8 @@
-"""What every test shares: one thread, and GPU tests only where there is a CUDA device."""
+"""What every test shares: one thread, the markers that depend on the place or the machine, and the number of processes."""
 
+import math
 import os
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,11 +13,32 @@ pytest.register_assert_rewrite("support")  # asserts in support modules show the
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 torch.set_num_threads(1)
 
+TESTS = Path(__file__).parent
+MOST_WORKERS = 8  # each one holds torch in memory
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    if torch.cuda.is_available():
-        return
+    """Mark the tests in tests/system, and skip those marked `gpu` where there is no CUDA device."""
     skip = pytest.mark.skip(reason="no CUDA device")
     for item in items:
-        if "gpu" in item.keywords:
+        if TESTS / "system" in item.path.parents:
+            item.add_marker(pytest.mark.system)
+        if "gpu" in item.keywords and not torch.cuda.is_available():
             item.add_marker(skip)
+
+
+def cores() -> int:
+    """The cores that this process may use: those it is bound to, less where its container has a smaller quota."""
+    bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        return min(bound, max(1, math.ceil(int(quota) / int(period))))
+    except (OSError, ValueError):  # no quota
+        return bound
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """The processes of `pytest -n auto`: one per core. On a single core the tests run in this process."""
+    workers = min(cores(), MOST_WORKERS)
+    return workers if workers > 1 else 0

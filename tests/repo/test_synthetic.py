@@ -45,6 +45,7 @@ def test_views_agree_on_the_colour_of_a_point(made: Synthetic) -> None:
     assert len(error) > 2000 and np.median(error) < 0.04 and (error < 0.1).mean() > 0.85  # the rest lies at the edge of something
 
 
+@pytest.mark.slow
 def test_the_same_seed_makes_the_same_capture(made: Synthetic, tmp_path: Path) -> None:
     again, other = make_capture(tmp_path / "a"), make_capture(tmp_path / "b", seed=1)
     assert all(np.array_equal(made.images[name], again.images[name]) for name in made.images)

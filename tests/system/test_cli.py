@@ -128,6 +128,7 @@ def test_flags_reach_the_configuration():
     assert made.cfg.recipe == "moe-gs" and parse_train(["scaffold-gs", "-s", "c", "-m", "r"]).cfg == RECIPES["scaffold-gs"][1]
 
 
+@pytest.mark.slow
 def test_train_eval_compare_export_import(capsys, capture, tmp_path):
     for recipe in ("scaffold-gs", "moe-gs"):
         args = ("train", recipe, "--data", str(capture), "--out", str(tmp_path / recipe), "--iterations", "30")
@@ -185,6 +186,7 @@ def test_bad_captures(capsys, capture, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.slow
 def test_a_signal_saves_and_ends_cleanly(number, capture, tmp_path):
     args = [
         sys.executable,

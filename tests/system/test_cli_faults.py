@@ -38,6 +38,7 @@ def newest(out: Path) -> tuple[int, dict[str, torch.Tensor]]:
     return meta["step"], tensors
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_while_saving(capture, tmp_path):
     """Files may not grow beyond half a checkpoint: one sentence, exit code 1, the checkpoint before loads and the run goes on from it."""
     assert cli.main(arguments(capture, tmp_path, "--stop-at", 10)) == 0
@@ -59,6 +60,7 @@ def test_a_disk_that_fills_up_while_saving(capture, tmp_path):
     assert steps == sorted(steps) and steps[-1] == 16
 
 
+@pytest.mark.slow
 def test_killed_while_it_saves_the_run_goes_on_as_if_nothing_had_happened(capture, tmp_path):
     """SIGKILL, twice, in a training that saves after every iteration; the end is bit for bit that of a run left alone."""
     out, reached = tmp_path / "killed", 0

@@ -27,6 +27,7 @@ def scored(out: Path, *more: str) -> dict:
 
 
 @pytest.mark.parametrize("recipe", ["scaffold-gs", "moe-gs"])
+@pytest.mark.slow
 def test_brighton_from_photographs_to_scores(recipe, tmp_path):
     args = ["train", recipe, "--data", str(BRIGHTON), "--resolution", "factor:2", "--out", str(tmp_path)]
     assert cli.main([*args, "--iterations", "200", "--save-every", "100", "--preview-every", "0"]) == 0
@@ -65,6 +66,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean((a.astype(float) - b.astype(float)) ** 2) / 255**2))
 
 
+@pytest.mark.slow
 def test_colours_sizes_and_principal_points(coloured, tmp_path):
     """Scored here, against the pixels that were ray-cast, by nothing of the package."""
     drawn = renders(coloured, tmp_path / "good")

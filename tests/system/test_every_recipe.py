@@ -17,6 +17,7 @@ from scene_experts.render import choose
 from scene_experts.training.config import Train
 from scene_experts.training.events import Adjusted, Finished, Started
 from scene_experts.training.state import scene_from
+from support.lanes import slow_except
 from support.places import DEMO
 from support.trainings import assert_same, events, last_tensors
 
@@ -45,7 +46,7 @@ def rows(cfg: Train, capture: Capture, out: Path, **run) -> tuple[list[int], lis
     return [seen[0].anchors, *(e.edit.anchors for e in seen if isinstance(e, Adjusted))], [seen[0].step, seen[-1].step]
 
 
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize("recipe", slow_except(RECIPES, "moe-gs", "3dgs", "octree-gs", "sags"))
 def test_it_trains_grows_resumes_to_the_bit_and_is_scored(recipe, buddha, tmp_path):
     cfg = short(recipe)
     whole, parts = tmp_path / "whole", tmp_path / "parts"

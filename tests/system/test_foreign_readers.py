@@ -22,6 +22,7 @@ from scene_experts.files.ply import read_gaussian_ply
 from support.gltf import column, parsed
 from support.splat_quanta import check, differences, quanta, scene
 
+pytestmark = pytest.mark.foreign
 PYTHON = os.environ.get("SCENE_EXPERTS_FOREIGN_PYTHON", sys.executable)
 TRANSFORM = os.environ.get("SCENE_EXPERTS_SPLAT_TRANSFORM") or shutil.which("splat-transform")
 NODE = shutil.which("node")

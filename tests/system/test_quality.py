@@ -62,6 +62,7 @@ BOTH = [(recipe, name) for recipe in ("scaffold-gs", "moe-gs") for name in ("bri
 
 
 @pytest.mark.parametrize(("recipe", "name"), [*BOTH, ("3dgs", "coloured")])
+@pytest.mark.slow
 def test_held_out_psnr_stays_within_three_sigma_of_the_recorded_seeds(name, recipe, captures, monkeypatch):
     key = f"{recipe} on {name}"
     by_seed = lambda: [round(held_out(captures[name], recipe, seed, monkeypatch=monkeypatch), 4) for seed in range(5)]  # noqa: E731
@@ -70,6 +71,7 @@ def test_held_out_psnr_stays_within_three_sigma_of_the_recorded_seeds(name, reci
     assert held_out(captures[name], recipe, monkeypatch=monkeypatch) >= floor - 1e-3
 
 
+@pytest.mark.slow
 def test_growth_pays(captures, monkeypatch):
     """A weaker claim than it should be: on the training views. On brighton's three held-out views growth does not pay within 800 iterations
     (19.92 dB with, 20.11 dB without at seed 0; seeds spread by 0.17 dB)."""
@@ -79,11 +81,13 @@ def test_growth_pays(captures, monkeypatch):
     assert with_growth > without + 0.05
 
 
+@pytest.mark.slow
 def test_levels_of_detail_cost_less_than_a_decibel(captures, monkeypatch):
     seeds = json.loads((GOLDEN / "quality.json").read_text())["scaffold-gs on brighton"]
     assert held_out(captures["brighton"], "octree-moe-gs", monkeypatch=monkeypatch) > statistics.mean(seeds) - 1.0
 
 
+@pytest.mark.slow
 def test_sags_is_near_scaffold_gs(captures, monkeypatch):
     """Within 300 iterations on brighton (17.4 dB both at seed 0); after 800, 19.9 and 20.0 dB."""
     sags, scaffold = (held_out(captures["brighton"], recipe, monkeypatch=monkeypatch, steps=300) for recipe in ("sags", "scaffold-gs"))

@@ -24,6 +24,7 @@ def no_library(monkeypatch):
     native.load.cache_clear()
 
 
+@pytest.mark.slow
 def test_without_the_library_the_rest_is_measured_and_what_is_missing_is_said(no_library, tmp_path):
     text, path = io.StringIO(), tmp_path / "b.json"
     with pytest.warns(UserWarning, match="reference"):

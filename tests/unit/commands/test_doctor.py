@@ -39,6 +39,7 @@ def test_this_machine() -> None:
     assert doctor.run(console) == 0 and console.file.getvalue()  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_pycolmap_is_not_imported() -> None:
     code = "import sys; from scene_experts.commands import doctor; doctor.diagnose(); "
     code += "sys.exit('pycolmap' in sys.modules or 'viser' in sys.modules)"

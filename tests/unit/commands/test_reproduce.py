@@ -15,6 +15,7 @@ from support.synthetic import make_capture
 pytest.importorskip("matplotlib")
 
 
+@pytest.mark.slow
 def test_runs_tables_and_figures_and_nothing_twice(tmp_path, capsys):
     capture = make_capture(tmp_path / "box", views=9).folder
     args = [
@@ -86,6 +87,7 @@ def test_the_plans_of_the_results_page_are_one_command_each(tmp_path, capsys):
     assert recipes == {"scaffold-gs", "moe-gs", "moe-gs-dist"} and seeds == {"0", "1", "2"} and count == 27
 
 
+@pytest.mark.slow
 def test_a_failure_is_told_at_the_end(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "transforms.json").touch()

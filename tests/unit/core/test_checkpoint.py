@@ -193,6 +193,7 @@ for line in sys.stdin:  # one child per line: saves without pause from that step
 """
 
 
+@pytest.mark.slow
 def test_killed_at_random_points_of_saving_nothing_is_lost(tmp_path):
     """A process that saves without pause is killed with SIGKILL: what it had reported as saved is still there, whole."""
     rng, step, midway = random.Random(0), 1, 0

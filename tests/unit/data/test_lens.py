@@ -63,6 +63,7 @@ def test_every_classic_model_is_there() -> None:
 
 
 @pytest.mark.parametrize("index", range(len(LENSES)), ids=IDS)
+@pytest.mark.foreign
 def test_projection_equals_pycolmap(oracle: tuple[Path, np.ndarray, list], index: int) -> None:
     folder, rays, _ = oracle
     lens = LENSES[index]
@@ -72,6 +73,7 @@ def test_projection_equals_pycolmap(oracle: tuple[Path, np.ndarray, list], index
 
 
 @pytest.mark.parametrize("index", range(len(LENSES)), ids=IDS)
+@pytest.mark.foreign
 def test_undistorted_camera_and_picture_equal_pycolmap(oracle: tuple[Path, np.ndarray, list], index: int) -> None:
     folder, _, cameras = oracle
     width, height, params = cameras[index]

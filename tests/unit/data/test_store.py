@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import weakref
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -46,8 +47,12 @@ def wait(condition: object) -> None:
     assert condition()  # type: ignore[operator]
 
 
-def threads() -> int:
-    return sum(t.name == "scene-experts images" for t in threading.enumerate())
+@pytest.fixture
+def threads() -> Callable[[], int]:
+    """Counts the decoding threads that this test started and that still run."""
+    named = lambda: {t for t in threading.enumerate() if t.name == "scene-experts images"}  # noqa: E731
+    before = named()
+    return lambda: len(named() - before)
 
 
 def test_what_was_used_last_goes_first(tmp_path: Path) -> None:
@@ -86,14 +91,14 @@ def test_epochs_in_random_order_find_what_the_cache_holds(tmp_path: Path, monkey
     assert len(decoded) < 0.6 * 400  # half is the least that any rule can do
 
 
-def test_without_room_nothing_is_kept_and_all_still_works(tmp_path: Path) -> None:
+def test_without_room_nothing_is_kept_and_all_still_works(tmp_path: Path, threads: Callable[[], int]) -> None:
     store = ImageStore(sources(tmp_path, 2), cache_bytes=FRAME - 1)
     store.prefetch([0, 1])
     np.testing.assert_array_equal(store.get(1)[0], truth(1))
     assert store.used_bytes == 0 and threads() == 0
 
 
-def test_prefetched_frames_are_there_and_the_same(tmp_path: Path) -> None:
+def test_prefetched_frames_are_there_and_the_same(tmp_path: Path, threads: Callable[[], int]) -> None:
     store = ImageStore(sources(tmp_path, 6), cache_bytes=100 * FRAME)
     store.prefetch([3, 1, 3])
     wait(lambda: store.used_bytes == 2 * FRAME)
@@ -126,7 +131,7 @@ def test_a_bad_file_is_reported_by_get_not_by_the_thread(tmp_path: Path) -> None
     store.close()
 
 
-def test_a_forgotten_store_ends_its_thread(tmp_path: Path) -> None:
+def test_a_forgotten_store_ends_its_thread(tmp_path: Path, threads: Callable[[], int]) -> None:
     store = ImageStore(sources(tmp_path, 3), cache_bytes=100 * FRAME)
     store.prefetch([0])
     gone = weakref.ref(store)
@@ -136,6 +141,7 @@ def test_a_forgotten_store_ends_its_thread(tmp_path: Path) -> None:
     assert gone() is None and threads() == 0
 
 
+@pytest.mark.slow
 def test_exit_while_busy_is_quiet_and_quick(tmp_path: Path) -> None:
     for i in range(40):
         Image.fromarray(np.random.default_rng(i).integers(0, 256, (300, 300, 3)).astype(np.uint8)).save(tmp_path / f"{i}.png")

@@ -118,6 +118,7 @@ print("went on")
 @pytest.mark.skipif(not sys.platform.startswith("linux") or native.load() is None, reason="needs the compiled library and Linux's limits")
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize(("what", "said"), [("loss", "the photometric loss"), ("picture", "drawing 300,000 Gaussians")])
+@pytest.mark.slow
 def test_out_of_memory_is_an_error_that_a_process_survives(what, said, threads):
     code = SHORT.replace("WHAT", what).replace("THREADS", str(threads))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

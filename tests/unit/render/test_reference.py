@@ -169,6 +169,7 @@ def test_recomputing_tiles_in_backward_changes_nothing(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("center", [(None, None), (5.1, 13.4)], ids=["centred", "off-centre"])
+@pytest.mark.slow
 def test_gradients_are_those_of_finite_differences(antialias: bool, center: tuple[float | None, float | None]) -> None:
     # Steps of 1e-6 cross no threshold of alpha or transmittance at this seed.
     g, camera = make_scene(9, seed=3, size=0.2, spread=0.5), make_camera(17, 13, *center, f=16.0)

@@ -65,6 +65,7 @@ def test_several_runs_stand_beside_each_other(tmp_path):
         write(runs)
 
 
+@pytest.mark.slow
 def test_runs_that_were_not_scored_alike_are_no_rivals(tmp_path):
     runs = [make_run(tmp_path / "a"), make_run(tmp_path / "b", "scaffold-gs")]
     alike = write(runs, tmp_path / "alike.html").read_text()

@@ -24,6 +24,7 @@ def test_no_runs_no_charts(tmp_path):
     assert figures.relative_psnr(EXPERIMENTS["fig1b"], [record()], ["fox"], tmp_path / "d") == [] and not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_figure_3_and_7_and_6(tmp_path):
     pair = [record("moe-gs-e3-top2"), record("moe-gs-e3-no-load")]
     assert whole(figures.expert_shares(EXPERIMENTS["fig3"], pair, "fox", tmp_path / "fig3"))

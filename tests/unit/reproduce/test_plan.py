@@ -96,6 +96,7 @@ def test_the_papers_scenes_are_found_with_their_protocol(tmp_path):
     assert made.cfg == spec.train and made.cfg.scene.voxel_size == 0.001
 
 
+@pytest.mark.slow
 def test_the_papers_scenes_bring_the_numbers_of_their_scripts():
     rome = Scene("rome", "BungeeNeRF", Path("rome"), {}, catalog.BUNGEENERF.numbers)
     octree = Spec(rome, "octree-gs", 0, Scale()).train.scene.select

@@ -40,6 +40,8 @@ def centres(capture, names) -> torch.Tensor:
     return torch.stack([by_name[name] for name in names])
 
 
+@pytest.mark.slow
+@pytest.mark.foreign
 def test_poses_of_photographs_are_those_that_are_known(tmp_path):
     if importlib.util.find_spec("pycolmap") is None:
         pytest.skip("pycolmap is not installed")

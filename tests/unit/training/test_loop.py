@@ -22,6 +22,7 @@ from scene_experts.training.events import Adjusted, Finished, Previewed, Saved, 
 from scene_experts.training.loop import Run, iterate, rows_to_move, stepped, without_graph
 from scene_experts.training.state import Training
 from support.golden import recorded_text
+from support.lanes import slow_except
 from support.messages import naming
 from support.scenes import METHODS
 from support.synthetic import make_capture
@@ -33,7 +34,7 @@ def folder(tmp_path_factory) -> Path:
     return make_capture(tmp_path_factory.mktemp("capture"), views=16).folder
 
 
-@pytest.mark.parametrize("recipe", METHODS)
+@pytest.mark.parametrize("recipe", slow_except(METHODS, "moe-gs", "3dgs"))
 def test_resumed_equals_uninterrupted_bit_for_bit_while_rows_come_and_go(recipe, folder, tmp_path):
     cfg = config(recipe)
     edits = [e for e in events(cfg, folder, tmp_path / "whole", stop_at=120) if isinstance(e, Adjusted)]
@@ -78,6 +79,7 @@ def test_experts_without_loss_weights_and_one_expert_are_scaffold_gs_bit_for_bit
 
 
 @pytest.mark.parametrize("scale", [100.0, 0.01])
+@pytest.mark.slow
 def test_the_unit_of_a_capture_does_not_matter(scale, folder, tmp_path):
     scaled = make_capture(tmp_path, views=16, scale=scale).folder
     a, b = ([e.terms for e in events(config(), f, stop_at=40, log_every=10) if isinstance(e, Stepped)] for f in (folder, scaled))
@@ -85,7 +87,7 @@ def test_the_unit_of_a_capture_does_not_matter(scale, folder, tmp_path):
         assert x.keys() == y.keys() and all(y[k] == pytest.approx(x[k], rel=2e-3, abs=1e-6) for k in x)
 
 
-@pytest.mark.parametrize("recipe", METHODS)
+@pytest.mark.parametrize("recipe", slow_except(METHODS, "3dgs-mcmc"))
 def test_losses_follow_the_golden_curve(recipe, tmp_path):
     """The first 100 iterations at a fixed seed, Top-k from the 51st, in float64 by the reference parts, so that machines agree to 1e-3:
     in float32 Adam turns the rounding of another instruction set into 1 % within these iterations. Recorded by this test with
@@ -105,12 +107,14 @@ def test_losses_follow_the_golden_curve(recipe, tmp_path):
     assert curve == pytest.approx(json.loads(golden), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_anchor_cap_holds(folder):
     n = next(e for e in events(config(), folder, stop_at=1) if isinstance(e, Started)).anchors
     capped = [e for e in events(config(max_anchors=n + 30), folder, stop_at=200) if isinstance(e, Adjusted)]
     assert max(e.edit.anchors for e in capped) <= n + 30 and any(e.edit.capped for e in capped)
 
 
+@pytest.mark.slow
 def test_memory_cap_stops_growth(folder):
     capped = [e for e in events(config(), folder, stop_at=100, max_memory=0.001) if isinstance(e, Adjusted)]
     assert capped and not any(e.edit.grown for e in capped) and any(e.edit.capped for e in capped)
@@ -228,6 +232,7 @@ def test_the_routing_of_the_whole_scene_is_told_beside_the_views(folder, monkeyp
     assert few[-1].scene_gates != event.scene_gates and few[-1].psnr == event.psnr  # a smaller sample, the same training
 
 
+@pytest.mark.slow
 def test_sparse_adam_moves_what_was_decoded(folder):
     capture, rasterize = load(folder), choose("reference", "cpu")
     cfg = replace(config(), sparse_adam=True)

@@ -64,6 +64,7 @@ def test_where_no_process_file_is_the_most_ever_held_counts(monkeypatch):
     assert memory.used_bytes(torch.device("cpu")) == 0
 
 
+@pytest.mark.slow
 def test_freed_arrays_are_used_again():
     script = (
         "import resource, torch; from scene_experts.training.memory import reuse_freed; took = reuse_freed()\n"

@@ -42,6 +42,7 @@ def settled(viewer, seconds=20.0):
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_fifty_reconnects_leak_nothing(serving):
     with socket(serving) as made:
         assert picture(made)

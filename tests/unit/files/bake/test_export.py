@@ -90,6 +90,7 @@ def test_frames_and_folders(run, tmp_path):
 
 
 @pytest.mark.parametrize("run", ["moe-gs"], indirect=True)
+@pytest.mark.slow
 def test_each_format_is_measured_from_its_own_file(run, tmp_path):
     for format, of in FORMATS.items():
         path = tmp_path / f"scene{of.suffix}"
@@ -134,6 +135,7 @@ def test_plain_gaussians_need_no_capture(run, tmp_path):
     torch.testing.assert_close(read_standard(tmp_path / "x.ply").means, from_scene(opened.scene, capture.world).means)
 
 
+@pytest.mark.slow
 def test_levels_of_detail_become_one_file_each(tmp_path):
     run = trained("octree-gs", tmp_path)
     scene = run_folder.open_run(run).scene

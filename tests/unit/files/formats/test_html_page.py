@@ -63,6 +63,7 @@ def psnr(a, b):
 
 
 @pytest.mark.slow
+@pytest.mark.foreign
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 def test_the_page_in_a_browser(tmp_path):
     """The start pose, a pose set from outside, one from the link, a drag and a key: from disk, without a request to anywhere."""
@@ -187,6 +188,7 @@ def test_the_hint_is_in_the_words_of_the_pointer():
 
 
 @pytest.mark.slow
+@pytest.mark.foreign
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 def test_hints_on_touch_screens_and_none_without_webgl(tmp_path):
     playwright = pytest.importorskip("playwright.sync_api")

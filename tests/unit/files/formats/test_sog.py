@@ -42,6 +42,7 @@ def test_the_palette_is_near_and_the_bytes_are_the_same_twice(tmp_path):
     assert meta["version"] == 2 and meta["count"] == 5000 and meta["asset"]["scene-experts"] == {"a": 1} and meta["shN"]["count"] <= 4096
 
 
+@pytest.mark.slow
 def test_a_scene_of_usual_size_takes_seconds():
     began = time.process_time()
     assert len(sog.sog_bytes(scene(60_000, 3), {})) < 60_000 * 42

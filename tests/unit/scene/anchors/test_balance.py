@@ -99,6 +99,7 @@ def test_the_recipe_and_its_flags():
     assert {f"{a}.router_balance" for a in ("opacity", "cov", "color")} <= set(scene.network_tensors())
 
 
+@pytest.mark.slow
 def test_a_run_folder_is_read_where_nothing_else_named_the_part(tmp_path):
     train = to_json(RECIPES["moe-gs-balance"][1])
     write_json(tmp_path / "config.json", {"format": 1, "train": train, "data": {"path": "c"}, "type": "RunConfig"})

@@ -82,6 +82,7 @@ def test_levels_and_rows_of_sags():
     assert 0.9e-4 < float(table.abs().max()) <= 1e-4
 
 
+@pytest.mark.slow
 def test_gradient_of_the_table_by_finite_differences():
     grid = built()
     assert torch.autograd.gradcheck(lambda table: encode(table, grid.unit(places(9)), grid.config), (grid.table,))

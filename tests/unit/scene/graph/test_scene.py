@@ -89,6 +89,7 @@ def slow(scene: GraphScene, rows: torch.Tensor) -> dict[str, torch.Tensor]:
     return {name: torch.stack(values).detach() for name, values in found.items()}
 
 
+@pytest.mark.slow
 def test_the_decode_is_that_of_the_text():
     scene = start_graph()
     rows = torch.arange(0, len(scene.table), 2)
