@@ -17,8 +17,8 @@ from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.sh import rgb_to_dc
-from scene_experts.training.losses import photometric
-from scene_experts.training.optim import Adam
+from scene_experts.training.optim import FusedAdam
+from scene_experts.training.photometric import photometric
 
 Draw = Callable[[dict[str, Tensor], Camera, int, Tensor], Tensor]
 RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "dc": 2.5e-3, "rest": 2.5e-3 / 20}  # 3DGS's
@@ -76,7 +76,7 @@ class Training:
         newest = checkpoint.latest(folder)
         tensors, meta = checkpoint.load(newest) if newest else (initialise(capture, count), {})
         self.params = {name: tensors[name].to(device).requires_grad_() for name in RATES}
-        self.optimizer = Adam([{"params": [p], "name": name, "lr": RATES[name]} for name, p in self.params.items()])
+        self.optimizer = FusedAdam([{"params": [p], "name": name, "lr": RATES[name]} for name, p in self.params.items()])
         if newest:
             self.step, self.seconds, self.queue = int(meta["step"]), float(meta["seconds"]), list(meta["queue"])
             self.views.set_state(tensors["views"])

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import torch
 
 from scene_experts.native import library as native
-from scene_experts.training.losses import l1, photometric, ssim
+from scene_experts.training.photometric import l1, photometric, ssim
 
 
 def compute_composed(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

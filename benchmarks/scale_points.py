@@ -31,7 +31,7 @@ from scene_experts.files.export import write_compact_run
 from scene_experts.render import choose
 from scene_experts.strategy import observe
 from scene_experts.training.config import Data, RunConfig
-from scene_experts.training.losses import photometric
+from scene_experts.training.photometric import photometric
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.state import Training, save
 
@@ -89,7 +89,7 @@ def measure_anchors(count: int) -> list[Row]:
     rows.rows.append(("values, moments and gradients alone", None, 4 * held))
     set_statistics(work.training)
     growth, scene = work.training.cfg.growth, work.training.scene
-    rows.add("adjustment", lambda: growth.update(scene, 1600, work.training.growth), again=False)  # type: ignore[arg-type]
+    rows.add("adjustment", lambda: growth.update(scene, 1600, work.training.growth_rng), again=False)  # type: ignore[arg-type]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         rows.add("save", lambda: save(work.training, folder, 1), again=False)

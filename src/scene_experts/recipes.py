@@ -1,4 +1,5 @@
 """The methods and ablations of the paper, a few lines each. Nothing that trains, draws or scores knows a recipe by name.
+Recipes of other packages come beside them; `training/recipe_book.py` says how.
 
 3DGS: Kerbl et al., SIGGRAPH 2023.  3DGS-MCMC: Kheradmand et al., NeurIPS 2024.
 Scaffold-GS: Lu et al., CVPR 2024.  Octree-GS: Ren et al., 2024.  SAGS: Ververas et al., ECCV 2024.
@@ -23,6 +24,7 @@ from scene_experts.strategy.mcmc import MCMC
 from scene_experts.strategy.split_clone import SplitClone
 from scene_experts.training.config import Train
 from scene_experts.training.losses import Weights
+from scene_experts.training.recipe_book import Recipe, RecipeBook
 
 EXPERTS = Experts(num=5, top_k=2, warmup=1500)
 
@@ -61,7 +63,7 @@ def _scaffold(name: str, **scene: object) -> Train:
     return replace(scaffold_gs, recipe=name, scene=replace(scaffold_gs.scene, **scene))  # type: ignore[arg-type]
 
 
-RECIPES: dict[str, tuple[str, Train]] = {
+OWN: dict[str, Recipe] = {
     "scaffold-gs": ("Scaffold-GS: one network per attribute (the baseline)", scaffold_gs),
     "moe-gs": ("MoE-GS: five experts per attribute, Top-2 after a dense warm-up (the paper's main results)", moe_gs),
     "3dgs": ("3DGS: explicit Gaussians with spherical harmonics, cloned, split and pruned", gs_3d),
@@ -103,3 +105,6 @@ RECIPES: dict[str, tuple[str, Train]] = {
         for depth in (2, 3, 4, 5, 6)
     },
 }
+
+RECIPES = RecipeBook(OWN)
+"""All recipes by name: a sentence about each, and its value."""

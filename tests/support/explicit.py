@@ -6,7 +6,7 @@ import torch
 
 from scene_experts.core.table import Table
 from scene_experts.scene.gaussians import Explicit, GaussianScene
-from scene_experts.training.optim import Adam
+from scene_experts.training.optim import FusedAdam
 
 EXTENT = 5.0
 
@@ -24,7 +24,7 @@ def make_gaussians(n=200, seed=0) -> GaussianScene:
     }
     scene = GaussianScene(Explicit(), Table(params, {}), EXTENT)
     groups = scene.rate_groups().items()
-    optimizer = Adam([{"params": p, "name": name, "lr": 0.0, "by_row": True} for name, p in groups])
+    optimizer = FusedAdam([{"params": p, "name": name, "lr": 0.0, "by_row": True} for name, p in groups])
     scene.table.attach(optimizer)
     for parameter in scene.table.params.values():
         parameter.grad = torch.randn_like(parameter)

@@ -16,7 +16,7 @@ from scene_experts.native import library as native
 from scene_experts.scene.anchors.experts import Experts
 from scene_experts.scene.anchors.mlp import CHANNELS, Plain
 from scene_experts.scene.anchors.scene import ATTRIBUTES, Anchors, AnchorScene
-from scene_experts.training.losses import dissimilarity, l1, photometric
+from scene_experts.training.photometric import dissimilarity, l1, photometric
 
 DECODE, LOSS = "decode, one thread", "loss, one thread"
 SPARSE = 1_000_000  # an iteration after every warm-up

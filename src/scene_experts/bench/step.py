@@ -19,7 +19,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer, choose
 from scene_experts.render.cpu import CpuRasterizer
 from scene_experts.training.config import with_numbers
-from scene_experts.training.losses import terms
+from scene_experts.training.losses import Sample, compute_terms
 from scene_experts.training.state import Training
 
 MIXTURE, BASELINE = "moe-gs", "scaffold-gs"
@@ -48,11 +48,11 @@ class Work:
         times.append(clock())
         render = self.rasterize(decoded.gaussians, self.camera, torch.zeros(3))
         times.append(clock())
-        loss = torch.stack(list(terms(decoded, render, self.target, training.cfg.loss, AT).values())).sum()
+        loss = torch.stack(list(compute_terms(Sample(decoded, render, self.target, step=AT), training.cfg.loss).values())).sum()
         times.append(clock())
         loss.backward()
         times.append(clock())
-        training.cfg.growth.observe(scene, decoded, render, AT)  # type: ignore[arg-type]
+        training.cfg.growth.observe(scene, decoded, render, AT)
         times.append(clock())
         training.optimizer.step()
         training.optimizer.zero_grad(set_to_none=True)

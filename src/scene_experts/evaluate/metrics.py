@@ -19,7 +19,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.progress import ByteProgress
 from scene_experts.evaluate import weights
 from scene_experts.evaluate.lpips import Lpips
-from scene_experts.training import losses
+from scene_experts.training import photometric
 
 VARIANTS = {
     "psnr": "PSNR in dB per view over all pixels and channels of the 8-bit pictures, at most 100; mean over views",
@@ -42,7 +42,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Return the structural similarity (3DGS's variant), 1 for identical pictures."""
     filled, area = _fill_masked(image, target, mask)
-    return 1.0 - (1.0 - float(losses.ssim(filled, target))) / area
+    return 1.0 - (1.0 - float(photometric.ssim(filled, target))) / area
 
 
 def sharpness(image: Tensor, mask: Tensor | None = None) -> float:

@@ -17,13 +17,14 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json, write_bytes
+from scene_experts.core.plain import to_json
 from scene_experts.evaluate.pictures import read_picture
 from scene_experts.evaluate.results import find_difference, find_outdated, load_results
 from scene_experts.evaluate.tables import ResultTable, distinguish_runs, make_table
 from scene_experts.report import chart
 from scene_experts.report.chart import Line
 from scene_experts.training import run_folder
-from scene_experts.training.config import RunConfig, to_json
+from scene_experts.training.config import RunConfig
 
 NAME = "report.html"
 MOST_VIEWS = 8  # of a capture; pictures are most of a page's bytes

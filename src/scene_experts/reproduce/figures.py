@@ -92,8 +92,8 @@ def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str,
         points = [(c["step"], c[whose][attribute]) for c in record.curves if attribute in c.get(whose, {})]
         for e in range(len(points[0][1]) if points else 0):
             axis.plot([s for s, _ in points], [100 * v[e] for _, v in points], color=COLOURS[e], label=f"expert {e + 1}")
-        decoder = getattr(record.config.train.scaled().scene, "decoder", None)
-        axis.axvline(getattr(decoder, "warmup", 0), color="grey", linestyle=":", linewidth=1, label="end of the dense warm-up")
+        dense = record.config.train.scaled().scene.dense_until
+        axis.axvline(dense, color="grey", linestyle=":", linewidth=1, label="end of the dense warm-up")
         axis.set(title=f"{name} ({scene})", xlabel="iteration", ylim=(0, 100))
         axis.set_ylabel(f"share of {attribute} assignments (dense: of gates), %")
     handles, labels = axes[0][0].get_legend_handles_labels()

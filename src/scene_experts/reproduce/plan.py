@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.plain import to_json
 from scene_experts.data.fetch import catalog
 from scene_experts.data.fetch.obtain import is_present
 from scene_experts.data.images import check_policy
 from scene_experts.data.readers import is_capture, unrecognised_error
 from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import Experiment
-from scene_experts.training.config import Data, Train, flags_of, to_json, with_numbers
+from scene_experts.training.config import Data, Train, flags_of, with_numbers
 
 COLLECTIONS = {"mipnerf360": "MipNeRF360", "tandt": "TanksAndTemples", "db": "DeepBlending", "bungeenerf": "BungeeNeRF"}
 OWN = "captures"  # the data set of the user's own captures

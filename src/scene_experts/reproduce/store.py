@@ -16,10 +16,11 @@ from typing import Any
 
 from scene_experts.core.errors import InputError, few
 from scene_experts.core.io import read_json, write_bytes
+from scene_experts.core.plain import from_json, to_json
 from scene_experts.evaluate.results import load_results
 from scene_experts.reproduce.columns import columns, length, rows, text
 from scene_experts.reproduce.plan import Spec, identity
-from scene_experts.training.config import RunConfig, from_json, to_json
+from scene_experts.training.config import RunConfig
 from scene_experts.training.run_folder import load_capture, read_config
 
 FORMAT = 2  # format 1 has a row for each view and each point of a curve

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor, nn
 
+from scene_experts.core.errors import InputError
+from scene_experts.core.parts import Part
+from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Mode, Points, Routing
 
@@ -120,21 +123,60 @@ class Scene(nn.Module):
         return self
 
 
-class SceneConfig(Protocol):
-    """What a scene is made of: a frozen dataclass, whose fields are the recipe's flags under --scene."""
+class LatticeScene(Scene):
+    """A scene whose rows lie at the cells of a lattice; growth adds rows at empty cells. The table has a fact `cell` [N, 3] int64."""
 
+    voxel: float  # edge of the finest lattice cell, trained world units
+
+    @abstractmethod
+    def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
+        """Columns of new rows at cells [n, 3] of `level`, with scaling `size` and features [n, F]."""
+
+    @abstractmethod
+    def slot_points(self, slots: Tensor, rows: Tensor) -> Tensor:
+        """Where the Gaussians of flat `slots` [P] (row * K + slot) of `rows` [P] are, [P, 3] float64."""
+
+
+@dataclass(frozen=True)
+class SceneConfig(Part, ABC):
+    """What a scene is made of; its fields are the recipe's flags under --scene."""
+
+    family: ClassVar[str]
+    """Key of the family, as in `Traits.family`."""
+
+    @property
+    @abstractmethod
+    def grown_as(self) -> str:
+        """What growth rules for this scene name in `Strategy.grows`, for example "anchors on levels"."""
+
+    @property
+    def dense_until(self) -> int:
+        """The last iteration of the experts' dense warm-up; 0 without one."""
+        return 0
+
+    @abstractmethod
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> Scene:
-        """A new scene from a point cloud and the training views' cameras; scenes that need no cameras do without."""
-        ...
+        """A new scene from a point cloud and the cameras of the training views; some families do not need the cameras."""
 
+    @abstractmethod
     def load(self, table: Table, meta: dict[str, Any]) -> Scene:
-        """The scene that a checkpoint's table and `Scene.meta()` describe; its networks' tensors are filled in by the caller."""
-        ...
+        """The scene that a checkpoint's table and `Scene.meta()` describe; the caller fills in the tensors of its networks."""
 
-    def scaled(self, factor: float) -> Any:
-        """The same with every window of its schedule `factor` times as long."""
-        ...
+
+@dataclass(frozen=True)
+class LearningRates(Part, ABC):
+    """Learning rates of a family's scenes: one `Rate` for each group of `Scene.rate_groups`; flags under --rates."""
+
+    family: ClassVar[str]
+    """Key of the family, as in `Traits.family`."""
+
+    @abstractmethod
+    def at(self, group: str, step: int, total: int, extent: float) -> float:
+        """The rate of `group` at `step` of `total`; extent: the scene's R, trained world units."""
 
     def check(self) -> None:
-        """Raises InputError, naming the flag, for invalid settings."""
-        ...
+        """Raises InputError, naming the flag, for a rate that is not positive throughout or 0 throughout."""
+        for name, rate in vars(self).items():
+            if isinstance(rate, Rate) and not (rate.first > 0 < rate.last or rate.first == rate.last == 0):
+                flag = f"--rates.{name.replace('_', '-')}"
+                raise InputError(f"expected {flag} to run between two rates above 0, or to be 0, found {rate.first} and {rate.last}")

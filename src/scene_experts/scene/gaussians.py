@@ -9,20 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.parts import register
 from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.sh import MAX_DEGREE, rgb_to_dc
 from scene_experts.geometry.sh_colors import compute_sh_colors
-from scene_experts.scene import Cull, Scene, Traits
+from scene_experts.scene import Cull, LearningRates, Scene, SceneConfig, Traits
 
 COLUMNS = ("means", "log_scales", "quats", "raw_opacity", "sh_dc", "sh_rest")
 FILE_VALUES = 3 + 3 + 1 + 3 + 4  # position, normal, opacity, scale and rotation of a row of the 3DGS file; the harmonics come on top
@@ -30,9 +31,12 @@ _EPS = 1e-12
 _ROUND = 1.001  # a Gaussian is looked for as a ball of its largest axis and this, so that rounding loses none
 
 
+@register
 @dataclass(frozen=True)
-class Explicit:
+class Explicit(SceneConfig):
     """What a scene of explicit Gaussians is made of."""
+
+    family = "gaussians"
 
     sh_degree: int = 3
     """Highest degree of the spherical harmonics, 0 to 3."""
@@ -42,6 +46,10 @@ class Explicit:
     """Opacity of every Gaussian at the start."""
     size: float = 1.0
     """Size of a Gaussian at the start, in distances to its nearest neighbours."""
+
+    @property
+    def grown_as(self) -> str:
+        return "Gaussians"
 
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> GaussianScene:
         """One Gaussian per point of the cloud. Raises InputError when there are none."""
@@ -67,7 +75,7 @@ class Explicit:
             raise InputError("expected the columns of explicit Gaussians in the checkpoint, found others; use its own run folder")
         return GaussianScene(self, table, float(meta["extent"]))
 
-    def scaled(self, factor: float) -> Explicit:
+    def scaled(self, factor: float) -> Self:
         """The same in a training `factor` times as long."""
         return replace(self, sh_ramp=max(1, round(self.sh_ramp * factor)))
 
@@ -92,7 +100,7 @@ class GaussianScene(Scene):
 
     @property
     def traits(self) -> Traits:
-        return Traits("gaussians", "Gaussians", sh_degree=self.config.sh_degree)
+        return Traits(self.config.family, "Gaussians", sh_degree=self.config.sh_degree)
 
     @property
     def K(self) -> int:
@@ -145,9 +153,12 @@ class GaussianScene(Scene):
         return {"extent": self.extent}
 
 
+@register
 @dataclass(frozen=True)
-class ExplicitRates:
+class ExplicitRates(LearningRates):
     """Learning rates (3DGS's). `means` is multiplied by the scene's extent R."""
+
+    family = "gaussians"
 
     means: Rate = Rate(0.00016, 0.0000016)
     log_scales: Rate = Rate(0.005, 0.005)

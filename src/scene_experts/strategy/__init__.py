@@ -1,18 +1,24 @@
-"""Strategies: how a scene's rows grow and shrink during training. A strategy is its hyper-parameters; its memory is in `table.stats`."""
+"""Strategies: how a scene's rows grow and shrink during training (densification)."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Generic
 
 import torch
+from typing_extensions import TypeVar
 
+from scene_experts.core.parts import Part
 from scene_experts.core.types import Decoded, Render
+from scene_experts.scene import Scene
+
+S = TypeVar("S", bound=Scene, default=Any)
 
 
 @dataclass(frozen=True)
 class Edit:
-    """What one adjustment did."""
+    """What one densification step did."""
 
     grown: int
     pruned: int
@@ -20,20 +26,30 @@ class Edit:
     capped: bool = False  # the cap on rows held some back
 
 
-class Strategy(Protocol):
-    """Called once per iteration, after the backward pass: first `observe`, then `update`; after the optimiser's step, `finish`."""
+@dataclass(frozen=True)
+class Strategy(Part, Generic[S], ABC):
+    """Hyper-parameters of a growth rule for scenes of class S; flags under --growth. What it remembers is in `table.stats`.
 
-    @property
-    def max_anchors(self) -> int:
-        """Never more rows than this; 0 is no cap."""
-        ...
+    Called once per iteration, after the backward pass: first `observe`, then `update`; after the optimiser's step, `finish`.
+    """
 
-    def observe(self, scene: Any, decoded: Decoded, render: Render, step: int) -> None: ...
+    grows: ClassVar[str]
+    """What the rule grows; `SceneConfig.grown_as` of its scenes."""
 
-    def update(self, scene: Any, step: int, generator: torch.Generator) -> Edit | None: ...
+    max_anchors: int = 0
+    """Never more rows than this; 0 is no cap."""
+    enabled: bool = True
+    """Whether rows are added and removed at all."""
 
-    def finish(self, scene: Any, step: int, rates: dict[str, float], generator: torch.Generator) -> None: ...
+    def observe(self, scene: S, decoded: Decoded, render: Render, step: int) -> None:
+        """Count one view. By default nothing is counted."""
 
-    def scaled(self, factor: float) -> Any: ...
+    @abstractmethod
+    def update(self, scene: S, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
+        """Add and remove rows where that is due at `step`; None where nothing was due.
 
-    def check(self) -> None: ...
+        generator: the only source of randomness.  cap: never more rows than this now (`max_anchors`, or what memory allows); 0 is no cap.
+        """
+
+    def finish(self, scene: S, step: int, rates: dict[str, float], generator: torch.Generator) -> None:
+        """Called after the optimiser's step; rates: the learning rates in use, by group. By default nothing is done."""

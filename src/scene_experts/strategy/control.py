@@ -7,17 +7,22 @@ from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import torch
+from typing_extensions import TypeVar
 
 from scene_experts.core.errors import expect_at_least
 from scene_experts.core.schedule import Every
 from scene_experts.core.types import Decoded, Render
-from scene_experts.scene.anchors.scene import AnchorScene
-from scene_experts.strategy import Edit, observe
+from scene_experts.scene import LatticeScene
+from scene_experts.strategy import Edit, Strategy, observe
+
+L = TypeVar("L", bound=LatticeScene, default=LatticeScene)
 
 
 @dataclass(frozen=True)
-class AnchorControl:
-    """Hyper-parameters of density control; its memory is in `table.stats`. A method adds `grow`."""
+class AnchorControl(Strategy[L]):
+    """Hyper-parameters of density control. A method adds `grow`."""
+
+    grows = "anchors"
 
     start_stat: int = 500
     adjust: Every = Every(1500, 15_000, 100)
@@ -29,20 +34,16 @@ class AnchorControl:
     """After each adjustment, Gaussian size bounds (log-scaling 3..5) are held below 0.05 in log or linear units."""
     max_anchors: int = 0
     """Never more anchors than this; 0 is no cap. The largest gradients go first."""
-    enabled: bool = True
 
     def scaled(self, factor: float) -> Self:
         """The same in a training `factor` times as long: windows scale; interval, gates and thresholds stay."""
         return replace(self, start_stat=round(self.start_stat * factor), adjust=self.adjust.scaled(factor))
 
     def check(self) -> None:
-        """Raises InputError for numbers that no training can have."""
+        """Raises InputError, naming the flag, for invalid settings."""
         expect_at_least([("--growth.adjust.interval", self.adjust.interval, 1), ("--growth.max-anchors", self.max_anchors, 0)])
 
-    def finish(self, scene: AnchorScene, step: int, rates: dict[str, float], generator: torch.Generator) -> None:
-        """Nothing is left to do after the optimiser's step."""
-
-    def observe(self, scene: AnchorScene, decoded: Decoded, render: Render, step: int) -> None:
+    def observe(self, scene: L, decoded: Decoded, render: Render, step: int) -> None:
         """Count one view, after its backward pass."""
         if not self.enabled or not self.start_stat < step < self.adjust.stop:
             return
@@ -50,7 +51,7 @@ class AnchorControl:
             observe.start(scene.table, scene.K)
         observe.observe(scene.table, decoded, render)
 
-    def update(self, scene: AnchorScene, step: int, generator: torch.Generator) -> Edit | None:
+    def update(self, scene: L, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
         """Grow and prune when due. `generator` draws the random elimination."""
         if step >= self.adjust.stop:
             observe.stop(scene.table)
@@ -58,12 +59,12 @@ class AnchorControl:
             return None
         for column in scene.table.params.values():
             column.grad = None  # Scaffold-GS's anchors miss the step of an adjustment, whether it changed a row or not
-        grown, capped = self.grow(scene, generator, step)
+        grown, capped = self.grow(scene, generator, step, cap)
         pruned = self.prune(scene)
         return Edit(grown, pruned, len(scene.table), capped)
 
-    def grow(self, scene: AnchorScene, generator: torch.Generator, step: int = 0) -> tuple[int, bool]:
-        """Found anchors. Returns how many, and whether the cap held some back."""
+    def grow(self, scene: L, generator: torch.Generator, step: int = 0, cap: int = 0) -> tuple[int, bool]:
+        """Create anchors, never more than `cap` in all (0: no cap). Returns how many, and whether the cap held some back."""
         raise NotImplementedError
 
     def gate(self) -> float:
@@ -71,7 +72,7 @@ class AnchorControl:
         return self.adjust.interval * self.success_threshold * 0.5
 
     @torch.no_grad()
-    def prune(self, scene: AnchorScene) -> int:
+    def prune(self, scene: L) -> int:
         """Remove anchors seen often enough and found faint; start the count of the well-seen ones anew; clamp sizes."""
         table = scene.table
         seen = table.stats["visits"] > self.adjust.interval * self.success_threshold  # 80 of 100

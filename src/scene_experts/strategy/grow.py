@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import expect_at_least
-from scene_experts.core.table import Table
+from scene_experts.core.parts import register
 from scene_experts.geometry.voxel import AXIS_LIMIT, coarsen, in_set, pack, scatter_max
-from scene_experts.scene.anchors.scene import AnchorScene
-from scene_experts.strategy.control import AnchorControl
+from scene_experts.strategy.control import AnchorControl, L
 
 
+@register
 @dataclass(frozen=True)
-class GrowAnchors(AnchorControl):
+class GrowAnchors(AnchorControl[L]):
     """Scaffold-GS's rule."""
 
     levels: int = 3
@@ -31,7 +31,7 @@ class GrowAnchors(AnchorControl):
     """Scaffold-GS's quirk: no finer level is tried once a call has added nothing so far."""
 
     def check(self) -> None:
-        """Raises InputError for numbers that no training can have."""
+        """Raises InputError, naming the flag, for invalid settings."""
         super().check()
         expect_at_least([("--growth.hierarchy-factor", self.hierarchy_factor, 2), ("--growth.init-factor", self.init_factor, 1)])
         expect_at_least([("--growth.levels", self.levels, 1)])
@@ -41,19 +41,15 @@ class GrowAnchors(AnchorControl):
         factors = [self.init_factor // self.hierarchy_factor**level for level in range(self.levels)]
         return [f for f in factors if f > 0]
 
-    def points(self, scene: AnchorScene, slots: Tensor, parents: Tensor) -> Tensor:
-        """Where the Gaussians of flat `slots` [P] of rows `parents` [P] are, [P, 3] float64."""
-        return slot_points(scene.table, slots, parents)
-
     @torch.no_grad()
-    def grow(self, scene: AnchorScene, generator: torch.Generator, step: int = 0) -> tuple[int, bool]:
-        """Found anchors where gradients are large. Returns how many, and whether the cap held some back."""
-        rows, born, capped = self.search(scene, generator)  # what that needs is gone before columns are copied
+    def grow(self, scene: L, generator: torch.Generator, step: int = 0, cap: int = 0) -> tuple[int, bool]:
+        """Create anchors where gradients are large. Returns how many, and whether the cap held some back."""
+        rows, born, capped = self.search(scene, generator, cap)  # what that needs is gone before columns are copied
         if rows:
             scene.table.append({name: torch.cat([row[name] for row in rows]) for name in rows[0]})
         return born, capped
 
-    def search(self, scene: AnchorScene, generator: torch.Generator) -> tuple[list[dict[str, Tensor]], int, bool]:
+    def search(self, scene: L, generator: torch.Generator, cap: int = 0) -> tuple[list[dict[str, Tensor]], int, bool]:
         """The rows to append, level by level, how many they are, and whether the cap held some back; restarts the counts."""
         table, stats = scene.table, scene.table.stats
         eligible = (stats["count"].view(-1) > self.gate()).nonzero().squeeze(1)  # flat slots, row * K + k
@@ -61,7 +57,7 @@ class GrowAnchors(AnchorControl):
         strong = (g >= self.grad_threshold).nonzero().squeeze(1)  # the first threshold is the lowest
         slots, g = eligible.index_select(0, strong), g.index_select(0, strong)
         parents = torch.div(slots, scene.K, rounding_mode="floor")
-        points = self.points(scene, slots, parents)
+        points = scene.slot_points(slots, parents)
         fine, features = points / scene.voxel, table.params["feature"]
         cells, rows, born, capped = table.facts["cell"], [], 0, False
         for level, factor in enumerate(self.cell_factors()):
@@ -75,7 +71,7 @@ class GrowAnchors(AnchorControl):
             if found is None:
                 continue
             new, feature, strength = found
-            best = strongest(strength, self.max_anchors, len(table) + born)
+            best = strongest(strength, cap, len(table) + born)
             if len(best) < len(new):
                 capped, new, feature = True, new[best], feature[best]
             if len(new):
@@ -84,13 +80,6 @@ class GrowAnchors(AnchorControl):
         for name in ("grad", "count"):
             stats[name].view(-1).index_fill_(0, eligible, 0.0)
         return rows, born, capped
-
-
-def slot_points(table: Table, slots: Tensor, rows: Tensor) -> Tensor:
-    """Where the Gaussians of flat `slots` [P] of anchors `rows` [P] are, [P, 3] float64."""
-    scaling = table.params["log_scaling"][:, :3].contiguous().exp().index_select(0, rows)
-    offsets = table.params["offsets"].view(-1, 3).index_select(0, slots)
-    return table.facts["xyz"].index_select(0, rows).double() + (offsets * scaling).double()
 
 
 def strongest(strength: Tensor, cap: int, rows: int) -> Tensor:

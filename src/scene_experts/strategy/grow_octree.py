@@ -12,17 +12,20 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.parts import register
 from scene_experts.core.schedule import Every
 from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.scene import AnchorScene
-from scene_experts.scene.anchors.select import LevelSelector
 from scene_experts.strategy.control import AnchorControl
-from scene_experts.strategy.grow import empty_cells, slot_points, strongest
+from scene_experts.strategy.grow import empty_cells, strongest
 
 
+@register
 @dataclass(frozen=True)
-class GrowOctree(AnchorControl):
+class GrowOctree(AnchorControl[AnchorScene]):
     """Octree-GS's rule: thresholds rise by u = fork^update_ratio a level."""
+
+    grows = "anchors on levels"
 
     adjust: Every = Every(1500, 25_000, 100)
     update_ratio: float = 0.2
@@ -36,21 +39,21 @@ class GrowOctree(AnchorControl):
     """Octree-GS's bug: an anchor is asked about once for every level, and not for its own alone."""
 
     def check(self) -> None:
-        """Raises InputError for numbers that no training can have."""
+        """Raises InputError, naming the flag, for invalid settings."""
         super().check()
         if not self.update_ratio >= 0:
             raise InputError(f"expected --growth.update-ratio of at least 0, found {self.update_ratio}; give a larger number")
 
     @torch.no_grad()
-    def grow(self, scene: AnchorScene, generator: torch.Generator, step: int = 0) -> tuple[int, bool]:
-        """Found anchors level by level, coarse to fine. Returns how many, and whether the cap held some back."""
-        assert isinstance(scene.select, LevelSelector)
+    def grow(self, scene: AnchorScene, generator: torch.Generator, step: int = 0, cap: int = 0) -> tuple[int, bool]:
+        """Create anchors level by level, coarse to fine. Returns how many, and whether the cap held some back."""
         table, levels = scene.table, scene.select.lattices
+        assert levels is not None
         refine = self.parity_coarse_gate or not scene.select.coarse(step)
         eligible, g, mean = self.gradients(table.stats)
         slots = (g.view(-1) >= self.grad_threshold).nonzero().squeeze(1)  # level 0's threshold is the lowest
         strength, parents = g.view(-1).index_select(0, slots), torch.div(slots, scene.K, rounding_mode="floor")
-        points, own = slot_points(table, slots, parents), table.facts["level"].index_select(0, parents)
+        points, own = scene.slot_points(slots, parents), table.facts["level"].index_select(0, parents)
         cells = [table.facts["cell"][table.facts["level"] == level] for level in range(levels.count)]
         rows: list[dict[str, Tensor]] = []
         born, capped = 0, False
@@ -66,7 +69,7 @@ class GrowOctree(AnchorControl):
                     continue
                 keep = levels.wanted(levels.positions(found[0], target).float(), torch.full_like(found[0][:, 0], target))
                 new, feature, force = (t[keep] for t in found)
-                best = strongest(force, self.max_anchors, len(table) + born)
+                best = strongest(force, cap, len(table) + born)
                 capped |= len(best) < len(new)
                 new, feature = new[best], feature[best]
                 if len(new):

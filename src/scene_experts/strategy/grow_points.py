@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
-from torch import Tensor
-
+from scene_experts.core.parts import register
 from scene_experts.core.types import Decoded, Render
-from scene_experts.scene.graph.scene import GraphScene
+from scene_experts.scene import LatticeScene
 from scene_experts.strategy.grow import GrowAnchors
 
 
+@register
 @dataclass(frozen=True)
 class GrowPoints(GrowAnchors):
     """As for anchors, but for what counts as a visit and for the sizes, which nothing clamps."""
+
+    grows = "graph points"
 
     success_threshold: float = 0.6
     scale_clamp: Literal["log0.05", "linear0.05", "off"] = "off"
     visits: Literal["drawn", "seen"] = "drawn"
     """drawn: a view counts only for points that it drew, so that a point never drawn is never removed (SAGS); seen: for all it decoded."""
 
-    def observe(self, scene: Any, decoded: Decoded, render: Render, step: int) -> None:
+    def observe(self, scene: LatticeScene, decoded: Decoded, render: Render, step: int) -> None:
         """Count one view, after its backward pass."""
         super().observe(scene, self.counted(decoded, render), render, step)
 
@@ -32,8 +34,3 @@ class GrowPoints(GrowAnchors):
         drawn = (render.radii > 0).nonzero().squeeze(1)
         opacity = decoded.gaussians.opacities.detach().index_select(0, drawn)
         return replace(decoded, rows=decoded.gaussians.source.index_select(0, drawn), raw_opacity=opacity[:, None])
-
-    def points(self, scene: Any, slots: Tensor, parents: Tensor) -> Tensor:
-        """Where the Gaussians of rows [P] are, [P, 3] float64."""
-        assert isinstance(scene, GraphScene)
-        return scene.slot_points(parents)

@@ -8,25 +8,29 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from scene_experts.core.errors import expect_at_least
+from scene_experts.core.parts import register
 from scene_experts.core.schedule import Every
-from scene_experts.core.types import Decoded, Render
 from scene_experts.geometry.rotation import normalise_quats, quat_to_matrix
 from scene_experts.native import library as native
 from scene_experts.scene.gaussians import GaussianScene
-from scene_experts.strategy import Edit
+from scene_experts.strategy import Edit, Strategy
 
 MOST = 51  # Gaussians that one is shared among at most
 _SHARP = 100.0  # how steeply the noise fades with opacity
 
 
+@register
 @dataclass(frozen=True)
-class MCMC:
+class MCMC(Strategy[GaussianScene]):
     """Hyper-parameters of density control by sampling; it keeps no statistics."""
+
+    grows = "Gaussians"
 
     adjust: Every = Every(500, 25_000, 100)
     """Relocate and add at multiples of `interval` strictly inside (start, stop)."""
@@ -38,14 +42,13 @@ class MCMC:
     """Size of the noise on positions, times their learning rate; 0 is none."""
     max_anchors: int = 1_000_000
     """Never more Gaussians than this; 0 is no cap."""
-    enabled: bool = True
 
-    def scaled(self, factor: float) -> MCMC:
+    def scaled(self, factor: float) -> Self:
         """The same in a training `factor` times as long: the window scales; the interval stays."""
         return replace(self, adjust=self.adjust.scaled(factor))
 
     def check(self) -> None:
-        """Raises InputError for numbers that no training can have."""
+        """Raises InputError, naming the flag, for invalid settings."""
         expect_at_least(
             [
                 ("--growth.adjust.interval", self.adjust.interval, 1),
@@ -55,15 +58,12 @@ class MCMC:
             ]
         )
 
-    def observe(self, scene: GaussianScene, decoded: Decoded, render: Render, step: int) -> None:
-        """Nothing is counted."""
-
-    def update(self, scene: GaussianScene, step: int, generator: torch.Generator) -> Edit | None:
+    def update(self, scene: GaussianScene, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
         """Relocate and add when due. `generator` draws who is shared."""
         if not self.enabled or not self.adjust.due(step) or len(scene.table) == 0:
             return None
         self.relocate(scene, generator)
-        grown, capped = self.add(scene, generator)
+        grown, capped = self.add(scene, generator, cap)
         for column in scene.table.params.values():
             column.grad = None  # as in 3DGS, Gaussians miss the step of an adjustment
         return Edit(grown, 0, len(scene.table), capped)
@@ -83,11 +83,11 @@ class MCMC:
         return len(dead)
 
     @torch.no_grad()
-    def add(self, scene: GaussianScene, generator: torch.Generator) -> tuple[int, bool]:
+    def add(self, scene: GaussianScene, generator: torch.Generator, cap: int = 0) -> tuple[int, bool]:
         """Add shares of Gaussians drawn by opacity. Returns how many, and whether the cap held some back."""
         table, n = scene.table, len(scene.table)
         wanted = int(self.growth * n)
-        target = min(self.max_anchors, wanted) if self.max_anchors else wanted
+        target = min(cap, wanted) if cap else wanted
         if target <= n:
             return 0, target < wanted
         sources = draw(table.params["raw_opacity"].sigmoid(), target - n, generator)

@@ -7,23 +7,28 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.parts import register
 from scene_experts.core.schedule import Every
 from scene_experts.core.types import Decoded, Render
 from scene_experts.geometry.rotation import normalise_quats, quat_to_matrix
 from scene_experts.scene.gaussians import GaussianScene
-from scene_experts.strategy import Edit, observe
+from scene_experts.strategy import Edit, Strategy, observe
 
 SHRINK = 1.6  # a half of a split Gaussian is this much smaller (3DGS: 0.8 N for N = 2 halves)
 
 
+@register
 @dataclass(frozen=True)
-class SplitClone:
-    """Hyper-parameters of density control; its memory is in `table.stats`."""
+class SplitClone(Strategy[GaussianScene]):
+    """Hyper-parameters of density control."""
+
+    grows = "Gaussians"
 
     adjust: Every = Every(500, 15_000, 100)
     """Adjust at multiples of `interval` strictly inside (start, stop); statistics are kept until stop."""
@@ -44,16 +49,15 @@ class SplitClone:
     """Reset at `adjust.start` too, as 3DGS does for captures on white."""
     max_anchors: int = 0
     """Never more Gaussians than this; 0 is no cap. The largest gradients go first."""
-    enabled: bool = True
 
-    def scaled(self, factor: float) -> SplitClone:
+    def scaled(self, factor: float) -> Self:
         """The same in a training `factor` times as long: windows and, down to `reset_least`, the interval of resets scale."""
         least = min(self.reset_least, self.reset.interval)
         reset = replace(self.reset.scaled(factor), interval=max(1, least, round(self.reset.interval * factor)))
         return replace(self, adjust=self.adjust.scaled(factor), reset=reset)
 
     def check(self) -> None:
-        """Raises InputError for numbers that no training can have."""
+        """Raises InputError, naming the flag, for invalid settings."""
         intervals = [("--growth.adjust.interval", self.adjust.interval, 1), ("--growth.reset.interval", self.reset.interval, 1)]
         intervals += [("--growth.reset-least", self.reset_least, 1)]
         expect_at_least([*intervals, ("--growth.max-anchors", self.max_anchors, 0)])
@@ -70,7 +74,7 @@ class SplitClone:
             stats |= {"grad": torch.zeros_like(like), "count": torch.zeros_like(like)}
         observe.observe_drawn(stats, decoded, render)
 
-    def update(self, scene: GaussianScene, step: int, generator: torch.Generator) -> Edit | None:
+    def update(self, scene: GaussianScene, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
         """Grow, prune and reset when due. `generator` draws where the halves of a split Gaussian go."""
         table = scene.table
         if step >= self.adjust.stop:
@@ -79,7 +83,7 @@ class SplitClone:
             return None
         edit = None
         if self.adjust.due(step) and "grad" in table.stats:
-            grown, capped = self.grow(scene, generator)
+            grown, capped = self.grow(scene, generator, cap)
             pruned = self.prune(scene, step)
             for name in ("grad", "count"):
                 table.stats[name].zero_()
@@ -90,16 +94,13 @@ class SplitClone:
             self.press_opacities(scene)
         return edit
 
-    def finish(self, scene: GaussianScene, step: int, rates: dict[str, float], generator: torch.Generator) -> None:
-        """Nothing is left to do after the optimiser's step."""
-
     @torch.no_grad()
-    def grow(self, scene: GaussianScene, generator: torch.Generator) -> tuple[int, bool]:
+    def grow(self, scene: GaussianScene, generator: torch.Generator, cap: int = 0) -> tuple[int, bool]:
         """Clone small Gaussians with large gradients, split large ones. Returns the rows gained, and whether the cap held some back."""
         table = scene.table
         g = table.stats["grad"] / table.stats["count"].clamp_min(1)
         chosen = (g >= self.grad_threshold).nonzero().squeeze(1)
-        room = max(0, self.max_anchors - len(table)) if self.max_anchors else len(chosen)
+        room = max(0, cap - len(table)) if cap else len(chosen)
         capped = len(chosen) > room
         if capped:
             best = g.index_select(0, chosen).argsort(descending=True, stable=True)[:room]

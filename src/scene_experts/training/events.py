@@ -7,6 +7,7 @@ from pathlib import Path
 
 from torch import Tensor
 
+from scene_experts.scene import Traits
 from scene_experts.strategy import Edit
 
 
@@ -20,8 +21,8 @@ class Started:
     """The last iteration of this training."""
     anchors: int
     """Number of rows: anchors, Gaussians or graph points."""
-    voxel: float = 0.0
-    """Edge of the finest lattice cell, trained units; 0 for Gaussians that are on no lattice."""
+    traits: Traits
+    """What the scene is and can do."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,10 +17,10 @@ from scene_experts.core.transfer import upload
 from scene_experts.core.types import Decoded, Mode, Render, Routing
 from scene_experts.data.capture import Capture
 from scene_experts.render import Rasterizer
-from scene_experts.strategy import Edit, Strategy
+from scene_experts.strategy import Edit
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.events import Adjusted, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
-from scene_experts.training.losses import hinge_is_on, load_dense, load_sparse, terms
+from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
 from scene_experts.training.memory import anchor_cap
 from scene_experts.training.state import Training, resume, save
 
@@ -64,13 +64,13 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     cfg = cfg.scaled()
     folder = run.out / "checkpoints" if run.out else None
     training = resume(cfg, folder, run.device) if run.resume and folder else None
-    if training and training.capture not in ("", capture.fingerprint()):
+    if training and training.capture_id not in ("", capture.fingerprint()):
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
     training = training or Training.start(cfg, capture, run.device, run.dtype)
-    training.capture = capture.fingerprint()
+    training.capture_id = capture.fingerprint()
     total = min(cfg.iterations, run.config.stop_at or cfg.iterations)
     run.begin(training)
-    yield Started(training.step, total, len(training.scene.table), training.scene.meta().get("voxel", 0.0))
+    yield Started(training.step, total, len(training.scene.table), training.scene.traits)
     saved, parts = training.step, {}
     while training.step < total and not run.stop:
         with training.clock.running():
@@ -109,12 +109,12 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     capture.images.prefetch(following)
     target = upload(frame.rgb, run.device, run.dtype).div_(255.0)
     mask = None if frame.mask is None else upload(frame.mask, run.device, run.dtype)
-    background = torch.rand(3, generator=training.views) if cfg.random_background else torch.tensor(capture.background)
+    background = torch.rand(3, generator=training.views_rng) if cfg.random_background else torch.tensor(capture.background)
     decoded = scene(camera, training.step, Mode.TRAIN, rasterize.visible)
-    if cfg.loss.opacity_scope == "all" and hinge_is_on(cfg.loss, training.step):
+    if cfg.loss.needs_scene_opacity(training.step):
         decoded = replace(decoded, scene_opacity=scene.scene_opacity(camera, training.step, Mode.TRAIN))
     render = rasterize(decoded.gaussians, camera, upload(background, run.device, run.dtype))
-    parts = terms(decoded, render, target, cfg.loss, training.step, mask)
+    parts = compute_terms(Sample(decoded, render, target, mask, training.step), cfg.loss)
     loss = torch.stack(list(parts.values())).sum()
     if loss.requires_grad:
         loss.backward()
@@ -122,21 +122,21 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     del loss
     training.largest.see(decoded, render)
     cap = anchor_cap(scene, cfg.growth.max_anchors, run.max_memory, training.largest)
-    strategy: Strategy = cast(Strategy, replace(cfg.growth, max_anchors=cap))
-    strategy.observe(scene, decoded, render, training.step)
-    edit = strategy.update(scene, training.step, training.growth)
-    training.optimizer.step(rows=rows_to_move(cfg, decoded) if edit is None else None)
-    training.optimizer.zero_grad(set_to_none=True)
-    strategy.finish(scene, training.step, training.rates(), training.growth)
+    cfg.growth.observe(scene, decoded, render, training.step)
+    edit = cfg.growth.update(scene, training.step, training.growth_rng, cap)
+    step_optimizer(training, decoded, edit)
+    cfg.growth.finish(scene, training.step, training.rates(), training.growth_rng)
     return Iteration(decoded, render, parts, target, mask, edit)
 
 
-def rows_to_move(cfg: Train, decoded: Decoded) -> Tensor | None:
-    """The rows of the table that Adam moves: those decoded, under `sparse_adam`; None for all, also where the objective reaches all."""
-    seen = len(decoded.rows)
-    everywhere = decoded.scene_opacity is not None or (decoded.population is not None and (cfg.loss.mean_opacity or cfg.loss.mean_size))
-    everywhere = everywhere or any(len(r.gates) != seen for r in decoded.routing.values())
-    return decoded.rows if cfg.sparse_adam and not everywhere else None
+def step_optimizer(training: Training, decoded: Decoded, edit: Edit | None) -> None:
+    """One step of the optimiser: under `sparse_adam` of the decoded rows alone, unless rows came or went, or the objective reaches all."""
+    cfg = training.cfg
+    if cfg.sparse_adam and edit is None and not cfg.loss.reaches_every_row(decoded):
+        training.optimizer.step(rows=decoded.rows)  # type: ignore[call-arg]
+    else:
+        training.optimizer.step()
+    training.optimizer.zero_grad(set_to_none=True)
 
 
 def without_graph(value: Any) -> Any:

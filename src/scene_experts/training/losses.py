@@ -1,4 +1,4 @@
-"""The objective: photometric loss, scale volume, opacity hinge and the load balance of the experts, as a named sum.
+"""The objective: a sum of named terms. A new term is one function and one entry in `Weights.terms`.
 
 Pictures are [H, W, 3] float RGB in [0, 1]. The mean of nothing (no Gaussian, no anchor, no pixel that counts) is 0.
 Equation numbers are those of "Scene Experts" (MoE-GS, AAAI 2026); the photometric part is 3DGS's.
@@ -6,25 +6,45 @@ Equation numbers are those of "Scene Experts" (MoE-GS, AAAI 2026); the photometr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
-from typing import Any, Literal
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.parts import Part, register
 from scene_experts.core.types import Decoded, Render, Routing
-from scene_experts.native import library as native
 from scene_experts.native import terms as native_terms
-
-TAPS, SIGMA, C1, C2 = 11, 1.5, 0.01**2, 0.03**2
+from scene_experts.training.photometric import photometric
 
 
 @dataclass(frozen=True)
-class Weights:
-    """Weights of the objective's terms and the switches for what the paper leaves open. A term of weight 0 is left out."""
+class Sample:
+    """What the objective sees of one iteration."""
+
+    decoded: Decoded
+    render: Render
+    target: Tensor  # [H, W, 3], the photograph
+    mask: Tensor | None = None  # [H, W] in [0, 1], 1 = counts
+    step: int | None = None  # the iteration, for terms that start or end; None: all are on
+
+
+Term = Callable[["Weights", Sample], dict[str, Tensor]]
+"""Weights and a sample to weighted terms by name, each []; empty where the term is off or has nothing to act on."""
+
+
+@register
+@dataclass(frozen=True)
+class Weights(Part):
+    """Weights of the objective's terms and the switches for what the paper leaves open. A term of weight 0 is left out.
+
+    A recipe with a term of its own subclasses this class, adds a field for the weight, and adds the function to `terms`.
+    """
+
+    terms: ClassVar[tuple[Term, ...]] = ()
 
     dssim: float = 0.2
     """Weight of 1 - SSIM; L1 gets the rest of 1."""
@@ -53,135 +73,88 @@ class Weights:
     opacity_until: int | None = None
     """Last iteration with the opacity hinge; None: it never ends."""
 
+    def scaled(self, factor: float) -> Self:
+        """The same in a training `factor` times as long: the window of the opacity hinge scales."""
+        until = None if self.opacity_until is None else round(self.opacity_until * factor)
+        return replace(self, opacity_from=round(self.opacity_from * factor), opacity_until=until)
+
     def check(self) -> None:
-        """Raises InputError for weights that no training can have: below 0, or a share of 1 - SSIM beyond 1."""
+        """Raises InputError, naming the flag, for a weight below 0, or a share of 1 - SSIM above 1."""
         names = ("dssim", "scale", "opacity", "load", "mean_opacity", "mean_size")
         expect_at_least([(f"--loss.{name.replace('_', '-')}", getattr(self, name), 0) for name in names])
         if self.dssim > 1:
             raise InputError(f"expected --loss.dssim of at most 1, found {self.dssim}; L1 gets the rest of 1, so give a smaller number")
 
+    def has_hinge(self, step: int | None) -> bool:
+        """Whether the opacity hinge acts at `step` (None: its window is ignored)."""
+        on = step is None or (step >= self.opacity_from and (self.opacity_until is None or step <= self.opacity_until))
+        return self.opacity != 0 and on
 
-def terms(
-    decoded: Decoded, render: Render, target: Tensor, w: Weights, step: int | None = None, mask: Tensor | None = None
-) -> dict[str, Tensor]:
-    """The weighted terms of the objective by name, each []; their sum is what training minimises.
+    def needs_scene_opacity(self, step: int) -> bool:
+        """Whether `Decoded.scene_opacity` is needed at `step`."""
+        return self.opacity_scope == "all" and self.has_hinge(step)
 
-    target [H, W, 3]; mask [H, W] in [0, 1], 1 = counts; step: the iteration, for terms that start or end (None: all are on).
-    """
-    l1_term, dssim_term = photometric(render.image, target, w.dssim, mask)
-    out = {}
-    if w.dssim != 1:
-        out["l1"] = l1_term
-    if w.dssim != 0:
-        out["dssim"] = dssim_term
-    if w.scale != 0:
-        out["volume"] = w.scale * volume(decoded.gaussians.scales)
-    if hinge_is_on(w, step) and decoded.raw_opacity is not None:
-        out["opacity"] = w.opacity * opacity_hinge(hinge_opacities(decoded, render, w), w.tau)
-    if decoded.population is not None:
-        logits, log_scales = decoded.population
-        if w.mean_opacity != 0:
-            out["mean_opacity"] = w.mean_opacity * (logits.sigmoid().sum() / max(logits.numel(), 1))
-        if w.mean_size != 0:
-            out["mean_size"] = w.mean_size * (log_scales.exp().sum() / max(log_scales.numel(), 1))
-    if w.load != 0 and decoded.routing:
-        out["load"] = w.load * load(decoded.routing, w)
+    def reaches_every_row(self, decoded: Decoded) -> bool:
+        """Whether the objective has a gradient for rows of the table that the view did not decode."""
+        population = decoded.population is not None and bool(self.mean_opacity or self.mean_size)
+        routing = any(len(r.gates) != len(decoded.rows) for r in decoded.routing.values())
+        return decoded.scene_opacity is not None or population or routing
+
+
+def compute_terms(sample: Sample, weights: Weights) -> dict[str, Tensor]:
+    """The weighted terms of the objective by name, each []; their sum is what training minimises."""
+    out: dict[str, Tensor] = {}
+    for term in weights.terms:
+        out |= term(weights, sample)
     return out
 
 
-def l1(image: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference over pixels and channels, []."""
-    return (image - target).abs().sum() / max(image.numel(), 1)
+# --- the terms: weights and sample to {name: weighted value} ------------------------------------------------------------------------------
 
 
-def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity, [], 1 for equal pictures.
-
-    11 x 11 Gaussian window of sigma 1.5, zero padding, per channel, biased variances, mean over pixels and channels (Wang et al. 2004 with
-    the padding of 3DGS). image, target [H, W, 3] of any size, device and floating dtype; differentiable in both.
-    """
-    return 1 - dissimilarity(image, target)
+def photometric_terms(w: Weights, sample: Sample) -> dict[str, Tensor]:
+    """L1 and 1 - SSIM, whose weights sum to 1."""
+    l1, dssim = photometric(sample.render.image, sample.target, w.dssim, sample.mask)
+    return ({"l1": l1} if w.dssim != 1 else {}) | ({"dssim": dssim} if w.dssim != 0 else {})
 
 
-def dissimilarity(image: Tensor, target: Tensor) -> Tensor:
-    """1 - SSIM, [], written so that float32 loses nothing of it where the pictures agree.
-
-    With the sum s and the difference d of the pictures: S = (1 - p)(1 - q), p = E[d]^2 / (mx^2 + my^2 + C1) and
-    q = var(d) / (var(x) + var(y) + C2), where mx^2 + my^2 = (E[s]^2 + E[d]^2) / 2 and the same for the variances.
-    """
-    s, d = (image + target - 1).movedim(2, 0), (image - target).movedim(2, 0)  # [3, H, W]
-    # The sum minus 1 (and its padding with it) has the same variance, from smaller squares.
-    s, d = functional.pad(s, [TAPS // 2] * 4, value=-1.0), functional.pad(d, [TAPS // 2] * 4)
-    window = _window(s.dtype, s.device)
-    maps = torch.cat([s, d, s * s, d * d])[None]
-    maps = functional.conv2d(functional.conv2d(maps, window[:, :, None], groups=12), window[..., None], groups=12)
-    ms, md, ss, dd = maps[0].chunk(4)  # each [3, H, W]
-    vd = dd - md * md
-    p = md * md / (((ms + 1).square() + md * md) / 2 + C1)
-    q = vd / ((ss - ms * ms + vd) / 2 + C2)
-    return (p + q - p * q).sum() / max(p.numel(), 1)
+def volume_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
+    """The mean volume of the drawn Gaussians (Scaffold-GS)."""
+    return {"volume": w.scale * volume(sample.decoded.gaussians.scales)} if w.scale != 0 else {}
 
 
-@cache
-def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The window's one-dimensional factor for each of 12 maps, shaped [12, 1, TAPS]."""
-    t = torch.arange(TAPS, dtype=torch.float64) - TAPS // 2
-    w = torch.exp(-t * t / (2 * SIGMA * SIGMA))
-    return (w / w.sum()).to(device, dtype).repeat(12, 1, 1)
+def hinge_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
+    """The opacity hinge (eq. 8)."""
+    if not w.has_hinge(sample.step) or sample.decoded.raw_opacity is None:
+        return {}
+    return {"opacity": w.opacity * opacity_hinge(hinge_opacities(sample.decoded, sample.render, w), w.tau)}
 
 
-def photometric(image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """((1 - lambda) L1, lambda (1 - SSIM)), both []: 3DGS's photometric loss as two terms.
-
-    image, target [H, W, 3]. With mask [H, W] (1 = counts), the render is replaced by the target where nothing counts and both terms are
-    divided by the share that counts. float32 on the CPU is one call of the compiled library for values and gradient; anything else, and
-    a target that needs a gradient, is plain torch.
-    """
-    if mask is not None:
-        image = torch.lerp(target, image, mask.to(image.dtype)[..., None])
-    fused = image.device.type == "cpu" and image.dtype == target.dtype == torch.float32 and not target.requires_grad and image.numel() > 0
-    if fused and native.load() is not None:
-        both = _Photometric.apply(image, target, float(lambda_dssim))
-    else:
-        both = ((1 - lambda_dssim) * l1(image, target), lambda_dssim * dissimilarity(image, target))
-    if mask is None:
-        return both
-    share = mask.to(image.dtype).mean().clamp_min(1e-12)
-    return both[0] / share, both[1] / share
+def mean_opacity_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
+    """The mean opacity over all explicit Gaussians, seen or not (3DGS-MCMC)."""
+    if w.mean_opacity == 0 or sample.decoded.population is None:
+        return {}
+    logits = sample.decoded.population[0]
+    return {"mean_opacity": w.mean_opacity * (logits.sigmoid().sum() / max(logits.numel(), 1))}
 
 
-class _Photometric(torch.autograd.Function):
-    """Both terms and the gradient of their sum in one pass over the picture; the backward pass only scales it."""
-
-    @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, lambda_dssim: float) -> tuple[Tensor, Tensor]:
-        x, y = image.detach().contiguous(), target.detach().contiguous()
-        gradient = torch.empty_like(x) if ctx.needs_input_grad[0] else None
-        found = torch.empty(2, dtype=torch.float64)
-        H, W, _ = x.shape
-        tensors = [native.pointer(t) for t in (x, y, gradient, found)]
-        code = native.require().se_photometric_loss(
-            *tensors[:2], H, W, 1 - lambda_dssim, lambda_dssim, native.count_threads(), *tensors[2:]
-        )
-        native.check(code, "the photometric loss")
-        ctx.l1_weight = 1 - lambda_dssim
-        if gradient is not None:
-            ctx.save_for_backward(x, y, gradient)
-        return ((1 - lambda_dssim) * found[0]).float(), (lambda_dssim * found[1]).float()
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None, None]:
-        x, y, gradient = ctx.saved_tensors
-        by_l1, by_dssim = (float(g) for g in upstream)
-        out = gradient if by_dssim == 1 else gradient * by_dssim
-        if by_l1 != by_dssim:  # the stored sum holds both terms in equal parts; L1's share is cheap to make again
-            out = torch.add(out, (x - y).sign_(), alpha=(by_l1 - by_dssim) * ctx.l1_weight / x.numel())
-        return out, None, None
+def mean_size_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
+    """The mean scale over all explicit Gaussians and axes, seen or not (3DGS-MCMC)."""
+    if w.mean_size == 0 or sample.decoded.population is None:
+        return {}
+    log_scales = sample.decoded.population[1]
+    return {"mean_size": w.mean_size * (log_scales.exp().sum() / max(log_scales.numel(), 1))}
 
 
-def hinge_is_on(w: Weights, step: int | None) -> bool:
-    """Whether the opacity hinge acts at `step` (None: its window is ignored)."""
-    return w.opacity != 0 and (step is None or (step >= w.opacity_from and (w.opacity_until is None or step <= w.opacity_until)))
+def load_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
+    """The load balance of the experts (eq. 6, 7)."""
+    return {"load": w.load * load(sample.decoded.routing, w)} if w.load != 0 and sample.decoded.routing else {}
+
+
+Weights.terms = (photometric_terms, volume_term, hinge_term, mean_opacity_term, mean_size_term, load_term)
+
+
+# --- what they are made of ----------------------------------------------------------------------------------------------------------------
 
 
 def hinge_opacities(decoded: Decoded, render: Render, w: Weights) -> Tensor:

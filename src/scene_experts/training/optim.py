@@ -1,22 +1,67 @@
-"""Adam, natively on the CPU: one call and one pass over memory for all parameters, bit for bit torch's own fused Adam (AVX2, AVX-512).
+"""Optimisers. Adam is native on the CPU: one call and one pass over memory for all parameters, bit for bit torch's own fused Adam.
 
 State names are torch's (`exp_avg`, `exp_avg_sq`, `step`), so a checkpoint does not know which of them wrote it.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.parts import Part, register
 from scene_experts.native import library as native
 from scene_experts.native.api import SeAdamTensor
 
 
-class Adam(torch.optim.Adam):
-    """Adam (Kingma and Ba 2015) without weight decay; groups of one pair of betas and one eps.
+@dataclass(frozen=True)
+class Optimizer(Part, ABC):
+    """Which optimiser moves the parameters; flags under --optimizer. Learning rates are the recipe's `rates`."""
+
+    prefix: ClassVar[str] = "optimizer"
+    """First word of the names that its state has in checkpoints."""
+    by_row: ClassVar[bool] = False
+    """Whether `step(rows=...)` of the built optimiser can move some rows of a table only; --sparse-adam needs it."""
+
+    @abstractmethod
+    def build(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
+        """The optimiser of `groups`: {"params": tensors, "name": str, "lr": 0.0, "by_row": whether they are columns of the table}.
+
+        The training sets "lr" before every step. The state of a parameter holds tensors only: of the parameter's shape, whose rows come
+        and go with the table's, or of no dimension.
+        """
+
+
+@register
+@dataclass(frozen=True)
+class Adam(Optimizer):
+    """Adam (Kingma and Ba 2015) without weight decay."""
+
+    prefix = "adam"
+    by_row = True
+
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Decay of the mean gradient and of the mean squared gradient."""
+    eps: float = 1e-15
+    """Added to the root of the mean squared gradient."""
+
+    def build(self, groups: list[dict[str, Any]]) -> FusedAdam:
+        return FusedAdam(groups, betas=self.betas, eps=self.eps)
+
+    def check(self) -> None:
+        """Raises InputError, naming the flag, for invalid settings."""
+        expect_at_least([("--optimizer.eps", self.eps, 0), *(("--optimizer.betas", beta, 0) for beta in self.betas)])
+        if max(self.betas) >= 1:
+            raise InputError(f"expected --optimizer.betas below 1, found {self.betas}; give smaller numbers")
+
+
+class FusedAdam(torch.optim.Adam):
+    """Adam without weight decay; all groups have one pair of betas and one eps.
 
     A group with `by_row` true holds tables [N, ...] of which `step(rows=...)` moves some rows only.
     """

@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as TaskBar
 from rich.text import Text
 
+from scene_experts.scene import Traits
 from scene_experts.training.events import Adjusted, Event, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
 
 
@@ -23,7 +24,7 @@ class Progress:
         self.total, self.first, self.began, self.printed = 0, 0, time.perf_counter(), 0.0
         self.loss: dict[str, float] = {}
         self.psnr: float | None = None
-        self.preview, self.rows = "", "anchors"
+        self.traits = Traits("", "rows")
 
     def __enter__(self) -> Progress:
         if self.live:
@@ -39,14 +40,15 @@ class Progress:
             case Started():
                 self.total, self.first, self.began = event.total, event.step, time.perf_counter()
                 verb = f"resumed at iteration {event.step:,}" if event.step else "started"
-                self.rows = "anchors" if event.voxel else "Gaussians"
-                lattice = f" on a lattice of {event.voxel:.3g}" if event.voxel else ""
-                self.say(f"{verb}: {event.anchors:,} {self.rows}{lattice}, {event.total:,} iterations")
+                self.traits, rows = event.traits, event.traits.rows
+                lattice = f" on a lattice of {event.traits.voxel:.3g}" if event.traits.voxel else ""
+                self.say(f"{verb}: {event.anchors:,} {rows}{lattice}, {event.total:,} iterations")
             case Stepped():
                 self.step(event)
             case Adjusted():
                 if event.edit.capped:
-                    what = f"the cap on {self.rows} or memory held growth back at {event.edit.anchors:,} {self.rows}"
+                    rows = self.traits.rows
+                    what = f"the cap on {rows} or memory held growth back at {event.edit.anchors:,} {rows}"
                     self.say(f"iteration {event.step:,}: {what}")
             case Saved():
                 self.say(f"saved {event.path}")
@@ -60,16 +62,16 @@ class Progress:
                 pass
 
     def step(self, event: Stepped) -> None:
-        mix = 0.9
+        keep = 0.9  # of the running mean
         for name, value in event.terms.items():
-            self.loss[name] = mix * self.loss.get(name, value) + (1 - mix) * value
-        self.psnr = event.psnr if self.psnr is None else mix * self.psnr + (1 - mix) * event.psnr
+            self.loss[name] = keep * self.loss.get(name, value) + (1 - keep) * value
+        self.psnr = event.psnr if self.psnr is None else keep * self.psnr + (1 - keep) * event.psnr
         speed = (event.step - self.first) / max(time.perf_counter() - self.began, 1e-9)
         left = (self.total - event.step) / max(speed, 1e-9)
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
-        active = f"active {100 * event.active:.0f} %  " if self.rows == "anchors" else ""
+        active = f"active {100 * event.active:.0f} %  " if self.traits.activation else ""
         line = (
-            f"{event.step:>6,}/{self.total:,}  {terms}  PSNR {self.psnr:.2f}  {self.rows} {event.anchors:,}  {active}"
+            f"{event.step:>6,}/{self.total:,}  {terms}  PSNR {self.psnr:.2f}  {self.traits.rows} {event.anchors:,}  {active}"
             f"{speed:.1f} it/s  {clock(left)} left"
         )
         if self.live:

@@ -25,17 +25,18 @@ import torch
 from torch import Tensor
 
 import scene_experts
-from scene_experts import recipes  # noqa: F401  (variants of parts that only a recipe names must be known before a configuration is read)
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import locked, read_json, write_json
+from scene_experts.core.plain import UnknownPart, first_difference, from_json, to_json
 from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
+from scene_experts.recipes import RECIPES
 from scene_experts.scene import Scene
 from scene_experts.training import capture_place
 from scene_experts.training.clock import Clock
-from scene_experts.training.config import Data, RunConfig, Train, from_json, to_json
+from scene_experts.training.config import Data, RunConfig, Train
 from scene_experts.training.state import scene_from
 
 FORMAT = 1
@@ -116,19 +117,12 @@ def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
         )
     old = to_json(replace(found.data, path=Path())) | to_json(found.train)
     new = to_json(replace(config.data, path=Path())) | to_json(config.train)
-    other = _difference(old, new)
+    other = first_difference(old, new)
     if other:
         raise InputError(
             f"expected the settings that the run in {out} began with, found other settings: {other}; "
             f"resume with the run's own flags, or choose another --out"
         )
-
-
-def _difference(old: object, new: object, where: str = "") -> str:
-    """The first place where two trees of plain values differ, as "loss.load was 0.01, is now 0.5", or nothing."""
-    if isinstance(old, dict) and isinstance(new, dict) and old.keys() == new.keys():
-        return next((found for key in old if (found := _difference(old[key], new[key], f"{where}.{key}".lstrip(".")))), "")
-    return "" if old == new else f"{where} was {old}, is now {new}"
 
 
 @contextmanager
@@ -174,7 +168,11 @@ def read_config(run: Path) -> RunConfig:
     if not isinstance(value, dict) or value.pop("format", None) != FORMAT:
         raise InputError(f"expected a run configuration of format {FORMAT} in {run}, found another; train it again with this version")
     relative = value.pop(capture_place.KEY, None)
-    config = from_json(RunConfig, value)
+    try:
+        config = from_json(RunConfig, value)
+    except UnknownPart:  # of another package, perhaps
+        RECIPES.load()
+        config = from_json(RunConfig, value)
     path = capture_place.find(run, config.data.path, relative if isinstance(relative, str) else None)
     return replace(config, data=replace(config.data, path=path))
 

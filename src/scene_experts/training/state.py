@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 from pathlib import Path
 
@@ -12,13 +10,14 @@ from torch import Tensor
 
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
+from scene_experts.core.plain import first_difference, from_json, to_json
 from scene_experts.core.table import Table
 from scene_experts.data.capture import Capture
 from scene_experts.scene import Scene
 from scene_experts.training.clock import Clock
-from scene_experts.training.config import Train, to_json
+from scene_experts.training.config import Train
 from scene_experts.training.memory import Largest
-from scene_experts.training.optim import Adam
+from scene_experts.training.old_hash import old_hash
 
 log = logging.getLogger(__name__)
 
@@ -32,12 +31,13 @@ class Training:
         self.largest = Largest()
         self.clock = Clock()
         self.queue: list[int] = []
-        self.capture = ""  # its fingerprint
-        self.views = torch.Generator().manual_seed(cfg.seed)
-        self.growth = torch.Generator().manual_seed(cfg.seed + 1)
+        self.capture_id = ""  # fingerprint of the capture
+        self.views_rng = torch.Generator().manual_seed(cfg.seed)  # order of the views, backgrounds
+        self.growth_rng = torch.Generator().manual_seed(cfg.seed + 1)  # all that growth draws
         columns = scene.table.params
         named = scene.rate_groups().items()
-        self.optimizer = Adam([{"params": params, "name": name, "lr": 0.0, "by_row": name in columns} for name, params in named])
+        groups = [{"params": params, "name": name, "lr": 0.0, "by_row": name in columns} for name, params in named]
+        self.optimizer = cfg.optimizer.build(groups)
         scene.table.attach(self.optimizer)
 
     @classmethod
@@ -51,8 +51,9 @@ class Training:
         scene = cfg.scene.start(capture.points, capture.extent, [capture.views[i].camera for i in capture.train])
         cap, n = cfg.max_anchors, len(scene.table)
         if 0 < cap < n:
-            what, also = ("anchors", " or --scene.voxel-size") if "voxel" in scene.meta() else ("Gaussians", "")
-            raise InputError(f"expected at most {cap:,} {what} to start with, found {n:,}; raise --max-anchors{also}")
+            traits = scene.traits
+            also = " or --scene.voxel-size" if traits.voxel else ""
+            raise InputError(f"expected at most {cap:,} {traits.rows} to start with, found {n:,}; raise --max-anchors{also}")
         if 0 < cfg.growth.max_anchors < n:
             log.warning("starts with %s rows, more than the recipe's %s: none will be added", f"{n:,}", f"{cfg.growth.max_anchors:,}")
         return cls(cfg, scene.to(device, dtype))
@@ -60,7 +61,7 @@ class Training:
     def next_view(self, train: tuple[int, ...], ahead: int = 3) -> tuple[int, list[int]]:
         """The next training view and the few after it: each view once per epoch, in random order."""
         while len(self.queue) < ahead + 1:
-            self.queue += [train[i] for i in torch.randperm(len(train), generator=self.views).tolist()]
+            self.queue += [train[i] for i in torch.randperm(len(train), generator=self.views_rng).tolist()]
         return self.queue.pop(0), self.queue[:ahead]
 
     def set_rates(self) -> None:
@@ -80,8 +81,9 @@ class Training:
         for group in self.optimizer.param_groups:
             for i, parameter in enumerate(group["params"]):
                 for key, value in self.optimizer.state.get(parameter, {}).items():
-                    out[f"adam.{group['name']}.{i}.{key}"] = value
-        out |= {"rng.torch": torch.get_rng_state(), "rng.views": self.views.get_state(), "rng.growth": self.growth.get_state()}
+                    if isinstance(value, Tensor):
+                        out[f"{self.cfg.optimizer.prefix}.{group['name']}.{i}.{key}"] = value
+        out |= {"rng.torch": torch.get_rng_state(), "rng.views": self.views_rng.get_state(), "rng.growth": self.growth_rng.get_state()}
         if table.device.type == "cuda":
             out["rng.cuda"] = torch.cuda.get_rng_state(table.device)
         out["queue"] = torch.tensor(self.queue, dtype=torch.int64)
@@ -93,35 +95,31 @@ class Training:
             "step": self.step,
             **self.clock.meta(),
             **self.scene.meta(),
-            "config": config_hash(self.cfg),
-            "capture": self.capture,
+            "train": to_json(self.cfg),
+            "capture": self.capture_id,
         }
 
     @classmethod
     def restore(cls, cfg: Train, tensors: dict[str, Tensor], meta: dict, device: str) -> Training:
         """The training that `tensors` and `meta` were taken from. Raises InputError when they are of another configuration."""
-        if meta["config"] != config_hash(cfg):
-            raise InputError(
-                "expected a checkpoint of this configuration, found one trained with other settings; "
-                "resume with the run's own flags, or start in another --out folder"
-            )
+        check_same(cfg, meta)
         scene = scene_from(cfg, tensors, meta)
         scene.table.stats = {k.removeprefix("stats."): v for k, v in tensors.items() if k.startswith("stats.")}
         training = cls(cfg, scene.to(device))
         table = training.scene.table
         for group in training.optimizer.param_groups:
             for i, parameter in enumerate(group["params"]):
-                prefix = f"adam.{group['name']}.{i}."
+                prefix = f"{cfg.optimizer.prefix}.{group['name']}.{i}."
                 state = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
                 if state:
                     training.optimizer.state[parameter] = {k: v.to(device) for k, v in state.items()}
         torch.set_rng_state(tensors["rng.torch"])
         if "rng.cuda" in tensors and table.device.type == "cuda":
             torch.cuda.set_rng_state(tensors["rng.cuda"], table.device)
-        training.views.set_state(tensors["rng.views"])
-        training.growth.set_state(tensors["rng.growth"])
+        training.views_rng.set_state(tensors["rng.views"])
+        training.growth_rng.set_state(tensors["rng.growth"])
         training.queue = tensors["queue"].tolist()
-        training.step, training.clock, training.capture = int(meta["step"]), Clock.of(meta), meta.get("capture", "")
+        training.step, training.clock, training.capture_id = int(meta["step"]), Clock.of(meta), meta.get("capture", "")
         return training
 
 
@@ -138,32 +136,20 @@ def scene_from(cfg: Train, tensors: dict[str, Tensor], meta: dict) -> Scene:
     return scene
 
 
-LATER = {
-    "sparse_adam": False,
-    "schedule": 30_000,
-    "loss.mean_opacity": 0.0,
-    "loss.mean_size": 0.0,
-    "rates.appearance": {"type": "Rate", "first": 0.05, "last": 0.0005},
-    "rates.mix": {"type": "Rate", "first": 0.01, "last": 0.00001},
-    "scene.appearance": 0,
-    "scene.mix": {"type": "OwnFeature"},
-    "scene.select": {"type": "AllAnchors"},
-    "scene.test_appearance": "mean",
-}
-"""Settings that the first checkpoints do not know, with what those were trained with: there they do not count, so such a run resumes."""
+def check_same(cfg: Train, meta: dict) -> None:
+    """Raises InputError where the checkpoint that `meta` describes was trained with other settings than `cfg` (scaled).
 
-
-def config_hash(cfg: Train) -> str:
-    """A short hash of everything in the configuration."""
-    plain = to_json(cfg)
-    for path, value in LATER.items():
-        *above, name = path.split(".")
-        at = plain
-        for part in above:
-            at = at.get(part, {})
-        if name in at and at[name] == value:
-            del at[name]
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+    A setting that is newer than the checkpoint counts as its default.
+    """
+    if "train" in meta:
+        other = first_difference(to_json(from_json(Train, meta["train"])), to_json(cfg))
+    else:  # an older checkpoint: a hash alone
+        other = "" if meta["config"] == old_hash(cfg) else "it does not say which"
+    if other:
+        raise InputError(
+            f"expected a checkpoint of this configuration, found one trained with other settings: {other}; "
+            "resume with the run's own flags, or start in another --out folder"
+        )
 
 
 def save(training: Training, folder: Path, keep: int) -> Path:

@@ -12,7 +12,7 @@ from torch import Tensor
 from scene_experts.evaluate import metrics, weights
 from scene_experts.evaluate.lpips import Lpips
 from scene_experts.evaluate.metrics import Perceptual
-from scene_experts.training import losses
+from scene_experts.training import photometric
 from support.lpips import random_tensors
 
 
@@ -47,7 +47,7 @@ def test_psnr_counts_the_masked_pixels_alone() -> None:
 
 def test_ssim_is_that_of_the_losses() -> None:
     image, target = pair()
-    assert metrics.ssim(image, target) == pytest.approx(float(losses.ssim(image, target)))
+    assert metrics.ssim(image, target) == pytest.approx(float(photometric.ssim(image, target)))
     assert metrics.ssim(target, target) == pytest.approx(1.0)
 
 

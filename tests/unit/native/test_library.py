@@ -90,7 +90,7 @@ def test_levels_follow_the_processor(monkeypatch, capability, expected):
 SHORT = """
 import resource, torch
 from pathlib import Path
-from scene_experts.training import losses
+from scene_experts.training import photometric
 from scene_experts.core.errors import RunError
 from scene_experts.render import choose
 from scene_experts.core.types import Camera, Gaussians
@@ -100,7 +100,7 @@ x, y, n = torch.rand(22, 200_000, 3), torch.rand(22, 200_000, 3), 300_000
 means = torch.rand(n, 3) - 0.5 + torch.tensor([0, 0, 2.0])
 g = Gaussians(means, torch.rand(n, 4), torch.full((n, 3), 0.02), torch.rand(n), torch.rand(n, 3), torch.arange(n))
 camera, draw = Camera(torch.eye(4), torch.tensor([[300.0, 0, 160], [0, 300, 100], [0, 0, 1]]), 320, 200, id=0), choose("cpu", "cpu")
-work = {"loss": lambda: losses.photometric(x, y, 0.2), "picture": lambda: draw(g, camera, torch.zeros(3))}["WHAT"]
+work = {"loss": lambda: photometric.photometric(x, y, 0.2), "picture": lambda: draw(g, camera, torch.zeros(3))}["WHAT"]
 pages = int(Path("/proc/self/statm").read_text().split()[0])
 limits = resource.getrlimit(resource.RLIMIT_AS)
 resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + (16 << 20), limits[1]))

@@ -8,10 +8,11 @@ import pytest
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
+from scene_experts.core.plain import to_json
 from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec
 from scene_experts.reproduce.runner import Runner, last_line
-from scene_experts.training.config import RunConfig, to_json
+from scene_experts.training.config import RunConfig
 from scene_experts.training.run_folder import held
 from support.records import record
 

@@ -8,9 +8,9 @@ import pytest
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
+from scene_experts.core.plain import to_json
 from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec, drop_repeated
 from scene_experts.reproduce.store import POINTS, check_captures, find, find_all, load, read, read_curves, read_run, unpack, write
-from scene_experts.training.config import to_json
 from scene_experts.training.run_folder import load_capture
 from support.messages import naming
 from support.records import record

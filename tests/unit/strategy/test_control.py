@@ -16,7 +16,7 @@ from support.scenes import start_scene
 class Still(AnchorControl):
     """Grows nothing."""
 
-    def grow(self, scene, generator, step=0):
+    def grow(self, scene, generator, step=0, cap=0):
         return 0, False
 
 

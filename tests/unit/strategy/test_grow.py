@@ -119,9 +119,9 @@ def test_impossible_numbers_are_refused():
 def test_cap_holds_and_prefers_large_gradients():
     scene = make()
     cap = len(scene.table) + 5
-    grown, capped = GrowAnchors(elimination=False, max_anchors=cap).grow(scene, torch.Generator())
+    grown, capped = GrowAnchors(elimination=False).grow(scene, torch.Generator(), cap=cap)
     assert capped and grown == 5 and len(scene.table) == cap
-    again, _ = GrowAnchors(elimination=False, max_anchors=cap).grow(scene, torch.Generator())
+    again, _ = GrowAnchors(elimination=False).grow(scene, torch.Generator(), cap=cap)
     assert again == 0
 
 

@@ -127,7 +127,7 @@ def test_finer_levels_wait_for_the_coarse_phase_unless_the_bug_is_asked_for():
 def test_the_cap_takes_the_strongest():
     scene = make()
     n = len(scene.table)
-    grown, capped = GrowOctree(max_anchors=n + 7).grow(scene, torch.Generator(), LATE)
+    grown, capped = GrowOctree().grow(scene, torch.Generator(), LATE, cap=n + 7)
     assert (grown, capped, len(scene.table)) == (7, True, n + 7)
 
 

@@ -45,7 +45,7 @@ def test_points_found_new_ones_where_their_gaussians_are():
     scene.table.params["log_scaling"].data[:, :3] = 2.0  # offsets reach far
     growth.observe(scene, *view([5], [0.5], [4]), 1)
     scene.table.stats["count"][5], scene.table.stats["grad"][5] = 50, 50.0
-    place, n = scene.slot_points(torch.tensor([5]))[0], len(scene.table)
+    place, n = scene.slot_points(torch.tensor([5]), torch.tensor([5]))[0], len(scene.table)
     sizes = scene.table.params["log_scaling"].detach().clone()
     edit = growth.update(scene, 10, torch.Generator().manual_seed(0))
     assert edit is not None and 1 <= edit.grown <= 3 and edit.pruned == 0 and len(scene.table) == n + edit.grown
@@ -59,7 +59,7 @@ def test_parts_of_another_method_are_refused():
     cfg = RECIPES["sags"][1]
     check(cfg)
     for wrong in (replace(cfg, growth=GrowAnchors()), replace(RECIPES["scaffold-gs"][1], growth=GrowPoints())):
-        with pytest.raises(InputError, match="sags"):
+        with pytest.raises(InputError, match="graph points"):
             check(wrong)
 
 

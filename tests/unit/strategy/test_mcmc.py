@@ -79,8 +79,8 @@ def test_gaussians_are_added_up_to_the_cap():
     scene = make_gaussians()
     assert MCMC().add(scene, torch.Generator()) == (10, False) and len(scene.table) == 210
     assert not moments(scene, "means")[200:].any()
-    assert MCMC(max_anchors=213).add(scene, torch.Generator()) == (3, True)
-    assert MCMC(max_anchors=100).add(scene, torch.Generator()) == (0, True) and len(scene.table) == 213
+    assert MCMC().add(scene, torch.Generator(), cap=213) == (3, True)
+    assert MCMC().add(scene, torch.Generator(), cap=100) == (0, True) and len(scene.table) == 213
 
 
 def test_when_things_happen():

@@ -109,12 +109,12 @@ def test_the_cap_lets_the_largest_gradients_through():
     best = g.argsort(descending=True)[:7]
     small = (scene.table.params["log_scales"].amax(1).exp() <= 0.05)[best]
     means = scene.table.params["means"].detach().clone()
-    assert SplitClone(max_anchors=207).grow(scene, torch.Generator()) == (7, True)
+    assert SplitClone().grow(scene, torch.Generator(), cap=207) == (7, True)
     assert len(scene.table) == 207
     copies = scene.table.params["means"].detach()[200 - int((~small).sum()) :][: int(small.sum())]
     assert torch.equal(copies, means[best[small].sort().values])
     full = make_gaussians()
-    assert SplitClone(max_anchors=150).grow(full, torch.Generator()) == (0, True) and len(full.table) == 200
+    assert SplitClone().grow(full, torch.Generator(), cap=150) == (0, True) and len(full.table) == 200
 
 
 def test_windows_scale_and_thresholds_stay():

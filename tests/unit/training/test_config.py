@@ -1,21 +1,16 @@
-import json
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import pytest
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.schedule import Every, Rate
 from scene_experts.recipes import RECIPES
-from scene_experts.training.config import Data, RunConfig, Train, check, expect_at_least, from_json, to_json
+from scene_experts.scene.gaussians import ExplicitRates
+from scene_experts.strategy.grow_octree import GrowOctree
+from scene_experts.strategy.split_clone import SplitClone
+from scene_experts.training.config import check
+from scene_experts.training.losses import Weights
 from support.messages import naming
-
-
-@pytest.mark.parametrize("name", list(RECIPES))
-def test_every_recipe_survives_json(name):
-    config = RunConfig(RECIPES[name][1], Data(Path("somewhere"), background=(0.0, 0.5, 1.0)), "a command", True, 7, {"torch": "x"})
-    assert from_json(RunConfig, json.loads(json.dumps(to_json(config)))) == config
-    assert config.train.recipe == name
 
 
 def test_iterations_scale_windows_and_nothing_else():
@@ -27,28 +22,6 @@ def test_iterations_scale_windows_and_nothing_else():
     assert RECIPES["moe-gs"][1].scaled() == RECIPES["moe-gs"][1]
     with pytest.raises(InputError, match="--iterations"):
         replace(RECIPES["moe-gs"][1], iterations=0).scaled()
-
-
-@pytest.mark.parametrize(
-    ("edit", "place"),
-    [
-        ({"iterations": "many"}, "config.iterations"),
-        ({"unheard_of": 1}, "unheard_of"),
-        (
-            {"rates": {"type": "Rates", "mix": {"type": "Rate", "first": 0.1}}},
-            "config.rates.mix",
-        ),
-        ({"scene": 3}, "config.scene"),
-        ({"growth": {"type": "GrowAnchors", "scale_clamp": "never"}}, "config.growth.scale_clamp"),
-        (
-            {"scene": {"type": "Anchors", "decoder": {"type": "Transformer"}}},
-            "config.scene.decoder.*Transformer",
-        ),
-    ],
-)
-def test_errors_name_the_place(edit, place):
-    with pytest.raises(InputError, match=place):
-        from_json(Train, {"recipe": "x", **edit})
 
 
 @pytest.mark.parametrize("name", list(RECIPES))
@@ -77,3 +50,23 @@ def test_impossible_settings_name_their_flag():
     check(replace(moe, rates=replace(moe.rates, feature=Rate(0.0, 0.0))))
     with pytest.raises(InputError, match=naming("--x", "nan")):
         expect_at_least([("--x", float("nan"), 0)])
+
+
+def test_parts_that_do_not_fit_together_are_refused():
+    moe = RECIPES["moe-gs"][1]
+    for wrong, said in (
+        (replace(moe, growth=SplitClone()), "growth rule for anchors, found one for Gaussians"),
+        (replace(moe, growth=GrowOctree()), "growth rule for anchors, found one for anchors on levels"),
+        (replace(moe, rates=ExplicitRates()), "rates for anchors, found those for gaussians"),
+    ):
+        with pytest.raises(InputError, match=said):
+            check(wrong)
+
+
+def test_a_part_that_nobody_registered_is_refused():
+    @dataclass(frozen=True)
+    class Unheard(Weights):
+        pass
+
+    with pytest.raises(InputError, match="Unheard"):
+        check(replace(RECIPES["moe-gs"][1], loss=Unheard()))

@@ -19,7 +19,7 @@ from scene_experts.scene.graph.scene import GraphPoints
 from scene_experts.strategy.split_clone import SplitClone
 from scene_experts.training.config import Data, RunConfig
 from scene_experts.training.events import Adjusted, Finished, Previewed, Saved, Started, Stepped, Stopped
-from scene_experts.training.loop import Run, iterate, rows_to_move, stepped, without_graph
+from scene_experts.training.loop import Run, iterate, stepped, without_graph
 from scene_experts.training.state import Training
 from support.golden import recorded_text
 from support.lanes import slow_except
@@ -189,10 +189,10 @@ def test_losses_that_are_no_numbers_end_the_run_and_keep_its_checkpoint(folder, 
     list(events(config(), folder, tmp_path, stop_at=5))
     before = last_tensors(tmp_path)
 
-    def broken(decoded, render, target, weights, step, mask):
-        return {"l1": render.image.mean() * (math.nan if step > 8 else 1.0)}
+    def broken(sample, weights):
+        return {"l1": sample.render.image.mean() * (math.nan if sample.step > 8 else 1.0)}
 
-    monkeypatch.setattr("scene_experts.training.loop.terms", broken)
+    monkeypatch.setattr("scene_experts.training.loop.compute_terms", broken)
     with pytest.raises(RunError, match=naming("l1", "nan", 9)):
         list(events(config(), folder, tmp_path, stop_at=60, log_every=1, resume=True))
     assert_same(before, last_tensors(tmp_path))
@@ -243,10 +243,9 @@ def test_sparse_adam_moves_what_was_decoded(folder):
             before = training.scene.table.params["feature"].detach().clone()
             done = iterate(training, Run(RunConfig(each, Data(folder))), capture, rasterize)
         moved[each.sparse_adam] = (training.scene.table.params["feature"].detach() != before).any(1).nonzero().squeeze(1)
-        rows = rows_to_move(each, done.decoded)
-        assert (rows is None) == (not each.sparse_adam)
-        assert not each.sparse_adam or set(moved[True].tolist()) <= set(rows.tolist())
-    assert rows_to_move(cfg, replace(done.decoded, scene_opacity=torch.zeros(1, 1))) is None
+        assert not each.loss.reaches_every_row(done.decoded)
+        assert not each.sparse_adam or set(moved[True].tolist()) <= set(done.decoded.rows.tolist())
+    assert cfg.loss.reaches_every_row(replace(done.decoded, scene_opacity=torch.zeros(1, 1)))
     capture.images.close()
 
 

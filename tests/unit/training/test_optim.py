@@ -5,8 +5,9 @@ import copy
 import pytest
 import torch
 
+from scene_experts.core.errors import InputError
 from scene_experts.native import library as native
-from scene_experts.training.optim import Adam, _by_torch
+from scene_experts.training.optim import Adam, FusedAdam, _by_torch
 
 SHAPES = [(300, 32), (300, 10, 3), (300, 6), (64, 35), (7,), (1,), (0, 4)]
 
@@ -41,7 +42,7 @@ def test_it_is_torchs_fused_adam_bit_for_bit(threads):
     ours, theirs, before = parameters(), parameters(), torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        a = trained(Adam(groups(ours)), ours, range(12))
+        a = trained(FusedAdam(groups(ours)), ours, range(12))
         b = trained(torch.optim.Adam(groups(theirs), betas=(0.9, 0.999), eps=1e-15, fused=True), theirs, range(12))
     finally:
         torch.set_num_threads(before)
@@ -54,7 +55,7 @@ def test_it_is_torchs_fused_adam_bit_for_bit(threads):
 
 def test_a_parameter_without_gradient_stays_and_its_step_is_not_counted():
     tensors = parameters()
-    optimizer = trained(Adam(groups(tensors)), tensors, range(2))
+    optimizer = trained(FusedAdam(groups(tensors)), tensors, range(2))
     before = tensors[0].detach().clone()
     tensors[0].grad = None
     optimizer.step()
@@ -65,7 +66,7 @@ def test_a_parameter_without_gradient_stays_and_its_step_is_not_counted():
 @pytest.mark.parametrize("composed", [False, True])
 def test_only_the_given_rows_of_a_table_move(composed):
     tensors = parameters()
-    optimizer = Adam(groups(tensors))
+    optimizer = FusedAdam(groups(tensors))
     optimizer._native &= not composed
     trained(optimizer, tensors, range(3))
     exact = [p.detach().double().requires_grad_() for p in tensors]
@@ -86,14 +87,14 @@ def test_only_the_given_rows_of_a_table_move(composed):
 
 def test_all_rows_are_the_whole_table():
     some, whole = parameters(), parameters()
-    trained(Adam(groups(some)), some, range(4), rows=torch.arange(300))
-    trained(Adam(groups(whole)), whole, range(4))
+    trained(FusedAdam(groups(some)), some, range(4), rows=torch.arange(300))
+    trained(FusedAdam(groups(whole)), whole, range(4))
     assert all(torch.allclose(a, b, rtol=1e-6, atol=0) for a, b in zip(some, whole))
 
 
 def test_other_dtypes_take_torchs_way():
     tensors = [torch.nn.Parameter(torch.ones(3, dtype=torch.float64))]
-    optimizer = Adam([{"params": tensors, "lr": 0.1}])
+    optimizer = FusedAdam([{"params": tensors, "lr": 0.1}])
     tensors[0].grad = torch.ones(3, dtype=torch.float64)
     optimizer.step()
     assert torch.allclose(tensors[0].detach(), torch.tensor(0.9, dtype=torch.float64))
@@ -108,4 +109,14 @@ def test_a_closure_is_called_once():
         loss.backward()
         return loss.detach()
 
-    assert float(Adam([{"params": tensors, "lr": 0.1}]).step(closure)) == 3 and len(calls) == 1
+    assert float(FusedAdam([{"params": tensors, "lr": 0.1}]).step(closure)) == 3 and len(calls) == 1
+
+
+def test_the_part_builds_it_with_its_numbers():
+    tensor = torch.nn.Parameter(torch.ones(3))
+    built = Adam(betas=(0.8, 0.9), eps=1e-8).build([{"params": [tensor], "name": "a", "lr": 0.0, "by_row": True}])
+    assert isinstance(built, FusedAdam) and built.param_groups[0]["betas"] == (0.8, 0.9) and built.param_groups[0]["eps"] == 1e-8
+    assert Adam().scaled(0.5) == Adam()
+    for wrong in (Adam(betas=(1.0, 0.9)), Adam(eps=-1.0)):
+        with pytest.raises(InputError, match="--optimizer"):
+            wrong.check()

@@ -3,6 +3,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from scene_experts.scene import Traits
 from scene_experts.strategy import Edit
 from scene_experts.training.events import Adjusted, Finished, Saved, Started, Stepped, Stopped
 from scene_experts.training.progress import Bar, Progress, clock
@@ -11,7 +12,7 @@ from scene_experts.training.progress import Bar, Progress, clock
 def test_a_log_file_gets_plain_lines():
     out = io.StringIO()
     with Progress(Console(file=out, width=200), every=0.0) as show:
-        show(Started(0, 200, 1234, 0.02))
+        show(Started(0, 200, 1234, Traits("anchors", "anchors", 0.02, activation=True)))
         show(Stepped(10, {"l1": 0.05, "dssim": 0.02}, 21.5, 1300, 800, 4000, 0.61, 1.0, {}))
         show(Adjusted(100, Edit(10, 0, 1310, capped=True)))
         show(Saved(200, Path("a/b")))
@@ -38,7 +39,7 @@ def test_a_log_file_gets_plain_lines():
 def test_explicit_gaussians_are_called_so():
     out = io.StringIO()
     with Progress(Console(file=out, width=200), every=0.0) as show:
-        show(Started(0, 200, 1234))
+        show(Started(0, 200, 1234, Traits("gaussians", "Gaussians")))
         show(Stepped(10, {"l1": 0.05}, 21.5, 1300, 800, 800, 0.0, 1.0, {}))
         show(Adjusted(100, Edit(10, 0, 1310, capped=True)))
     text = out.getvalue()

@@ -5,10 +5,13 @@ import torch
 from PIL import Image
 
 from scene_experts.core.errors import RunError
+from scene_experts.scene import Traits
 from scene_experts.strategy import Edit
 from scene_experts.training.events import Adjusted, Previewed, Started, Stepped
 from scene_experts.training.record import Recorder
 from support.messages import naming
+
+TRAITS = Traits("anchors", "anchors")
 
 
 def step(i: int) -> Stepped:
@@ -21,7 +24,7 @@ def lines(folder):
 
 def test_metrics_previews_and_what_a_resumed_run_writes_again(tmp_path):
     with Recorder(tmp_path, False) as record:
-        record(Started(0, 30, 10))
+        record(Started(0, 30, 10, TRAITS))
         for i in (10, 20, 30):
             record(step(i))
         record(Adjusted(30, Edit(5, 1, 14)))
@@ -31,18 +34,18 @@ def test_metrics_previews_and_what_a_resumed_run_writes_again(tmp_path):
     with (tmp_path / "metrics.jsonl").open("ab") as stream:
         stream.write(b'{"step": 31, "cut o\n\0\xff\xfe')  # killed while writing, and what a power cut leaves
     with Recorder(tmp_path, False) as record:
-        record(Started(20, 30, 10))
+        record(Started(20, 30, 10, TRAITS))
         record(step(30))
     assert [v["step"] for v in lines(tmp_path)] == [10, 20, 30]
     with Recorder(tmp_path, False) as record:
-        record(Started(0, 30, 10))
+        record(Started(0, 30, 10, TRAITS))
     assert lines(tmp_path) == []
 
 
 def test_tensorboard_files_appear_when_asked(tmp_path):
     pytest.importorskip("tensorboard")
     with Recorder(tmp_path, True) as record:
-        record(Started(0, 30, 10))
+        record(Started(0, 30, 10, TRAITS))
         record(step(10))
     assert list((tmp_path / "tensorboard").glob("events.out.*"))
 

@@ -8,7 +8,8 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.data.capture import load
 from scene_experts.recipes import RECIPES
-from scene_experts.training.state import Training, config_hash, resume, save, scene_from
+from scene_experts.training.old_hash import old_hash
+from scene_experts.training.state import Training, resume, save, scene_from
 from support.messages import naming
 from support.synthetic import make_capture
 
@@ -60,8 +61,7 @@ def test_each_view_comes_once_an_epoch(capture):
 def test_another_configuration_is_refused(capture):
     training = started(capture)
     other = replace(training.cfg, seed=5)
-    assert config_hash(other) != config_hash(training.cfg)
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="seed was 0, is now 5"):
         Training.restore(other, training.tensors(), training.meta(), "cpu")
 
 
@@ -82,11 +82,19 @@ def test_saved_is_found_again_and_none_is_none(capture, tmp_path):
         resume(training.cfg, tmp_path, "cpu")
 
 
-def test_the_first_checkpoints_still_fit():
-    """Hashes that the first release wrote; a new setting goes into LATER with the value that they were trained with."""
-    first = {"scaffold-gs": "f304f3c44732921f", "moe-gs": "536629188212acee"}
-    assert {name: config_hash(RECIPES[name][1].scaled()) for name in first} == first
-    assert config_hash(replace(RECIPES["moe-gs"][1], sparse_adam=True).scaled()) != first["moe-gs"]
+def test_checkpoints_that_hold_a_hash_alone_still_fit(capture):
+    training = started(capture)
+    meta = {k: v for k, v in training.meta().items() if k != "train"} | {"config": old_hash(training.cfg)}
+    assert Training.restore(training.cfg, training.tensors(), meta, "cpu").step == 7
+    with pytest.raises(InputError, match="other settings"):
+        Training.restore(replace(training.cfg, sparse_adam=True), training.tensors(), meta, "cpu")
+
+
+def test_a_setting_that_is_newer_than_a_checkpoint_counts_as_its_default(capture):
+    training = started(capture)
+    meta = training.meta()
+    del meta["train"]["optimizer"], meta["train"]["scene"]["mix"]
+    assert Training.restore(training.cfg, training.tensors(), meta, "cpu").step == 7
 
 
 def test_a_checkpoint_without_a_cpu_time_opens_and_it_stays_unknown(capture):

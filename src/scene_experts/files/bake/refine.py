@@ -14,8 +14,8 @@ from scene_experts.files.bake.views import Views
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Draws
 from scene_experts.scene.gaussians import GaussianScene
-from scene_experts.training.losses import photometric
-from scene_experts.training.optim import Adam
+from scene_experts.training.optim import FusedAdam
+from scene_experts.training.photometric import photometric
 
 DRAWN_AT = 3  # the step at which baked scenes are drawn: all degrees are in use from it on
 
@@ -52,7 +52,7 @@ def refine(
     """
     generator = torch.Generator().manual_seed(seed)
     groups = scene.rate_groups().items()
-    optimizer = Adam([{"params": params, "name": name, "lr": 0.0} for name, params in groups])
+    optimizer = FusedAdam([{"params": params, "name": name, "lr": 0.0} for name, params in groups])
     free = (torch.rand(how.iterations, generator=generator) < how.free).tolist()
     queue: list[int] = []
     for i, is_free in enumerate(free):

@@ -14,10 +14,12 @@ import torch
 from torch import Tensor, nn
 
 from scene_experts.core.errors import expect_at_least
+from scene_experts.core.parts import register
 from scene_experts.core.types import Mode, Routing
 from scene_experts.scene.anchors.experts import Experts, MixtureHead, top_k
 
 
+@register
 @dataclass(frozen=True)
 class BalancedExperts(Experts):
     """E experts whose shares a bias evens out."""

@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.parts import register
 from scene_experts.core.types import Mode, Routing
-from scene_experts.scene.anchors.mlp import ACTIVATIONS, ATTRIBUTES, MLP, HeadWeights, linear_init
+from scene_experts.scene.anchors.mlp import ACTIVATIONS, ATTRIBUTES, MLP, Decoder, HeadWeights, linear_init
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +40,9 @@ class Router:
     """Append the anchor's position (divided by the scene's extent) to the router's input: the appendix's negative result."""
 
 
+@register
 @dataclass(frozen=True)
-class Experts:
+class Experts(Decoder):
     """E experts of the attribute's own shape behind a linear router."""
 
     num: int = 5
@@ -58,12 +60,24 @@ class Experts:
     """How torch computes Top-k: anchors gathered per expert, or all experts with zero weights (the slow, obvious reference)."""
     router: Router = Router()
 
-    def scaled(self, factor: float) -> Experts:
+    @property
+    def with_experts(self) -> tuple[str, ...]:
+        return self.attributes
+
+    @property
+    def dense_until(self) -> int:
+        return self.warmup
+
+    @property
+    def balances_all(self) -> bool:
+        return self.load_scope == "all"
+
+    def scaled(self, factor: float) -> Self:
         """The same in a training `factor` times as long: the dense warm-up scales."""
         return replace(self, warmup=round(self.warmup * factor))
 
     def check(self) -> None:
-        """Raises InputError for numbers that no training can have."""
+        """Raises InputError, naming the flag, for invalid settings."""
         expect_at_least([("--scene.decoder.num", self.num, 1), ("--scene.decoder.warmup", self.warmup, 0)])
         expect_at_least([("--scene.decoder.router.noise-std", self.router.noise_std, 0)])
         if self.top_k is not None and not 1 <= self.top_k <= self.num:

@@ -5,6 +5,7 @@ Routers always see the raw feature, so that routing stays a property of the anch
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.parts import Part, register
 from scene_experts.core.table import Table
 from scene_experts.scene.anchors.mlp import linear_init
 
@@ -26,22 +28,36 @@ class Mixer(Protocol):
 
 
 @dataclass(frozen=True)
-class OwnFeature:
+class FeatureMix(Part, ABC):
+    """What the decoders see of an anchor's feature."""
+
+    @abstractmethod
+    def width(self, F: int) -> int:
+        """Size of what the decoders see, for features of size F."""
+
+    @abstractmethod
+    def build(self, F: int) -> nn.Module | None:
+        """The `Mixer`; None hands the feature on as it is."""
+
+    def check_size(self, F: int) -> None:
+        """Raises InputError, naming the flag, for invalid settings with features of size F. By default every setting is valid."""
+
+
+@register
+@dataclass(frozen=True)
+class OwnFeature(FeatureMix):
     """The anchor's own feature as it is."""
 
     def width(self, F: int) -> int:
-        """Size of what the decoders see, for features of size F."""
         return F
 
     def build(self, F: int) -> None:
-        """Nothing to learn: the scene hands the feature on."""
-
-    def check(self, F: int) -> None:
-        """Everything is possible."""
+        """None: nothing is learned."""
 
 
+@register
 @dataclass(frozen=True)
-class FeatureBank:
+class FeatureBank(FeatureMix):
     """Every fourth, every second and all channels of the feature, blended by weights that depend on where the camera is."""
 
     hidden: int = 32
@@ -53,8 +69,8 @@ class FeatureBank:
     def build(self, F: int) -> Bank:
         return Bank(self.hidden)
 
-    def check(self, F: int) -> None:
-        """Raises InputError for features that cannot be cut in four."""
+    def check_size(self, F: int) -> None:
+        """Raises InputError for a feature size that is no multiple of 4."""
         expect_at_least([("--scene.mix.hidden", self.hidden, 1)])
         if F % 4:
             raise InputError(f"expected --scene.F as a multiple of 4 for the feature bank, found {F}; give another size")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.parts import Part, register
 from scene_experts.core.types import Mode, Routing
 
 ATTRIBUTES = ("opacity", "cov", "color")  # what is decoded, in the compiled library's order
@@ -64,14 +66,35 @@ def linear_init(shape: tuple[int, ...], fan_in: int) -> nn.Parameter:
 
 
 @dataclass(frozen=True)
-class Plain:
+class Decoder(Part, ABC):
+    """What turns an anchor's feature into its Gaussians: builds one head per attribute."""
+
+    @property
+    def with_experts(self) -> tuple[str, ...]:
+        """Attributes that have experts."""
+        return ()
+
+    @property
+    def dense_until(self) -> int:
+        """The last iteration of the experts' dense warm-up; 0 without one."""
+        return 0
+
+    @property
+    def balances_all(self) -> bool:
+        """Whether the load of the experts is balanced over all anchors, and not over the visible ones."""
+        return False
+
+    @abstractmethod
+    def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> nn.Module:
+        """The head of an attribute, a `Head`: [A, inputs] and features [A, feature] to [A, outputs]."""
+
+
+@register
+@dataclass(frozen=True)
+class Plain(Decoder):
     """One network per attribute, as in Scaffold-GS. `depth` counts linear layers (the paper's Figure 7 goes to 6)."""
 
     depth: int = 2
-
-    def scaled(self, factor: float) -> Plain:
-        """It has no schedule."""
-        return self
 
     def check(self) -> None:
         """Raises InputError for a network without a hidden layer."""

@@ -12,36 +12,40 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.parts import register
 from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points, Routing
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.voxel import VoxelChoice, choose_voxel_size
 from scene_experts.native import library as native
-from scene_experts.scene import Cull, Draws, Scene, Traits
+from scene_experts.scene import Cull, Draws, LatticeScene, LearningRates, SceneConfig, Traits
 from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors.appearance import Codes, TestRule, fold
-from scene_experts.scene.anchors.experts import Experts, MixtureHead
-from scene_experts.scene.anchors.features import FeatureBank, OwnFeature
+from scene_experts.scene.anchors.experts import MixtureHead
+from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
 from scene_experts.scene.anchors.frozen import Frozen
-from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, HeadWeights, Plain
-from scene_experts.scene.anchors.select import AllAnchors, Octree, Selector, faded, visible_rows
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, Decoder, HeadWeights, Plain
+from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, faded, visible_rows
 
 log = logging.getLogger(__name__)
 NEARLY_ALL = 0.95  # of the points in voxels of their own: the lattice does next to nothing
 EPS = 1e-12  # keeps directions and quaternions finite where their length is 0
 
 
+@register
 @dataclass(frozen=True)
-class Anchors:
+class Anchors(SceneConfig):
     """What an anchor scene is made of."""
+
+    family = "anchors"
 
     K: int = 10
     """Gaussians per anchor."""
@@ -59,15 +63,24 @@ class Anchors:
     """Flip each expert's quaternion into the hemisphere of the anchor's first expert before mixing (composed decode only)."""
     decode: Literal["auto", "composed", "native"] = "auto"
     """Which implementation decodes: the fused native one where it covers the scene, or the composed torch form."""
-    decoder: Plain | Experts = Plain()
-    select: AllAnchors | Octree = AllAnchors()
+    decoder: Decoder = Plain()
+    """The networks that turn features into Gaussians."""
+    select: Selection = AllAnchors()
     """Which anchors a camera uses."""
-    mix: OwnFeature | FeatureBank = OwnFeature()
+    mix: FeatureMix = OwnFeature()
     """What the decoders see of an anchor's feature."""
     appearance: int = 0
     """Size of a code per training view that the colour network sees; 0 is none."""
     test_appearance: TestRule = "mean"
     """The code of a view that was not trained on: the mean of all, or (Scaffold-GS's quirk) that of the training view of the same index."""
+
+    @property
+    def grown_as(self) -> str:
+        return "anchors on levels" if self.select.has_levels else "anchors"
+
+    @property
+    def dense_until(self) -> int:
+        return self.decoder.dense_until
 
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
         """One anchor per occupied voxel of the point cloud."""
@@ -77,7 +90,7 @@ class Anchors:
         """The scene of a checkpoint, its networks fresh."""
         return AnchorScene(self, table, float(meta["voxel"]), float(meta["extent"]), self.select.restored(meta), meta.get("views", ()))
 
-    def scaled(self, factor: float) -> Anchors:
+    def scaled(self, factor: float) -> Self:
         """The same in a training `factor` times as long."""
         return replace(self, decoder=self.decoder.scaled(factor), select=self.select.scaled(factor))
 
@@ -87,13 +100,13 @@ class Anchors:
         expect_at_least([("--scene.voxel-size", self.voxel_size, 0), ("--scene.appearance", self.appearance, 0)])
         self.decoder.check()
         self.select.check()
-        self.mix.check(self.F)
-        unknown = {*self.add_dist, *getattr(self.decoder, "attributes", ())} - set(ATTRIBUTES)
+        self.mix.check_size(self.F)
+        unknown = {*self.add_dist, *self.decoder.with_experts} - set(ATTRIBUTES)
         if unknown:
             raise InputError(f"expected attributes among {', '.join(ATTRIBUTES)}, found {', '.join(sorted(unknown))}; correct the flag")
 
 
-class AnchorScene(Scene):
+class AnchorScene(LatticeScene):
     """N anchors and three decoder heads. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], offsets [N,K,3], log_scaling [N,6]."""
 
     def __init__(
@@ -114,7 +127,7 @@ class AnchorScene(Scene):
     @property
     def traits(self) -> Traits:
         return Traits(
-            "anchors",
+            self.config.family,
             "anchors",
             self.voxel,
             experts=max(head.experts for head in self.heads.values()),
@@ -148,7 +161,7 @@ class AnchorScene(Scene):
         voxel = config.voxel_size or choose_voxel_size(points.xyz, config.voxel_rule)
         facts, voxel, select = config.select.begin(points.xyz, voxel, cameras)
         chosen = config.voxel_size or config.voxel_rule != "neighbours"
-        if chosen and isinstance(select, AllAnchors) and len(facts["xyz"]) > NEARLY_ALL * len(points.xyz):
+        if chosen and not select.count and len(facts["xyz"]) > NEARLY_ALL * len(points.xyz):
             log.warning("voxels of %.4g units keep nearly every point (%d of %d)", voxel, len(facts["xyz"]), len(points.xyz))
         scale = knn_d2(facts["xyz"].float().double()).clamp_min(1e-7).sqrt().log().float()
         n = len(scale)
@@ -170,6 +183,12 @@ class AnchorScene(Scene):
             "offsets": feature.new_zeros(n, self.K, 3),
             "log_scaling": feature.new_full((n, 6), math.log(size)),
         }
+
+    @torch.no_grad()
+    def slot_points(self, slots: Tensor, rows: Tensor) -> Tensor:
+        scaling = self.table.params["log_scaling"][:, :3].contiguous().exp().index_select(0, rows)
+        offsets = self.table.params["offsets"].view(-1, 3).index_select(0, slots)
+        return self.table.facts["xyz"].index_select(0, rows).double() + (offsets * scaling).double()
 
     def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
         """The Gaussians that `camera` sees at `step`. `cull(means, scales, camera)` is the rasteriser's visibility test."""
@@ -232,7 +251,7 @@ class AnchorScene(Scene):
             x = torch.cat([seen, direction] + ([distance] if attribute in self.config.add_dist else []), dim=1)
             if attribute == "color" and self.codes is not None:
                 x = torch.cat([x, self.codes(camera, mode).expand(len(x), -1)], dim=1)
-            if attribute == "cov" and self.config.quat_align and isinstance(head, MixtureHead):
+            if attribute == "cov" and self.config.quat_align and head.experts:
                 out[attribute], found = head.aligned(x, feature, step, position, K, mode)
             else:
                 out[attribute], found = head(x, feature, step, position, mode)
@@ -294,8 +313,7 @@ class AnchorScene(Scene):
 
     def with_global_routing(self, decoded: Decoded, step: int) -> Decoded:
         """For `load_scope = all`: the routing of all anchors in place of the visible ones', so that L_load balances the whole scene."""
-        decoder = self.config.decoder
-        if isinstance(decoder, Experts) and decoder.load_scope == "all" and decoded.routing:
+        if self.config.decoder.balances_all and decoded.routing:
             return replace(decoded, routing=self.routing(step, mode=Mode.TRAIN))
         return decoded
 
@@ -328,9 +346,12 @@ def no_kernels(device: torch.device) -> str | None:
     return native.explain_missing() if device.type == "cpu" else f"no kernels for {device.type}"
 
 
+@register
 @dataclass(frozen=True)
-class Rates:
+class Rates(LearningRates):
     """Learning rates (Scaffold-GS's). `offsets` is multiplied by the scene's extent R."""
+
+    family = "anchors"
 
     feature: Rate = Rate(0.0075, 0.0075)
     offsets: Rate = Rate(0.01, 0.0001)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol, Self
 
 import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.parts import Part, register
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Mode
 from scene_experts.geometry.voxel import find_unique_cells, to_lattice
@@ -24,8 +26,17 @@ class Selector(Protocol):
     """Which anchors are drawn, and where anchors may be."""
 
     @property
+    def lattices(self) -> Levels | None:
+        """The levels of detail; None without."""
+        ...
+
+    @property
     def count(self) -> int:
-        """Levels of detail; 0 without levels."""
+        """Number of levels of detail; 0 without levels."""
+        ...
+
+    def coarse(self, step: int) -> bool:
+        """Whether finer levels are still to come into use after `step`."""
         ...
 
     def capped(self, level: int | None) -> Selector:
@@ -50,12 +61,36 @@ class Selector(Protocol):
 
 
 @dataclass(frozen=True)
-class AllAnchors:
+class Selection(Part, ABC):
+    """Which anchors a camera uses: makes the scene's `Selector`."""
+
+    has_levels: ClassVar[bool] = False
+    """Whether anchors lie on levels of detail."""
+
+    @abstractmethod
+    def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
+        """The first anchors for points [P, 3]: facts of the rows, the finest cell's edge, the selector."""
+
+    @abstractmethod
+    def restored(self, meta: dict[str, Any]) -> Selector:
+        """The selector that `Selector.meta()` describes."""
+
+
+@register
+@dataclass(frozen=True)
+class AllAnchors(Selection):
     """Every anchor, as in Scaffold-GS."""
+
+    @property
+    def lattices(self) -> None:
+        return None
 
     @property
     def count(self) -> int:
         return 0
+
+    def coarse(self, step: int) -> bool:
+        return False
 
     def capped(self, level: int | None) -> AllAnchors:
         return self
@@ -80,16 +115,13 @@ class AllAnchors:
     def restored(self, meta: dict[str, Any]) -> Selector:
         return self
 
-    def scaled(self, factor: float) -> AllAnchors:
-        return self
 
-    def check(self) -> None:
-        """Everything is possible."""
-
-
+@register
 @dataclass(frozen=True)
-class Octree:
-    """Levels of detail (Ren et al., Octree-GS): anchors on several lattices, each camera using a level the nearer it is."""
+class Octree(Selection):
+    """Levels of detail (Ren et al., Octree-GS): anchors on several lattices; near cameras use finer levels."""
+
+    has_levels = True
 
     fork: int = 2
     """Cells of a level are so many times as small as the level's before."""
@@ -155,7 +187,7 @@ class Octree:
     def restored(self, meta: dict[str, Any]) -> Selector:
         return LevelSelector(self, Levels.from_meta(meta["levels"]))
 
-    def scaled(self, factor: float) -> Octree:
+    def scaled(self, factor: float) -> Self:
         return replace(self, coarse_until=round(self.coarse_until * factor))
 
     def turns(self, levels: Levels) -> list[float]:

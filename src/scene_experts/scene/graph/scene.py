@@ -18,13 +18,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.parts import register
 from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.geometry.curvature import curvature, find_flat, find_midpoint_pairs
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.voxel import VoxelChoice, choose_voxel_size, coarsen, find_unique_cells, to_lattice
-from scene_experts.scene import Cull, Scene, Traits
+from scene_experts.scene import Cull, LatticeScene, LearningRates, SceneConfig, Traits
 from scene_experts.scene.anchors.mlp import CHANNELS
 from scene_experts.scene.anchors.scene import EPS
 from scene_experts.scene.anchors.select import visible_rows
@@ -35,9 +36,12 @@ PROBES = 1000  # points whose first opacity is looked at
 HALF = 2  # midpoints lie on a lattice of half the voxel
 
 
+@register
 @dataclass(frozen=True)
-class GraphPoints:
+class GraphPoints(SceneConfig):
     """What a scene of graph points is made of."""
+
+    family = "graph"
 
     F: int = 32
     """Feature size."""
@@ -61,6 +65,10 @@ class GraphPoints:
     """neighbours: a quarter of the median neighbour distance; the others are Scaffold-GS's rule as coded and as documented."""
     grid: HashGrid = HashGrid()
 
+    @property
+    def grown_as(self) -> str:
+        return "graph points"
+
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> GraphScene:
         """The occupied voxels of the point cloud and the midpoints between them. Raises InputError when there are no points."""
         if len(points.xyz) == 0:
@@ -83,10 +91,6 @@ class GraphPoints:
         """The scene of a checkpoint, its networks fresh."""
         corner, edge = tuple(float(v) for v in meta["grid_low"]), float(meta["grid_edge"])
         return GraphScene(self, table, float(meta["voxel"]), float(meta["extent"]), corner, edge)
-
-    def scaled(self, factor: float) -> GraphPoints:
-        """It has no schedule."""
-        return self
 
     def check(self) -> None:
         """Raises InputError for settings that no training can have."""
@@ -117,12 +121,12 @@ class Unbiased(nn.Module):
         return h
 
 
-class GraphScene(Scene):
+class GraphScene(LatticeScene):
     """N points, one Gaussian each. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], log_scaling [N,6]."""
 
     @property
     def traits(self) -> Traits:
-        return Traits("graph", "points", self.voxel, activation=True)
+        return Traits(self.config.family, "points", self.voxel, activation=True)
 
     @property
     def K(self) -> int:
@@ -249,8 +253,8 @@ class GraphScene(Scene):
         return torch.cat([v / distance.clamp_min(EPS), distance], dim=1)
 
     @torch.no_grad()
-    def slot_points(self, rows: Tensor) -> Tensor:
-        """Where the Gaussians of `rows` [P] are, [P, 3] float64: from the whole graph, as no camera is asked."""
+    def slot_points(self, slots: Tensor, rows: Tensor) -> Tensor:
+        """Where the Gaussians of `rows` [P] are, [P, 3] float64: from the whole graph, as there is no camera."""
         everyone = torch.arange(len(self.table), device=rows.device)
         offset = self.offset(*self.encode(everyone, rows)) * self.table.params["log_scaling"].index_select(0, rows)[:, :3].exp()
         return self.table.facts["xyz"].index_select(0, rows).double() + offset.double()
@@ -274,9 +278,12 @@ class GraphScene(Scene):
         return {**layers, "grid.table": self.grid.table, "affine.alpha": self.alpha, "affine.beta": self.beta}
 
 
+@register
 @dataclass(frozen=True)
-class GraphRates:
+class GraphRates(LearningRates):
     """Learning rates (SAGS's)."""
+
+    family = "graph"
 
     feature: Rate = Rate(0.0075, 0.0075)
     log_scaling: Rate = Rate(0.007, 0.007)

@@ -75,8 +75,8 @@ def test_decoders_see_the_blend_and_routers_the_raw_feature():
 
 
 def test_features_must_be_cut_in_four():
-    FeatureBank().check(32)
-    OwnFeature().check(33)
+    FeatureBank().check_size(32)
+    OwnFeature().check_size(33)
     with pytest.raises(InputError, match=r"--scene\.F"):
-        FeatureBank().check(30)
+        FeatureBank().check_size(30)
     assert OwnFeature().width(7) == 7 and OwnFeature().build(7) is None and FeatureBank().width(8) == 8

@@ -123,7 +123,7 @@ def test_gaussians_stand_where_the_whole_graph_puts_them():
         whole = torch.cat([own, strongest.expand(len(own), -1)], dim=1) * scene.alpha + scene.beta
         offset = whole @ scene.offsets.layers[0].T @ scene.offsets.layers[1].T * scene.table.params["log_scaling"][:, :3].exp()
         rows = torch.tensor([7, 3, 30])
-        torch.testing.assert_close(scene.slot_points(rows), scene.table.facts["xyz"][rows] + offset[rows])
+        torch.testing.assert_close(scene.slot_points(rows, rows), scene.table.facts["xyz"][rows] + offset[rows])
         torch.testing.assert_close(scene.scene_opacity(CAMERA, 1), scene.decode(everybody, CAMERA).raw_opacity)
 
 

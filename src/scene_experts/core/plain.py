@@ -1,0 +1,107 @@
+"""Dataclasses to plain JSON values and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import types as pytypes
+import typing
+from pathlib import Path
+from typing import Any, Literal
+
+from scene_experts.core.errors import InputError
+from scene_experts.core.parts import Part, find, names_of
+
+
+class UnknownPart(InputError):
+    """A configuration names a part that nobody has registered."""
+
+
+def to_json(value: Any) -> Any:
+    """Plain JSON values of a tree of dataclasses. Each dataclass carries its class name under "type"."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        out = {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {"type": type(value).__name__, **out}
+    if isinstance(value, dict):
+        return {str(k): to_json(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_json(v) for v in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def from_json(kind: Any, value: Any, where: str = "config") -> Any:
+    """The value of type `kind` that `to_json` wrote. A field that accepts a part accepts every registered kind of it.
+
+    Raises InputError naming the place that does not fit, UnknownPart for the name of a part that is not registered.
+    """
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, pytypes.UnionType):
+        return _from_union(args, value, where)
+    if isinstance(kind, type) and issubclass(kind, Part):
+        return _from_object(_part_named(kind, value, where), value, where)
+    if dataclasses.is_dataclass(kind):
+        return _from_object(kind, value, where)
+    if origin is Literal:
+        if value not in args:
+            raise InputError(f"expected one of {list(args)} at {where}, found {value!r}; correct the file")
+        return value
+    if origin is tuple:
+        _expect(isinstance(value, list), "a list", where, value)
+        inner = [args[0]] * len(value) if len(args) == 2 and args[1] is Ellipsis else list(args)
+        _expect(len(inner) == len(value), f"{len(inner)} values", where, value)
+        return tuple(from_json(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(inner, value)))
+    if origin is dict:
+        _expect(isinstance(value, dict), "an object", where, value)
+        return {k: from_json(args[1], v, f"{where}.{k}") for k, v in value.items()}
+    if kind is Path:
+        _expect(isinstance(value, str), "a path", where, value)
+        return Path(value)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    _expect(isinstance(value, kind) and not (kind is int and isinstance(value, bool)), f"a {kind.__name__}", where, value)
+    return value
+
+
+def _part_named(kind: type[Part], value: Any, where: str) -> type[Part]:
+    """The part that `value` names."""
+    _expect(isinstance(value, dict), "an object", where, value)
+    name = value.get("type", kind.__name__)
+    part = find(name, kind)
+    if part is None:
+        raise UnknownPart(f"expected one of {names_of(kind)} at {where}, found {name!r}; install or import the package that defines it")
+    return part
+
+
+def _from_union(args: tuple[Any, ...], value: Any, where: str) -> Any:
+    if value is None and type(None) in args:
+        return None
+    options = [a for a in args if a is not type(None)]
+    if len(options) == 1:
+        return from_json(options[0], value, where)
+    for option in options:
+        if isinstance(value, dict) and getattr(option, "__name__", None) == value.get("type"):
+            return from_json(option, value, where)
+    found = value["type"] if isinstance(value, dict) and "type" in value else value
+    raise InputError(f"expected one of {[getattr(o, '__name__', str(o)) for o in options]} at {where}, found {found!r}; correct the file")
+
+
+def _from_object(kind: Any, value: Any, where: str) -> Any:
+    _expect(isinstance(value, dict), "an object", where, value)
+    hints = typing.get_type_hints(kind)  # annotations for the command line are left out
+    known = {f.name for f in dataclasses.fields(kind)}
+    unknown = set(value) - known - {"type"}
+    _expect(not unknown, f"only the keys {sorted(known)}", where, sorted(unknown))
+    needed = [f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING]
+    _expect(not set(needed) - set(value), f"the keys {needed}", where, sorted(set(value) - {"type"}))
+    return kind(**{name: from_json(hints[name], item, f"{where}.{name}") for name, item in value.items() if name in known})
+
+
+def _expect(fits: bool, what: str, where: str, found: Any) -> None:
+    if not fits:
+        raise InputError(f"expected {what} at {where}, found {found!r}; correct the file or start a new run")
+
+
+def first_difference(old: Any, new: Any, where: str = "") -> str:
+    """The first place where two trees of plain values differ, as "loss.load was 0.01, is now 0.5"; empty where they are equal."""
+    if isinstance(old, dict) and isinstance(new, dict) and old.keys() == new.keys():
+        return next((found for key in old if (found := first_difference(old[key], new[key], f"{where}.{key}".lstrip(".")))), "")
+    return "" if old == new else f"{where} was {old}, is now {new}"
