@@ -10,9 +10,9 @@ import pytest
 from scene_experts.arguments.table import rows as rows_of
 from scene_experts.commands.evaluate import EvalCommand
 from scene_experts.commands.render import RenderCommand
-from scene_experts.commands.reproduce import ReproduceCommand
 from scene_experts.commands.train import TrainCommand
 from scene_experts.recipes import RECIPES
+from scene_experts.reproduce.options import ReproduceOptions
 from support.places import ROOT
 
 PLACES = (ROOT / "src" / "scene_experts", ROOT / "csrc", ROOT / "tests", ROOT)
@@ -105,7 +105,7 @@ def test_every_equation_names_its_code_and_its_test():
 @functools.cache
 def every_flag() -> frozenset[str]:
     """Every option of these commands and of every recipe, without dashes, with the negations of the switches."""
-    tables = [rows_of(kind, {}) for kind in (EvalCommand, RenderCommand, ReproduceCommand)]
+    tables = [rows_of(kind, {}) for kind in (EvalCommand, RenderCommand, ReproduceOptions)]
     tables += [rows_of(TrainCommand, {"cfg": recipe}) for _, recipe in RECIPES.values()]
     return frozenset(name.lstrip("-") for table in tables for row in table for name in row.names)
 

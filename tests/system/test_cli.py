@@ -61,7 +61,7 @@ def test_help_and_version_do_not_load_torch():
     assert subprocess.run([sys.executable, "-c", probe], capture_output=True, check=False).returncode == 0
 
 
-LOADS_TORCH = ("train", "reproduce")
+LOADS_TORCH = ("train",)
 """Commands whose help loads torch: the options of `train` are those of its recipes."""
 
 

@@ -88,14 +88,16 @@ class _Reader:
             self._keep(row, name, self._value(row, name, [value] if joined else _take(row, args)))
 
     def _word(self, args: list[str]) -> None:
-        left = [row for row in self.waiting if row.place not in self.given]
         if not args[0]:
             raise InputError("expected a value after the command, found an empty one; give one, or leave it out")
+        left = [row for row in self.waiting if row.place not in self.given or count(row.kind)[1] is None]
         if not left:
             takes = " ".join(map(stands_for, self.waiting)) or "only options"
             raise InputError(f"expected {takes} after `{self.command.name}`, found also '{args[0]}'; leave it out")
         row = left[0]
-        self._keep(row, stands_for(row), self._value(row, stands_for(row), _take(row, args)))
+        before = self.given.pop(row.place, ())  # words of a list may stand before and after an option
+        value = self._value(row, stands_for(row), _take(row, args))
+        self._keep(row, stands_for(row), before + value if before else value)
 
     def _value(self, row: Row, name: str, words: list[str]) -> Any:
         if "" in words:

@@ -1,7 +1,5 @@
 """From words to a dataclass; one sentence for words that do not fit."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -96,6 +94,16 @@ def test_every_form_of_an_option():
 def test_one_sentence_for_each_mistake(args, facts):
     sentence = refuses(*args)
     assert all(fact in sentence for fact in facts), sentence
+
+
+def test_words_of_a_list_may_stand_around_options():
+    @dataclass(frozen=True)
+    class Many:
+        words: tuple[str, ...]
+        fast: bool = False
+
+    for args in (["a", "b", "--fast"], ["a", "--fast", "b"], ["--fast", "a", "b"]):
+        assert parse(Many, Command("se", ("--words",)), args) == Many(("a", "b"), True)
 
 
 def test_underscores_are_hyphens():

@@ -2,10 +2,11 @@
 
 import pytest
 
-from scene_experts.commands.reproduce import ReproduceCommand, experiments_of
 from scene_experts.evaluate.tables import load_paper
 from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS, OURS
+from scene_experts.reproduce.options import ReproduceOptions
+from scene_experts.reproduce.request import choose_experiments
 
 
 def test_all_of_the_paper_is_there():
@@ -29,7 +30,7 @@ def test_a_figure_has_its_own_scenes():
 
 
 def test_all_is_what_the_paper_shows():
-    names = {e.name for e in experiments_of(ReproduceCommand(("all",)))}
+    names = {e.name for e in choose_experiments(ReproduceOptions(("all",)))}
     assert names == EXPERIMENTS.keys() - set(OURS) and "extras" in EXPERIMENTS
     grown_from = {"3dgs-mcmc": "3dgs", "scaffold-gs-bank": "scaffold-gs", "octree-moe-gs": "octree-gs"}
     recipes = set(EXPERIMENTS["extras"].rows.values())

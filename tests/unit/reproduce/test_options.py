@@ -1,0 +1,17 @@
+"""Options of a reproduction."""
+
+import pytest
+
+from scene_experts.core.errors import InputError
+from scene_experts.reproduce.options import ReproduceOptions
+
+
+@pytest.mark.parametrize(("given", "workers"), [({}, 1), ({"devices": ("0", "1")}, 2), ({"devices": ("0", "1"), "workers": 1}, 1)])
+def test_every_device_has_a_worker_unless_told_otherwise(given, workers):
+    assert ReproduceOptions(("table3",), **given).worker_count == workers
+
+
+@pytest.mark.parametrize(("given", "flag"), [({"workers": 0}, "--workers"), ({"seeds": (0, -1)}, "--seeds")])
+def test_invalid_values_name_their_option(given, flag):
+    with pytest.raises(InputError, match=flag):
+        ReproduceOptions(("table3",), **given).check()

@@ -1,0 +1,29 @@
+"""From options to experiments, scenes and runs."""
+
+import pytest
+
+from scene_experts.core.errors import InputError
+from scene_experts.reproduce.options import ReproduceOptions
+from scene_experts.reproduce.request import choose_experiments, choose_scenes, make_plan
+from support.messages import naming
+
+
+def test_names_that_are_none(tmp_path):
+    (tmp_path / "box").mkdir()
+    (tmp_path / "note").touch()
+    with pytest.raises(InputError, match="'table1'"):
+        choose_experiments(ReproduceOptions(("tabel1",)))
+    with pytest.raises(InputError, match="table1, table2"):
+        choose_experiments(ReproduceOptions(()))
+    with pytest.raises(InputError, match=naming(tmp_path)):
+        choose_scenes(ReproduceOptions(("table1",), data=tmp_path))
+    with pytest.raises(InputError, match=naming("--scenes", "box", "bax")):
+        choose_scenes(ReproduceOptions(("table1",), captures=(tmp_path / "box",), scenes=("bax",)))
+    with pytest.raises(InputError, match=naming(tmp_path / "box")):
+        make_plan(ReproduceOptions(("table1",), captures=(tmp_path / "box",), dry_run=True))
+    with pytest.raises(InputError, match=naming(tmp_path / "note")):
+        make_plan(ReproduceOptions(("table1",), captures=(tmp_path / "box",), out=tmp_path / "note"))
+    with pytest.raises(InputError, match="'rome'"):
+        choose_scenes(ReproduceOptions(("table1",), data=tmp_path, scenes=("roma",)))
+    with pytest.raises(InputError, match="rome"):
+        choose_scenes(ReproduceOptions(("table1",), data=tmp_path, scenes=("rome",)))
