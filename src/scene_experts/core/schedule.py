@@ -11,8 +11,11 @@ class Every:
     """True at the multiples of `interval` strictly between `start` and `stop` (as Scaffold-GS compares them)."""
 
     start: int
+    """Iteration after which it begins."""
     stop: int
+    """Iteration before which it ends."""
     interval: int
+    """Iterations between two steps."""
 
     def due(self, step: int) -> bool:
         return self.start < step < self.stop and step % self.interval == 0
@@ -31,7 +34,9 @@ class Rate:
     """A learning rate that runs log-linearly from `first` to `last` over the training; 0 stays 0."""
 
     first: float
+    """At the first iteration."""
     last: float
+    """At the last iteration."""
 
     def at(self, step: int, total: int) -> float:
         """The rate at `step` (1-based) of `total`: exp((1 - t/T) ln first + (t/T) ln last), t clipped to [0, T]."""

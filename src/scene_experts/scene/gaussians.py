@@ -41,11 +41,11 @@ class Explicit(SceneConfig):
     sh_degree: int = 3
     """Highest degree of the spherical harmonics, 0 to 3."""
     sh_ramp: int = 1000
-    """Iterations until the next degree is used; the first is 0."""
+    """Iterations until the next degree is used; the first degree is 0."""
     opacity: float = 0.1
-    """Opacity of every Gaussian at the start."""
+    """Initial opacity of every Gaussian."""
     size: float = 1.0
-    """Size of a Gaussian at the start, in distances to its nearest neighbours."""
+    """Initial size of a Gaussian, in mean distances to its nearest neighbours."""
 
     @property
     def grown_as(self) -> str:
@@ -161,11 +161,17 @@ class ExplicitRates(LearningRates):
     family = "gaussians"
 
     means: Rate = Rate(0.00016, 0.0000016)
+    """Learning rate of the positions, times the scene's extent."""
     log_scales: Rate = Rate(0.005, 0.005)
+    """Learning rate of the sizes."""
     quats: Rate = Rate(0.001, 0.001)
+    """Learning rate of the rotations."""
     raw_opacity: Rate = Rate(0.05, 0.05)
+    """Learning rate of the opacities."""
     sh_dc: Rate = Rate(0.0025, 0.0025)
+    """Learning rate of the base colours."""
     sh_rest: Rate = Rate(0.000125, 0.000125)
+    """Learning rate of the higher spherical harmonics."""
 
     def at(self, group: str, step: int, total: int, extent: float) -> float:
         """The rate of a group of `rate_groups` at `step` of `total`."""

@@ -25,15 +25,19 @@ class AnchorControl(Strategy[L]):
     grows = "anchors"
 
     start_stat: int = 500
+    """Iteration from which statistics are collected."""
     adjust: Every = Every(1500, 15_000, 100)
-    """Adjust at multiples of `interval` strictly inside (start, stop); statistics are kept from start_stat to stop."""
+    """When densification runs."""
     grad_threshold: float = 0.0002
+    """Mean 2D gradient (NDC units) above which new anchors are created."""
     success_threshold: float = 0.8
+    """Share of the interval in which an anchor must be seen before it can be removed; half of it before it can grow."""
     min_opacity: float = 0.005
+    """Anchors whose mean opacity is lower are removed."""
     scale_clamp: Literal["log0.05", "linear0.05", "off"] = "log0.05"
-    """After each adjustment, Gaussian size bounds (log-scaling 3..5) are held below 0.05 in log or linear units."""
+    """Upper bound of the Gaussians' sizes after each densification step: 0.05 in log space, 0.05 in linear units, or off."""
     max_anchors: int = 0
-    """Never more anchors than this; 0 is no cap. The largest gradients go first."""
+    """Maximum number of anchors; 0 means no limit. Anchors with the largest gradients are created first."""
 
     def scaled(self, factor: float) -> Self:
         """The same in a training `factor` times as long: windows scale; interval, gates and thresholds stay."""

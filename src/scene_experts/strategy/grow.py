@@ -23,12 +23,15 @@ class GrowAnchors(AnchorControl[L]):
     """Scaffold-GS's rule."""
 
     levels: int = 3
+    """Number of voxel sizes at which anchors are created in one step."""
     init_factor: int = 16
+    """Voxel size of the coarsest of these levels, in units of the scene's voxel size."""
     hierarchy_factor: int = 4
+    """Ratio of the voxel sizes of two successive levels."""
     elimination: bool = True
-    """Let only a random part of the candidates through: half at the coarsest level, then 3/4, then 7/8."""
+    """Keep only a random part of the candidates: half at the coarsest level, then 3/4, then 7/8."""
     parity_level_skip: bool = False
-    """Scaffold-GS's quirk: no finer level is tried once a call has added nothing so far."""
+    """Reproduce a quirk of Scaffold-GS: skip the finer levels while a step has created no anchor yet."""
 
     def check(self) -> None:
         """Raises InputError, naming the flag, for invalid settings."""

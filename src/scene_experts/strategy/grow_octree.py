@@ -28,15 +28,17 @@ class GrowOctree(AnchorControl[AnchorScene]):
     grows = "anchors on levels"
 
     adjust: Every = Every(1500, 25_000, 100)
+    """When densification runs."""
     update_ratio: float = 0.2
+    """The gradient threshold grows by the factor fork^update_ratio from level to level."""
     extra_ratio: float = 0.25
-    """Anchors whose mean gradient reaches this part of their level's threshold ask for finer levels."""
+    """Anchors whose mean gradient reaches this share of the threshold of their level request finer levels."""
     extra_up: float = 0.01
-    """By so much of a level, each adjustment."""
+    """Level increment per densification step."""
     parity_coarse_gate: bool = False
-    """Octree-GS's bug: finer levels grow, and are asked for, before the coarse phase has ended."""
+    """Reproduce a bug of Octree-GS: create and request finer levels before the coarse phase has ended."""
     parity_extra_level: bool = False
-    """Octree-GS's bug: an anchor is asked about once for every level, and not for its own alone."""
+    """Reproduce a bug of Octree-GS: add the level increment once per level instead of once."""
 
     def check(self) -> None:
         """Raises InputError, naming the flag, for invalid settings."""

@@ -19,9 +19,12 @@ class GrowPoints(GrowAnchors):
     grows = "graph points"
 
     success_threshold: float = 0.6
+    """Share of the interval in which an anchor must be seen before it can be removed; half of it before it can grow."""
     scale_clamp: Literal["log0.05", "linear0.05", "off"] = "off"
+    """Upper bound of the Gaussians' sizes after each densification step: 0.05 in log space, 0.05 in linear units, or off."""
     visits: Literal["drawn", "seen"] = "drawn"
-    """drawn: a view counts only for points that it drew, so that a point never drawn is never removed (SAGS); seen: for all it decoded."""
+    """drawn: a view counts only for the points that it draws, so a point that is never drawn is never removed (SAGS). seen: a view counts
+    for all points that it decodes."""
 
     def observe(self, scene: LatticeScene, decoded: Decoded, render: Render, step: int) -> None:
         """Count one view, after its backward pass."""

@@ -33,15 +33,15 @@ class MCMC(Strategy[GaussianScene]):
     grows = "Gaussians"
 
     adjust: Every = Every(500, 25_000, 100)
-    """Relocate and add at multiples of `interval` strictly inside (start, stop)."""
+    """When Gaussians are relocated and added."""
     min_opacity: float = 0.005
-    """Gaussians this faint are dead: they move to where others are."""
+    """Gaussians with a lower opacity are relocated."""
     growth: float = 1.05
-    """An adjustment adds Gaussians up to this many times those there are."""
+    """Factor by which the number of Gaussians grows in one step, at most."""
     noise: float = 500_000.0
-    """Size of the noise on positions, times their learning rate; 0 is none."""
+    """Scale of the noise on positions, times their learning rate; 0 means no noise."""
     max_anchors: int = 1_000_000
-    """Never more Gaussians than this; 0 is no cap."""
+    """Maximum number of Gaussians; 0 means no limit."""
 
     def scaled(self, factor: float) -> Self:
         """The same in a training `factor` times as long: the window scales; the interval stays."""

@@ -31,24 +31,25 @@ class SplitClone(Strategy[GaussianScene]):
     grows = "Gaussians"
 
     adjust: Every = Every(500, 15_000, 100)
-    """Adjust at multiples of `interval` strictly inside (start, stop); statistics are kept until stop."""
+    """When densification runs."""
     grad_threshold: float = 0.0002
-    """Mean 2D gradient (NDC units) from which a Gaussian is cloned or split."""
+    """Mean 2D gradient (NDC units) above which a Gaussian is cloned or split."""
     dense_size: float = 0.01
-    """Share of the scene's extent up to which a Gaussian is cloned; larger ones are split."""
+    """Largest size of a cloned Gaussian, as a share of the scene's extent; larger ones are split."""
     min_opacity: float = 0.005
-    """Fainter Gaussians are removed."""
+    """Gaussians with a lower opacity are removed."""
     max_size: float = 0.1
-    """Share of the scene's extent beyond which Gaussians are removed, after the first reset."""
+    """Gaussians larger than this share of the scene's extent are removed after the first opacity reset."""
     reset: Every = Every(0, 15_000, 3000)
-    """When opacities are pressed down to `reset_opacity`."""
+    """When opacities are reset."""
     reset_least: int = 1000
-    """Resets are at least so many iterations apart, however short the training: it takes them hundreds to come back."""
+    """Minimum number of iterations between resets, however short the training is."""
     reset_opacity: float = 0.01
+    """Upper bound of the opacities after a reset."""
     reset_at_start: bool = False
-    """Reset at `adjust.start` too, as 3DGS does for captures on white."""
+    """Also reset at adjust.start, as 3DGS does for captures with a white background."""
     max_anchors: int = 0
-    """Never more Gaussians than this; 0 is no cap. The largest gradients go first."""
+    """Maximum number of Gaussians; 0 means no limit. Gaussians with the largest gradients are added first."""
 
     def scaled(self, factor: float) -> Self:
         """The same in a training `factor` times as long: windows and, down to `reset_least`, the interval of resets scale."""

@@ -41,17 +41,18 @@ class Train:
     optimizer: Optimizer = Adam()
     """The optimiser."""
     iterations: int = SCHEDULE
-    """Length of the training. Another length rescales the whole schedule (learning rates, densification windows, warm-up)."""
+    """Number of training iterations. Another number rescales the whole schedule (learning rates, densification, warm-up)."""
     seed: int = 0
     """Seed of all random numbers, at least 0."""
     antialias: bool = False
-    """Compensate opacity for the 0.3 px blur (Mip-Splatting's 2D filter)."""
+    """Compensate the opacity for the 0.3 px blur (2D filter of Mip-Splatting)."""
     random_background: bool = False
-    """Another background colour every iteration."""
+    """Use a random background colour in each iteration."""
     max_anchors: int = 0
-    """Stop growing at this many anchors; 0 is no cap."""
+    """Stop densification at this number of anchors; 0 means no limit."""
     sparse_adam: bool = False
-    """Move only what a view decoded (gsplat's SelectiveAdam): faster where views see a small part; changes results."""
+    """Update only the rows that a view has decoded (SelectiveAdam of gsplat). Faster if views see a small part of the scene; changes the
+    results."""
     schedule: Annotated[int, Option(hidden=True)] = SCHEDULE
     """The iterations that this recipe's windows are written for."""
 

@@ -47,31 +47,31 @@ class Weights(Part):
     terms: ClassVar[tuple[Term, ...]] = ()
 
     dssim: float = 0.2
-    """Weight of 1 - SSIM; L1 gets the rest of 1."""
+    """Weight of 1 - SSIM; L1 has the weight 1 - dssim."""
     scale: float = 0.01
-    """Weight of the mean volume of the drawn Gaussians."""
+    """Weight of the mean volume of the rendered Gaussians."""
     opacity: float = 0.0
     """Weight of the opacity hinge (eq. 8)."""
     load: float = 0.0
-    """Weight of the load balance (eq. 6, 7)."""
+    """Weight of the load balancing (eq. 6 and 7)."""
     tau: float = 0.0
-    """Opacity below which the hinge pulls."""
+    """Opacity below which the hinge acts."""
     opacity_scope: Literal["visible", "rendered_anchors", "all"] = "visible"
-    """Whose opacities the hinge sees: all K of every visible anchor, of anchors with a drawn Gaussian, or of every anchor of the scene."""
+    """Opacities in the hinge: those of all visible anchors, of anchors with a rendered Gaussian, or of all anchors."""
     load_reduce: Literal["sum", "mean"] = "sum"
-    """Over the attributes that have experts."""
+    """How L_load is reduced over the attributes with experts."""
     load_phase: Literal["exclusive", "both"] = "exclusive"
-    """exclusive: eq. 7 while dense, eq. 6 after; both: their sum after."""
+    """exclusive: eq. 7 during the dense warm-up, eq. 6 after it. both: after it, the sum of the two."""
     load_normalise_by_k: bool = False
     """Divide eq. 6 by k, so that perfect balance is 1 for every k."""
     mean_opacity: float = 0.0
-    """Weight of the mean opacity over all explicit Gaussians (3DGS-MCMC)."""
+    """Weight of the mean opacity of all explicit Gaussians (3DGS-MCMC)."""
     mean_size: float = 0.0
-    """Weight of the mean scale over all explicit Gaussians and axes (3DGS-MCMC)."""
+    """Weight of the mean size of all explicit Gaussians over the three axes (3DGS-MCMC)."""
     opacity_from: int = 0
     """First iteration with the opacity hinge."""
     opacity_until: int | None = None
-    """Last iteration with the opacity hinge; None: it never ends."""
+    """Last iteration with the opacity hinge; none means the last iteration of the training."""
 
     def scaled(self, factor: float) -> Self:
         """The same in a training `factor` times as long: the window of the opacity hinge scales."""

@@ -46,9 +46,9 @@ class Adam(Optimizer):
     by_row = True
 
     betas: tuple[float, float] = (0.9, 0.999)
-    """Decay of the mean gradient and of the mean squared gradient."""
+    """Decay rates of the first and second moment."""
     eps: float = 1e-15
-    """Added to the root of the mean squared gradient."""
+    """Term added to the denominator."""
 
     def build(self, groups: list[dict[str, Any]]) -> FusedAdam:
         return FusedAdam(groups, betas=self.betas, eps=self.eps)

@@ -25,7 +25,7 @@ class BalancedExperts(Experts):
     """E experts whose shares a bias evens out."""
 
     speed: float = 0.001
-    """How far a bias moves in an iteration; gates are between 0 and 1."""
+    """Change of a bias per iteration; gates are between 0 and 1."""
 
     def head(self) -> type[BalancedHead]:
         return BalancedHead

@@ -29,15 +29,17 @@ class Router:
     """How gates are made. The defaults are the paper's "simple linear layer"; the rest are switches for its open questions."""
 
     bias: bool = True
+    """Give the linear layer a bias."""
     init: Literal["default", "zeros"] = "default"
+    """Initialisation of the weights: PyTorch's default, or zeros."""
     renormalise: bool = True
-    """Weights of the chosen experts sum to 1 (eq. 5). With k = 1 the router then gets no gradient from the picture, only from L_load."""
+    """Scale the weights of the chosen experts to sum to 1 (eq. 5). With k = 1 the router then gets gradients from L_load only."""
     noise_std: float = 0.0
-    """Standard deviation of Gaussian noise on the logits in training."""
+    """Standard deviation of the Gaussian noise on the logits during training."""
     detach_feature: bool = False
-    """Do not let the gates train the features."""
+    """Stop gradients from the gates to the anchor features."""
     input_pos: bool = False
-    """Append the anchor's position (divided by the scene's extent) to the router's input: the appendix's negative result."""
+    """Append the anchor's position, divided by the scene's extent, to the router's input (the paper's appendix)."""
 
 
 @register
@@ -46,18 +48,22 @@ class Experts(Decoder):
     """E experts of the attribute's own shape behind a linear router."""
 
     num: int = 5
+    """Number of experts per attribute."""
     top_k: int | None = 2
-    """Experts per anchor after the warm-up; None keeps the dense mixture for good."""
+    """Number of experts per anchor after the warm-up; none keeps the dense mixture."""
     warmup: int = 1500
-    """Iterations of the dense mixture before Top-k (rescaled by --iterations)."""
+    """Iterations with the dense mixture before Top-k. --iterations rescales it."""
     attributes: tuple[str, ...] = ATTRIBUTES
-    """Which attributes get experts; the others keep one network."""
+    """Attributes that have experts: opacity, cov, color. The others have one network."""
     mix: Literal["post_activation", "pre_activation"] = "post_activation"
+    """Mix the outputs of the experts after or before the activation function."""
     expert_init: Literal["independent", "clone_jitter"] = "independent"
+    """independent: initialise each expert on its own. clone_jitter: copies of one network with small noise."""
     load_scope: Literal["visible", "all"] = "visible"
-    """Over which anchors L_load balances."""
+    """Anchors over which L_load balances the experts: the visible ones, or all."""
     form: Literal["fast", "masked"] = "fast"
-    """How torch computes Top-k: anchors gathered per expert, or all experts with zero weights (the slow, obvious reference)."""
+    """How PyTorch computes Top-k. fast: gather the anchors of each expert. masked: run all experts and zero the weights of the others (slow
+    reference)."""
     router: Router = Router()
 
     @property

@@ -61,7 +61,7 @@ class FeatureBank(FeatureMix):
     """Every fourth, every second and all channels of the feature, blended by weights that depend on where the camera is."""
 
     hidden: int = 32
-    """Width of the network that gives the weights."""
+    """Width of the network that predicts the blending weights."""
 
     def width(self, F: int) -> int:
         return F

@@ -95,6 +95,7 @@ class Plain(Decoder):
     """One network per attribute, as in Scaffold-GS. `depth` counts linear layers (the paper's Figure 7 goes to 6)."""
 
     depth: int = 2
+    """Number of linear layers per network."""
 
     def check(self) -> None:
         """Raises InputError for a network without a hidden layer."""

@@ -48,21 +48,22 @@ class Anchors(SceneConfig):
     family = "anchors"
 
     K: int = 10
-    """Gaussians per anchor."""
+    """Number of Gaussians per anchor."""
     F: int = 32
-    """Feature size."""
+    """Number of feature channels per anchor."""
     hidden: int = 32
     """Width of the decoder networks."""
     add_dist: tuple[str, ...] = ()
-    """Attributes whose networks also see the distance to the camera."""
+    """Attributes whose networks also receive the distance to the camera: opacity, cov, color."""
     voxel_size: float = 0.0
-    """Edge of the finest lattice in trained world units; 0 takes `voxel_rule`."""
+    """Edge of the finest voxels in trained units; 0 lets voxel_rule choose it."""
     voxel_rule: VoxelChoice = "neighbours"
-    """neighbours: a quarter of the median neighbour distance; the others are Scaffold-GS's rule as coded and as documented."""
+    """neighbours: a quarter of the median distance to the nearest neighbours. squared_median and median_nn: the rule of Scaffold-GS as
+    implemented and as documented."""
     quat_align: bool = False
-    """Flip each expert's quaternion into the hemisphere of the anchor's first expert before mixing (composed decode only)."""
+    """Flip each expert's quaternion to the hemisphere of the first expert of the anchor before mixing (composed decoding only)."""
     decode: Literal["auto", "composed", "native"] = "auto"
-    """Which implementation decodes: the fused native one where it covers the scene, or the composed torch form."""
+    """Implementation that decodes anchors: native (fused), composed (PyTorch), or auto (native if it supports the scene)."""
     decoder: Decoder = Plain()
     """The networks that turn features into Gaussians."""
     select: Selection = AllAnchors()
@@ -70,9 +71,10 @@ class Anchors(SceneConfig):
     mix: FeatureMix = OwnFeature()
     """What the decoders see of an anchor's feature."""
     appearance: int = 0
-    """Size of a code per training view that the colour network sees; 0 is none."""
+    """Size of the appearance code per training view; 0 means no codes."""
     test_appearance: TestRule = "mean"
-    """The code of a view that was not trained on: the mean of all, or (Scaffold-GS's quirk) that of the training view of the same index."""
+    """Appearance code of a held-out view. mean: the mean of all codes. index: the code of the training view with the same index, as in
+    Scaffold-GS."""
 
     @property
     def grown_as(self) -> str:
@@ -354,16 +356,23 @@ class Rates(LearningRates):
     family = "anchors"
 
     feature: Rate = Rate(0.0075, 0.0075)
+    """Learning rate of the anchor features."""
     offsets: Rate = Rate(0.01, 0.0001)
+    """Learning rate of the offsets, times the scene's extent."""
     log_scaling: Rate = Rate(0.007, 0.007)
+    """Learning rate of the anchor sizes."""
     opacity: Rate = Rate(0.002, 0.00002)
+    """Learning rate of the opacity network."""
     cov: Rate = Rate(0.004, 0.004)
+    """Learning rate of the covariance network."""
     color: Rate = Rate(0.008, 0.00005)
+    """Learning rate of the colour network."""
     mix: Rate = Rate(0.01, 0.00001)
-    """The feature bank's network."""
+    """Learning rate of the network of the feature bank."""
     appearance: Rate = Rate(0.05, 0.0005)
+    """Learning rate of the appearance codes."""
     router_scale: float = 1.0
-    """Routers follow their attribute's rate times this."""
+    """Factor of a router's learning rate over that of its attribute."""
 
     def at(self, group: str, step: int, total: int, extent: float) -> float:
         """The rate of a group of `rate_groups` at `step` of `total`."""

@@ -124,31 +124,31 @@ class Octree(Selection):
     has_levels = True
 
     fork: int = 2
-    """Cells of a level are so many times as small as the level's before."""
+    """Subdivision factor between levels."""
     count: int = 0
-    """Number of levels; 0 takes it from the distances between training cameras and points."""
+    """Number of levels; 0 derives it from the distances between training cameras and points."""
     first: int = -1
-    """Coarse-to-fine training begins with levels 0 to this; -1 takes half of them."""
+    """Finest level at the start of coarse-to-fine training; -1 means half of the levels."""
     base_layer: int = -1
-    """Level 0 divides the scene's cube in fork^base_layer cells an axis; -1 adapts it to `coarseness`."""
+    """Level 0 divides the scene's cube into fork^base_layer cells per axis; -1 derives it from coarseness."""
     coarseness: float = 4.0
-    """Edge of a cell of the middle level (count / 2 - 1) in voxels of the scene's rule, where base_layer is -1."""
+    """Cell size of the middle level in voxels, if base_layer is -1."""
     dist_ratio: float = 0.999
-    """Quantile of the distances that count as the farthest; one minus it, as the nearest."""
+    """Quantile of the camera distances that is used as the largest distance; one minus it gives the smallest."""
     visible_threshold: float = -1.0
-    """Weed out anchors that no larger share of the training cameras asks for; below 0: the mean share."""
+    """Remove anchors that are selected by no larger share of the training cameras; a negative value means the mean share."""
     rule: LevelRule = "round"
-    """How a real-valued level becomes a whole one; blend fades the finest level's opacity in by the fraction."""
+    """How the level of detail is rounded to an integer. blend fades in the opacity of the finest level."""
     coarse_to_fine: bool = True
-    """Train the coarser half of the levels first and let finer ones in one by one."""
+    """Start with the coarser half of the levels and add the finer levels one by one."""
     coarse_until: int = 10_000
-    """The iteration after which all levels are in use (rescaled by --iterations)."""
+    """Iteration from which all levels are used. --iterations rescales it."""
     coarse_factor: float = 1.5
-    """Until then each finer level is let in after a time so many times as long as the next."""
+    """Ratio of the waiting times of successive levels in coarse-to-fine training."""
     extend: float = 1.1
-    """The cube is so many times as large as the points' bounding cube."""
+    """Edge of the scene's cube, in edges of the bounding cube of the points."""
     parity_cube: bool = False
-    """Octree-GS's quirk: the cube's ends are scaled about the origin and not about its centre."""
+    """Reproduce a quirk of Octree-GS: scale the cube about the origin instead of its centre."""
 
     def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
         """Anchors in the occupied cells of every level, weeded: facts of the rows, the finest cell's edge, the selector."""

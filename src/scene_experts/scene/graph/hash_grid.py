@@ -26,16 +26,17 @@ class HashGrid:
     """Size of the grid."""
 
     levels: int = 16
+    """Number of levels."""
     features: int = 2
-    """Features a level."""
+    """Number of features per level."""
     log2_table: int = 15
-    """A level has at most 2^log2_table rows."""
+    """Base-2 logarithm of the largest table of a level."""
     base: int = 16
-    """Cells an axis at the coarsest level."""
+    """Cells per axis at the coarsest level."""
     growth: float = 1.447
-    """Cells an axis grow by this factor from level to level."""
+    """Ratio of the cells per axis of two successive levels."""
     coordinates: Literal["box", "world"] = "box"
-    """box: places within the cube around the starting points; world: as they are, outside of [0, 1] too, as SAGS's code feeds them."""
+    """box: positions relative to the cube around the initial points. world: unscaled positions, as in SAGS's code."""
 
     @property
     def width(self) -> int:

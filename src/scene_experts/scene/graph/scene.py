@@ -44,25 +44,26 @@ class GraphPoints(SceneConfig):
     family = "graph"
 
     F: int = 32
-    """Feature size."""
+    """Number of feature channels per point."""
     hidden: int = 32
     """Width of the networks of opacity, colour and covariance (two hidden layers)."""
     offset_hidden: int = 64
-    """Width of the network of offsets (one hidden layer, linear throughout)."""
+    """Width of the offset network (one hidden layer, no activation)."""
     neighbours: int = 10
-    """Points in a neighbourhood, the point itself among them: of the graph and of the curvature."""
+    """Number of points in a neighbourhood, including the point itself, for the graph and the curvature."""
     blend: float = 0.5
-    """Share of what the neighbours say."""
+    """Weight of the neighbours in the feature of a point."""
     low: int = 10
-    """Flat places are filled with midpoints to the so many nearest points, the point itself among them."""
+    """Flat regions: number of nearest points, including the point itself, to which midpoints are added."""
     high: int = 5
-    """All other places, to so many others (2 to 8 by scene in SAGS's scripts)."""
+    """Other regions: number of nearest points to which midpoints are added (SAGS's scripts use 2 to 8)."""
     flat_sigmas: float = 1.0
-    """Flat: a curvature so many standard deviations below the mean."""
+    """A point is in a flat region if its curvature is this many standard deviations below the mean."""
     voxel_size: float = 0.0
-    """Edge of the finest lattice in trained world units; 0 takes `voxel_rule`."""
+    """Edge of the finest voxels in trained units; 0 lets voxel_rule choose it."""
     voxel_rule: VoxelChoice = "neighbours"
-    """neighbours: a quarter of the median neighbour distance; the others are Scaffold-GS's rule as coded and as documented."""
+    """neighbours: a quarter of the median distance to the nearest neighbours. squared_median and median_nn: the rule of Scaffold-GS as
+    implemented and as documented."""
     grid: HashGrid = HashGrid()
 
     @property
@@ -286,14 +287,21 @@ class GraphRates(LearningRates):
     family = "graph"
 
     feature: Rate = Rate(0.0075, 0.0075)
+    """Learning rate of the point features."""
     log_scaling: Rate = Rate(0.007, 0.007)
+    """Learning rate of the point sizes."""
     opacity: Rate = Rate(0.002, 0.00002)
+    """Learning rate of the opacity network."""
     cov: Rate = Rate(0.004, 0.00004)
+    """Learning rate of the covariance network."""
     color: Rate = Rate(0.008, 0.00005)
+    """Learning rate of the colour network."""
     offsets: Rate = Rate(0.005, 0.001)
-    """Of the network of offsets."""
+    """Learning rate of the offset network."""
     grid: Rate = Rate(0.005, 0.001)
+    """Learning rate of the hash grid."""
     affine: Rate = Rate(0.005, 0.001)
+    """Learning rate of the affine layers."""
 
     def at(self, group: str, step: int, total: int, extent: float) -> float:
         """The rate of a group of `rate_groups` at `step` of `total`."""
