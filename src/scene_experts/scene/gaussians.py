@@ -34,7 +34,7 @@ _ROUND = 1.001  # a Gaussian is looked for as a ball of its largest axis and thi
 @register
 @dataclass(frozen=True)
 class Explicit(SceneConfig):
-    """What a scene of explicit Gaussians is made of."""
+    """Settings of a scene of explicit Gaussians."""
 
     family = "gaussians"
 
@@ -156,7 +156,7 @@ class GaussianScene(Scene):
 @register
 @dataclass(frozen=True)
 class ExplicitRates(LearningRates):
-    """Learning rates (3DGS's). `means` is multiplied by the scene's extent R."""
+    """Learning rates of 3DGS. `means` is multiplied by the scene's extent R."""
 
     family = "gaussians"
 

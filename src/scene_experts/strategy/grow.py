@@ -20,7 +20,7 @@ from scene_experts.strategy.control import AnchorControl, L
 @register
 @dataclass(frozen=True)
 class GrowAnchors(AnchorControl[L]):
-    """Scaffold-GS's rule."""
+    """Densification of Scaffold-GS."""
 
     levels: int = 3
     """Number of voxel sizes at which anchors are created in one step."""

@@ -23,7 +23,7 @@ from scene_experts.strategy.grow import empty_cells, strongest
 @register
 @dataclass(frozen=True)
 class GrowOctree(AnchorControl[AnchorScene]):
-    """Octree-GS's rule: thresholds rise by u = fork^update_ratio a level."""
+    """Densification of Octree-GS: thresholds rise by u = fork^update_ratio per level."""
 
     grows = "anchors on levels"
 

@@ -14,7 +14,7 @@ from scene_experts.strategy.grow import GrowAnchors
 @register
 @dataclass(frozen=True)
 class GrowPoints(GrowAnchors):
-    """As for anchors, but for what counts as a visit and for the sizes, which nothing clamps."""
+    """Densification of SAGS: as for anchors, except for what counts as a visit; sizes are not clamped."""
 
     grows = "graph points"
 

@@ -28,7 +28,7 @@ _SHARP = 100.0  # how steeply the noise fades with opacity
 @register
 @dataclass(frozen=True)
 class MCMC(Strategy[GaussianScene]):
-    """Hyper-parameters of density control by sampling; it keeps no statistics."""
+    """Densification of 3DGS-MCMC: relocate and add Gaussians. It keeps no statistics."""
 
     grows = "Gaussians"
 

@@ -26,7 +26,7 @@ SHRINK = 1.6  # a half of a split Gaussian is this much smaller (3DGS: 0.8 N for
 @register
 @dataclass(frozen=True)
 class SplitClone(Strategy[GaussianScene]):
-    """Hyper-parameters of density control."""
+    """Densification of 3DGS: clone, split and remove Gaussians."""
 
     grows = "Gaussians"
 

@@ -26,7 +26,7 @@ LARGEST_SEED = 2**63 - 2  # torch takes signed 64 bits, and growth draws from th
 
 @dataclass(frozen=True)
 class Train:
-    """A recipe with its numbers."""
+    """A recipe and its numbers."""
 
     recipe: Annotated[str, Option(hidden=True)]
     """Name of the recipe."""

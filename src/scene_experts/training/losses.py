@@ -39,7 +39,7 @@ Term = Callable[["Weights", Sample], dict[str, Tensor]]
 @register
 @dataclass(frozen=True)
 class Weights(Part):
-    """Weights of the objective's terms and the switches for what the paper leaves open. A term of weight 0 is left out.
+    """Weights of the loss terms, and settings for what the paper leaves open. A term of weight 0 is left out.
 
     A recipe with a term of its own subclasses this class, adds a field for the weight, and adds the function to `terms`.
     """

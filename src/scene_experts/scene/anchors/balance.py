@@ -22,7 +22,7 @@ from scene_experts.scene.anchors.experts import Experts, MixtureHead, top_k
 @register
 @dataclass(frozen=True)
 class BalancedExperts(Experts):
-    """E experts whose shares a bias evens out."""
+    """A mixture of experts that biases keep in balance."""
 
     speed: float = 0.001
     """Change of a bias per iteration; gates are between 0 and 1."""

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Router:
-    """How gates are made. The defaults are the paper's "simple linear layer"; the rest are switches for its open questions."""
+    """The router, which computes the gates. The defaults are the paper's "simple linear layer"; the other values cover what it leaves open."""
 
     bias: bool = True
     """Give the linear layer a bias."""
@@ -45,7 +45,7 @@ class Router:
 @register
 @dataclass(frozen=True)
 class Experts(Decoder):
-    """E experts of the attribute's own shape behind a linear router."""
+    """A mixture of experts for each attribute, with a linear router."""
 
     num: int = 5
     """Number of experts per attribute."""

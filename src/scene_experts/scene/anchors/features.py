@@ -58,7 +58,7 @@ class OwnFeature(FeatureMix):
 @register
 @dataclass(frozen=True)
 class FeatureBank(FeatureMix):
-    """Every fourth, every second and all channels of the feature, blended by weights that depend on where the camera is."""
+    """The feature bank of Scaffold-GS: every fourth, every second and all channels of the feature, blended by weights that depend on the camera."""
 
     hidden: int = 32
     """Width of the network that predicts the blending weights."""

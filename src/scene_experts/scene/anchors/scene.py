@@ -43,7 +43,7 @@ EPS = 1e-12  # keeps directions and quaternions finite where their length is 0
 @register
 @dataclass(frozen=True)
 class Anchors(SceneConfig):
-    """What an anchor scene is made of."""
+    """Settings of a scene of anchors."""
 
     family = "anchors"
 
@@ -351,7 +351,7 @@ def no_kernels(device: torch.device) -> str | None:
 @register
 @dataclass(frozen=True)
 class Rates(LearningRates):
-    """Learning rates (Scaffold-GS's). `offsets` is multiplied by the scene's extent R."""
+    """Learning rates of Scaffold-GS. `offsets` is multiplied by the scene's extent R."""
 
     family = "anchors"
 

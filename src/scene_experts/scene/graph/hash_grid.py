@@ -23,7 +23,7 @@ LARGEST = 24  # 2^24 rows a level, the most that the paper tries
 
 @dataclass(frozen=True)
 class HashGrid:
-    """Size of the grid."""
+    """Size of the hash grid."""
 
     levels: int = 16
     """Number of levels."""

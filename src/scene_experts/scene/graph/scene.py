@@ -39,7 +39,7 @@ HALF = 2  # midpoints lie on a lattice of half the voxel
 @register
 @dataclass(frozen=True)
 class GraphPoints(SceneConfig):
-    """What a scene of graph points is made of."""
+    """Settings of a scene of points with a graph."""
 
     family = "graph"
 
@@ -282,7 +282,7 @@ class GraphScene(LatticeScene):
 @register
 @dataclass(frozen=True)
 class GraphRates(LearningRates):
-    """Learning rates (SAGS's)."""
+    """Learning rates of SAGS."""
 
     family = "graph"
 
