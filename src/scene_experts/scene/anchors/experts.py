@@ -26,7 +26,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Router:
-    """The router, which computes the gates. The defaults are the paper's "simple linear layer"; the other values cover what it leaves open."""
+    """The router, which computes the gates.
+
+    The defaults are the paper's "simple linear layer"; the other values cover what it leaves open.
+    """
 
     bias: bool = True
     """Give the linear layer a bias."""

@@ -58,7 +58,10 @@ class OwnFeature(FeatureMix):
 @register
 @dataclass(frozen=True)
 class FeatureBank(FeatureMix):
-    """The feature bank of Scaffold-GS: every fourth, every second and all channels of the feature, blended by weights that depend on the camera."""
+    """The feature bank of Scaffold-GS.
+
+    It blends every fourth, every second and all channels of the feature by weights that depend on the camera.
+    """
 
     hidden: int = 32
     """Width of the network that predicts the blending weights."""
