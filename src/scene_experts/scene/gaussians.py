@@ -80,7 +80,7 @@ class Explicit(SceneConfig):
         return replace(self, sh_ramp=max(1, round(self.sh_ramp * factor)))
 
     def check(self) -> None:
-        """Raises InputError for settings that no training can have."""
+        """Raises InputError, naming the flag, for invalid settings."""
         expect_at_least([("--scene.sh-degree", self.sh_degree, 0), ("--scene.sh-ramp", self.sh_ramp, 1)])
         if self.sh_degree > MAX_DEGREE:
             raise InputError(f"expected --scene.sh-degree of at most {MAX_DEGREE}, found {self.sh_degree}; give a lower degree")

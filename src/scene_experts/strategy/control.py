@@ -72,7 +72,7 @@ class AnchorControl(Strategy[L]):
         raise NotImplementedError
 
     def gate(self) -> float:
-        """Slots drawn more often than this may found anchors: 40 of 100."""
+        """Slots drawn more often than this can create anchors: 40 of 100."""
         return self.adjust.interval * self.success_threshold * 0.5
 
     @torch.no_grad()

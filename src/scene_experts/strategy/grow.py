@@ -1,6 +1,6 @@
 """Growing and pruning anchors (Scaffold-GS), on an integer lattice.
 
-Every `interval` iterations, offsets whose mean 2D gradient is large found anchors in empty cells of three lattices, coarse to
+Every `interval` iterations, offsets whose mean 2D gradient is large create anchors in empty cells of three lattices, coarse to
 fine; anchors whose offsets stay faint are removed. Cells are integers throughout, so no device disagrees about which is taken.
 """
 

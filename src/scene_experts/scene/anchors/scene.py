@@ -36,7 +36,7 @@ from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, Decoder, 
 from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, faded, visible_rows
 
 log = logging.getLogger(__name__)
-NEARLY_ALL = 0.95  # of the points in voxels of their own: the lattice does next to nothing
+NEARLY_ALL = 0.95  # share of points that are alone in their voxel from which the lattice has almost no effect
 EPS = 1e-12  # keeps directions and quaternions finite where their length is 0
 
 
@@ -97,7 +97,7 @@ class Anchors(SceneConfig):
         return replace(self, decoder=self.decoder.scaled(factor), select=self.select.scaled(factor))
 
     def check(self) -> None:
-        """Raises InputError for settings that no training can have."""
+        """Raises InputError, naming the flag, for invalid settings."""
         expect_at_least([(f"--scene.{name}", getattr(self, name), 1) for name in ("K", "F", "hidden")])
         expect_at_least([("--scene.voxel-size", self.voxel_size, 0), ("--scene.appearance", self.appearance, 0)])
         self.decoder.check()

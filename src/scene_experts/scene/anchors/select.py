@@ -1,4 +1,4 @@
-"""Which anchors a camera uses, before the visibility filter: all of them, or those of the levels that its distance asks for (Octree-GS)."""
+"""Which anchors a camera uses, before the visibility filter: all anchors, or those of the levels that its distance needs (Octree-GS)."""
 
 from __future__ import annotations
 
@@ -198,7 +198,7 @@ class Octree(Selection):
         return list(accumulate(q**i / sum(q**j for j in range(m)) * self.coarse_until for i in range(m)))
 
     def check(self) -> None:
-        """Raises InputError for numbers that no training can have."""
+        """Raises InputError, naming the flag, for invalid settings."""
         expect_at_least(
             [("--scene.select.fork", self.fork, 2), ("--scene.select.count", self.count, 0), ("--scene.select.first", self.first, -1)]
         )

@@ -94,7 +94,7 @@ class GraphPoints(SceneConfig):
         return GraphScene(self, table, float(meta["voxel"]), float(meta["extent"]), corner, edge)
 
     def check(self) -> None:
-        """Raises InputError for settings that no training can have."""
+        """Raises InputError, naming the flag, for invalid settings."""
         names = ("F", "hidden", "offset_hidden", "neighbours", "low")
         expect_at_least([(f"--scene.{name.replace('_', '-')}", getattr(self, name), 1) for name in names])
         expect_at_least([(f"--scene.{name.replace('_', '-')}", getattr(self, name), 0) for name in ("high", "voxel_size")])
