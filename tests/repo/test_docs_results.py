@@ -134,4 +134,10 @@ def test_pages_are_what_their_commands_write(folder, tmp_path, monkeypatch):
         assert (out / path.name).read_text() == path.read_text(), path
 
 
+def test_a_record_keeps_the_name_of_its_run():
+    """A new setting must not change the hash of the runs that have its default: they would be trained again."""
+    found = {store.record_path(RECORDS, record) for record in records(RECORDS)}
+    assert found == set(RECORDS.rglob("*.json"))
+
+
 records = functools.cache(store.load)

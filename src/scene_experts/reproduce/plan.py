@@ -20,6 +20,7 @@ from scene_experts.reproduce.experiments import Experiment
 from scene_experts.training.config import Data, Train, flags_of, with_numbers
 
 COLLECTIONS = {"mipnerf360": "MipNeRF360", "tandt": "TanksAndTemples", "db": "DeepBlending", "bungeenerf": "BungeeNeRF"}
+NEWER = ("optimizer",)  # settings of Train that the first records do not have: a default value does not change a run's hash
 OWN = "captures"  # the data set of the user's own captures
 
 
@@ -123,7 +124,9 @@ class Spec:
 
 def identity(scene: str, train: Train, data: Data) -> str:
     """Return the hash that names a run: of the scene's name, the recipe with all numbers and how the capture is read, not of its path."""
-    text = json.dumps([scene, to_json(train), data.settings()], sort_keys=True)
+    plain, default = to_json(train), to_json(Train(train.recipe))
+    kept = {name: value for name, value in plain.items() if name not in NEWER or value != default[name]}
+    text = json.dumps([scene, kept, data.settings()], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
