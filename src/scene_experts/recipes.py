@@ -28,14 +28,14 @@ from scene_experts.training.recipe_book import Recipe, RecipeBook
 
 EXPERTS = Experts(num=5, top_k=2, warmup=1500)
 
-scaffold_gs = Train(recipe="scaffold-gs", scene=Anchors(decoder=Plain()), loss=Weights(scale=0.01))
-moe_gs = replace(
+scaffold_gs: Train = Train(recipe="scaffold-gs", scene=Anchors(decoder=Plain()), loss=Weights(scale=0.01))
+moe_gs: Train = replace(
     scaffold_gs,
     recipe="moe-gs",
     scene=Anchors(decoder=EXPERTS),
     loss=Weights(scale=0.01, opacity=0.01, load=0.01),
 )
-octree_gs = replace(
+octree_gs: Train = replace(
     scaffold_gs,
     recipe="octree-gs",
     scene=Anchors(decoder=Plain(), select=Octree()),
@@ -43,15 +43,15 @@ octree_gs = replace(
     iterations=40_000,
     schedule=40_000,
 )
-gs_3d = Train(recipe="3dgs", scene=Explicit(), loss=Weights(scale=0.0), growth=SplitClone(), rates=ExplicitRates())
-gs_mcmc = replace(
+gs_3d: Train = Train(recipe="3dgs", scene=Explicit(), loss=Weights(scale=0.0), growth=SplitClone(), rates=ExplicitRates())
+gs_mcmc: Train = replace(
     gs_3d,
     recipe="3dgs-mcmc",
     scene=Explicit(opacity=0.5, size=0.1),
     loss=Weights(scale=0.0, mean_opacity=0.01, mean_size=0.01),
     growth=MCMC(),
 )
-sags = Train(recipe="sags", scene=GraphPoints(), loss=Weights(scale=0.0), growth=GrowPoints(), rates=GraphRates())
+sags: Train = Train(recipe="sags", scene=GraphPoints(), loss=Weights(scale=0.0), growth=GrowPoints(), rates=GraphRates())
 
 
 def _moe(name: str, *, loss: Weights = moe_gs.loss, add_dist: tuple[str, ...] = (), decoder: Experts = EXPERTS, **experts: object) -> Train:

@@ -1,7 +1,10 @@
 """The examples run, on a shipped capture in thumbnails, and stay short."""
 
+import os
 import runpy
+import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -72,3 +75,24 @@ def test_sweep_two_numbers(example, thumbnails, capsys):
 def test_orbit_video(run, example):
     example("orbit_video", run.path, "frames", "--frames", 3, "--width", 32, "--height", 18, "--show", "experts")
     assert len(list(Path("frames").glob("*.png"))) == 3
+
+
+def test_new_recipe(tmp_path):
+    """The package is installed as pip does it: its module, and a .dist-info folder with its entry points."""
+    project = tomllib.loads((EXAMPLES / "new_recipe" / "pyproject.toml").read_text())["project"]
+    (group, entries), info = next(iter(project["entry-points"].items())), tmp_path / "wide_decoders-0.1.0.dist-info"
+    info.mkdir()
+    info.joinpath("METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    info.joinpath("entry_points.txt").write_text(f"[{group}]\n" + "".join(f"{name} = {place}\n" for name, place in entries.items()))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(EXAMPLES / "new_recipe"), str(tmp_path), *filter(None, sys.path)])}
+
+    def call(*words: object) -> str:
+        command = [sys.executable, "-m", "scene_experts", *map(str, words)]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=tmp_path, timeout=300)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    size = ("--resolution", "longest:48", "--max-views", 16, "--iterations", 3, "--scene.voxel-size", 0.2)
+    call("train", "wide-decoders", "--data", DEMO / "buddha", "--out", "run", *size, "--scene.decoder.width", 3)
+    call("eval", "run", "--no-lpips")
+    assert "wide-decoders" in (tmp_path / "run" / "config.json").read_text()

@@ -82,7 +82,7 @@ class Capture:
         return self.loaded.world.to_input(points.xyz).numpy(), points.rgb.numpy().copy()
 
     @property
-    def center(self) -> NDArray[np.float64]:
+    def centre(self) -> NDArray[np.float64]:
         """The point [3] that the training cameras look at: the nearest to all their optical axes."""
         return self.loaded.world.to_input(paths.analyse_cameras(self.loaded).centre).numpy()
 
@@ -133,7 +133,7 @@ class Capture:
 
         Args:
             eye: [3] Centre of the camera.
-            target: [3] Point in the middle of the picture. Default: `center`.
+            target: [3] Point in the middle of the picture. Default: `centre`.
             up: [3] Direction that points upwards in the picture. Default: `up`.
             size: Width and height of the picture, px. Default: those of the median training camera.
             fov: Vertical field of view, degrees, between 0 and 180. Default: that of the median training camera.
@@ -143,7 +143,7 @@ class Capture:
         """
         seen = paths.analyse_cameras(self.loaded)
         model = paths.median_camera(seen.cameras, size)
-        aim = self.center if target is None else vector(target, "target")
+        aim = self.centre if target is None else vector(target, "target")
         upward = self.up if up is None else vector(up, "up")
         angle = float(np.degrees(model.fov)) if fov is None else fov
         return Camera.look_at(eye, aim, upward, width=model.width, height=model.height, fov=angle)
@@ -154,7 +154,7 @@ class Capture:
         """Return cameras along a path through the scene.
 
         Args:
-            kind: "orbit" goes once around `center`. "spiral" circles in front of a scene that faces one way. "views" moves smoothly
+            kind: "orbit" goes once around `centre`. "spiral" circles in front of a scene that faces one way. "views" moves smoothly
                 through the training cameras. "auto" chooses an orbit if the cameras surround the scene, else a spiral.
             frames: Number of cameras, at least 1.
             size: Width and height of the pictures, px. Default: those of the median training camera.

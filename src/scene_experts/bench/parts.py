@@ -46,6 +46,10 @@ def list_outputs(decoded: Decoded) -> list[Tensor]:
 class Decode:
     """One decoder in one form. Every run takes the same rows, camera and upstream gradients."""
 
+    scene: AnchorScene
+    rows: Tensor
+    camera: Camera
+
     def __init__(self, config: Anchors, form: str, anchors: int) -> None:
         self.scene, self.rows = make_scene(replace(config, decode=form), anchors)  # type: ignore[arg-type]
         pose = torch.eye(4)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 from rich.table import Table
 
 from scene_experts.arguments.option import Option
@@ -129,6 +129,11 @@ def described(scene: CatalogScene, root: Path) -> list[str]:
 
 class Told:
     """Shows a download: a bar on a terminal, a line now and then elsewhere."""
+
+    console: Console
+    said: float
+    bar: Progress | None
+    task: TaskID | None
 
     def __init__(self, console: Console) -> None:
         self.console, self.said = console, time.monotonic()

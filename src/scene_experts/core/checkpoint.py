@@ -27,7 +27,7 @@ KIND = "checkpoint"
 KEY = "scene_experts"
 _NAME = re.compile(r"ckpt_(\d{6,})\.safetensors")
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 
 
 # --- a folder of checkpoints --------------------------------------------------------------------------------------------------------------

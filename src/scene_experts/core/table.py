@@ -16,6 +16,10 @@ class Table(nn.Module):
     and pruning go through `append` and `keep` alone, so no column and no optimiser moment can fall out of step with the rest.
     """
 
+    params: nn.ParameterDict
+    facts: dict[str, Tensor]
+    stats: dict[str, Tensor]
+
     def __init__(self, params: dict[str, Tensor], facts: dict[str, Tensor], stats: dict[str, Tensor] | None = None) -> None:
         super().__init__()
         self.params = nn.ParameterDict({name: nn.Parameter(value) for name, value in params.items()})

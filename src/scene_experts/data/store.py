@@ -143,6 +143,9 @@ class ImageStore:
         cache_bytes: Memory for decoded frames. None is a third of `available_bytes()`, or of 4 GiB if that is unknown.
     """
 
+    sources: tuple[FrameSource, ...]
+    cache_bytes: int
+
     def __init__(self, sources: Iterable[FrameSource], cache_bytes: int | None = None) -> None:
         self.sources = tuple(sources)
         if cache_bytes is None:

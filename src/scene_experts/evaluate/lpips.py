@@ -80,6 +80,9 @@ def tensor_shapes(net: str) -> dict[str, tuple[int, ...]]:
 class Lpips:
     """LPIPS with one backbone: `Lpips("vgg", tensors)(x, y)`. The names of `tensors` are those of `tensor_shapes`."""
 
+    net: str
+    tensors: dict[str, Tensor]
+
     def __init__(self, net: str, tensors: dict[str, Tensor]) -> None:
         wanted = tensor_shapes(net)
         found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}

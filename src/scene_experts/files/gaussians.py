@@ -33,7 +33,7 @@ from scene_experts.training import run_folder
 from scene_experts.training.config import Data, RunConfig, Train, from_json, to_json
 from scene_experts.training.run_folder import OpenRun
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 KIND = "gaussians"  # in our description of a scene
 
 

@@ -55,6 +55,9 @@ class Traits:
 class Scene(nn.Module):
     """Rows of a table that decode into Gaussians for a camera. A family subclasses it; the defaults suit a scene without extras."""
 
+    table: Table
+    extent: float
+
     codes: Codes | None  # appearance codes; None where `traits.appearance` is 0
 
     def __init__(self, table: Table, extent: float) -> None:

@@ -24,7 +24,7 @@ from scene_experts.training.losses import Sample, compute_terms, load_dense, loa
 from scene_experts.training.memory import anchor_cap
 from scene_experts.training.state import Training, resume, save
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 ROUTED = 16_384  # anchors whose routing a training's figures are of: their shares are within half a percent of all anchors'
 
 

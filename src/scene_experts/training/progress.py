@@ -6,7 +6,7 @@ import time
 
 from rich.console import Console
 from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as TaskBar
 from rich.text import Text
 
@@ -16,6 +16,15 @@ from scene_experts.training.events import Adjusted, Event, Exported, Finished, P
 
 class Progress:
     """Shows training events. Use as a context manager; call it with each event."""
+
+    console: Console
+    every: float
+    live: Live | None
+    total: int
+    first: int
+    began: float
+    printed: float
+    traits: Traits
 
     def __init__(self, console: Console, every: float = 15.0) -> None:
         """every: seconds between lines where there is no terminal."""
@@ -86,6 +95,12 @@ class Progress:
 
 class Bar:
     """How far a piece of work is: a bar on a terminal, a line now and then elsewhere. Use as a context manager and call it."""
+
+    console: Console
+    every: float
+    said: float
+    bar: TaskBar
+    task: TaskID
 
     def __init__(self, console: Console, every: float = 15.0) -> None:
         """every: seconds between lines where there is no terminal."""

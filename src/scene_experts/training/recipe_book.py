@@ -13,7 +13,7 @@ GROUP = "scene_experts.recipes"
 Recipe = tuple[str, Train]
 """A sentence about the recipe, and its value."""
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 
 
 class RecipeBook(Mapping[str, Recipe]):

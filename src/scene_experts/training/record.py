@@ -22,6 +22,8 @@ class Recorder:
         tensorboard: Also write TensorBoard files. Raises InputError if TensorBoard is not installed.
     """
 
+    path: Path
+
     def __init__(self, out: Path, tensorboard: bool) -> None:
         self.out = out
         self.path = out / "metrics.jsonl"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,11 +20,19 @@ from scene_experts.training.config import Train
 from scene_experts.training.memory import Largest
 from scene_experts.training.old_hash import old_hash
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 
 
 class Training:
     """Everything that a resumed run must find again: scene, optimiser, random streams, the queue of views, the clock."""
+
+    cfg: Train
+    scene: Scene
+    largest: Largest
+    clock: Clock
+    views_rng: torch.Generator
+    growth_rng: torch.Generator
+    optimizer: torch.optim.Optimizer
 
     def __init__(self, cfg: Train, scene: Scene) -> None:
         self.cfg, self.scene = cfg, scene
@@ -89,7 +98,7 @@ class Training:
         out["queue"] = torch.tensor(self.queue, dtype=torch.int64)
         return out
 
-    def meta(self) -> dict:
+    def meta(self) -> dict[str, Any]:
         return {
             "recipe": self.cfg.recipe,
             "step": self.step,
@@ -100,7 +109,7 @@ class Training:
         }
 
     @classmethod
-    def restore(cls, cfg: Train, tensors: dict[str, Tensor], meta: dict, device: str) -> Training:
+    def restore(cls, cfg: Train, tensors: dict[str, Tensor], meta: dict[str, Any], device: str) -> Training:
         """The training that `tensors` and `meta` were taken from. Raises InputError when they are of another configuration."""
         check_same(cfg, meta)
         scene = scene_from(cfg, tensors, meta)
@@ -123,7 +132,7 @@ class Training:
         return training
 
 
-def scene_from(cfg: Train, tensors: dict[str, Tensor], meta: dict) -> Scene:
+def scene_from(cfg: Train, tensors: dict[str, Tensor], meta: dict[str, Any]) -> Scene:
     """A scene from a checkpoint's tensors; `cfg` must be scaled."""
     pick = lambda prefix: {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
     scene = cfg.scene.load(Table(pick("params."), pick("facts.")), meta)
@@ -136,7 +145,7 @@ def scene_from(cfg: Train, tensors: dict[str, Tensor], meta: dict) -> Scene:
     return scene
 
 
-def check_same(cfg: Train, meta: dict) -> None:
+def check_same(cfg: Train, meta: dict[str, Any]) -> None:
     """Raises InputError where the checkpoint that `meta` describes was trained with other settings than `cfg` (scaled).
 
     A setting that is newer than the checkpoint counts as its default.

@@ -33,10 +33,10 @@ class Keyframes:
     def __post_init__(self) -> None:
         gui = self.server.gui
         with gui.add_folder("Camera path", expand_by_default=False):
-            self.words = gui.add_markdown("no keyframes")
+            self.words: Any = gui.add_markdown("no keyframes")
             add, clear = gui.add_button("add keyframe"), gui.add_button("clear")
-            self.seconds = gui.add_number("seconds between keyframes", initial_value=2.0, min=0.1, max=60.0, step=0.1)
-            self.loop = gui.add_checkbox("loop", initial_value=False)
+            self.seconds: Any = gui.add_number("seconds between keyframes", initial_value=2.0, min=0.1, max=60.0, step=0.1)
+            self.loop: Any = gui.add_checkbox("loop", initial_value=False)
             play, save = gui.add_button("play"), gui.add_button("save")
         add.on_click(lambda event: self.add(event.client))
         clear.on_click(lambda _: self.clear())

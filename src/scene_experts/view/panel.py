@@ -13,7 +13,7 @@ import torch
 from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
 from scene_experts.geometry.rotation import matrix_to_quat
-from scene_experts.scene import Scene
+from scene_experts.scene import Scene, Traits
 from scene_experts.training.events import Event, Finished, Stepped, Stopped
 from scene_experts.view.keyframes import Keyframes
 from scene_experts.view.paint import Look, available_shows
@@ -36,6 +36,30 @@ class Panel:
         go_to_view: Called with the index of a view to move all clients to.
         paths: Folder that camera paths are saved in.
     """
+
+    server: Any
+    capture: Capture
+    current: Callable[[], tuple[Scene, int]]
+    changed: Callable[[], None]
+    go_to_view: Callable[[int], None]
+    traits: Traits
+    status_time: float
+    curve_time: float
+    charts: list[tuple[str, Any]]
+    keyframes: Keyframes
+    names: tuple[str, ...]
+    switches: list[Any]
+    bounds: list[Any]
+    pause: Any
+    status: Any
+    show: Any
+    size: Any
+    color: Any
+    level: Any
+    attribute: Any
+    wipe: Any
+    chosen: Any
+    crop: Any
 
     def __init__(
         self,

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.types import Camera
@@ -30,7 +31,7 @@ from scene_experts.view.paint import paint
 from scene_experts.view.panel import Panel
 from scene_experts.view.paths import analyse_cameras, choose_best_view
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 
 REST = 0.15  # seconds without movement after which a full-size picture is drawn
 GOAL = 1 / 25  # seconds per picture while the client moves
@@ -93,16 +94,17 @@ class Viewer:
         logging.getLogger("websockets").setLevel(logging.CRITICAL)  # a browser that disconnects is not an error
         warnings.filterwarnings("ignore", message=r"Queued an? \w+ on a closed connection")
         try:
-            self.server = module.ViserServer(host=self.host, port=self.port, label=self.label, verbose=False)
+            self.server: Any = module.ViserServer(host=self.host, port=self.port, label=self.label, verbose=False)
         except OSError as error:
             raise RunError(f"cannot serve on {self.host}:{self.port}: {error.strerror or error}; choose another --port") from error
-        self.lock = threading.Lock()
-        self.device = self.current()[0].table.device
+        self.lock: threading.Lock = threading.Lock()
+        self.device: torch.device = self.current()[0].table.device
         rig = analyse_cameras(self.capture)
         self.server.scene.set_up_direction(tuple(rig.up.tolist()))
-        self.centre, self.reach = rig.centre, float((rig.positions - rig.centre).norm(dim=1).median())
-        self.first = choose_best_view(self.capture)  # where clients start
-        self.panel = Panel(self.server, self.capture, self.current, self.request_redraw, self.go_to_view, self.paths)
+        self.centre: Tensor = rig.centre
+        self.reach: float = float((rig.positions - rig.centre).norm(dim=1).median())
+        self.first: int = choose_best_view(self.capture)  # where clients start
+        self.panel: Panel = Panel(self.server, self.capture, self.current, self.request_redraw, self.go_to_view, self.paths)
         self.server.on_client_connect(self.connect)
         self.server.on_client_disconnect(self.disconnect)
 

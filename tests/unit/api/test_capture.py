@@ -46,7 +46,7 @@ def test_masks_are_between_0_and_1(folder, tmp_path):
 def test_a_new_camera_takes_the_lens_of_the_photographs(capture):
     camera = capture.look_at((8, 0, 4))
     assert np.allclose(camera.position, (8, 0, 4)) and camera.view == -1
-    middle = camera.K @ (camera.world_to_camera @ np.append(capture.center, 1))[:3]
+    middle = camera.K @ (camera.world_to_camera @ np.append(capture.centre, 1))[:3]
     assert np.allclose(middle[:2] / middle[2], (camera.width / 2, camera.height / 2))
     assert (camera.width, camera.height) in {(c.width, c.height) for c in capture.cameras}
     assert capture.up @ (0, 0, 1) > 0.9 and np.linalg.norm(capture.up) == pytest.approx(1)
@@ -56,7 +56,7 @@ def test_a_new_camera_takes_the_lens_of_the_photographs(capture):
 
 def test_an_orbit_goes_around_the_centre(capture):
     cameras = capture.camera_path("orbit", frames=5, size=(20, 10))
-    away = [np.linalg.norm(camera.position - capture.center) for camera in cameras]
+    away = [np.linalg.norm(camera.position - capture.centre) for camera in cameras]
     assert len(cameras) == 5 and np.allclose(away, away[0]) and {(c.width, c.height) for c in cameras} == {(20, 10)}
     assert len(capture.camera_path(frames=3)) == 3
     for kind, frames in (("zigzag", 3), ("orbit", 0)):

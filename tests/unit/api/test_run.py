@@ -25,7 +25,7 @@ def test_a_picture_is_the_one_that_eval_draws(run, capture):
 
 
 def test_layers_are_in_the_units_of_the_capture(run, capture):
-    camera = capture.look_at(capture.center + 9 * capture.up)
+    camera = capture.look_at(capture.centre + 9 * capture.up)
     layers = run.render_layers(camera)
     shape = (camera.height, camera.width)
     assert layers.image.shape == (*shape, 3) and layers.depth.shape == layers.alpha.shape == shape
@@ -51,6 +51,10 @@ def test_a_run_opens_from_any_folder(run, capture, tmp_path, monkeypatch):
     opened = se.open_run(run.path)
     assert np.array_equal(opened.render(opened.test_cameras[0]), picture)
     assert (opened.step, opened.recipe, opened.path) == (run.step, run.recipe, run.path) and opened.seconds > 0
+    monkeypatch.chdir(capture.path.parent)
+    relative = se.train(run.recipe, capture.path.name, tmp_path / "relative", stop_at=1, progress=False)
+    monkeypatch.chdir(tmp_path)
+    assert len(se.open_run(relative.path or "").test_cameras) == 2, "trained with a relative path, opened from another folder"
     assert len(opened.train_cameras) == 7 and "step 6" in repr(opened) and opened.scene.table is not None
 
 

@@ -101,12 +101,16 @@ def test_a_loop_may_pause_go_on_and_stop(capture, small, tmp_path):
 
 
 def test_ctrl_c_saves_and_is_raised(capture, tmp_path, monkeypatch):
-    long = se.recipe("scaffold-gs", iterations=100_000, **{"scene.voxel_size": 0.2})
-    monkeypatch.setattr("scene_experts.api.trainer.Progress.__call__", lambda self, event: os.kill(os.getpid(), signal.SIGINT))
+    def interrupt(self: object, event: se.Event) -> None:
+        if isinstance(event, se.Stepped) and event.step == 10:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("scene_experts.api.trainer.Progress.__call__", interrupt)
     before = signal.getsignal(signal.SIGINT)
+    long = se.recipe("scaffold-gs", iterations=100_000, **{"scene.voxel_size": 0.2})
     with pytest.raises(KeyboardInterrupt):
         se.train(long, capture, tmp_path / "run", progress=False)
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is before and se.open_run(tmp_path / "run").step == 10
 
 
 @pytest.mark.parametrize(

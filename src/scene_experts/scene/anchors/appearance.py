@@ -27,6 +27,10 @@ class Codes(nn.Module):
     found; they are no part of the scene.
     """
 
+    views: tuple[int, ...]
+    row: dict[int, int]
+    table: nn.Parameter
+
     def __init__(self, dim: int, views: Sequence[int], rule: TestRule = "mean") -> None:
         super().__init__()
         self.views, self.rule = tuple(views), rule

@@ -38,7 +38,8 @@ class BalancedExperts(Experts):
 class BalancedHead(MixtureHead):
     """A mixture whose choice is biased. `router_balance` [E] is no parameter of the optimiser: it moves with every training view."""
 
-    config: BalancedExperts
+    config: BalancedExperts  # type: ignore[assignment]
+    router_balance: Tensor
 
     def __init__(self, config: BalancedExperts, *shape: Any) -> None:
         super().__init__(config, *shape)

@@ -21,7 +21,7 @@ from scene_experts.core.parts import register
 from scene_experts.core.types import Mode, Routing
 from scene_experts.scene.anchors.mlp import ACTIVATIONS, ATTRIBUTES, MLP, Decoder, HeadWeights, linear_init
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -121,6 +121,16 @@ def top_k(logits: Tensor, k: int) -> Tensor:
 
 class MixtureHead(nn.Module):
     """A sparsely gated mixture of E two-layer networks for one attribute."""
+
+    config: Experts
+    attribute: str
+    experts: int
+    w1: nn.Parameter
+    b1: nn.Parameter
+    w2: nn.Parameter
+    b2: nn.Parameter
+    router_w: nn.Parameter
+    router_b: nn.Parameter | None
 
     def __init__(self, config: Experts, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> None:
         super().__init__()

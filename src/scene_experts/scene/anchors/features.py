@@ -85,6 +85,11 @@ class Bank(nn.Module):
     `tile` repeats the whole strided vector. Tensors are stacked with a leading axis of 1, as every head's are.
     """
 
+    w1: nn.Parameter
+    b1: nn.Parameter
+    w2: nn.Parameter
+    b2: nn.Parameter
+
     def __init__(self, hidden: int) -> None:
         super().__init__()
         self.w1, self.b1 = linear_init((1, hidden, 4), 4), linear_init((1, hidden), 4)

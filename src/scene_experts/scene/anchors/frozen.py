@@ -39,6 +39,15 @@ class Kept:
 class Frozen:
     """Draws one scene at one step without gradients; routing is left out of what it returns (`AnchorScene.routing` has it)."""
 
+    scene: AnchorScene
+    step: int
+    columns: list[Tensor]
+    xyz: Tensor
+    scales: Tensor
+    with_dist: dict[str, bool]
+    weights: dict[str, HeadWeights]
+    kept: tuple[Kept, ...]
+
     @torch.no_grad()
     def __init__(self, scene: AnchorScene, weights: dict[str, HeadWeights], step: int) -> None:
         self.scene, self.step = scene, step

@@ -15,7 +15,7 @@ from torch import Tensor
 from scene_experts.core.types import Camera
 from scene_experts.geometry.voxel import AXIS_LIMIT, find_unique_cells, to_lattice
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 LevelRule = Literal["round", "floor", "ceil", "blend"]
 MOST_CELLS = AXIS_LIMIT - 1  # of an axis of the cube, at any level
 

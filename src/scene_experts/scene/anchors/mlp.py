@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,7 +17,8 @@ from scene_experts.core.parts import Part, register
 from scene_experts.core.types import Mode, Routing
 
 ATTRIBUTES = ("opacity", "cov", "color")  # what is decoded, in the compiled library's order
-ACTIVATIONS = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid}  # the last layer of each attribute
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid}
+"""Activation of the last layer of each attribute."""
 CHANNELS = {"opacity": 1, "cov": 7, "color": 3}  # values per Gaussian: opacity; 3 scale + 4 rotation; RGB
 
 
@@ -107,6 +109,12 @@ class Plain(Decoder):
 
 class MLP(nn.Module):
     """Linear - ReLU - (Linear - ReLU)* - Linear - activation; weights stacked with a leading expert axis of 1."""
+
+    w1: nn.Parameter
+    b1: nn.Parameter
+    middle: nn.ModuleList
+    w2: nn.Parameter
+    b2: nn.Parameter
 
     def __init__(self, attribute: str, inputs: int, hidden: int, outputs: int, depth: int = 2) -> None:
         super().__init__()

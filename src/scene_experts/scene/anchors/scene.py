@@ -35,7 +35,7 @@ from scene_experts.scene.anchors.frozen import Frozen
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, Decoder, HeadWeights, Plain
 from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, faded, visible_rows
 
-log = logging.getLogger(__name__)
+log: logging.Logger = logging.getLogger(__name__)
 NEARLY_ALL = 0.95  # share of points that are alone in their voxel from which the lattice has almost no effect
 EPS = 1e-12  # keeps directions and quaternions finite where their length is 0
 
@@ -110,6 +110,10 @@ class Anchors(SceneConfig):
 
 class AnchorScene(LatticeScene):
     """N anchors and three decoder heads. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], offsets [N,K,3], log_scaling [N,6]."""
+
+    config: Anchors
+    mix: Any
+    codes: Codes | None
 
     def __init__(
         self, config: Anchors, table: Table, voxel: float, extent: float, select: Selector | None = None, views: Sequence[int] = ()

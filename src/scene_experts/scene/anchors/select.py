@@ -18,6 +18,7 @@ from scene_experts.core.parts import Part, register
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Mode
 from scene_experts.geometry.voxel import find_unique_cells, to_lattice
+from scene_experts.scene import Cull
 from scene_experts.scene.anchors import levels as lattices
 from scene_experts.scene.anchors.levels import LevelRule, Levels, blended, whole
 
@@ -272,7 +273,7 @@ def capped(scene: Any, level: int | None) -> AbstractContextManager[None]:
     return scene.at_level(level)
 
 
-def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera: Camera, cull) -> Tensor:
+def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera: Camera, cull: Cull) -> Tensor:
     """Rows [A] of the selected anchors whose own ellipsoid touches the picture. means [N, 3], scales [N, 3]; no gradient."""
     with torch.no_grad():
         if selected is None:

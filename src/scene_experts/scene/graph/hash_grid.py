@@ -65,6 +65,11 @@ class HashGrid:
 class Grid(nn.Module):
     """The learned table [rows of all levels, features] and the cube that it covers: its low corner and its edge, world units."""
 
+    config: HashGrid
+    low: tuple[float, ...]
+    edge: float
+    table: nn.Parameter
+
     def __init__(self, config: HashGrid, low: tuple[float, ...], edge: float) -> None:
         super().__init__()
         self.config, self.low, self.edge = config, low, edge

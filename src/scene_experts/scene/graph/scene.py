@@ -29,7 +29,7 @@ from scene_experts.scene import Cull, LatticeScene, LearningRates, SceneConfig, 
 from scene_experts.scene.anchors.mlp import CHANNELS
 from scene_experts.scene.anchors.scene import EPS
 from scene_experts.scene.anchors.select import visible_rows
-from scene_experts.scene.graph.hash_grid import HashGrid
+from scene_experts.scene.graph.hash_grid import Grid, HashGrid
 from scene_experts.scene.graph.network import Graph, blended
 
 PROBES = 1000  # points whose first opacity is looked at
@@ -104,6 +104,8 @@ class GraphPoints(SceneConfig):
 class Unbiased(nn.Module):
     """Linear layers without biases, Glorot-uniform at first."""
 
+    layers: nn.ParameterList
+
     def __init__(self, sizes: Sequence[int]) -> None:
         super().__init__()
         self.layers = nn.ParameterList(nn.init.xavier_uniform_(torch.empty(b, a)) for a, b in pairwise(sizes))
@@ -124,6 +126,12 @@ class Unbiased(nn.Module):
 
 class GraphScene(LatticeScene):
     """N points, one Gaussian each. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], log_scaling [N,6]."""
+
+    config: GraphPoints
+    grid: Grid
+    alpha: nn.Parameter
+    beta: nn.Parameter
+    offsets: Unbiased
 
     @property
     def traits(self) -> Traits:
