@@ -1,4 +1,4 @@
-// The core's clock: a loop of dependent additions takes one cycle each.
+// The clock rate of the core: each addition of a dependent chain takes one cycle.
 #include <time.h>
 
 #include <algorithm>
@@ -17,7 +17,7 @@ extern "C" double peer_clock_hz() {
     for (int i = 0; i < 500000; ++i) {
       for (int k = 0; k < 8; ++k) {
         x += 3;
-        asm volatile("" : "+r"(x));  // so that the compiler does not fold the additions
+        asm volatile("" : "+r"(x));  // keeps the compiler from folding the additions
       }
     }
     best = std::min(best, now() - start);

@@ -1,7 +1,8 @@
-// A scalar peer of the CPU rasteriser, to measure against: the per-pixel algorithm of 3DGS (Kerbl et al. 2023, section 6 and appendix)
-// as it is published, one pixel after the other, in plain C++ left to the compiler (-O3 -march=native): 3 sigma squares of 16 x 16 tiles,
-// one radix sort of (tile, depth) keys, blending front to back, backward back to front with T recovered by division. One thread.
-// Own code; same conventions as src/scene_experts/render/reference.py (pixel centres at +0.5, no gradient where alpha is clamped).
+// A scalar peer of the CPU rasteriser for benchmarks: the per-pixel algorithm of 3DGS (Kerbl et al. 2023, section 6 and appendix) as
+// published, pixel by pixel, in plain C++ that the compiler optimises (-O3 -march=native), on one thread. It uses 3 sigma squares of
+// 16 x 16 tiles, one radix sort of (tile, depth) keys, front-to-back blending, and a back-to-front backward pass that recovers T by
+// division. The code is our own. Its conventions are those of src/scene_experts/render/reference.py: pixel centres at +0.5, and no
+// gradient where alpha is clamped.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -13,7 +14,7 @@
 namespace {
 
 constexpr int kTile = 16;
-// exp of less is below 1/255 whatever the opacity; the published kernel does not skip here, but it saves the peer half its time.
+// exp of smaller values is below 1/255 for any opacity. The published kernel does not skip them; skipping halves the time of the peer.
 constexpr float kFaint = -5.55f;
 
 using Camera = SeCamera;
@@ -23,7 +24,7 @@ struct Splat {
   int x0, y0, x1, y1;
 };
 
-struct Geometry {  // what the projection of one Gaussian is made of, for forward and backward
+struct Geometry {  // intermediate values of the projection of one Gaussian, for the forward and the backward pass
   float p[3], tx, ty, R[9], J[6], T[6], B[6], A[6];
   bool free_x, free_y;
 };
@@ -84,7 +85,7 @@ void sort_pairs(Peer& s, int bits) {
   }
 }
 
-// Tile by tile, as the published kernel's blocks of threads are, so that a tile's Gaussians stay in the cache.
+// Tile by tile like the thread blocks of the published kernel, so that the Gaussians of a tile stay in the cache.
 template <class F>
 void each_pixel(const Camera& cam, F&& f) {
   for (int y = 0; y < cam.height; y += kTile)

@@ -1,7 +1,6 @@
-"""The build for 64-bit ARM (NEON), cross-compiled and run under an emulator, against this machine's own portable build.
+"""Compare the build for 64-bit ARM (NEON), cross-compiled and run under an emulator, with the portable build of this machine.
 
-Compiling takes a minute, so this runs only where SCENE_EXPERTS_CROSS is set and the tools are there (Debian: g++-aarch64-linux-gnu,
-qemu-user).
+Compiling takes a minute, so the test needs SCENE_EXPERTS_CROSS=1 and the tools (Debian: g++-aarch64-linux-gnu, qemu-user).
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def sums(folder: Path, *configure: str, run: tuple[str, ...] = ()) -> dict[str, tuple[float, ...]]:
-    """What tests/cross/raster_check.cpp prints when built with these settings."""
+    """Build tests/cross/raster_check.cpp with these settings and return what it prints."""
     subprocess.run(["cmake", "-S", str(ROOT), "-B", str(folder), "-DSCENE_EXPERTS_CHECK=ON", *configure], check=True, capture_output=True)
     subprocess.run(["cmake", "--build", str(folder), "--target", "raster_check"], check=True, capture_output=True)
     text = subprocess.run([*run, str(folder / "raster_check")], check=True, capture_output=True, text=True).stdout

@@ -1,4 +1,4 @@
-"""The benchmark scene: as many Gaussians as asked for, of finite sizes, the same every time."""
+"""The benchmark scene: any number of Gaussians, finite values, deterministic."""
 
 from dataclasses import replace
 

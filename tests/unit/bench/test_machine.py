@@ -1,4 +1,4 @@
-"""What the machine is said to do at most."""
+"""Peak rates of the machine."""
 
 import pytest
 
@@ -6,12 +6,12 @@ from scene_experts.bench import machine, peer
 from scene_experts.native import library as native
 
 
-def test_the_machine_describes_itself():
+def test_describe():
     found = machine.describe(2)
     assert found.processor and found.cores >= 1 and found.threads == 2 and set(found.levels) <= set(native.LEVELS)
 
 
-def test_rates_are_of_this_world():
+def test_rates_are_plausible():
     assert 1e8 < machine.measure_copy(0.0) < 1e13
     if native.load() is None or peer.load(native.load().level) is None:
         pytest.skip("no compiled library or no peer")
@@ -19,7 +19,7 @@ def test_rates_are_of_this_world():
     assert 1e8 < machine.measure_clock(native.load().level, 0.0) < 2e10
 
 
-def test_wider_vectors_multiply_more():
+def test_wider_vectors_multiply_faster():
     levels = [level for level in native.list_levels() if native.find(level)]
     if not {"portable", "avx2"} <= set(levels):
         pytest.skip("one instruction set alone")

@@ -3,7 +3,7 @@
 from scene_experts.bench.measure import choose_clock, measure_minima
 
 
-def test_least_takes_the_least_of_each_part_and_holds_slow_subjects_back():
+def test_minima_are_per_part_and_slow_subjects_run_once():
     seen = {"quick": 0, "slow": 0}
     parts = {"quick": [(5.0, 1.0), (3.0, 2.0), (4.0, 0.5)], "slow": [(9.0,)]}
 
@@ -19,13 +19,13 @@ def test_least_takes_the_least_of_each_part_and_holds_slow_subjects_back():
     assert best == {"quick": (3.0, 0.5), "slow": (9.0,)}
 
 
-def test_everything_runs_twice_whatever_the_budget():
+def test_every_subject_runs_at_least_twice():
     seen = []
     measure_minima({"a": lambda clock: (float(len(seen)), seen.append(1))[:1]}, 0.0, choose_clock(2))
     assert len(seen) == 2
 
 
-def test_slow_subjects_alone_come_to_an_end():
+def test_slow_subjects_alone_terminate():
     seen = []
     measure_minima({"a": lambda clock: (float(len(seen)), seen.append(1))[:1]}, 5.0, choose_clock(2), {"a": 3})
     assert len(seen) == 3

@@ -1,4 +1,4 @@
-"""Decode and loss: both forms measured on the same work."""
+"""Decode and loss: both forms do the same work."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ def test_multiply_adds_are_those_of_the_layers():
     assert parts.count_multiply_adds(scene.config, 2) == 2 * one
 
 
-def test_both_forms_decode_alike():
+def test_both_forms_decode_the_same_values():
     config = Anchors(decoder=Experts(num=3, top_k=2))
     runs = [parts.Decode(config, form, 40) for form in ("composed", "auto")]
     forward, backward = runs[0](choose_clock(2))

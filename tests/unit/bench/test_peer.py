@@ -1,4 +1,4 @@
-"""The scalar peer draws the same picture as the reference, and its gradient."""
+"""The scalar peer renders the image of the reference and its gradient."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from scene_experts.render.reference import ReferenceRasterizer
 
 
 @pytest.mark.parametrize("level", native.LEVELS)
-def test_the_peer_is_a_rasteriser(level):
+def test_the_peer_agrees_with_the_reference(level):
     found = peer.load(level) if level in native.list_levels() else None
     if found is None:
         pytest.skip("not installed")
@@ -27,7 +27,7 @@ def test_the_peer_is_a_rasteriser(level):
     assert (gradient - means.grad).norm() < 1e-3 * means.grad.norm()
 
 
-def test_no_library_no_peer(monkeypatch):
+def test_there_is_no_peer_without_a_library(monkeypatch):
     assert peer.load(None) is None
     monkeypatch.setattr(native, "find", lambda level: None)
     assert peer.load("avx512") is None

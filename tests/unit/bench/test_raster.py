@@ -1,4 +1,4 @@
-"""Figures of the rasteriser: what each ratio is of."""
+"""Figures of the rasteriser."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A whole step on a made scene: the same step each time, every part timed."""
+"""A whole step on a synthetic scene: every step is the same, and every part is timed."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from scene_experts.bench.measure import Missing, choose_clock
 from scene_experts.core.types import Mode
 
 
-def test_half_of_the_anchors_are_seen_and_a_step_leaves_the_networks_as_they_were():
+def test_half_of_the_anchors_are_visible_and_a_step_restores_the_networks():
     work = step.make_work(step.MIXTURE, 200, 64, 48)
     before = {k: v.detach().clone() for k, v in work.training.scene.network_tensors().items()}
     times = work(choose_clock(2))
@@ -19,18 +19,18 @@ def test_half_of_the_anchors_are_seen_and_a_step_leaves_the_networks_as_they_wer
     assert work.count_drawn() > 100
 
 
-def test_a_mixture_alike_draws_the_same_gaussians():
+def test_copied_networks_draw_the_same_gaussians():
     mixture, base = (step.make_work(recipe, 300, 64, 48) for recipe in (step.MIXTURE, step.BASELINE))
     step.copy_networks(mixture, base)
     for made in (mixture, base):
-        made(choose_clock(2))  # and a step changes nothing of it
+        made(choose_clock(2))  # a step restores the scene
     a, b = (w.training.scene(w.camera, step.AT, Mode.DRAW, w.rasterize.visible) for w in (mixture, base))
     assert torch.allclose(a.raw_opacity, b.raw_opacity, atol=1e-5) and abs(mixture.count_drawn() - base.count_drawn()) <= 2
     sure = (b.raw_opacity.abs() > 1e-4).all() and len(a.gaussians) == len(b.gaussians)
     assert not sure or torch.allclose(a.gaussians.colors, b.gaussians.colors, atol=1e-4)
 
 
-def test_figures_of_a_step():
+def test_measure():
     here = replace(machine.describe(1), copied=1e9)
     found = {f.name: f for f in step.measure(100, 48, 32, here, 0.0)}
     whole = found["whole step"]
@@ -38,7 +38,7 @@ def test_figures_of_a_step():
     assert sum(found[part].value for part in step.PARTS) <= whole.value * 1.001
 
 
-def test_gain_of_threads():
+def test_measure_scaling():
     scene = raster.make_picture(200, 48, 32)
     assert isinstance(step.measure_scaling(scene, machine.describe(1), 0.0)[0], Missing)
     threads = torch.get_num_threads()

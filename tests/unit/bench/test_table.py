@@ -1,4 +1,4 @@
-"""The groups together: JSON without NaN, and a machine without the compiled library."""
+"""All groups together: the table, JSON, and a machine without the compiled library."""
 
 import io
 import json
@@ -25,7 +25,7 @@ def no_library(monkeypatch):
 
 
 @pytest.mark.slow
-def test_without_the_library_the_rest_is_measured_and_what_is_missing_is_said(no_library, tmp_path):
+def test_without_the_library_the_report_names_what_is_missing(no_library, tmp_path):
     text, path = io.StringIO(), tmp_path / "b.json"
     with pytest.warns(UserWarning, match="reference"):
         assert table.run(0.5, 1, path, Console(file=text, width=200)) == 0

@@ -1,4 +1,4 @@
-"""Curvature on known surfaces, and the pairs whose midpoints densify a cloud, by slow loops."""
+"""Curvature of known surfaces, and midpoint pairs against slow loops."""
 
 import math
 
@@ -21,7 +21,7 @@ def test_a_plane_and_a_line_are_flat_and_a_ball_is_not():
 
 
 def test_singular_values_and_not_eigenvalues():
-    """An octahedron-like neighbourhood of half-axes 3, 2, 1 has singular values in that ratio."""
+    """A neighbourhood shaped like an octahedron with half-axes 3, 2, 1 has singular values in this ratio."""
     axes = torch.tensor([[3.0, 0, 0], [0, 2, 0], [0, 0, 1]], dtype=torch.float64)
     points = torch.cat([torch.zeros(1, 3, dtype=torch.float64), axes, -axes])
     assert curvature(points, 7).tolist() == pytest.approx([1 / 6] * 7)

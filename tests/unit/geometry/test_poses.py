@@ -1,4 +1,4 @@
-"""Camera poses and curves between them, against plain geometry."""
+"""Camera poses and their interpolation."""
 
 import itertools
 import math

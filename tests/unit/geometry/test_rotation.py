@@ -54,7 +54,7 @@ def test_zero_quaternion_stays_finite() -> None:
 
 
 def ring(roll: list[float], pitch: float = 0.5) -> torch.Tensor:
-    """Cameras on a circle that look inwards and down by `pitch`, turned about their axis by `roll`; up is +z. [V, 3, 3]"""
+    """Rotations [V, 3, 3] of cameras on a circle that look inwards, pitched down by `pitch` and rolled by `roll`; up is +z."""
     out = []
     for i, turn in enumerate(torch.tensor(roll, dtype=torch.float64)):
         a = torch.tensor(2 * torch.pi * i / len(roll), dtype=torch.float64)
@@ -66,7 +66,7 @@ def ring(roll: list[float], pitch: float = 0.5) -> torch.Tensor:
     return torch.stack(out)
 
 
-def test_the_common_up_is_that_of_the_upright_photographs_whatever_lies_on_its_side() -> None:
+def test_photographs_on_their_side_do_not_tilt_the_up_direction() -> None:
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     quarter = torch.pi / 2
     torch.testing.assert_close(estimate_up(ring([0.0] * 9)), up)
@@ -76,7 +76,7 @@ def test_the_common_up_is_that_of_the_upright_photographs_whatever_lies_on_its_s
         assert float(estimate_up(rotations) @ up) > 0.995 > float(mean @ up)
 
 
-def test_the_common_up_of_cameras_that_look_one_way_is_their_mean() -> None:
+def test_the_up_direction_of_cameras_that_look_one_way_is_their_mean() -> None:
     one = ring([0.0])
     torch.testing.assert_close(estimate_up(one), -one[0, :, 1])
     torch.testing.assert_close(estimate_up(one.expand(5, 3, 3)), -one[0, :, 1])

@@ -10,7 +10,7 @@ from support.messages import naming
 
 
 def sphere(n: int) -> torch.Tensor:
-    """Evenly spread directions (a Fibonacci lattice), so that means over them integrate over the sphere."""
+    """Evenly distributed directions (a Fibonacci lattice): a mean over them is an integral over the sphere."""
     i = torch.arange(n, dtype=torch.float64) + 0.5
     z, phi = 1 - 2 * i / n, math.pi * (1 + 5**0.5) * i
     r = (1 - z * z).sqrt()
@@ -34,7 +34,7 @@ def test_order_and_signs_of_the_first_bands() -> None:
     assert sh.basis(diagonal, 2)[4] == pytest.approx(0.5 * math.sqrt(15 / math.pi) * 0.5)
 
 
-def test_constant_colour_comes_back() -> None:
+def test_a_constant_colour_survives() -> None:
     rgb = torch.rand(10, 3, generator=torch.Generator().manual_seed(0))
     coefficients = torch.zeros(10, 16, 3)
     coefficients[:, 0] = sh.rgb_to_dc(rgb)
@@ -51,7 +51,7 @@ def test_length_of_the_direction_does_not_matter_and_gradients_are_right() -> No
     assert torch.autograd.gradcheck(lambda c, d: sh.sh_to_rgb(c, d, 3), (coefficients, directions))
 
 
-def test_gradient_is_cut_where_the_colour_is() -> None:
+def test_a_clamped_colour_has_no_gradient() -> None:
     coefficients = torch.tensor([[[-3.0, 1.0, 0.0]]], requires_grad=True)
     rgb = sh.sh_to_rgb(coefficients, torch.ones(1, 3), 0)
     rgb.sum().backward()

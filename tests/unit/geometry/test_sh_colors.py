@@ -1,4 +1,4 @@
-"""The native colours against the torch form in float64, in value and in every gradient, at every instruction set that is built."""
+"""Native colours against torch in float64: values and every gradient, for every instruction set."""
 
 import pytest
 import torch

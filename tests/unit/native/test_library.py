@@ -1,4 +1,4 @@
-"""The compiled library is found, refused when it is of another version, and its absence explained."""
+"""The compiled library: finding it, refusing other versions, and explaining its absence."""
 
 import os
 import subprocess
@@ -23,12 +23,12 @@ def elsewhere(tmp_path, monkeypatch):
     native.load.cache_clear()
 
 
-def test_levels_end_with_the_one_that_runs_everywhere():
+def test_the_last_level_runs_everywhere():
     found = native.list_levels()
     assert found[-1] == "portable" and found == native.LEVELS[-len(found) :]
 
 
-def test_a_loaded_library_is_one_of_this_processors():
+def test_a_loaded_library_fits_this_processor():
     if native.load() is None:
         assert native.explain_missing()
     else:
@@ -37,7 +37,7 @@ def test_a_loaded_library_is_one_of_this_processors():
     assert native.load("no such level") is None and native.find("no such level") is None
 
 
-def test_no_library_is_one_sentence_that_says_what_to_do(elsewhere):
+def test_a_missing_library_is_explained_in_one_sentence(elsewhere):
     assert native.load() is None and "not installed" in native.explain_missing() and "pip install ." in native.explain_missing()
 
 
@@ -56,7 +56,7 @@ def test_a_library_that_lacks_a_function_is_not_used(elsewhere, monkeypatch):
     assert native.load("portable") is None
 
 
-def test_require_says_what_is_missing(elsewhere):
+def test_require_names_what_is_missing(elsewhere):
     with pytest.raises(InputError):
         native.require()
     with pytest.raises(InputError):
@@ -119,7 +119,7 @@ print("went on")
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize(("what", "said"), [("loss", "the photometric loss"), ("picture", "drawing 300,000 Gaussians")])
 @pytest.mark.slow
-def test_out_of_memory_is_an_error_that_a_process_survives(what, said, threads):
+def test_a_process_survives_running_out_of_memory(what, said, threads):
     code = SHORT.replace("WHAT", what).replace("THREADS", str(threads))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -127,7 +127,7 @@ def test_out_of_memory_is_an_error_that_a_process_survives(what, said, threads):
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not bind processes to cores")
-def test_cores_are_those_that_this_process_may_use():
+def test_only_cores_available_to_this_process_count():
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(before)})
     try:
