@@ -24,7 +24,7 @@ from scene_experts.training import loop, run_folder
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Event
 from scene_experts.training.memory import reuse_freed
-from scene_experts.training.progress import Progress
+from scene_experts.training.progress import TrainingProgress
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.state import Training
 
@@ -204,7 +204,7 @@ def train(
     """
     trainer = Trainer(method, capture, out, **settings)
     console = Console(highlight=False, quiet=not progress)
-    with saved_on_interrupt(trainer, out is not None), Progress(console) as show:
+    with saved_on_interrupt(trainer, out is not None), TrainingProgress(console) as show:
         for event in trainer:
             show(event)
     return trainer.run

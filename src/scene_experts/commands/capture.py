@@ -41,11 +41,11 @@ def capture(args: list[str]) -> int:
     from rich.console import Console
 
     from scene_experts.sfm.reconstruct import reconstruct
-    from scene_experts.training.progress import Bar
+    from scene_experts.training.progress import ProgressBar
 
     console = Console(highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
-    with handled(interrupt), Bar(console) as bar:
+    with handled(interrupt), ProgressBar(console) as bar:
         note = reconstruct(command.photos, command.out, command.options, overwrite=command.overwrite, say=say, progress=bar)
     for line in told(note):
         say(line)
@@ -60,12 +60,12 @@ def interrupt(*_: object) -> None:
 
 def told(note: dict[str, Any]) -> list[str]:
     """What was found, and what to do where it is little."""
-    from scene_experts.training.progress import clock
+    from scene_experts.training.progress import format_duration
 
     have, all_, without = note["with_pose"], note["photographs"], note["without_pose"]
     lines = [
         f"{have} of {all_} photographs have a pose: {note['points']:,} points, {note['observations']:.0f} seen in a photograph, "
-        f"{note['error']:.2f} px off on average; {note['mapper']} mapper, {clock(note['seconds'])} min"
+        f"{note['error']:.2f} px off on average; {note['mapper']} mapper, {format_duration(note['seconds'])} min"
     ]
     if without:
         lines.append(f"without a pose: {few(without, 8)}")

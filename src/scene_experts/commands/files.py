@@ -83,11 +83,11 @@ def _standard(command: ExportCommand, args: list[str], rasterize: Rasterizer) ->
     from scene_experts.files.bake.bake import Bake
     from scene_experts.files.bake.export import Options, export_standard
     from scene_experts.files.bake.refine import Refine
-    from scene_experts.training.progress import Bar
+    from scene_experts.training.progress import ProgressBar
 
     how = Bake(command.sh_degree, command.max_gaussians, command.prune, Refine(command.refine))
     options = Options(how, command.frame, command.levels, command.measure, shlex.join([PROG, "export", *args]))
-    with Bar(Console(stderr=True)) as tell:
+    with ProgressBar(Console(stderr=True)) as tell:
         return export_standard(command.run, command.format, command.out, command.step, rasterize, options, command.data, tell)
 
 

@@ -47,7 +47,7 @@ def render(args: list[str]) -> int:
 
     from scene_experts.api.backend import backend
     from scene_experts.training import run_folder
-    from scene_experts.training.progress import Bar
+    from scene_experts.training.progress import ProgressBar
     from scene_experts.view.film import check_out, make_film
 
     check_out(command.out)
@@ -59,7 +59,7 @@ def render(args: list[str]) -> int:
         if command.save_path:
             film.write_path(command.save_path)
         out = command.out or command.run / "renders" / f"{Path(command.options.path).stem}.mp4"
-        with Bar(Console(stderr=True)) as tell:
+        with ProgressBar(Console(stderr=True)) as tell:
             count = film.write(out, rasterize, device, tell)
     finally:
         capture.images.close()

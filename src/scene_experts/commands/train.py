@@ -31,7 +31,7 @@ from scene_experts.training.config import Data, RunConfig, Train, with_numbers
 from scene_experts.training.events import Exported
 from scene_experts.training.loop import Run
 from scene_experts.training.memory import reuse_freed
-from scene_experts.training.progress import Progress
+from scene_experts.training.progress import TrainingProgress
 from scene_experts.view.live import Live
 from scene_experts.view.server import check_port, import_viser
 
@@ -206,7 +206,7 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
         label = f"{command.cfg.recipe} on {capture.name}"
         live = Live(capture, rasterize, lambda: bool(run.stop), command.port, label, command.out / "paths", say)
         run = replace(run, watch=live)
-    with handled(stop), Progress(console) as progress:
+    with handled(stop), TrainingProgress(console) as progress:
         try:
             for event in recording.train(run, capture, rasterize, overwrite=command.overwrite, tensorboard=command.tensorboard):
                 progress(event)

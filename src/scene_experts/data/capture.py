@@ -14,7 +14,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera
 from scene_experts.data import prepare
 from scene_experts.data.images import FrameSource, check_policy, probe
-from scene_experts.data.lens import Lens, centre_principal_point, pinhole_of
+from scene_experts.data.lens import Lens, centre_principal_point, to_pinhole
 from scene_experts.data.match import to_relative_name
 from scene_experts.data.readers import PosedImage, RawCapture, ReadOptions, find_reader, unrecognised_error
 from scene_experts.data.store import ImageStore
@@ -113,7 +113,7 @@ def _assemble(root: Path, kind: str, raw: RawCapture, centred: bool, background:
         lens, turn = _fit_lens(image)
         if centred:
             lens = centre_principal_point(lens)
-        flat = pinhole_of(lens)
+        flat = to_pinhole(lens)
         K = torch.tensor([[flat.fx, 0, flat.cx], [0, flat.fy, flat.cy], [0, 0, 1]], dtype=torch.float64)
         camera = Camera(torch.from_numpy(image.world_to_cam), K, flat.width, flat.height, id=i)
         views.append(View(image.name, camera, image.path))
@@ -150,7 +150,7 @@ def _fit_lens(image: PosedImage) -> tuple[Lens, bool]:
         (w, h), lens = size, image.lens
         # the sides of a downscaled copy are rounded to whole pixels, so aspect ratios may differ by a pixel
         if abs(w * lens.height - h * lens.width) <= max(lens.width, lens.height, 0.01 * w * lens.height):
-            return lens.resized(w, h), size != stored
+            return lens.resize(w, h), size != stored
     raise InputError(
         f"expected {image.path} with the aspect ratio of its camera ({image.lens.width}x{image.lens.height}), found "
         f"{stored[0]}x{stored[1]}; use the photographs that the cameras were reconstructed from"

@@ -18,7 +18,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.lens import Lens, pinhole_of
+from scene_experts.data.lens import Lens, to_pinhole
 
 Size = tuple[int, int]  # width, height
 _ORIENTATION = 0x0112  # EXIF tag; 5 to 8 swap the axes
@@ -48,7 +48,7 @@ def probe(path: Path) -> tuple[Size, Size]:
         try:
             turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)
         except (OSError, ValueError, SyntaxError) as error:  # PNG stores EXIF after the pixels: a truncated file fails here
-            raise _unreadable(path, error) from error
+            raise _unreadable_error(path, error) from error
     return size, (size[1], size[0]) if turned else size
 
 
@@ -58,10 +58,10 @@ def _open(path: Path) -> Image.Image:
     except FileNotFoundError:
         raise InputError(f"expected an image at {path}, found no such file; restore it or remove it from the capture") from None
     except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
-        raise _unreadable(path, error) from error
+        raise _unreadable_error(path, error) from error
 
 
-def _unreadable(path: Path, error: Exception) -> InputError:
+def _unreadable_error(path: Path, error: Exception) -> InputError:
     return InputError(f"cannot read the image {path}: {error}; replace it or remove it from the capture")
 
 
@@ -121,7 +121,7 @@ def decode(source: FrameSource) -> tuple[Tensor, Tensor | None]:
     if source.lens.distorted:
         rgb = _undistort(rgb, source.lens)
         mask = None if mask is None else _undistort(_resize_mask(mask, (source.lens.width, source.lens.height)), source.lens)
-        outside = _mask_outside(source.lens)
+        outside = _make_outside_mask(source.lens)
     if rgb.size != source.size:
         rgb = rgb.resize(source.size, Image.Resampling.BICUBIC)
     weights = [np.asarray(_resize_mask(m, source.size)) for m in (mask, outside) if m is not None]
@@ -160,7 +160,7 @@ def _load_pixels(source: FrameSource) -> Image.Image:
             image.load()
             out = to_8_bit(ImageOps.exif_transpose(image) if source.turn else image)
         except (OSError, ValueError, SyntaxError) as error:  # Pillow's decoders raise all three for damaged files
-            raise _unreadable(source.path, error) from error
+            raise _unreadable_error(source.path, error) from error
     expected = (source.lens.width, source.lens.height)
     if out.size != expected:
         raise InputError(
@@ -190,7 +190,7 @@ def _load_mask(source: FrameSource) -> Image.Image | None:
         try:
             out = to_mask(image)
         except (OSError, ValueError, SyntaxError) as error:
-            raise _unreadable(source.mask, error) from error
+            raise _unreadable_error(source.mask, error) from error
     if not source.turn or (out.width > out.height) == (source.lens.width > source.lens.height):
         return out
     exif = out.getexif()
@@ -206,9 +206,9 @@ def to_mask(image: Image.Image) -> Image.Image:
 
 
 @functools.lru_cache(maxsize=2)  # neighbouring views share their camera
-def _undistortion_grid(lens: Lens) -> Tensor:
+def _make_grid(lens: Lens) -> Tensor:
     """Return where each pixel of the undistorted image lies in the photograph: [h, w, 2] float32 in [-1, 1], for grid_sample."""
-    pinhole = pinhole_of(lens)
+    pinhole = to_pinhole(lens)
     out = np.empty((pinhole.height, pinhole.width, 2), np.float32)
     u = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
     for top in range(0, pinhole.height, 64):  # strips keep the float64 temporaries small
@@ -223,7 +223,7 @@ def _undistort(image: Image.Image, lens: Lens) -> Image.Image:
     """Undistort `image` with bilinear interpolation. Its border is repeated outside."""
     pixels = np.array(image)
     planes = torch.from_numpy(pixels.reshape(*pixels.shape[:2], -1)).permute(2, 0, 1)[None].float()
-    grid = _undistortion_grid(lens)
+    grid = _make_grid(lens)
     strips = [
         torch.nn.functional.grid_sample(planes, grid[None, top : top + 256], padding_mode="border", align_corners=False)[0].round().byte()
         for top in range(0, grid.shape[0], 256)
@@ -231,7 +231,7 @@ def _undistort(image: Image.Image, lens: Lens) -> Image.Image:
     return Image.fromarray(torch.cat(strips, 1).permute(1, 2, 0).squeeze(-1).numpy(), image.mode)
 
 
-def _mask_outside(lens: Lens) -> Image.Image | None:
+def _make_outside_mask(lens: Lens) -> Image.Image | None:
     """Return a mask that is black where the undistorted image exceeds the photograph, or None if it nowhere does."""
-    inside = (_undistortion_grid(lens).abs() <= 1).all(-1)
+    inside = (_make_grid(lens).abs() <= 1).all(-1)
     return None if bool(inside.all()) else Image.fromarray(inside.numpy().astype(np.uint8) * 255)

@@ -86,7 +86,7 @@ class Lens:
         geometric = {"f", "fx", "fy", "cx", "cy"}
         return self.model in FISHEYE or any(p != 0 for n, p in zip(MODELS[self.model], self.params) if n not in geometric)
 
-    def resized(self, width: int, height: int) -> Lens:
+    def resize(self, width: int, height: int) -> Lens:
         """Return the same lens for an image of another size. Each axis is scaled by its own ratio, exactly.
 
         With pixel centres at +0.5, the focal length and the principal point are multiplied by the ratio, without an offset. A
@@ -107,7 +107,7 @@ class Lens:
     def distort(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Map normalised pinhole coordinates to normalised distorted ones (u', v'); the pixel is (fx u' + cx, fy v' + cy)."""
         if self.model == "FOV":
-            return _fov(self.value("omega"), u, v)
+            return _distort_fov(self.value("omega"), u, v)
         if self.model in FISHEYE:  # equidistant projection first: |(u, v)| = angle from the axis
             r = np.hypot(u, v)
             s = np.where(r > 1e-8, np.arctan(r) / np.maximum(r, 1e-8), 1.0)
@@ -117,7 +117,7 @@ class Lens:
     def undistort(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Invert `distort` by Newton's method. Rays over 88 degrees from the axis of a fisheye lens are clamped to 88 degrees."""
         if self.model == "FOV":
-            return _fov_inverse(self.value("omega"), u, v)
+            return _undistort_fov(self.value("omega"), u, v)
         a, b = self._undistort_polynomial(u, v)
         if self.model in FISHEYE:
             theta = np.hypot(a, b)
@@ -168,7 +168,7 @@ _TWO_FOCALS = {
 }
 
 
-def _fov(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
+def _distort_fov(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
     """Apply the field-of-view model of Devernay and Faugeras: r' = atan(2 r tan(omega/2)) / omega."""
     if abs(omega) < 1e-9:
         return u, v
@@ -178,7 +178,7 @@ def _fov(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
     return u * s, v * s
 
 
-def _fov_inverse(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
+def _undistort_fov(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
     if abs(omega) < 1e-9:
         return u, v
     r = np.hypot(u, v)
@@ -187,7 +187,7 @@ def _fov_inverse(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
     return u * s, v * s
 
 
-def pinhole_of(lens: Lens) -> Lens:
+def to_pinhole(lens: Lens) -> Lens:
     """Return the pinhole camera that `lens` is undistorted to: the same focal lengths and the largest size without empty pixels.
 
     As in COLMAP, the image border is undistorted, and each axis is grown or cropped about the principal point until every output

@@ -15,7 +15,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Points
 from scene_experts.data.images import check_policy, target_size
-from scene_experts.data.lens import pinhole_of
+from scene_experts.data.lens import to_pinhole
 from scene_experts.data.store import ImageStore
 from scene_experts.data.views import Capture, Vector, View, World
 
@@ -119,7 +119,7 @@ def downscale(capture: Capture, policy: str) -> Capture:
     policy = check_policy(policy)
     views, sources = [], []
     for view, source in zip(capture.views, capture.images.sources):
-        full = pinhole_of(source.lens)
+        full = to_pinhole(source.lens)
         size = target_size(policy, (full.width, full.height))
         sources.append(replace(source, size=size))
         views.append(replace(view, camera=_resize_camera(view.camera, size)))

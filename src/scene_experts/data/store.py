@@ -105,7 +105,7 @@ class _Cache:
         free = (index for index in reversed(self.frames) if index != new and index not in self.ahead)
         return next(free, next(iter(self.frames)))
 
-    def work(self) -> None:
+    def decode_ahead(self) -> None:
         """Decode the wanted frames in order until stopped; runs in the thread. `get` reports files that cannot be decoded."""
         while True:
             with self.changed:
@@ -188,7 +188,7 @@ class ImageStore:
             self._cache.ahead = set(wanted)
             self._cache.changed.notify_all()
         if self._thread is None and not self._cache.stopped:
-            self._thread = threading.Thread(target=self._cache.work, name="scene-experts images", daemon=True)
+            self._thread = threading.Thread(target=self._cache.decode_ahead, name="scene-experts images", daemon=True)
             self._thread.start()
             weakref.finalize(self, _stop, self._cache, self._thread)  # also runs at exit
 

@@ -12,7 +12,7 @@ from scene_experts.evaluate.results import About
 from scene_experts.evaluate.score import evaluate
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.training import run_folder
-from scene_experts.training.progress import Bar
+from scene_experts.training.progress import ProgressBar
 from scene_experts.training.run_folder import OpenRun
 
 
@@ -27,7 +27,7 @@ def evaluate_run(
     rasterize = as_trained(rasterize, opened.cfg.antialias)
     capture = run_folder.capture_of(opened, data)
     try:
-        with Bar(Console(stderr=True)) as tell:
+        with ProgressBar(Console(stderr=True)) as tell:
             return evaluate(opened.scene, capture, rasterize, run, options, step=opened.step, about=about(opened), progress=tell)
     finally:
         capture.images.close()

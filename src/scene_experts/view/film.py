@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.progress import Progress
 from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
 from scene_experts.evaluate.pictures import join_pictures, to_8bit
@@ -19,8 +20,6 @@ from scene_experts.view import path_files, paths, video
 from scene_experts.view.film_options import FilmOptions
 from scene_experts.view.paint import Look, paint
 from scene_experts.view.paths import CameraPath
-
-Progress = Callable[[str, int, int], None]  # name of the work, frames done, all frames
 
 
 @dataclass(frozen=True)
@@ -33,23 +32,23 @@ class Film:
     path: CameraPath
 
     def write(self, out: Path, rasterize: Rasterizer, device: str, progress: Progress) -> int:
-        """Write a video, or PNG files if `out` is a folder; returns the number of frames.
+        """Write a video, or PNG files if `out` is a folder, and return the number of frames.
 
         Raises InputError if a video is impossible, RunError if the encoder fails or the disk is full.
         """
         if not video.is_video(out):
-            return video.write_pictures(out, self.frames(rasterize, device, progress))
+            return video.write_pictures(out, self.draw_frames(rasterize, device, progress))
         video.import_ffmpeg()  # reports a missing package before the first frame is drawn
         self.expect_one_size()
-        return video.write_video(out, self.frames(rasterize, device, progress), self.path.fps, self.options.quality)
+        return video.write_video(out, self.draw_frames(rasterize, device, progress), self.path.fps, self.options.quality)
 
     def write_path(self, out: Path) -> None:
         """Write the camera path as JSON: nerfstudio's if the name ends in .nerfstudio.json."""
         write = path_files.write_nerfstudio if out.name.endswith(".nerfstudio.json") else path_files.write_path
         write(out, self.path, self.capture.world)
 
-    def frames(self, rasterize: Rasterizer, device: str, progress: Progress) -> Iterator[np.ndarray]:
-        """The frames as 8-bit RGB [H, W, 3]: every run in every mode, side by side."""
+    def draw_frames(self, rasterize: Rasterizer, device: str, progress: Progress) -> Iterator[np.ndarray]:
+        """Yield the frames as 8-bit RGB [H, W, 3]: every run in every mode, side by side."""
         only = tuple(number - 1 for number in self.options.only) or None
         looks = [Look(show, self.options.attribute, only) for show in self.options.show]
         background = torch.tensor(self.capture.background, device=device)
@@ -64,7 +63,7 @@ class Film:
             progress("rendering", i + 1, len(self.path.cameras))
 
     def expect_one_size(self) -> None:
-        """Raises InputError for cameras of several sizes: a video has one."""
+        """Raise InputError for cameras of several sizes. A video has one size."""
         sizes = sorted({(camera.width, camera.height) for camera in self.path.cameras})
         if len(sizes) > 1:
             first, last = (f"{width}x{height}" for width, height in (sizes[0], sizes[-1]))
@@ -74,7 +73,7 @@ class Film:
 
 
 def make_film(options: FilmOptions, runs: Sequence[OpenRun], capture: Capture) -> Film:
-    """Raises InputError for runs of different captures, unknown experts and an unknown path."""
+    """Return the film of `runs`. Raises InputError for runs of different captures, unknown experts and an unknown path."""
     for run in runs:
         count = run.scene.traits.experts
         if options.only and max(options.only) > count:
@@ -87,13 +86,13 @@ def make_film(options: FilmOptions, runs: Sequence[OpenRun], capture: Capture) -
 
 
 def check_out(out: Path | None) -> None:
-    """Raises InputError for a name that is neither a video's nor a folder's."""
+    """Raise InputError for a name that is neither that of a video nor of a folder."""
     if out is not None and out.suffix and not video.is_video(out) and not out.is_dir():
         raise InputError(f"expected --out as a folder or a file ending in {', '.join(video.VIDEO)}, found {out}; choose one of those")
 
 
 def make_path(options: FilmOptions, capture: Capture) -> CameraPath:
-    """The camera path of the options. Raises InputError if it is unknown."""
+    """Return the camera path of the options. Raises InputError if it is unknown."""
     size = options.pixels()
     if path_files.is_path_file(options.path):
         model = paths.median_camera([v.camera for v in capture.views], size)
@@ -101,12 +100,12 @@ def make_path(options: FilmOptions, capture: Capture) -> CameraPath:
     fps = options.fps or 24.0
     if options.path == "test":
         chosen = capture.test or capture.train
-        return CameraPath(tuple(resized(capture.views[i].camera, size) for i in chosen), options.fps or 2.0)
+        return CameraPath(tuple(resize_camera(capture.views[i].camera, size) for i in chosen), options.fps or 2.0)
     return paths.make_path(options.path, capture, max(1, round(options.seconds * fps)), size, fps)
 
 
-def resized(camera: Camera, size: tuple[int, int] | None) -> Camera:
-    """The camera with another picture size; the picture is stretched."""
+def resize_camera(camera: Camera, size: tuple[int, int] | None) -> Camera:
+    """Return the camera with another picture size. The picture is stretched."""
     if size is None:
         return camera
     width, height = size

@@ -43,7 +43,7 @@ class Live:
             self.ready(self.viewer.url + (f" (port {self.port} is taken)" if self.viewer.moved else ""))
             self.last = now
         self.owed, self.last = max(0.0, self.owed - (now - self.last)), now
-        if self.owed == 0.0 and self.viewer.due(now):
+        if self.owed == 0.0 and self.viewer.find_due(now):
             self.owed = self.viewer.draw(budget=0.01) * (1 / SHARE - 1)
             self.last = time.monotonic()
         while self.viewer.panel.is_paused() and not self.stopped():

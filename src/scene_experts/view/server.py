@@ -167,7 +167,7 @@ class Viewer:
 
     # --- drawing
 
-    def due(self, now: float) -> list[Client]:
+    def find_due(self, now: float) -> list[Client]:
         """Return the clients that need a picture: something changed, or they rest and have only a small picture."""
         with self.lock:
             return [c for c in self.clients.values() if c.wanted or (not c.full and not c.is_moving(now))]
@@ -175,7 +175,7 @@ class Viewer:
     def draw(self, budget: float = float("inf")) -> float:
         """Draw for every client that is due and return the seconds taken. The last picture may exceed `budget` seconds."""
         began = time.monotonic()
-        for client in self.due(began):
+        for client in self.find_due(began):
             if time.monotonic() - began >= budget:
                 self.changed.set()
                 break

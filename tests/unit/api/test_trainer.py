@@ -105,7 +105,7 @@ def test_ctrl_c_saves_and_is_raised(capture, tmp_path, monkeypatch):
         if isinstance(event, se.Stepped) and event.step == 10:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("scene_experts.api.trainer.Progress.__call__", interrupt)
+    monkeypatch.setattr("scene_experts.api.trainer.TrainingProgress.__call__", interrupt)
     before = signal.getsignal(signal.SIGINT)
     long = se.recipe("scaffold-gs", iterations=100_000, **{"scene.voxel_size": 0.2})
     with pytest.raises(KeyboardInterrupt):

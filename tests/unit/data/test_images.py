@@ -11,7 +11,7 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.images import FrameSource, check_policy, decode, probe, target_size
-from scene_experts.data.lens import Lens, pinhole_of
+from scene_experts.data.lens import Lens, to_pinhole
 from support.messages import naming
 from support.synthetic import look_at, picture
 
@@ -121,7 +121,7 @@ def test_exif_is_applied_only_when_asked(tmp_path: Path) -> None:
 def test_undistorted_photograph_is_the_pinhole_picture(tmp_path: Path, lens: Lens) -> None:
     pose = look_at(np.array([2.6, 1.9, 2.2]), np.array([0.0, 0.0, 0.2]))
     Image.fromarray(np.rint(255 * picture(lens, pose, 1.0, (0, 0, 0))).astype(np.uint8)).save(tmp_path / "a.png")
-    flat = pinhole_of(lens)
+    flat = to_pinhole(lens)
     rgb, _ = decode(FrameSource(tmp_path / "a.png", lens, (flat.width, flat.height)))
     truth = picture(flat, pose, 1.0, (0, 0, 0))
     error = np.abs(rgb.numpy() / 255 - truth)

@@ -14,7 +14,7 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.images import FrameSource, decode
-from scene_experts.data.lens import MODELS, Lens, centre_principal_point, pinhole_of
+from scene_experts.data.lens import MODELS, Lens, centre_principal_point, to_pinhole
 from support.lenses import IDS, LENSES
 
 # Runs without this project: it must not be imported beside pycolmap.
@@ -77,7 +77,7 @@ def test_projection_equals_pycolmap(oracle: tuple[Path, np.ndarray, list], index
 def test_undistorted_camera_and_picture_equal_pycolmap(oracle: tuple[Path, np.ndarray, list], index: int) -> None:
     folder, _, cameras = oracle
     width, height, params = cameras[index]
-    flat = pinhole_of(LENSES[index])
+    flat = to_pinhole(LENSES[index])
     assert (flat.width, flat.height) == (width, height)
     theirs = params if len(params) == 4 else [params[0], *params]
     np.testing.assert_allclose(flat.params, theirs, rtol=1e-9)
@@ -100,7 +100,7 @@ def test_undistort_inverts_distort(lens: Lens) -> None:
 
 @pytest.mark.parametrize("lens", LENSES, ids=IDS)
 def test_resizing_scales_pixels_exactly(lens: Lens) -> None:
-    small = lens.resized(80, 45)
+    small = lens.resize(80, 45)
     u, v = np.array([0.2, -0.3]), np.array([0.1, 0.25])
     (a, b), (c, d) = lens.distort(u, v), small.distort(u, v)
     np.testing.assert_allclose(c * small.fx + small.cx, (a * lens.fx + lens.cx) * 0.5, rtol=1e-12)
@@ -110,11 +110,11 @@ def test_resizing_scales_pixels_exactly(lens: Lens) -> None:
 def test_distorted_only_with_a_coefficient() -> None:
     assert not Lens("OPENCV", 8, 8, (5, 5, 4, 4, 0, 0, 0, 0)).distorted
     assert Lens("OPENCV_FISHEYE", 8, 8, (5, 5, 4, 4, 0, 0, 0, 0)).distorted
-    assert pinhole_of(Lens("SIMPLE_RADIAL", 8, 6, (5, 4, 3, 0))) == Lens("PINHOLE", 8, 6, (5, 5, 4, 3))
+    assert to_pinhole(Lens("SIMPLE_RADIAL", 8, 6, (5, 4, 3, 0))) == Lens("PINHOLE", 8, 6, (5, 5, 4, 3))
 
 
 def test_wide_fisheye_gets_a_bounded_picture() -> None:
-    flat = pinhole_of(Lens("OPENCV_FISHEYE", 200, 200, (60, 60, 100, 100, 0, 0, 0, 0)))  # about 190 degrees across
+    flat = to_pinhole(Lens("OPENCV_FISHEYE", 200, 200, (60, 60, 100, 100, 0, 0, 0, 0)))  # about 190 degrees across
     assert 40 <= flat.width <= 400 and 40 <= flat.height <= 400
 
 

@@ -6,12 +6,12 @@ from rich.console import Console
 from scene_experts.scene import Traits
 from scene_experts.strategy import Edit
 from scene_experts.training.events import Adjusted, Finished, Saved, Started, Stepped, Stopped
-from scene_experts.training.progress import Bar, Progress, clock
+from scene_experts.training.progress import ProgressBar, TrainingProgress, format_duration
 
 
 def test_a_log_file_gets_plain_lines():
     out = io.StringIO()
-    with Progress(Console(file=out, width=200), every=0.0) as show:
+    with TrainingProgress(Console(file=out, width=200), every=0.0) as show:
         show(Started(0, 200, 1234, Traits("anchors", "anchors", 0.02, activation=True)))
         show(Stepped(10, {"l1": 0.05, "dssim": 0.02}, 21.5, 1300, 800, 4000, 0.61, 1.0, {}))
         show(Adjusted(100, Edit(10, 0, 1310, capped=True)))
@@ -38,7 +38,7 @@ def test_a_log_file_gets_plain_lines():
 
 def test_explicit_gaussians_are_called_so():
     out = io.StringIO()
-    with Progress(Console(file=out, width=200), every=0.0) as show:
+    with TrainingProgress(Console(file=out, width=200), every=0.0) as show:
         show(Started(0, 200, 1234, Traits("gaussians", "Gaussians")))
         show(Stepped(10, {"l1": 0.05}, 21.5, 1300, 800, 800, 0.0, 1.0, {}))
         show(Adjusted(100, Edit(10, 0, 1310, capped=True)))
@@ -48,15 +48,15 @@ def test_explicit_gaussians_are_called_so():
 
 
 def test_clock():
-    assert [clock(s) for s in (0, 59.6, 61, 3661)] == ["0:00", "1:00", "1:01", "1:01:01"]
+    assert [format_duration(s) for s in (0, 59.6, 61, 3661)] == ["0:00", "1:00", "1:01", "1:01:01"]
 
 
 def test_a_bar_speaks_in_lines_where_there_is_no_terminal():
     console = Console(file=io.StringIO(), force_terminal=False)
-    with Bar(console, every=0.0) as tell:
+    with ProgressBar(console, every=0.0) as tell:
         tell("rendering", 3, 9)
     assert console.file.getvalue() == "rendering: 3 of 9\n"  # type: ignore[attr-defined]
     quiet = Console(file=io.StringIO(), force_terminal=False)
-    with Bar(quiet) as tell:
+    with ProgressBar(quiet) as tell:
         tell("rendering", 3, 9)
     assert quiet.file.getvalue() == ""  # type: ignore[attr-defined]

@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.view.film import check_out, resized
+from scene_experts.view.film import check_out, resize_camera
 from support.scenes import CAMERA
 
 
 def test_a_camera_at_another_size():
-    assert resized(CAMERA, (96, 32)).fx == pytest.approx(2 * CAMERA.fx) and resized(CAMERA, None) is CAMERA
-    assert torch.allclose(resized(CAMERA, (96, 64)).K[:2], CAMERA.K[:2] * 2)
+    assert resize_camera(CAMERA, (96, 32)).fx == pytest.approx(2 * CAMERA.fx) and resize_camera(CAMERA, None) is CAMERA
+    assert torch.allclose(resize_camera(CAMERA, (96, 64)).K[:2], CAMERA.K[:2] * 2)
 
 
 def test_a_name_that_is_neither_a_video_nor_a_folder(tmp_path):

@@ -90,7 +90,7 @@ def test_fifty_clients_that_go_leave_nothing(viewer):
         handle = joined(viewer, number)
         viewer.draw()
         viewer.disconnect(handle)
-    assert viewer.clients == {} and viewer.due(time.monotonic()) == []
+    assert viewer.clients == {} and viewer.find_due(time.monotonic()) == []
 
 
 def test_a_budget_leaves_clients_for_the_next_turn(viewer):

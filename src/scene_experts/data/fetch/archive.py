@@ -92,7 +92,7 @@ def extract(archive: Path, scene: str, into: Path, inside: Sequence[str] = (), p
     with open_archive(archive) as entries:
         prefix = find_scene(entries, scene, inside, archive)
         wanted = [(parts, m) for m in entries if (parts := _parts_after(m.name, prefix)) and m.kind != "folder" and not _is_clutter(parts)]
-        total = _check(wanted, archive)
+        total = _check_entries(wanted, archive)
         _expect_room(into, total)
         temporary = Path(tempfile.mkdtemp(dir=into.parent, prefix=f".{into.name}.", suffix=".part"))
         try:
@@ -149,7 +149,7 @@ def find_scene(entries: Sequence[Member], scene: str, inside: Sequence[str], arc
     )
 
 
-def _check(wanted: Sequence[tuple[tuple[str, ...], Member]], archive: Path) -> int:
+def _check_entries(wanted: Sequence[tuple[tuple[str, ...], Member]], archive: Path) -> int:
     """Return the total size in bytes of the entries `wanted`. Raises RunError if one of them is not trustworthy."""
 
     def refuse(found: str) -> RunError:

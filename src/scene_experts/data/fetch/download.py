@@ -158,7 +158,7 @@ def _continue(url: str, part: Path, known: bool, size: int | None, progress: Byt
 
     known: Whether the checksum is known. Then a part from another address is resumed, too, because the checksum is verified at the end.
     """
-    have, begun = _resumable(url, part, known)
+    have, begun = _find_resumable(url, part, known)
     headers = {"User-Agent": "scene-experts", "Accept-Encoding": "identity"}
     if have:
         headers["Range"] = f"bytes={have}-"
@@ -200,7 +200,7 @@ def _append(answer: http.client.HTTPResponse, part: Path, have: int, total: int,
     return have
 
 
-def _resumable(url: str, part: Path, known: bool) -> tuple[int, _Partial]:
+def _find_resumable(url: str, part: Path, known: bool) -> tuple[int, _Partial]:
     """Return the number of bytes of `part` that `url` can continue (0: start over), and the facts about their file."""
     have = part.stat().st_size if part.is_file() else 0
     begun = _Partial()

@@ -31,13 +31,13 @@ def register(reader: Reader) -> None:
 
 
 @functools.cache
-def _built_in() -> tuple[Reader, ...]:
+def _load_built_in() -> tuple[Reader, ...]:
     places = (place.partition(":") for place in READERS)
     return tuple(getattr(importlib.import_module(module), name) for module, _, name in places)
 
 
 @functools.cache
-def _installed() -> tuple[Reader, ...]:
+def _load_installed() -> tuple[Reader, ...]:
     """Load the readers that installed packages offer. Raises InputError if one cannot be imported."""
     found = []
     for entry in entry_points(group=GROUP):
@@ -50,7 +50,7 @@ def _installed() -> tuple[Reader, ...]:
 
 def find_reader(folder: Path) -> Reader | None:
     """Return the reader that recognises `folder`, or None."""
-    for readers in (_registered, _built_in(), _installed()):
+    for readers in (_registered, _load_built_in(), _load_installed()):
         for reader in readers:
             if reader.recognise(folder):
                 return reader
@@ -64,7 +64,7 @@ def is_capture(folder: Path) -> bool:
 
 def unrecognised_error(folder: Path) -> InputError:
     """Return the error for a folder that no reader recognises. It says what to do, e.g. with photographs without camera poses."""
-    kinds = ", ".join(reader.files for reader in (*_built_in(), *_installed(), *_registered))
+    kinds = ", ".join(reader.files for reader in (*_load_built_in(), *_load_installed(), *_registered))
     expected = f"expected a capture in {folder} ({kinds}), found"
     if is_capture(folder.absolute().parent):
         return InputError(f"{expected} a part of one; give the folder that contains it: {folder.absolute().parent}")

@@ -133,23 +133,23 @@ class _Bytes:
         self.path, self.data, self.at = path, path.read_bytes(), 0
         (self.count,) = self.take("<Q")
         if self.count * smallest > len(self.data):
-            raise self.truncated()
+            raise self.truncated_error()
 
-    def truncated(self) -> InputError:
+    def truncated_error(self) -> InputError:
         return InputError(f"expected a complete COLMAP file at {self.path}, found only its first {len(self.data)} bytes; copy it again")
 
     def take(self, layout: str) -> tuple:
         """Unpack the next values, as `struct` describes them."""
         start, self.at = self.at, self.at + struct.calcsize(layout)
         if self.at > len(self.data):
-            raise self.truncated()
+            raise self.truncated_error()
         return struct.unpack_from(layout, self.data, start)
 
     def text(self) -> str:
         """Return the next zero-terminated string."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
-            raise self.truncated()
+            raise self.truncated_error()
         start, self.at = self.at, end + 1
         return self.data[start:end].decode("utf-8", "surrogateescape")
 
@@ -157,7 +157,7 @@ class _Bytes:
         """Skip `size` bytes and return where they start."""
         start, self.at = self.at, self.at + size
         if self.at > len(self.data):
-            raise self.truncated()
+            raise self.truncated_error()
         return start
 
 
@@ -201,9 +201,9 @@ def _read_points_bin(path: Path) -> NDArray:
             heads.append(data[at : at + size])
             at += size + 8 * length(data, at + size - 8)[0]
     except struct.error:
-        raise file.truncated() from None
+        raise file.truncated_error() from None
     if at > len(data):
-        raise file.truncated()
+        raise file.truncated_error()
     return np.frombuffer(b"".join(heads), _POINT)
 
 

@@ -27,7 +27,7 @@ from scene_experts.scene.anchors.select import LevelSelector, capped
 from scene_experts.scene.gaussians import GaussianScene
 from scene_experts.training import run_folder
 from scene_experts.training.config import to_json
-from scene_experts.training.progress import clock
+from scene_experts.training.progress import format_duration
 from scene_experts.training.run_folder import OpenRun
 
 SIDECAR_FORMAT = 1
@@ -151,7 +151,7 @@ def one_file(
     size = path.stat().st_size
     frame = "the capture's own frame" if options.frame == "capture" else "the trained world"
     count = f"{len(made.splats):,} Gaussians, {size / 1e6:.2f} MB, harmonics of degree {made.splats.degree}, in {frame}"
-    lines = [f"wrote {path}", count + ("" if is_direct(run, options.bake) else f"; baked in {clock(seconds)}")]
+    lines = [f"wrote {path}", count + ("" if is_direct(run, options.bake) else f"; baked in {format_duration(seconds)}")]
     measured: dict[str, Any] = {}
     views = counted(capture) if options.measure and capture is not None else []
     if views and capture is not None:

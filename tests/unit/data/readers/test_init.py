@@ -95,15 +95,15 @@ def test_a_training_runs_on_a_capture_of_a_registered_kind(folder: Path) -> None
 def test_an_installed_package_offers_a_reader(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     entry = SimpleNamespace(name="poses", value="elsewhere:READER", load=PosesReader)
     monkeypatch.setattr(readers, "entry_points", lambda group: [entry] if group == "scene_experts.readers" else [])
-    readers._installed.cache_clear()
+    readers._load_installed.cache_clear()
     try:
         assert load(folder).kind == "poses"
-        readers._installed.cache_clear()
+        readers._load_installed.cache_clear()
         entry.load = lambda: 1 / 0
         with pytest.raises(InputError, match="elsewhere:READER"):
             load(folder)
     finally:
-        readers._installed.cache_clear()
+        readers._load_installed.cache_clear()
 
 
 def test_a_registered_reader_is_asked_before_the_built_in_ones(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
