@@ -257,7 +257,7 @@ class AnchorScene(LatticeScene):
             x = torch.cat([seen, direction] + ([distance] if attribute in self.config.add_dist else []), dim=1)
             if attribute == "color" and self.codes is not None:
                 x = torch.cat([x, self.codes(camera, mode).expand(len(x), -1)], dim=1)
-            if attribute == "cov" and self.config.quat_align and head.experts:
+            if attribute == "cov" and self.config.quat_align and isinstance(head, MixtureHead):
                 out[attribute], found = head.aligned(x, feature, step, position, K, mode)
             else:
                 out[attribute], found = head(x, feature, step, position, mode)
