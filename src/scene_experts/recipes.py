@@ -66,34 +66,40 @@ def _scaffold(name: str, **scene: object) -> Train:
 OWN: dict[str, Recipe] = {
     "scaffold-gs": ("Scaffold-GS: one network per attribute (the baseline)", scaffold_gs),
     "moe-gs": ("MoE-GS: five experts per attribute, Top-2 after a dense warm-up (the paper's main results)", moe_gs),
-    "3dgs": ("3DGS: explicit Gaussians with spherical harmonics, cloned, split and pruned", gs_3d),
-    "3dgs-mcmc": ("3DGS-MCMC: the same Gaussians, relocated and disturbed instead, at most a million of them", gs_mcmc),
-    "octree-gs": ("Octree-GS: anchors on levels of detail, each view using those that its distance asks for", octree_gs),
+    "3dgs": ("3DGS: explicit Gaussians with spherical harmonics, cloned and split", gs_3d),
+    "3dgs-mcmc": ("3DGS-MCMC: explicit Gaussians, relocated and perturbed, at most a million", gs_mcmc),
+    "octree-gs": ("Octree-GS: anchors on levels of detail; each view uses the levels for its distance", octree_gs),
     "octree-moe-gs": (
-        "Octree-GS with five experts per attribute, Top-2 after a dense warm-up (published nowhere)",
+        "Octree-GS with five experts per attribute, Top-2 after a dense warm-up (unpublished)",
         replace(octree_gs, recipe="octree-moe-gs", scene=replace(octree_gs.scene, decoder=EXPERTS), loss=moe_gs.loss),
     ),
-    "sags": ("SAGS: points with a graph over them and a hash grid, denser where the surface is flat", sags),
-    "scaffold-gs-bank": ("Scaffold-GS with its feature bank", _scaffold("scaffold-gs-bank", mix=FeatureBank())),
+    "sags": ("SAGS: points with a graph and a hash grid, denser in flat regions", sags),
+    "scaffold-gs-bank": ("Scaffold-GS with the feature bank", _scaffold("scaffold-gs-bank", mix=FeatureBank())),
     "scaffold-gs-opacity": (
-        "Scaffold-GS with the opacity hinge: the paper's 'w/o MoE' (Table 4) and Table 3, row 2",
+        "Scaffold-GS with the opacity hinge ('w/o MoE' in Table 4; row 2 of Table 3)",
         replace(scaffold_gs, recipe="scaffold-gs-opacity", loss=Weights(scale=0.01, opacity=0.01)),
     ),
-    "moe-gs-no-cl": ("without curriculum: Top-2 from the first iteration (Table 4)", _moe("moe-gs-no-cl", warmup=0)),
-    "moe-gs-no-load": ("without the load-balancing losses (Table 4)", _moe("moe-gs-no-load", loss=replace(moe_gs.loss, load=0.0))),
-    "moe-gs-no-opacity": ("without the opacity hinge (Table 4)", _moe("moe-gs-no-opacity", loss=replace(moe_gs.loss, opacity=0.0))),
-    "moe-gs-dist": ("the decoders also see the distance, as the paper's text has it", _moe("moe-gs-dist", add_dist=ATTRIBUTES)),
-    "moe-gs-posrouter": ("the routers also see the anchor's position (appendix)", _moe("moe-gs-posrouter", router=Router(input_pos=True))),
+    "moe-gs-no-cl": ("Without the curriculum: Top-2 from the first iteration (Table 4)", _moe("moe-gs-no-cl", warmup=0)),
+    "moe-gs-no-load": ("Without the load-balancing losses (Table 4)", _moe("moe-gs-no-load", loss=replace(moe_gs.loss, load=0.0))),
+    "moe-gs-no-opacity": ("Without the opacity hinge (Table 4)", _moe("moe-gs-no-opacity", loss=replace(moe_gs.loss, opacity=0.0))),
+    "moe-gs-dist": ("The decoders also see the distance, as the paper's text says", _moe("moe-gs-dist", add_dist=ATTRIBUTES)),
+    "moe-gs-posrouter": (
+        "The routers also see the anchor's position (appendix)",
+        _moe("moe-gs-posrouter", router=Router(input_pos=True)),
+    ),
     "moe-gs-balance": (
-        "experts kept in use by biases instead of L_load (Wang et al. 2024; not in the paper)",
+        "Biases balance the experts instead of L_load (Wang et al. 2024; not in the paper)",
         _moe("moe-gs-balance", loss=replace(moe_gs.loss, load=0.0), decoder=BalancedExperts()),
     ),
     "moe-gs-e3-no-load": (
-        "three experts without L_load (Figure 3a)",
+        "Three experts without L_load (Figure 3a)",
         _moe("moe-gs-e3-no-load", num=3, loss=replace(moe_gs.loss, load=0.0)),
     ),
     **{
-        f"moe-gs-e{num}-{name}": (f"{num} experts, {name} (Figure 6)", _moe(f"moe-gs-e{num}-{name}", num=num, top_k=k))
+        f"moe-gs-e{num}-{name}": (
+            f"{num} experts, {name.replace('top', 'Top-')} (Figure 6)",
+            _moe(f"moe-gs-e{num}-{name}", num=num, top_k=k),
+        )
         for num in (2, 3, 4, 5)
         for name, k in (("top1", 1), ("top2", 2), ("dense", None))
     },

@@ -117,7 +117,9 @@ class _Reader:
         self.given[row.place], self.written[row.place] = value, name
 
     def _advice(self, name: str) -> str:
-        close = nearest(name, [known for known in self.by_name if known.startswith("--")]).removeprefix("; ")
+        known = [each for each in self.by_name if each.startswith("--")]
+        parts = [each for each in known if each.rpartition(".")[2] == name.removeprefix("--")]  # --top-k for --scene.decoder.top-k
+        close = f"did you mean {' or '.join(map(repr, parts[:3]))}?" if parts else nearest(name, known).removeprefix("; ")
         return self.command.elsewhere(name) or close or f"`{self.command.name} {HELP_ALL}` lists them"
 
 

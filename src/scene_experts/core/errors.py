@@ -21,8 +21,10 @@ def expect_at_least(numbers: list[tuple[str, float, float]]) -> None:
 
 def nearest(word: str, words: Iterable[str]) -> str:
     """A hint at the known words most like an unknown one: "; did you mean 'moe-gs'?", or nothing."""
-    like = difflib.get_close_matches(word, list(words), 3, 0.6)
-    return f"; did you mean {' or '.join(repr(found) for found in like)}?" if like else ""
+    like = difflib.get_close_matches(word, list(words), 3, 0.6)  # best first
+    alike = [difflib.SequenceMatcher(None, found, word).ratio() for found in like]
+    close = [found for found, ratio in zip(like, alike) if ratio > alike[0] - 0.05]
+    return f"; did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 
 def few(names: Sequence[str], most: int = 3) -> str:

@@ -71,7 +71,7 @@ def test_every_form_of_an_option():
         (["r"], ("expected --out, found none",)),
         ([*NEEDED, "--iteration", "5"], ("found --iteration", "did you mean '--iterations'?")),
         ([*NEEDED, "--iteration=5"], ("found --iteration;", "did you mean '--iterations'?")),
-        ([*NEEDED, "--gain", "5"], ("found --gain", "--look.gain")),
+        ([*NEEDED, "--gain", "5"], ("found --gain", "did you mean '--look.gain'?")),
         ([*NEEDED, "--xyzzy"], ("found --xyzzy", "`se draw --help-all`")),
         ([*NEEDED, "-x"], ("found -x",)),
         ([*NEEDED, "--rates", "1"], ("`se train` has it",)),

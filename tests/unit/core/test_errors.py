@@ -42,6 +42,8 @@ def test_neither_is_the_other_and_a_fault_of_ours_is_not_hidden(monkeypatch):
 def test_a_word_like_a_known_one_is_hinted_at():
     assert nearest("exprt", ["export", "eval"]) == "; did you mean 'export'?"
     assert nearest("zzz", ["export", "eval"]) == ""
+    assert nearest("--iteration", ["--resolution", "--iterations"]) == "; did you mean '--iterations'?"  # the other is much less alike
+    assert nearest("roma", ["rome", "room", "truck"]) == "; did you mean 'room' or 'rome'?"
 
 
 def test_of_many_names_the_first_are_told():
