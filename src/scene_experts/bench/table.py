@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -124,7 +125,7 @@ def _format(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 100 else f"{value:,.0f}"
 
 
-def convert_to_json(machine: Machine, size: Size, results: list[Result], took: float) -> dict:
+def convert_to_json(machine: Machine, size: Size, results: list[Result], took: float) -> dict[str, Any]:
     """All figures as plain JSON, each value with its unit and its peer."""
     figures = [asdict(r) for r in results if isinstance(r, Figure)]
     missing = [asdict(r) for r in results if isinstance(r, Missing)]

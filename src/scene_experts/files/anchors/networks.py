@@ -11,6 +11,7 @@ import re
 import warnings
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -154,12 +155,12 @@ def from_flat_names(tensors: dict[str, Tensor]) -> dict[str, Network]:
     return out
 
 
-def write_moe(path: Path, networks: dict[str, Network], sidecar: dict) -> None:
+def write_moe(path: Path, networks: dict[str, Network], sidecar: dict[str, Any]) -> None:
     """Write routers and experts with the scene's description. Raises RunError when the disk is full."""
     write_tensors(path, flat_names(networks), MOE_KIND, MOE_FORMAT, sidecar)
 
 
-def read_moe(path: Path) -> tuple[dict[str, Network], dict]:
+def read_moe(path: Path) -> tuple[dict[str, Network], dict[str, Any]]:
     """Routers and experts, and the description they were written with. Raises InputError when the file is damaged or another."""
     tensors, sidecar = read_tensors(path, MOE_KIND, MOE_FORMAT)
     networks = from_flat_names(tensors)

@@ -113,6 +113,7 @@ class AnchorScene(LatticeScene):
 
     config: Anchors
     mix: Any
+    voxel: float
     codes: Codes | None
 
     def __init__(

@@ -128,6 +128,7 @@ class GraphScene(LatticeScene):
     """N points, one Gaussian each. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], log_scaling [N,6]."""
 
     config: GraphPoints
+    voxel: float
     grid: Grid
     alpha: nn.Parameter
     beta: nn.Parameter
