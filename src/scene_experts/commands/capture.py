@@ -1,4 +1,4 @@
-"""`scene-experts capture`: photographs or a video to a capture that `train` takes."""
+"""`scene-experts capture`: photographs or a video to a capture for `train`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scene_experts.core.errors import few
 from scene_experts.core.signals import handled
 from scene_experts.sfm.options import Options
 
-FEW = 0.9  # a smaller share of photographs with a pose is worth a word of advice
+FEW = 0.9  # a smaller share of photographs with a pose gets a warning
 
 
 @dataclass(frozen=True)
@@ -47,32 +47,32 @@ def capture(args: list[str]) -> int:
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
     with handled(interrupt), ProgressBar(console) as bar:
         note = reconstruct(command.photos, command.out, command.options, overwrite=command.overwrite, say=say, progress=bar)
-    for line in told(note):
+    for line in summarise(note):
         say(line)
     say(f"next: {PROG} train moe-gs --data {shlex.quote(str(command.out))} --out RUN")
     return 0
 
 
 def interrupt(*_: object) -> None:
-    """SIGTERM and a closed terminal end the work as Ctrl-C does: COLMAP's process with it."""
+    """Handle SIGTERM and a closed terminal like Ctrl-C, which also ends the process of COLMAP."""
     raise KeyboardInterrupt
 
 
-def told(note: dict[str, Any]) -> list[str]:
-    """What was found, and what to do where it is little."""
+def summarise(note: dict[str, Any]) -> list[str]:
+    """Lines about the result, with advice if few photographs have a pose."""
     from scene_experts.training.progress import format_duration
 
     have, all_, without = note["with_pose"], note["photographs"], note["without_pose"]
     lines = [
-        f"{have} of {all_} photographs have a pose: {note['points']:,} points, {note['observations']:.0f} seen in a photograph, "
-        f"{note['error']:.2f} px off on average; {note['mapper']} mapper, {format_duration(note['seconds'])} min"
+        f"{have} of {all_} photographs have a pose: {note['points']:,} points, {note['observations']:.0f} points per photograph, "
+        f"mean error {note['error']:.2f} px, {note['mapper']} mapper, {format_duration(note['seconds'])} min"
     ]
     if without:
-        lines.append(f"without a pose: {few(without, 8)}")
+        lines.append(f"photographs without a pose: {few(without, 8)}")
     if note["apart"]:
         parts = ", ".join(map(str, note["apart"]))
-        lines.append(f"warning: {parts} of these fit together, but not with the others: take photographs in between")
+        lines.append(f"warning: {parts} of these fit together, but not with the others; add photographs that connect them")
     if have < FEW * all_:
-        more = "" if note["all_compared"] else "; --matching exhaustive --overwrite may find more"
-        lines.append(f"warning: each thing should be in three photographs or more, from different places and sharp{more}")
+        more = "" if note["all_compared"] else "; --matching exhaustive --overwrite may find more poses"
+        lines.append(f"warning: every part of the scene should be sharp in at least three photographs from different positions{more}")
     return lines

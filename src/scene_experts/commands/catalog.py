@@ -1,4 +1,4 @@
-"""`scene-experts download` and `catalog`: the captures of the paper."""
+"""`scene-experts download` and `catalog`: the scenes of the paper."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.data.fetch.catalog import COLLECTIONS, SCENES, CatalogScene, select
 from scene_experts.data.fetch.obtain import captures_dir, is_present, obtain
 
-SAY_EVERY = 15.0  # seconds between lines where there is no terminal
+SAY_EVERY = 15.0  # seconds between lines, without a terminal
 
 
 @dataclass(frozen=True)
@@ -48,16 +48,16 @@ def download(args: list[str]) -> int:
         console.print(table(scenes or SCENES, root))
         return 0
     if not scenes:
-        raise InputError(f"expected scenes to download, found none; name some of those that `{PROG} catalog` lists")
-    with Told(console) as told:
-        obtain(scenes, root, mirrors=command.mirror, keep=command.keep_archives, say=told.say, progress=told)
+        raise InputError(f"expected SCENE, found none; name scenes to download (`{PROG} catalog` lists them)")
+    with DownloadBar(console) as bar:
+        obtain(scenes, root, mirrors=command.mirror, keep=command.keep_archives, say=bar.say, progress=bar)
     for scene in scenes:
         console.print(f"next: {PROG} train moe-gs {flags(scene, command.to)} --out RUN", markup=False)
     return 0
 
 
 def flags(scene: CatalogScene, to: Path | None) -> str:
-    """How `train` is told to read a scene by the paper's protocol."""
+    """The options of `train` that follow the paper's protocol for a scene."""
     if to is None:
         return f"--data catalog:{scene.name}"
     from scene_experts.training.config import Train, flags_of
@@ -84,17 +84,17 @@ def catalog(args: list[str]) -> int:
         console.print(table(SCENES, root))
         for one in COLLECTIONS:
             console.print(f"{one.key}: {one.archive.name} ({one.archive.size}); licence: {one.licence}", markup=False)
-        console.print(f"captures lie in {root}", markup=False)
+        console.print(f"folder of the scenes: {root}", markup=False)
     for scene in scenes:
-        for line in described(scene, root):
+        for line in describe(scene, root):
             console.print(line, markup=False)
     return 0
 
 
 def table(scenes: tuple[CatalogScene, ...] | list[CatalogScene], root: Path) -> Table:
-    """One row a scene."""
+    """A table with a row per scene."""
     out = Table(box=None, pad_edge=False)
-    for name in ("scene", "data set", "archive", "views", "resolution", "split", "here"):
+    for name in ("scene", "data set", "archive", "views", "resolution", "split", "downloaded"):
         out.add_column(name, no_wrap=True)
     for s in scenes:
         views = "" if s.views is None else str(s.views)
@@ -103,8 +103,8 @@ def table(scenes: tuple[CatalogScene, ...] | list[CatalogScene], root: Path) -> 
     return out
 
 
-def described(scene: CatalogScene, root: Path) -> list[str]:
-    """Everything about a scene, and how to get it by hand."""
+def describe(scene: CatalogScene, root: Path) -> list[str]:
+    """The lines that describe a scene, with the steps to download it by hand."""
     from scene_experts.training.config import flag
 
     c, a = scene.collection, scene.collection.archive
@@ -114,34 +114,34 @@ def described(scene: CatalogScene, root: Path) -> list[str]:
         f"  licence     {c.licence}",
         f"  archive     {a.name}, {a.size}, from {a.page}" + (f" ({a.notes})" if a.notes else ""),
         *(f"  address     {url}" for url in a.urls),
-        f"  SHA-256     {a.sha256 or 'not published; the first download is kept for comparison'}",
-        f"  in it       {' or '.join(scene.inside)}",
+        f"  SHA-256     {a.sha256 or 'not published; later downloads are compared with the first'}",
+        f"  inside      {' or '.join(scene.inside)}",
         f"  protocol    --resolution {scene.resolution} --split {scene.split}" + (f"; others use {scene.also}" if scene.also else ""),
-        f"              --normalise none and, in recipes that have them, {numbers}",
-        f"  views       {scene.views or 'not known here'}",
-        f"  place       {root / scene.path}" + (" (here)" if is_present(root, scene) else " (not here)"),
+        f"              --normalise none, and {numbers} for recipes with these options",
+        f"  views       {scene.views or 'unknown'}",
+        f"  folder      {root / scene.path}" + (" (downloaded)" if is_present(root, scene) else " (not downloaded)"),
     ]
     if not is_present(root, scene):
-        lines.append(f"  by hand     put {a.name} at {root / 'archives' / a.name} and run `{PROG} download {scene.name}`,")
-        lines.append(f"              or put the scene's images and sparse/0 into {root / scene.path}")
+        lines.append(f"  by hand     save {a.name} as {root / 'archives' / a.name} and run `{PROG} download {scene.name}`,")
+        lines.append(f"              or copy the scene's images and sparse/0 to {root / scene.path}")
     return lines
 
 
-class Told:
-    """Shows a download: a bar on a terminal, a line now and then elsewhere."""
+class DownloadBar:
+    """Shows the progress of a download: a bar on a terminal, otherwise a line every SAY_EVERY seconds."""
 
     console: Console
-    said: float
+    last: float
     bar: Progress | None
     task: TaskID | None
 
     def __init__(self, console: Console) -> None:
-        self.console, self.said = console, time.monotonic()
+        self.console, self.last = console, time.monotonic()
         columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
         self.bar = Progress(*columns, console=console, transient=True) if console.is_terminal else None
         self.task = self.bar.add_task("", total=None) if self.bar else None
 
-    def __enter__(self) -> Told:
+    def __enter__(self) -> DownloadBar:
         if self.bar:
             self.bar.start()
         return self
@@ -156,6 +156,6 @@ class Told:
     def __call__(self, what: str, done: int, total: int) -> None:
         if self.bar and self.task is not None:
             self.bar.update(self.task, description=what, completed=done, total=total or None)
-        elif time.monotonic() - self.said > SAY_EVERY:
-            self.said = time.monotonic()
+        elif time.monotonic() - self.last > SAY_EVERY:
+            self.last = time.monotonic()
             self.say(f"{what}: {done / 1e6:,.0f} of {f'{total / 1e6:,.0f}' if total else '?'} MB")

@@ -1,4 +1,4 @@
-"""Says which backends work on this machine, why the others do not, and what to install."""
+"""Checks which backends work on this machine, why the others do not, and what to install."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ class Check:
 
     name: str
     ok: bool
-    found: str  # version, level, or why it is absent
-    fix: str = ""  # what to install or run; empty where nothing is missing
-    needed: bool = False  # nothing can be trained without it
+    found: str  # version, level, or why it is missing
+    fix: str = ""  # what to install or run; empty if nothing is missing
+    needed: bool = False  # required for training
 
 
 def diagnose() -> list[Check]:
-    """Look at everything the package can use. Nothing is installed, downloaded or changed, and no check raises."""
+    """Run all checks. They install, download and change nothing, and raise no exception."""
     checks = (python, pytorch, cuda, native_library, gsplat, triton, machine, memory, lpips, viewer, sfm, tensorboard)
     return [_guarded(check) for check in checks]
 
 
 def run(console: Console) -> int:
-    """Print the report; returns the exit code: 0 where a capture can be trained here, else 1."""
+    """Print the report and return the exit code: 0 if training is possible on this machine, else 1."""
     checks = diagnose()
     console.print(render(checks), markup=False, soft_wrap=True)
     return exit_code(checks)
 
 
 def exit_code(checks: list[Check]) -> int:
-    """0 where everything that training needs is here, else 1."""
+    """0 if everything that training requires is there, else 1."""
     return 0 if all(check.ok for check in checks if check.needed) else 1
 
 
 def render(checks: list[Check]) -> str:
-    """The report as plain text: one line per check, what to do about an absent part below it, and a verdict."""
+    """The report as plain text: a line per check, with advice below it if something is missing, and a conclusion."""
     width = max(len(check.name) for check in checks)
     lines = []
     for check in checks:
@@ -61,15 +61,15 @@ def render(checks: list[Check]) -> str:
 
 
 def verdict(checks: list[Check]) -> str:
-    """One sentence: what a training would run on."""
+    """One sentence: the backend that a training would use."""
     if exit_code(checks):
-        return "A capture cannot be trained here yet: mend what is MISSING above."
+        return "Training is not possible yet: fix what is MISSING above."
     by_name = {check.name: check for check in checks}
     if by_name["CUDA"].ok and by_name["gsplat"].ok:
         return "Ready: training runs on CUDA through gsplat."
     if by_name["CPU library"].ok:
         return "Ready: training runs on the CPU with the compiled library."
-    return "Ready, but slow: training runs in plain torch, tens of times slower than with the compiled CPU library."
+    return "Ready, but slow: training runs in plain PyTorch, tens of times slower than with the compiled CPU library."
 
 
 def python() -> Check:
@@ -89,8 +89,8 @@ def cuda() -> Check:
         return Check("CUDA", True, "; ".join(f"{p.name}, {p.total_memory / 2**30:.0f} GiB" for p in names))
     if torch.version.cuda is None and torch.version.hip is None:
         fix = f"only for an NVIDIA GPU: install a CUDA build of torch {torch.__version__.split('+')[0]}"
-        return Check("CUDA", False, "this torch is built without it", fix)
-    found = f"torch is built for CUDA {torch.version.cuda} but finds no device"
+        return Check("CUDA", False, "this build of torch does not support it", fix)
+    found = f"torch supports CUDA {torch.version.cuda}, but finds no device"
     return Check("CUDA", False, found, "check the NVIDIA driver with nvidia-smi")
 
 
@@ -99,7 +99,7 @@ def native_library() -> Check:
     if reason is None:
         return Check("CPU library", True, f"{native.load().level}, up to {native.count_threads()} threads")  # type: ignore[union-attr]
     why, _, fix = reason.partition(": ")
-    return Check("CPU library", False, f"{why}; the slow torch reference is used instead", fix)
+    return Check("CPU library", False, f"{why}; the slow PyTorch reference is used instead", fix)
 
 
 def gsplat() -> Check:
@@ -117,7 +117,7 @@ def gsplat() -> Check:
     except Exception as error:  # a broken compiled extension may raise anything when imported
         reason = f"{type(error).__name__}: {error}"
     found = version if reason is None else f"{version}: {reason}"
-    return Check("gsplat", reason is None, found, "install it again for this torch and CUDA")
+    return Check("gsplat", reason is None, found, "reinstall it for this version of torch and CUDA")
 
 
 def triton() -> Check:
@@ -128,7 +128,7 @@ def triton() -> Check:
 
     reason = triton_decode.available()
     why, _, fix = (reason or "").partition(": ")
-    return Check("triton", reason is None, version or "unknown" if reason is None else f"{why}; anchors are decoded in plain torch", fix)
+    return Check("triton", reason is None, version or "unknown" if reason is None else f"{why}; anchors are decoded in plain PyTorch", fix)
 
 
 def machine() -> Check:
@@ -142,7 +142,7 @@ def memory() -> Check:
     free = available_bytes()
     if free is None:
         return Check("memory", True, "unknown")
-    fix = "less than 2 GiB is free: train at a lower --resolution, or cap growth with --max-memory"
+    fix = "less than 2 GiB is free: train at a lower --resolution, or limit densification with --max-memory"
     return Check("memory", free >= 2 * 2**30, f"{free / 2**30:.1f} GiB free", fix)
 
 
@@ -157,11 +157,11 @@ def lpips() -> Check:
 
 
 def viewer() -> Check:
-    return _package("viser", "viewer", "scenes in a browser: view, train --viewer")
+    return _package("viser", "viewer", "view and train --viewer")
 
 
 def sfm() -> Check:
-    return _package("pycolmap", "sfm", "poses of photographs: capture")
+    return _package("pycolmap", "sfm", "capture")
 
 
 def tensorboard() -> Check:
@@ -169,11 +169,11 @@ def tensorboard() -> Check:
 
 
 def _package(name: str, extra: str, purpose: str) -> Check:
-    """An optional package, looked up without importing it: pycolmap corrupts the heap of a process that also uses Pillow."""
+    """Check an optional package without importing it: pycolmap corrupts the heap of a process that also uses Pillow."""
     version = _version(name)
     if version is not None:
         return Check(name, True, version)
-    return Check(name, False, f"not installed (only for {purpose})", f"pip install 'scene-experts[{extra}]'; {PIN}")
+    return Check(name, False, f"not installed (needed for {purpose})", f"pip install 'scene-experts[{extra}]'; {PIN}")
 
 
 def _version(name: str) -> str | None:
@@ -188,5 +188,5 @@ def _version(name: str) -> str | None:
 def _guarded(check: Callable[[], Check]) -> Check:
     try:
         return check()
-    except Exception as error:  # the report must reach the user whatever is broken here
+    except Exception as error:  # the report must appear whatever is broken
         return Check(check.__name__.replace("_", " "), False, f"the check itself failed: {type(error).__name__}: {error}", "report this")

@@ -1,4 +1,4 @@
-"""`scene-experts train`: flags to a training, its events to the terminal and the run folder."""
+"""`scene-experts train`: reads the options, trains and shows the events on the terminal."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def train(args: list[str]) -> int:
         check_port(command.port)
         import_viser()  # reports a missing package before anything is read
     command = replace(command, data=run_folder.named(command.data))
-    line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # the command that makes the whole run
+    line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # the command of the whole run
     run = run_of(command, line)
     recording.check_settings(run)
     reuse_freed()
@@ -225,5 +225,5 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
     if exported:
         console.print(f"next: {shlex.join([PROG, 'eval', str(command.out)])}", soft_wrap=True)
     else:
-        console.print("nothing was left to train: the run's files stay as they are", soft_wrap=True)
+        console.print("the training was already complete; the files of the run are unchanged", soft_wrap=True)
     return 0

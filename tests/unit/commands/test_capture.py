@@ -1,7 +1,7 @@
 """`scene-experts capture`: its words and its refusals."""
 
 from scene_experts import cli
-from scene_experts.commands.capture import told
+from scene_experts.commands.capture import summarise
 from support.photos import fake_worker, write_black
 
 NOTE = {
@@ -19,9 +19,9 @@ NOTE = {
 
 
 def test_what_was_found_and_what_to_do():
-    (line,) = told(NOTE)
+    (line,) = summarise(NOTE)
     assert all(fact in line for fact in ("3 of 3", "1,200", "400", "0.51 px", "global", "1:01"))
-    few = told({**NOTE, "photographs": 30, "without_pose": [f"{i}.jpg" for i in range(27)], "apart": [2], "all_compared": False})
+    few = summarise({**NOTE, "photographs": 30, "without_pose": [f"{i}.jpg" for i in range(27)], "apart": [2], "all_compared": False})
     assert "0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, 5.jpg, 6.jpg, 7.jpg" in few[1] and "19" in few[1] and "8.jpg" not in few[1]
     assert "2" in few[2] and "--matching exhaustive --overwrite" in few[3]
 

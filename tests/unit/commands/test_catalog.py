@@ -76,7 +76,7 @@ def test_the_table_and_the_particulars(captures: Path, capsys: pytest.CaptureFix
     assert cli.main(["catalog", "quebec", "truck"]) == 0
     out = capsys.readouterr().out
     assert str(captures / "archives" / "bungeenerf.tar.gz") in out and "scene-experts download quebec" in out
-    assert "(here)" in out and "816e62f2" in out and "first:31" in out
+    assert "(downloaded)" in out and "816e62f2" in out and "first:31" in out
     assert cli.main(["download", "--list", "db"]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["scene", "drjohnson", "playroom"]
 
@@ -93,12 +93,12 @@ def test_bad_words(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_progress_with_and_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "SAY_EVERY", -1.0)
     plain = Console(file=io.StringIO(), width=120)
-    with command.Told(plain) as told:
+    with command.DownloadBar(plain) as told:
         told("360_v2.zip", 5_000_000, 0)
         told("360_v2.zip", 5_000_000, 10_000_000)
     assert plain.file.getvalue().splitlines() == ["360_v2.zip: 5 of ? MB", "360_v2.zip: 5 of 10 MB"]
     screen = Console(file=io.StringIO(), force_terminal=True, width=120, highlight=False)
-    with command.Told(screen) as told:
+    with command.DownloadBar(screen) as told:
         told("unpacking truck", 5, 10)
         told.say("a [word] as it is")
     assert "unpacking truck" in screen.file.getvalue() and "a [word] as it is" in screen.file.getvalue()
