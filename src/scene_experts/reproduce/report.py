@@ -58,11 +58,12 @@ def caveat(records: Sequence[Record]) -> list[str]:
     if length >= SCHEDULE:
         return []
     counts = {tables.densifications(r.config.train) for r in records if r.config.train.iterations == length}
-    made = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
+    made = tables.count_range(counts)
     meaning = "An undecided or contradicted claim may hold in longer trainings."
     if length < SHORT:
         meaning = "Too little is learnt by then: **these verdicts say nothing about the paper**."
-    size = f"{length:,} iterations with {made} densification steps, not {SCHEDULE:,} with 134 (Scaffold-GS)"
+    steps = f" with {made} densification steps" if made else ""
+    size = f"{length:,} iterations{steps}, not {SCHEDULE:,} with 134 (Scaffold-GS)"
     return [f"The verdicts are from trainings of {size}. {meaning}", ""]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from scene_experts.evaluate.tables import ResultTable, load_paper, to_markdown
@@ -142,13 +142,12 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
     records = [r for rows in found.values() for r in rows]
     if not records:
         return ("No run of this table is finished.",)
-    lengths: dict[int, set[int]] = {}
+    lengths: dict[int, set[int | None]] = {}
     for r in records:
         lengths.setdefault(r.config.train.iterations, set()).add(densifications(r.config.train))
     sizes = sorted({r.config.data.resolution for r in records})
     seeds = sorted({r.seed for r in records})
-    between = {n: " to ".join(str(m) for m in sorted({min(many), max(many)})) for n, many in lengths.items()}
-    made = ", ".join(f"{n:,} iterations ({many} densification steps)" for n, many in sorted(between.items()))
+    made = ", ".join(f"{n:,} iterations{bracketed(counts)}" for n, counts in sorted(lengths.items()))
     out = [f"{made}; resolution {', '.join(sizes)}; seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}."]
     for name, rows in found.items():
         whole = sorted(complete_seeds(rows))
@@ -183,9 +182,20 @@ def time_notes(records: Sequence[Record]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def densifications(train: Train) -> int:
+def densifications(train: Train) -> int | None:
     """Return the number of densification steps. Shorter trainings densify at the same interval, so less often in total."""
-    return train.scaled().growth.adjust.count(train.iterations)
+    return train.scaled().growth.count_steps(train.iterations)
+
+
+def count_range(counts: Iterable[int | None]) -> str:
+    """Write the numbers of densification steps as "13" or "13 to 17"; empty where a growth rule does not say."""
+    known = [n for n in counts if n is not None]
+    return " to ".join(str(n) for n in sorted({min(known), max(known)})) if known else ""
+
+
+def bracketed(counts: Iterable[int | None]) -> str:
+    """Write the numbers of densification steps in brackets, or nothing."""
+    return f" ({text} densification steps)" if (text := count_range(counts)) else ""
 
 
 def to_latex(table: ResultTable, caption: str) -> str:

@@ -41,6 +41,10 @@ class Strategy(Part, Generic[S], ABC):
     enabled: bool = True
     """Whether rows are added and removed at all."""
 
+    def count_steps(self, iterations: int) -> int | None:
+        """How often the rule densifies in a training of `iterations`; None where it does not say."""
+        return None
+
     def observe(self, scene: S, decoded: Decoded, render: Render, step: int) -> None:
         """Count one view. By default nothing is counted."""
 

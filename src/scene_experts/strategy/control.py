@@ -43,6 +43,10 @@ class AnchorControl(Strategy[L]):
         """The same in a training `factor` times as long: windows scale; interval, gates and thresholds stay."""
         return replace(self, start_stat=round(self.start_stat * factor), adjust=self.adjust.scaled(factor))
 
+    def count_steps(self, iterations: int) -> int:
+        """How often rows are added and removed in a training of `iterations`."""
+        return self.adjust.count(iterations)
+
     def check(self) -> None:
         """Raises InputError, naming the flag, for invalid settings."""
         expect_at_least([("--growth.adjust.interval", self.adjust.interval, 1), ("--growth.max-anchors", self.max_anchors, 0)])

@@ -47,6 +47,10 @@ class MCMC(Strategy[GaussianScene]):
         """The same in a training `factor` times as long: the window scales; the interval stays."""
         return replace(self, adjust=self.adjust.scaled(factor))
 
+    def count_steps(self, iterations: int) -> int:
+        """How often rows are added and removed in a training of `iterations`."""
+        return self.adjust.count(iterations)
+
     def check(self) -> None:
         """Raises InputError, naming the flag, for invalid settings."""
         expect_at_least(

@@ -57,6 +57,10 @@ class SplitClone(Strategy[GaussianScene]):
         reset = replace(self.reset.scaled(factor), interval=max(1, least, round(self.reset.interval * factor)))
         return replace(self, adjust=self.adjust.scaled(factor), reset=reset)
 
+    def count_steps(self, iterations: int) -> int:
+        """How often rows are added and removed in a training of `iterations`."""
+        return self.adjust.count(iterations)
+
     def check(self) -> None:
         """Raises InputError, naming the flag, for invalid settings."""
         intervals = [("--growth.adjust.interval", self.adjust.interval, 1), ("--growth.reset.interval", self.reset.interval, 1)]

@@ -1,7 +1,17 @@
 """Tables: ours beside the paper's, spreads, best cells, notes; LaTeX that escapes."""
 
 from scene_experts.reproduce.experiments import EXPERIMENTS
-from scene_experts.reproduce.tables import COLUMNS, by_dataset, by_scene, escape, expert_shares, paper_numbers, to_latex, write_all
+from scene_experts.reproduce.tables import (
+    COLUMNS,
+    by_dataset,
+    by_scene,
+    count_range,
+    escape,
+    expert_shares,
+    paper_numbers,
+    to_latex,
+    write_all,
+)
 from support.records import record
 
 TABLE4, TABLE3 = EXPERIMENTS["table4"], EXPERIMENTS["table3"]
@@ -98,3 +108,7 @@ def test_table_1_has_the_cpu_time_beside_the_paper_s_columns_where_every_record_
     assert table.titles[5:7] == ("training, CPU s", "PSNR (paper)") and len(table.rows[0]) == len(table.titles)
     assert table.rows[list(table1.rows).index("MoE-GS")][5] == "150"
     assert "training, CPU s" not in by_dataset(table1, [*new, record("3dgs", "truck")], "TanksAndTemples", ["truck"]).titles
+
+
+def test_a_growth_rule_that_does_not_say_how_often_it_acts():
+    assert count_range([17, None, 13]) == "13 to 17" and count_range([13]) == "13" and count_range([None]) == ""
