@@ -26,7 +26,9 @@ def test_runs_tables_and_figures_and_nothing_twice(tmp_path, capsys):
     here = ["--out", str(tmp_path / "out")]
     assert cli.main(["reproduce", "fig3", *args, *here]) == 0
     first = capsys.readouterr().out
-    assert "2 runs" in first and len(store.load(tmp_path / "out" / "records")) == 2
+    records = store.load(tmp_path / "out" / "records")
+    assert "2 runs" in first and len(records) == 2
+    assert all(r.results["cpu_seconds"] > 0 and r.results["load"].keys() == {"cores", "start", "end"} for r in records)
     assert (tmp_path / "out" / "fig3_box.png").is_file() and (tmp_path / "out" / "README.md").is_file()
     assert cli.main(["reproduce", "fig3", "fig5", *args, *here]) == 0
     assert len(store.load(tmp_path / "out" / "records")) == 2 and (tmp_path / "out" / "fig5_box.png").is_file()
