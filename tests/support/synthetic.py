@@ -1,8 +1,9 @@
-"""A coloured capture made in code: photo-consistent views of a known scene, with everything that hides faults when it is absent.
+"""Writes synthetic captures: photo-consistent views of a known scene.
 
-The scene (z up, about 4 units wide) is a square floor with a smooth texture, a red, a green and a blue ball and a yellow box, ray-cast
-exactly with 4x4 samples a pixel. Colour depends on the place alone. Principal points are off centre, views differ in size and shape, red,
-green and blue are far apart and no axis is symmetric, so that a swapped channel, a centred principal point or a mixed-up size shows.
+The scene (z up, about 4 units wide) is a square floor with a smooth texture, a red, a green and a blue ball, and a yellow box. It is
+ray-cast exactly with 4x4 samples per pixel, and colour depends only on the position. Principal points are off centre, views differ in
+size and shape, the colours are distinct and no axis is symmetric. A swapped channel, a centred principal point or a wrong size therefore
+changes the pictures.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _HALF = 2.0  # half the floor's side
 
 @dataclass(frozen=True)
 class Synthetic:
-    """What was written and what it shows."""
+    """A capture that was written, and the scene that it shows."""
 
     folder: Path
     model: Model  # cameras, poses and points as written
@@ -41,12 +42,12 @@ class Synthetic:
     background: tuple[float, float, float]
 
     def picture(self, lens: Lens, world_to_cam: Array, samples: int = 4) -> Array:
-        """The true picture [H, W, 3] in [0, 1] of any camera given in the capture's own units."""
+        """Return the true picture [H, W, 3] in [0, 1] of a camera in the capture's own units."""
         return picture(lens, world_to_cam, self.scale, self.background, samples)
 
 
 def colours(xyz: Array) -> Array:
-    """Colour [..., 3] in (0, 1) of the surface at scene points [..., 3] (unscaled): each takes that of the nearest surface."""
+    """Return the colour [..., 3] in (0, 1) of the surface nearest to scene points [..., 3] (unscaled)."""
     surfaces = [np.abs(xyz[..., 2])]
     x, y = xyz[..., 0], xyz[..., 1]
     floor = np.stack((0.5 + 0.4 * np.sin(2.1 * x + 0.5), 0.45 + 0.35 * np.sin(1.7 * y - 0.8), 0.35 + 0.25 * np.sin(1.3 * (x + y))), -1)
@@ -66,7 +67,7 @@ def colours(xyz: Array) -> Array:
 
 
 def hits(origin: Array, rays: Array) -> Array:
-    """Distance along `rays` [..., 3] from `origin` [3] to the scene, inf where it is missed."""
+    """Return the distance along `rays` [..., 3] from `origin` [3] to the scene, or inf if a ray misses it."""
     with np.errstate(divide="ignore", invalid="ignore"):
         t = -origin[2] / rays[..., 2]
         at = origin[:2] + t[..., None] * rays[..., :2]
@@ -84,7 +85,7 @@ def hits(origin: Array, rays: Array) -> Array:
 
 
 def picture(lens: Lens, world_to_cam: Array, scale: float, background: tuple[float, float, float], samples: int = 4) -> Array:
-    """Ray-cast the scene through `lens` (distorted or not): [H, W, 3] in [0, 1]."""
+    """Ray-cast the scene through `lens`, which may be distorted, to a picture [H, W, 3] in [0, 1]."""
     offsets = (np.arange(samples) + 0.5) / samples
     x = (np.arange(lens.width)[:, None] + offsets).ravel()
     y = (np.arange(lens.height)[:, None] + offsets).ravel()
@@ -102,7 +103,7 @@ def picture(lens: Lens, world_to_cam: Array, scale: float, background: tuple[flo
 
 
 def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
-    """World to camera [4, 4], OpenCV axes, z of the world up, rolled by `roll` radians."""
+    """Return a world-to-camera matrix [4, 4] with OpenCV axes, z of the world up, rolled by `roll` radians."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -115,7 +116,7 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
 
 
 def quaternion(R: Array) -> tuple[float, float, float, float]:
-    """(w, x, y, z) of a rotation matrix, as the leading eigenvector of Bar-Itzhack's symmetric matrix."""
+    """Return (w, x, y, z) of a rotation matrix, the leading eigenvector of Bar-Itzhack's symmetric matrix."""
     (a, b, c), (d, e, f), (g, h, i) = R
     K = np.array([[a - e - i, 0, 0, 0], [b + d, e - a - i, 0, 0], [c + g, f + h, i - a - e, 0], [h - f, c - g, d - b, a + e + i]]) / 3
     x, y, z, w = np.linalg.eigh(K)[1][:, -1]
@@ -123,7 +124,7 @@ def quaternion(R: Array) -> tuple[float, float, float, float]:
 
 
 def lenses(size: tuple[int, int], mixed_sizes: bool, principal_point_offset: bool, distortion: Lens | None) -> list[Lens]:
-    """One lens, or three of different sizes (one upright); `distortion` lends its model and coefficients."""
+    """Return one lens, or three of different sizes (one upright), with the model and coefficients of `distortion`."""
     w, h = size
     sizes = [(w, h), (w * 5 // 6, h * 9 // 8), (h, w)] if mixed_sizes else [(w, h)]
     out = []
@@ -152,9 +153,9 @@ def make_capture(
     text: bool = False,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Synthetic:
-    """Write a COLMAP capture to `folder`: images/*.png, sparse/0/*.bin (or .txt), and return the truth.
+    """Write a COLMAP capture to `folder`: images/*.png and sparse/0/*.bin (or .txt), and return the ground truth.
 
-    scale: the capture's unit, the scene is that many times larger.  background: load the capture with the same one.
+    scale: Factor by which the scene is enlarged. background: Colour behind the scene; load the capture with the same one.
     """
     rng = np.random.default_rng(seed)
     kinds = lenses(size, mixed_sizes, principal_point_offset, distortion)
@@ -183,7 +184,7 @@ def make_capture(
 
 
 def surface_points(count: int, rng: np.random.Generator) -> Array:
-    """Points on the visible surfaces [count, 3], unscaled, spread about evenly by area."""
+    """Return points [count, 3] on the visible surfaces, unscaled and spread about evenly by area."""
     areas = [16.0, *(4 * np.pi * radius**2 for _, radius, _ in _BALLS), 2.0]
     share = rng.choice(len(areas), count, p=np.array(areas) / sum(areas))
     out = np.concatenate((rng.uniform(-_HALF, _HALF, (count, 2)), np.zeros((count, 1))), 1)
@@ -200,14 +201,14 @@ def surface_points(count: int, rng: np.random.Generator) -> Array:
 
 
 def opengl(world_to_cam: Array) -> list[list[float]]:
-    """Camera to world with OpenGL axes, as transforms*.json wants it."""
+    """Return the camera-to-world matrix with OpenGL axes, as in transforms*.json."""
     pose = np.linalg.inv(world_to_cam)
     pose[:3, 1:3] *= -1
     return pose.tolist()
 
 
 def make_nerfstudio(folder: Path, **options: object) -> Synthetic:
-    """The same capture as transforms.json with intrinsics for every frame, and its points in a PLY file."""
+    """Write the same capture as transforms.json with intrinsics for every frame, and its points as a PLY file."""
     made = make_capture(folder, **options)  # pyright: ignore[reportArgumentType]
     frames = []
     for image in made.model.images:
@@ -227,7 +228,7 @@ def make_nerfstudio(folder: Path, **options: object) -> Synthetic:
 
 
 def make_blender(folder: Path, views: int = 6, size: int = 64, seed: int = 0) -> Synthetic:
-    """A NeRF-synthetic capture: square RGBA pictures, transparent where the scene is missed; every third is a test view."""
+    """Write a NeRF-synthetic capture: square RGBA pictures that are transparent where rays miss the scene. Every third is a test view."""
     made = make_capture(folder, views, (size, size), seed, mixed_sizes=False, principal_point_offset=False)
     width = 2 * np.arctan(0.5 * size / made.model.cameras[1].fx)
     lens = Lens("SIMPLE_PINHOLE", size, size, (made.model.cameras[1].fx, size / 2, size / 2))

@@ -70,7 +70,7 @@ def serving(viewer):
 
 
 def joined(viewer, number=0) -> Handle:
-    """Connect a client that wants its full picture at once."""
+    """Connect a client that gets its full picture immediately."""
     handle = Handle(number)
     viewer.connect(handle)
     viewer.clients[number].moved = viewer.clients[number].arriving = 0.0

@@ -187,7 +187,7 @@ def test_transforms(case, text, tmp_path, capsys):
     as_recorded(case, sentence, tmp_path)
 
 
-def test_paths_that_are_no_captures(made, tmp_path, capsys):
+def test_paths_without_a_capture(made, tmp_path, capsys):
     (tmp_path / "file").write_text("x")
     (tmp_path / "empty").mkdir()
     for case, path in (("capture is a file", "file"), ("capture is absent", "absent"), ("capture is empty", "empty")):

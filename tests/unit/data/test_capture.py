@@ -1,4 +1,4 @@
-"""Loading whole captures: what is detected, how it is normalised, and every bad input."""
+"""Loading whole captures: detection, normalisation, resizing, and every kind of unusable input."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_parts_of_a_capture(made: Synthetic) -> None:
     np.testing.assert_array_equal(capture.points.rgb, made.model.rgb)
 
 
-def test_principal_points_are_honoured_or_centred_on_request(made: Synthetic) -> None:
+def test_principal_points_are_used_or_centred_on_request(made: Synthetic) -> None:
     camera = load(made.folder).views[0].camera
     assert abs(camera.cx - camera.width / 2) > 4 and abs(camera.cy - camera.height / 2) > 2
     parity = load(made.folder, ignore_principal_point=True).views[0].camera
@@ -67,8 +67,8 @@ def test_the_unit_of_a_capture_does_not_matter(made: Synthetic, tmp_path: Path, 
     assert a.extent == b.extent
 
 
-def test_large_coordinates_lose_nothing(made: Synthetic, copy: Path) -> None:
-    model = read_model(copy / "sparse/0")  # as surveyed: half a million units from the origin
+def test_large_coordinates_lose_no_precision(made: Synthetic, copy: Path) -> None:
+    model = read_model(copy / "sparse/0")  # as in surveyed data: half a million units from the origin
     away = np.array([5e5, 4.2e6, 100.0])
     images = tuple(
         replace(i, translation=tuple(np.array(i.translation) - i.world_to_cam()[:3, :3] @ away))  # type: ignore[arg-type]
@@ -80,7 +80,7 @@ def test_large_coordinates_lose_nothing(made: Synthetic, copy: Path) -> None:
         torch.testing.assert_close(v.camera.world_to_cam, w.camera.world_to_cam, atol=1e-5, rtol=1e-5)
 
 
-def test_distorted_captures_show_the_pinhole_picture(tmp_path: Path) -> None:
+def test_distorted_captures_are_undistorted_to_the_pinhole_picture(tmp_path: Path) -> None:
     made = make_capture(tmp_path, views=3, size=(96, 64), points=50, distortion=LENSES[4])
     capture = load(tmp_path, split="none", normalise="none", resolution="as-is")
     for view in capture.views:
@@ -91,7 +91,7 @@ def test_distorted_captures_show_the_pinhole_picture(tmp_path: Path) -> None:
         assert np.median(error) < 0.006 and error.mean() < 0.03
 
 
-def test_resizing_on_the_fly_shows_the_smaller_pinhole_picture(made: Synthetic) -> None:
+def test_resizing_while_loading_gives_the_smaller_pinhole_picture(made: Synthetic) -> None:
     capture = load(made.folder, resolution="factor:2", normalise="none")
     camera = capture.views[1].camera
     lens = Lens("PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy))
@@ -114,8 +114,8 @@ def test_image_folders_of_another_size(made: Synthetic, copy: Path) -> None:
         load(copy, resolution="inria:4")
 
 
-def test_images_turned_by_exif_follow_the_camera(copy: Path) -> None:
-    """The tool had applied the orientation: the camera is 48x32, the stored pixels 32x48 with a quarter turn in EXIF."""
+def test_images_rotated_by_exif_follow_the_camera(copy: Path) -> None:
+    """The tool applied the orientation: the camera is 48x32, the stored pixels are 32x48 with a quarter turn in EXIF."""
     path = copy / "images/view_000.png"
     upright = np.asarray(Image.open(path))
     exif = Image.Exif()
@@ -180,14 +180,14 @@ def test_no_points(copy: Path) -> None:
     assert capture.points is not None and len(capture.points.xyz) > 1000
 
 
-def test_only_useless_points(copy: Path) -> None:
+def test_only_points_that_are_not_finite(copy: Path) -> None:
     model = read_model(copy / "sparse/0")
     write_model(copy / "sparse/0", replace(model, xyz=np.full_like(model.xyz, np.nan)))
     with pytest.raises(InputError, match="--init random"):
         load(copy)
 
 
-def test_paths_that_are_no_captures(made: Synthetic, tmp_path: Path) -> None:
+def test_paths_without_a_capture(made: Synthetic, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=naming(tmp_path)):
         load(tmp_path / "none")
     with pytest.raises(InputError, match=naming("view_000.png")):

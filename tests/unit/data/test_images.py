@@ -1,4 +1,4 @@
-"""Decoding: sizes, alpha, masks, EXIF, depth of colour, undistortion, bad files."""
+"""Decoding: sizes, alpha, masks, EXIF, colour depth, undistortion, damaged files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def source(path: Path, pixels: np.ndarray, **options: object) -> FrameSource:
     return FrameSource(path, pinhole(w, h), **({"size": (w, h)} | options))  # type: ignore[arg-type]
 
 
-def test_pixels_come_through_untouched(tmp_path: Path) -> None:
+def test_pixels_are_not_changed(tmp_path: Path) -> None:
     pixels = noise(9, 13)
     rgb, mask = decode(source(tmp_path / "a.png", pixels))
     assert rgb.dtype == torch.uint8 and mask is None
@@ -56,7 +56,7 @@ def test_palette_with_transparency_becomes_a_mask(tmp_path: Path) -> None:
     assert mask is not None and mask[1, 1] == 0 and mask.sum() == 255 * 11
 
 
-def test_resizing_is_pillows(tmp_path: Path) -> None:
+def test_resizing_equals_pillows(tmp_path: Path) -> None:
     pixels = noise(40, 60)
     rgb, _ = decode(source(tmp_path / "a.png", pixels, size=(21, 13)))
     np.testing.assert_array_equal(rgb, np.asarray(Image.fromarray(pixels).resize((21, 13), Image.Resampling.BICUBIC)))
@@ -74,7 +74,7 @@ def test_alpha_is_a_mask_or_composited_in_float_and_rounded(tmp_path: Path) -> N
     assert mask is None and np.abs(over.numpy() - expected).max() <= 0.5 + 1e-4
 
 
-def test_an_image_four_pixels_high_is_no_alpha(tmp_path: Path) -> None:  # the fault of the reference codes
+def test_an_image_four_pixels_high_is_not_taken_for_alpha(tmp_path: Path) -> None:  # the reference codes take it for alpha
     _, mask = decode(source(tmp_path / "a.png", noise(4, 6)))
     assert mask is None
 
@@ -91,7 +91,7 @@ def test_mask_files_multiply_with_alpha_and_follow_the_size(tmp_path: Path) -> N
     assert mask is not None and mask.shape == (4, 3) and mask[:, 0].max() == 0 and mask[:, 2].min() == 255
 
 
-def test_exif_is_applied_only_when_asked(tmp_path: Path) -> None:
+def test_exif_is_applied_only_on_request(tmp_path: Path) -> None:
     pixels = noise(10, 16)
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -103,7 +103,7 @@ def test_exif_is_applied_only_when_asked(tmp_path: Path) -> None:
     np.testing.assert_array_equal(rgb, np.rot90(pixels, -1))
     stencil = np.zeros((10, 16), np.uint8)
     stencil[:3] = 255
-    for mask in (stencil, np.ascontiguousarray(np.rot90(stencil, -1))):  # made of the stored pixels, or of the turned ones
+    for mask in (stencil, np.ascontiguousarray(np.rot90(stencil, -1))):  # a mask of the stored pixels, or of the rotated ones
         Image.fromarray(mask).save(tmp_path / "m.png")
         found = decode(FrameSource(tmp_path / "a.png", pinhole(10, 16), (10, 16), mask=tmp_path / "m.png", turn=True))[1]
         np.testing.assert_array_equal(found, np.rot90(stencil, -1))
@@ -125,7 +125,7 @@ def test_undistorted_photograph_is_the_pinhole_picture(tmp_path: Path, lens: Len
     rgb, _ = decode(FrameSource(tmp_path / "a.png", lens, (flat.width, flat.height)))
     truth = picture(flat, pose, 1.0, (0, 0, 0))
     error = np.abs(rgb.numpy() / 255 - truth)
-    assert np.median(error) < 0.004 and error.mean() < 0.02  # edges of objects are blurred a little by the second sampling
+    assert np.median(error) < 0.004 and error.mean() < 0.02  # the second sampling slightly blurs the edges of objects
 
 
 def test_policies() -> None:

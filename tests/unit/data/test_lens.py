@@ -1,4 +1,4 @@
-"""Lenses against pycolmap (in a process of its own) and against their own inverse."""
+"""Lenses against pycolmap, in a process of its own, and against their own inverse."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scene_experts.data.images import FrameSource, decode
 from scene_experts.data.lens import MODELS, Lens, centre_principal_point, to_pinhole
 from support.lenses import IDS, LENSES
 
-# Runs without this project: it must not be imported beside pycolmap.
+# This code runs without the project, which must not be imported in a process with pycolmap.
 ORACLE = """
 import json, sys
 import numpy as np
@@ -38,7 +38,7 @@ print(json.dumps(out))
 
 
 def photo() -> np.ndarray:
-    """A smooth, strongly coloured picture [120, 160, 3]."""
+    """Return a smooth, strongly coloured picture [120, 160, 3]."""
     y, x = np.mgrid[:120, :160] / 20.0
     return np.rint(127 + 120 * np.stack((np.sin(x + 0.3 * y), np.cos(y), np.sin(0.7 * x - y)), -1)).astype(np.uint8)
 
@@ -58,7 +58,7 @@ def oracle(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, 
     return folder, rays, json.loads(done.stdout.splitlines()[-1])
 
 
-def test_every_classic_model_is_there() -> None:
+def test_every_classic_camera_model_is_known() -> None:
     assert [lens.model for lens in LENSES] == list(MODELS)
 
 
@@ -83,7 +83,7 @@ def test_undistorted_camera_and_picture_equal_pycolmap(oracle: tuple[Path, np.nd
     np.testing.assert_allclose(flat.params, theirs, rtol=1e-9)
     rgb, mask = decode(FrameSource(folder / "photo.png", LENSES[index], (flat.width, flat.height)))
     difference = np.abs(rgb.numpy().astype(int) - np.load(folder / f"flat_{index}.npy").astype(int))
-    inner = difference[2:-2, 2:-2]  # at the very edge pycolmap writes black where we continue the border
+    inner = difference[2:-2, 2:-2]  # at the edge pycolmap writes black, and this project repeats the border
     assert inner.max() <= 1
     assert mask is None or float((mask[2:-2, 2:-2] > 0).float().mean()) > 0.999
 
@@ -113,8 +113,8 @@ def test_distorted_only_with_a_coefficient() -> None:
     assert to_pinhole(Lens("SIMPLE_RADIAL", 8, 6, (5, 4, 3, 0))) == Lens("PINHOLE", 8, 6, (5, 5, 4, 3))
 
 
-def test_wide_fisheye_gets_a_bounded_picture() -> None:
-    flat = to_pinhole(Lens("OPENCV_FISHEYE", 200, 200, (60, 60, 100, 100, 0, 0, 0, 0)))  # about 190 degrees across
+def test_a_wide_fisheye_gets_a_bounded_picture() -> None:
+    flat = to_pinhole(Lens("OPENCV_FISHEYE", 200, 200, (60, 60, 100, 100, 0, 0, 0, 0)))  # a field of view of about 190 degrees
     assert 40 <= flat.width <= 400 and 40 <= flat.height <= 400
 
 

@@ -46,7 +46,7 @@ def test_one_photograph_is_not_two_views(tmp_path: Path) -> None:
         ("C:\\photos\\a.png", "photos/a.png"),
     ],
 )
-def test_a_name_leads_out_of_no_folder(name: str, plain: str) -> None:
+def test_a_relative_name_stays_inside_any_folder(name: str, plain: str) -> None:
     assert to_relative_name(name) == plain
 
 
@@ -57,7 +57,7 @@ def test_flattened_folders_when_base_names_are_unique(tmp_path: Path) -> None:
     assert "another folder" in match.warnings[0]
 
 
-def test_nothing_there(tmp_path: Path) -> None:
+def test_an_absent_image_is_reported(tmp_path: Path) -> None:
     match = match_images(tmp_path / "none", ["a.jpg"])
     assert match.absent == ("a.jpg",)
     text = str(absent_error(tmp_path, ["a.jpg", "b.jpg"], match.absent))
@@ -65,7 +65,7 @@ def test_nothing_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mask", ["masks/s/a.jpg", "masks/s/a.jpg.png", "masks/s/a.png", "images/s/a.mask.png", "images/s/a_mask.png"])
-def test_masks_under_every_name(tmp_path: Path, mask: str) -> None:
+def test_masks_are_found_under_every_name(tmp_path: Path, mask: str) -> None:
     touch(tmp_path, "images/s/a.jpg")
     image = tmp_path / "images/s/a.jpg"
     assert find_mask(tmp_path, "s/a.jpg", image) is None

@@ -1,4 +1,4 @@
-"""Pure functions on captures: none changes its argument, each does what it says."""
+"""The preparation of captures: each step against its definition, and none changes its argument."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def same(a: Capture, b: Capture) -> bool:
-    """Equal apart from the frames kept in memory."""
+    """Return whether two captures are equal apart from the cached frames."""
     return (
         [(v.name, v.path, v.camera.id, v.camera.width) for v in a.views] == [(v.name, v.path, v.camera.id, v.camera.width) for v in b.views]
         and all(torch.equal(v.camera.world_to_cam, w.camera.world_to_cam) for v, w in zip(a.views, b.views))
@@ -45,7 +45,7 @@ def test_bad_splits(capture: Capture, split: str) -> None:
         prepare.hold_out(capture, split)
 
 
-def test_subset_renumbers_views_and_keeps_the_split(capture: Capture) -> None:
+def test_selecting_views_renumbers_them_and_keeps_the_split(capture: Capture) -> None:
     held = prepare.hold_out(capture, "mod5")
     out = prepare.select_views(held, [7, 5, 2, 7])
     assert [v.name for v in out.views] == ["view_002.png", "view_005.png", "view_007.png"]
@@ -62,7 +62,7 @@ def test_downscale_keeps_rays(capture: Capture) -> None:
     for before, after in zip(capture.views, out.views):
         a, b = before.camera, after.camera
         assert (b.width, b.height) == (round(a.width / 3), round(a.height / 3))
-        for share in (0.0, 0.25, 1.0):  # the same fraction of the image is the same ray
+        for share in (0.0, 0.25, 1.0):  # the same fraction of the image belongs to the same ray
             assert (share * a.width - a.cx) / a.fx == pytest.approx((share * b.width - b.cx) / b.fx, abs=1e-6)
             assert (share * a.height - a.cy) / a.fy == pytest.approx((share * b.height - b.cy) / b.fy, abs=1e-6)
         assert out.frame(b.id).rgb.shape == (b.height, b.width, 3)
@@ -79,7 +79,7 @@ def test_extent_is_that_of_3dgs(capture: Capture) -> None:
     assert held.views[0].camera.near == pytest.approx(min(0.2, 0.02 * expected))
 
 
-def test_one_place_takes_its_extent_from_the_points(capture: Capture) -> None:
+def test_cameras_at_one_place_take_the_extent_from_the_points(capture: Capture) -> None:
     alone = prepare.select_views(capture, [3])
     eye = prepare.camera_centres(alone.views)[0]
     assert alone.points is not None
@@ -114,12 +114,12 @@ def test_far_and_infinite_points_are_dropped_and_counted(capture: Capture) -> No
     assert "3 of 303 points" in out.warnings[-1]
     assert noisy.points is not None and len(noisy.points.xyz) == 303
     assert prepare.drop_outliers(before) is before
-    for factor in (1e-3, 1e3):  # the rule has no unit
+    for factor in (1e-3, 1e3):  # the rule does not depend on the unit
         scaled = prepare.drop_outliers(prepare.scale(noisy, factor))
         assert scaled.points is not None and len(scaled.points.xyz) == 300
 
 
-def test_lost_cameras_are_dropped_and_counted(capture: Capture) -> None:
+def test_mislocated_cameras_are_dropped_and_counted(capture: Capture) -> None:
     pose = capture.views[4].camera.world_to_cam.clone()
     pose[:3, 3] += 5000
     views = list(capture.views)
@@ -138,7 +138,7 @@ def test_random_points_are_seeded_and_around_the_subject(capture: Capture) -> No
     assert (a.xyz.amin(0) < torch.tensor([-1.0, -1.0, 0.0])).all() and (a.xyz.amax(0) > torch.tensor([1.0, 1.0, 1.0])).all()
 
 
-def test_nothing_changes_its_argument(capture: Capture) -> None:
+def test_no_step_changes_its_argument(capture: Capture) -> None:
     before = replace(capture)
     for step in (
         lambda c: prepare.hold_out(c, "mod8"),

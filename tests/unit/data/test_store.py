@@ -1,4 +1,4 @@
-"""The cache: never over its budget, the same frames whatever the thread does, and a clean end."""
+"""The frame cache: it never exceeds its limit, frames do not depend on the thread, and it ends cleanly."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ def wait(condition: object) -> None:
 
 @pytest.fixture
 def threads() -> Callable[[], int]:
-    """Counts the decoding threads that this test started and that still run."""
+    """Return the number of decoding threads that this test started and that still run."""
     named = lambda: {t for t in threading.enumerate() if t.name == "scene-experts images"}  # noqa: E731
     before = named()
     return lambda: len(named() - before)
 
 
-def test_what_was_used_last_goes_first(tmp_path: Path) -> None:
+def test_the_most_recently_used_frame_is_dropped_first(tmp_path: Path) -> None:
     store = ImageStore(sources(tmp_path, 4), cache_bytes=2 * FRAME)
     a = store.get(0)[0]
     store.get(1)
@@ -66,13 +66,13 @@ def test_what_was_used_last_goes_first(tmp_path: Path) -> None:
         store.get(1)
 
 
-def test_what_comes_next_is_not_dropped(tmp_path: Path) -> None:
+def test_prefetched_frames_are_not_dropped(tmp_path: Path) -> None:
     store = ImageStore(sources(tmp_path, 9), cache_bytes=6 * FRAME)
     store.get(0)
     store.prefetch([3, 1])
     wait(lambda: store.used_bytes == 3 * FRAME)
     for i in (3, 1):
-        (tmp_path / f"{i}.png").unlink()  # they can only come from memory now
+        (tmp_path / f"{i}.png").unlink()  # they can come only from memory now
     for i in (4, 5, 6, 7, 8):
         store.get(i)
     for i in (3, 1):
@@ -80,7 +80,7 @@ def test_what_comes_next_is_not_dropped(tmp_path: Path) -> None:
     store.close()
 
 
-def test_epochs_in_random_order_find_what_the_cache_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_epochs_in_random_order_hit_the_cache_as_often_as_possible(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     decoded = []
     store = ImageStore(sources(tmp_path, 20), cache_bytes=10 * FRAME)
     monkeypatch.setattr("scene_experts.data.store.decode", lambda source: decoded.append(source) or decode(source))
@@ -88,21 +88,21 @@ def test_epochs_in_random_order_find_what_the_cache_holds(tmp_path: Path, monkey
     for _ in range(20):
         for i in rng.permutation(20):
             store.get(int(i))
-    assert len(decoded) < 0.6 * 400  # half is the least that any rule can do
+    assert len(decoded) < 0.6 * 400  # no rule can decode fewer than half
 
 
-def test_without_room_nothing_is_kept_and_all_still_works(tmp_path: Path, threads: Callable[[], int]) -> None:
+def test_a_cache_without_room_keeps_nothing_and_still_works(tmp_path: Path, threads: Callable[[], int]) -> None:
     store = ImageStore(sources(tmp_path, 2), cache_bytes=FRAME - 1)
     store.prefetch([0, 1])
     np.testing.assert_array_equal(store.get(1)[0], truth(1))
     assert store.used_bytes == 0 and threads() == 0
 
 
-def test_prefetched_frames_are_there_and_the_same(tmp_path: Path, threads: Callable[[], int]) -> None:
+def test_prefetched_frames_equal_decoded_frames(tmp_path: Path, threads: Callable[[], int]) -> None:
     store = ImageStore(sources(tmp_path, 6), cache_bytes=100 * FRAME)
     store.prefetch([3, 1, 3])
     wait(lambda: store.used_bytes == 2 * FRAME)
-    (tmp_path / "3.png").unlink()  # it can only come from memory now
+    (tmp_path / "3.png").unlink()  # it can come only from memory now
     np.testing.assert_array_equal(store.get(3)[0], truth(3))
     store.close()
     assert threads() == 0
@@ -131,7 +131,7 @@ def test_a_bad_file_is_reported_by_get_not_by_the_thread(tmp_path: Path) -> None
     store.close()
 
 
-def test_a_forgotten_store_ends_its_thread(tmp_path: Path, threads: Callable[[], int]) -> None:
+def test_a_deleted_store_ends_its_thread(tmp_path: Path, threads: Callable[[], int]) -> None:
     store = ImageStore(sources(tmp_path, 3), cache_bytes=100 * FRAME)
     store.prefetch([0])
     gone = weakref.ref(store)
@@ -179,7 +179,7 @@ def test_available_memory_counts_the_containers_limit_and_its_files_as_free(monk
         return files[str(path)]
 
     monkeypatch.setattr(module, "_read", read)
-    assert available_bytes() == 2**29, "full of files, not full"
+    assert available_bytes() == 2**29, "pages of files count as free"
     del files[f"{group}memory.stat"]
     assert available_bytes() == 0 and ImageStore([]).cache_bytes == 0
     files[f"{group}memory.max"] = "max\n"

@@ -1,4 +1,4 @@
-"""`eval` opens what the run folder says and passes it on."""
+"""`eval` opens the run that it is given and evaluates it with the settings of the run."""
 
 from __future__ import annotations
 

@@ -117,4 +117,4 @@ def test_a_file_for_each_attribute_with_experts(recipe, names, tmp_path):
     assert {path.name for path in found} == names
     for sheet in map(pictures.read_picture, found):
         assert sheet.shape[1] == 6 * (WIDEST + pictures.GAP) - pictures.GAP
-        assert sheet[-320:, :WIDEST].max() > 20, "the whole picture is no black one"
+        assert sheet[-320:, :WIDEST].max() > 20, "the picture is not black"

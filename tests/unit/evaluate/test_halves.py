@@ -1,4 +1,4 @@
-"""Codes found on left halves: what is counted, that the true code is found again, and that right halves alone are scored."""
+"""Appearance codes fitted to left halves: the true code is found again, and only right halves are scored."""
 
 import json
 from dataclasses import replace
@@ -43,7 +43,7 @@ def test_halves_share_no_pixel():
     assert halves.right_half(mask, 4, 6).sum() == 4
 
 
-def test_the_code_is_found_on_the_left_half_alone(capture):
+def test_the_code_is_fitted_to_the_left_half_only(capture):
     scene, draw = started(capture), choose("auto", "cpu", deterministic=True)
     camera, black = capture.views[capture.test[0]].camera, torch.zeros(3)
     code = scene.codes.table[2].detach() * 1.5
@@ -52,7 +52,7 @@ def test_the_code_is_found_on_the_left_half_alone(capture):
         photo = draw(scene(camera, STEP, Mode.DRAW, draw.visible).gaussians, camera, black).image.clamp(0, 1)
     left = halves.left_half(camera.height, camera.width)
     misled = photo.clone()
-    misled[:, camera.width // 2 :] = torch.rand_like(misled[:, camera.width // 2 :])  # what is not counted does not matter
+    misled[:, camera.width // 2 :] = torch.rand_like(misled[:, camera.width // 2 :])  # pixels that do not count have no effect
     before = {name: p.detach().clone() for name, p in scene.named_parameters()}
     found = halves.fit_code(scene, scene.codes, draw, camera, misled, left, STEP, black)
     errors = {}

@@ -1,4 +1,4 @@
-"""LPIPS against the values torchmetrics documented for it, a plain form of its definition, and itself in strips."""
+"""LPIPS against values that torchmetrics documented, against its definition, and in strips against the whole."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from support.messages import naming
 
 
 def definition(net: str, tensors: dict[str, Tensor], x: Tensor, y: Tensor) -> float:
-    """The formula at the head of lpips.py, layer by layer in float64, both pictures one after the other."""
+    """Compute the formula at the head of lpips.py layer by layer in float64, one picture after the other."""
     features = []
     for picture in (x, y):
         f = (picture.double().permute(2, 0, 1) - torch.tensor(SHIFT).double()[:, None, None]) / torch.tensor(SCALE).double()[:, None, None]
@@ -57,7 +57,7 @@ def test_identical_pictures_are_at_distance_zero() -> None:
     assert Lpips("alex", random_tensors("alex"))(x, x) == 0.0
 
 
-def test_refuses() -> None:
+def test_unusable_pictures_and_weights_are_rejected() -> None:
     network = Lpips("alex", random_tensors("alex"))
     with pytest.raises(InputError, match="31"):
         network(torch.zeros(30, 60, 3), torch.zeros(30, 60, 3))
@@ -69,9 +69,9 @@ def test_refuses() -> None:
 
 @pytest.mark.skipif(weights.explain_missing("vgg") is not None, reason="no VGG weights on this machine")
 def test_documented_values() -> None:
-    """torchmetrics 0.x documented two values for VGG: pictures as drawn, and the same rescaled to [-1, 1].
+    """torchmetrics 0.x documented two values for VGG: for random pictures, and for the same pictures rescaled to [-1, 1].
 
-    Its example seeds, builds the network (whose initial weights draw random numbers before the trained ones replace them), then draws.
+    Its example sets the seed, builds the network, whose initial weights consume random numbers, and then draws the pictures.
     """
     tensors, _ = weights.load("vgg")
     network = Lpips("vgg", tensors)

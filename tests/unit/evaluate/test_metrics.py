@@ -1,4 +1,4 @@
-"""Scores from their formulas, and what a mask does to them."""
+"""Scores against their formulas, with and without masks."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_psnr() -> None:
     assert metrics.psnr(target, target) == 100.0
 
 
-def test_psnr_counts_the_masked_pixels_alone() -> None:
+def test_psnr_counts_only_unmasked_pixels() -> None:
     image, target = pair()
     assert metrics.psnr(image, target, half()) == pytest.approx(metrics.psnr(image[:, :25], target[:, :25]))
     spoiled = image.clone()
@@ -51,8 +51,8 @@ def test_ssim_is_that_of_the_losses() -> None:
     assert metrics.ssim(target, target) == pytest.approx(1.0)
 
 
-def test_masked_ssim_is_that_of_the_counted_part() -> None:
-    """The same error everywhere must score the same with half of it masked, but for windows across the mask's edge."""
+def test_masked_ssim_equals_that_of_the_counted_part() -> None:
+    """A uniform error has the same score with half of it masked, except for windows across the edge of the mask."""
     image, target = pair(80, 240)
     whole, masked = metrics.ssim(image, target), metrics.ssim(image, target, half(80, 240))
     assert abs(masked - whole) < 0.1 * (1 - whole)
@@ -85,7 +85,7 @@ def test_each_variant_gets_its_own_input() -> None:
     assert found.keys() == metrics.NETWORKS.keys() < metrics.VARIANTS.keys()
 
 
-def test_without_weights_the_reason_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_weights_the_reason_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(net: str, explicit: Path | None = None) -> tuple[dict[str, Tensor], str]:
         if net == "vgg":
             raise weights.Missing("no weights of LPIPS (vgg): run this")
@@ -98,7 +98,7 @@ def test_without_weights_the_reason_is_kept(monkeypatch: pytest.MonkeyPatch) -> 
     assert set(Perceptual.off().absent) == {"lpips", "lpips_3dgs", "lpips_alex"}
 
 
-def test_download_is_for_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_missing_weights_are_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
     fetched: list[str] = []
     monkeypatch.setattr(weights, "explain_missing", lambda net, explicit=None: None if net == "vgg" or fetched else "absent")
     monkeypatch.setattr(weights, "download", lambda net, progress=None: fetched.append(net))
@@ -119,4 +119,4 @@ def test_scores_on_cuda_are_those_on_the_cpu() -> None:
     here = metrics.score(image, target, None, Perceptual(networks))
     there = metrics.score(image.cuda(), target.cuda(), None, Perceptual({net: network.to("cuda") for net, network in networks.items()}))
     assert there == pytest.approx(here, rel=1e-4)
-    assert torch.backends.cudnn.allow_tf32  # as it was
+    assert torch.backends.cudnn.allow_tf32  # unchanged

@@ -1,4 +1,4 @@
-"""Where the results of an evaluation go."""
+"""Where an evaluation writes its results."""
 
 from scene_experts.evaluate.options import EvalOptions
 

@@ -1,4 +1,4 @@
-"""What is written to disk: rounding, names, colours."""
+"""Pictures on disk: rounding, names, colours, captions."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def test_names_stay_apart() -> None:
     assert found["y.jpg"] == "y.jpg.png" and found["Y.png"] == "Y.png.png"
 
 
-def test_heat_rises_from_black_to_white() -> None:
+def test_error_colours_run_from_black_to_white() -> None:
     colours = pictures.color_errors(np.linspace(0, 2 * pictures.WORST, 101)[None])[0].astype(int)
     assert colours[0].tolist() == [0, 0, 0] and colours[50].tolist() == colours[100].tolist() == list(pictures.HEAT[-1])
     brightness = colours[:51] @ np.array([0.299, 0.587, 0.114])
     assert (np.diff(brightness) >= 0).all()
 
 
-def test_errors_count_only_where_the_mask_does() -> None:
+def test_errors_are_black_where_the_mask_excludes_pixels() -> None:
     photo, render = np.zeros((4, 6, 3), np.uint8), np.full((4, 6, 3), 64, np.uint8)
     mask = np.zeros((4, 6), np.uint8)
     mask[:, :3] = 255
@@ -68,7 +68,7 @@ def test_unreadable_picture(tmp_path: Path) -> None:
         pictures.read_picture(tmp_path / "gone.png")
 
 
-def test_clear_leaves_other_files(tmp_path: Path) -> None:
+def test_removing_pictures_leaves_other_files(tmp_path: Path) -> None:
     for kind in ("renders", "experts"):
         pictures.write_picture(tmp_path / kind / "old.png", np.zeros((2, 2), np.uint8))
     (tmp_path / "mine.txt").write_text("keep")
@@ -76,7 +76,7 @@ def test_clear_leaves_other_files(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_a_strip_has_a_white_gap():
+def test_joined_pictures_have_a_white_gap():
     left, right = torch.zeros(5, 7, 3), torch.full((5, 6, 3), 0.5)
     made = pictures.join_pictures([left, right], gap=2)
     assert made.shape == (5, 15, 3) and (made[:, 7:9] == 1).all() and (made[:, 9:] == 0.5).all()
@@ -90,7 +90,7 @@ def test_captions_of_a_wide_row_grow_with_it():
     assert np.ptp(ink[1]) > 1.6 * np.ptp(ink[0]) > 0
 
 
-def test_narrowed_keeps_what_is_narrow_enough():
+def test_limiting_the_width_keeps_narrow_pictures():
     part = np.full((30, 60, 3), 7, np.uint8)
     assert pictures.limit_width(part, 60) is part
     assert pictures.limit_width(part, 20).shape == (10, 20, 3) and (pictures.limit_width(part, 20) == 7).all()

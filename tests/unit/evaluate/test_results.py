@@ -1,4 +1,4 @@
-"""What results.json states, and when two of them may be compared."""
+"""What results.json states, and when two results may be compared."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_sizes_are_those_of_the_published_layouts(recipe: str, row: int) -> None
     assert size["MB"] == size["total_bytes"] / 1e6 and size["MiB"] == size["total_bytes"] / 2**20
 
 
-def test_what_was_trained_on_after_it_was_scored_is_said(tmp_path):
+def test_runs_trained_after_they_were_scored_are_reported(tmp_path):
     for step in (231, 400):
         (tmp_path / "checkpoints").mkdir(exist_ok=True)
         (tmp_path / "checkpoints" / f"ckpt_{step:06d}.safetensors").touch()

@@ -1,4 +1,4 @@
-"""An evaluation of a scene whose renders are known: files, figures, masks, refusals."""
+"""An evaluation of a scene with known renders: files, scores, masks, errors."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ N, K, F, H, W = 6, 4, 8, 36, 48
 
 
 def photo(index: int) -> Tensor:
-    """[H, W, 3] uint8, smooth, another one for every view."""
+    """Return a smooth picture [H, W, 3] uint8, a different one for each view."""
     y, x = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")
     return torch.stack([(4 * x + 10 * index) % 256, (5 * y) % 256, (x + y) % 256], dim=2).to(torch.uint8)
 
 
 @dataclass(frozen=True)
 class FakeCapture:
-    """Views 0..3; 0 and 2 are held out."""
+    """A capture with views 0 to 3, of which 0 and 2 are held out."""
 
     train: tuple[int, ...] = (1, 3)
     test: tuple[int, ...] = (0, 2)
@@ -59,7 +59,7 @@ class FakeCapture:
 
 
 class FakeScene(Scene):
-    """Decodes 2 of 6 anchors; of their 8 Gaussians 3 have positive opacity."""
+    """A scene that decodes 2 of 6 anchors. 3 of their 8 Gaussians have positive opacity."""
 
     K = K
     file_values = 9
@@ -88,7 +88,7 @@ class FakeScene(Scene):
 
 
 class FakeRasterizer:
-    """Draws the photograph with `error` added; one of three Gaussians falls outside."""
+    """Draws the photograph with `error` added. One of three Gaussians is outside the picture."""
 
     name = "fake"
 
@@ -142,14 +142,14 @@ def test_files_and_figures(tmp_path: Path) -> None:
 
 
 def test_scores_are_those_of_the_8_bit_files(tmp_path: Path) -> None:
-    """A render 0.3/255 off is the same picture once it is written: the clamped, rounded values are scored, not the floats."""
+    """A render with an error of 0.3/255 equals the photograph once it is written, because the rounded values are scored."""
     assert evaluated(tmp_path, rasterize=FakeRasterizer(0.3 / 255))["psnr"] == 100.0
     results = evaluated(tmp_path, rasterize=FakeRasterizer(0.1))
     files = [tmp_path / "test" / "renders" / "day" / "0.png", tmp_path / "test" / "gt" / "day" / "0.png"]
     a, b = (pictures.read_picture(file).astype(np.float64) / 255 for file in files)
     per_view = json.loads((tmp_path / "per_view.json").read_text())
     assert per_view["day/0.jpg"]["psnr"] == pytest.approx(-10 * np.log10(np.mean((a - b) ** 2)), abs=1e-4)
-    assert results["psnr"] == pytest.approx(20 * np.log10(255 / 26), abs=1e-4)  # 25.5 off, rounded up everywhere
+    assert results["psnr"] == pytest.approx(20 * np.log10(255 / 26), abs=1e-4)  # an error of 25.5, rounded up everywhere
 
 
 def test_absent_lpips_is_null_with_its_reason(tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_absent_lpips_is_null_with_its_reason(tmp_path: Path) -> None:
 def test_masks_are_respected(tmp_path: Path) -> None:
     mask = torch.zeros(H, W)
     mask[:, :20] = 1.0
-    results = evaluated(tmp_path, FakeCapture(mask=mask), FakeRasterizer(0.3, slice(20, None)))  # wrong only where nothing counts
+    results = evaluated(tmp_path, FakeCapture(mask=mask), FakeRasterizer(0.3, slice(20, None)))  # wrong only where pixels do not count
     assert results["psnr"] == 100.0 and results["ssim"] == pytest.approx(1) and results["masked"]
     assert (pictures.read_picture(tmp_path / "test" / "errors" / "day" / "0.png") == 0).all()
     assert evaluated(tmp_path, FakeCapture(mask=mask), FakeRasterizer(0.3))["psnr"] < 20
@@ -170,7 +170,7 @@ def test_masks_are_respected(tmp_path: Path) -> None:
         evaluated(tmp_path, FakeCapture(mask=torch.zeros(H, W)))
 
 
-def test_training_views_are_kept_apart(tmp_path: Path) -> None:
+def test_training_views_have_results_of_their_own(tmp_path: Path) -> None:
     held_out = evaluated(tmp_path)
     results = evaluated(tmp_path, views="train")
     assert results["views"] == "train" and (tmp_path / "train" / "renders" / "day" / "3.png").is_file()
@@ -185,21 +185,21 @@ def test_empty_split(tmp_path: Path) -> None:
     assert evaluated(tmp_path, FakeCapture(test=()), views="train")["view_count"] == 2
 
 
-def test_pictures_of_an_earlier_split_go(tmp_path: Path) -> None:
+def test_pictures_of_an_earlier_split_are_removed(tmp_path: Path) -> None:
     evaluated(tmp_path)
     evaluated(tmp_path, FakeCapture(test=(1,), train=(0, 2, 3)))
     assert [p.name for p in (tmp_path / "test" / "renders").rglob("*.png")] == ["1.png"]
 
 
-def test_a_strip_of_one_view_by_expert(tmp_path: Path) -> None:
+def test_a_strip_shows_one_view_for_each_expert(tmp_path: Path) -> None:
     evaluated(tmp_path, lpips=False)
     folder = tmp_path / "test" / "experts"
     assert [p.name for p in folder.iterdir()] == ["color.png"]
     sheet, drawn = pictures.read_picture(folder / "color.png"), pictures.read_picture(tmp_path / "test" / "renders" / "day" / "0.png")
     assert sheet.shape == (pictures.BAR + H, 3 * W + 2 * pictures.GAP, 3)
-    for i in range(3):  # the rasteriser draws the first view whatever it is given
+    for i in range(3):  # the rasteriser draws the first view for any Gaussians
         assert np.array_equal(sheet[pictures.BAR :, i * (W + pictures.GAP) :][:, :W], drawn)
-    pictures.write_picture(folder / "opacity.png", drawn)  # as an evaluation of another scene left it
+    pictures.write_picture(folder / "opacity.png", drawn)  # left by an evaluation of another scene
     evaluated(tmp_path, lpips=False)
     evaluated(tmp_path, lpips=False, views="train")
     assert [p.name for p in folder.iterdir()] == ["color.png"] and (tmp_path / "train" / "experts" / "color.png").is_file()
@@ -213,7 +213,7 @@ def test_photograph_of_another_size(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         evaluated(tmp_path)
 
 
-def test_lpips_where_there_are_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lpips_is_scored_if_there_are_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(weights, "load", lambda net, explicit=None: (random_tensors(net), f"{net} from here"))
     results = evaluated(tmp_path)
     assert results["lpips"] > 0 and results["lpips_3dgs"] > 0 and results["lpips_alex"] > 0 and not results["absent"]

@@ -1,4 +1,4 @@
-"""Tables: what is compared, what is refused, how it is written."""
+"""Tables of results: formats, protocols that must agree, the paper's numbers."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_print_results(tmp_path: Path) -> None:
     assert "right halves" in text and str(tmp_path / "results_half.json") in text and "test_half" in text
 
 
-def test_a_table_tells_a_shorter_training_from_one_cut_off() -> None:
+def test_a_table_distinguishes_a_short_training_from_an_interrupted_one() -> None:
     short, cut = results("moe-gs", 27.0, step=7000, iterations=7000), results("moe-gs", 26.0, step=7000, iterations=30_000)
     made = tables.make_table(["short", "cut"], [short, cut])
     place = made.titles.index("iterations")
@@ -162,10 +162,10 @@ def test_no_cell_is_cut_in_a_narrow_terminal(runs: list[Path], width: int) -> No
     lines = [line.rstrip() for line in text.splitlines()]
     straight = any(line.startswith("run ") and "PSNR" in line for line in lines)
     assert straight == (width == 200)
-    assert width < 40 or max(map(len, lines)) <= max(width, len(made.notes[0]))  # prose is wrapped by the terminal
+    assert width < 40 or max(map(len, lines)) <= max(width, len(made.notes[0]))  # the terminal wraps prose
 
 
-def test_a_file_that_knows_nothing_of_its_training_has_no_figures_of_it() -> None:
+def test_a_file_without_a_training_has_no_training_figures() -> None:
     trained = results("moe-gs", 27.0, step=4000, iterations=7000)
     imported = results("scaffold-gs", 26.0, step=0, iterations=0, train_seconds=0.0)
     found = tables.make_table(["a", "b"], [trained, imported])
@@ -174,13 +174,13 @@ def test_a_file_that_knows_nothing_of_its_training_has_no_figures_of_it() -> Non
     assert not {"iterations", "of schedule", "train s"} & set(tables.make_table(["b"], [imported]).titles)
 
 
-def test_an_absent_score_says_whose_it_is():
+def test_a_note_names_the_run_whose_score_is_absent():
     one, two = {"psnr": 1.0, "lpips": 0.2}, {"psnr": 2.0, "absent": {"lpips": "not asked for"}}
     assert tables.make_table(["a", "b"], [one, two]).notes == ("lpips of b absent: not asked for",)
     assert tables.make_table(["b"], [two]).notes == ("lpips absent: not asked for",)
 
 
-def test_rows_are_called_what_they_are() -> None:
+def test_rows_are_called_anchors_or_gaussians() -> None:
     anchors, explicit = results("moe-gs", 27.0), results("3dgs", 26.0, activation_ratio=None)
     assert "anchors" in tables.make_table(["a"], [anchors]).titles and "Gaussians" in tables.make_table(["b"], [explicit]).titles
     assert "anchors or Gaussians" in tables.make_table(["a", "b"], [anchors, explicit]).titles

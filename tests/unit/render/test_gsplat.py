@@ -24,9 +24,9 @@ def single(g: Gaussians, device: str = "cpu", grad: bool = False) -> Gaussians:
 
 
 class FakeGsplat(ModuleType):
-    """The four functions the adapter calls, with the parameters, shapes and meanings of gsplat 1.5.3, in plain torch.
+    """The four functions that the adapter calls, in plain torch, with the parameters, shapes and meanings of gsplat 1.5.3.
 
-    It is no test of gsplat: only of how the adapter orders, shapes and converts what goes in and comes out.
+    It tests how the adapter orders, shapes and converts arguments and results, not gsplat itself.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class FakeGsplat(ModuleType):
         if opacities is not None:
             assert not opacities.requires_grad
             radii[opacities < 1 / 255] = 0
-        radii[-1] = 77  # one that gsplat draws and the 3 sigma rule does not
+        radii[-1] = 77  # drawn by gsplat, but not by the 3 sigma rule
         return radii[None], p.mean2d[None], p.depth[None], p.conic[None], p.compensation[None] if calc_compensations else None
 
     def isect_tiles(
@@ -110,7 +110,7 @@ def backward(render: Render, g: Gaussians) -> list[Tensor]:
 
 
 @pytest.mark.parametrize("antialias", [False, True])
-def test_what_goes_in_and_comes_out(fake: FakeGsplat, antialias: bool) -> None:
+def test_the_adapter_converts_arguments_and_results(fake: FakeGsplat, antialias: bool) -> None:
     scene, camera = make_scene(80, size=0.05), make_camera(45, 37, 14.2, 25.1, near=0.33).to(dtype=torch.float32)
     scene.means[-1, 0] = 50.0  # far outside: the 3 sigma rule gives it no radius
     results = []
@@ -141,7 +141,7 @@ def test_why_it_is_not_available(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert "CUDA device" in ask()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setitem(sys.modules, "gsplat", None)  # what an import of a missing module finds
+    monkeypatch.setitem(sys.modules, "gsplat", None)  # as for a missing module
     assert "pip install scene-experts[cuda]" in ask()
     library, backend = FakeGsplat(), ModuleType("gsplat.cuda._backend")
     monkeypatch.setitem(sys.modules, "gsplat", library)
@@ -204,7 +204,7 @@ def test_the_real_gsplat_agrees_with_the_reference(antialias: bool, center: tupl
         results.append((render, backward(render, g)))
     (ours, our_grads), (expected, grads) = results
     assert torch.equal(ours.radii, expected.radii)
-    # Isolated pixels differ where an alpha falls on the other side of a threshold; so means, not maxima.
+    # Single pixels differ where an alpha is on the other side of a threshold, so means are compared.
     assert (ours.image - expected.image).abs().mean() < 1e-5
     assert (ours.depth - expected.depth).abs().mean() < 1e-4
     assert (ours.alpha - expected.alpha).abs().mean() < 1e-5

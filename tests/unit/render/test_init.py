@@ -1,4 +1,4 @@
-"""The choice of a rasteriser: what `auto` takes, and what cannot be had."""
+"""The choice of a rasteriser: `auto`, and rasterisers that cannot be used."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def test_auto_on_a_device_without_a_fast_one_takes_the_reference():
         ("opengl", "cpu", NAMES),
     ],
 )
-def test_what_cannot_be_had_names_what_can(name, device, others):
+def test_an_unusable_rasteriser_names_the_usable_ones(name, device, others):
     with pytest.raises(InputError, match=naming(*others)):
         choose(name, device)
 
@@ -69,7 +69,7 @@ def test_channels_come_out_in_the_order_they_went_in(name):
 def test_a_rasteriser_is_as_the_run_was_trained():
     draw = choose("reference", "cpu")
     assert as_trained(draw, False) is draw and as_trained(draw, True) == replace(draw, antialias=True)  # type: ignore[type-var]
-    plain = object()  # one that has no compensation
+    plain = object()  # a rasteriser without compensation
     assert as_trained(plain, True) is plain  # type: ignore[arg-type]
 
 

@@ -15,7 +15,7 @@ BLACK = torch.zeros(3, dtype=F64)
 
 
 def plain_camera(width: int = 33, height: int = 21, f: float = 40.0, cx: float = 16.5, cy: float = 10.5) -> Camera:
-    """At the origin, looking along z."""
+    """Return a camera at the origin that looks along z."""
     return Camera(torch.eye(4, dtype=F64), torch.tensor([[f, 0, cx], [0, f, cy], [0, 0, 1]], dtype=F64), width, height)
 
 
@@ -38,7 +38,7 @@ def join(*parts: Gaussians) -> Gaussians:
 
 
 def matrix_of(q: list[float]) -> Tensor:
-    """The rotation of a quaternion from its action on the axes: v + 2 w (u x v) + 2 u x (u x v)."""
+    """Return the rotation of a quaternion from its action on the axes: v + 2 w (u x v) + 2 u x (u x v)."""
     w, u = q[0], torch.tensor(q[1:], dtype=F64)
     eye = torch.eye(3, dtype=F64)
     turned = [e + 2 * w * torch.linalg.cross(u, e) + 2 * torch.linalg.cross(u, torch.linalg.cross(u, e)) for e in eye]
@@ -46,7 +46,7 @@ def matrix_of(q: list[float]) -> Tensor:
 
 
 def slow(g: Gaussians, camera: Camera, background: Tensor, antialias: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-    """Image, alpha and depth by one loop over pixels and one over Gaussians, straight from the published per-pixel algorithm."""
+    """Return image, alpha and depth of the published per-pixel algorithm, with a loop over pixels and one over Gaussians."""
     fx, fy, cx, cy, W, H = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
     R, t = camera.world_to_cam[:3, :3], camera.world_to_cam[:3, 3]
     splats = []
@@ -173,7 +173,7 @@ def test_gradients_are_those_of_finite_differences(antialias: bool, center: tupl
     # Steps of 1e-6 cross no threshold of alpha or transmittance at this seed.
     g, camera = make_scene(9, seed=3, size=0.2, spread=0.5), make_camera(17, 13, *center, f=16.0)
     wide = make_scene(2, seed=5, size=0.9)
-    wide = replace(wide, means=torch.tensor([[2.6, 0.2, -0.5], [-3.4, -1.7, 0.1]], dtype=F64))  # beyond the limits of the Jacobian
+    wide = replace(wide, means=torch.tensor([[2.6, 0.2, -0.5], [-3.4, -1.7, 0.1]], dtype=F64))  # outside the limits of the Jacobian
     flat = replace(make_scene(2, seed=6, size=1.5, spread=0.1), opacities=torch.ones(2, dtype=F64))  # alpha above 0.99
     g = join(g, wide, flat)
     inputs = [x.clone().requires_grad_() for x in (g.means, g.quats, g.scales, g.opacities, g.colors, torch.rand(3, dtype=F64))]
@@ -218,7 +218,7 @@ def test_mean2d_gradient_is_in_ndc_units() -> None:
     assert (render.mean2d_grad == 0).all() and not render.mean2d_grad.requires_grad
     (render.alpha * weights).sum().backward()
 
-    def loss(cx: float, cy: float) -> float:  # moving the principal point moves the centre alone, far from the Jacobian's limits
+    def loss(cx: float, cy: float) -> float:  # inside the limits of the Jacobian, the principal point moves only the centre
         r = ReferenceRasterizer()(g, plain_camera(cx=cx, cy=cy), BLACK)
         return (r.alpha * weights).sum().item()
 
@@ -255,7 +255,7 @@ def test_near_plane_is_the_camera_s() -> None:
 def test_what_the_picture_cannot_show_has_no_radius() -> None:
     camera = plain_camera(33, 21)  # tiles cover 48 x 32 pixels
     left, right = one(x=-3.0), one(x=3.0)
-    just = one(x=(40 - 16.5) / 40 * 2, size=0.02)  # centre at column 40: past the picture, within its last tile
+    just = one(x=(40 - 16.5) / 40 * 2, size=0.02)  # centre at column 40: outside the picture, inside its last tile
     render = ReferenceRasterizer()(join(left, right, just), camera, BLACK)
     assert (render.radii > 0).tolist() == [False, False, True]
     assert render.alpha.max() == 0

@@ -1,4 +1,4 @@
-"""Frames of a video: the sharpest of each stretch."""
+"""Frames of a video: the sharpest of each segment."""
 
 import numpy as np
 import pytest
@@ -8,23 +8,23 @@ from scene_experts.core.errors import InputError
 from scene_experts.sfm import frames
 
 
-def test_one_of_each_stretch_is_taken():
+def test_one_frame_of_each_segment_is_chosen():
     assert frames.choose_sharpest([1, 3, 2, 9, 8, 7, 0, 0, 5], 3) == [1, 3, 8]
     assert frames.choose_sharpest([1.0, 2.0], 5) == [0, 1] and frames.choose_sharpest([], 5) == []
 
 
-def test_blur_lowers_the_grade():
+def test_blur_lowers_the_sharpness():
     picture = Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8))
     grades = [frames.sharpness(np.asarray(picture.filter(ImageFilter.GaussianBlur(r)))) for r in (0, 1, 2)]
     assert grades[0] > grades[1] > grades[2]
 
 
-def test_the_sharp_frames_of_a_video_come_out_whole_and_in_order(tmp_path):
+def test_the_sharp_frames_of_a_video_are_extracted_in_order(tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     generator = np.random.default_rng(0)
     stream = ffmpeg.write_frames(str(tmp_path / "walk.mp4"), (96, 64), fps=10, macro_block_size=2, quality=9)
     stream.send(None)
-    for shade in (40, 120, 200):  # of three frames each the middle one is sharp
+    for shade in (40, 120, 200):  # the middle one of every three frames is sharp
         noise = Image.fromarray((shade + generator.integers(-30, 30, (64, 96, 3))).astype(np.uint8))
         for blur in (4, 0, 4):
             stream.send(np.ascontiguousarray(noise.filter(ImageFilter.GaussianBlur(blur))))
@@ -38,7 +38,7 @@ def test_the_sharp_frames_of_a_video_come_out_whole_and_in_order(tmp_path):
     assert (9, 9) in [step[1:] for step in said]
 
 
-def test_a_file_that_is_no_video_is_told(tmp_path):
+def test_a_file_that_is_not_a_video_is_reported(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     (tmp_path / "broken.mp4").write_bytes(b"nothing of the kind")
     with pytest.raises(InputError, match=r"broken\.mp4"):

@@ -1,4 +1,4 @@
-"""Masks as COLMAP reads them: where none counts, no feature is sought."""
+"""Masks in COLMAP's format: no features are extracted where a mask is black."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from support.photos import write_photo, write_turned
 
 
 def half(size=(40, 30), value=255):
-    """The upper half counts."""
+    """Return a mask whose upper half counts."""
     out = np.zeros((size[1], size[0]), np.uint8)
     out[: size[1] // 2] = value
     return Image.fromarray(out)
@@ -23,7 +23,7 @@ def test_the_mask_is_found_where_training_finds_it(tmp_path):
         write_photo(images / name)
     half().save(images / "a_mask.png")
     (tmp_path / "masks" / "sub").mkdir(parents=True)
-    half((20, 15), value=200).save(tmp_path / "masks" / "b.jpg.png")  # of another size, and not quite white
+    half((20, 15), value=200).save(tmp_path / "masks" / "b.jpg.png")  # another size, and not quite white
     half().save(tmp_path / "masks" / "sub" / "d.png")
     found = check_in_place(find_photos(images), images)
     marks = write_masks(found, images, tmp_path / "out")
@@ -34,7 +34,7 @@ def test_the_mask_is_found_where_training_finds_it(tmp_path):
         with Image.open(tmp_path / "out" / name) as mask:
             values = np.asarray(mask)
         assert values.shape == (30, 40) and (values[:14] == 255).all() and (values[16:] == 0).all()
-    with Image.open(tmp_path / "out" / "c.jpg.png") as mask:  # none of its own: COLMAP would pass over it
+    with Image.open(tmp_path / "out" / "c.jpg.png") as mask:  # no mask of its own: COLMAP would skip the photograph
         assert mask.size == (40, 30) and mask.getextrema() == (255, 255)
     assert len(marks) == 4 and write_masks(found, images, tmp_path / "out") == marks
     half(value=0).save(images / "a_mask.png")
@@ -57,8 +57,8 @@ def test_alpha_is_a_mask(tmp_path):
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 5, 6, 7, 8])
-def test_a_mask_lies_as_its_photograph_is_stored(tmp_path, orientation):
-    """Of a photograph that EXIF turns the mask may lie as this is stored or as it is looked at; COLMAP takes it as it is stored."""
+def test_a_mask_has_the_orientation_of_the_stored_photograph(tmp_path, orientation):
+    """The mask of a photograph that EXIF rotates may be stored upright or not. COLMAP reads it in the orientation of the stored pixels."""
     source, images = tmp_path / "photos", tmp_path / "images"
     for folder in (source, images):
         for name in ("a", "b", "c"):
@@ -76,7 +76,7 @@ def test_a_mask_lies_as_its_photograph_is_stored(tmp_path, orientation):
 
 
 def copy_of(path, orientation):
-    """The mask at `path` as one looks at it, beside it."""
+    """Write the mask at `path` upright and return its new path."""
     from scene_experts.sfm.photos import transfer
 
     transfer(path, path.with_name("upright.bmp"), orientation, suffix=".png")

@@ -1,4 +1,4 @@
-"""Photographs found, grouped by camera and copied."""
+"""Photographs: finding, grouping by camera, copying."""
 
 import os
 
@@ -12,14 +12,14 @@ from support.messages import naming
 from support.photos import write_photo, write_turned
 
 
-def test_names_are_in_the_order_of_their_numbers_and_hidden_files_are_none(tmp_path):
+def test_names_are_sorted_by_their_numbers_and_hidden_files_are_ignored(tmp_path):
     for name in ("10.jpg", "2.jpg", "b/1.png", ".thumbs/1.jpg", "1.JPG"):
         write_photo(tmp_path / name)
     (tmp_path / "notes.txt").write_text("no photograph")
     assert [p.name for p in find_photos(tmp_path)] == ["1.JPG", "2.jpg", "10.jpg", "b/1.png"]
 
 
-def test_too_few_or_unreadable_photographs_are_told(tmp_path):
+def test_too_few_or_unreadable_photographs_are_reported(tmp_path):
     write_photo(tmp_path / "1.jpg")
     for i in range(4):
         (tmp_path / f"{i}.HEIC").write_bytes(b"")
@@ -42,7 +42,7 @@ def test_a_camera_is_one_size_maker_and_focal_length(tmp_path):
     assert group_by_camera(find_photos(tmp_path)) == [["1.jpg", "3.jpg"], ["2.jpg"], ["4.jpg"], ["5.jpg"]]
 
 
-def test_photographs_that_are_shown_turned_are_written_upright_and_their_masks_too(tmp_path):
+def test_rotated_photographs_and_their_masks_are_written_upright(tmp_path):
     source, target = tmp_path / "photos", tmp_path / "work" / "images"
     for i, orientation in enumerate((6, 1, 6)):
         write_turned(source / f"{i}.jpg", orientation)
@@ -61,7 +61,7 @@ def test_photographs_that_are_shown_turned_are_written_upright_and_their_masks_t
     assert [p.orientation for p in check_in_place(find_photos(source), source)] == [6, 1, 6]
 
 
-def test_names_and_kinds_are_those_that_colmap_takes_and_copies_are_made_once(tmp_path):
+def test_copies_have_names_and_formats_that_colmap_reads_and_are_made_once(tmp_path):
     source, target = tmp_path / "my photos", tmp_path / "work" / "images"
     write_photo(source / "#a b" / "IMG (0).jpg").chmod(0o444)
     write_photo(source / "c.webp")
@@ -86,14 +86,14 @@ def test_names_and_kinds_are_those_that_colmap_takes_and_copies_are_made_once(tm
         find_photos(source)
 
 
-def test_the_capture_inside_the_photographs_is_left_out(tmp_path):
+def test_a_capture_inside_the_photographs_is_ignored(tmp_path):
     for i in range(3):
         write_photo(tmp_path / f"{i}.jpg")
     write_photo(tmp_path / "out" / "images" / "0.jpg")
     assert len(find_photos(tmp_path, exclude=tmp_path / "out")) == 3 and len(find_photos(tmp_path)) == 4
 
 
-def test_names_that_are_no_text_are_told(tmp_path):
+def test_names_that_are_not_utf8_are_reported(tmp_path):
     for i in range(3):
         write_photo(tmp_path / f"{i}.jpg")
     try:
@@ -104,8 +104,8 @@ def test_names_that_are_no_text_are_told(tmp_path):
         find_photos(tmp_path)
 
 
-def test_grey_of_sixteen_bits_is_written_with_eight(tmp_path):
-    """COLMAP does not read it, and Pillow's own conversion cuts it off at 255."""
+def test_grey_images_of_16_bits_are_written_with_8(tmp_path):
+    """COLMAP does not read 16 bits, and Pillow's own conversion clips at 255."""
     source, target = tmp_path / "photos", tmp_path / "work" / "images"
     source.mkdir()
     deep = np.linspace(0, 65535, 40 * 30).astype(np.uint16).reshape(30, 40)

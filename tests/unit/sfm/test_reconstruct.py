@@ -1,4 +1,4 @@
-"""A capture made of photographs: the poses are those that are known, a stopped one goes on, and nothing is half there."""
+"""Captures made from photographs: correct poses, interrupted calls, and no incomplete results."""
 
 import importlib.util
 import json
@@ -23,11 +23,11 @@ from support.photos import fake_worker, write_black, write_photo
 from support.places import DEMO
 
 BUDDHA = DEMO / "buddha"
-TOGETHER = ["008.jpg", "009.jpg", "017.jpg", "018.jpg", "025.jpg", "043.jpg", "053.jpg", "067.jpg"]  # they show much of each other
+TOGETHER = ["008.jpg", "009.jpg", "017.jpg", "018.jpg", "025.jpg", "043.jpg", "053.jpg", "067.jpg"]  # they overlap strongly
 
 
 def aligned(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """`a` [V, 3] moved, turned and scaled onto `b` (Umeyama 1991)."""
+    """Return `a` [V, 3] aligned with `b` by a similarity transform (Umeyama 1991)."""
     from_, to = a - a.mean(0), b - b.mean(0)
     u, s, vh = torch.linalg.svd(to.T @ from_)
     sign = torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vh).sign())], dtype=a.dtype))
@@ -42,7 +42,7 @@ def centres(capture, names) -> torch.Tensor:
 
 @pytest.mark.slow
 @pytest.mark.foreign
-def test_poses_of_photographs_are_those_that_are_known(tmp_path):
+def test_poses_of_photographs_equal_the_known_ones(tmp_path):
     if importlib.util.find_spec("pycolmap") is None:
         pytest.skip("pycolmap is not installed")
     source, out = tmp_path / "photos", tmp_path / "capture"
@@ -50,7 +50,7 @@ def test_poses_of_photographs_are_those_that_are_known(tmp_path):
     for name in TOGETHER:
         shutil.copy(BUDDHA / "images" / name, source / name)
     top = np.zeros((544, 800), np.uint8)
-    top[:400] = 255  # of two views the lower quarter does not count
+    top[:400] = 255  # the lower quarter of two views does not count
     for name in TOGETHER[:2]:
         with Image.open(source / name) as picture:
             Image.fromarray(top).resize(picture.size, Image.Resampling.NEAREST).save(source / f"{Path(name).stem}_mask.png")
@@ -69,7 +69,7 @@ def test_poses_of_photographs_are_those_that_are_known(tmp_path):
 
 
 def lowest_features(capture: Path) -> dict[str, float]:
-    """By photograph, where its lowest feature lies: 0 at the top edge, 1 at the bottom. pycolmap is asked in a process of its own."""
+    """Return the height of the lowest feature by photograph: 0 at the top edge, 1 at the bottom. pycolmap runs in a process of its own."""
     code = (
         "import json, sys, pycolmap; found = pycolmap.Reconstruction(sys.argv[1]).images.values(); "
         "print(json.dumps({i.name: max(p.xy[1] for p in i.points2D) / i.camera.height for i in found}))"
@@ -91,7 +91,7 @@ FOUND = {
 
 @pytest.fixture(autouse=True)
 def with_pycolmap(monkeypatch, request):
-    """Whether pycolmap is installed matters to the test of the poses alone."""
+    """Pretend that pycolmap is installed, except for the test of the poses."""
     if "known" not in request.node.name:
         monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: name)
 
@@ -100,7 +100,7 @@ def make(source, out, options=Options(), **more):  # noqa: B008
     return run.reconstruct(source, out, options, say=lambda _: None, **more)
 
 
-def test_photographs_that_fit_nowhere_leave_the_reason_and_nothing_else(tmp_path, monkeypatch):
+def test_photographs_without_poses_leave_only_a_work_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "run_worker", fake_worker())
     with pytest.raises(InputError, match=naming(tmp_path / "photos")):
         make(write_black(tmp_path / "photos"), tmp_path / "out")
@@ -109,7 +109,7 @@ def test_photographs_that_fit_nowhere_leave_the_reason_and_nothing_else(tmp_path
         load(tmp_path / "out")
 
 
-def test_frames_of_a_video_are_taken_once(tmp_path, monkeypatch):
+def test_frames_of_a_video_are_extracted_once(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "run_worker", fake_worker())
     taken = []
 
@@ -127,7 +127,7 @@ def test_frames_of_a_video_are_taken_once(tmp_path, monkeypatch):
     assert taken == [5, 4, 2]
 
 
-def test_the_same_request_finds_its_database_again_and_another_does_not(tmp_path, monkeypatch):
+def test_only_the_same_request_reuses_its_database(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "run_worker", fake_worker())
     source, kept = write_black(tmp_path / "photos"), tmp_path / "out" / NAME / "database" / "colmap.db"
 
@@ -142,12 +142,12 @@ def test_the_same_request_finds_its_database_again_and_another_does_not(tmp_path
     ask(Options(max_side=800))
     assert not kept.exists()
     kept.write_bytes(b"features")
-    write_photo(source / "1.jpg", size=(64, 48), model="B")  # another photograph of the same name
+    write_photo(source / "1.jpg", size=(64, 48), model="B")  # another photograph with the same name
     ask(Options(max_side=800))
     assert not kept.exists()
 
 
-def test_new_poses_take_the_place_of_old_ones_whole(tmp_path, monkeypatch):
+def test_a_complete_capture_replaces_the_old_one(tmp_path, monkeypatch):
     worker = fake_worker(**FOUND)
     monkeypatch.setattr(run, "run_worker", worker)
     out = tmp_path / "out"
@@ -161,7 +161,7 @@ def test_new_poses_take_the_place_of_old_ones_whole(tmp_path, monkeypatch):
     assert len(list((out / "images").iterdir())) == 4
 
 
-def test_a_capture_s_own_images_stay_as_they_are(tmp_path, monkeypatch):
+def test_the_own_images_of_a_capture_are_not_modified(tmp_path, monkeypatch):
     worker = fake_worker(**FOUND)
     monkeypatch.setattr(run, "run_worker", worker)
     images = write_black(tmp_path / "images")
@@ -172,7 +172,7 @@ def test_a_capture_s_own_images_stay_as_they_are(tmp_path, monkeypatch):
         make(write_black(tmp_path.parent / "elsewhere"), tmp_path, overwrite=True)
 
 
-def test_what_is_somebody_s_is_not_touched(tmp_path, monkeypatch):
+def test_files_of_the_user_are_not_replaced(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "run_worker", fake_worker(**FOUND))
     out = tmp_path / "out"
     for inside in (f"{NAME}/done", "sparse/photos", "images/more"):
@@ -188,7 +188,7 @@ def test_what_is_somebody_s_is_not_touched(tmp_path, monkeypatch):
         make(tmp_path / "photos", tmp_path / "old")
 
 
-def test_what_is_no_folder_and_no_video_is_told(tmp_path, monkeypatch):
+def test_a_source_that_is_neither_folder_nor_video_is_reported(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=naming("1.jpg")):
         make(write_photo(tmp_path / "1.jpg"), tmp_path / "out")
     with pytest.raises(InputError, match=naming(tmp_path / "none")):
@@ -207,7 +207,7 @@ def test_what_is_no_folder_and_no_video_is_told(tmp_path, monkeypatch):
         ("import sys; sys.exit('E20261122 10:00 1 sqlite.h:9] disk is full')", RunError, "disk is full"),
     ],
 )  # fmt: skip
-def test_a_worker_that_fails_is_told(tmp_path, monkeypatch, code, error, fact):
+def test_a_failed_worker_is_reported(tmp_path, monkeypatch, code, error, fact):
     (tmp_path / "worker.py").write_text(code)
     monkeypatch.setattr(run.worker, "__file__", str(tmp_path / "worker.py"))
     with pytest.raises(error, match=fact):

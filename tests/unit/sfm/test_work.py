@@ -1,4 +1,4 @@
-"""The hidden folder where a capture is made: published whole, from any moment on, and for one process."""
+"""The hidden folder in which a capture is made: atomic publication, continuation after a kill, one process at a time."""
 
 from contextlib import suppress
 
@@ -24,7 +24,7 @@ def there(out):
     return [(out / place).read_text() if "." in name else (out / place / "file").read_text() for name, place in work.PLACES.items()]
 
 
-def test_what_is_done_takes_the_place_of_what_was_there(tmp_path):
+def test_results_replace_earlier_ones(tmp_path):
     for text in ("old", "new"):
         with work.open_work_folder(tmp_path) as desk:
             made(desk, text)
@@ -35,7 +35,7 @@ def test_what_is_done_takes_the_place_of_what_was_there(tmp_path):
 
 
 @pytest.mark.parametrize("moves", range(7))
-def test_killed_between_any_two_moves_it_goes_on(tmp_path, monkeypatch, moves):
+def test_a_publication_killed_between_any_two_moves_continues(tmp_path, monkeypatch, moves):
     with work.open_work_folder(tmp_path) as desk:
         made(desk, "old")
         work.publish(tmp_path)
@@ -56,7 +56,7 @@ def test_killed_between_any_two_moves_it_goes_on(tmp_path, monkeypatch, moves):
         assert there(tmp_path) == ["new"] * 3
 
 
-def test_what_was_not_whole_is_not_published(tmp_path):
+def test_incomplete_results_are_not_published(tmp_path):
     with work.open_work_folder(tmp_path) as desk:
         made(desk, "half")
     with work.open_work_folder(tmp_path):

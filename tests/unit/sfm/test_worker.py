@@ -1,4 +1,4 @@
-"""The process that runs pycolmap: its words, without it."""
+"""The process that runs pycolmap: its messages, tested without pycolmap."""
 
 import ast
 import json
@@ -14,7 +14,7 @@ from scene_experts.sfm import worker
 SOURCE = Path(worker.__file__)
 
 
-def test_it_imports_nothing_of_this_project_nor_what_pycolmap_does_not_bear():
+def test_the_worker_imports_only_pycolmap_and_the_standard_library():
     found = set()
     for node in ast.walk(ast.parse(SOURCE.read_text())):
         if isinstance(node, ast.Import):
@@ -24,7 +24,7 @@ def test_it_imports_nothing_of_this_project_nor_what_pycolmap_does_not_bear():
     assert found - set(sys.stdlib_module_names) - {"__future__"} == {"pycolmap"}
 
 
-def test_it_says_so_where_pycolmap_is_missing(tmp_path):
+def test_a_missing_pycolmap_is_reported(tmp_path):
     ask = json.dumps({"seed": 0}) + "\n"
     code = f"import sys, runpy; sys.modules['pycolmap'] = None; runpy.run_path({str(SOURCE)!r}, run_name='__main__')"
     done = subprocess.run([sys.executable, "-c", code], input=ask, capture_output=True, text=True)
@@ -37,7 +37,7 @@ class Image:
 
 
 class Model:
-    """A reconstruction with the photographs `names`."""
+    """A stand-in for a reconstruction of the photographs `names`."""
 
     def __init__(self, names, written):
         self.images, self.cameras, self.written = {i: Image(name) for i, name in enumerate(names)}, {}, written
@@ -62,7 +62,7 @@ class Model:
 
 @pytest.fixture
 def reconstruct(tmp_path, monkeypatch):
-    """Which mappers ran and which model was written, for models of these photographs; None: the mapper fails."""
+    """Return a function that runs the mappers with given results and returns which ran and what was written. None: the mapper fails."""
     calls = []
 
     def reconstructed(incremental, at_once, mapper="auto"):
@@ -86,10 +86,10 @@ def reconstruct(tmp_path, monkeypatch):
     return reconstructed
 
 
-def test_the_second_mapper_is_tried_where_the_first_leaves_many_out(reconstruct, capsys):
+def test_the_second_mapper_is_tried_if_the_first_leaves_many_out(reconstruct, capsys):
     ran, written, found = reconstruct(["abcdefghi", "abj"], ["abcdefghij"])
     assert ran == ["incremental"] and written == ["abcdefghi"] and found["registered"] == list("abcdefghi")
-    assert found["apart"] == [1]  # of the second model, j alone is nowhere else
+    assert found["apart"] == [1]  # only j of the second model is in no other model
     ran, written, found = reconstruct(["abcd"], ["abcdefg"])
     assert ran == ["incremental", "global"] and written == ["abcdefg"] and found["mapper"] == "global" and found["apart"] == []
     ran, written, found = reconstruct(["abcd"], None)
@@ -98,8 +98,8 @@ def test_the_second_mapper_is_tried_where_the_first_leaves_many_out(reconstruct,
     assert ran == ["global"] and not written and found == {"registered": []}
 
 
-def test_it_ends_when_the_process_that_started_it_is_gone(tmp_path):
-    """The parent is killed while a (false) pycolmap sleeps."""
+def test_the_worker_ends_when_its_parent_ends(tmp_path):
+    """The parent is killed while a stand-in for pycolmap sleeps."""
     (tmp_path / "pycolmap.py").write_text("import time\ndef set_random_seed(seed):\n    print('here', flush=True)\n    time.sleep(60)\n")
     code = "import os, subprocess, sys; p = subprocess.Popen([sys.executable, sys.argv[1]], stdin=subprocess.PIPE); " \
         "p.stdin.write(b'{\"seed\": 0}\\n'); p.stdin.flush(); print(p.pid, flush=True); import time; time.sleep(60)"  # fmt: skip
@@ -108,5 +108,5 @@ def test_it_ends_when_the_process_that_started_it_is_gone(tmp_path):
     said = {parent.stdout.readline().strip(), parent.stdout.readline().strip()}
     parent.kill()
     assert "here" in said
-    assert parent.stdout.read() == ""  # ends when the worker, which holds the other end, does
+    assert parent.stdout.read() == ""  # returns when the worker, which holds the other end, ends
     parent.wait()

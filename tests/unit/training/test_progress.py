@@ -36,7 +36,7 @@ def test_a_log_file_gets_plain_lines():
     assert "--resume" in text and "\x1b" not in text
 
 
-def test_explicit_gaussians_are_called_so():
+def test_rows_have_the_name_that_the_traits_state():
     out = io.StringIO()
     with TrainingProgress(Console(file=out, width=200), every=0.0) as show:
         show(Started(0, 200, 1234, Traits("gaussians", "Gaussians")))
@@ -47,11 +47,11 @@ def test_explicit_gaussians_are_called_so():
     assert "anchors" not in text and "active" not in text and "lattice" not in text
 
 
-def test_clock():
+def test_durations_are_formatted():
     assert [format_duration(s) for s in (0, 59.6, 61, 3661)] == ["0:00", "1:00", "1:01", "1:01:01"]
 
 
-def test_a_bar_speaks_in_lines_where_there_is_no_terminal():
+def test_a_bar_prints_lines_without_a_terminal():
     console = Console(file=io.StringIO(), force_terminal=False)
     with ProgressBar(console, every=0.0) as tell:
         tell("rendering", 3, 9)

@@ -32,7 +32,7 @@ def test_metrics_previews_and_what_a_resumed_run_writes_again(tmp_path):
     assert [v["step"] for v in lines(tmp_path)] == [10, 20, 30, 30] and lines(tmp_path)[-1]["grown"] == 5
     assert Image.open(tmp_path / "previews" / "000030.png").getpixel((0, 0)) == (0, 128, 255)
     with (tmp_path / "metrics.jsonl").open("ab") as stream:
-        stream.write(b'{"step": 31, "cut o\n\0\xff\xfe')  # killed while writing, and what a power cut leaves
+        stream.write(b'{"step": 31, "cut o\n\0\xff\xfe')  # a killed process and a power failure leave such bytes
     with Recorder(tmp_path, False) as record:
         record(Started(20, 30, 10, TRAITS))
         record(step(30))
@@ -50,6 +50,6 @@ def test_tensorboard_files_appear_when_asked(tmp_path):
     assert list((tmp_path / "tensorboard").glob("events.out.*"))
 
 
-def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path):
+def test_a_folder_that_cannot_be_written_is_reported(tmp_path):
     with Recorder(tmp_path / "no" / "folder", False) as record, pytest.raises(RunError, match=naming("metrics.jsonl")):
         record(step(1))

@@ -1,4 +1,4 @@
-"""Keyframes: collected where a client stands, saved as a path that `render` reads, played back."""
+"""Keyframes: set where a client stands, saved as a path that `render` reads, played back."""
 
 import json
 
@@ -23,7 +23,7 @@ def test_keyframes_become_a_path_that_render_reads(viewer, capture, tmp_path):
     (path,) = tmp_path.iterdir()
     assert json.loads(path.read_text())["fps"] == 24.0
     made = path_files.read_path(path, capture.world, capture.views[0].camera)
-    assert len(made) == 97 and made.fps == 24.0  # two gaps of two seconds, both ends
+    assert len(made) == 97 and made.fps == 24.0  # two intervals of two seconds, including both ends
     assert np.allclose(made.cameras[48].position.numpy(), [1.0, 0, 0], atol=1e-4)
     sent = []
     handle.send_file_download = lambda name, data: sent.append((name, data))

@@ -14,7 +14,7 @@ from scene_experts.view.live import Live
 from support.viewers import DRAW, joined
 
 
-def test_a_training_is_shown_within_its_share_and_held_while_paused(viewer, capture):
+def test_drawing_keeps_to_its_share_and_a_paused_training_waits(viewer, capture):
     scene, _ = viewer.current()
     training = SimpleNamespace(scene=scene, step=5)
     stop: list[str] = []
@@ -26,7 +26,7 @@ def test_a_training_is_shown_within_its_share_and_held_while_paused(viewer, capt
         for _ in range(200):
             live.viewer.request_redraw()
             live(training)
-        assert 1 <= len(handle.pictures) < 200  # most iterations are left alone
+        assert 1 <= len(handle.pictures) < 200  # most iterations draw nothing
         live.viewer.panel.pause.value = True  # type: ignore[union-attr]
         stop.append("enough")
         began = time.monotonic()
@@ -36,7 +36,7 @@ def test_a_training_is_shown_within_its_share_and_held_while_paused(viewer, capt
         live.close()
 
 
-def test_a_coarser_level_in_the_browser_leaves_the_training_all_its_levels(capture):
+def test_a_coarser_level_in_the_browser_does_not_affect_the_training(capture):
     torch.manual_seed(0)
     scene = RECIPES["octree-gs"][1].scene.start(capture.points, capture.extent, [v.camera for v in capture.views])
     live = Live(capture, DRAW, lambda: False, port=0, ready=lambda url: None)
@@ -48,7 +48,7 @@ def test_a_coarser_level_in_the_browser_leaves_the_training_all_its_levels(captu
         live.viewer.panel.level.value = 0  # type: ignore[union-attr]
         live.viewer.draw()
         whole, coarse = (picture for picture, _ in handle.pictures[-2:])
-        assert (whole != coarse).any()  # it is drawn coarser there
+        assert (whole != coarse).any()  # the browser shows a coarser level
         camera: Camera = capture.views[0].camera
         assert scene.table.facts["level"][scene(camera, 20_000, Mode.TRAIN, DRAW.visible).rows].unique().numel() > 1
     finally:

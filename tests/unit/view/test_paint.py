@@ -1,4 +1,4 @@
-"""What a picture shows: each mode from its definition."""
+"""What a picture shows, against the definitions."""
 
 import pytest
 import torch
@@ -64,7 +64,7 @@ def test_one_expert_alone_draws_less_and_all_together_the_whole():
     assert paint(scene, CAMERA, 2000, DRAW, BLACK, Look("alpha", only=())).max() == 0
 
 
-def test_no_experts_no_expert_view():
+def test_a_scene_without_experts_has_no_expert_picture():
     with pytest.raises(InputError, match="color"):
         paint(start_scene("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("experts"))
     assert paint(start_scene("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("activation")).shape == (32, 48, 3)

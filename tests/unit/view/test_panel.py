@@ -1,4 +1,4 @@
-"""What the controls offer for each kind of scene."""
+"""The controls of the page."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def test_one_expert_alone(viewer):
     assert viewer.panel.read_look().only == (2,)
 
 
-def test_cameras_and_anchors_come_and_go(viewer):
+def test_cameras_and_anchors_are_shown_and_hidden(viewer):
     viewer.panel.show_frusta(True)
     viewer.panel.show_rows(True)
     assert (
@@ -31,7 +31,7 @@ def test_curves_follow_a_training(viewer):
     viewer.panel.add_training_controls()
     for step in (10, 20):
         viewer.panel.curve_time = 0.0
-        viewer.panel.report_picture(0.1, viewer.capture.views[0].camera)  # somebody moves
+        viewer.panel.report_picture(0.1, viewer.capture.views[0].camera)  # a client moves
         viewer.panel.follow(Stepped(step, {"l1": 0.1, "dssim": 0.2}, 20.0 + step, 100, 50, 400, 0.5, 1.0, {}))
     assert viewer.panel.curves["psnr"] == [30.0, 40.0] and viewer.panel.curves["loss"] == [pytest.approx(0.3)] * 2
     plots = dict(viewer.panel.charts)

@@ -1,4 +1,4 @@
-"""Path files: what is written comes back, in the capture's frame; nerfstudio's form; damage in one sentence."""
+"""Path files: round trips in the capture's own frame, nerfstudio's format, damaged files."""
 
 import json
 import math
@@ -28,7 +28,7 @@ def path(frames=5) -> CameraPath:
 
 
 @pytest.mark.parametrize("write", [path_files.write_path, path_files.write_nerfstudio])
-def test_a_path_comes_back(write, tmp_path):
+def test_a_path_survives_a_round_trip(write, tmp_path):
     made = path()
     write(tmp_path / "p.json", made, WORLD)
     back = path_files.read_path(tmp_path / "p.json", WORLD, CAMERA)
@@ -58,7 +58,7 @@ def test_between_keyframes_the_camera_moves_and_size_and_speed_can_be_others(tmp
     assert len(path_files.read_path(tmp_path / "p.json", World(), CAMERA)) == 3
 
 
-def test_the_way_back_of_a_loop_turns_the_field_of_view_back(tmp_path):
+def test_a_loop_interpolates_the_field_of_view_back_to_the_first(tmp_path):
     path_files.write_path(tmp_path / "p.json", path(3), World(), loop=True, play_fps=20.0)  # 50, 51, 52 degrees at 0, 0.1, 0.2 s
     back = path_files.read_path(tmp_path / "p.json", World(), CAMERA)
     assert [math.degrees(camera.fov) for camera in back.cameras] == pytest.approx([50, 50.5, 51, 51.5, 52, 51], abs=1e-3)

@@ -1,4 +1,4 @@
-"""Camera paths: where they stand, what they look at, and that they are smooth, against plain geometry."""
+"""Camera paths: positions, directions and smoothness, against plain geometry."""
 
 import math
 from dataclasses import replace
@@ -24,7 +24,7 @@ def capture(tmp_path_factory):
 
 
 def ring(count=8, radius=3.0, height=1.0) -> CameraRig:
-    """Cameras on a circle about (1, 2, 3) that look at it; up is +z."""
+    """Return cameras on a circle around (1, 2, 3) that look at this point; up is +z."""
     centre, up = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     poses = []
     for i in range(count):
@@ -79,7 +79,7 @@ def test_the_centre_is_where_the_axes_meet(capture):
 
 
 def standing(capture, places, rolls):
-    """The capture with views at `places` that look at the middle of a ring, turned about their axes; up is +z."""
+    """Return the capture with views at `places` that look at the origin, rolled by `rolls`; up is +z."""
     up, views = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), []
     for i, (place, roll) in enumerate(zip(places, rolls)):
         made = look_at(torch.tensor(place, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), up)
@@ -91,13 +91,13 @@ def standing(capture, places, rolls):
 
 def test_the_best_view_is_upright_not_near_and_level(capture):
     around = [(4 * math.cos(a), 4 * math.sin(a), 1.0) for a in (0.1, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)]
-    rolls = [0.0] * 4 + [math.pi / 2] * 3  # portraits among them
+    rolls = [0.0] * 4 + [math.pi / 2] * 3  # with portraits
     scene = lambda places, turned: standing(capture, [*places, *around], [*turned, *rolls])  # noqa: E731
     far, near, above, level = (5.0, 0, 1.0), (0.0, 1.5, 0.3), (0.5, 0, 6.0), (0, 6.0, 1.0)
     assert choose_best_view(scene((far, near, level), (math.pi / 2, 0.0, 0.0))) == 2  # on its side; a close-up
     assert choose_best_view(scene((above, level, near), (0.0, 0.0, 0.0))) == 1  # from straight above
-    assert choose_best_view(scene((far, near, near), (math.pi / 2, math.pi, 0.1))) == 2  # upright before far
-    assert choose_best_view(scene((near, (0, 2.0, 0.3), near), (0.0, 0.0, 0.0))) == 1  # all near: the farthest
+    assert choose_best_view(scene((far, near, near), (math.pi / 2, math.pi, 0.1))) == 2  # upright takes precedence over far
+    assert choose_best_view(scene((near, (0, 2.0, 0.3), near), (0.0, 0.0, 0.0))) == 1  # all are near: the farthest
     none_held_out = replace(scene((far, level, near), (1.0, 0.0, 0.0)), test=(), train=tuple(range(10)))
     assert choose_best_view(none_held_out) == 1
     assert choose_best_view(replace(none_held_out, views=none_held_out.views[:1], train=(0,))) == 0

@@ -1,4 +1,4 @@
-"""The viewer without a browser: clients come, move, ask, go away, and send nonsense; in a browser it is driven in test_view_browser.py."""
+"""The viewer without a browser: clients connect, move, disconnect and send nonsense. test_view_browser.py tests it in a browser."""
 
 import time
 
@@ -15,7 +15,7 @@ from scene_experts.view.server import Client, Viewer
 from support.viewers import DRAW, Handle, joined
 
 
-def test_a_client_starts_at_the_best_held_out_view_and_gets_our_own_render(viewer, capture):
+def test_a_client_starts_at_the_best_held_out_view_and_gets_the_render(viewer, capture):
     handle = joined(viewer)
     viewer.draw()
     (picture, how), camera = handle.pictures[-1], viewer.read_camera(viewer.clients[0])
@@ -29,7 +29,7 @@ def test_a_client_starts_at_the_best_held_out_view_and_gets_our_own_render(viewe
     assert len(handle.pictures) == 1  # nothing changed
 
 
-def test_moving_gets_small_pictures_and_rest_the_full_one(viewer):
+def test_a_moving_client_gets_small_pictures_and_a_resting_one_the_full_picture(viewer):
     handle = joined(viewer)
     viewer.draw()
     viewer.clients[0].seconds_a_pixel = 1e-3
@@ -63,7 +63,7 @@ def test_the_photograph_is_wiped_over_the_render_at_its_view(viewer, capture):
     viewer.request_redraw()
     viewer.draw()
     photo = capture.frame(view).rgb.float() / 255
-    assert torch.allclose(viewer.reproject_photograph(view, camera), photo, atol=2e-3)  # from its own camera it is itself
+    assert torch.allclose(viewer.reproject_photograph(view, camera), photo, atol=2e-3)  # reprojected to its own camera it is unchanged
     found = handle.pictures[-1][0]
     assert np.array_equal(found, to_8bit(viewer.reproject_photograph(view, viewer.read_camera(viewer.clients[0]))))
     viewer.clients[0].at_view = None
@@ -72,7 +72,7 @@ def test_the_photograph_is_wiped_over_the_render_at_its_view(viewer, capture):
     assert not np.array_equal(handle.pictures[-1][0], found)
 
 
-def test_nonsense_from_one_client_is_not_the_others_trouble(viewer):
+def test_nonsense_from_one_client_does_not_affect_the_others(viewer):
     bad, good = joined(viewer, 1), joined(viewer, 2)
     for wrong in (np.full(4, np.nan), np.zeros(4), np.zeros(3), "x"):
         bad.camera.wxyz = wrong
@@ -85,7 +85,7 @@ def test_nonsense_from_one_client_is_not_the_others_trouble(viewer):
     assert bad.pictures == []
 
 
-def test_fifty_clients_that_go_leave_nothing(viewer):
+def test_fifty_disconnected_clients_leave_nothing(viewer):
     for number in range(50):
         handle = joined(viewer, number)
         viewer.draw()
@@ -101,7 +101,7 @@ def test_a_budget_leaves_clients_for_the_next_turn(viewer):
     assert all(h.pictures for h in handles)
 
 
-def test_a_taken_port_is_told(viewer, capture):
+def test_a_taken_port_is_reported(viewer, capture):
     taken = viewer.server.get_port()
     other = Viewer(capture, viewer.current, DRAW, port=taken)
     try:

@@ -1,4 +1,4 @@
-"""The viewer over real sockets, by the page's own protocol: clients that come and go leave nothing, nonsense harms nobody."""
+"""The viewer over real sockets with the page's protocol: disconnected clients leave nothing, and nonsense affects only its sender."""
 
 import gc
 import threading
@@ -25,11 +25,11 @@ def socket(viewer, camera=True):
 
 
 def picture(made, seconds=20.0) -> bool:
-    """Whether a picture comes. The name is in the compressed part, so any message of a picture's size does."""
+    """Return whether a picture arrives. Its name is compressed, so any message of a picture's size counts."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         try:
-            if b"\xff\xd8\xff" in made.recv(timeout=0.5):  # a JPEG's first bytes: pictures are sent as they are
+            if b"\xff\xd8\xff" in made.recv(timeout=0.5):  # the first bytes of a JPEG, which is not compressed again
                 return True
         except TimeoutError:
             pass
@@ -58,8 +58,8 @@ def test_fifty_reconnects_leak_nothing(serving):
         settled(serving)
         assert serving.clients == {}
     gc.collect()
-    assert threading.active_count() <= threads + 4  # a pool of viser's may grow to its own limit
-    assert len(gc.get_objects()) < clients + 50 * 20  # of each client nothing stays
+    assert threading.active_count() <= threads + 4  # a thread pool of viser may grow to its limit
+    assert len(gc.get_objects()) < clients + 50 * 20  # nothing remains of each client
     assert serving.server.get_clients() == {}
 
 

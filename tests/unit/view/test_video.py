@@ -1,4 +1,4 @@
-"""Frames to disk: pictures as they are, a video that reads back."""
+"""Frames on disk: exact pictures, and a video that can be read back."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def frames(count=6, size=(33, 47)):
     return [np.stack([x * 5, y * 7, np.full_like(x, 20 * i)], 2).astype(np.uint8) for i in range(count)]
 
 
-def test_pictures_are_the_frames_and_those_of_a_longer_path_go(tmp_path):
+def test_pictures_are_the_frames_and_those_of_a_longer_path_are_removed(tmp_path):
     assert video.write_pictures(tmp_path, frames(5)) == 5
     (tmp_path / "mine.png").write_bytes(b"kept")
     assert video.write_pictures(tmp_path, frames(3)) == 3
@@ -25,7 +25,7 @@ def test_pictures_are_the_frames_and_those_of_a_longer_path_go(tmp_path):
         video.write_pictures(tmp_path / "file", frames(1))
 
 
-def test_numbered_pictures_of_somebody_else_are_not_touched(tmp_path):
+def test_foreign_numbered_pictures_are_not_replaced(tmp_path):
     (tmp_path / "00007.png").write_bytes(b"a photograph")
     drawn = []
     with pytest.raises(InputError, match=naming("00007.png", "--out")):
@@ -41,7 +41,7 @@ def test_numbered_pictures_of_somebody_else_are_not_touched(tmp_path):
         video.write_pictures(tmp_path, frames())
 
 
-def test_pictures_of_a_path_that_was_stopped_are_replaced(tmp_path):
+def test_pictures_of_an_interrupted_path_are_replaced(tmp_path):
     def stopped():
         yield from frames(3)
         raise KeyboardInterrupt
@@ -52,7 +52,7 @@ def test_pictures_of_a_path_that_was_stopped_are_replaced(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["00000.png", "00001.png", "frames.json"]
 
 
-def test_a_video_that_was_cut_off_is_no_video(tmp_path, monkeypatch):
+def test_an_incomplete_video_is_an_error(tmp_path, monkeypatch):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     whole = ffmpeg.count_frames_and_secs
     monkeypatch.setattr(ffmpeg, "count_frames_and_secs", lambda path: (whole(path)[0] - 1, 1.0))

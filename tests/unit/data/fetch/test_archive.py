@@ -1,4 +1,4 @@
-"""Scenes out of archives: only theirs, only plain files, within bounds, whole or not at all."""
+"""Scenes from archives: only their own plain files, within size limits, all of them or none."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_one_scene_of_many(tmp_path: Path, write, prefix: str) -> None:
     assert stat.S_IMODE((tmp_path / "deep" / "truck").stat().st_mode) == stat.S_IMODE((tmp_path / "deep").stat().st_mode)
 
 
-def test_the_stated_place_wins_and_two_others_are_refused(tmp_path: Path) -> None:
+def test_the_stated_place_takes_precedence_and_two_others_are_rejected(tmp_path: Path) -> None:
     source = write_zip(tmp_path / "a.zip", {**in_folder("x/truck", {"images/x": b"x"}), **in_folder("y/truck", {"images/y": b"y"})})
     archive.extract(source, "truck", tmp_path / "one", ["y/truck"])
     assert read_tree(tmp_path / "one") == {"images/y": b"y"}
@@ -42,14 +42,14 @@ def test_the_stated_place_wins_and_two_others_are_refused(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ["../evil", "images/../../evil", "images/..\\..\\evil", "C:evil", "images/./x"])
-def test_names_that_lead_elsewhere(tmp_path: Path, name: str) -> None:
+def test_names_that_lead_outside_the_folder_are_rejected(tmp_path: Path, name: str) -> None:
     source = write_zip(tmp_path / "a.zip", {**in_folder("truck"), f"truck/{name}": b"evil"})
     with pytest.raises(RunError, match=naming("a.zip")):
         archive.extract(source, "truck", tmp_path / "in" / "truck")
     assert not list(tmp_path.rglob("*evil*")) and not (tmp_path / "in").exists()
 
 
-def test_links_are_refused(tmp_path: Path) -> None:
+def test_links_are_rejected(tmp_path: Path) -> None:
     tar = write_tar(tmp_path / "a.tar.gz", in_folder("truck"), {"truck/images/link.jpg": "/etc/passwd"})
     with pytest.raises(RunError, match=naming("link.jpg")):
         archive.extract(tar, "truck", tmp_path / "truck")
@@ -79,7 +79,7 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.zip"]
 
 
-def test_two_files_of_one_name(tmp_path: Path) -> None:
+def test_two_files_with_the_same_name_are_rejected(tmp_path: Path) -> None:
     source = write_zip(tmp_path / "a.zip", in_folder("truck"))
     with zipfile.ZipFile(source, "a") as out, pytest.warns(UserWarning, match="Duplicate"):
         out.writestr("truck/poses.npy", b"other")
@@ -108,7 +108,7 @@ def test_damage_leaves_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
 
 
-def test_an_entry_longer_than_it_says_is_cut_off() -> None:
+def test_an_entry_longer_than_declared_is_rejected() -> None:
     member = archive.Member("x", 4, "file", lambda: io.BytesIO(b"12345"))
     with pytest.raises(EOFError, match="x"):
         archive._copy(member.open(), io.BytesIO(), member, 0, 4, None)

@@ -1,4 +1,4 @@
-"""The catalog: the paper's scenes, each once, with addresses and a protocol that the loader knows."""
+"""The catalog: each scene of the paper once, with addresses and a protocol that the loader accepts."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_every_entry_can_be_used() -> None:
     assert outdoor == {"bicycle", "garden", "stump"}  # as the evaluation script of 3DGS reads them
 
 
-def test_words() -> None:
+def test_words_select_scenes() -> None:
     assert [s.name for s in select(["truck", "mipnerf360/bonsai", "tandt", "catalog:bonsai"])] == ["bonsai", "truck", "train"]
     assert len(select(["all"])) == 17 and select([]) == []
     assert one("Quebec").path == "bungeenerf/quebec"
@@ -45,6 +45,6 @@ def test_words() -> None:
 
 
 @pytest.mark.parametrize(("word", "hint"), [("bonzai", "'bonsai'"), ("mipnerf/garden", "'mipnerf360/garden'"), ("tant", "'tandt'")])
-def test_unknown_words_are_answered_with_the_nearest(word: str, hint: str) -> None:
+def test_unknown_words_suggest_the_nearest_names(word: str, hint: str) -> None:
     with pytest.raises(InputError, match=naming(word, hint)):
         select([word])

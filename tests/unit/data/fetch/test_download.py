@@ -1,4 +1,4 @@
-"""Downloads from a server on this machine: continued, checked, several addresses, whole or not at all."""
+"""Downloads from a server on this machine: resuming, verification, several addresses, atomic results."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ def test_fetch(server: Server, tmp_path: Path) -> None:
     assert got == download.Fetched(f"{server.url}/file", len(CONTENT), DIGEST)
     assert list(path.parent.iterdir()) == [path]
     download.fetch([f"{server.url}/file"], path, DIGEST)
-    assert len(server.asked) == 1  # nothing to do the second time
+    assert len(server.asked) == 1  # the second call has nothing to do
 
 
-def test_an_answer_cut_short_is_continued(server: Server, tmp_path: Path) -> None:
+def test_an_incomplete_answer_is_resumed(server: Server, tmp_path: Path) -> None:
     server.cuts = [300_000, 200_000]
     download.fetch([f"{server.url}/file"], tmp_path / "file", DIGEST)
     assert (tmp_path / "file").read_bytes() == CONTENT and server.asked == [None, "bytes=300000-", "bytes=500000-"]
 
 
-def test_the_next_call_continues(server: Server, tmp_path: Path) -> None:
+def test_the_next_call_resumes_the_download(server: Server, tmp_path: Path) -> None:
     server.cuts = [300_000] + [0] * 10
     with pytest.raises(RunError, match=naming(300000, 1280000)):
         download.fetch([f"{server.url}/file"], tmp_path / "file", DIGEST)
@@ -60,25 +60,25 @@ def test_server_that_cannot_resume(server: Server, tmp_path: Path) -> None:
     assert (tmp_path / "file").read_bytes() == CONTENT
 
 
-def test_part_that_is_no_beginning(server: Server, tmp_path: Path) -> None:
+def test_a_part_that_is_not_the_beginning_of_the_file(server: Server, tmp_path: Path) -> None:
     (tmp_path / "file.part").write_bytes(CONTENT + b"more")
     download.fetch([f"{server.url}/file"], tmp_path / "file", DIGEST)
     assert (tmp_path / "file").read_bytes() == CONTENT
 
 
-def test_part_that_is_complete_needs_no_server(tmp_path: Path) -> None:
+def test_a_complete_part_needs_no_server(tmp_path: Path) -> None:
     (tmp_path / "file.part").write_bytes(CONTENT)
     download.fetch([DEAD], tmp_path / "file", DIGEST)
     assert (tmp_path / "file").read_bytes() == CONTENT
 
 
-def test_without_a_checksum_only_the_same_version_is_continued(server: Server, tmp_path: Path) -> None:
+def test_without_a_checksum_only_the_same_version_is_resumed(server: Server, tmp_path: Path) -> None:
     server.headers["/file"] = {"ETag": '"one"'}
     server.cuts = [300_000] + [0] * 10
     with pytest.raises(RunError, match=naming(300000, 1280000)):
         download.fetch([f"{server.url}/file"], tmp_path / "file")
     server.cuts, server.asked = [], []
-    download.fetch([f"{server.url}/file"], tmp_path / "same")  # another name: its own part
+    download.fetch([f"{server.url}/file"], tmp_path / "same")  # another name has a part of its own
     (tmp_path / "other.part").write_bytes((tmp_path / "file.part").read_bytes())
     (tmp_path / "other.part.json").write_text((tmp_path / "file.part.json").read_text())
     got = download.fetch([f"{server.url}/file"], tmp_path / "file")
@@ -88,7 +88,7 @@ def test_without_a_checksum_only_the_same_version_is_continued(server: Server, t
     assert (tmp_path / "other").read_bytes() == CONTENT[::-1]
 
 
-def test_without_a_checksum_or_version_a_part_is_begun_anew(server: Server, tmp_path: Path) -> None:
+def test_without_a_checksum_or_version_a_download_starts_over(server: Server, tmp_path: Path) -> None:
     (tmp_path / "file.part").write_bytes(b"x" * 1000)
     download.fetch([f"{server.url}/file"], tmp_path / "file")
     assert (tmp_path / "file").read_bytes() == CONTENT and server.asked == [None]
@@ -146,7 +146,7 @@ def test_errors_are_one_sentence(server: Server, tmp_path: Path) -> None:
         download.check_web_address("ftp://host/file")
 
 
-def test_too_small_a_disk_is_said_before_anything_is_written(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_before_anything_is_written(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(download.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 1000})())
     with pytest.raises(RunError, match=naming("0.1 GB")):
         download.fetch([f"{server.url}/file"], tmp_path / "file", DIGEST)

@@ -1,4 +1,4 @@
-"""Scenes fetched from a server on this machine: archives once, checksums kept, everything else by hand."""
+"""Scenes from a server on this machine: shared archives, recorded checksums, and advice for what is done by hand."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_an_archive_is_fetched_once(server: Server, tmp_path: Path) -> None:
     assert get(both, tmp_path) == [f"{s.name} is at {tmp_path / s.path}" for s in both]
 
 
-def test_archives_may_go(server: Server, tmp_path: Path) -> None:
+def test_archives_are_removed_on_request(server: Server, tmp_path: Path) -> None:
     get(scenes(server), tmp_path, keep=False)
     assert [p.name for p in (tmp_path / "archives").iterdir()] == ["checksums.json"]
 
@@ -96,7 +96,7 @@ def test_mirrors_come_first_and_the_owner_last(server: Server, tmp_path: Path) -
         get(scenes(server), tmp_path / "c", mirrors=["/some/folder"])
 
 
-def test_when_the_source_is_gone_the_archive_is_put_there_by_hand(server: Server, tmp_path: Path) -> None:
+def test_without_a_source_the_error_says_where_to_put_the_archive(server: Server, tmp_path: Path) -> None:
     data = server.files.pop("/both.zip")
     place = tmp_path / "archives" / "both.zip"
     with pytest.raises(RunError, match=naming(404, "https://owner/page", place)):
@@ -106,7 +106,7 @@ def test_when_the_source_is_gone_the_archive_is_put_there_by_hand(server: Server
     assert json.loads((tmp_path / "archives" / "checksums.json").read_text())["both.zip"]["bytes"] == len(data)
 
 
-def test_a_damaged_download_is_not_what_later_ones_are_compared_with(server: Server, tmp_path: Path) -> None:
+def test_a_damaged_download_is_not_recorded(server: Server, tmp_path: Path) -> None:
     whole = server.files["/both.zip"]
     server.files["/both.zip"] = whole[:-30]
     with pytest.raises(RunError, match=naming("both.zip")):
@@ -117,7 +117,7 @@ def test_a_damaged_download_is_not_what_later_ones_are_compared_with(server: Ser
     get(scenes(server), tmp_path)
 
 
-def test_a_scene_put_there_by_hand_is_taken(server: Server, tmp_path: Path) -> None:
+def test_a_scene_that_was_copied_by_hand_is_used(server: Server, tmp_path: Path) -> None:
     truck = scenes(server)[0]
     (tmp_path / "pair" / "truck" / "images").mkdir(parents=True)
     with pytest.raises(RunError, match=naming(tmp_path / "pair" / "truck")):
@@ -126,12 +126,12 @@ def test_a_scene_put_there_by_hand_is_taken(server: Server, tmp_path: Path) -> N
     assert get([truck], tmp_path) == [f"truck is at {tmp_path / 'pair' / 'truck'}"]
 
 
-def test_other_counts_of_photographs_are_said(server: Server, tmp_path: Path) -> None:
+def test_another_number_of_photographs_is_a_warning(server: Server, tmp_path: Path) -> None:
     said = get([replace(scenes(server)[0], views=3)], tmp_path)
     assert any(all(fact in line for fact in ("warning", "truck", "3", "2")) for line in said)
 
 
-def test_names_become_folders_with_the_papers_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_resolve_to_folders_and_the_papers_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(obtain.VARIABLE, str(tmp_path))
     assert obtain.captures_dir() == tmp_path
     assert obtain.resolve(Path("some/folder"), "auto", "auto") == (Path("some/folder"), "auto", "auto")
@@ -146,7 +146,7 @@ def test_names_become_folders_with_the_papers_protocol(tmp_path: Path, monkeypat
         obtain.resolve(Path("catalog:bonsay"), "auto", "auto")
 
 
-def test_a_record_that_is_none(server: Server, tmp_path: Path) -> None:
+def test_a_damaged_record_of_checksums(server: Server, tmp_path: Path) -> None:
     (tmp_path / "archives").mkdir()
     (tmp_path / "archives" / "checksums.json").write_text('{"both.zip": 3}')
     with pytest.raises(InputError, match=naming("checksums.json")):

@@ -14,7 +14,7 @@ from scene_experts.data.lens import Lens
 from support.synthetic import make_blender, picture
 
 
-def test_blender_split_pose_and_background(tmp_path: Path) -> None:
+def test_split_pose_and_background(tmp_path: Path) -> None:
     made = make_blender(tmp_path)
     capture = load(tmp_path, init="random", normalise="none")
     assert capture.kind == "blender" and capture.split == "files"
@@ -33,7 +33,7 @@ def test_blender_split_pose_and_background(tmp_path: Path) -> None:
         assert capture.background == colour
 
 
-def test_blender_random_points_fill_its_cube_in_any_world(tmp_path: Path) -> None:
+def test_random_points_fill_the_cube_of_3dgs(tmp_path: Path) -> None:
     make_blender(tmp_path)
     capture = load(tmp_path, init="random")
     assert capture.points is not None and len(capture.points.xyz) == 10_000

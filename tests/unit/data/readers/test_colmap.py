@@ -34,7 +34,7 @@ def test_a_reconstruction_states_neither_split_nor_bounds(made: Synthetic) -> No
     assert raw.alpha_over is None and raw.bounds is None and not raw.states_split and "points3D" in raw.points_source
 
 
-def test_text_models_load_alike(made: Synthetic, copy: Path) -> None:
+def test_text_models_load_like_binary_ones(made: Synthetic, copy: Path) -> None:
     model = read_model(copy / "sparse/0")
     shutil.rmtree(copy / "sparse/0")
     write_model(copy / "sparse/0", model, text=True)

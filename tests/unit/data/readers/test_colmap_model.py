@@ -1,4 +1,4 @@
-"""The COLMAP reader: both formats, 2D tracks, and every way a file can be bad."""
+"""COLMAP reconstructions: both formats, 2D tracks, and every kind of damaged file."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def with_tracks(folder: Path) -> None:
     (folder / "points3D.bin").write_bytes(struct.pack("<Q", 2) + one + two)
 
 
-def test_tracks_are_read_or_jumped_over(tmp_path: Path) -> None:
+def test_tracks_are_read_or_skipped(tmp_path: Path) -> None:
     with_tracks(tmp_path)
     got = read_model(tmp_path, observations=True)
     assert got.cameras[7].params == (500.0, 501.0, 320.5, 240.25)
@@ -84,7 +84,7 @@ def test_text_with_observations_and_blank_lines(tmp_path: Path) -> None:
     np.testing.assert_array_equal(got.rgb, [[255, 0, 7]])
 
 
-def test_75_thousand_points_in_well_under_a_second_or_two(tmp_path: Path) -> None:
+def test_75_thousand_points_are_read_within_two_seconds(tmp_path: Path) -> None:
     made, count = model(), 75_000
     rng = np.random.default_rng(0)
     made = replace(
@@ -119,14 +119,14 @@ def test_missing_files_are_named(tmp_path: Path, name: str) -> None:
         read_model(tmp_path)
 
 
-def test_missing_points_mean_none(tmp_path: Path) -> None:
+def test_without_a_points_file_there_are_no_points(tmp_path: Path) -> None:
     write_model(tmp_path, model())
     (tmp_path / "points3D.bin").unlink()
     assert len(read_model(tmp_path).xyz) == 0
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_truncation_anywhere_is_an_input_error(tmp_path: Path, name: str) -> None:
+def test_a_file_truncated_anywhere_is_an_input_error(tmp_path: Path, name: str) -> None:
     with_tracks(tmp_path)
     whole = (tmp_path / f"{name}.bin").read_bytes()
     for size in range(len(whole)):

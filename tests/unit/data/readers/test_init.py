@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+import scene_experts
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Points
 from scene_experts.data import readers
@@ -113,3 +115,12 @@ def test_a_registered_reader_is_asked_before_the_built_in_ones(folder: Path, mon
     readers.register(PosesReader())
     after = readers.find_reader(folder)
     assert before and after and (before.name, after.name) == ("nerfstudio", "poses")
+
+
+def test_only_its_reader_knows_the_name_of_a_kind() -> None:
+    """Other files read what a capture states and never compare its kind."""
+    names = {reader.name for reader in readers._load_built_in()}
+    source = Path(scene_experts.__file__).parent
+    for path in set(source.rglob("*.py")) - set(Path(readers.__file__).parent.glob("*.py")):
+        constants = {node.value for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Constant)}
+        assert not names & {value for value in constants if isinstance(value, str)}, path

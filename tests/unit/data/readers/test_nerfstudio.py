@@ -53,8 +53,8 @@ def test_distorted_frames_are_undistorted(tmp_path: Path, index: int) -> None:
 
 
 @pytest.mark.parametrize("outside", ["../photos", "{}/photos"])
-def test_photographs_elsewhere_keep_their_results_inside(tmp_path: Path, outside: str) -> None:
-    """Results are written under the names of views: a name with a root or ".." would overwrite the photograph itself."""
+def test_results_of_photographs_elsewhere_stay_inside_the_run(tmp_path: Path, outside: str) -> None:
+    """Results are written under the names of views, so a name with a root or ".." would overwrite the photograph itself."""
     make_nerfstudio(tmp_path / "c", views=3, size=(24, 16), points=50)
     (tmp_path / "c/images").rename(tmp_path / "photos")
     edit(
@@ -67,7 +67,7 @@ def test_photographs_elsewhere_keep_their_results_inside(tmp_path: Path, outside
         assert (tmp_path / "run" / view.name).resolve().is_relative_to(tmp_path / "run")
 
 
-def test_photographs_whose_results_would_share_a_name(tmp_path: Path) -> None:
+def test_photographs_whose_results_would_have_the_same_name(tmp_path: Path) -> None:
     make_nerfstudio(tmp_path / "c", views=3, size=(24, 16), points=50)
     (tmp_path / "images").mkdir()
     (tmp_path / "images/view_000.png").write_bytes((tmp_path / "c/images/view_000.png").read_bytes())
@@ -98,7 +98,7 @@ def test_masks_of_nerfstudio(tmp_path: Path, place: str) -> None:
     assert mask is not None and not mask.any() and capture.frame(0).mask is None
 
 
-def test_auto_takes_the_split_that_the_file_names(tmp_path: Path) -> None:
+def test_auto_uses_the_split_that_the_file_states(tmp_path: Path) -> None:
     make_nerfstudio(tmp_path, views=5, size=(24, 16), points=50)
     edit(tmp_path / "transforms.json", lambda m: m.update(test_filenames=["images/view_001.png", "images/view_003.png"]))
     capture = load(tmp_path)

@@ -41,7 +41,7 @@ def test_float_colours(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_points(tmp_path / "p.ply")[1], RGB)
 
 
-def test_no_colours_are_grey(tmp_path: Path) -> None:
+def test_points_without_colours_are_grey(tmp_path: Path) -> None:
     (tmp_path / "p.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n"
     )

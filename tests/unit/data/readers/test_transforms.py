@@ -1,4 +1,4 @@
-"""The frames of transforms*.json: what is read of them, and every way they can be wrong."""
+"""The frames of transforms*.json: their values, and every kind of invalid value."""
 
 from __future__ import annotations
 
