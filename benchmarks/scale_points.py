@@ -27,7 +27,8 @@ from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap_model import ColmapImage, Model, write_model
 from scene_experts.data.views import World
-from scene_experts.files.export import write_compact_run
+from scene_experts.files.anchors import FAMILY
+from scene_experts.files.formats import compact
 from scene_experts.render import choose
 from scene_experts.strategy import observe
 from scene_experts.training.config import Data, RunConfig
@@ -95,7 +96,8 @@ def measure_anchors(count: int) -> list[Row]:
         rows.add("save", lambda: save(work.training, folder, 1), again=False)
         rows.add("load", lambda: restore(work.training, folder), again=False)
         run = OpenRun(folder, RunConfig(work.training.cfg, Data(folder)), work.training.cfg, scene, step.AT, 0.0)
-        rows.add("export compact", lambda: write_compact_run(run, World(1.0, (0.0, 0.0, 0.0)), folder / "scene.compact"), again=False)
+        file = folder / "scene.compact"
+        rows.add("export compact", lambda: compact.write(file, FAMILY.contents(run, World(), {}), {}), again=False)
     return rows.rows
 
 

@@ -71,13 +71,13 @@ def of_checkpoint(folder: Path) -> dict[str, str]:
 
 
 def of_archive(path: Path) -> str:
-    """Digest of the members of a torch archive; the archive's own bytes where it is none."""
+    """Digest of the tensors in a torch archive, without the names that torch counts up; the archive's own bytes where it is none."""
     import zipfile
 
     if not zipfile.is_zipfile(path):
         return sha(path.read_bytes())
     with zipfile.ZipFile(path) as archive:
-        names = sorted(n for n in archive.namelist() if "/data" in n)
+        names = sorted(n for n in archive.namelist() if "/data/" in n)
         return sha(*(archive.read(n) for n in names))
 
 

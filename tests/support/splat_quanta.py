@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from scene_experts.files.formats.sort import morton_order
+from scene_experts.files.formats.pack import morton_order
 from scene_experts.files.formats.splats import Splats
 from scene_experts.geometry.sh import C0
 

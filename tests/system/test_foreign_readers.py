@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 import torch
 
+from scene_experts.files.formats import ply
 from scene_experts.files.formats.pack import turned
 from scene_experts.files.formats.splats import Splats
-from scene_experts.files.formats.standard import FORMATS, read_standard, write_standard
-from scene_experts.files.ply import read_gaussian_ply
+from scene_experts.files.registry import GAUSSIANS, format_named, formats_of, read
 from support.gltf import column, parsed
 from support.splat_quanta import check, differences, quanta, scene
 
@@ -69,12 +69,12 @@ def by_gaussforge(path, tmp_path) -> Splats:
         pytest.skip("gaussforge is not installed")
     kind = path.name.split(".", 1)[1]
     run(PYTHON, "-c", GAUSSFORGE, str(path), str(tmp_path / "gaussforge.ply"), kind)
-    s = Splats(**read_gaussian_ply(tmp_path / "gaussforge.ply"))
+    s = ply.read(tmp_path / "gaussforge.ply")
     return turned(s, "x") if path.suffix == ".spz" else s  # so does gaussforge
 
 
 def as_ply(path, tmp_path) -> Splats:
-    return Splats(**read_gaussian_ply(by_splat_transform(path, tmp_path, "splat_transform.ply")))
+    return ply.read(by_splat_transform(path, tmp_path, "splat_transform.ply"))
 
 
 def by_splat_transform(path, tmp_path, out):
@@ -96,13 +96,13 @@ READS = [
 @pytest.mark.parametrize("degree", [0, 3])
 def test_a_foreign_reader_finds_what_was_written(tmp_path, reader, format, degree):
     s = scene(1000, degree)
-    path = tmp_path / f"a{FORMATS[format].suffix}"
-    write_standard(path, s, format, {"recipe": "moe-gs", "psnr": 21.88})
+    path = tmp_path / f"a{format_named(format).suffix}"
+    format_named(format).write(path, s, {"recipe": "moe-gs", "psnr": 21.88})
     found = READERS[reader](path, tmp_path)
     if format == "splat":
         found = Splats(found.means, found.log_scales, found.quats, found.opacity_logit, found.sh[:, :1])
     check(format, found, s)
-    ours = read_standard(path)
+    ours = read(path)
     for name, difference in differences(found, ours).items():
         assert float(difference.max()) <= (0.02 if name == "sh" and format == "compressed-ply" else 0.01), (name, float(difference.max()))
 
@@ -110,8 +110,8 @@ def test_a_foreign_reader_finds_what_was_written(tmp_path, reader, format, degre
 @pytest.mark.parametrize("format", ["ply", "compressed-ply", "spz", "sog"])
 def test_we_read_what_splat_transform_writes(tmp_path, format):
     s = scene(1500, 3)
-    write_standard(tmp_path / "a.ply", s, "ply", {})
-    found = read_standard(by_splat_transform(tmp_path / "a.ply", tmp_path, f"b{FORMATS[format].suffix}"))
+    format_named("ply").write(tmp_path / "a.ply", s, {})
+    found = read(by_splat_transform(tmp_path / "a.ply", tmp_path, f"b{format_named(format).suffix}"))
     nearest = torch.cdist(found.means.double(), s.means.double()).argmin(1)
     wanted = s.rows(nearest)
     assert len(nearest.unique()) > 1480
@@ -125,15 +125,15 @@ def test_we_read_what_splat_transform_writes(tmp_path, format):
 def test_our_gltf_has_the_accessors_of_splat_transform_s(tmp_path):
     """It writes glTF and reads none: the same scene, attribute by attribute."""
     s = scene(300, 3)
-    write_standard(tmp_path / "a.ply", s, "ply", {})
+    format_named("ply").write(tmp_path / "a.ply", s, {})
     theirs = by_splat_transform(tmp_path / "a.ply", tmp_path, "b.glb")
-    write_standard(tmp_path / "a.glb", s, "glb", {})
+    format_named("glb").write(tmp_path / "a.glb", s, {})
     (ours, our_body), (their, their_body) = parsed(tmp_path / "a.glb"), parsed(theirs)
     names = ours["meshes"][0]["primitives"][0]["attributes"]
     assert set(names) == set(their["meshes"][0]["primitives"][0]["attributes"])
     assert ours["meshes"][0]["primitives"][0]["extensions"] == their["meshes"][0]["primitives"][0]["extensions"]
     # it quotes a node's transform or turns the data: compared after both are read
-    check("glb", read_standard(theirs), s)
+    check("glb", read(theirs), s)
     for name in names:
         if name.endswith("COLOR_0"):
             assert np.abs(column(ours, our_body, name).astype(int) - column(their, their_body, name)).max() <= 1
@@ -162,7 +162,7 @@ def test_a_general_gltf_reader_finds_what_was_written(tmp_path, degree):
     if not NODE or not modules or not os.path.isdir(os.path.join(modules, "@gltf-transform", "core")):
         pytest.skip("@gltf-transform/core is not installed (SCENE_EXPERTS_NODE_MODULES names the folder that has it)")
     s = scene(500, degree)
-    write_standard(tmp_path / "a.glb", s, "glb", {"recipe": "moe-gs"})
+    format_named("glb").write(tmp_path / "a.glb", s, {"recipe": "moe-gs"})
     run(NODE, "-e", GLTF_TRANSFORM, modules, str(tmp_path / "a.glb"), str(tmp_path / "a.json"))
     columns = {
         name.removeprefix("KHR_gaussian_splatting:"): torch.tensor(v) for name, v in json.loads((tmp_path / "a.json").read_text()).items()
@@ -188,7 +188,7 @@ def test_khronos_validator_finds_no_error(tmp_path):
     modules = os.environ.get("SCENE_EXPERTS_NODE_MODULES")
     if not NODE or not modules or not os.path.isdir(os.path.join(modules, "gltf-validator")):
         pytest.skip("gltf-validator is not installed (SCENE_EXPERTS_NODE_MODULES names the folder that has it)")
-    write_standard(tmp_path / "a.glb", scene(100, 3), "glb", {"recipe": "moe-gs"})
+    format_named("glb").write(tmp_path / "a.glb", scene(100, 3), {"recipe": "moe-gs"})
     done = subprocess.run([NODE, "-e", VALIDATOR, modules, str(tmp_path / "a.glb")], capture_output=True, text=True, timeout=120)
     # it knows the extension no more than the names of its attributes
     errors = [
@@ -200,7 +200,7 @@ def test_khronos_validator_finds_no_error(tmp_path):
 def test_quanta_of_every_format_are_small():
     """The limits above say something: far below the spread of the values."""
     s = scene(2000, 3)
-    for format in FORMATS:
+    for format in formats_of(GAUSSIANS):
         for name, limit in quanta(format, s).items():
             if not (format == "sog" and name == "sh"):
                 assert float(torch.as_tensor(limit).float().mean()) < 0.35, (format, name)

@@ -3,7 +3,7 @@ import { readFileSync, writeFileSync } from "node:fs";
 import { gzipSync } from "node:zlib";
 import { build } from "esbuild";
 
-const out = new URL("../../src/scene_experts/export/formats/assets/", import.meta.url);
+const out = new URL("../../src/scene_experts/files/formats/assets/", import.meta.url);
 const made = await build({
   entryPoints: ["viewer.js"], bundle: true, minify: true, format: "iife", target: "es2021", legalComments: "none", write: false,
 });

@@ -11,7 +11,8 @@ import torch
 
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.data.capture import Capture
-from scene_experts.files.export import warnings_of_layout, write_layout
+from scene_experts.files.export import result_warnings, write_result_folder
+from scene_experts.files.registry import exported_files
 from scene_experts.render import Rasterizer
 from scene_experts.training import loop, run_folder
 from scene_experts.training.config import check
@@ -38,7 +39,7 @@ def train(run: loop.Run, capture: Capture, rasterize: Rasterizer, *, overwrite: 
             if isinstance(event, Started):  # the training can start: from here on the folder may change
                 complete = event.step == event.total and is_exported(run.out, event.step)
                 folder.enter_context(run_folder.held(run.out))
-                run_folder.prepare(run.out, run.config, run.resume, overwrite)
+                run_folder.prepare(run.out, run.config, run.resume, overwrite, exported_files(run.out))
             record(event)
             if isinstance(event, Finished):
                 finished = event  # yielded last; the loop ends first and frees its memory
@@ -58,7 +59,7 @@ def is_exported(out: Path, step: int) -> bool:
 def export_layout(out: Path, capture: Capture) -> Exported:
     """Write the newest checkpoint of a run folder in the layout that other tools read."""
     opened = run_folder.open_run(out)
-    return Exported(opened.step, write_layout(opened, capture), tuple(warnings_of_layout(opened)))
+    return Exported(opened.step, write_result_folder(opened, capture), tuple(result_warnings(opened)))
 
 
 def check_settings(run: loop.Run) -> None:

@@ -25,10 +25,9 @@ from scene_experts.evaluate.command import about
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.pictures import to_8bit
 from scene_experts.evaluate.score import evaluate
-from scene_experts.files.bake.bake import Bake
-from scene_experts.files.bake.export import Options, export_standard
-from scene_experts.files.bake.refine import Refine
-from scene_experts.files.export import export_run, import_result
+from scene_experts.files import export as exporting
+from scene_experts.files.export import Options
+from scene_experts.files.importing import import_files
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.report import page
 from scene_experts.scene import Draws, Scene
@@ -38,8 +37,6 @@ from scene_experts.training.state import Training
 from scene_experts.view import video
 from scene_experts.view.paint import Look, paint
 from scene_experts.view.show import SHOWS, Show
-
-Format = Literal["compact", "anchors", "ply", "compressed-ply", "splat", "spz", "sog", "glb", "html"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +231,7 @@ class Run:
 
     def export(
         self,
-        format: Format = "compact",
+        format: str = "compact",
         out: str | Path | None = None,
         *,
         sh_degree: int = 3,
@@ -263,13 +260,12 @@ class Run:
             InputError: The format cannot hold the scene, the run is only in memory, or a value is out of range.
             RunError: The disk is full.
         """
-        run, where = self._in_folder("export"), None if out is None else Path(out)
-        if format in ("compact", "anchors"):
-            lines = export_run(run, format, where, self.step, None, self._data)
-        else:
-            options = Options(Bake(sh_degree, max_gaussians, prune, Refine(refine)), frame, False, False)
-            lines = export_standard(run, format, where, self.step, self._rasterize, options, self._data)
-        return Path(lines[0].removeprefix("wrote "))
+        folder, opened = self._in_folder("export"), self._opened
+        if self._device != "cpu":
+            opened = run_folder.open_run(folder, "cpu", self.step)
+        options = Options(False, sh_degree, max_gaussians, prune, refine, frame)
+        opened = run_folder.with_capture(opened, self._data)
+        return exporting.export(opened, format, None if out is None else Path(out), options)[0].path
 
     def report(self) -> Path:
         """Write RUN/report.html, a page with curves, held-out views, experts and the command that repeats the run.
@@ -386,5 +382,5 @@ def import_run(
         InputError: The source holds no scene, the capture does not fit it, or `out` holds something else.
     """
     known = capture if isinstance(capture, Capture) else load_capture(capture)
-    import_result(Path(source), known.data, Path(out), iteration)
+    import_files(Path(source), known.data, Path(out), iteration)
     return open_run(out, device=device)

@@ -1,4 +1,5 @@
-"""cameras.json, the list of views that viewers of the 3DGS family read beside a scene, in the capture's own frame."""
+"""cameras.json, the list of views that viewers of the 3DGS family read beside a scene, in the
+capture's own frame."""
 
 from __future__ import annotations
 
@@ -11,9 +12,11 @@ from scene_experts.data.views import Capture, View, World
 
 
 def camera_entries(views: Iterable[View], world: World) -> list[dict[str, Any]]:
-    """One entry a view, numbered in the order given: position (camera centre) and rotation (3x3, camera to world) in the input frame.
+    """One entry a view, numbered in the order given: position (camera centre) and rotation (3x3,
+    camera to world) in the input frame.
 
-    Sizes, fx and fy are pixels of the trained resolution. cx and cy are ours: the readers of this family take the image centre.
+    Sizes, fx and fy are pixels of the trained resolution. cx and cy are ours: the readers of this
+    family take the image centre.
     """
     out = []
     for i, view in enumerate(views):

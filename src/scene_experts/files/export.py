@@ -1,235 +1,324 @@
-"""Trained runs to files: the Scaffold-GS layout and the compact file, in the capture's own frame."""
+"""Runs to files: the only entry is `export`. `write_result_folder` writes what a training leaves
+for other tools."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import time
+from contextlib import nullcontext
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
-
+import scene_experts
 from scene_experts.core.errors import InputError
-from scene_experts.core.io import write_bytes
+from scene_experts.core.io import check_writable, read_json, write_bytes, write_json
 from scene_experts.data.views import Capture, World
-from scene_experts.files import gaussians as explicit
-from scene_experts.files.anchors.compact import Compact, Sizes, read_compact, write_compact
-from scene_experts.files.anchors.extras import extra_networks, level_columns
-from scene_experts.files.anchors.frame import Network, anchors_to_input, lattice_to_input, networks_to_input
-from scene_experts.files.anchors.layout import SIDECAR, describe, read_sidecar, write_scaffold_folder
-from scene_experts.files.anchors.networks import is_plain, sequential
-from scene_experts.files.anchors.read import compact_anchors, run_tensors, world_in
-from scene_experts.files.anchors.read import import_result as import_files
-from scene_experts.files.bake.measure import counted, nothing_counted, scores
 from scene_experts.files.cameras import write_cameras
-from scene_experts.files.graph import read as graph_points_in
-from scene_experts.files.graph import write as graph_points
-from scene_experts.render import Rasterizer, as_trained
-from scene_experts.scene.anchors.experts import MixtureHead
-from scene_experts.scene.anchors.scene import ATTRIBUTES, AnchorScene
-from scene_experts.scene.anchors.select import LevelSelector
-from scene_experts.scene.gaussians import GaussianScene
-from scene_experts.scene.graph.scene import GraphScene
-from scene_experts.training import run_folder
-from scene_experts.training.config import Data, to_json
-from scene_experts.training.run_folder import OpenRun
-from scene_experts.training.state import scene_from
+from scene_experts.files.measure import Tell, capture_if_there, cost
+from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
+from scene_experts.files.registry import GAUSSIANS, Family, Format, family_named, format_named, format_names, formats_of
+from scene_experts.render import Rasterizer
+from scene_experts.scene import Scene
+from scene_experts.training.config import to_json
+from scene_experts.training.progress import format_duration
+from scene_experts.training.run_folder import OpenRun, capture_of
 
-COMPACT = "scene.compact"
-_LATTICE_TOLERANCE = 1e-3  # voxels
+NAME = "scene"  # of files whose name the caller does not choose
+DESCRIPTION = "scene.json"  # in a result folder
+NOTE_FORMAT = 1
 
 
-def write_layout(run: OpenRun, capture: Capture, out: Path | None = None) -> Path:
-    """Write point_cloud/iteration_<step>/, cameras.json and (not for SAGS) cfg_args below `out`, the run folder; the iteration's folder."""
+@dataclass(frozen=True)
+class Written:
+    """What `export` wrote."""
+
+    path: Path
+    """The file, or the folder point_cloud/iteration_N of a result folder."""
+    bytes: int
+    """Size of the file, or of the folder's files."""
+    rows: int
+    """Anchors, Gaussians or points in it."""
+    lines: tuple[str, ...]
+    """The same in sentences, for a terminal."""
+    psnr: dict[str, float] = field(default_factory=dict)
+    """Mean PSNR of the held-out views against the photographs, dB, drawn from the "run" and from
+    the "file", for a baked scene also from its "closed_form" and its "bake"; empty where nothing
+    was measured."""
+
+
+@dataclass(frozen=True)
+class _Work:
+    """An export under way."""
+
+    run: OpenRun
+    name: str  # of the format
+    format: Format
+    options: Options
+    rasterize: Rasterizer | None
+    tell: Tell
+    command: str
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether the run's rows are standard Gaussians already and are written as they are."""
+        degree, how = self.run.scene.traits.sh_degree, self.options
+        cut = 0 < how.max_gaussians < len(self.run.scene.table)
+        return degree is not None and how.sh_degree >= degree and not how.prune and not cut
+
+
+def export(
+    run: OpenRun,
+    format: str = "compact",
+    out: Path | None = None,
+    options: Options = DEFAULT,
+    *,
+    rasterize: Rasterizer | None = None,
+    tell: Tell = lambda what, done, total: None,
+    command: str = "",
+) -> list[Written]:
+    """Write a trained scene in a format of `registry.FORMATS`.
+
+    A format that keeps scenes with their networks takes scenes of its own family only. A format of
+    standard Gaussians takes every scene. Scenes whose Gaussians depend on the camera are baked for
+    it, which takes minutes and needs the capture.
+
+    Args:
+        run: The run, on the CPU. `run_folder.with_capture` says where its capture is if it moved.
+        format: Name of the format.
+        out: File, or folder for it. Default: scene.SUFFIX in the run folder. With `options.levels`,
+            one file per level of detail beside it.
+        options: What to write, and whether to measure it.
+        rasterize: Draws the views. Default: the fastest rasteriser on this CPU.
+        tell: Called with the progress: what, done, total.
+        command: The command line, kept in the file's note.
+
+    Returns:
+        One `Written` per file. Beside a standard file, FILE.json says how it was made.
+
+    Raises:
+        InputError: The format is unknown or cannot hold the scene, an option is out of range, or
+            the capture is missing.
+        RunError: The disk is full.
+    """
+    _check(options)
+    work = _Work(run, format, format_named(format), options, rasterize, tell, command)
+    if work.format.family != GAUSSIANS:
+        return [_export_scene(work, out)]
+    if run.scene.traits.sh_degree is None:  # it will be baked
+        work = replace(work, options=replace(options, sh_degree=min(options.sh_degree, work.format.sh_degree)))
+    path = file_path(run.path, format, work.format, out)
+    check_writable(path)
+    with capture_if_there(run, needed=not work.is_direct) as capture:
+        return [_export_gaussians(work, file, level, capture) for level, file in _files(run, path, options.levels)]
+
+
+def write_result_folder(run: OpenRun, capture: Capture, out: Path | None = None) -> Path:
+    """Write the result folder of the run's family (point_cloud/iteration_N, cfg_args) and
+    cameras.json below `out`, the run by default.
+
+    Returns the iteration's folder; `out` for a family without files of its own. Raises RunError
+    when the disk is full.
+    """
     out = out or run.path
-    own = {GaussianScene: explicit.write_folder, GraphScene: graph_points.write_folder}
-    folder = own.get(type(run.scene), _write_anchors)(run, capture.world, out)
+    family = family_named(run.scene.traits.family)
+    folder = out if family is None else write_scene_folder(run, family, capture.world, out)
     write_cameras(out / "cameras.json", capture)
     return folder
 
 
-def export_run(
-    run: Path, format: str, out: Path | None = None, step: int | None = None, rasterize: Rasterizer | None = None, data: Path | None = None
-) -> list[str]:
-    """Write the newest checkpoint of a run (or the one at `step`) as "anchors" (the Scaffold-GS layout) or "compact"; says what it wrote.
+def result_warnings(run: OpenRun) -> list[str]:
+    """What other readers of the result folder get wrong about a run; empty in most cases."""
+    family = family_named(run.scene.traits.family)
+    return [] if family is None else family.warnings(run)
 
-    Standard files of Gaussians are `bake/run`'s.
-    out: folder for anchors, file or folder for compact; inside the run folder by default.
-    rasterize: what to draw the held-out views with, to say what a compact file costs in PSNR; None leaves that out.
-    data: where the capture is now, if it moved.
+
+def file_path(run: Path, name: str, format: Format, out: Path | None) -> Path:
+    """Where a file of a format goes: `out`, or scene.SUFFIX in the folder `out` or `run`.
+
+    Raises InputError for a name with the suffix of another format: programs go by it.
     """
-    opened = moved(run_folder.open_run(run, "cpu", step), data)
-    graph_points.refuse(opened)
-    anchors = len(opened.scene.table)
-    if format == "anchors":
-        out = out or run
-        folder = _write_anchors(opened, world_of(opened), out)
-        if out != run and (run / "cameras.json").is_file():
-            write_bytes(out / "cameras.json", (run / "cameras.json").read_bytes())
-        size = sum(p.stat().st_size for p in folder.iterdir())
-        said = f"{anchors:,} anchors, {size / 1e6:.2f} MB with networks, in the capture's own frame"
-        return [f"wrote {folder}", said, *warnings_of_layout(opened)]
-    path = out or run / COMPACT
-    path = path / COMPACT if path.is_dir() else path
-    sizes = write_compact_run(opened, world_of(opened), path)
-    lines = [f"wrote {path}", f"{anchors:,} anchors, {sizes.per_anchor:.1f} bytes an anchor, {sizes.total / 1e6:.2f} MB with networks"]
-    if rasterize is not None:
-        lines.append(_cost_line(opened, path, rasterize))
-    return lines
-
-
-@torch.no_grad()
-def warnings_of_layout(run: OpenRun) -> list[str]:
-    """What readers of the Scaffold-GS layout would get wrong of a run: single networks of another form than the layout can say."""
-    if not isinstance(run.scene, AnchorScene) or not is_plain(networks := _networks(run.scene)):
-        return []
-    others = []
-    for attribute, network in networks.items():
-        x = torch.randn(64, network["w1"].shape[2], generator=torch.Generator().manual_seed(0))
-        own, _ = run.scene.heads[attribute](x, x[:, : run.scene.config.F], run.step)
-        if not torch.allclose(own, sequential(attribute, network)(x), atol=1e-4, rtol=1e-4):
-            others.append(attribute)
-    if not others:
-        return []
-    what = f"the {', '.join(others)} networks of '{run.config.train.recipe}' are not Linear, ReLU, ..., Linear"
-    return [f"warning: {what}, which is all that the Scaffold-GS layout can say: other readers of it will draw another scene"]
-
-
-def _cost_line(run: OpenRun, path: Path, rasterize: Rasterizer) -> str:
-    if not run.config.data.path.exists():
-        return f"its capture is not at {run.config.data.path}: the cost in PSNR was not measured (--data says where it is)"
-    capture = run_folder.capture_of(run)
-    try:
-        views = len(counted(capture))
-        if not views:
-            return f"{nothing_counted(capture)}: the cost in PSNR was not measured"
-        before, after = psnr_cost(run, capture, path, rasterize)
-    finally:
-        capture.images.close()
-    return f"PSNR of {views} held-out views {before:.3f} dB, from this file {after:.3f} dB ({after - before:+.3f})"
-
-
-def psnr_cost(run: OpenRun, capture: Capture, path: Path, rasterize: Rasterizer) -> tuple[float, float]:
-    """Mean PSNR (dB, 8-bit pictures) of the held-out views drawn from the run and from its compact file."""
-    again = scene_of_compact(run, read_compact(path), capture.world)
-    scenes = {"run": (run.scene.frozen(run.step), run.step), "file": (again.frozen(run.step), run.step)}
-    found = scores(scenes, capture, counted(capture), as_trained(rasterize, run.cfg.antialias))
-    return found["run"].photographs, found["file"].photographs
-
-
-def scene_of_compact(run: OpenRun, file: Compact, world: World) -> AnchorScene:
-    """The scene that a compact file holds, in the world and with the configuration of the run it was written from."""
-    old = anchors_of(run)
-    tensors = run_tensors(compact_anchors(file), file.cells, file.networks, old.config.add_dist, old.voxel, world)
-    return scene_from(run.cfg, tensors, old.meta())
-
-
-def write_compact_run(run: OpenRun, world: World, path: Path) -> Sizes:
-    """Write the compact file of an opened run. Raises InputError where the anchors are not on a lattice."""
-    scene = anchors_of(run)
-    if isinstance(scene.select, LevelSelector):
-        raise InputError(f"expected anchors of one lattice for a compact file, found levels of detail ({run.path}); use --format anchors")
-    cells, xyz = scene.table.facts["cell"], scene.table.facts["xyz"]
-    if len(cells):
-        away = float((cells.double() * scene.voxel - xyz.double()).abs().max())
-        if away > _LATTICE_TOLERANCE * scene.voxel + 1e-6 * float(xyz.abs().max()):
-            raise InputError("expected anchors on a lattice of known voxel size for a compact file, found others; use --format anchors")
-    found = anchors_to_input(_anchors(scene), world)
-    voxel, origin = lattice_to_input(scene.voxel, world)
-    columns = (found["feature"], found["log_scaling"], found["offsets"])
-    return write_compact(path, cells, voxel, origin, *columns, _networks_in_input(scene, world), sidecar_of(run, world))
-
-
-def _write_anchors(run: OpenRun, world: World, out: Path) -> Path:
-    scene = anchors_of(run)
-    anchors = anchors_to_input(_anchors(scene), world) | level_columns(scene, world.scale)
-    return write_scaffold_folder(out, run.step, anchors, _networks_in_input(scene, world), sidecar_of(run, world))
-
-
-def _anchors(scene: AnchorScene) -> dict[str, Tensor]:
-    """The anchors' columns in the trained world."""
-    return {"xyz": scene.table.facts["xyz"].cpu(), **{k: v.detach().cpu() for k, v in scene.table.params.items()}}
-
-
-def _networks(scene: AnchorScene) -> dict[str, Network]:
-    """The heads' tensors by attribute, in trained units."""
-    out: dict[str, Network] = {a: {} for a in ATTRIBUTES}
-    for name, value in scene.network_tensors().items():
-        attribute, _, rest = name.partition(".")
-        if attribute in out:
-            out[attribute][rest] = value.detach().cpu()
+    if out is None or out.is_dir():
+        return (out or run) / f"{NAME}{format.suffix}"
+    suffixes = {other: format_named(other).suffix for other in format_names()}
+    matching = {other: suffix for other, suffix in suffixes.items() if suffix and out.name.lower().endswith(suffix)}
+    found = max(matching, key=lambda other: len(matching[other]), default=name)
+    if found != name and matching[found] not in format.other_suffixes:
+        raise InputError(f"expected a name that ends in {format.suffix} for --format {name}, found {out.name}; correct --out or --format")
     return out
 
 
-def _networks_in_input(scene: AnchorScene, world: World) -> dict[str, Network]:
-    features = scene.config.mix.width(scene.config.F)
-    return networks_to_input(_networks(scene), scene.config.add_dist, world.scale, features) | extra_networks(scene, world.scale)
-
-
-def sidecar_of(run: OpenRun, world: World) -> dict[str, Any]:
-    """The description of an opened run: `scaffold.describe` with the whole configuration, the capture's path left out."""
-    scene = anchors_of(run)
-    networks = _networks(scene)
-    k = {a: head.k(run.step) for a, head in scene.heads.items() if isinstance(head, MixtureHead)}
-    return describe(
-        recipe=run.config.train.recipe,
-        networks=networks,
-        k=k,
-        K=scene.K,
-        F=scene.config.F,
-        add_dist=scene.config.add_dist,
-        voxel_size=scene.voxel,
-        scale=world.scale,
-        shift=world.shift,
-        step=run.step,
-        extra={
-            "appearance_dim": scene.config.appearance,
-            "feature_bank": scene.mix is not None,
-            "extent": scene.extent,
-            "scene": scene.meta(),
-            "train": to_json(run.config.train),
-            "data": run.config.data.settings(),
-        },
-    )
-
-
-def anchors_of(run: OpenRun) -> AnchorScene:
-    """The run's scene, which must be one of anchors. Raises InputError where it is none."""
-    if not isinstance(run.scene, AnchorScene):
-        raise InputError(f"expected a scene of anchors, found a run of '{run.config.train.recipe}', which has none; use --format ply")
-    return run.scene
-
-
-def moved(run: OpenRun, data: Path | None) -> OpenRun:
-    """The run with its capture at `data` (a folder or catalog:SCENE), where that is given."""
-    if data is None:
-        return run
-    return replace(run, config=replace(run.config, data=replace(run.config.data, path=run_folder.named(Data(data)).path)))
-
-
 def world_of(run: OpenRun) -> World:
-    """The world a run was trained in: from the description beside its exported anchors, else from its capture."""
-    for path in sorted((run.path / "point_cloud").glob(f"iteration_*/{SIDECAR}"), key=lambda p: p.stat().st_mtime, reverse=True):
+    """The world that a run was trained in: from a description in its result folder, else from its capture."""
+    data = _trained(run)["data"]
+    for path in sorted((run.path / "point_cloud").glob(f"iteration_*/{DESCRIPTION}"), key=lambda p: p.stat().st_mtime, reverse=True):
         try:
-            found = read_sidecar(path)
-        except InputError:
+            found = read_json(path, "scene description")
+            if found["data"] == data:
+                x, y, z = (float(v) for v in found["world"]["shift"])
+                return World(float(found["world"]["scale"]), (x, y, z))
+        except (InputError, KeyError, TypeError, ValueError):
             continue  # the capture says it too
-        if found.get("data") == run.config.data.settings():
-            return world_in(found)
-    capture = run_folder.capture_of(run)
+    capture = capture_of(run)
     capture.images.close()
     return capture.world
 
 
-def import_result(source: Path, data: Data, out: Path, iteration: int | None = None) -> Path:
-    """Make the run folder `out` of a result folder, compact file (`incoming`) or PLY file of 3DGS, with its layout; returns it."""
-    if not Path(source).exists():
-        raise InputError(f"expected a result folder or a file of a scene at {source}, found nothing; check the path")
-    if graph := graph_points_in.find_folder(source, iteration):
-        capture = graph_points_in.import_folder(graph, data, out)
-        write_layout(run_folder.open_run(out), capture)
-        return out
-    file = explicit.find_file(source, iteration)
-    capture = import_files(source, data, out, iteration) if file is None else explicit.import_file(file, data, out, iteration)
-    write_layout(run_folder.open_run(out), capture)
-    return out
+def _trained(run: OpenRun) -> dict[str, Any]:
+    """The entries of a description about the training: recipe and reading of the capture, without
+    the capture's path."""
+    plain = to_json(run.config)
+    del plain["data"]["path"]
+    return {"train": plain["train"], "data": plain["data"]}
+
+
+def _check(options: Options) -> None:
+    """Raises InputError, naming the flag, for values out of range."""
+    for name in ("sh_degree", "max_gaussians", "refine"):
+        if getattr(options, name) < 0:
+            raise InputError(f"expected {_flag(name)} of at least 0, found {getattr(options, name)}; give a larger number")
+    if options.sh_degree > MAX_DEGREE:
+        raise InputError(f"expected --sh-degree of at most {MAX_DEGREE}, found {options.sh_degree}; give a lower degree")
+    if not 0 <= options.prune < 1:
+        raise InputError(f"expected --prune as a share from 0 to below 1, found {options.prune}; correct it")
+
+
+def _expect_unused(options: Options, format: str) -> None:
+    """Raises InputError for options of standard files with a format that is none."""
+    for f in fields(options):
+        if f.name != "measure" and getattr(options, f.name) != f.default:
+            raise InputError(f"expected {_flag(f.name)} with a standard file (ply, spz, html, ...), found --format {format}; leave it out")
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+# --- scenes with their networks -----------------------------------------------------------------------------------------------------------
+
+
+def _export_scene(work: _Work, out: Path | None) -> Written:
+    """Write the run's scene as it is, in a format of its own family."""
+    run, format, traits = work.run, work.format, work.run.scene.traits
+    family = family_named(format.family)
+    if traits.family != format.family or family is None:
+        own = formats_of(traits.family) if family_named(traits.family) is not None else {}
+        raise InputError(
+            f"expected a scene of {format.family} for --format {work.name}, found {traits.rows} (a run of '{run.config.train.recipe}'); "
+            f"use --format {next(iter(own), 'ply')}"
+        )
+    _expect_unused(work.options, work.name)
+    world = world_of(run)
+    if format.is_folder:
+        return _export_folder(work, family, world, out or run.path)
+    path = file_path(run.path, work.name, format, out)
+    about = family.describe(run, world) | _trained(run)
+    detail = format.write(path, family.contents(run, world, about), {})  # type: ignore[misc]
+    rows, size = len(run.scene.positions), path.stat().st_size
+    said = f"{rows:,} {traits.rows}, {size / 1e6:.2f} MB with networks" + (f", {detail}" if detail is not None else "")
+    written = Written(path, size, rows, (f"wrote {path}", said))
+    if not work.options.measure or format.read is None:
+        return written
+    with capture_if_there(run, needed=False) as capture:
+        found = cost(run, lambda: {"file": family.scene(run, format.read(path), world)}, capture, work.rasterize, work.tell)  # type: ignore[misc]
+    return replace(written, lines=(*written.lines, *found.lines), psnr=found.psnr)
+
+
+def _export_folder(work: _Work, family: Family, world: World, out: Path) -> Written:
+    run = work.run
+    folder = write_scene_folder(run, family, world, out)
+    if out != run.path and (run.path / "cameras.json").is_file():
+        write_bytes(out / "cameras.json", (run.path / "cameras.json").read_bytes())
+    size, rows = sum(p.stat().st_size for p in folder.iterdir()), len(run.scene.positions)
+    said = f"{rows:,} {run.scene.traits.rows}, {size / 1e6:.2f} MB with networks, in the capture's own frame"
+    return Written(folder, size, rows, (f"wrote {folder}", said, *family.warnings(run)))
+
+
+def write_scene_folder(run: OpenRun, family: Family, world: World, out: Path) -> Path:
+    """Write point_cloud/iteration_N with the scene and its description, and cfg_args above it; the
+    iteration's folder."""
+    folder = out / "point_cloud" / f"iteration_{run.step}"
+    about = family.describe(run, world) | _trained(run)
+    settings = family.write(run, world, folder, about)
+    write_json(folder / DESCRIPTION, about)
+    if settings:
+        text = ", ".join(f"{name}={value!r}" for name, value in settings.items())
+        write_bytes(out / "cfg_args", f"Namespace({text})".encode())
+    return folder
+
+
+# --- standard Gaussians -------------------------------------------------------------------------------------------------------------------
+
+
+def _files(run: OpenRun, path: Path, levels: bool) -> list[tuple[int | None, Path]]:
+    """The files to write: (finest level, path) each, None for all levels. Raises InputError for
+    --levels without levels."""
+    if not levels:
+        return [(None, path)]
+    if not run.scene.traits.levels:
+        raise InputError(f"expected a run with levels of detail for --levels, found one of '{run.config.train.recipe}'; leave --levels out")
+    held = run.scene.rows_by_level()  # levels without rows would repeat the level before
+    stem, dot, suffixes = path.name.partition(".")
+    return [(level, path.with_name(f"{stem}_level{level}{dot}{suffixes}")) for level, count in enumerate(held) if count]
+
+
+def _export_gaussians(work: _Work, path: Path, level: int | None, capture: Capture | None) -> Written:
+    """Make, write, read again and measure one file."""
+    run, options, format, gaussians = work.run, work.options, work.format, family_named(GAUSSIANS)
+    assert gaussians is not None and format.write is not None
+    world = World() if options.frame == "trained" else world_of(run) if capture is None else capture.world
+    began = time.perf_counter()
+    with nullcontext() if level is None else run.scene.at_level(level):
+        made, bake, before = (run, {}, {}) if work.is_direct else _bake(work, capture)
+        contents = gaussians.contents(made, world, {})
+        seconds = time.perf_counter() - began
+        contents.expect_finite("the scene")
+        about = _describe(work, contents, level) | bake
+        note = {name: value for name, value in about.items() if name != "antialias" or format.antialias}
+        views = {} if format.view_note is None or capture is None else format.view_note(capture, world)
+        format.write(path, contents, note | views)
+        facts: dict[str, Any] = {"file": path.name, "bytes": path.stat().st_size, "seconds": round(seconds, 1), "psnr": {}}
+        frame = "the capture's own frame" if options.frame == "capture" else "the trained world"
+        said = f"{len(contents):,} Gaussians, {facts['bytes'] / 1e6:.2f} MB, harmonics of degree {contents.degree}, in {frame}"
+        lines = (f"wrote {path}", said + (f"; baked in {format_duration(seconds)}" if bake else ""))
+        written = Written(path, facts["bytes"], len(contents), lines)
+        if options.measure and format.read is not None:
+
+            def scenes() -> dict[str, tuple[Scene, int]]:
+                baked = {"bake": gaussians.scene(run, contents, world)} if bake else {}
+                return {**before, **baked, "file": gaussians.scene(run, format.read(path), world)}  # type: ignore[misc]
+
+            found = cost(run, scenes, capture, work.rasterize, work.tell)
+            facts["psnr"], written = found.plain, replace(written, lines=(*lines, *found.lines), psnr=found.psnr)
+    write_json(path.with_name(path.name + ".json"), about | facts)
+    return written
+
+
+def _bake(work: _Work, capture: Capture | None) -> tuple[OpenRun, dict[str, Any], dict[str, tuple[Scene, int]]]:
+    """The run with baked Gaussians, the entries of its description about the bake, and the scene
+    before its refinement to measure too."""
+    from scene_experts.files.bake.bake import DRAWN_AT, Bake, Refine, bake
+
+    assert capture is not None
+    options = work.options
+    how = Bake(options.sh_degree, options.max_gaussians, options.prune, Refine(options.refine))
+    baked = bake(work.run, capture, how, work.rasterize, work.tell)
+    before: dict[str, tuple[Scene, int]] = {"closed_form": (baked.closed_form, DRAWN_AT)} if options.refine else {}
+    return replace(work.run, scene=baked.scene), baked.about, before
+
+
+def _describe(work: _Work, contents: Any, level: int | None) -> dict[str, Any]:
+    """How a file was made, as JSON values."""
+    run = work.run
+    return {
+        "format": NOTE_FORMAT,
+        "made_by": f"scene-experts {scene_experts.__version__}",
+        "command": work.command,
+        "recipe": run.config.train.recipe,
+        "step": run.step,
+        "capture": run.capture,
+        "frame": work.options.frame,
+        "antialias": run.cfg.antialias,
+        "gaussians": len(contents),
+        "sh_degree": contents.degree,
+        **({} if level is None else {"level": level}),
+    }

@@ -13,9 +13,8 @@ from __future__ import annotations
 import json
 import math
 import platform
-import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,7 +39,6 @@ from scene_experts.training.config import Data, RunConfig, Train
 from scene_experts.training.state import scene_from
 
 FORMAT = 1
-EXPORTED = re.compile(r"scene(_level\d+)?\.(compact|((compressed\.)?ply|splat|spz|sog|glb|html)(\.json)?)")  # what `export` calls its files
 PICTURES = ("renders", "gt", "errors", "side_by_side", "masks", "experts")  # the folders of an evaluation's pictures
 
 
@@ -134,12 +132,11 @@ def held(out: Path) -> Iterator[None]:
         yield
 
 
-def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -> None:
+def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False, exported: Iterable[Path] = ()) -> None:
     """Make `out` ready for a run that `check` admits: an overwritten run's checkpoints and results go, config.json is written."""
     check(out, config, resume, overwrite)
     if overwrite:
         results = [out / f"{name}{suffix}.json" for name in ("results", "per_view") for suffix in ("", "_train", "_half")]
-        exported = [path for path in out.glob("scene*.*") if EXPORTED.fullmatch(path.name)]
         others = [*exported, out / "report.html", out / "config.json"]
         for old in [*(out / "checkpoints").glob("ckpt_*.safetensors"), *(out / "previews").glob("*.png"), *results, *others]:
             old.unlink(missing_ok=True)
@@ -221,6 +218,13 @@ def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
         capture.images.close()
         raise InputError(f"expected the capture that {run.path} was trained on, found other views in {capture.root}; give the right --data")
     return capture
+
+
+def with_capture(run: OpenRun, data: Path | None) -> OpenRun:
+    """The run with its capture at `data` (a folder or catalog:SCENE); as it is where that is None."""
+    if data is None:
+        return run
+    return replace(run, config=replace(run.config, data=replace(run.config.data, path=named(Data(data)).path)))
 
 
 def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun:

@@ -1,15 +1,15 @@
-"""`export` and `import` from their flags; the files themselves are tested in test_export_*.py."""
+"""`export` and `import` from their flags; the files themselves are tested in tests/unit/files."""
 
 import json
-import typing
 from dataclasses import replace
 
 import pytest
 
-from scene_experts.commands.files import ExportCommand, export, import_
+from scene_experts.arguments.parse import HelpAsked
+from scene_experts.commands.files import export, import_
 from scene_experts.core.errors import InputError, RunError
-from scene_experts.files.export import write_layout
-from scene_experts.files.formats.standard import FORMATS, read_standard
+from scene_experts.files import registry
+from scene_experts.files.export import write_result_folder
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.anchors.mlp import MLP
@@ -30,8 +30,18 @@ def test_a_source_that_is_no_result_is_refused(tmp_path):
         import_([str(tmp_path / "nothing"), "--data", str(tmp_path), "--out", str(tmp_path / "run")])
 
 
-def test_every_standard_format_can_be_named():
-    assert set(typing.get_args(typing.get_type_hints(ExportCommand)["format"])) == {"anchors", "compact", *FORMATS}
+@pytest.mark.parametrize("command", [export, import_])
+def test_the_help_lists_every_format(command):
+    with pytest.raises(HelpAsked) as asked:
+        command(["--help"])
+    text = str(asked.value)
+    for name in registry.format_names():
+        assert registry.about(name) in text
+
+
+def test_an_unknown_format_is_answered_with_the_nearest(run):
+    with pytest.raises(InputError, match=naming("compactt", "compact")):
+        export([str(run), "--format", "compactt"])
 
 
 def test_flags_reach_the_bake(tmp_path, capsys):
@@ -45,7 +55,7 @@ def test_flags_reach_the_bake(tmp_path, capsys):
     assert export([str(tmp_path / "run"), "--format", "spz", *flags]) == 0
     out, file = capsys.readouterr().out, tmp_path / "run" / "scene.spz"
     assert str(file) in out and "degree 1" in out
-    assert len(read_standard(file)) <= 90
+    assert len(registry.read(file)) <= 90
     about = json.loads((tmp_path / "run" / "scene.spz.json").read_text())
     assert about["command"].startswith("scene-experts export ") and about["command"].endswith("--frame trained")
     assert about["bake"]["prune"] == 0.01 and about["bake"]["refine"]["iterations"] == 3
@@ -61,7 +71,7 @@ def run(tmp_path_factory):
     run_folder.prepare(root / "run", config, resume=False)
     capture = run_folder.load_capture(config.data)
     list(train.train(config.train, train.Run(config, root / "run"), capture, choose("auto", "cpu")))
-    write_layout(run_folder.open_run(root / "run"), capture)
+    write_result_folder(run_folder.open_run(root / "run"), capture)
     capture.images.close()
     return root / "run"
 

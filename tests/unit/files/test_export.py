@@ -1,7 +1,7 @@
-"""A trained run written out, read back and drawn: the same picture, in the capture's own frame."""
+"""Runs to files of every format: read back and drawn, they give the same picture; baked, what their description says."""
 
 import json
-import re
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,16 +10,25 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
-from scene_experts.files.anchors.compact import read_compact
-from scene_experts.files.anchors.layout import read_scaffold_folder
-from scene_experts.files.export import export_run, import_result, psnr_cost, world_of, write_compact_run, write_layout
-from scene_experts.files.ply import read_anchor_ply
+from scene_experts.data.views import World
+from scene_experts.evaluate.metrics import psnr
+from scene_experts.files import registry
+from scene_experts.files.anchors.read import read_anchors, read_folder
+from scene_experts.files.export import Options, export, file_path, result_warnings, world_of, write_result_folder
+from scene_experts.files.formats import compact
+from scene_experts.files.gaussians.read import DRAWN_AT, scene_of, table_columns
+from scene_experts.files.gaussians.write import splats_of
+from scene_experts.files.importing import import_files
+from scene_experts.files.measure import Painter
+from scene_experts.files.registry import GAUSSIANS, format_named, formats_of
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.training import run_folder
 from scene_experts.training.config import Data, RunConfig, Train
 from scene_experts.training.loop import Run, train
+from support.files import export_run
+from support.messages import naming
 from support.synthetic import make_capture
 
 STEPS = 25
@@ -40,7 +49,7 @@ def trained(recipe: str, folder: Path, out: Path) -> run_folder.OpenRun:
     for _ in train(cfg, Run(config, out=out), capture, choose("auto", "cpu")):
         pass
     opened = run_folder.open_run(out)
-    write_layout(opened, capture)
+    write_result_folder(opened, capture)
     capture.images.close()
     return opened
 
@@ -69,7 +78,7 @@ def test_the_layout_is_in_the_input_frame(run, folder):
     world = capture.world
     assert not world.identity and world_of(run) == world
     layout = run.path / "point_cloud" / f"iteration_{STEPS}"
-    found = read_anchor_ply(layout / "point_cloud.ply")
+    found = read_anchors(layout / "point_cloud.ply")
     xyz = run.scene.table.facts["xyz"]
     torch.testing.assert_close(found["xyz"], world.to_input(xyz.double()).float())
     torch.testing.assert_close(found["log_scaling"].exp() * world.scale, run.scene.table.params["log_scaling"].detach().exp())
@@ -86,17 +95,17 @@ def test_the_layout_is_in_the_input_frame(run, folder):
 
 
 def test_the_distance_column_is_in_the_input_unit(run):
-    networks = read_scaffold_folder(run.path)[1]
+    networks = read_folder(run.path / "point_cloud" / f"iteration_{STEPS}").networks
     world = world_of(run)
     trained_w1 = run.scene.network_tensors()["color.w1"].detach()
-    torch.testing.assert_close(networks["color"]["w1"][..., 35], trained_w1[..., 35] * world.scale)
+    torch.testing.assert_close(networks["color.experts.w1"][..., 35], trained_w1[..., 35] * world.scale)
     others = [i for i in range(trained_w1.shape[2]) if i != 35]
-    assert torch.equal(networks["color"]["w1"][..., others], trained_w1[..., others])
-    assert torch.equal(networks["opacity"]["w1"], run.scene.network_tensors()["opacity.w1"].detach())
+    assert torch.equal(networks["color.experts.w1"][..., others], trained_w1[..., others])
+    assert torch.equal(networks["opacity.experts.w1"], run.scene.network_tensors()["opacity.w1"].detach())
 
 
 def packable(run) -> None:
-    if hasattr(run.scene.select, "lattices"):
+    if run.scene.traits.levels:
         pytest.skip("levels of detail have no compact form")
 
 
@@ -105,9 +114,10 @@ def test_written_and_read_back_it_draws_the_same_picture(run, tmp_path, form):
     if form == "compact":
         packable(run)
     target = tmp_path / "out" if form == "anchors" else tmp_path / "file"
-    lines = export_run(run.path, form, target)
-    assert str(target) in lines[0] and "anchors" in lines[1]
-    back = import_result(target, Data(run.config.data.path), tmp_path / "back")
+    (written,) = export_run(run.path, form, target)
+    assert str(target) in written.lines[0] and "anchors" in written.lines[1] and written.rows == len(run.scene.positions)
+    assert written.path.is_relative_to(target) and written.bytes > 1000
+    back = import_files(target, Data(run.config.data.path), tmp_path / "back")
     again = run_folder.open_run(back)
     assert again.cfg == run.cfg and again.step == run.step and again.scene.voxel == run.scene.voxel
     rows = lambda s: sorted(map(tuple, s.table.facts["xyz"].tolist()))  # noqa: E731
@@ -122,25 +132,31 @@ def test_written_and_read_back_it_draws_the_same_picture(run, tmp_path, form):
 def test_a_folder_of_another_name_keeps_its_step(run, tmp_path):
     """Experts are drawn by the step: all of them at its beginning."""
     (tmp_path / "shared").symlink_to(run.path / "point_cloud" / f"iteration_{STEPS}")
-    back = import_result(tmp_path / "shared", Data(run.config.data.path), tmp_path / "back")
+    back = import_files(tmp_path / "shared", Data(run.config.data.path), tmp_path / "back")
     assert run_folder.open_run(back).step == STEPS
 
 
 def test_the_cost_of_the_compact_file_is_measured_and_small(run, tmp_path):
     packable(run)
-    lines = export_run(run.path, "compact", tmp_path / "file", rasterize=choose("auto", "cpu"))
-    before, after, change = (float(x) for x in re.search(r"views ([\d.]+) dB.* ([\d.]+) dB \(([-+][\d.]+)\)", lines[2]).groups())
-    assert change == pytest.approx(after - before, abs=0.0011) and abs(change) < 0.05
-    capture = run_folder.load_capture(run.config.data)
-    assert psnr_cost(run, capture, tmp_path / "file", choose("auto", "cpu"))[0] == pytest.approx(before, abs=6e-4)
-    assert float(re.search(r"([\d.]+) bytes an anchor", lines[1])[1]) < 150
+    (written,) = export_run(run.path, "compact", tmp_path / "file", measure=True)
+    before, after = written.psnr["run"], written.psnr["file"]
+    assert abs(after - before) < 0.05 and f"run {before:.3f} dB, this file {after:.3f} dB" in written.lines[-1]
+    capture, total = run_folder.load_capture(run.config.data), 0.0
+    for index in capture.test:
+        painter = Painter.of(run.scene, run.step, choose("auto", "cpu"))
+        with torch.no_grad():
+            image = painter.picture_8bit(capture.views[index].camera, torch.tensor(capture.background))
+        total += psnr(image, capture.frame(index).rgb.float() / 255) / len(capture.test)
+    capture.images.close()
+    assert total == pytest.approx(before, abs=1e-5)
+    assert "bytes per anchor" in written.lines[1]
 
 
 def test_defaults_lie_in_the_run_folder(run):
     packable(run)
-    assert export_run(run.path, "compact")[0] == f"wrote {run.path / 'scene.compact'}"
-    assert read_compact(run.path / "scene.compact").sidecar["recipe"] == run.config.train.recipe
-    assert export_run(run.path, "anchors")[0].endswith(f"iteration_{STEPS}")
+    assert export_run(run.path, "compact")[0].path == run.path / "scene.compact"
+    assert compact.read(run.path / "scene.compact").about["recipe"] == run.config.train.recipe
+    assert export_run(run.path, "anchors")[0].path == run.path / "point_cloud" / f"iteration_{STEPS}"
 
 
 def test_the_world_without_an_earlier_export_comes_from_the_capture(folder, tmp_path):
@@ -170,16 +186,16 @@ def test_another_capture_gives_no_world_and_a_catalogs_name_is_understood(folder
     (tmp_path / "captures" / "tandt").mkdir(parents=True)
     (tmp_path / "captures" / "tandt" / "truck").symlink_to(folder)
     monkeypatch.setenv("SCENE_EXPERTS_CAPTURES", str(tmp_path / "captures"))
-    lines = export_run(opened.path, "compact", tmp_path / "file", rasterize=choose("auto", "cpu"), data=Path("catalog:truck"))
-    assert "PSNR of 2 held-out views" in lines[2]
+    (written,) = export_run(opened.path, "compact", tmp_path / "file", data=Path("catalog:truck"), measure=True)
+    assert "PSNR of 2 held-out views" in written.lines[2]
 
 
 def test_anchors_off_the_lattice_cannot_be_packed(run, tmp_path):
     packable(run)
     opened = run_folder.open_run(run.path)
-    opened.scene.table.facts["xyz"] = opened.scene.table.facts["xyz"] + 0.4 * opened.scene.voxel
+    opened.scene.table.facts["xyz"] = opened.scene.positions + 0.4 * opened.scene.voxel
     with pytest.raises(InputError, match="--format anchors"):
-        write_compact_run(opened, world_of(opened), tmp_path / "file")
+        export(opened, "compact", tmp_path / "file")
 
 
 def test_levels_of_detail_are_written_with_their_columns_and_not_packed(folder, tmp_path):
@@ -187,8 +203,153 @@ def test_levels_of_detail_are_written_with_their_columns_and_not_packed(folder, 
     with pytest.raises(InputError, match="--format anchors"):
         export_run(opened.path, "compact")
     path = opened.path / "point_cloud" / f"iteration_{STEPS}" / "point_cloud.ply"
-    found, scale = read_anchor_ply(path), world_of(opened).scale
+    found, scale = read_anchors(path), world_of(opened).scale
     levels, facts = opened.scene.select.lattices, opened.scene.table.facts
     assert torch.equal(found["level"], facts["level"]) and torch.equal(found["extra_level"], facts["extra_level"])
     assert found["info"][:3].tolist() == pytest.approx([levels.edge / scale, levels.standard / scale, 0.0])
     assert path.stat().st_size - 316 * len(facts["level"]) < 4000  # 316 bytes an anchor and a header
+
+
+# --- standard Gaussians -------------------------------------------------------------------------------------------------------------------
+
+SHORT = {"sh_degree": 1, "refine": 5}
+
+
+def short_run(recipe: str, root: Path) -> Path:
+    folder = make_capture(root / "capture", views=9, size=(48, 32), points=250, scale=3.0).folder
+    config = RunConfig(replace(RECIPES[recipe][1], iterations=300), Data(folder), stop_at=20)
+    run_folder.prepare(root / "run", config, resume=False)
+    capture = run_folder.load_capture(config.data)
+    list(train(config.train, Run(config, root / "run"), capture, choose("auto", "cpu")))
+    capture.images.close()
+    return root / "run"
+
+
+@pytest.fixture(scope="module", params=["moe-gs", "sags", "3dgs"])
+def short(request, tmp_path_factory) -> Path:
+    return short_run(request.param, tmp_path_factory.mktemp(request.param))
+
+
+def measured(short: Path, file: Path, world: World | None = None) -> float:
+    """PSNR of the held-out views as our own renderer draws the file."""
+    opened = run_folder.open_run(short)
+    capture, draw, total = run_folder.load_capture(opened.config.data), choose("auto", "cpu"), 0.0
+    scene = scene_of(table_columns(registry.read(file), world or capture.world), capture.extent)
+    painter = Painter.of(scene, DRAWN_AT, draw)
+    with torch.no_grad():
+        for index in capture.test:
+            image = painter.picture_8bit(capture.views[index].camera, torch.tensor(capture.background))
+            total += psnr(image, capture.frame(index).rgb.float() / 255)
+    capture.images.close()
+    return total / len(capture.test)
+
+
+def test_what_is_printed_is_what_the_file_gives(short, tmp_path):
+    said = []
+    opened, options = run_folder.open_run(short), Options(**SHORT)
+    tell = lambda *what: said.append(what[0])  # noqa: E731
+    (written,) = export(opened, "ply", tmp_path / "a.ply", options, tell=tell, command="scene-experts export RUN")
+    lines = written.lines
+    about = json.loads((tmp_path / "a.ply.json").read_text())
+    assert lines[0] == f"wrote {tmp_path / 'a.ply'}" and "held-out views" in lines[2]
+    assert f"this file {about['psnr']['file']['photographs']:.3f} dB" in lines[2]
+    assert measured(short, tmp_path / "a.ply") == pytest.approx(about["psnr"]["file"]["photographs"], abs=2e-5)
+    assert about["gaussians"] == len(registry.read(tmp_path / "a.ply")) > 50 and about["command"] == "scene-experts export RUN"
+    assert about["bytes"] == (tmp_path / "a.ply").stat().st_size and about["frame"] == "capture"
+    assert about["sh_degree"] == 1 and about["bake"]["refine"]["iterations"] == 5
+    assert {"run", "closed_form", "bake", "file", "views"} == set(about["psnr"]) and "refining" in said
+
+
+@pytest.mark.parametrize("short", ["moe-gs", "3dgs"], indirect=True)
+def test_frames_and_folders(short, tmp_path):
+    export_run(short, "ply", tmp_path, refine=0)
+    (written,) = export_run(short, "ply", tmp_path / "world.ply", refine=0, frame="trained")
+    assert len(written.lines) == 2 and "in the trained world" in written.lines[1] and written.psnr == {}
+    opened = run_folder.open_run(short)
+    capture = run_folder.load_capture(opened.config.data)
+    capture.images.close()
+    own, world = registry.read(tmp_path / "scene.ply"), registry.read(tmp_path / "world.ply")
+    assert capture.world.scale != 1 and own.degree == 3
+    torch.testing.assert_close(capture.world.from_input(own.means.double()).float(), world.means, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(own.log_scales + math.log(capture.world.scale), world.log_scales, rtol=1e-4, atol=1e-4)
+    assert measured(short, tmp_path / "world.ply", World()) == pytest.approx(measured(short, tmp_path / "scene.ply"), abs=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("short", ["moe-gs"], indirect=True)
+def test_each_format_is_measured_from_its_own_file(short, tmp_path):
+    for format, of in formats_of(GAUSSIANS).items():
+        path = tmp_path / f"scene{of.suffix}"
+        export_run(short, format, path, sh_degree=1, refine=0, measure=True)
+        about = json.loads(path.with_name(path.name + ".json").read_text())
+        assert measured(short, path) == pytest.approx(about["psnr"]["file"]["photographs"], abs=2e-5), format
+        assert about["sh_degree"] == (0 if format == "splat" else 1)
+
+
+@pytest.mark.parametrize("short", ["moe-gs"], indirect=True)
+def test_what_cannot_be_is_refused_in_one_sentence(short, tmp_path):
+    with pytest.raises(InputError, match=naming("obj", "ply")):
+        export_run(short, "obj")
+    file = tmp_path / "x.ply"
+    wrong = {"levels": True, "sh_degree": 5, "max_gaussians": -1, "refine": -1, "prune": 1.0}
+    for name, value in wrong.items():
+        with pytest.raises(InputError, match="--" + name.replace("_", "-")):
+            export_run(short, "ply", file, **{name: value})
+    with pytest.raises(InputError, match=naming("gone", "--data")):
+        export_run(short, "ply", file, data=tmp_path / "gone", **SHORT)
+    other = make_capture(tmp_path / "other", views=10, size=(48, 32), points=50).folder
+    with pytest.raises(InputError, match="--data"):
+        export_run(short, "ply", file, data=other, **SHORT)
+    assert not file.exists()
+
+
+def test_the_name_of_a_file_may_not_say_another_format(tmp_path):
+    ply, compressed = format_named("ply"), format_named("compressed-ply")
+    assert file_path(tmp_path, "ply", ply, None) == tmp_path / "scene.ply" == file_path(Path("run"), "ply", ply, tmp_path)
+    assert file_path(tmp_path, "ply", ply, tmp_path / "a.bin") == tmp_path / "a.bin"
+    for name in ("a.PLY", "a.compressed.ply"):
+        assert file_path(tmp_path, "compressed-ply", compressed, tmp_path / name) == tmp_path / name
+    for name in ("a.spz", "a.compressed.ply"):
+        with pytest.raises(InputError, match=naming(name, ".ply")):
+            file_path(tmp_path, "ply", ply, tmp_path / name)
+
+
+def test_a_family_without_files_leaves_its_cameras_and_can_be_baked(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(registry, "FAMILIES", {GAUSSIANS: registry.FAMILIES[GAUSSIANS]})
+    opened = trained("scaffold-gs", folder, tmp_path / "run")
+    assert (opened.path / "cameras.json").is_file() and not (opened.path / "point_cloud").exists() and result_warnings(opened) == []
+    with pytest.raises(InputError, match="--format ply"):
+        export(opened, "compact")
+    assert export(opened, "ply", options=Options(False, refine=0))[0].path.is_file()
+
+
+@pytest.mark.parametrize("short", ["moe-gs"], indirect=True)
+def test_a_capture_that_moved_is_found_by_its_flag(short, tmp_path):
+    data = run_folder.read_config(short).data.path
+    (tmp_path / "moved").symlink_to(data)
+    (written,) = export_run(short, "ply", tmp_path / "x.ply", data=tmp_path / "moved", measure=True, **SHORT)
+    assert "held-out views" in written.lines[2]
+
+
+@pytest.mark.parametrize("short", ["3dgs"], indirect=True)
+def test_plain_gaussians_need_no_capture(short, tmp_path):
+    opened = run_folder.open_run(short)
+    capture = run_folder.load_capture(opened.config.data)
+    capture.images.close()
+    write_result_folder(opened, capture)
+    (written,) = export_run(short, "ply", tmp_path / "x.ply", data=tmp_path / "gone", measure=True)
+    assert "held-out" not in written.lines[2] and "--data" in written.lines[2]
+    torch.testing.assert_close(registry.read(tmp_path / "x.ply").means, splats_of(opened.scene, capture.world).means)
+
+
+@pytest.mark.slow
+def test_levels_of_detail_become_one_file_each(tmp_path):
+    short = short_run("octree-gs", tmp_path)
+    scene = run_folder.open_run(short).scene
+    files = export_run(short, "ply", tmp_path / "out.ply", sh_degree=1, refine=0, levels=True)
+    count = sum(rows > 0 for rows in scene.rows_by_level())
+    assert sorted(tmp_path.glob("out_level*.ply")) == [file.path for file in files] and len(files) == count > 1
+    sizes = [file.rows for file in files]
+    assert sizes == sorted(set(sizes))  # a level without anchors gets no file
+    assert json.loads((tmp_path / "out_level1.ply.json").read_text())["level"] == 1
+    assert export_run(short, "ply", tmp_path / "bare", refine=0, levels=True)[0].path.name == "bare_level0"

@@ -134,10 +134,7 @@ def test_overwriting_removes_what_belonged_to_the_old_run_and_nothing_else(run):
         (run / "test" / kind).mkdir(parents=True)
     exported = [
         "scene.compact",
-        "scene.ply",
         "scene.ply.json",
-        "scene_level1.compressed.ply",
-        "scene.html",
         "test/renders/1.png",
         "test/experts/cov.png",
     ]
@@ -149,8 +146,8 @@ def test_overwriting_removes_what_belonged_to_the_old_run_and_nothing_else(run):
         (run / "point_cloud" / name).write_text("old")
     other = RunConfig(RECIPES["scaffold-gs"][1], CONFIG.data)
     run_folder.check(run, other, resume=False, overwrite=True)
-    assert len(state(run)) == 19
-    run_folder.prepare(run, other, resume=False, overwrite=True)
+    assert len(state(run)) == 16
+    run_folder.prepare(run, other, False, True, exported=[run / "scene.compact", run / "scene.ply.json"])
     assert state(run).keys() == {"config.json", *mine, "point_cloud/iteration_7/mine.txt"} and run_folder.read_config(run) == other
 
 

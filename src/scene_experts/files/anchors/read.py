@@ -1,181 +1,243 @@
-"""Files to runs: a run folder made of a published Scaffold-GS result, of one of ours, or of a compact file."""
+"""Files to runs of anchors: a published result folder of Scaffold-GS or Octree-GS, one of ours, or
+a compact file.
+
+Published folders hold point_cloud.ply and opacity_mlp.pt, cov_mlp.pt, color_mlp.pt (or all networks
+in checkpoints.pth). Ours hold the same, with moe.safetensors in place of the three networks where
+there are experts, and the description scene.json.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import math
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from scene_experts.core import checkpoint
+from scene_experts.core.checkpoint import read_tensors
 from scene_experts.core.errors import InputError
-from scene_experts.data.views import Capture, World
-from scene_experts.files.anchors.compact import Compact, read_compact
-from scene_experts.files.anchors.extras import RULES, level_facts, levels_in, published_levels, trained_names
-from scene_experts.files.anchors.frame import (
-    Network,
-    anchors_from_input,
-    cell_positions,
-    cells_of,
-    lattice_to_input,
-    networks_from_input,
-    recover_voxel,
-)
-from scene_experts.files.anchors.layout import read_scaffold_folder
-from scene_experts.recipes import octree_gs, scaffold_gs
-from scene_experts.scene.anchors.features import FeatureBank
+from scene_experts.data.views import World
+from scene_experts.files import result_folder
+from scene_experts.files.anchors import torchscript
+from scene_experts.files.anchors.data import AnchorData, Network, by_attribute, by_file_name
+from scene_experts.files.anchors.published import cells_of, meta_of, recipe_of, recover_voxel
+from scene_experts.files.anchors.write import BANK_DISTANCE, LEVEL_COLUMNS, MOE_FILE, MOE_FORMAT, MOE_KIND
+from scene_experts.files.formats.ply import numbered_names, property_names, read_vertices, stack
+from scene_experts.files.registry import Imported, recognise
+from scene_experts.files.result_folder import expect_world, world_in
+from scene_experts.scene import Scene
 from scene_experts.scene.anchors.levels import Levels
-from scene_experts.scene.anchors.mlp import Plain
-from scene_experts.scene.anchors.scene import ATTRIBUTES, Anchors
-from scene_experts.scene.anchors.select import Octree
-from scene_experts.training import run_folder
-from scene_experts.training.config import Data, RunConfig, Train, from_json
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS
+from scene_experts.training.config import Data, Train, from_json
+from scene_experts.training.run_folder import OpenRun, load_capture
+from scene_experts.training.state import scene_from
 
-UNKNOWN = 0  # the step of files that do not say how long they were trained
-
-
-@dataclass(frozen=True)
-class _Read:
-    """What a file holds, in the input frame."""
-
-    anchors: dict[str, Tensor]
-    cells: Tensor | None  # None: on no lattice that is known
-    voxel: float  # input unit
-    networks: dict[str, Network]
-    add_dist: tuple[str, ...]
-    step: int  # 0 where nothing says it
-    scene: dict[str, Any] | None  # our description
-    cfg: dict[str, Any] = field(default_factory=dict)  # cfg_args
+MOST_LEVELS = 64  # of detail
 
 
-def import_result(source: Path, data: Data, out: Path, iteration: int | None = None) -> Capture:
-    """Make the run folder `out` (configuration and checkpoint) of a published Scaffold-GS result folder, of ours, or of a compact file.
+def find(source: Path, iteration: int | None) -> Path | None:
+    """The iteration's folder of a result folder with anchors; None for other scenes."""
+    folder = result_folder.iteration_folder(source, iteration)
+    return folder if "f_offset_0" in property_names(folder / "point_cloud.ply") else None
 
-    A published result is in its capture's own units, so its capture is read with --normalise none. Ours must meet the world it was trained
-    in. Returns the capture in that world. Raises InputError for what cannot be rendered here and for captures that do not fit.
+
+def read(source: Path, data: Data, iteration: int | None) -> Imported:
+    """The run in an iteration's folder or in a file of anchors.
+
+    A published result is in its capture's own unit, so its capture is read with --normalise none. A
+    result of ours must meet the world that it was trained in. Raises InputError for scenes that
+    cannot be drawn here and for captures that do not fit.
     """
-    read = _read(Path(source), iteration)
-    if read.scene is None:
-        data = replace(data, normalise="none")
-    capture = run_folder.load_capture(data)
+    found = read_folder(source) if source.is_dir() else recognise(source)[1].read(source)  # type: ignore[misc]
+    networks = by_attribute(found.networks)
+    check_networks(networks, str(source))
+    about = found.about
+    data = data if about is not None else replace(data, normalise="none")
+    capture = load_capture(data)
     capture.images.close()
-    if read.scene is not None:
-        check_world(world_in(read.scene), capture.world)
-        capture = replace(capture, world=world_in(read.scene))
-    voxel = float(read.scene["voxel_size"]["trained"]) if read.scene else read.voxel
-    plain = _plain_values(read, capture)
-    levels = levels_in(plain)
-    tensors = run_tensors(read.anchors, read.cells, read.networks, read.add_dist, voxel, capture.world, levels, read.scene is not None)
-    cfg = _config(read)
-    config = RunConfig(cfg, data, f"import {Path(source).name}", versions=run_folder.versions())
-    run_folder.prepare(out, config, resume=False)
-    extent = float((read.scene or {}).get("extent", capture.extent))
-    voxel = levels.size(levels.count - 1) if levels else voxel
-    meta = {"recipe": cfg.recipe, "step": read.step, "seconds": 0.0, **plain, "voxel": voxel, "extent": extent, "config": "imported"}
-    checkpoint.save(out / "checkpoints", read.step, tensors, meta)
-    return capture
+    if about is None:
+        meta, voxel, cfg = meta_of(found, capture), found.voxel, recipe_of(found)
+    else:
+        expect_world(world_in(about), capture.world)
+        capture = replace(capture, world=world_in(about))
+        meta, voxel = dict(about.get("scene", {})), float(about["voxel_size"]["trained"])
+        cfg = from_json(Train, about["train"], "train") if "train" in about else recipe_of(found)
+    levels = Levels.from_meta(meta["levels"]) if "levels" in meta else None
+    tensors = tensors_of(found, networks, capture.world, voxel, levels, exact=about is not None)
+    meta |= {
+        "voxel": levels.size(levels.count - 1) if levels else voxel,
+        "extent": float((about or {}).get("extent", capture.extent)),
+    }
+    return Imported(cfg, data, capture, tensors, meta, found.step)
 
 
-def _plain_values(read: _Read, capture: Capture) -> dict[str, Any]:
-    """What a checkpoint must say of levels and appearance codes: from our description, or from the files and the capture."""
-    if read.scene is not None:
-        return dict(read.scene.get("scene", {}))
-    out: dict[str, Any] = {}
-    if "level" in read.anchors:
-        out["levels"] = published_levels(read.anchors, [capture.views[i].camera for i in capture.train], read.cfg).meta()
-    if "appearance" in read.networks:
-        codes = len(read.networks["appearance"]["table"])
-        if codes != len(capture.train):
-            raise InputError(
-                f"expected {codes} training views, one for each appearance code, found {len(capture.train)}; choose another --split"
-            )
-        out["views"] = list(capture.train)
-    return out
+def scene(run: OpenRun, contents: AnchorData, world: World) -> tuple[Scene, int]:
+    """The scene that a file holds, in the world and with the configuration of the run that it was
+    written from."""
+    networks = by_attribute(contents.networks)
+    check_networks(networks, "the file")
+    tensors = tensors_of(contents, networks, world, run.scene.traits.voxel)
+    return scene_from(run.cfg, tensors, run.scene.meta()).eval(), run.step
 
 
-def run_tensors(
-    anchors: dict[str, Tensor], cells: Tensor | None, networks: dict[str, Network], add_dist: tuple[str, ...], voxel: float, world: World,
-    levels: Levels | None = None, exact: bool = True,
-) -> dict[str, Tensor]:  # fmt: skip
-    """The tensors of a checkpoint, in the trained world, from anchors and networks in the input frame.
+# --- the trained world --------------------------------------------------------------------------------------------------------------------
 
-    voxel: edge of the lattice in trained units.  cells: None for anchors on no lattice that is known; they cannot grow or be packed.
-    levels: the lattices of anchors with a level, in trained units; exact: their positions follow from their cells.
+
+def tensors_of(
+    data: AnchorData, networks: dict[str, Network], world: World, voxel: float, levels: Levels | None = None, exact: bool = True
+) -> dict[str, Tensor]:
+    """The tensors of a checkpoint, in the trained world.
+
+    networks: those of `data`, by attribute. voxel: edge of the lattice in trained units; anchors on
+    no known lattice cannot grow and cannot be written as a compact file. levels: the lattices of
+    anchors with a level, in trained units. exact: compute positions from cells.
     """
-    moved = anchors_from_input(anchors, world)
-    place = {"cell": torch.zeros(len(moved["xyz"]), 3, dtype=torch.int64), "xyz": moved["xyz"]}
-    if cells is not None:
-        place = {"cell": cells, "xyz": cell_positions(cells, voxel)}
+    c = data.columns
+    xyz = world.from_input(c["xyz"].double()).float()
+    place = {"cell": torch.zeros(len(xyz), 3, dtype=torch.int64), "xyz": xyz}
+    if data.cells is not None:
+        place = {"cell": data.cells, "xyz": (data.cells.double() * voxel).float()}
     if levels is not None:
-        place = level_facts(levels, moved, exact)
-    trained = networks_from_input(trained_names(networks, world.scale), add_dist, world.scale, moved["feature"].shape[1])
-    out = {f"params.{name}": moved[name] for name in ("feature", "offsets", "log_scaling")}
+        place = level_facts(levels, xyz, c, exact)
+    trained = for_trained_unit(networks, data.add_dist, c["feature"].shape[1], world.scale)
+    scaling = (c["log_scaling"].double() + math.log(world.scale)).float()
+    out = {"params.feature": c["feature"], "params.offsets": c["offsets"], "params.log_scaling": scaling}
     out |= {f"facts.{name}": value for name, value in place.items()}
     return out | {f"network.{a}.{name}": value for a, n in trained.items() for name, value in n.items()}
 
 
-def compact_anchors(file: Compact) -> dict[str, Tensor]:
-    """The anchors' columns of a compact file, in the input frame."""
-    return {"xyz": file.xyz, "feature": file.feature, "offsets": file.offsets, "log_scaling": file.log_scaling}
+def for_trained_unit(networks: dict[str, Network], add_dist: tuple[str, ...], features: int, scale: float) -> dict[str, Network]:
+    """Networks that see distances in trained units, by the names of a scene's parts: the inverse of
+    `write.networks`, up to rounding.
 
-
-def world_in(sidecar: dict[str, Any]) -> World:
-    """The world that our description of a scene states."""
-    x, y, z = (float(v) for v in sidecar["world"]["shift"])
-    return World(float(sidecar["world"]["scale"]), (x, y, z))
-
-
-def _read(source: Path, iteration: int | None) -> _Read:
-    """A compact file, or a result folder."""
-    if source.is_file():
-        c = read_compact(source)
-        add_dist = tuple(a for a in ATTRIBUTES if c.sidecar["add_dist"][a])
-        return _Read(compact_anchors(c), c.cells, c.voxel, c.networks, add_dist, int(c.sidecar["step"]), c.sidecar)
-    anchors, networks, facts = read_scaffold_folder(source, iteration)
-    scene, spare = facts["scene"], {a: n["w1"].shape[2] - facts["F"] - 3 for a, n in networks.items() if a in ATTRIBUTES}
-    by_level = scene is None and facts["kind"] == "octree" and facts["cfg"].get("add_level") is True
-    if by_level or max(spare["opacity"], spare["cov"], spare["color"] - facts["appearance_dim"]) > 1:
+    Raises InputError for a feature bank with other inputs than direction and distance.
+    """
+    out = {("mix" if name == "feature_bank" else name): network for name, network in networks.items()}
+    if "mix" in out and out["mix"]["w1"].shape[2] != BANK_DISTANCE + 1:
         raise InputError(
-            f"expected networks that see feature, direction and distance in {source}, found ones that see the level too; train it here"
+            f"expected a feature bank that sees direction and distance ({BANK_DISTANCE + 1} numbers), found one that sees "
+            f"{out['mix']['w1'].shape[2]}; train the scene here"
         )
-    step = int((scene or {}).get("step") or facts["iteration"] or UNKNOWN)
-    voxel, origin = float(facts["voxel_size"] or 0.0), (0.0, 0.0, 0.0)
-    if facts["kind"] == "octree":  # its lattices are told by its own columns
-        return _Read(anchors, None, voxel, networks, facts["add_dist"], step, scene, facts["cfg"])
-    if scene is not None:
-        voxel, origin = lattice_to_input(float(scene["voxel_size"]["trained"]), world_in(scene))
-    elif voxel <= 0:  # it was automatic and is written nowhere
-        voxel = recover_voxel(anchors["xyz"]) or 0.0
-    cells = cells_of(anchors["xyz"], voxel, origin) if voxel > 0 else None
-    return _Read(anchors, cells, voxel, networks, facts["add_dist"], step, scene)
+    columns = dict.fromkeys(add_dist, features + 3) | ({"mix": BANK_DISTANCE} if "mix" in out else {})
+    for name, column in columns.items():
+        w1 = out[name]["w1"].clone()
+        w1[:, :, column] = w1[:, :, column] * (1.0 / scale)
+        out[name] = out[name] | {"w1": w1}
+    return out
 
 
-def _config(read: _Read) -> Train:
-    """The recipe: the one our description holds, else Scaffold-GS with the numbers that the files show."""
-    if read.scene is not None and "train" in read.scene:
-        return from_json(Train, read.scene["train"], "train")
-    network, length = read.networks["opacity"], read.step or (octree_gs if "level" in read.anchors else scaffold_gs).iterations
-    depth = 2 + sum(name.startswith("middle.") and name.endswith(".weight") for name in network)
-    K, F = read.anchors["offsets"].shape[1], read.anchors["feature"].shape[1]
-    scene = Anchors(K=K, F=F, hidden=network["w1"].shape[1], add_dist=read.add_dist, voxel_size=max(read.voxel, 0.0), decoder=Plain(depth))
-    if "feature_bank" in read.networks:
-        scene = replace(scene, mix=FeatureBank(read.networks["feature_bank"]["w1"].shape[1]))
-    if "appearance" in read.networks:
-        scene = replace(scene, appearance=read.networks["appearance"]["table"].shape[1])
-    if "level" in read.anchors:
-        fork, rule = read.cfg.get("fork", 2), RULES[str(read.cfg.get("dist2level", "round"))]
-        return replace(octree_gs, scene=replace(scene, select=Octree(fork=fork, rule=rule)), iterations=length)
-    return replace(scaffold_gs, scene=scene, iterations=length)
+def level_facts(levels: Levels, xyz: Tensor, columns: dict[str, Tensor], exact: bool) -> dict[str, Tensor]:
+    """The table's facts of anchors with levels, trained world: cells, and positions computed from
+    them (`exact`) or as they are."""
+    level = columns["level"]
+    cells, places = torch.zeros(len(xyz), 3, dtype=torch.int64), xyz.clone()
+    for j in level.unique().tolist():
+        rows = (level == j).nonzero().squeeze(1)
+        cells[rows] = levels.cells(xyz[rows], j)
+        places[rows] = levels.positions(cells[rows], j).float()
+    extra = columns.get("extra_level", torch.zeros(len(xyz)))
+    return {"cell": cells, "xyz": places if exact else xyz, "level": level, "extra_level": extra}
 
 
-def check_world(trained: World, found: World) -> None:
-    """Raises InputError unless the capture is read into the world the scene was trained in (to rounding)."""
-    pairs = [(trained.scale, found.scale), *zip(trained.shift, found.shift)]
-    reach = max(1.0, *(abs(s) for s in trained.shift))
-    if any(abs(a - b) > 1e-5 * (abs(a) if i == 0 else reach) for i, (a, b) in enumerate(pairs)):
+# --- result folders -----------------------------------------------------------------------------------------------------------------------
+
+
+def read_folder(folder: Path) -> AnchorData:
+    """The scene in an iteration's folder, published or ours. Raises InputError for whatever is
+    missing, damaged or does not fit."""
+    columns = read_anchors(folder / "point_cloud.ply")
+    if (folder / MOE_FILE).is_file():
+        networks = by_attribute(read_tensors(folder / MOE_FILE, MOE_KIND, MOE_FORMAT)[0])
+    else:
+        networks = torchscript.read(folder)
+    check_networks(networks, str(folder))
+    about, settings = result_folder.read_description(folder), result_folder.read_settings(folder)
+    add_dist = distance_inputs(networks, columns, about is None and settings.get("add_level") is True, str(folder))
+    step = int((about or {}).get("step") or result_folder.iteration_of(folder) or 0)
+    flat = by_file_name(networks)
+    if "level" in columns:  # its own columns state the lattices
+        voxel = about["voxel_size"]["input"] if about else result_folder.number(settings.get("voxel_size"))
+        return AnchorData(columns, flat, about, None, float(voxel or 0.0), add_dist=add_dist, step=step, settings=settings)
+    origin = (0.0, 0.0, 0.0)
+    if about is not None:
+        world = world_in(about)
+        x, y, z = world.shift
+        voxel, origin = float(about["voxel_size"]["trained"]) / world.scale, (-x, -y, -z)
+    else:
+        voxel = float(result_folder.number(settings.get("voxel_size")) or 0.0)
+        voxel = voxel if voxel > 0 else recover_voxel(columns["xyz"]) or 0.0  # 0: it was automatic, and no file states it
+    cells = cells_of(columns["xyz"], voxel, origin) if voxel > 0 else None
+    return AnchorData(columns, flat, about, cells, voxel, origin, add_dist, step, settings)
+
+
+def read_anchors(path: Path) -> dict[str, Tensor]:
+    """The columns of a PLY of Scaffold-GS or Octree-GS: see `AnchorData.columns`.
+
+    Raises InputError for files without such columns, and for values that are not finite.
+    """
+    columns = read_vertices(path)
+    if "f_offset_0" not in columns:
+        what = "Gaussians of 3DGS" if "f_dc_0" in columns else f"only {', '.join(list(columns)[:8])}"
+        raise InputError(f"expected anchors (x, f_offset_*, f_anchor_feat_*, scale_*) in {path}, found {what}; give a Scaffold-GS result")
+    out = {"xyz": stack(columns, ["x", "y", "z"], path)}
+    flat = stack(columns, numbered_names(columns, "f_offset_"), path)
+    if flat.shape[1] % 3:
+        raise InputError(f"expected three f_offset columns per Gaussian in {path}, found {flat.shape[1]} in all; write the file again")
+    out["offsets"] = flat.reshape(len(flat), 3, flat.shape[1] // 3).transpose(1, 2).contiguous()
+    out["feature"] = stack(columns, numbered_names(columns, "f_anchor_feat_"), path)
+    out["log_scaling"] = stack(columns, [f"scale_{i}" for i in range(6)], path)
+    for name in ("xyz", "offsets", "feature", "log_scaling"):
+        bad = int((~out[name].isfinite()).flatten(1).any(1).sum())
+        if bad:
+            raise InputError(f"expected finite {name} in {path}, found {bad:,} anchors with others; export the result again")
+    if "level" in columns:
+        levels = {name: stack(columns, [name], path)[:, 0] for name in LEVEL_COLUMNS if name in columns}
+        level = levels["level"]
+        if not all(value.isfinite().all() for value in levels.values()) or not ((level >= 0) & (level <= MOST_LEVELS)).all():
+            raise InputError(f"expected finite levels between 0 and {MOST_LEVELS} in {path}, found others; export the result again")
+        out |= levels | {"level": level.round().long()}
+    return out
+
+
+def distance_inputs(networks: dict[str, Network], columns: dict[str, Tensor], by_level: bool, where: str) -> tuple[str, ...]:
+    """The attributes whose network sees the distance: it has one input more than feature, direction
+    and appearance code.
+
+    by_level: the networks also see the level (Octree-GS's add_level). Raises InputError for such
+    networks, which cannot be drawn here, and for widths that do not fit the anchors.
+    """
+    K, F = columns["offsets"].shape[1], columns["feature"].shape[1]
+    codes = networks["appearance"]["table"].shape[1] if "appearance" in networks else 0
+    most = 2 if "level" in columns else 1
+    spare: dict[str, int] = {}
+    for attribute in ATTRIBUTES:
+        w1, w2 = networks[attribute]["w1"], networks[attribute]["w2"]
+        spare[attribute] = w1.shape[2] - F - 3 - (codes if attribute == "color" else 0)
+        if not 0 <= spare[attribute] <= most or w2.shape[1] != CHANNELS[attribute] * K:
+            raise InputError(
+                f"expected {attribute} networks of {F + 3} inputs (1 more with the distance) and {CHANNELS[attribute] * K} outputs "
+                f"in {where}, found {w1.shape[2]} and {w2.shape[1]}; use the files of one training"
+            )
+    if by_level or max(spare.values()) > 1:
         raise InputError(
-            f"expected the capture in the world of the scene (scale {trained.scale:.6g}, shift {trained.shift}), found scale "
-            f"{found.scale:.6g}, shift {found.shift}; use the capture, --split, --normalise and --max-views it was trained with"
+            f"expected networks that see feature, direction and distance in {where}, found networks that see the level too; train it here"
         )
+    return tuple(attribute for attribute in ATTRIBUTES if spare[attribute])
+
+
+def check_networks(networks: dict[str, Network], where: str) -> None:
+    """Raises InputError unless every attribute has stacked tensors that fit together."""
+    for attribute in ATTRIBUTES:
+        n = networks.get(attribute, {})
+        if not {"w1", "b1", "w2", "b2"} <= n.keys():
+            raise InputError(f"expected the networks of {', '.join(ATTRIBUTES)} in {where}, found {sorted(networks)}; write the file again")
+        if any(n[name].ndim != rank for name, rank in (("w1", 3), ("b1", 2), ("w2", 3), ("b2", 2))):
+            raise InputError(f"expected stacked {attribute} networks in {where}, found tensors of other shapes; write the file again")
+        (E, H, _), out = n["w1"].shape, n["w2"].shape[1]
+        shapes = {"b1": (E, H), "w2": (E, out, H), "b2": (E, out), "router_b": (E,)}
+        wrong = [name for name, shape in shapes.items() if name in n and n[name].shape != shape]
+        if wrong or (E > 1 and ("router_w" not in n or len(n["router_w"]) != E)):
+            raise InputError(
+                f"expected {attribute} networks of {E} experts that fit together in {where}, found others; write the file again"
+            )

@@ -1,7 +1,9 @@
-"""A pickle read as data: its values are rebuilt as inert trees, nothing it names is imported, called or constructed.
+"""A pickle read as data: its values are rebuilt as inert trees, nothing it names is imported,
+called or constructed.
 
-A pickle is a program for a stack machine. The one here knows only the operations that describe data, and answers "make an object" and "call
-this" with a record of the names and arguments. Who reads the tree decides what such a record means. Python's own unpickler is not used.
+A pickle is a program for a stack machine. The one here knows only the operations that describe
+data, and answers "make an object" and "call this" with a record of the names and arguments. Who
+reads the tree decides what such a record means. Python's own unpickler is not used.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ class Global:
 
 @dataclass(eq=False)
 class Record:
-    """An object that was not made: what to make or call, with which arguments, and what would then be put into it."""
+    """An object that was not made: what to make or call, with which arguments, and what would then
+    be put into it."""
 
     what: Global
     args: tuple[Any, ...]
@@ -56,7 +59,8 @@ _FIXED = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
 def decode(data: bytes) -> Any:
-    """The value of a pickle as dicts, lists, tuples, numbers and texts, with `Record`, `Global` and `Outside` for the rest.
+    """The value of a pickle as dicts, lists, tuples, numbers and texts, with `Record`, `Global` and
+    `Outside` for the rest.
 
     Raises NotData.
     """
@@ -136,7 +140,8 @@ class _Machine:
                 self.describe(name, argument)
 
     def describe(self, name: str, argument: Any) -> None:
-        """The operations that in Python would import, construct or call: here they write down names and arguments."""
+        """The operations that in Python would import, construct or call: here they write down names
+        and arguments."""
         match name:
             case "GLOBAL":
                 module, _, member = argument.partition(" ")

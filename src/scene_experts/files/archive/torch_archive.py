@@ -1,9 +1,10 @@
 """The tensors of TorchScript and torch.save files, read without running any of it.
 
-Both are zip archives with a pickle that describes objects and tensors (data.pkl) and the tensors' bytes (data/0, data/1, ...); TorchScript
-adds source code, which is not looked at. The pickle is read as data (`pickle_data`) and only these names in it mean something here: tensors
-and their storages, ordered dictionaries, and TorchScript's own module classes (__torch__...), of which the attributes are taken. Any other
-name is refused.
+Both are zip archives with a pickle that describes objects and tensors (data.pkl) and the tensors'
+bytes (data/0, data/1, ...); TorchScript adds source code, which is not looked at. The pickle is
+read as data (`pickle_data`) and only these names in it mean something here: tensors and their
+storages, ordered dictionaries, and TorchScript's own module classes (__torch__...), of which the
+attributes are taken. Any other name is refused.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ _LARGEST = 1 << 62  # of a size, a stride, an offset
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """Every tensor of the file by its dotted place (`0.weight`, `opacity_mlp.0.weight`), on the CPU in the file's own dtype.
+    """Every tensor of the file by its dotted place (`0.weight`, `opacity_mlp.0.weight`), on the CPU
+    in the file's own dtype.
 
     Raises InputError: absent, not such an archive, damaged, or naming anything that is not tensor data.
     """
@@ -95,7 +97,8 @@ class _Reader:
             raise NotData(f"it holds {value}, which is no tensor")
 
     def content(self, record: Record) -> Tensor | dict[Any, Any]:
-        """What an admitted record stands for: a tensor, or the named values of a module or dictionary. Others are refused."""
+        """What an admitted record stands for: a tensor, or the named values of a module or
+        dictionary. Others are refused."""
         name = str(record.what)
         if name == "torch._utils._rebuild_tensor_v2" and len(record.args) >= 4:
             return self.tensor(*record.args[:4])

@@ -1,103 +1,113 @@
-"""The bake: a scene whose Gaussians depend on the camera as standard Gaussians, which do not but for their harmonics.
+"""The bake: a scene whose Gaussians depend on the camera becomes standard Gaussians, in which only
+the harmonics' colours depend on it.
 
-Every decoded Gaussian that contributes to a training view becomes one standard Gaussian. Its opacity, size, rotation and colour are means
-over the views, weighted by what it contributed (`sums`), its opacity less where the scene often leaves it out; then all parameters
-are moved together until the pictures agree (`refine`). Views held out are never looked at.
+1. Sums (`observe.sum_views`, `closed_form`): every Gaussian that contributes to a picture becomes
+   one row, with the mean position, size and rotation over the views, weighted by its contributions.
+2. Omission (`observe.omission`): a row loses opacity the more often the scene leaves its Gaussian
+   out.
+3. Colours (`observe.fit_harmonics`): least squares over the views.
+4. Refinement (`refine`): all parameters move together until the pictures agree.
+
+Held-out views are never used.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from scene_experts.core.errors import InputError, expect_at_least
-from scene_experts.core.table import Table
+from scene_experts.core.errors import InputError
 from scene_experts.data.views import Capture
+from scene_experts.files.bake.observe import Sums, fit_harmonics, omission, sum_views
 from scene_experts.files.bake.refine import Refine, refine
-from scene_experts.files.bake.sums import Sums, Tell, add_up, fit_harmonics, hidden
 from scene_experts.files.bake.views import Views
-from scene_experts.geometry.sh import MAX_DEGREE
+from scene_experts.files.gaussians.read import DRAWN_AT, scene_of
+from scene_experts.files.measure import Painter, Tell
 from scene_experts.render import Rasterizer
-from scene_experts.scene import Scene
-from scene_experts.scene.gaussians import Explicit, GaussianScene
+from scene_experts.scene.gaussians import GaussianScene
+from scene_experts.training.config import to_json
+from scene_experts.training.run_folder import OpenRun
 
-FREE_LOOKS = 150  # free views, beside the others, from which is seen what the scene leaves out
-MOSTLY = 3.0  # Gaussians left out more than so many times as much as they are drawn are dropped, and the others take their place
-MOST_ALPHA = 0.995  # so that logits stay finite
-LEAST_ALPHA = 1.0 / 255.0  # rasterisers leave out what is fainter: such a Gaussian is drawn nowhere
+__all__ = ["DRAWN_AT", "Bake", "Baked", "Refine", "bake"]
+
+OMISSION_VIEWS = 150  # free views, besides those of the sums, that show what the scene leaves out
+MOST_OMISSION = 3.0  # Gaussians left out this many times as much as they are drawn are dropped
+MOST_ALPHA = 0.995  # keeps logits finite
+LEAST_ALPHA = 1.0 / 255.0  # rasterisers skip fainter Gaussians
 
 
 @dataclass(frozen=True)
 class Bake:
-    """How much of a scene a bake keeps, and how long it is refined."""
+    """What a bake keeps of a scene, and how it is refined."""
 
     sh_degree: int = 3
-    max_gaussians: int = 0  # 0: no cap
-    prune: float = 0.0  # those that contribute least go, until they hold this share of all contributions
+    """Degree of the harmonics, 0 to 3."""
+    max_gaussians: int = 0
+    """Keep at most this many Gaussians, those with the largest contributions; 0 keeps all."""
+    prune: float = 0.0
+    """Share of all contributions to leave out, smallest first, in [0, 1)."""
     refine: Refine = field(default_factory=Refine)
     seed: int = 0
-
-    def check(self) -> None:
-        """Raises InputError for numbers that no bake can have."""
-        expect_at_least([("--sh-degree", self.sh_degree, 0), ("--max-gaussians", self.max_gaussians, 0)])
-        expect_at_least([("--refine", self.refine.iterations, 0), ("--seed", self.seed, 0)])
-        if self.sh_degree > MAX_DEGREE:
-            raise InputError(f"expected --sh-degree of at most {MAX_DEGREE}, found {self.sh_degree}; give a lower degree")
-        if not 0 <= self.prune < 1:
-            raise InputError(f"expected --prune as a share of 0 to below 1, found {self.prune}; correct it")
+    """Of the free views and of the order of the views in the refinement."""
 
 
 @dataclass(frozen=True)
 class Baked:
-    """A baked scene in the trained world, the same before its refinement, and how many Gaussians there were on the way."""
+    """A baked scene in the trained world."""
 
     scene: GaussianScene
     closed_form: GaussianScene
-    contributing: int  # Gaussians that any view showed
+    """The same before its refinement."""
+    about: dict[str, Any]
+    """How it was baked, as JSON values: all settings, and how many Gaussians contributed to any view."""
 
 
-def bake(scene: Scene, step: int, capture: Capture, rasterize: Rasterizer, how: Bake, tell: Tell) -> Baked:
-    """Bake `scene` as it is at `step`, over the training views of its capture.
+def bake(run: OpenRun, capture: Capture, how: Bake, rasterize: Rasterizer | None, tell: Tell) -> Baked:
+    """Bake the scene of a run from the training views of its capture.
 
-    rasterize: as the scene was trained (antialias). Raises InputError where no Gaussian shows in any training view.
+    rasterize: None for the fastest one on this CPU. Raises InputError where no Gaussian contributes
+    to any training view, and for a capture without training views.
     """
-    how.check()
+    scene, painter = run.scene, Painter.of(run.scene, run.step, rasterize, run.cfg.antialias)
     generator = torch.Generator().manual_seed(how.seed)
-    views, draws = Views.of(capture), scene.frozen(step)
-    cameras, slots = views.for_sums(generator), len(scene.table) * scene.K
-    sums = add_up(draws, step, slots, cameras, rasterize, tell)
+    views = Views.of(capture)
+    cameras, slots = views.for_sums(generator), len(scene.positions) * scene.K
+    sums = sum_views(painter, slots, cameras, tell)
     rows = (sums.weight > 0).nonzero().squeeze(1)
-    found, columns, opacity = len(rows), closed_form(sums, rows), sums.opacity().index_select(0, rows)
-    if not isinstance(scene, GaussianScene):
-        looks = [*cameras, *(views.free(generator) for _ in range(FREE_LOOKS))]
+    about = {"bake": to_json(how), "contributing": len(rows)}
+    columns, opacity = closed_form(sums, rows), sums.opacity().index_select(0, rows)
+    if scene.traits.needs_bake:
+        looks = [*cameras, *(views.free(generator) for _ in range(OMISSION_VIEWS))]
         sizes = columns["log_scales"].amax(1).exp()
-        left_out = hidden(draws, step, rows, slots, columns["means"], sizes, looks, rasterize, tell)
-        opacity = torch.where(left_out > MOSTLY, 0.0, opacity / (1 + left_out))
-    chosen = kept(sums.weight.index_select(0, rows), opacity, how)
+        left_out = omission(painter, rows, slots, columns["means"], sizes, looks, tell)
+        opacity = torch.where(left_out > MOST_OMISSION, 0.0, opacity / (1 + left_out))
+    chosen = choose(sums.weight.index_select(0, rows), opacity, how)
     if not len(chosen):
         raise InputError("expected a scene that shows in its training views, found none of its Gaussians in any; train it longer")
     columns["raw_opacity"] = torch.logit(opacity.clamp(LEAST_ALPHA, MOST_ALPHA))
     rows, columns = rows[chosen], {name: value.index_select(0, chosen) for name, value in columns.items()}
     degree = how.sh_degree
-    if isinstance(scene, GaussianScene):  # nothing but colours depends on the camera
-        degree = min(degree, scene.config.sh_degree)
+    if scene.traits.sh_degree is not None:  # the rows are standard Gaussians: keep all but the colours
+        degree = min(degree, scene.traits.sh_degree)
         columns = {name: scene.table.params[name].detach().index_select(0, rows) for name in columns}
-    sh = fit_harmonics(draws, step, rows, sums, columns["means"], degree, cameras, rasterize, tell)
+    sh = fit_harmonics(painter, rows, sums, columns["means"], degree, cameras, tell)
     columns |= {"sh_dc": sh[:, 0].contiguous(), "sh_rest": sh[:, 1:].contiguous()}
     del sums, sh
-    first = explicit(columns, scene.extent)
+    first = scene_of(columns, scene.extent)
     if not how.refine.iterations:
-        return Baked(first, first, found)
-    second = explicit({name: value.clone() for name, value in columns.items()}, scene.extent)
-    refine(second, draws, step, views, torch.tensor(capture.background), rasterize, how.refine, how.seed, tell)
-    return Baked(drawable(second), first, found)
+        return Baked(first, first, about)
+    second = scene_of({name: value.clone() for name, value in columns.items()}, scene.extent)
+    refine(second, painter, views, torch.tensor(capture.background), how.refine, how.seed, tell)
+    return Baked(without_faint(second), first, about)
 
 
-def kept(weight: Tensor, opacity: Tensor, how: Bake) -> Tensor:
-    """Which Gaussians [k] int64, ascending, of contributions `weight` [n] are kept: those that can be drawn, less what `how` leaves out."""
+def choose(weight: Tensor, opacity: Tensor, how: Bake) -> Tensor:
+    """The Gaussians [k] int64, ascending, that a bake keeps of those with contributions `weight`
+    [n] and opacities [n]."""
     order = weight.argsort(descending=True)
     sorted_ = weight.index_select(0, order).double()
     before = (sorted_.cumsum(0) - sorted_) / sorted_.sum().clamp_min(1e-12)
@@ -109,7 +119,8 @@ def kept(weight: Tensor, opacity: Tensor, how: Bake) -> Tensor:
 
 
 def closed_form(sums: Sums, rows: Tensor) -> dict[str, Tensor]:
-    """Means over the views, weighted by contribution, of the slots `rows` [n]: columns of explicit Gaussians but opacity and harmonics."""
+    """Means over the views, weighted by contribution, of the slots `rows` [n]: means, log_scales
+    and quats of standard Gaussians."""
     weight = sums.weight.index_select(0, rows)[:, None]
     return {
         "means": sums.means.index_select(0, rows) / weight,
@@ -118,15 +129,9 @@ def closed_form(sums: Sums, rows: Tensor) -> dict[str, Tensor]:
     }
 
 
-def explicit(columns: dict[str, Tensor], extent: float) -> GaussianScene:
-    """A scene of explicit Gaussians of these columns, all of whose harmonics are in use from step 3 on."""
-    degree = round((columns["sh_rest"].shape[1] + 1) ** 0.5) - 1
-    return GaussianScene(Explicit(sh_degree=degree, sh_ramp=1), Table(columns, {}), extent)
-
-
 @torch.no_grad()
-def drawable(scene: GaussianScene) -> GaussianScene:
-    """The scene without Gaussians so faint that they are drawn nowhere."""
+def without_faint(scene: GaussianScene) -> GaussianScene:
+    """The scene without Gaussians that are too faint to be drawn."""
     p = scene.table.params
     rows = (p["raw_opacity"].sigmoid() >= LEAST_ALPHA).nonzero().squeeze(1)
-    return explicit({name: value.detach().index_select(0, rows) for name, value in p.items()}, scene.extent)
+    return scene_of({name: value.detach().index_select(0, rows) for name, value in p.items()}, scene.extent)

@@ -1,4 +1,5 @@
-"""All parameters of baked Gaussians together, moved until their pictures are those of the scene that they stand for."""
+"""The refinement of baked Gaussians: all parameters move together until the pictures agree with
+those of the original scene."""
 
 from __future__ import annotations
 
@@ -9,24 +10,24 @@ from torch import Tensor
 
 from scene_experts.core.schedule import Rate
 from scene_experts.core.types import Mode
-from scene_experts.files.bake.sums import Tell
 from scene_experts.files.bake.views import Views
-from scene_experts.render import Rasterizer
-from scene_experts.scene import Draws
+from scene_experts.files.gaussians.read import DRAWN_AT
+from scene_experts.files.measure import Painter, Tell
 from scene_experts.scene.gaussians import GaussianScene
 from scene_experts.training.optim import FusedAdam
 from scene_experts.training.photometric import photometric
 
-DRAWN_AT = 3  # the step at which baked scenes are drawn: all degrees are in use from it on
-
 
 @dataclass(frozen=True)
 class Refine:
-    """How baked Gaussians are refined. Learning rates run log-linearly from first to last; that of means is multiplied by the extent."""
+    """How baked Gaussians are refined. Learning rates change log-linearly from first to last; the
+    rate of means is multiplied by the extent."""
 
     iterations: int = 1000
-    free: float = 0.6  # share of iterations that look from free views
-    dssim: float = 0.2  # weight of 1 - SSIM in the loss, L1 has the rest
+    free: float = 0.6
+    """Share of iterations that use free views."""
+    dssim: float = 0.2
+    """Weight of 1 - SSIM in the loss; L1 has the rest."""
     means: Rate = Rate(0.00012, 0.000005)
     log_scales: Rate = Rate(0.015, 0.0015)
     quats: Rate = Rate(0.006, 0.0006)
@@ -37,20 +38,18 @@ class Refine:
 
 def refine(
     scene: GaussianScene,
-    draws: Draws,
-    step: int,
+    painter: Painter,
     views: Views,
     background: Tensor,
-    rasterize: Rasterizer,
     how: Refine,
     seed: int,
     tell: Tell,
 ) -> None:
-    """Move the columns of `scene` until it draws what `draws` does at `step`, over `background` [3].
+    """Move the columns of `scene` until it draws what `painter` draws over `background` [3].
 
-    It looks from the training views, each once an epoch in random order, and from free views around them.
+    Uses the training views, each once per epoch in random order, and free views around them.
     """
-    generator = torch.Generator().manual_seed(seed)
+    rasterize, generator = painter.rasterize, torch.Generator().manual_seed(seed)
     groups = scene.rate_groups().items()
     optimizer = FusedAdam([{"params": params, "name": name, "lr": 0.0} for name, params in groups])
     free = (torch.rand(how.iterations, generator=generator) < how.free).tolist()
@@ -60,7 +59,7 @@ def refine(
             queue = torch.randperm(len(views), generator=generator).tolist()
         camera = views.free(generator) if is_free else views.cameras[queue.pop()]
         with torch.no_grad():
-            target = rasterize(draws(camera, step, Mode.DRAW, rasterize.visible).gaussians, camera, background).image.clamp_(0, 1)
+            target = painter.picture(camera, background).clamp_(0, 1)
         for group in optimizer.param_groups:
             rate: Rate = getattr(how, group["name"])
             group["lr"] = rate.at(i + 1, how.iterations) * (scene.extent if group["name"] == "means" else 1.0)

@@ -1,7 +1,9 @@
-"""The cameras that a bake looks from: the training views, and free views between and around neighbouring ones.
+"""The cameras of a bake: the training views, and free views between and around neighbouring
+training views.
 
-Held-out views are never among them. Free views matter: a Gaussian that training views show and that the scene leaves out from nearby (its
-anchor is behind the camera, its opacity is negative) would hang as fog before a camera there, and training views alone do not tell.
+Held-out views are never used. Free views are needed: where the scene leaves out a Gaussian that
+training views show (its anchor is behind the camera, its opacity is negative), a baked Gaussian
+would appear as fog, and training views alone do not reveal it.
 """
 
 from __future__ import annotations
@@ -18,24 +20,24 @@ from scene_experts.geometry.poses import FREE, make_pose, slerp
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 
 NEIGHBOURS = 8  # training views that a view may be joined with
-BEYOND = 0.1  # a free view lies in the triangle of three neighbours, made larger by so much
-LEAST_VIEWS = 60  # sums over views are taken over at least so many
-MOST_TRAINING = 120  # training views among them at most, evenly chosen
-FREE_SHARE = 0.25  # free views among them for each training view, at least
+BEYOND = 0.1  # the corners of the triangle of three neighbours move outwards by this share
+LEAST_VIEWS = 60  # views of the sums, at least
+MOST_TRAINING = 120  # training views among them, at most, evenly chosen
+FREE_SHARE = 0.25  # free views among them per training view, at least
 
 
 @dataclass(frozen=True)
 class Views:
-    """The training cameras of a capture and which of them are near each other."""
+    """The training cameras of a capture and the nearest neighbours of each."""
 
-    cameras: tuple[Camera, ...]  # as no view of the capture, so that appearance codes are those of a free camera
+    cameras: tuple[Camera, ...]  # with the id of a free camera, which chooses its appearance code
     positions: Tensor  # [V, 3] float64
     quats: Tensor  # [V, 4] float64, camera to world
-    near: Tensor  # [V, n] int64, the nearest others first
+    near: Tensor  # [V, n] int64, the nearest first
 
     @classmethod
     def of(cls, capture: Capture) -> Views:
-        """Looks at the training views. Raises InputError where there is none."""
+        """The training views of a capture. Raises InputError without any."""
         if not capture.train:
             raise InputError("expected training views to bake from, found none in the capture; choose another --split")
         cameras = tuple(replace(capture.views[i].camera, id=FREE) for i in capture.train)
@@ -48,10 +50,11 @@ class Views:
         return len(self.cameras)
 
     def free(self, generator: torch.Generator) -> Camera:
-        """A random view in the triangle of a training view and two of its neighbours, turned with them, with the lens of the first."""
+        """A random view in the triangle of a training view and two of its neighbours: rotation
+        between theirs, lens of the first."""
         i, (j, k) = self._three(generator)
         share = -torch.rand(3, generator=generator, dtype=torch.float64).clamp_min(1e-12).log()
-        share = share / share.sum() * (1 + 3 * BEYOND) - BEYOND  # uniform in the triangle, of which BEYOND pushes the corners outwards
+        share = share / share.sum() * (1 + 3 * BEYOND) - BEYOND  # uniform in the enlarged triangle
         place = share @ self.positions[[i, j, k]]
         turned = slerp(self.quats[i], self.quats[j], _part(share[1], share[0]))
         turned = slerp(turned, self.quats[k], _part(share[2], share[0] + share[1]))
@@ -59,14 +62,14 @@ class Views:
         return replace(first, world_to_cam=make_pose(place, quat_to_matrix(turned)).to(first.world_to_cam.dtype))
 
     def _three(self, generator: torch.Generator) -> tuple[int, list[int]]:
-        """A training view and two of its neighbours; the view itself where it has too few."""
+        """A training view and two of its neighbours; the view itself takes the place of missing ones."""
         first = int(torch.randint(len(self.cameras), (1,), generator=generator))
         near = self.near[first]
         others = near[torch.randperm(len(near), generator=generator)[:2]].tolist()
         return first, (others + [first, first])[:2]
 
     def for_sums(self, generator: torch.Generator) -> list[Camera]:
-        """The cameras over which sums are taken: training views, all or evenly chosen, and free ones."""
+        """The cameras of the sums: training views, all or evenly chosen, and free views."""
         n = min(len(self), MOST_TRAINING)
         chosen = torch.linspace(0, len(self) - 1, n).round().long().tolist()
         free = max(LEAST_VIEWS - n, round(FREE_SHARE * n))
@@ -74,7 +77,8 @@ class Views:
 
 
 def neighbours(positions: Tensor, forward: Tensor, extent: float, count: int = NEIGHBOURS) -> Tensor:
-    """The `count` nearest other views [V, n] int64 (n smaller where there are fewer): distance in extents plus the turn between directions.
+    """The `count` nearest other views [V, n] int64 (n = all others where there are fewer), by
+    distance in extents plus change of direction.
 
     positions, forward [V, 3] float64: camera centres and unit viewing directions.
     """
@@ -85,6 +89,6 @@ def neighbours(positions: Tensor, forward: Tensor, extent: float, count: int = N
 
 
 def _part(one: Tensor, other: Tensor) -> float:
-    """How much of two shares the first is, held in [0, 1]."""
+    """The first of two shares relative to their sum, in [0, 1]."""
     one, other = one.clamp_min(0), other.clamp_min(0)
     return float(one / (one + other).clamp_min(1e-12))

@@ -1,7 +1,9 @@
-"""Codebooks and palettes for packed files: 256 levels for many scalars, and up to 65,536 representatives of many vectors; deterministic.
+"""Codebooks and palettes for packed files: 256 levels for many scalars, and up to 65,536
+representatives of many vectors; deterministic.
 
-Plain k-means with 65,536 centres compares every vector with every centre. Here the vectors are first split into a few hundred coarse
-groups, each of which then gets its share of the centres, by its size and spread, and finds them alone: the work falls by two orders.
+Plain k-means with 65,536 centres compares every vector with every centre. Here the vectors are
+first split into a few hundred coarse groups, each of which then gets its share of the centres, by
+its size and spread, and finds them alone: the work falls by two orders.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ _BLOCK = 4096
 
 
 def codebook(values: NDArray[Any], steps: int = 24) -> Floats:
-    """256 sorted levels for scalars of any shape, by Lloyd's iteration from even ranks and even steps; exact for few values."""
+    """256 sorted levels for scalars of any shape, by Lloyd's iteration from even ranks and even
+    steps; exact for few values."""
     flat = np.sort(np.asarray(values, np.float64).ravel())
     if not len(flat):
         return np.zeros(LEVELS)
@@ -48,7 +51,8 @@ def nearest_levels(values: NDArray[Any], level: Floats) -> Bytes:
 
 
 def palette(vectors: Tensor, size: int, steps: int = 8) -> tuple[Tensor, Tensor]:
-    """At most `size` representatives [P, C] of vectors [N, C] float32, and the index [N] int64 of each vector's own."""
+    """At most `size` representatives [P, C] of vectors [N, C] float32, and the index [N] int64 of
+    each vector's own."""
     n = len(vectors)
     if n <= size:
         return vectors, torch.arange(n)
@@ -71,7 +75,8 @@ def palette(vectors: Tensor, size: int, steps: int = 8) -> tuple[Tensor, Tensor]
 
 
 def _shares(vectors: Tensor, coarse: Tensor, group: Tensor, counts: Tensor, size: int) -> Tensor:
-    """How many centres each group gets: by the square root of its size times its spread, 1 at least, its size at most."""
+    """How many centres each group gets: by the square root of its size times its spread, 1 at
+    least, its size at most."""
     error = ((vectors - coarse[group]) ** 2).sum(1).double()
     spread = torch.zeros(len(coarse), dtype=torch.float64).index_add_(0, group, error)
     weight = (spread * counts).sqrt().clamp_min(1e-12)
@@ -98,7 +103,8 @@ def _spread_start(vectors: Tensor, k: int) -> Tensor:
 
 
 def _lloyd(vectors: Tensor, centres: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Centres after some steps of k-means, and each vector's nearest. Centres that lose all vectors stay where they are."""
+    """Centres after some steps of k-means, and each vector's nearest. Centres that lose all vectors
+    stay where they are."""
     label = torch.zeros(len(vectors), dtype=torch.int64)
     for _ in range(steps if len(centres) < len(vectors) else 0):
         label = _nearest(vectors, centres)

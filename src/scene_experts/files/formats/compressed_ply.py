@@ -1,8 +1,10 @@
-"""SuperSplat's compressed PLY: 16 bytes a Gaussian and one per harmonic, in chunks of 256 that share their ranges.
+"""SuperSplat's compressed PLY, 16 to 61 bytes per Gaussian.
 
-A chunk holds the least and greatest position, log scale and colour; a Gaussian 11-10-11 bits of position and log scale within them, the
-smallest three of its quaternion in 10 bits each beside the largest's index, and 8-8-8-8 bits of colour and opacity. Harmonics above the
-constant are bytes over [-4, 4]. Gaussians are sorted along the Morton curve, which keeps the ranges small.
+Gaussians are stored in chunks of 256. A chunk stores the minimum and maximum of position, log scale
+and colour. A Gaussian stores position and log scale in 11-10-11 bits within those ranges, the
+smallest three components of its quaternion in 10 bits each with the index of the largest, and
+colour and opacity in 8-8-8-8 bits. Harmonics above the constant are bytes over [-4, 4]. Sorting
+along the Morton curve keeps the ranges small.
 """
 
 from __future__ import annotations
@@ -14,24 +16,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_experts.core.io import write_bytes
-from scene_experts.files.formats.comments import note_comments
-from scene_experts.files.formats.pack import Floats, alphas, byte_logits, damaged, from_smallest_three, smallest_three, tensor, unit_quats
-from scene_experts.files.formats.pack import to_bytes as bytes_of
-from scene_experts.files.formats.sort import morton_order
+from scene_experts.files.formats.pack import (
+    Floats,
+    alphas,
+    byte_logits,
+    damaged,
+    from_smallest_three,
+    morton_order,
+    smallest_three,
+    tensor,
+    to_bytes,
+    unit_quats,
+)
+from scene_experts.files.formats.ply import HEADER_LIMIT, header, note_comments
 from scene_experts.files.formats.splats import Splats
-from scene_experts.files.ply import HEADER_LIMIT
+from scene_experts.files.registry import Format
 from scene_experts.geometry.sh import C0
 
 CHUNK = 256
 _RANGES = [f"{end}_{name}" for part in ("xyz", ("scale_x", "scale_y", "scale_z"), "rgb") for end in ("min", "max") for name in part]
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 _BITS = (11, 10, 11)
-_LIMIT = 20.0  # log scales beyond are cut, as the format's own writers do
+_LIMIT = 20.0  # log scales are clipped to this, as in the format's own writers
 WHAT = "compressed PLY"
 
 
-def write_compressed_ply(path: Path, splats: Splats, note: dict[str, Any]) -> None:
-    """Write the compressed PLY, the note as a comment of its header."""
+def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
+    """Write the file; the note becomes a comment in the header."""
     s = splats.rows(morton_order(splats.means))
     n, chunks = len(s), -(-len(s) // CHUNK)
     parts = (
@@ -48,7 +59,7 @@ def write_compressed_ply(path: Path, splats: Splats, note: dict[str, Any]) -> No
         steps.append(np.where(span > 0, (values - low) / np.where(span > 0, span, 1), 0.0))
     packed[:, 0], packed[:, 2] = _pack_11_10_11(steps[0]), _pack_11_10_11(steps[1])
     packed[:, 1] = _pack_quats(unit_quats(s))
-    rgba = bytes_of(np.concatenate([steps[2], alphas(s)[:, None]], 1)).astype(np.uint32)
+    rgba = to_bytes(np.concatenate([steps[2], alphas(s)[:, None]], 1)).astype(np.uint32)
     packed[:, 3] = rgba @ np.array([1 << 24, 1 << 16, 1 << 8, 1], np.uint32)
     rest = s.sh[:, 1:].transpose(1, 2).flatten(1).double().numpy()
     harmonics = np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
@@ -60,18 +71,18 @@ def write_compressed_ply(path: Path, splats: Splats, note: dict[str, Any]) -> No
     write_bytes(path, head + ranges.tobytes() + packed.tobytes() + harmonics.tobytes())
 
 
-def read_compressed_ply(path: Path) -> Splats:
-    """The Gaussians of a compressed PLY. Raises InputError for other or damaged files."""
+def read(path: Path) -> Splats:
+    """The Gaussians of a file. Raises InputError for other or damaged files."""
     data = path.read_bytes()
     end = data[:HEADER_LIMIT].find(b"\nend_header\n")
     if end < 0:
-        raise damaged(path, WHAT, "no end of its header")
+        raise damaged(path, WHAT, "no end of the header")
     elements = _elements(path, data[:end].decode("ascii", "replace"))
     tables: dict[str, NDArray[Any]] = {}
     offset = end + len(b"\nend_header\n")
     for name, (count, row) in elements.items():
         if offset + count * row.itemsize > len(data):
-            raise damaged(path, WHAT, f"{len(data):,} bytes where its header asks for more")
+            raise damaged(path, WHAT, f"{len(data):,} bytes where the header declares more")
         tables[name] = np.frombuffer(data, row, count, offset)
         offset += count * row.itemsize
     return _decode(path, tables)
@@ -84,7 +95,7 @@ def _decode(path: Path, tables: dict[str, NDArray[Any]]) -> Splats:
         raise damaged(path, WHAT, f"{len(chunk):,} chunks for {n:,} Gaussians")
     column = np.stack([chunk[name] for name in _RANGES], 1).astype(np.float64) if len(chunk) else np.zeros((0, 18))
     if not np.isfinite(column).all():
-        raise damaged(path, WHAT, "ranges that are no numbers")
+        raise damaged(path, WHAT, "ranges that are not finite")
     columns = np.repeat(column, CHUNK, 0)[:n]
     steps = (
         _unpack_11_10_11(vertex["packed_position"]),
@@ -105,7 +116,7 @@ def _decode(path: Path, tables: dict[str, NDArray[Any]]) -> Splats:
 
 
 def _elements(path: Path, text: str) -> dict[str, tuple[int, np.dtype[Any]]]:
-    """Rows and row type of chunk, vertex and sh, as the header has them in order."""
+    """Number of rows and row type of chunk, vertex and sh, in the order of the header."""
     found: dict[str, tuple[int, list[tuple[str, str]]]] = {}
     types, name = {"float": "<f4", "uint": "<u4", "uchar": "u1"}, ""
     try:
@@ -137,7 +148,7 @@ def _elements(path: Path, text: str) -> dict[str, tuple[int, np.dtype[Any]]]:
 
 
 def _chunk_ranges(values: Floats, chunks: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The least and greatest of each chunk, [chunks, 3] each."""
+    """Minimum and maximum of each chunk, [chunks, 3] each."""
     if not chunks:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
     starts = np.arange(chunks) * CHUNK
@@ -162,3 +173,13 @@ def _pack_quats(quats: Floats) -> NDArray[np.uint32]:
 def _unpack_quats(packed: NDArray[np.uint32]) -> Floats:
     rest = np.stack([(packed >> shift & 1023) / 1023 for shift in (20, 10, 0)], 1)
     return from_smallest_three(packed >> 30, (rest - 0.5) * np.sqrt(2))
+
+
+FORMAT = Format(
+    suffix=".compressed.ply",
+    write=write,
+    read=read,
+    marks=(b"ply",),
+    looks_like=lambda path, head: b"\nelement chunk " in header(path),
+    other_suffixes=(".ply",),
+)

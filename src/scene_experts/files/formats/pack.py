@@ -1,4 +1,5 @@
-"""What the packed formats share: unit quaternions, the smallest three of their components, opacities in a byte, turned frames, limits."""
+"""Shared by the packed formats: row order, unit quaternions and their smallest three components,
+bytes, turned frames, size limits."""
 
 from __future__ import annotations
 
@@ -8,17 +9,19 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from scene_experts.core.errors import InputError
+from scene_experts.files.formats.compact import AXIS_BITS, morton
 from scene_experts.files.formats.splats import Splats
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-MAX_GAUSSIANS = 50_000_000  # of a compressed file; more are refused before memory is taken for them
-MAX_RATIO = 200  # bytes out of one byte in, above _SMALL: what real scenes never reach
+MAX_GAUSSIANS = 50_000_000  # of a compressed file; readers refuse more before they allocate memory
+MAX_RATIO = 200  # bytes out per byte in, above _SMALL bytes out; real scenes stay far below
 _SMALL = 1 << 26
-_EDGE = 0.25 / 255  # a byte of 0 or 255 is read as this far inside, so that logits stay finite
+_EDGE = 0.25 / 255  # bytes 0 and 255 are read this far inside [0, 1], so that logits are finite
 _SIGNS = {  # of x, y, z after half a turn about an axis
     "x": (1, -1, -1),
     "z": (-1, -1, 1),
@@ -30,27 +33,41 @@ _PARITY = (  # how often x, y, z occur in each harmonic, by coefficient: (odd x,
 
 
 def damaged(path: Path, what: str, found: object) -> InputError:
-    """The error for a file that claims to be of a format and does not hold together."""
-    return InputError(f"expected a whole {what} file at {path}, found {found}; copy it again or write it anew")
+    """The error for a file of format `what` whose parts do not fit together."""
+    return InputError(f"expected a whole {what} file at {path}, found {found}; copy it again or write it again")
 
 
 def check_size(path: Path, what: str, count: int, raw: int, stored: int) -> None:
-    """Raises InputError where a file declares more Gaussians, or unpacks to more bytes, than its `stored` bytes can honestly hold."""
+    """Raises InputError where a file of `stored` bytes declares implausibly many Gaussians or
+    unpacked bytes (`raw`)."""
     if count > MAX_GAUSSIANS:
         raise damaged(path, what, f"{count:,} Gaussians declared, above the limit of {MAX_GAUSSIANS:,}")
     if raw > _SMALL and raw > MAX_RATIO * stored:
         raise damaged(path, what, f"{stored:,} bytes that unpack to {raw:,}")
 
 
+def morton_order(means: Tensor) -> Tensor:
+    """Rows [N] of positions [N, 3] along the Morton curve through their bounding box: near rows
+    compress well. Ties keep their order."""
+    xyz = means.double().numpy()
+    if not len(xyz):
+        return torch.zeros(0, dtype=torch.int64)
+    low = xyz.min(0)
+    span = (xyz.max(0) - low).max()
+    cells = ((xyz - low) * (((1 << AXIS_BITS) - 1) / (span if span > 0 else 1.0))).astype(np.int64)
+    return torch.from_numpy(np.argsort(morton(cells), kind="stable"))
+
+
 def unit_quats(splats: Splats) -> Floats:
-    """Quaternions [N, 4] (w, x, y, z) of length 1; the identity where the length is 0."""
+    """Quaternions [N, 4] (w, x, y, z) of length 1; the identity for those of length 0."""
     q = splats.quats.double().numpy()
     length = np.linalg.norm(q, axis=1, keepdims=True)
     return np.where(length > 0, q / np.where(length > 0, length, 1), [1.0, 0, 0, 0])
 
 
 def smallest_three(quats: Floats) -> tuple[NDArray[np.intp], Floats]:
-    """The index of the largest component [N], and the others [N, 3] in order, for the sign that makes the largest positive."""
+    """The index of the largest component [N], and the others [N, 3] in order, for the sign that
+    makes the largest positive."""
     largest = np.abs(quats).argmax(1)
     rows = np.arange(len(quats))
     signed = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
@@ -82,13 +99,14 @@ def byte_logits(values: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def logits(opacity: Floats, edge: float = 1e-7) -> NDArray[np.float32]:
-    """Logits [N] of opacities in [0, 1], taken at least `edge` inside, so that they are finite."""
+    """Logits [N] of opacities, clipped to [edge, 1 - edge] so that they are finite."""
     a = np.clip(opacity, edge, 1 - edge)
     return np.log(a / (1 - a)).astype(np.float32)
 
 
 def turned(splats: Splats, axis: Literal["x", "z"]) -> Splats:
-    """The Gaussians after half a turn of the frame about an axis; twice is nothing. Scales keep their axes."""
+    """The Gaussians after half a turn of the frame about an axis. Applied twice it changes nothing.
+    Scales keep their axes."""
     signs = np.array(_SIGNS[axis])
     harmonics = np.prod(np.where(np.array(_PARITY[: splats.sh.shape[1]]) == 1, signs, 1), axis=1)
     vector = torch.from_numpy(signs).float()
@@ -102,5 +120,5 @@ def turned(splats: Splats, axis: Literal["x", "z"]) -> Splats:
 
 
 def tensor(values: NDArray[Any]) -> torch.Tensor:
-    """A float32 tensor of its own memory."""
+    """A float32 tensor with memory of its own."""
     return torch.from_numpy(np.array(values, dtype=np.float32, order="C"))

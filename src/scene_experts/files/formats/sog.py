@@ -1,8 +1,10 @@
-"""PlayCanvas's SOG, version 2: a zip of lossless WebP pictures with a byte or two per value, and a palette for the harmonics.
+"""PlayCanvas's SOG, the smallest.
 
-Positions are 16 bits of sign(x) ln(1 + |x|) between each axis's ends; log scales and colours indices into 256 levels; rotations the
-smallest three in a byte each; harmonics above the constant one of at most 65,536 rows, whose values are indices into 256 levels as well.
-Gaussians are sorted along the Morton curve and fill the pictures row by row.
+Version 2 is a zip of lossless WebP pictures with one or two bytes per value, and a palette for the
+harmonics. Positions are 16 bits of sign(x) ln(1 + |x|) within the range of each axis. Log scales
+and colours are indices into 256 levels. Rotations are the smallest three components in a byte each.
+Harmonics above the constant are one of at most 65,536 rows of indices into 256 levels. Gaussians
+are sorted along the Morton curve and fill the pictures row by row.
 """
 
 from __future__ import annotations
@@ -30,33 +32,34 @@ from scene_experts.files.formats.pack import (
     byte_logits,
     damaged,
     from_smallest_three,
+    morton_order,
     smallest_three,
     tensor,
     to_bytes,
     unit_quats,
 )
-from scene_experts.files.formats.sort import morton_order
 from scene_experts.files.formats.splats import Splats
+from scene_experts.files.registry import Format
 
 WHAT = "SOG"
 PALETTE = 1 << 16
-_COLUMNS = 64  # rows of the palette beside each other
+_COLUMNS = 64  # palette rows next to each other in a line of the picture
 _COEFFICIENTS = (0, 3, 8, 15)
 _META_LIMIT, _FILE_LIMIT = 1 << 20, 1 << 30
-_BROKEN = (  # what zipfile, json, Pillow and numpy raise for parts that are wrong
+_BROKEN = (  # raised by zipfile, json, Pillow and numpy for damaged parts
     zipfile.BadZipFile, zlib.error, KeyError, IndexError, ValueError, TypeError, AttributeError, OSError, EOFError, RuntimeError,
     Image.DecompressionBombError,
 )  # fmt: skip
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # the same scene, the same bytes
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # a fixed date: equal scenes give equal bytes
 
 
-def write_sog(path: Path, splats: Splats, note: dict[str, Any]) -> None:
-    """Write the .sog file, the note in meta.json's asset."""
+def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
+    """Write the file; the note goes into the asset entry of meta.json."""
     write_bytes(path, sog_bytes(splats, note))
 
 
 def sog_bytes(splats: Splats, note: dict[str, Any]) -> bytes:
-    """The bytes of a .sog file. Raises InputError for no Gaussians at all: its pictures cannot be empty."""
+    """The bytes of a file. Raises InputError without Gaussians: a picture cannot be empty."""
     if not len(splats):
         raise InputError("expected Gaussians to write as SOG, found none; choose another format or keep more of them")
     s = splats.rows(morton_order(splats.means))
@@ -97,8 +100,8 @@ def sog_bytes(splats: Splats, note: dict[str, Any]) -> bytes:
     return _zip({"meta.json": json.dumps(meta, allow_nan=False, default=str).encode()} | files)
 
 
-def read_sog(path: Path) -> Splats:
-    """The Gaussians of a .sog file of version 2. Raises InputError for other or damaged files."""
+def read(path: Path) -> Splats:
+    """The Gaussians of a file of version 2. Raises InputError for other or damaged files."""
     try:
         with zipfile.ZipFile(path) as archive:
             return _decode(path, lambda name, limit: _member(archive, name, limit))
@@ -115,7 +118,7 @@ def _decode(path: Path, member: Callable[[str, int], bytes]) -> Splats:
     def pixels(part: str, i: int = 0) -> Bytes:
         picture = _picture(member(meta[part]["files"][i], _FILE_LIMIT), 4 * n + 65536)
         if picture.shape[0] * picture.shape[1] < n:
-            raise ValueError(f"a picture for {part} of too few pixels")
+            raise ValueError(f"a picture of {part} with too few pixels")
         return picture.reshape(-1, 4)[:n]
 
     book = lambda part: np.array(meta[part]["codebook"], np.float64).reshape(-1)  # noqa: E731
@@ -131,12 +134,13 @@ def _decode(path: Path, member: Callable[[str, int], bytes]) -> Splats:
     if meta.get("shN"):
         sh = np.concatenate([sh, _read_harmonics(meta["shN"], pixels("shN", 1), member, book("shN"))], 1)
     if not all(np.isfinite(part).all() for part in (means, scales, sh)):
-        raise ValueError("values that are no numbers")
+        raise ValueError("values that are not finite")
     return Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(colors[:, 3])), tensor(sh))
 
 
 def _harmonics(splats: Splats) -> tuple[dict[str, Any], bytes, NDArray[Any]]:
-    """Its part of meta.json, the picture of the palette, and the index of each Gaussian's row in two bytes."""
+    """The entry of meta.json, the picture of the palette, and the palette row of each Gaussian in
+    two bytes."""
     n, coefficients = len(splats), _COEFFICIENTS[splats.degree]
     size = min(PALETTE, max(1, int(1024 * 2.0 ** np.floor(np.log2(n / 1024)))))
     rows, label = palette(splats.sh[:, 1:].reshape(n, -1), size)
@@ -173,7 +177,8 @@ def _stretch(x: Floats) -> Floats:
 
 
 def _webp(values: NDArray[Any], width: int, height: int) -> bytes:
-    """Values [N, 3 or 4], row by row in a lossless picture; alpha is opaque where there are three, and in pixels beyond N."""
+    """Values [N, 3 or 4], row by row in a lossless picture; alpha is opaque for three channels and
+    in pixels beyond N."""
     pixels = np.zeros((width * height, 4), np.uint8)
     pixels[:, 3] = 255
     pixels[: len(values), : values.shape[1]] = values
@@ -191,7 +196,7 @@ def _picture(data: bytes, limit: int) -> Bytes:
 
 
 def _member(archive: zipfile.ZipFile, name: object, limit: int) -> bytes:
-    """One file of the archive, at most `limit` bytes."""
+    """One file of the archive. Raises ValueError for more than `limit` bytes."""
     info = archive.getinfo(str(name))
     if info.file_size > limit:
         raise ValueError(f"{name} of {info.file_size:,} bytes")
@@ -201,7 +206,26 @@ def _member(archive: zipfile.ZipFile, name: object, limit: int) -> bytes:
 
 def _zip(files: dict[str, bytes]) -> bytes:
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:  # stored: pictures are compressed already
+    with zipfile.ZipFile(stream, "w") as archive:  # stored: the pictures are already compressed
         for name, data in files.items():
             archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
     return stream.getvalue()
+
+
+def looks_like(path: Path, head: bytes) -> bool:
+    """Whether a zip has the description of a SOG file. A damaged zip counts as one, so that `read`
+    explains the damage."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return "meta.json" in archive.namelist()
+    except _BROKEN:
+        return True
+
+
+FORMAT = Format(
+    suffix=".sog",
+    write=write,
+    read=read,
+    marks=(b"PK\x03\x04",),
+    looks_like=looks_like,
+)

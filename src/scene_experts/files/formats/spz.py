@@ -1,7 +1,10 @@
-"""Niantic's SPZ: written as version 3 (one gzip stream, which every reader takes), read in versions 1 to 4 (4 needs `zstandard`).
+"""Niantic's SPZ, small; phones and glTF tools read it.
 
-Streams of bytes, one attribute after the other: positions in 24-bit fixed point, opacity, colour, log scale (steps of 1/16 from -10),
-rotation (the smallest three, 10 bits each), and harmonics over [-1, 1]. The frame is x right, y up, z back: half a turn about x from ours.
+It is written as version 3 (one gzip stream, which every reader accepts) and read in versions 1 to 4
+(4 needs `zstandard`). The file stores one attribute after the other: positions in 24-bit fixed
+point, opacity, colour, log scale (steps of 1/16 from -10), rotation (the smallest three components,
+10 bits each), and harmonics over [-1, 1]. The frame is x right, y up, z back: half a turn about x
+from ours.
 """
 
 from __future__ import annotations
@@ -25,36 +28,39 @@ from scene_experts.files.formats.pack import (
     check_size,
     damaged,
     from_smallest_three,
+    morton_order,
     smallest_three,
     tensor,
     to_bytes,
     turned,
     unit_quats,
 )
-from scene_experts.files.formats.sort import morton_order
 from scene_experts.files.formats.splats import Splats
+from scene_experts.files.registry import Format
 
 MAGIC, HEADER = 0x5053474E, struct.Struct("<IIIBBBB")
 V4_HEADER = struct.Struct("<IIIBBBBI12x")
 WHAT = "SPZ"
-ANTIALIASED, _FLAGS = 1, 14  # a bit of the header's flags, and where these are in every version
+ANTIALIASED, _FLAGS = 1, 14  # a bit of the flags, and the offset of the flags in the header of every version
 _STREAMS = ("positions", "alphas", "colors", "scales", "rotations", "sh")
-_COLOR = 0.15  # of a byte's range for each unit of the constant harmonic
+_COLOR = 0.15  # share of a byte's range per unit of the constant harmonic
 _MAX_BITS = 20  # of a position's fraction
 _ROTATION = 511 * np.sqrt(2)
 
 
-def write_spz(path: Path, splats: Splats, note: dict[str, Any]) -> None:
-    """Write SPZ version 3; of a note it has room for `antialias` alone."""
+def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
+    """Write version 3. Of the note it stores `antialias` only."""
     write_bytes(path, spz_bytes(splats, antialias=bool(note.get("antialias", False))))
 
 
 def spz_bytes(splats: Splats, first_step: int = 1, rest_step: int = 1, antialias: bool = False) -> bytes:
-    """The bytes of an SPZ file, version 3; antialias: whether it is to be drawn with the compensation of the 0.3 px blur.
+    """The bytes of an SPZ file, version 3. antialias: whether to draw it with the compensation of
+    the 0.3 px blur.
 
-    first_step, rest_step: harmonics of degree 1 and above are kept in multiples of so many 1/128. The format's first writer has 8 and 16,
-    which saves a third of the bytes and costs a trained scene up to 20 dB against its own picture; 1 keeps all that a byte holds.
-    Positions get as many bits of fraction as their reach leaves, 12 in a room of 2 km.
+    first_step, rest_step: step of the harmonics of degree 1 and above, in 1/128. The format's first
+    writer uses 8 and 16, which saves a third of the bytes and costs a trained scene up to 20 dB
+    against its own picture; 1 keeps all that a byte holds. Positions have as many fraction bits as
+    their range leaves, 12 for a range of 2 km.
     """
     s = turned(splats.rows(morton_order(splats.means)), "x")
     means = s.means.double().numpy()
@@ -72,14 +78,13 @@ def spz_bytes(splats: Splats, first_step: int = 1, rest_step: int = 1, antialias
     return gzip.compress(head + b"".join(part.tobytes() for part in streams), 6, mtime=0)
 
 
-def read_spz(path: Path) -> Splats:
-    """The Gaussians of an SPZ file of version 1 to 4. Raises InputError for other or damaged files."""
-    data = path.read_bytes()
-    return decode_spz(data, path)
+def read(path: Path) -> Splats:
+    """The Gaussians of a file of version 1 to 4. Raises InputError for other or damaged files."""
+    return decode(path.read_bytes(), path)
 
 
 def is_antialiased(path: Path) -> bool:
-    """Whether an SPZ file says that it is to be drawn with antialiasing; False for files that no reader takes."""
+    """Whether a file says that it is drawn with antialiasing; False for damaged files."""
     with path.open("rb") as stream:
         data = stream.read(4096)
     try:
@@ -89,12 +94,12 @@ def is_antialiased(path: Path) -> bool:
     return len(head) > _FLAGS and bool(head[_FLAGS] & ANTIALIASED)
 
 
-def decode_spz(data: bytes, path: Path) -> Splats:
-    """The Gaussians in the bytes of an SPZ file; `path` is for messages."""
+def decode(data: bytes, path: Path) -> Splats:
+    """The Gaussians in the bytes of a file; `path` is for messages."""
     version, n, degree, bits, streams = _streams_v4(data, path) if data[:4] == b"NGSP" else _streams_gzip(data, path)
     means = _positions(streams["positions"], version, n, bits)
     if not np.isfinite(means).all():
-        raise damaged(path, WHAT, "positions that are no numbers")
+        raise damaged(path, WHAT, "positions that are not finite")
     quats = _unpack_quats(streams["rotations"], n) if version >= 3 else _unpack_xyz(streams["rotations"], n)
     dc = (streams["colors"].reshape(n, 1, 3) / 255.0 - 0.5) / _COLOR
     rest = (streams["sh"].reshape(n, (degree + 1) ** 2 - 1, 3).astype(np.float64) - 128) / 128
@@ -136,14 +141,14 @@ def _streams_gzip(data: bytes, path: Path) -> tuple[int, int, int, int, dict[str
     except zlib.error as error:
         raise damaged(path, WHAT, f"a stream that does not unpack ({error})") from None
     if len(body) != total:
-        raise damaged(path, WHAT, f"{len(body):,} bytes of attributes where {total:,} belong")
+        raise damaged(path, WHAT, f"{len(body):,} bytes of attributes where {total:,} are expected")
     ends = np.cumsum([0, *sizes.values()])
     flat = np.frombuffer(body, np.uint8)
     return version, n, degree, bits, {name: flat[ends[i] : ends[i + 1]] for i, name in enumerate(_STREAMS)}
 
 
 def _streams_v4(data: bytes, path: Path) -> tuple[int, int, int, int, dict[str, Bytes]]:
-    """The same of version 4: a plain header, a table of sizes, and one zstd stream an attribute."""
+    """The same for version 4: a plain header, a table of sizes, and one zstd stream per attribute."""
     try:
         import zstandard
     except ImportError:
@@ -155,7 +160,7 @@ def _streams_v4(data: bytes, path: Path) -> tuple[int, int, int, int, dict[str, 
     sizes = {name: size for name, size in _sizes(version, n, degree).items() if size or count == len(_STREAMS)}
     check_size(path, WHAT, n, sum(sizes.values()), len(data))
     if count != len(sizes) or table < V4_HEADER.size or table + 16 * count > len(data):
-        raise damaged(path, WHAT, f"a table of {count} streams where {len(sizes)} belong")
+        raise damaged(path, WHAT, f"a table of {count} streams where {len(sizes)} are expected")
     out: dict[str, Bytes] = {name: np.zeros(0, np.uint8) for name in _STREAMS}
     offset = table + 16 * count
     for i, (name, size) in enumerate(sizes.items()):
@@ -173,7 +178,7 @@ def _streams_v4(data: bytes, path: Path) -> tuple[int, int, int, int, dict[str, 
 
 
 def _honest(zstandard: Any, part: bytes, size: int) -> bool:
-    """Whether a zstd frame says that it unpacks to `size` bytes, as those of this format do."""
+    """Whether a zstd frame declares that it unpacks to `size` bytes."""
     return bool(part) and size > 0 and zstandard.frame_content_size(part) == size
 
 
@@ -189,14 +194,15 @@ def _positions(stream: Bytes, version: int, n: int, bits: int) -> Floats:
 
 
 def _harmonics(rest: Floats, first_step: int, rest_step: int) -> Bytes:
-    """Bytes [N, C, 3]: multiples of a step around 128."""
+    """Bytes [N, C, 3]: multiples of the step around 128."""
     step = np.where(np.arange(rest.shape[1]) < 3, first_step, rest_step)[:, None]
     level = np.rint(rest * 128)
     return np.clip(np.floor((level + 128 + step // 2) / step) * step, 0, 255).astype(np.uint8)
 
 
 def _pack_quats(quats: Floats) -> NDArray[np.uint32]:
-    """Index of the largest of x, y, z, w above a sign and 9 bits of each other."""
+    """The index of the largest of x, y, z, w in the top 2 bits, then sign and 9 bits of each other
+    component."""
     largest, rest = smallest_three(quats[:, [1, 2, 3, 0]])
     level = np.clip(np.rint(np.abs(rest) * _ROTATION), 0, 511).astype(np.uint32) | (rest < 0).astype(np.uint32) << np.uint32(9)
     return (largest.astype(np.uint32) << np.uint32(30) | level @ np.array([1 << 20, 1 << 10, 1], np.uint32)).astype("<u4")
@@ -210,8 +216,18 @@ def _unpack_quats(stream: Bytes, n: int) -> Floats:
 
 
 def _unpack_xyz(stream: Bytes, n: int) -> Floats:
-    """Versions 1 and 2: x, y, z in a byte each, w above 0."""
+    """Versions 1 and 2: x, y, z in a byte each, w positive."""
     xyz = stream.reshape(n, 3) / 127.5 - 1
     w = np.sqrt(np.maximum(0.0, 1 - (xyz * xyz).sum(1, keepdims=True)))
     quats = np.concatenate([w, xyz], 1)
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
+
+
+FORMAT = Format(
+    suffix=".spz",
+    write=write,
+    read=read,
+    marks=(b"\x1f\x8b", b"NGSP"),
+    antialias=True,
+    is_antialiased=is_antialiased,
+)

@@ -1,6 +1,7 @@
-"""Graph points from our own files (`graph_points`) back to a run.
+"""Files to runs of graph points: the result folders that `write` makes.
 
-SAGS's published `checkpoint.pth` is refused: it holds memory images of another hash grid and of half-precision networks, padded for a GPU.
+SAGS's published `checkpoint.pth` is refused: it holds memory images of another hash grid and of
+half-precision networks, padded for a GPU.
 """
 
 from __future__ import annotations
@@ -13,28 +14,28 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scene_experts.core import checkpoint
+from scene_experts.core.checkpoint import read_tensors
 from scene_experts.core.errors import InputError
-from scene_experts.data.views import Capture, World
-from scene_experts.files.anchors.layout import SIDECAR, iteration_folder, read_sidecar
-from scene_experts.files.anchors.read import check_world, world_in
+from scene_experts.data.views import World
+from scene_experts.files import result_folder
+from scene_experts.files.formats.ply import property_names, read_vertices
 from scene_experts.files.graph.write import KIND, NETWORKS
-from scene_experts.files.ply import read_vertices
+from scene_experts.files.registry import Imported
+from scene_experts.files.result_folder import expect_world, world_in
 from scene_experts.geometry.voxel import coarsen
 from scene_experts.scene.graph.scene import CHANNELS, HALF
-from scene_experts.training import run_folder
-from scene_experts.training.config import Data, RunConfig, Train, from_json
+from scene_experts.training.config import Data, Train, from_json
+from scene_experts.training.run_folder import load_capture
 
 
-def find_folder(source: Path, iteration: int | None = None) -> Path | None:
-    """The folder of graph points that a result folder holds; None where it holds another scene. Raises InputError for SAGS's own files."""
-    source = Path(source)
-    if not (source / "point_cloud").is_dir() and not (source / "point_cloud.ply").is_file():
-        return None
-    folder = iteration_folder(source, iteration)
-    if (folder / SIDECAR).is_file():
-        return folder if read_sidecar(folder / SIDECAR).get("kind") == KIND else None
-    if "feats_0" in read_vertices(folder / "point_cloud.ply"):
+def find(source: Path, iteration: int | None) -> Path | None:
+    """The iteration's folder of a result folder with graph points; None for other scenes. Raises
+    InputError for SAGS's own files."""
+    folder = result_folder.iteration_folder(source, iteration)
+    about = result_folder.read_description(folder)
+    if about is not None:
+        return folder if about.get("kind") == KIND else None
+    if "feats_0" in property_names(folder / "point_cloud.ply"):
         raise InputError(
             f"expected a scene of graph points that was trained here in {folder}, found SAGS's own files, whose hash grid is another; "
             "train the capture here with the recipe for SAGS"
@@ -42,38 +43,32 @@ def find_folder(source: Path, iteration: int | None = None) -> Path | None:
     return None
 
 
-def import_folder(folder: Path, data: Data, out: Path) -> Capture:
-    """Make the run folder `out` (configuration and checkpoint) of our folder of graph points; returns its capture.
-
-    Raises InputError where files are absent or damaged, or the capture is read into another world than the scene was trained in.
-    """
-    about = read_sidecar(folder / SIDECAR)
+def read(source: Path, data: Data, iteration: int | None) -> Imported:
+    """The run in an iteration's folder. Raises InputError for missing or damaged files and for a
+    capture in another world."""
+    about = result_folder.read_description(source) or {}
     if absent := {"grid", "extent", "step", "train"} - about.keys():
-        raise InputError(f"expected {', '.join(sorted(absent))} in {folder / SIDECAR}, found none; copy the whole folder")
+        raise InputError(f"expected {', '.join(sorted(absent))} in {source / result_folder.DESCRIPTION}, found none; copy the whole folder")
     world, cfg = world_in(about), from_json(Train, about.get("train"), "train")
-    capture = run_folder.load_capture(data)
+    capture = load_capture(data)
     capture.images.close()
-    check_world(world, capture.world)
+    expect_world(world, capture.world)
     voxel = float(about["voxel_size"]["trained"])
-    tensors = {**rows(folder / "point_cloud.ply", world, voxel), **networks(folder / NETWORKS, world.scale)}
-    config = RunConfig(cfg, data, f"import {folder.name}", versions=run_folder.versions())
-    run_folder.prepare(out, config, resume=False)
-    checkpoint.save(out / "checkpoints", int(about["step"]), tensors, meta(about, cfg, world, voxel))
-    return replace(capture, world=world)
+    tensors = {**rows(source / "point_cloud.ply", world, voxel), **networks(source / NETWORKS, world.scale)}
+    return Imported(cfg, data, replace(capture, world=world), tensors, meta(about, world, voxel), int(about["step"]))
 
 
-def meta(about: dict[str, Any], cfg: Train, world: World, voxel: float) -> dict[str, Any]:
-    """The plain values of a checkpoint: the grid's cube in the trained world among them."""
+def meta(about: dict[str, Any], world: World, voxel: float) -> dict[str, Any]:
+    """The values of `Scene.meta`; the cube of the grid in the trained world."""
     low = world.from_input(torch.tensor(about["grid"]["low"], dtype=torch.float64)).tolist()
     grid = {"grid_low": low, "grid_edge": float(about["grid"]["edge"]) * world.scale}
-    plain = {"recipe": cfg.recipe, "step": int(about["step"]), "seconds": 0.0, "config": "imported"}
-    return {**plain, **grid, "voxel": voxel, "extent": float(about["extent"])}
+    return {"voxel": voxel, "extent": float(about["extent"]), **grid}
 
 
 def rows(path: Path, world: World, voxel: float) -> dict[str, Tensor]:
-    """The columns of the table, in the trained world: positions are on the lattice of half voxels, exactly.
+    """The columns of the table, in the trained world. Positions lie exactly on the lattice of half voxels.
 
-    Raises InputError where columns are absent.
+    Raises InputError for missing columns.
     """
     found = {name: torch.from_numpy(column.copy()) for name, column in read_vertices(path).items()}
     stack = lambda names: torch.stack([found[name] for name in names], dim=1)  # noqa: E731
@@ -91,10 +86,10 @@ def rows(path: Path, world: World, voxel: float) -> dict[str, Tensor]:
 
 
 def networks(path: Path, scale: float) -> dict[str, Tensor]:
-    """The networks for distances in trained units."""
+    """The networks for distances in trained units. Raises InputError for a missing or damaged file."""
     if not path.is_file():
         raise InputError(f"expected the networks of the scene at {path}, found none; copy the whole folder")
-    tensors, _ = checkpoint.read_tensors(path, KIND)
+    tensors, _ = read_tensors(path, KIND)
     for attribute in CHANNELS:
         tensors[f"{attribute}.0"][:, -1] /= scale
     return {f"network.{name}": value for name, value in tensors.items()}

@@ -1,51 +1,43 @@
-"""Graph points as files: SAGS's PLY layout and the networks beside it, in the capture's own frame.
+"""Scenes of graph points to files: SAGS's PLY with the networks beside it, in the capture's own frame.
 
-From the trained world to the capture's frame positions move and lengths scale: log-scalings, the networks' distances, the grid's cube.
+From the trained world to the capture's frame, positions move and lengths scale: log-scalings, the
+distances that networks see, and the cube of the hash grid.
 """
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from scene_experts.core.checkpoint import write_tensors
-from scene_experts.core.errors import InputError
-from scene_experts.core.io import write_json
 from scene_experts.data.views import World
-from scene_experts.files.anchors.layout import SIDECAR, SIDECAR_FORMAT
-from scene_experts.files.ply import ANCHOR_OPACITY, write_vertices
+from scene_experts.files.formats.ply import Columns, floats, numbered, write_vertices
 from scene_experts.scene.graph.scene import GraphScene
 from scene_experts.training.config import to_json
 from scene_experts.training.run_folder import OpenRun
 
-KIND = "graph points"  # in our description of a scene
+KIND, DESCRIPTION_FORMAT = "graph points", 1
 NETWORKS = "networks.safetensors"
+INERT_OPACITY = math.log(0.1 / 0.9)  # SAGS stores it per point and never uses it
 
 
-def refuse(run: OpenRun) -> None:
-    """Raises InputError for a scene of graph points: no file of anchors holds what its networks need."""
-    if isinstance(run.scene, GraphScene):
-        raise InputError(
-            f"expected a scene of anchors for this format, found a run of '{run.config.train.recipe}'; "
-            "use a standard format such as ply; its own files are in point_cloud/ of the run folder, where training wrote them"
-        )
+def contents(run: OpenRun, world: World, about: dict[str, Any]) -> tuple[Columns, dict[str, Tensor]]:
+    """The columns of the PLY and the tensors of the networks."""
+    scene = cast(GraphScene, run.scene)
+    return vertices(scene, world), networks(scene, world.scale)
 
 
-def write_folder(run: OpenRun, world: World, out: Path) -> Path:
-    """Write out/point_cloud/iteration_<step>/ (PLY, networks, description); returns that folder. RunError when the disk is full."""
-    scene = run.scene
-    assert isinstance(scene, GraphScene)
-    folder = out / "point_cloud" / f"iteration_{run.step}"
-    write_points(folder / "point_cloud.ply", scene, world)
+def describe(run: OpenRun, world: World) -> dict[str, Any]:
+    """The description of a run: everything that its tensors do not say, as JSON values."""
+    scene = cast(GraphScene, run.scene)
     low, edge = world.to_input(torch.tensor(scene.grid.low, dtype=torch.float64)).tolist(), scene.grid.edge / world.scale
-    grid = {"low": low, "edge": edge, **to_json(scene.config.grid)}
-    write_tensors(folder / NETWORKS, networks_to_input(scene, world.scale), KIND, SIDECAR_FORMAT, {"grid": grid, "step": run.step})
-    about = {
-        "format": SIDECAR_FORMAT,
+    return {
+        "format": DESCRIPTION_FORMAT,
         "kind": KIND,
         "recipe": run.config.train.recipe,
         "step": run.step,
@@ -54,31 +46,37 @@ def write_folder(run: OpenRun, world: World, out: Path) -> Path:
         "voxel_size": {"trained": scene.voxel, "input": scene.voxel / world.scale},
         "world": {"scale": world.scale, "shift": list(world.shift)},
         "extent": scene.extent,
-        "grid": grid,
-        "train": to_json(run.config.train),
-        "data": run.config.data.settings(),
+        "grid": {"low": low, "edge": edge, **to_json(scene.config.grid)},
     }
-    write_json(folder / SIDECAR, about)
-    return folder
 
 
-def write_points(path: Path, scene: GraphScene, world: World) -> None:
-    """Write the points in SAGS's layout: 49 float32 (196 bytes) a point for F = 32; normals 0, opacity and rotation inert."""
+def write(run: OpenRun, world: World, folder: Path, about: dict[str, Any]) -> dict[str, Any]:
+    """Write point_cloud.ply and the networks into `folder`; no settings for cfg_args. Raises
+    RunError when the disk is full."""
+    columns, tensors = contents(run, world, about)
+    write_vertices(folder / "point_cloud.ply", columns)
+    write_tensors(folder / NETWORKS, tensors, KIND, DESCRIPTION_FORMAT, {"grid": about["grid"], "step": run.step})
+    return {}
+
+
+def vertices(scene: GraphScene, world: World) -> Columns:
+    """The columns of SAGS's PLY: 49 float32 (196 bytes) per point for F = 32; normals are 0,
+    opacity and rotation are inert."""
     p = {name: value.detach().cpu() for name, value in scene.table.params.items()}
     xyz = world.to_input(scene.table.facts["xyz"].cpu().double()).float()
     scaling = (p["log_scaling"].double() - math.log(world.scale)).float()
     n = len(xyz)
-    columns = dict(zip("xyz", xyz.numpy().T))
+    columns: Columns = dict(zip("xyz", floats(xyz)))
     columns |= {name: np.zeros(n, np.float32) for name in ("nx", "ny", "nz")}
-    columns |= {f"feats_{i}": column for i, column in enumerate(p["feature"].float().numpy().T)}
-    columns["opacity"] = np.full(n, ANCHOR_OPACITY, np.float32)
-    columns |= {f"scale_{i}": column for i, column in enumerate(scaling.numpy().T)}
-    columns |= {f"rot_{i}": np.full(n, float(i == 0), np.float32) for i in range(4)}
-    write_vertices(path, columns)
+    columns |= numbered("feats_", p["feature"])
+    columns["opacity"] = np.full(n, INERT_OPACITY, np.float32)
+    columns |= numbered("scale_", scaling)
+    return columns | {f"rot_{i}": np.full(n, float(i == 0), np.float32) for i in range(4)}
 
 
-def networks_to_input(scene: GraphScene, scale: float) -> dict[str, Tensor]:
-    """The networks for distances in the capture's unit: the distance is the last input of all but the offsets' network."""
+def networks(scene: GraphScene, scale: float) -> dict[str, Tensor]:
+    """The networks for distances in the capture's unit: the distance is the last input of all but
+    the offsets' network."""
     out = {name: value.detach().cpu().clone() for name, value in scene.network_tensors().items()}
     for attribute in scene.heads:
         out[f"{attribute}.0"][:, -1] *= scale

@@ -6,9 +6,10 @@ import torch
 
 from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
-from scene_experts.files.bake.bake import explicit
-from scene_experts.files.bake.refine import DRAWN_AT, Refine, refine
+from scene_experts.files.bake.refine import Refine, refine
 from scene_experts.files.bake.views import Views
+from scene_experts.files.gaussians.read import DRAWN_AT, scene_of
+from scene_experts.files.measure import Painter
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from support.synthetic import make_capture
@@ -34,9 +35,9 @@ def test_disturbed_gaussians_draw_the_same_picture_again(tmp_path):
 
     found = []
     for _ in range(2):
-        scene, said = explicit({name: value.clone() for name, value in moved.items()}, capture.extent), []
+        scene, said = scene_of({name: value.clone() for name, value in moved.items()}, capture.extent), []
         before = error(scene)
-        refine(scene, true, DRAWN_AT, views, background, draw, Refine(60), 3, lambda *what, said=said: said.append(what))
+        refine(scene, Painter.of(true, DRAWN_AT, draw), views, background, Refine(60), 3, lambda *what, said=said: said.append(what))
         assert said[-1] == ("refining", 60, 60) and error(scene) < 0.5 * before
         found.append(scene.table.params["sh_rest"].detach())
     assert torch.equal(*found)

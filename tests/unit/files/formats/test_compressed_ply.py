@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 
 from scene_experts.core.errors import InputError
-from scene_experts.files.formats.comments import read_note
-from scene_experts.files.formats.compressed_ply import read_compressed_ply, write_compressed_ply
+from scene_experts.files.formats.compressed_ply import read, write
+from scene_experts.files.formats.ply import read_note
 from scene_experts.files.formats.splats import Splats
 from support.messages import naming
 from support.splat_quanta import check, scene
@@ -19,12 +19,12 @@ from support.splat_quanta import check, scene
 def test_round_trip_within_the_quantum(tmp_path_factory, n, degree, seed, size):
     path = tmp_path_factory.mktemp("ply") / "a.ply"
     s = scene(n, degree, seed, size)
-    write_compressed_ply(path, s, {})
-    check("compressed-ply", read_compressed_ply(path), s)
+    write(path, s, {})
+    check("compressed-ply", read(path), s)
 
 
 def test_a_plain_ply_reader_sees_its_three_elements(tmp_path):
-    write_compressed_ply(tmp_path / "a.ply", scene(300, 2), {"recipe": "moe-gs"})
+    write(tmp_path / "a.ply", scene(300, 2), {"recipe": "moe-gs"})
     elements = PlyData.read(tmp_path / "a.ply")
     assert [(e.name, e.count, len(e.properties)) for e in elements] == [("chunk", 2, 18), ("vertex", 300, 4), ("sh", 300, 24)]
     assert read_note(tmp_path / "a.ply") == {"recipe": "moe-gs"}
@@ -33,15 +33,15 @@ def test_a_plain_ply_reader_sees_its_three_elements(tmp_path):
 def test_equal_values_in_a_chunk(tmp_path):
     s = scene(5, 1)
     s = Splats(s.means[:1].expand(5, 3), s.log_scales[:1].expand(5, 3), s.quats, s.opacity_logit, s.sh[:1].expand(5, 4, 3))
-    write_compressed_ply(tmp_path / "a.ply", s, {})
-    found = read_compressed_ply(tmp_path / "a.ply")
+    write(tmp_path / "a.ply", s, {})
+    found = read(tmp_path / "a.ply")
     torch.testing.assert_close(found.means, s.means)
     torch.testing.assert_close(found.log_scales, s.log_scales)
 
 
 def test_damaged_files(tmp_path):
     path = tmp_path / "a.ply"
-    write_compressed_ply(path, scene(300, 1), {})
+    write(path, scene(300, 1), {})
     good = path.read_bytes()
     for data in (
         good[:-1],
@@ -58,4 +58,4 @@ def test_damaged_files(tmp_path):
     ):
         path.write_bytes(data)
         with pytest.raises(InputError, match=naming(path)):
-            read_compressed_ply(path)
+            read(path)

@@ -8,6 +8,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.files.formats import pack
+from scene_experts.files.formats.pack import morton_order
 from scene_experts.geometry.rotation import covariance
 from scene_experts.geometry.sh import sh_to_rgb
 from support.messages import naming
@@ -54,3 +55,16 @@ def test_sizes_that_cannot_be_honest():
         pack.check_size(Path("a"), "SPZ", 10**9, 1, 1)
     with pytest.raises(InputError, match=naming(100)):
         pack.check_size(Path("a"), "SPZ", 10, 1 << 30, 100)
+
+
+def test_a_permutation_of_near_neighbours():
+    xyz = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * 100 - 30
+    order = morton_order(xyz)
+    assert order.sort().values.tolist() == list(range(4000))
+    step = lambda rows: (rows[1:] - rows[:-1]).norm(dim=1).mean()  # noqa: E731
+    assert step(xyz[order]) < 0.25 * step(xyz)
+
+
+def test_none_one_and_equal_places():
+    assert morton_order(torch.zeros(0, 3)).tolist() == [] and morton_order(torch.ones(1, 3)).tolist() == [0]
+    assert morton_order(torch.ones(5, 3)).tolist() == [0, 1, 2, 3, 4]

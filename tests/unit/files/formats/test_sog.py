@@ -22,8 +22,8 @@ from support.splat_quanta import check, differences, in_file_order, scene
 def test_round_trip_within_the_quantum(tmp_path_factory, n, degree, seed, size):
     path = tmp_path_factory.mktemp("sog") / "a.sog"
     s = scene(n, degree, seed, size)
-    sog.write_sog(path, s, {})
-    check("sog", sog.read_sog(path), s)
+    sog.write(path, s, {})
+    check("sog", sog.read(path), s)
 
 
 def test_the_palette_is_near_and_the_bytes_are_the_same_twice(tmp_path):
@@ -35,7 +35,7 @@ def test_the_palette_is_near_and_the_bytes_are_the_same_twice(tmp_path):
     first = sog.sog_bytes(s, {"a": 1})
     assert first == sog.sog_bytes(s, {"a": 1})
     (tmp_path / "a.sog").write_bytes(first)
-    wrong = differences(sog.read_sog(tmp_path / "a.sog"), in_file_order("sog", s))["sh"]
+    wrong = differences(sog.read(tmp_path / "a.sog"), in_file_order("sog", s))["sh"]
     assert wrong[:, 1:].square().mean().sqrt() < 0.012  # the noise alone has 0.01
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         meta = json.loads(archive.read("meta.json"))
@@ -58,7 +58,7 @@ def test_damaged_files(tmp_path):
     def refused(changed, fact="", raw=None):
         (tmp_path / "a.sog").write_bytes(raw if raw is not None else sog._zip(files | changed))
         with pytest.raises(InputError, match=naming("a.sog", fact)):
-            sog.read_sog(tmp_path / "a.sog")
+            sog.read(tmp_path / "a.sog")
 
     def described(**parts):
         return {"meta.json": json.dumps(meta | parts).encode()}

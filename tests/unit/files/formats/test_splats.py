@@ -1,16 +1,11 @@
-"""Standard Gaussians: shapes are checked, a scene comes back from them in its own world, and its picture stays."""
+"""Standard Gaussians: shapes and values are checked."""
 
 import dataclasses
-import math
 
 import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.types import Points
-from scene_experts.data.views import World
-from scene_experts.files.formats.splats import from_scene, to_columns
-from scene_experts.scene.gaussians import COLUMNS, Explicit
 from support.messages import naming
 from support.splats import splats
 
@@ -33,17 +28,10 @@ def test_shapes_that_disagree(name):
         dataclasses.replace(s, sh=s.sh[:, :5])
 
 
-@pytest.mark.parametrize("degree", [0, 3])
-def test_a_scene_to_the_capture_s_frame_and_back(degree):
-    world = World(scale=2.5, shift=(1.0, -2.0, 3.0))
-    points = Points(torch.randn(50, 3, generator=torch.Generator().manual_seed(1)), torch.full((50, 3), 90, dtype=torch.uint8))
-    scene = Explicit(sh_degree=degree).start(points, 1.0)
-    out = from_scene(scene, world)
-    torch.testing.assert_close(out.means, world.to_input(points.xyz.double()).float())
-    assert out.degree == degree
-    torch.testing.assert_close(out.log_scales, scene.table.params["log_scales"].detach() - math.log(2.5))
-    columns = to_columns(out, world)
-    assert tuple(columns) == COLUMNS
-    for name in COLUMNS:
-        torch.testing.assert_close(columns[name], scene.table.params[name].detach(), rtol=1e-6, atol=1e-6)
-        assert columns[name].is_contiguous()
+def test_values_that_are_not_finite_are_counted():
+    s = splats(6)
+    s.expect_finite("there")
+    s.sh[2, 1, 0], s.sh[4, 0, 0] = float("nan"), float("inf")
+    with pytest.raises(InputError, match=naming("sh", "there", 2)):
+        s.expect_finite("there")
+    splats(0).expect_finite("there")

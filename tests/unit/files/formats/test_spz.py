@@ -21,8 +21,8 @@ from support.splat_quanta import check, scene
 def test_round_trip_within_the_quantum(tmp_path_factory, n, degree, seed, size):
     path = tmp_path_factory.mktemp("spz") / "a.spz"
     s = scene(n, degree, seed, size)
-    spz.write_spz(path, s, {})
-    check("spz", spz.read_spz(path), s)
+    spz.write(path, s, {})
+    check("spz", spz.read(path), s)
 
 
 def test_the_layout_byte_by_byte(tmp_path):
@@ -45,7 +45,7 @@ def test_the_layout_byte_by_byte(tmp_path):
 def test_old_versions(tmp_path, version):
     s = scene(40, 1)
     raw = gzip.decompress(spz.spz_bytes(s))
-    now = spz.decode_spz(spz.spz_bytes(s), tmp_path)
+    now = spz.decode(spz.spz_bytes(s), tmp_path)
     flipped = spz.turned(now, "x")
     places = flipped.means.numpy().astype("<f2").tobytes() if version == 1 else raw[16 : 16 + 9 * 40]
     q = torch.nn.functional.normalize(flipped.quats, dim=1)
@@ -53,7 +53,7 @@ def test_old_versions(tmp_path, version):
     turns = np.clip(np.rint((q[:, 1:].numpy() + 1) * 127.5), 0, 255).astype(np.uint8).tobytes()
     rest = raw[16 + 9 * 40 :]
     data = spz.HEADER.pack(spz.MAGIC, version, 40, 1, raw[13], 0, 0) + places + rest[: 7 * 40] + turns + rest[11 * 40 :]
-    found = spz.decode_spz(gzip.compress(data), tmp_path)
+    found = spz.decode(gzip.compress(data), tmp_path)
     torch.testing.assert_close(found.means, now.means, rtol=1e-3, atol=1e-4)
     assert torch.equal(found.sh, now.sh) and torch.equal(found.log_scales, now.log_scales)
     dots = (torch.nn.functional.normalize(found.quats, dim=1) * torch.nn.functional.normalize(now.quats, dim=1)).sum(1).abs()
@@ -77,7 +77,7 @@ def version_4(s, degree=None):
 @pytest.mark.parametrize("degree", [0, 3])
 def test_version_4(tmp_path, degree):
     s = scene(50, degree)
-    found, wanted = spz.decode_spz(version_4(s), tmp_path), spz.decode_spz(spz.spz_bytes(s), tmp_path)
+    found, wanted = spz.decode(version_4(s), tmp_path), spz.decode(spz.spz_bytes(s), tmp_path)
     for name in ("means", "log_scales", "quats", "opacity_logit", "sh"):
         assert torch.equal(getattr(found, name), getattr(wanted, name))
 
@@ -85,7 +85,7 @@ def test_version_4(tmp_path, degree):
 @pytest.mark.parametrize("asked", [False, True])
 def test_the_flag_of_antialiasing(tmp_path, asked):
     s = scene(50, 1)
-    spz.write_spz(tmp_path / "a.spz", s, {"antialias": asked})
+    spz.write(tmp_path / "a.spz", s, {"antialias": asked})
     assert gzip.decompress((tmp_path / "a.spz").read_bytes())[14] == int(asked) and spz.is_antialiased(tmp_path / "a.spz") is asked
     data = bytearray(version_4(s))
     data[14] = int(asked)
@@ -120,6 +120,6 @@ def test_damaged_files(tmp_path):
         path = tmp_path / f"{i}.spz"
         path.write_bytes(data)
         with pytest.raises(InputError, match=naming(path, fact)):
-            spz.read_spz(path)
+            spz.read(path)
     with pytest.raises(InputError, match="SPZ"):
         spz.spz_bytes(scene(3, 0, 0, 1e8))

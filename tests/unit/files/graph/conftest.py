@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from scene_experts.data.capture import load
-from scene_experts.files.export import write_layout
+from scene_experts.files.export import write_result_folder
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training import loop as train
@@ -24,6 +24,6 @@ def made(tmp_path_factory):
     run_folder.prepare(root / "run", config, resume=False)
     capture = load(folder)
     list(train.train(cfg, train.Run(config, root / "run"), capture, choose("auto", "cpu")))
-    written = write_layout(run_folder.open_run(root / "run"), capture)
+    written = write_result_folder(run_folder.open_run(root / "run"), capture)
     capture.images.close()
     return root / "run", written, capture

@@ -9,12 +9,12 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.core.types import Mode
 from scene_experts.evaluate.results import describe_size
-from scene_experts.files.export import export_run
+from scene_experts.files.formats.ply import read_vertices
 from scene_experts.files.graph import write as graph_points
-from scene_experts.files.ply import read_vertices
 from scene_experts.render import choose
 from scene_experts.scene.graph.scene import GraphScene
 from scene_experts.training import run_folder
+from support.files import export_run
 from support.messages import naming
 
 

@@ -1,0 +1,250 @@
+"""One small file of this package, networks included: exact positions, 16-bit features and lengths.
+
+The networks are stored as they are. An anchor takes 316 bytes in Scaffold-GS's PLY; 32 of them are
+constants (normals, opacity, rotation) and 12 a position on a known lattice. Here a position is an
+integer cell (1 to 4 bytes, exact), features and offsets are half precision, and log-scalings are
+16-bit fixed point per channel, because halves are coarse where scalings lie (steps of 0.004 between
+4 and 8, 0.2 % of a length). Bytes are grouped by significance and deflated. The file is a
+safetensors file with a checksum. Rows come back in another order, which does not change pictures.
+
+Cells are sorted along the Morton curve, which interleaves the bits of the axes so that near cells
+have near keys, and stored as steps along it, each in as many 7-bit groups as it needs.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from scene_experts.core.checkpoint import read_tensors, write_tensors
+from scene_experts.core.errors import InputError
+from scene_experts.files.anchors.data import AnchorData
+from scene_experts.files.registry import Format
+
+KIND, VERSION = "compact scene", 1
+AXIS_BITS = 21  # bits of a cell coordinate; 63 bits per key
+Code = Literal["float32", "float16", "uint16", "uint8"]
+Keys = NDArray[np.uint64]
+_GROUP = 7
+_MAX_GROUPS = 9  # 63 bits
+_SPREAD = (  # (shift, mask): two zeros between every two bits of a 21-bit number
+    (32, 0x001F00000000FFFF),
+    (16, 0x001F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+@dataclass(frozen=True)
+class Coding:
+    """How the columns are stored. uint16 and uint8 are fixed point between the minimum and maximum
+    of each channel."""
+
+    feature: Code = "float16"
+    offsets: Code = "float16"
+    log_scaling: Code = "uint16"
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Bytes of a compact file."""
+
+    total: int
+    anchors: int
+    networks: int
+    per_anchor: float
+
+    def __str__(self) -> str:
+        return f"{self.per_anchor:.1f} bytes per anchor without the networks"
+
+
+def write(path: Path, data: AnchorData, note: dict[str, Any], coding: Coding = Coding()) -> Sizes:
+    """Write a scene to one file, atomically. The note has no place in it: the description says more.
+
+    Raises InputError for anchors on no lattice or on several, for values that are not finite, and
+    for cells that span more than 2^21 voxels; RunError when the disk is full.
+    """
+    if "level" in data.columns:
+        raise InputError("expected anchors on one lattice for a compact file, found levels of detail; use --format anchors")
+    if data.cells is None:
+        raise InputError("expected anchors on a lattice of known voxel size for a compact file, found others; use --format anchors")
+    place = data.cells.detach().cpu().numpy().astype(np.int64)
+    low = place.min(0) if len(place) else np.zeros(3, np.int64)
+    spread = int((place.max(0) - low).max()) if len(place) else 0
+    if spread >= 1 << AXIS_BITS:
+        raise InputError(f"expected a scene at most {1 << AXIS_BITS:,} voxels wide, found {spread + 1:,}; remove far anchors")
+    keys = morton(place - low)
+    order = np.argsort(keys, kind="stable")
+    blobs = {"cells": deflate(encode_steps(keys[order]))}
+    codes, n = {}, len(place)
+    for name in ("feature", "offsets", "log_scaling"):
+        value = data.columns[name]
+        array = value.detach().cpu().float().numpy().reshape(n, int(np.prod(value.shape[1:])))[order]
+        if not np.isfinite(array).all():
+            raise InputError(f"expected finite {name}, found others in {(~np.isfinite(array)).any(1).sum():,} anchors; train again")
+        codes[name], parts = _encode(array, getattr(coding, name))
+        blobs |= {name if part == "values" else f"{name}.{part}": blob for part, blob in parts.items()}
+    meta = {
+        "N": n,
+        "K": data.columns["offsets"].shape[1],
+        "F": data.columns["feature"].shape[1],
+        "voxel": data.voxel,
+        "origin": list(data.origin),
+        "low": low.tolist(),
+        "codes": codes,
+        "scene": data.about,
+    }
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(blob)) for name, blob in blobs.items()}
+    flat = {f"network.{name}": value.detach().cpu() for name, value in data.networks.items()}
+    write_tensors(Path(path), tensors | flat, KIND, VERSION, meta)
+    anchors = sum(t.numel() * t.element_size() for t in tensors.values())
+    return Sizes(Path(path).stat().st_size, anchors, sum(t.numel() * t.element_size() for t in flat.values()), anchors / max(n, 1))
+
+
+def read(path: Path) -> AnchorData:
+    """The scene in a file. Raises InputError for a missing, damaged or other file and for another
+    format version."""
+    tensors, meta = read_tensors(path, KIND, VERSION)
+    try:
+        n, K, F = int(meta["N"]), int(meta["K"]), int(meta["F"])
+        keys = decode_steps(inflate(tensors["cells"].numpy(), 9 * n, exact=False))
+        place = unmorton(keys) + np.array(meta["low"], np.int64)
+        columns = {
+            name: _decode(tensors, name, meta["codes"][name], n, width)
+            for name, width in (("feature", F), ("offsets", 3 * K), ("log_scaling", 6))
+        }
+        x, y, z = (float(v) for v in meta["origin"])
+        voxel, about = float(meta["voxel"]), dict(meta["scene"])
+        if place.shape != (n, 3) or not voxel > 0:
+            raise ValueError(f"{len(place)} cells of edge {voxel}")
+        step, add_dist = int(about["step"]), tuple(a for a, used in about["add_dist"].items() if used)
+    except (KeyError, ValueError, TypeError, AttributeError, OverflowError, zlib.error) as error:
+        raise InputError(
+            f"expected a whole compact scene at {path}, found parts that do not fit together ({error}); export it again"
+        ) from None
+    networks = {name.removeprefix("network."): value for name, value in tensors.items() if name.startswith("network.")}
+    cells = torch.from_numpy(place)
+    columns["offsets"] = columns["offsets"].reshape(n, K, 3)
+    columns = {"xyz": (cells.double() * voxel + torch.tensor([x, y, z], dtype=torch.float64)).float()} | columns
+    return AnchorData(columns, networks, about, cells, voxel, (x, y, z), add_dist, step)
+
+
+def looks_like(path: Path, head: bytes) -> bool:
+    """Whether a file is meant as a compact one: by its name, or by the start of a safetensors file
+    (length of a JSON header, header)."""
+    return path.suffix == FORMAT.suffix or (head[8:9] == b"{" and 2 <= int.from_bytes(head[:8], "little") < path.stat().st_size)
+
+
+FORMAT = Format(
+    suffix=".compact",
+    family="anchors",
+    write=write,
+    read=read,
+    looks_like=looks_like,
+)
+
+
+# --- columns ------------------------------------------------------------------------------------------------------------------------------
+
+
+def _encode(array: NDArray[np.float32], code: Code) -> tuple[Code, dict[str, NDArray[Any]]]:
+    """The code and the stored parts, by name, of one array [N, C]. Fixed point stores a minimum
+    (low) and a step per channel."""
+    if code == "float16" and array.size and np.abs(array).max() > float(np.finfo(np.float16).max):
+        code = "float32"  # too large for half precision
+    if code in ("float32", "float16"):
+        return code, {"values": deflate(array.astype(code))}
+    steps = float(np.iinfo(code).max)
+    low = array.min(0).astype(np.float64) if len(array) else np.zeros(array.shape[1])
+    step = (array.max(0) - low) / steps if len(array) else np.zeros(array.shape[1])
+    level = np.rint((array - low) / np.where(step > 0, step, 1.0)).clip(0, steps)
+    return code, {"values": deflate(level.astype(code)), "low": low, "step": step}
+
+
+def _decode(tensors: dict[str, Tensor], name: str, code: str, n: int, width: int) -> Tensor:
+    """The inverse of `_encode`, [N, C] float32."""
+    if code not in ("float32", "float16", "uint16", "uint8"):
+        raise ValueError(f"code {code!r}")
+    item = np.dtype(code)
+    planes = inflate(tensors[name].numpy(), n * width * item.itemsize).reshape(width, item.itemsize, n)
+    values = np.ascontiguousarray(planes.transpose(2, 0, 1)).reshape(n, width * item.itemsize).view(item.newbyteorder("<"))
+    if item.kind == "u":
+        low, step = tensors[f"{name}.low"].numpy(), tensors[f"{name}.step"].numpy()
+        values = values * step + low
+    return torch.from_numpy(np.ascontiguousarray(values.astype(np.float32)))
+
+
+def deflate(array: NDArray[Any]) -> NDArray[np.uint8]:
+    """The compressed (zlib) bytes of an array [N] or [N, C], by channel, then by significance."""
+    flat = array.reshape(len(array), -1) if len(array) else np.zeros((0, 1), array.dtype)
+    raw = np.ascontiguousarray(flat).astype(array.dtype.newbyteorder("<"), copy=False).view(np.uint8).reshape(*flat.shape, array.itemsize)
+    return np.frombuffer(zlib.compress(np.ascontiguousarray(raw.transpose(1, 2, 0)).tobytes(), 6), np.uint8).copy()
+
+
+def inflate(blob: NDArray[np.uint8], size: int, exact: bool = True) -> NDArray[np.uint8]:
+    """The bytes that `deflate` compressed, in its order: `size` of them, or at most `size` unless
+    `exact`. Raises ValueError for others."""
+    machine = zlib.decompressobj()
+    data = machine.decompress(blob.tobytes(), size + 1)  # never allocates more than expected, whatever the file declares
+    if len(data) > size or not (machine.eof and (len(data) == size or not exact)):
+        raise ValueError(f"{len(data)} bytes where {size} are expected")
+    return np.frombuffer(data, np.uint8)
+
+
+# --- cells --------------------------------------------------------------------------------------------------------------------------------
+
+
+def morton(cells: NDArray[np.int64]) -> Keys:
+    """Keys [N] of cells [N, 3], each coordinate in [0, 2^21); x is the lowest of each three bits."""
+    out = np.zeros(len(cells), np.uint64)
+    for axis in range(3):
+        value = cells[:, axis].astype(np.uint64)
+        for shift, mask in _SPREAD:
+            value = (value | (value << np.uint64(shift))) & np.uint64(mask)
+        out |= value << np.uint64(axis)
+    return out
+
+
+def unmorton(keys: Keys) -> NDArray[np.int64]:
+    """Cells [N, 3] of keys [N], the inverse of `morton`."""
+    out = np.empty((len(keys), 3), np.int64)
+    masks = [0x1FFFFF, *(mask for _, mask in _SPREAD)]
+    for axis in range(3):
+        value = (keys >> np.uint64(axis)) & np.uint64(_SPREAD[-1][1])
+        for i in range(len(_SPREAD) - 1, -1, -1):
+            value = (value | (value >> np.uint64(_SPREAD[i][0]))) & np.uint64(masks[i])
+        out[:, axis] = value.astype(np.int64)
+    return out
+
+
+def encode_steps(keys: Keys) -> NDArray[np.uint8]:
+    """The bytes of sorted keys [N]: the step to each key in groups of 7 bits, low groups first; the
+    top bit says that more follow."""
+    steps = np.diff(keys, prepend=np.uint64(0))
+    groups = np.stack([(steps >> np.uint64(_GROUP * i)).astype(np.uint8) & 0x7F for i in range(_MAX_GROUPS)], axis=1)
+    more = np.stack([steps >> np.uint64(_GROUP * (i + 1)) != 0 for i in range(_MAX_GROUPS)], axis=1)
+    used = np.concatenate([np.ones((len(steps), 1), bool), more[:, :-1]], axis=1)
+    return np.where(more, groups | 0x80, groups).astype(np.uint8)[used]
+
+
+def decode_steps(data: NDArray[np.uint8]) -> Keys:
+    """The keys that `encode_steps` encoded. Raises ValueError for damaged bytes."""
+    if not len(data):
+        return np.zeros(0, np.uint64)
+    ends = np.flatnonzero(data < 0x80)
+    if not len(ends) or ends[-1] != len(data) - 1:
+        raise ValueError("a step is cut short")
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    place = np.arange(len(data)) - np.repeat(starts, ends - starts + 1)
+    if place.max() >= _MAX_GROUPS:
+        raise ValueError("a step is too long")
+    parts = (data & 0x7F).astype(np.uint64) << (_GROUP * place).astype(np.uint64)
+    return np.cumsum(np.add.reduceat(parts, starts), dtype=np.uint64)

@@ -1,0 +1,188 @@
+"""A binary glTF file with KHR_gaussian_splatting, exact; any glTF parser reads the points.
+
+Scales and opacities are stored directly (no logarithms or logits), quaternions as (x, y, z, w),
+harmonics in one accessor per coefficient. +Y is up: half a turn about z from ours. COLOR_0 shows
+the points in viewers without the extension.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_experts.core.io import write_bytes
+from scene_experts.files.formats.pack import Floats, alphas, damaged, logits, tensor, to_bytes, turned, unit_quats
+from scene_experts.files.formats.splats import Splats
+from scene_experts.files.registry import Format
+from scene_experts.geometry.sh import C0
+
+NAME = "KHR_gaussian_splatting"
+SETTINGS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective", "sortingMethod": "cameraDistance"}
+WHAT = "glTF"
+_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
+_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_HALF_TURN = np.array([[0, 0, 0, -1], [0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0.0]])  # (0, 0, 0, 1) times a quaternion (w, x, y, z)
+
+
+def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
+    """Write the file; the note goes into asset.extras."""
+    columns = _columns(splats)
+    views, accessors, parts, offset = [], [], [], 0
+    for name, column in columns.items():
+        accessor: dict[str, Any] = {
+            "bufferView": len(views),
+            "componentType": 5121 if column.dtype == np.uint8 else 5126,
+            "count": len(column),
+            "type": "SCALAR" if column.ndim == 1 else f"VEC{column.shape[1]}",
+        }
+        if column.dtype == np.uint8:
+            accessor["normalized"] = True
+        if name == "POSITION" and len(column):
+            accessor |= {"min": column.min(0).tolist(), "max": column.max(0).tolist()}
+        accessors.append(accessor)
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": column.nbytes, "target": 34962})
+        parts.append(column.tobytes())
+        offset += column.nbytes
+    primitive = {"attributes": {name: i for i, name in enumerate(columns)}, "mode": 0, "extensions": {NAME: SETTINGS}}
+    scene = {
+        "asset": {"version": "2.0", "generator": "scene-experts", **({"extras": {"scene-experts": note}} if note else {})},
+        "extensionsUsed": [NAME],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+    if not len(splats):  # glTF has no accessors without elements
+        scene = {name: scene[name] for name in ("asset", "extensionsUsed", "scene", "scenes")} | {"scenes": [{}]}
+    text = json.dumps(scene, separators=(",", ":"), allow_nan=False, default=str).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), _JSON) + text
+    if len(splats):
+        chunks += struct.pack("<II", offset, _BIN) + b"".join(parts)
+    write_bytes(path, struct.pack("<III", _MAGIC, 2, 12 + len(chunks)) + chunks)
+
+
+def read(path: Path) -> Splats:
+    """The Gaussians of all primitives with the extension, together. Transforms of nodes are not applied.
+
+    Raises InputError for damaged files and for files without such a primitive.
+    """
+    scene, data = _parse(path)
+    try:
+        primitives = [p for mesh in scene.get("meshes", []) for p in mesh["primitives"] if NAME in p.get("extensions", {})]
+        found = [_read_primitive(path, scene, data, p["attributes"]) for p in primitives]
+        none_meant = NAME in scene.get("extensionsUsed", [])
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise damaged(path, WHAT, f"Gaussians that do not fit together ({error})") from None
+    if not found:
+        if none_meant:
+            return _splats(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3)))
+        raise damaged(path, WHAT, f"no primitive with {NAME}")
+    coefficients = min(part[4].shape[1] for part in found)
+    means, scales, quats, opacity = (np.concatenate([part[i] for part in found]) for i in range(4))
+    return _splats(means, scales, quats, opacity, np.concatenate([part[4][:, :coefficients] for part in found]))
+
+
+def _columns(splats: Splats) -> dict[str, NDArray[Any]]:
+    """The attributes in the frame of glTF, by name."""
+    s = turned(splats, "z")
+    dc, opacity = s.sh[:, 0].double().numpy(), alphas(s)
+    quats = unit_quats(splats) @ _HALF_TURN.T
+    columns: dict[str, NDArray[Any]] = {
+        "POSITION": s.means.numpy().astype("<f4"),
+        "COLOR_0": to_bytes(np.concatenate([dc * C0 + 0.5, opacity[:, None]], 1)),
+        f"{NAME}:ROTATION": quats[:, [1, 2, 3, 0]].astype("<f4"),
+        f"{NAME}:SCALE": s.log_scales.double().exp().numpy().astype("<f4"),
+        f"{NAME}:OPACITY": opacity.astype("<f4"),
+    }
+    for degree in range(s.degree + 1):
+        for i in range(2 * degree + 1):
+            columns[f"{NAME}:SH_DEGREE_{degree}_COEF_{i}"] = s.sh[:, degree * degree + i].numpy().astype("<f4")
+    return columns
+
+
+def _splats(means: Floats, scales: Floats, quats: Floats, opacity: Floats, sh: Floats) -> Splats:
+    """From the frame and units of glTF to ours."""
+    wxyz = quats[:, [3, 0, 1, 2]] @ _HALF_TURN  # its transpose undoes the turn
+    turned_wrong = turned(
+        Splats(tensor(means), tensor(np.log(np.maximum(scales, 1e-30))), tensor(wxyz), tensor(logits(opacity)), tensor(sh)), "z"
+    )
+    return Splats(turned_wrong.means, turned_wrong.log_scales, tensor(wxyz), turned_wrong.opacity_logit, turned_wrong.sh)
+
+
+def _parse(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The JSON and the binary chunk of a .glb file."""
+    data = path.read_bytes()
+    if len(data) < 20 or struct.unpack_from("<II", data) != (_MAGIC, 2):
+        raise damaged(path, WHAT, "another header")
+    length = struct.unpack_from("<I", data, 8)[0]
+    size, kind = struct.unpack_from("<II", data, 12)
+    if length > len(data) or kind != _JSON or 20 + size > len(data):
+        raise damaged(path, WHAT, f"{len(data):,} bytes where the header declares {length:,}")
+    try:
+        scene = json.loads(data[20 : 20 + size])
+    except (ValueError, RecursionError):
+        raise damaged(path, WHAT, "a description that is not JSON") from None
+    if not isinstance(scene, dict):
+        raise damaged(path, WHAT, "a description that is not an object")
+    start = 20 + size
+    if len(data) < start + 8:
+        return scene, b""
+    size, kind = struct.unpack_from("<II", data, start)
+    body = data[start + 8 : start + 8 + size]
+    if kind != _BIN or len(body) != size:
+        raise damaged(path, WHAT, "a binary chunk that was cut short")
+    return scene, body
+
+
+def _read_primitive(path: Path, scene: dict[str, Any], data: bytes, attributes: dict[str, int]) -> tuple[Floats, ...]:
+    """Means, scales, quaternions (x, y, z, w), opacities and harmonics of one primitive."""
+    get = lambda name: _accessor(path, scene, data, attributes[name])  # noqa: E731
+    degree = max(int(m[1]) for name in attributes if (m := re.fullmatch(NAME + r":SH_DEGREE_(\d)_COEF_0", name)))
+    names = [f"{NAME}:SH_DEGREE_{d}_COEF_{i}" for d in range(min(degree, 3) + 1) for i in range(2 * d + 1)]
+    out = (
+        get("POSITION"),
+        get(f"{NAME}:SCALE"),
+        get(f"{NAME}:ROTATION"),
+        get(f"{NAME}:OPACITY")[:, 0],
+        np.stack([get(n) for n in names], 1),
+    )
+    shapes = (out[0].shape[1:], out[1].shape[1:], out[2].shape[1:], out[4].shape[2:])
+    if len({len(part) for part in out}) != 1 or shapes != ((3,), (3,), (4,), (3,)) or not all(np.isfinite(part).all() for part in out):
+        raise ValueError("columns of different lengths or other widths, or values that are not finite")
+    return out
+
+
+def _accessor(path: Path, scene: dict[str, Any], data: bytes, index: int) -> Floats:
+    """The values [N, C] of an accessor; normalised integers become fractions."""
+    accessor = scene["accessors"][index]
+    view = scene["bufferViews"][accessor["bufferView"]]
+    item, width, count = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]], int(accessor["count"])
+    stride = int(view.get("byteStride", item.itemsize * width))
+    start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
+    last = start + stride * (count - 1) + item.itemsize * width if count else start
+    if view.get("buffer", 0) != 0 or count < 0 or start < 0 or stride < item.itemsize * width or last > len(data) or "sparse" in accessor:
+        raise ValueError(f"accessor {index} reaches beyond the file")
+    rows = np.ndarray((count, width), item, data, start, (stride, item.itemsize))
+    if accessor.get("normalized"):
+        return np.maximum(rows / float(np.iinfo(item).max), -1.0)
+    with np.errstate(invalid="ignore"):  # the caller refuses values that are not finite
+        return rows.astype(np.float64)
+
+
+FORMAT = Format(
+    suffix=".glb",
+    write=write,
+    read=read,
+    marks=(b"glTF",),
+)

@@ -1,0 +1,153 @@
+"""A page that shows the scene in any browser, opened from disk; it fetches nothing.
+
+Renderer, scene and start pose are in one file. The renderer is Spark on three.js (MIT), bundled by
+tools/viewer; the scene is an SPZ file in base64. The note may set the start: `camera`, an entry as
+in cameras.json (position, rotation as rows of the 3x3 camera-to-world matrix, and fov in degrees or
+fy and height), `cameras`, a list of such entries to step through, `background` (RGB in [0, 1]),
+`antialias` and `title`.
+"""
+
+from __future__ import annotations
+
+import base64
+import html as markup
+import json
+import math
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+import torch
+
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import write_bytes
+from scene_experts.data.views import Capture, World
+from scene_experts.files.cameras import camera_entries
+from scene_experts.files.formats.pack import Floats, damaged
+from scene_experts.files.formats.splats import Splats
+from scene_experts.files.formats.spz import decode, spz_bytes
+from scene_experts.files.registry import Format
+from scene_experts.geometry.rotation import estimate_up
+from scene_experts.view.paths import choose_best_view
+
+ASSETS = files("scene_experts.files.formats") / "assets"
+MARK = b'<meta name="generator" content="scene-experts">'
+_SCENE = b'<script type="text/plain" id="scene">'
+_FOV = 50.0  # degrees, without a camera
+Pose = dict[str, Any]
+
+
+def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
+    """Write the page. Raises InputError for invalid cameras in the note."""
+    code = (ASSETS / "viewer.min.js.gz").read_bytes()
+    settings = json.dumps(page_settings(splats, note), allow_nan=False).replace("</", "<\\/")
+    page = Template((ASSETS / "page.html").read_text()).substitute(
+        title=markup.escape(str(note.get("title", "scene-experts"))),
+        licences=(ASSETS / "LICENCES.txt").read_text().replace("--", "- -"),
+        count=f"{len(splats):,}",
+        settings=settings,
+        scene=base64.b64encode(spz_bytes(splats)).decode(),
+        code=base64.b64encode(code).decode(),
+    )
+    write_bytes(path, page.encode())
+
+
+def read(path: Path) -> Splats:
+    """The Gaussians in a page that `write` made. Raises InputError for other and damaged pages."""
+    data = path.read_bytes()
+    start = data.find(_SCENE) + len(_SCENE)
+    end = data.find(b"</script>", start)
+    if start < len(_SCENE) or end < 0:
+        raise damaged(path, "html", "no scene")
+    try:
+        scene = base64.b64decode(data[start:end], validate=True)
+    except ValueError:
+        raise damaged(path, "html", "a scene that is not base64") from None
+    return decode(scene, path)
+
+
+def view_note(capture: Capture, world: World) -> dict[str, Any]:
+    """The entries of a note that the page uses: start at the view that shows the scene best, step
+    through all, over the capture's background.
+
+    world: the frame that the Gaussians are written in.
+    """
+    entries = camera_entries(capture.views, world)
+    return {
+        "camera": entries[choose_best_view(capture)] if entries else None,
+        "cameras": entries,
+        "background": list(capture.background),
+    }
+
+
+def page_settings(splats: Splats, note: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of the page's script: poses, up direction, distances, background."""
+    means = splats.means.double().numpy()
+    poses = [_pose(entry) for entry in note.get("cameras") or []]
+    first = _pose(note["camera"]) if note.get("camera") else poses[0] if poses else _from_outside(means)
+    poses = poses or [first]
+    up = estimate_up(torch.tensor([pose["rotation"] for pose in poses], dtype=torch.float64))
+    distance = _distance(means, first)
+    return {
+        "count": len(splats),
+        "pose": first,
+        "poses": poses,
+        "index": poses.index(first) if first in poses else 0,
+        "fov": first["fov"],
+        "up": up.tolist(),
+        "distance": distance,
+        "near": distance / 500,
+        "far": max(distance * 1000, 4 * _radius(means)),
+        "speed": distance / 2,
+        "background": [float(v) for v in note.get("background", (0.0, 0.0, 0.0))],
+        "antialias": bool(note.get("antialias", False)),
+    }
+
+
+def _pose(entry: Mapping[str, Any]) -> Pose:
+    try:
+        position = np.array(entry["position"], np.float64).reshape(3)
+        rotation = np.array(entry["rotation"], np.float64).reshape(3, 3)
+        fov = float(entry["fov"]) if "fov" in entry else math.degrees(2 * math.atan(entry["height"] / (2 * entry["fy"])))
+        if not (np.isfinite(position).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and 0 < fov < 180):
+            raise ValueError("its rotation is invalid, or its field of view is not between 0 and 180 degrees")
+    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        raise InputError(
+            f"expected cameras with position, rotation and fov (or fy and height) for the page, found one without ({error}); correct it"
+        ) from None
+    return {"position": position.tolist(), "rotation": rotation.tolist(), "fov": fov}
+
+
+def _from_outside(means: Floats) -> Pose:
+    """A pose that sees the whole scene."""
+    centre = np.median(means, 0) if len(means) else np.zeros(3)
+    away = 1.5 * _radius(means) / math.tan(math.radians(_FOV / 2))
+    return {"position": (centre - [0, 0, away]).tolist(), "rotation": np.eye(3).tolist(), "fov": _FOV}
+
+
+def _radius(means: Floats) -> float:
+    """Radius of the ball around the median position that holds 90 % of the Gaussians."""
+    if not len(means):
+        return 1.0
+    return max(float(np.quantile(np.linalg.norm(means - np.median(means, 0), axis=1), 0.9)), 1e-6)
+
+
+def _distance(means: Floats, pose: Pose) -> float:
+    """Distance from the camera to the scene: the median depth of the Gaussians near its axis."""
+    local = (means - pose["position"]) @ np.array(pose["rotation"])
+    ahead = local[(local[:, 2] > 0) & (np.abs(local[:, :2]).max(1, initial=0.0) < 0.3 * local[:, 2])]
+    return float(np.median(ahead[:, 2])) if len(ahead) else 2 * _radius(means)
+
+
+FORMAT = Format(
+    suffix=".html",
+    write=write,
+    read=read,
+    marks=(b"<!doctype html>",),
+    looks_like=lambda path, head: MARK in head,
+    antialias=True,
+    view_note=view_note,
+)

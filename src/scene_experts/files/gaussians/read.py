@@ -1,0 +1,130 @@
+"""Files to runs of explicit Gaussians: a file of any format of standard Gaussians, or a result
+folder of 3DGS, published or ours."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import read_json
+from scene_experts.core.table import Table
+from scene_experts.data.views import World
+from scene_experts.files import result_folder
+from scene_experts.files.formats.ply import property_names
+from scene_experts.files.formats.splats import Splats
+from scene_experts.files.gaussians.write import KIND
+from scene_experts.files.registry import Imported, recognise
+from scene_experts.recipes import gs_3d
+from scene_experts.scene import Scene
+from scene_experts.scene.gaussians import Explicit, GaussianScene
+from scene_experts.training.config import Data, Train, from_json
+from scene_experts.training.run_folder import OpenRun, load_capture
+
+log: logging.Logger = logging.getLogger(__name__)
+DRAWN_AT = 3  # the step to draw scenes of `scene_of` at: all their harmonics are in use from this step on
+
+
+def find(source: Path, iteration: int | None) -> Path | None:
+    """The PLY of a result folder with Gaussians; None for other scenes."""
+    path = result_folder.iteration_folder(source, iteration) / "point_cloud.ply"
+    return path if "f_dc_0" in property_names(path) else None
+
+
+def read(source: Path, data: Data, iteration: int | None) -> Imported:
+    """The run in a file of Gaussians, published or ours, in the frame and unit of the capture.
+
+    The recipe is 3DGS and the step 0 unless the file, the description beside it (FILE.json) or its
+    folder says otherwise. Raises InputError where a description says that the file is in another
+    frame.
+    """
+    antialias = antialiased(source)
+    about = result_folder.read_description(source.parent) or {}
+    capture = load_capture(data)
+    capture.images.close()
+    made_on = beside(source).get("capture")
+    if made_on not in (None, "", capture.fingerprint()):
+        log.warning(
+            "%s was made with other views than those of %s; check that it is the same capture (and --split, --resolution)",
+            source,
+            capture.root,
+        )
+    columns = table_columns(read_splats(source), capture.world)
+    step = int(about.get("step") or iteration or result_folder.iteration_of(source.parent) or 0)
+    degree = math.isqrt(columns["sh_rest"].shape[1] + 1) - 1
+    cfg = replace(gs_3d, scene=Explicit(sh_degree=degree), iterations=step or gs_3d.iterations, antialias=antialias)
+    if about.get("kind") == KIND and "train" in about:
+        cfg = from_json(Train, about["train"], "train")
+        try:
+            cfg = replace(cfg, scene=replace(cfg.scene, sh_degree=degree))  # some formats keep fewer harmonics
+        except TypeError:
+            raise InputError(
+                f"expected the recipe of a scene of Gaussians in the description beside {source}, found '{cfg.recipe}'; remove it"
+            ) from None
+    tensors = {f"params.{name}": value for name, value in columns.items()}
+    return Imported(cfg, data, capture, tensors, {"extent": capture.extent}, step)
+
+
+def read_splats(path: Path) -> Splats:
+    """The Gaussians of a file of any format. Raises InputError for files without Gaussians and for
+    values that are not finite."""
+    format = recognise(path)[1]
+    assert format.read is not None
+    found: Splats = format.read(path)
+    if not len(found):
+        raise InputError(f"expected Gaussians in {path}, found none; export the result again")
+    found.expect_finite(str(path))
+    return found
+
+
+def table_columns(splats: Splats, world: World) -> dict[str, Tensor]:
+    """The columns of a table of explicit Gaussians, trained world: the inverse of `write.splats_of`."""
+    return {
+        "means": world.from_input(splats.means.double()).float(),
+        "log_scales": (splats.log_scales.double() + math.log(world.scale)).float(),
+        "quats": splats.quats,
+        "raw_opacity": splats.opacity_logit,
+        "sh_dc": splats.sh[:, 0].contiguous(),
+        "sh_rest": splats.sh[:, 1:].contiguous(),
+    }
+
+
+def scene_of(columns: dict[str, Tensor], extent: float) -> GaussianScene:
+    """A scene of explicit Gaussians with these columns. Draw it at step `DRAWN_AT` or later for all
+    harmonics."""
+    degree = round((columns["sh_rest"].shape[1] + 1) ** 0.5) - 1
+    return GaussianScene(Explicit(sh_degree=degree, sh_ramp=1), Table(columns, {}), extent)
+
+
+def scene(run: OpenRun, contents: Splats, world: World) -> tuple[Scene, int]:
+    """The scene that a file holds, in the run's world, and the step to draw it at."""
+    return scene_of(table_columns(contents, world), run.scene.extent), DRAWN_AT
+
+
+def beside(path: Path) -> dict[str, Any]:
+    """The description that `export` writes beside a file (FILE.json); empty where there is none."""
+    file = path.with_name(path.name + ".json")
+    found = read_json(file, "description of a file") if file.is_file() else None
+    return found if isinstance(found, dict) else {}
+
+
+def antialiased(path: Path) -> bool:
+    """Whether the description beside a file, or without one the file itself, says that it is drawn
+    with antialiasing.
+
+    Raises InputError where the description says that the file is not in the capture's own frame.
+    """
+    found = beside(path)
+    if not found:
+        format = recognise(path)[1]
+        return format.is_antialiased is not None and format.is_antialiased(path)
+    if found.get("frame") == "trained":
+        raise InputError(
+            f"expected a file in the capture's own frame, found {path} in the trained one; export it again with --frame capture"
+        )
+    return found.get("antialias") is True

@@ -1,0 +1,150 @@
+"""What a file costs: the same views drawn from several scenes, scored against the photographs and
+against the first scene's pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scene_experts.core.errors import InputError
+from scene_experts.core.types import Camera, Gaussians, Mode
+from scene_experts.data.capture import Capture
+from scene_experts.evaluate.metrics import psnr
+from scene_experts.render import Rasterizer, as_trained, choose
+from scene_experts.scene import Draws, Scene
+from scene_experts.training.run_folder import OpenRun, capture_of
+
+Tell = Callable[[str, int, int], None]
+"""Reports the progress of long work: (what, done, total)."""
+
+
+@dataclass(frozen=True)
+class Painter:
+    """Draws one scene at one step."""
+
+    draws: Draws
+    step: int
+    rasterize: Rasterizer
+
+    @classmethod
+    def of(cls, scene: Scene, step: int, rasterize: Rasterizer | None = None, antialias: bool = False) -> Painter:
+        """A painter for a trained scene, which must not change meanwhile. rasterize: None for the
+        fastest one on this CPU."""
+        return cls(scene.frozen(step), step, as_trained(rasterize or choose("auto", "cpu"), antialias))
+
+    def gaussians(self, camera: Camera) -> Gaussians:
+        """The Gaussians that a camera sees."""
+        return self.draws(camera, self.step, Mode.DRAW, self.rasterize.visible).gaussians
+
+    def picture(self, camera: Camera, background: Tensor) -> Tensor:
+        """The picture [H, W, 3] over `background` [3], not clamped."""
+        return self.rasterize(self.gaussians(camera), camera, background).image
+
+    def picture_8bit(self, camera: Camera, background: Tensor) -> Tensor:
+        """The picture [H, W, 3] as an 8-bit file holds it, in [0, 1]."""
+        return (self.picture(camera, background).clamp(0, 1) * 255 + 0.5).floor() / 255
+
+
+@dataclass(frozen=True)
+class Score:
+    """Means over views, dB, from 8-bit pictures."""
+
+    photographs: float
+    """PSNR against the photographs."""
+    first: float
+    """PSNR against the pictures of the first scene; 100 for that scene itself."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a file costs in PSNR. Empty where nothing was measured."""
+
+    lines: tuple[str, ...]
+    """A sentence: the figures, or why there are none."""
+    psnr: dict[str, float] = field(default_factory=dict)
+    """Mean PSNR of the held-out views against the photographs, dB, of the "run", of the "file", and
+    for a baked scene of its "closed_form" and its "bake"."""
+    plain: dict[str, Any] = field(default_factory=dict)
+    """Everything as JSON values."""
+
+
+def cost(
+    run: OpenRun,
+    scenes: Callable[[], Mapping[str, tuple[Scene, int]]],
+    capture: Capture | None,
+    rasterize: Rasterizer | None = None,
+    tell: Tell | None = None,
+) -> Cost:
+    """Draw the held-out views of a capture from a run and from other scenes.
+
+    scenes: makes them, with the step to draw each at; "file" is what a file holds, "closed_form"
+    and "bake" lie before it. capture: None where it is gone.  rasterize: None for the fastest one
+    on this CPU.
+    """
+    views = [] if capture is None else scored_views(capture)
+    if capture is None or not views:
+        where = f"the capture is not at {run.config.data.path} (say where it is with --data)"
+        why = where if capture is None else why_no_views(capture)
+        return Cost(lines=(f"{why}: what the file costs in PSNR was not measured",))
+    drawn = {"run": (run.scene, run.step), **scenes()}
+    painters = {name: Painter.of(scene, step, rasterize, run.cfg.antialias) for name, (scene, step) in drawn.items()}
+    found = scores(painters, capture, views, tell)
+    before, after = found["run"].photographs, found["file"].photographs
+    words = {"closed_form": "means over the views", "bake": "refined" if "closed_form" in found else "means over the views"}
+    between = "".join(f"{words[name]} {found[name].photographs:.3f}, " for name in words if name in found)
+    line = f"PSNR of {len(views)} held-out views: run {before:.3f} dB, {between}this file {after:.3f} dB ({after - before:+.3f})"
+    line += f"; its pictures against the run's {found['file'].first:.2f} dB" if "bake" in found else ""
+    plain: dict[str, Any] = {name: {"photographs": round(s.photographs, 6), "run": round(s.first, 6)} for name, s in found.items()}
+    psnr = {name: score.photographs for name, score in found.items()}
+    return Cost((line,), psnr, plain | {"views": len(views)})
+
+
+@contextmanager
+def capture_if_there(run: OpenRun, needed: bool) -> Iterator[Capture | None]:
+    """The capture of a run; None where it is gone and not needed. Raises InputError where it is
+    needed and gone, and for another one."""
+    path = run.config.data.path
+    if not path.exists():
+        if needed:
+            raise InputError(
+                f"expected the run's capture at {path}, whose cameras this file is made with, found none; say where it is with --data"
+            )
+        yield None
+        return
+    capture = capture_of(run)
+    try:
+        yield capture
+    finally:
+        capture.images.close()
+
+
+def scored_views(capture: Capture) -> list[int]:
+    """The held-out views that can be scored: those whose mask leaves something."""
+    return [i for i in capture.test if (mask := capture.frame(i).mask) is None or bool(mask.any())]
+
+
+def why_no_views(capture: Capture) -> str:
+    """Why `scored_views` is empty."""
+    return "the masks leave nothing of the held-out views" if capture.test else "no view is held out"
+
+
+@torch.no_grad()
+def scores(painters: Mapping[str, Painter], capture: Capture, views: Sequence[int], tell: Tell | None = None) -> dict[str, Score]:
+    """The score of each scene over `views` (at least one, of `scored_views`) of the capture."""
+    background = torch.tensor(capture.background)
+    totals = {name: [0.0, 0.0] for name in painters}
+    for i, index in enumerate(views):
+        camera, frame = capture.views[index].camera, capture.frame(index)
+        pictures = {name: painter.picture_8bit(camera, background) for name, painter in painters.items()}
+        first = next(iter(pictures.values()))
+        for name, image in pictures.items():
+            totals[name][0] += psnr(image, frame.rgb.float() / 255, frame.mask)
+            totals[name][1] += psnr(image, first, frame.mask)
+        if tell is not None:
+            tell("measuring", i + 1, len(views))
+    return {name: Score(a / len(views), b / len(views)) for name, (a, b) in totals.items()}

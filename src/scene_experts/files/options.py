@@ -1,0 +1,35 @@
+"""The options of an export, as one value. This module loads no torch: the help of the command line
+reads it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+MAX_DEGREE = 3  # of spherical harmonics in any format
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to write, and whether to measure it. All but `measure` are for formats of standard Gaussians."""
+
+    measure: bool = True
+    """Draw the held-out views from the run and from the file, and say what the file costs in PSNR."""
+    sh_degree: int = MAX_DEGREE
+    """Standard files: degree of the spherical harmonics, 0 (smallest file) to 3 (best)."""
+    max_gaussians: int = 0
+    """Standard files: keep at most this many Gaussians, those that contribute most to the pictures;
+    0 keeps all."""
+    prune: float = 0.0
+    """Standard files: share of all contributions to the pictures to leave out, smallest first, 0 to
+    below 1 (0.02 costs little)."""
+    refine: int = 1000
+    """Standard files: iterations that fit all parameters to the run's pictures; 0 keeps the means
+    over the views."""
+    frame: Literal["capture", "trained"] = "capture"
+    """Standard files: the capture's own frame, or the frame that the scene was trained in."""
+    levels: bool = False
+    """Standard files: one file per level of detail, each without the finer levels."""
+
+
+DEFAULT = Options()

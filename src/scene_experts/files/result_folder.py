@@ -1,0 +1,132 @@
+"""Result folders of the 3DGS family, read: point_cloud/iteration_N with our description of the
+scene, and cfg_args above it.
+
+Published folders have no description. Everything in a folder is in the capture's own frame and unit.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import read_json
+from scene_experts.data.views import World
+
+DESCRIPTION, DESCRIPTION_FORMAT = "scene.json", 1
+SETTINGS = "cfg_args"
+_SETTINGS_LIMIT = 1 << 20
+
+
+def is_result(path: Path) -> bool:
+    """Whether a folder looks like a result folder, or like one of its iterations."""
+    return (path / "point_cloud").is_dir() or (path / "point_cloud.ply").is_file()
+
+
+def iteration_folder(path: Path, iteration: int | None = None) -> Path:
+    """The folder of `iteration` (None: the newest) in a result folder; a folder that holds
+    point_cloud.ply itself is returned as it is.
+
+    Raises InputError for a folder without results or without that iteration.
+    """
+    path = Path(path)
+    if (path / "point_cloud.ply").is_file():
+        return path
+    found = {}
+    for folder in (path / "point_cloud").glob("iteration_*") if (path / "point_cloud").is_dir() else ():
+        if (number := iteration_of(folder)) is not None and (folder / "point_cloud.ply").is_file():
+            found[number] = folder
+    if not found:
+        raise InputError(f"expected a result (point_cloud/iteration_N/point_cloud.ply) in {path}, found none; check the path")
+    if iteration is not None and iteration not in found:
+        raise InputError(f"expected iteration {iteration} in {path}, found {', '.join(map(str, sorted(found)))}; choose one of those")
+    return found[max(found) if iteration is None else iteration]
+
+
+def iteration_of(folder: Path) -> int | None:
+    """N of a folder called iteration_N; None for other names."""
+    match = re.fullmatch(r"iteration_(\d{1,18})", folder.name)
+    return int(match[1]) if match else None
+
+
+def read_description(folder: Path) -> dict[str, Any] | None:
+    """The description of the scene in an iteration's folder; None where there is none.
+
+    Raises InputError for a damaged one and for another format version.
+    """
+    path = folder / DESCRIPTION
+    if not path.is_file():
+        return None
+    value = read_json(path, "scene description")
+    if not isinstance(value, dict) or value.get("format") != DESCRIPTION_FORMAT:
+        found = value.get("format") if isinstance(value, dict) else value
+        raise InputError(
+            f"expected a scene description of format {DESCRIPTION_FORMAT} at {path}, found format {found}; write the scene again"
+        )
+    absent = {"K", "F", "voxel_size", "world", "recipe"} - value.keys()
+    if absent:
+        raise InputError(f"expected {', '.join(sorted(absent))} in the scene description {path}, found none; write the scene again")
+    try:
+        numbers = [*map(float, value["voxel_size"].values()), float(value["world"]["scale"]), *map(float, value["world"]["shift"])]
+        others = [float(value.get("extent", 1)), int(value.get("step", 0)), *dict(value.get("scene", {}))]
+        if len(numbers) != 6 or not numbers[2] > 0 or not others[0] > 0:
+            raise ValueError
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise InputError(
+            f"expected voxel_size, world, extent and step as numbers in the scene description {path}, found others; write it again"
+        ) from None
+    return value
+
+
+def world_in(about: dict[str, Any]) -> World:
+    """The world that a description states."""
+    x, y, z = (float(v) for v in about["world"]["shift"])
+    return World(float(about["world"]["scale"]), (x, y, z))
+
+
+def expect_world(trained: World, found: World) -> None:
+    """Raises InputError unless the capture is read into the world that the scene was trained in, up
+    to rounding."""
+    pairs = [(trained.scale, found.scale), *zip(trained.shift, found.shift)]
+    reach = max(1.0, *(abs(s) for s in trained.shift))
+    if any(abs(a - b) > 1e-5 * (abs(a) if i == 0 else reach) for i, (a, b) in enumerate(pairs)):
+        raise InputError(
+            f"expected the capture in the world of the scene (scale {trained.scale:.6g}, shift {trained.shift}), found scale "
+            f"{found.scale:.6g}, shift {found.shift}; use the capture, --split, --normalise and --max-views it was trained with"
+        )
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """The settings in cfg_args of the result folder above an iteration's folder; empty without the file.
+
+    The file is the text of a Python namespace, `Namespace(voxel_size=0.001, ...)`. Its values are
+    parsed as literals and never evaluated; others (a path object, a call) are left out. Raises
+    InputError for a file of another form.
+    """
+    path = folder.parent.parent / SETTINGS
+    if not path.is_file():
+        return {}
+    wrong = f"expected the text Namespace(name=value, ...) in {path}, found something else; remove the file to go on without it"
+    try:
+        text = path.read_bytes()[: _SETTINGS_LIMIT + 1].decode()
+        call = ast.parse(text.strip(), mode="eval").body if len(text) <= _SETTINGS_LIMIT else None
+    except (SyntaxError, ValueError, MemoryError, RecursionError):
+        raise InputError(wrong) from None
+    if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace" and not call.args):
+        raise InputError(wrong)
+    out: dict[str, Any] = {}
+    for keyword in call.keywords:
+        try:
+            if keyword.arg is not None:
+                out[keyword.arg] = ast.literal_eval(keyword.value)
+        except (ValueError, TypeError, MemoryError, RecursionError):
+            continue
+    return out
+
+
+def number(value: Any) -> float | None:
+    """A finite number among the settings; None for anything else."""
+    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else None

@@ -1,0 +1,115 @@
+"""glTF: exact, as a plain glTF parser sees it in glTF's own frame, and damaged files in one sentence."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scene_experts.core.errors import InputError
+from scene_experts.files.formats import glb
+from scene_experts.geometry.rotation import covariance
+from scene_experts.geometry.sh import sh_to_rgb
+from support.gltf import column, parsed
+from support.messages import naming
+from support.splat_quanta import check, scene
+
+
+@given(st.integers(0, 200), st.integers(0, 3), st.integers(0, 99))
+@settings(max_examples=15, deadline=None)
+def test_round_trip_is_exact(tmp_path_factory, n, degree, seed):
+    path = tmp_path_factory.mktemp("glb") / "a.glb"
+    s = scene(n, degree if n else 0, seed)
+    glb.write(path, s, {})
+    check("glb", glb.read(path), s)
+
+
+def test_what_a_gltf_viewer_sees_is_the_scene_half_turned(tmp_path):
+    """Covariances and colours in glTF's frame are those of ours, turned by 180 degrees about z."""
+    s = scene(50, 3)
+    glb.write(tmp_path / "a.glb", s, {"recipe": "moe-gs"})
+    doc, body = parsed(tmp_path / "a.glb")
+    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    get = lambda name: torch.from_numpy(column(doc, body, name).copy())  # noqa: E731
+    torch.testing.assert_close(get("POSITION"), s.means @ turn)
+    q, lengths = get("KHR_gaussian_splatting:ROTATION"), get("KHR_gaussian_splatting:SCALE")
+    torch.testing.assert_close(q.norm(dim=1), torch.ones(50))
+    ours = covariance(torch.nn.functional.normalize(s.quats, dim=1), s.log_scales.exp())
+    torch.testing.assert_close(covariance(q[:, [3, 0, 1, 2]], lengths), turn @ ours @ turn, rtol=1e-4, atol=1e-7)
+    names = [f"KHR_gaussian_splatting:SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1)]
+    sh, look = torch.stack([get(name) for name in names], 1), torch.randn(50, 3)
+    torch.testing.assert_close(sh_to_rgb(sh, look @ turn, 3), sh_to_rgb(s.sh, look, 3), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(get("KHR_gaussian_splatting:OPACITY")[:, 0], s.opacity_logit.sigmoid())
+    assert doc["extensionsUsed"] == ["KHR_gaussian_splatting"] and doc["asset"]["extras"] == {"scene-experts": {"recipe": "moe-gs"}}
+    primitive = doc["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0 and primitive["extensions"]["KHR_gaussian_splatting"]["kernel"] == "ellipse"
+    low = doc["accessors"][primitive["attributes"]["POSITION"]]["min"]
+    np.testing.assert_allclose(low, get("POSITION").numpy().min(0))
+
+
+def rebuilt(path, doc, body):
+    text = json.dumps(doc).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(body), 0x004E4942) + body
+    path.write_bytes(struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks)
+
+
+def test_normalised_bytes_and_strides(tmp_path):
+    """Opacities as bytes and interleaved positions, as other writers have them."""
+    path = tmp_path / "a.glb"
+    s = scene(10, 0)
+    glb.write(path, s, {})
+    doc, body = parsed(path)
+    alpha = np.arange(10, dtype=np.uint8) * 20
+    place = np.zeros((10, 5), np.float32)
+    place[:, :3] = s.means.numpy()
+    doc["bufferViews"] += [
+        {"buffer": 0, "byteOffset": len(body), "byteLength": 10},
+        {"buffer": 0, "byteOffset": len(body) + 12, "byteLength": 200, "byteStride": 20},
+    ]
+    doc["accessors"] += [
+        {"bufferView": len(doc["bufferViews"]) - 2, "componentType": 5121, "normalized": True, "count": 10, "type": "SCALAR"},
+        {"bufferView": len(doc["bufferViews"]) - 1, "componentType": 5126, "count": 10, "type": "VEC3"},
+    ]
+    attributes = doc["meshes"][0]["primitives"][0]["attributes"]
+    attributes["KHR_gaussian_splatting:OPACITY"], attributes["POSITION"] = len(doc["accessors"]) - 2, len(doc["accessors"]) - 1
+    rebuilt(path, doc, body + alpha.tobytes() + b"\0\0" + place.tobytes())
+    found = glb.read(path)
+    torch.testing.assert_close(found.opacity_logit.sigmoid()[1:], torch.from_numpy(alpha[1:] / 255).float())
+    torch.testing.assert_close(found.means, s.means * torch.tensor([-1.0, -1.0, 1.0]))
+
+
+def test_damaged_files(tmp_path):
+    path = tmp_path / "a.glb"
+    glb.write(path, scene(20, 1), {})
+    good, (doc, body) = path.read_bytes(), parsed(path)
+
+    def refused(fact=""):
+        with pytest.raises(InputError, match=naming(path, fact)):
+            glb.read(path)
+
+    for data in (good[:-8], good[:10], b"glTF" + bytes(40)):
+        path.write_bytes(data)
+        refused()
+    for change, fact in (
+        (lambda d: d["accessors"][0].update(count=10**9), "accessor 0"),
+        (lambda d: d["accessors"][0].update(count=float("inf")), ""),
+        (lambda d: d["bufferViews"][0].update(byteOffset=-4), "accessor 0"),
+        (lambda d: d["accessors"][0].update(componentType=1), ""),
+        (lambda d: d["accessors"][3].update(count=19), ""),
+        (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), ""),
+        (lambda d: d.update(meshes=[], extensionsUsed=[]), "KHR_gaussian_splatting"),
+        (lambda d: d.update(meshes=5), ""),
+        (lambda d: d.update(meshes=[], extensionsUsed=None), ""),
+        (lambda d: d["accessors"][2].update(type="VEC3"), ""),
+        (lambda d: d["accessors"][0].update(type="VEC2"), ""),
+    ):
+        changed = json.loads(json.dumps(doc))
+        change(changed)
+        rebuilt(path, changed, body)
+        refused(fact)
+    rebuilt(path, [1], body)
+    refused()
