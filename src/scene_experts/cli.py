@@ -25,6 +25,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def dispatch(args: list[str]) -> int:
     """Run a command and turn its errors into a sentence and an exit code."""
+    if args[:1] == ["help"] and args[1:2]:
+        args = [args[1], "--help"]
     if not args or args[0] in ("-h", "--help", "--help-all", "help"):
         print(usage())
         return 0 if args else 2

@@ -69,8 +69,8 @@ LOADS_TORCH = ("train",)
 @pytest.mark.parametrize("command", list(COMMANDS))
 def test_every_command_has_help_in_plain_text_for_80_columns(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    for flag in ("--help", "-h", "--help-all"):
-        code, out, _ = run(capsys, command, flag)
+    for words in ([command, "--help"], [command, "-h"], [command, "--help-all"], ["help", command]):
+        code, out, _ = run(capsys, *words)
         assert code == 0 and out.startswith(f"usage: scene-experts {command}") and plain(out)
         assert max(map(len, out.splitlines())) <= 80
 
@@ -215,6 +215,14 @@ def test_a_signal_saves_and_ends_cleanly(number, capture, tmp_path):
     again = [*args, "--resume", "--stop-at", str(step + 5)]
     done = subprocess.run(again, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0 and f"iteration {step:,}" in done.stdout, done.stdout + done.stderr
+
+
+def test_a_file_that_cannot_be_used_is_one_sentence(capsys, monkeypatch):
+    from scene_experts import commands
+
+    monkeypatch.setattr(commands, "run", lambda *_: (_ for _ in ()).throw(PermissionError(13, "Permission denied", "a/b")))
+    code, _, err = run(capsys, "info", "x")
+    assert code == 1 and "a/b: permission denied" in err and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 1 byte\nmore")])

@@ -317,3 +317,32 @@ def test_other_commands(case, made, trained, tmp_path, capsys):
     code, sentence = said(capsys, *(re.sub("^(TMP|MADE|RUN)", lambda m: str(where[m[0]]), word) for word in OTHERS[case]))
     assert code == 2 and (tmp_path / "file").read_text() == "precious" and not (tmp_path / "r").exists()
     as_recorded(case, sentence, tmp_path, trained, made)
+
+
+TRAIN = ["train", "moe-gs", "--data", "c", "--out", "r"]
+WORDS = {
+    "no recipe": ["train"],
+    "recipe after an option": ["train", "--data", "c", "moe-gs"],
+    "recipe unknown": ["train", "moegs"],
+    "option missing": ["train", "moe-gs", "--data", "c"],
+    "options missing": ["train", "moe-gs"],
+    "option unknown": [*TRAIN, "--iteration", "5"],
+    "option without its part": [*TRAIN, "--top-k", "1"],
+    "option of another recipe": ["train", "scaffold-gs", "--data", "c", "--out", "r", "--scene.decoder.num", "3"],
+    "option twice": [*TRAIN, "-m", "s"],
+    "number is a word": [*TRAIN, "--iterations", "abc"],
+    "choice unknown": [*TRAIN, "--device", "gpu"],
+    "value missing": [*TRAIN, "--iterations"],
+    "value for a switch": [*TRAIN, "--resume=yes"],
+    "two numbers of three": [*TRAIN, "--background", "1", "1"],
+    "run missing": ["eval"],
+    "two runs": ["eval", "a", "b"],
+    "word for a command without any": ["doctor", "a"],
+}
+
+
+@pytest.mark.parametrize("case", list(WORDS))
+def test_words_of_the_command_line(case, tmp_path, capsys):
+    code, sentence = said(capsys, *WORDS[case])
+    assert code == 2
+    as_recorded(case, sentence, tmp_path)

@@ -92,8 +92,8 @@ class _Reader:
             raise InputError("expected a value after the command, found an empty one; give one, or leave it out")
         left = [row for row in self.waiting if row.place not in self.given or count(row.kind)[1] is None]
         if not left:
-            takes = " ".join(map(stands_for, self.waiting)) or "only options"
-            raise InputError(f"expected {takes} after `{self.command.name}`, found also '{args[0]}'; leave it out")
+            takes = " ".join(map(stands_for, self.waiting)) or "options"
+            raise InputError(f"expected only {takes} after `{self.command.name}`, found also '{args[0]}'; leave it out")
         row = left[0]
         before = self.given.pop(row.place, ())  # words of a list may stand before and after an option
         value = self._value(row, stands_for(row), _take(row, args))

@@ -12,6 +12,7 @@ from scene_experts.core.errors import InputError, nearest
 
 NONE = ("none", "None")
 LONG = 40  # characters; longer choices are listed in the text beside an option
+FEW = 4  # of so few choices none is named again as the nearest
 WORDS: dict[Any, tuple[str, str, Callable[[str], Any]]] = {
     int: ("a whole number", "N", int),
     float: ("a number", "X", float),
@@ -55,7 +56,8 @@ def _one(kind: Any, word: str, name: str, example: str) -> Any:
     if typing.get_origin(kind) is Literal:
         known = {str(choice): choice for choice in typing.get_args(kind)}
         if word not in known:
-            raise InputError(f"expected {described(kind)} after {name}, found '{word}'{nearest(word, known) or '; choose one of these'}")
+            hint = nearest(word, known) if len(known) > FEW else ""
+            raise InputError(f"expected {described(kind)} after {name}, found '{word}'{hint or '; choose one of these'}")
         return known[word]
     what, _, make = WORDS[kind]
     try:

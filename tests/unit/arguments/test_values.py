@@ -40,7 +40,7 @@ def test_what_fits(kind, words, value):
         (int, ["1.5"], ("a whole number", "'1.5'")),
         (float, ["1,5"], ("a number", "'1,5'")),
         (Literal["auto", "cpu", "cuda"], ["gpu"], ("auto, cpu or cuda", "'gpu'")),
-        (Literal["auto", "cpu", "cuda"], ["cud"], ("did you mean 'cuda'",)),
+        (Literal["one", "two", "three", "four", "five"], ["thre"], ("did you mean 'three'",)),
         (tuple[int, ...], ["1", "x"], ("a whole number", "'x'")),
         (TRIPLE, ["1", "2"], ("3 values", "found 2")),
     ],
