@@ -8,6 +8,7 @@ from PIL import Image
 
 import scene_experts as se
 from scene_experts.data.readers.colmap_model import read_model
+from support.messages import naming
 
 
 def test_a_capture_is_in_its_own_frame_and_unit(folder, capture):
@@ -28,7 +29,7 @@ def test_photographs_are_the_files(folder, capture):
     assert photo.dtype == np.float32 and np.array_equal(photo, file) and np.array_equal(capture.photo(capture.cameras[1]), photo)
     assert photo.shape == (capture.cameras[1].height, capture.cameras[1].width, 3) and capture.mask(1) is None
     for wrong in (9, -1, capture.look_at((9, 9, 9))):
-        with pytest.raises(se.InputError, match="view from 0 to 8"):
+        with pytest.raises(se.InputError, match=naming(0, 8)):
             capture.photo(wrong)
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from scene_experts.core import parts
 from scene_experts.core.parts import Part, find, names_of, register
+from support.messages import naming
 
 
 @pytest.fixture(autouse=True)
@@ -43,10 +44,10 @@ def test_a_name_belongs_to_one_class_which_may_be_defined_again():
     register(make("one"))
     again = make("one")
     assert register(again) is again and find("Plum", Part) is again
-    with pytest.raises(ValueError, match="'Plum' of both one and another"):
+    with pytest.raises(ValueError, match=naming("Plum", "one", "another")):
         register(make("another"))
 
 
 def test_only_frozen_dataclasses_are_parts():
-    with pytest.raises(TypeError, match="frozen dataclass"):
+    with pytest.raises(TypeError):
         register(int)  # type: ignore[type-var]

@@ -9,6 +9,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.plain import UnknownPart, first_difference, from_json, to_json
 from scene_experts.recipes import RECIPES
 from scene_experts.training.config import Data, RunConfig, Train
+from support.messages import naming
 
 
 @pytest.mark.parametrize("name", list(RECIPES))
@@ -43,7 +44,7 @@ def test_errors_name_the_place(edit, message):
 def test_an_unknown_part_is_told_from_a_wrong_value():
     with pytest.raises(UnknownPart, match="MyScene"):
         from_json(Train, {"recipe": "x", "scene": {"type": "MyScene"}})
-    with pytest.raises(UnknownPart, match=r"at config\.scene, found 'GrowAnchors'"):  # a part, but of another kind
+    with pytest.raises(UnknownPart, match=naming("config.scene", "GrowAnchors")):  # a part, but of another kind
         from_json(Train, {"recipe": "x", "scene": {"type": "GrowAnchors"}})
 
 

@@ -26,7 +26,7 @@ def test_another_extension_when_there_is_one_choice(tmp_path: Path) -> None:
     touch(tmp_path, "a.png", "b.png", "b.webp")
     match = match_images(tmp_path, ["a.JPG", "b.JPG"])
     assert match.found == {"a.JPG": tmp_path / "a.png"} and match.absent == ("b.JPG",)
-    assert len(match.warnings) == 1 and "a.JPG -> a.png" in match.warnings[0]
+    assert len(match.warnings) == 1 and "a.JPG" in match.warnings[0] and "a.png" in match.warnings[0]
 
 
 def test_one_photograph_is_not_two_views(tmp_path: Path) -> None:

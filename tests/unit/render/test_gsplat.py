@@ -142,7 +142,7 @@ def test_why_it_is_not_available(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "CUDA device" in ask()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setitem(sys.modules, "gsplat", None)  # as for a missing module
-    assert "pip install scene-experts[cuda]" in ask()
+    assert "scene-experts[cuda]" in ask()
     library, backend = FakeGsplat(), ModuleType("gsplat.cuda._backend")
     monkeypatch.setitem(sys.modules, "gsplat", library)
     monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend)
@@ -150,7 +150,7 @@ def test_why_it_is_not_available(monkeypatch: pytest.MonkeyPatch) -> None:
     backend._C = None  # type: ignore[attr-defined]
     assert "nvcc" in ask()
     library.fully_fused_projection = lambda means: None  # type: ignore[method-assign,assignment]
-    assert "1.5.3 or newer" in ask()
+    assert "1.5.3" in ask()
     monkeypatch.setattr(adapter, "explain_missing", ask)
     with pytest.raises(InputError, match=r"1\.5\.3"):
         adapter.GsplatRasterizer()(single(make_scene(1)), make_camera(), BACKGROUND)

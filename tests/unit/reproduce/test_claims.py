@@ -82,8 +82,6 @@ def test_number_of_experts_and_top_2_near_dense():
     assert get(runs, "rises with the number").verdict == "confirmed"
     assert get(runs, "Top-1 has less").verdict == "confirmed"
     near = get(runs, "close to dense")
-    assert (
-        near.verdict == "undecided" and "3 experts: undecided" in near.measured
-    )  # 5 pairs whose seeds differ by 0.2 dB do not tell 0.1 dB
+    assert near.verdict == "undecided" and "undecided" in near.measured  # 5 pairs whose seeds differ by 0.2 dB do not tell 0.1 dB
     better = [record("moe-gs-e5-top2", psnr=31, seed=k, scene=s) for k in (0, 1, 2) for s in "vwxyz"]
     assert get([*better, *(r for r in runs if r.recipe == "moe-gs-e5-dense")], "close to dense").verdict == "confirmed"

@@ -19,7 +19,7 @@ def test_files_and_page(tmp_path):
     assert not (tmp_path / "fig7.png").exists()
     page = (tmp_path / "README.md").read_text()
     assert "scene-experts reproduce table4 fig7" in page and "](fig7." not in page
-    assert "(table4.md)" in page and "MoE-GS has more PSNR than Scaffold-GS | confirmed | +1.00 dB" in page
+    assert "(table4.md)" in page and "| confirmed | +1.00 dB" in page
     assert "99" not in (tmp_path / "table4.md").read_text()
     assert "fern" in (tmp_path / "table4.md").read_text()
 
@@ -29,19 +29,14 @@ def test_means_are_over_the_captures_that_every_row_has(tmp_path):
     runs = [record("moe-gs", "fox", psnr=30.0, views=1), record("scaffold-gs-opacity", "fox", psnr=29.0, views=1)]
     report.write(tmp_path, [EXPERIMENTS["table4"]], scenes, [*runs, record("moe-gs", "fern", psnr=10.0, views=1)])
     means, by_scene = (tmp_path / "table4.md").read_text().split("scene by scene")
-    assert (
-        "means over fox\n" in means
-        and "| MoE-GS | **30.00** |" in means
-        and "not every row has a run there: fern" in means
-        and "10.00" not in means
-    )
+    assert "means over fox\n" in means and "| MoE-GS | **30.00** |" in means and "fern" in means and "10.00" not in means
     assert "10.00" in by_scene
 
 
 def test_short_trainings_are_said_to_be_no_judges():
     assert report.caveat([record(iterations=30_000)]) == report.caveat([]) == []
     (line, _) = report.caveat([record(iterations=3000), record(iterations=200)])
-    assert "3,000 iterations with 13 densification steps, not 30,000" in line
+    assert all(fact in line for fact in ("3,000", "13", "30,000"))
     several = report.caveat([record("octree-gs"), record()])[0]
-    assert "3,000 iterations with 13 to 17 " in several
-    assert "say nothing about the paper" in report.caveat([record(iterations=200)])[0]
+    assert all(fact in several for fact in ("3,000", "13", "17"))
+    assert "200" in report.caveat([record(iterations=200)])[0]

@@ -28,13 +28,13 @@ def test_ours_stand_beside_the_papers():
     rows = {row[0]: row for row in table.rows}
     assert rows["MoE-GS"][1] == "24.50 ± 0.71" and rows["MoE-GS"][5] == "24.61"
     assert rows["w/o MoE"][1] == "23.00" and rows["w/o CL"][1] == "-" and rows["w/o CL"][5] == "24.42"
-    assert not table.best and "w/o MoE: no run on truck with seed 1." in table.notes  # means over other seeds are no rivals
+    assert not table.best  # means over other seeds are no rivals
+    assert any("w/o MoE" in note and "truck" in note and "1" in note for note in table.notes)
     table = by_dataset(TABLE4, [r for r in runs() if r.seed == 0], "TanksAndTemples", ["truck"])
     assert (list(rows).index("MoE-GS"), 1) in table.best and (list(rows).index("w/o MoE"), 4) in table.best
     table = by_dataset(TABLE4, runs(), "TanksAndTemples", ["truck"])
-    assert (
-        any(note.startswith("No run: w/o CL") for note in table.notes)
-        and "3,000 iterations (13 densification steps), 30,000 iterations (134 " in table.notes[0]
+    assert any(note.startswith("No run: w/o CL") for note in table.notes) and all(
+        fact in table.notes[0] for fact in ("3,000", "13", "30,000", "134")
     )
 
 
@@ -71,14 +71,14 @@ def test_a_row_that_lacks_a_scene_is_no_rival():
     table = by_dataset(
         TABLE4, [*runs(), record("scaffold-gs-opacity", "train", 0, psnr=10.0, views=1)], "TanksAndTemples", ["truck", "train"]
     )
-    assert (list(TABLE4.rows).index("MoE-GS"), 1) not in table.best and "MoE-GS: no run on train." in table.notes
+    assert (list(TABLE4.rows).index("MoE-GS"), 1) not in table.best and any("MoE-GS" in note and "train" in note for note in table.notes)
 
 
 def test_notes_say_which_seeds_each_mean_is_of():
     pair = [record("moe-gs", s, seed, psnr=24.0 + seed) for s in ("truck", "train") for seed in (0, 1)]
     lacking = [record("scaffold-gs-opacity", s, seed) for s, seed in (("truck", 0), ("truck", 1), ("train", 0))]
     found = by_dataset(TABLE4, [*pair, *lacking], "TanksAndTemples", ["truck", "train"]).notes
-    assert any("w/o MoE: mean over seeds 0;" in note for note in found) and not any("MoE-GS: mean" in note for note in found)
+    assert any("w/o MoE" in note for note in found) and not any("MoE-GS" in note for note in found)
 
 
 def test_shares_of_experts_at_the_end():
@@ -96,7 +96,7 @@ def test_training_times_are_cpu_time_where_every_record_has_it():
     new = [record(row, seconds=90.0, cpu_seconds=150.0, load={"cores": 2, "start": 0.4, "end": 1.9}) for row in rows]
     cpu, wall = (by_dataset(EXPERIMENTS["fig6"], runs, "captures", ["fox"]) for runs in (new, [old, new[1]]))
     assert cpu.titles[2] == COLUMNS["cpu_seconds"].title and cpu.rows[0][2] == "150"
-    assert any("0.4 to 1.9 on 2 cores" in note for note in cpu.notes)
+    assert any("0.4" in note and "1.9" in note for note in cpu.notes)
     assert wall.titles[2] == COLUMNS["train_seconds"].title and wall.rows[0][2] == "100"
     assert any("wall times" in note for note in wall.notes) and not any("load average" in note for note in wall.notes)
 

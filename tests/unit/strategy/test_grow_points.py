@@ -59,7 +59,7 @@ def test_parts_of_another_method_are_refused():
     cfg = RECIPES["sags"][1]
     check(cfg)
     for wrong in (replace(cfg, growth=GrowAnchors()), replace(RECIPES["scaffold-gs"][1], growth=GrowPoints())):
-        with pytest.raises(InputError, match="graph points"):
+        with pytest.raises(InputError):
             check(wrong)
 
 

@@ -61,7 +61,7 @@ def test_each_view_comes_once_an_epoch(capture):
 def test_another_configuration_is_refused(capture):
     training = started(capture)
     other = replace(training.cfg, seed=5)
-    with pytest.raises(InputError, match="seed was 0, is now 5"):
+    with pytest.raises(InputError, match=naming("seed", 0, 5)):
         Training.restore(other, training.tensors(), training.meta(), "cpu")
 
 
@@ -86,7 +86,7 @@ def test_checkpoints_that_hold_a_hash_alone_still_fit(capture):
     training = started(capture)
     meta = {k: v for k, v in training.meta().items() if k != "train"} | {"config": old_hash(training.cfg)}
     assert Training.restore(training.cfg, training.tensors(), meta, "cpu").step == 7
-    with pytest.raises(InputError, match="other settings"):
+    with pytest.raises(InputError, match="--out"):
         Training.restore(replace(training.cfg, sparse_adam=True), training.tensors(), meta, "cpu")
 
 

@@ -36,7 +36,7 @@ def test_keyframes_become_a_path_that_render_reads(viewer, capture, tmp_path):
 def test_playing_moves_the_client(viewer):
     handle, keys = joined(viewer), viewer.panel.keyframes
     keys.play(handle)
-    assert "at least two" in keys.words.content
+    assert keys.words.content
     for x in (0.0, 1.0):
         handle.camera.position = np.array([x, 0.0, 0.0])
         keys.add(handle)

@@ -52,7 +52,7 @@ def test_an_archive_is_fetched_once(server: Server, tmp_path: Path) -> None:
     assert read_tree(folder).keys() == {*FILES, "source.json"} and not (tmp_path / "pair" / "train").exists()
     assert {told[0] for told in seen} == {"both.zip", "unpacking truck"}
     assert any(digest in line for line in said)
-    assert get(both, tmp_path)[0] == f"truck is at {folder}" and server.asked == [None]
+    assert str(folder) in get(both, tmp_path)[0] and server.asked == [None]
     assert all(obtain.is_present(tmp_path, s) for s in both)
     assert get(both, tmp_path) == [f"{s.name} is at {tmp_path / s.path}" for s in both]
 

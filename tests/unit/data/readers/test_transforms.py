@@ -25,7 +25,7 @@ def test_frames_without_a_file_are_dropped_and_counted(tmp_path: Path) -> None:
     (tmp_path / "images/view_002.png").unlink()
     capture = load(tmp_path)
     assert len(capture.views) == 4
-    assert any("1 of 5 frames" in w and "images/view_002.png" in w for w in capture.warnings)
+    assert any("images/view_002.png" in w for w in capture.warnings)
     for path in (tmp_path / "images").iterdir():
         path.unlink()
     with pytest.raises(InputError, match="5"):
