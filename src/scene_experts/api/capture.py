@@ -225,6 +225,9 @@ def load_capture(
     """
     chosen = normalise or ("none" if str(path).startswith("catalog:") else "extent")
     data = Data(Path(path), images, resolution, split, missing, chosen, init, max_views, near, ignore_principal_point, background)
+    for name, value in (("resolution", resolution), ("split", split)):
+        if not isinstance(value, str):
+            raise InputError(f"expected {name} as text such as 'longest:800' or 'mod8', found {value!r}; write it in quotes")
     for name, value, known in (
         ("missing", missing, ("error", "drop")),
         ("normalise", chosen, ("extent", "none")),

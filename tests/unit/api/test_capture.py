@@ -93,3 +93,8 @@ def test_random_points_follow_the_seed(folder, capture):
     other = random.with_seed(3)
     assert not np.array_equal(other.points[0], random.points[0])
     assert np.array_equal(other.points[0], se.load_capture(folder, init="random", seed=3).points[0])
+
+
+def test_a_resolution_that_is_no_text_is_refused():
+    with pytest.raises(se.InputError, match="resolution"):
+        se.load_capture("anywhere", resolution=64)  # type: ignore[arg-type]
