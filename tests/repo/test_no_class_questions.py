@@ -10,14 +10,6 @@ import scene_experts
 
 SOURCE = Path(scene_experts.__file__).parent
 OWNERS = ("scene", "strategy")  # the rooms whose classes nobody else asks for
-LEFT = {  # places that still ask; the list only shrinks
-    "files/anchors/extras.py": 1,
-    "files/bake/bake.py": 2,
-    "files/bake/export.py": 5,
-    "files/export.py": 5,
-    "files/gaussians.py": 2,
-    "files/graph/write.py": 2,
-}
 PART = re.compile(r"\b(scene|growth|strategy|decoder|select|heads?|rates|optimizer)(\]|\b)[^.(]*$")  # what an expression ends with
 
 
@@ -75,5 +67,4 @@ def test_nobody_asks_for_the_class_of_a_scene():
         place = path.relative_to(SOURCE).as_posix()
         if not place.startswith("scene/") and (lines := questions(path.read_text())):
             found[place] = lines
-    too_many = {place: lines for place, lines in found.items() if len(lines) > LEFT.get(place, 0)}
-    assert not too_many
+    assert not found
