@@ -56,7 +56,7 @@ class BalancedHead(MixtureHead):
         if mode is Mode.TRAIN and routing.chosen is not None and step != self.moved_at:
             count = torch.bincount(routing.chosen.reshape(-1), minlength=self.config.num).to(w.dtype)
             self.router_balance += self.config.speed * (count.mean() - count).sign()
-            self.moved_at = step  # losses over the whole scene ask again
+            self.moved_at = step  # a loss over the whole scene calls `route` a second time
         return routing, w
 
     def weights(self, step: int) -> None:
