@@ -64,9 +64,8 @@ def export(args: list[str]) -> int:
     if bakes:
         reuse_freed()
     line = shlex.join([PROG, "export", *args])
-    with ProgressBar(Console(stderr=True)) if bakes else nullcontext() as bar:
-        progress = {} if bar is None else {"tell": bar}
-        written = write(run, command.format, command.out, command.options, command=line, **progress)
+    with ProgressBar(Console(stderr=True)) if bakes else nullcontext(lambda what, done, total: None) as tell:
+        written = write(run, command.format, command.out, command.options, command=line, tell=tell)
     for file in written:
         print("\n".join(file.lines))
     return 0

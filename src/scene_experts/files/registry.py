@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from importlib.abc import InspectLoader
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -198,7 +197,8 @@ def about(name: str) -> str:
     """What a format is, in one sentence: the first of its module's docstring, read without
     importing the module."""
     spec = find_spec(_module(name))
-    source = spec.loader.get_source(spec.name) if spec is not None and isinstance(spec.loader, InspectLoader) else None
+    read_source = getattr(spec.loader, "get_source", None) if spec is not None else None  # the loader of an editable install has it too
+    source = read_source(spec.name) if spec is not None and read_source is not None else None
     text = ast.get_docstring(ast.parse(source)) if source else None
     return " ".join((text or "").partition("\n\n")[0].split())
 

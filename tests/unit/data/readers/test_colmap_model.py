@@ -14,6 +14,7 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.data.readers.colmap_model import ColmapImage, Model, find_model, read_model, write_model
 from support.lenses import LENSES
+from support.messages import naming
 
 
 def model() -> Model:
@@ -115,7 +116,7 @@ def test_no_model(tmp_path: Path) -> None:
 def test_missing_files_are_named(tmp_path: Path, name: str) -> None:
     write_model(tmp_path, model())
     (tmp_path / f"{name}.bin").unlink()
-    with pytest.raises(InputError, match=f"{name}.bin or {name}.txt"):
+    with pytest.raises(InputError, match=naming(f"{name}.bin", f"{name}.txt")):
         read_model(tmp_path)
 
 

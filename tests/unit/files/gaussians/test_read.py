@@ -120,7 +120,7 @@ def test_every_standard_file_comes_back_as_a_run(made, tmp_path, format):
     whole = file.read_bytes()
     end = whole.find(b'id="scene"') + 500 if format == "html" else len(whole) * 2 // 3 // 32 * 32 + 5
     file.write_bytes(whole[:end])
-    with pytest.raises(InputError, match=r"^expected [^\n]*$"):
+    with pytest.raises(InputError, match=r"^[^\n]+$"):
         import_files(file, Data(folder), tmp_path / "damaged")
     assert not (tmp_path / "damaged").exists()
 
