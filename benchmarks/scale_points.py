@@ -26,12 +26,13 @@ from scene_experts.core.types import Gaussians
 from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap_model import ColmapImage, Model, write_model
+from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.files.anchors import FAMILY
 from scene_experts.files.formats import compact
 from scene_experts.render import choose
 from scene_experts.strategy import observe
-from scene_experts.training.config import Data, RunConfig
+from scene_experts.training.config import RunConfig
 from scene_experts.training.photometric import photometric
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.state import Training, save

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from scene_experts.api.camera import Camera, from_trained, vector
 from scene_experts.core.errors import InputError
 from scene_experts.data import views
+from scene_experts.data.settings import Data
 from scene_experts.training import run_folder
-from scene_experts.training.config import Data
 from scene_experts.view import paths
 
 

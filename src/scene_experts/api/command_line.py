@@ -7,8 +7,9 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
-from scene_experts.training.config import Data, Train, flag
+from scene_experts.training.config import Train, flag
 
 
 def command_of(cfg: Train, data: Data, out: Path | None, deterministic: bool, stop_at: int | None) -> str:

@@ -24,10 +24,11 @@ from scene_experts.core.errors import InputError, few, nearest
 from scene_experts.core.signals import handled
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.catalog import PREFIX, Numbers, one
+from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer
 from scene_experts.training import run_folder
-from scene_experts.training.config import Data, RunConfig, Train, with_numbers
+from scene_experts.training.config import RunConfig, Train, with_numbers
 from scene_experts.training.events import Exported
 from scene_experts.training.loop import Run
 from scene_experts.training.memory import reuse_freed

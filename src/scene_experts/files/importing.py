@@ -6,12 +6,13 @@ from pathlib import Path
 
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
+from scene_experts.data.settings import Data
 from scene_experts.files.export import write_result_folder
 from scene_experts.files.formats.ply import read_vertices
 from scene_experts.files.registry import FAMILIES, Family, family_named, recognise
 from scene_experts.files.result_folder import is_result, iteration_folder
 from scene_experts.training import run_folder
-from scene_experts.training.config import Data, RunConfig
+from scene_experts.training.config import RunConfig
 
 
 def import_files(source: Path, data: Data, out: Path, iteration: int | None = None) -> Path:

@@ -25,9 +25,10 @@ from scene_experts.core.errors import InputError, nearest
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from scene_experts.data.settings import Data
     from scene_experts.data.views import Capture, World
     from scene_experts.scene import Scene
-    from scene_experts.training.config import Data, Train
+    from scene_experts.training.config import Train
     from scene_experts.training.run_folder import OpenRun
 
 FORMATS = {

@@ -15,9 +15,10 @@ from scene_experts.data.fetch import catalog
 from scene_experts.data.fetch.obtain import is_present
 from scene_experts.data.images import check_policy
 from scene_experts.data.readers import is_capture, unrecognised_error
+from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import Experiment
-from scene_experts.training.config import Data, Train, flags_of, with_numbers
+from scene_experts.training.config import Train, flags_of, with_numbers
 
 COLLECTIONS = {"mipnerf360": "MipNeRF360", "tandt": "TanksAndTemples", "db": "DeepBlending", "bungeenerf": "BungeeNeRF"}
 NEWER = ("optimizer",)  # settings of Train that the first records do not have: a default value does not change a run's hash

@@ -31,11 +31,12 @@ from scene_experts.core.plain import UnknownPart, first_difference, from_json, t
 from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
+from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
 from scene_experts.scene import Scene
 from scene_experts.training import capture_place
 from scene_experts.training.clock import Clock
-from scene_experts.training.config import Data, RunConfig, Train
+from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.state import scene_from
 
 FORMAT = 1

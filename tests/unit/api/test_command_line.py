@@ -9,7 +9,7 @@ import pytest
 import scene_experts as se
 from scene_experts.api.command_line import command_of
 from scene_experts.commands.train import parse_train
-from scene_experts.training.config import Data
+from scene_experts.data.settings import Data
 
 OUT = Path("a run")
 

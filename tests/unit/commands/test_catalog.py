@@ -14,8 +14,8 @@ from scene_experts import cli
 from scene_experts.commands import catalog as command
 from scene_experts.data.fetch import download, obtain
 from scene_experts.data.fetch.catalog import one
+from scene_experts.data.settings import Data
 from scene_experts.training import run_folder
-from scene_experts.training.config import Data
 from support.archives import in_folder, read_tree, write_tar
 from support.synthetic import make_capture
 from support.web import Server, serving

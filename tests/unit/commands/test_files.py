@@ -8,6 +8,7 @@ import pytest
 from scene_experts.arguments.parse import HelpAsked
 from scene_experts.commands.files import export, import_
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.data.settings import Data
 from scene_experts.files import registry
 from scene_experts.files.export import write_result_folder
 from scene_experts.recipes import RECIPES
@@ -15,7 +16,7 @@ from scene_experts.render import choose
 from scene_experts.scene.anchors.mlp import MLP
 from scene_experts.training import loop as train
 from scene_experts.training import run_folder
-from scene_experts.training.config import Data, RunConfig
+from scene_experts.training.config import RunConfig
 from support.messages import naming
 from support.synthetic import make_capture
 

@@ -7,8 +7,9 @@ import pytest
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.plain import UnknownPart, first_difference, from_json, to_json
+from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
-from scene_experts.training.config import Data, RunConfig, Train
+from scene_experts.training.config import RunConfig, Train
 from support.messages import naming
 
 

@@ -10,6 +10,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
+from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.files import registry
@@ -25,7 +26,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.training import run_folder
-from scene_experts.training.config import Data, RunConfig, Train
+from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.loop import Run, train
 from support.files import export_run
 from support.messages import naming

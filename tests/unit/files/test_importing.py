@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from scene_experts.core.errors import InputError
+from scene_experts.data.settings import Data
 from scene_experts.files.anchors import FAMILY as ANCHORS
 from scene_experts.files.formats.ply import write_vertices
 from scene_experts.files.gaussians import FAMILY as GAUSSIANS
 from scene_experts.files.importing import import_files, owner
 from scene_experts.files.registry import format_named
-from scene_experts.training.config import Data
 from support.messages import naming
 from support.splats import splats
 

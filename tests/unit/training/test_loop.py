@@ -10,6 +10,7 @@ import torch
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.data.capture import load
+from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.anchors.experts import Experts
@@ -17,7 +18,7 @@ from scene_experts.scene.anchors.scene import Anchors
 from scene_experts.scene.gaussians import Explicit
 from scene_experts.scene.graph.scene import GraphPoints
 from scene_experts.strategy.split_clone import SplitClone
-from scene_experts.training.config import Data, RunConfig
+from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Adjusted, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.loop import Run, iterate, stepped, without_graph
 from scene_experts.training.state import Training

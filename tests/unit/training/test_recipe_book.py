@@ -14,10 +14,11 @@ from scene_experts.commands.train import parse_train
 from scene_experts.core.schedule import Every
 from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
+from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES, moe_gs
 from scene_experts.render import choose
 from scene_experts.training import recipe_book, run_folder
-from scene_experts.training.config import Data, RunConfig, check
+from scene_experts.training.config import RunConfig, check
 from scene_experts.training.events import Adjusted, Finished, Stepped
 from scene_experts.training.loop import Run, train
 from scene_experts.training.recipe_book import GROUP, RecipeBook

@@ -10,9 +10,9 @@ from scene_experts.files.gaussians import write as writing
 from scene_experts.files.registry import Imported
 
 if TYPE_CHECKING:
+    from scene_experts.data.settings import Data
     from scene_experts.data.views import World
     from scene_experts.scene import Scene
-    from scene_experts.training.config import Data
     from scene_experts.training.run_folder import OpenRun
 
 

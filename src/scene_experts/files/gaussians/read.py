@@ -14,6 +14,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json
 from scene_experts.core.table import Table
+from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.files import result_folder
 from scene_experts.files.formats.ply import property_names
@@ -23,7 +24,7 @@ from scene_experts.files.registry import Imported, recognise
 from scene_experts.recipes import gs_3d
 from scene_experts.scene import Scene
 from scene_experts.scene.gaussians import Explicit, GaussianScene
-from scene_experts.training.config import Data, Train, from_json
+from scene_experts.training.config import Train, from_json
 from scene_experts.training.run_folder import OpenRun, load_capture
 
 log: logging.Logger = logging.getLogger(__name__)

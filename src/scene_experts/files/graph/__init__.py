@@ -9,8 +9,8 @@ from scene_experts.files.graph import write as writing
 from scene_experts.files.registry import Imported
 
 if TYPE_CHECKING:
+    from scene_experts.data.settings import Data
     from scene_experts.data.views import World
-    from scene_experts.training.config import Data
     from scene_experts.training.run_folder import OpenRun
 
 

@@ -12,6 +12,7 @@ from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.core.types import Mode
+from scene_experts.data.settings import Data
 from scene_experts.files.anchors import torchscript
 from scene_experts.files.anchors.data import by_attribute
 from scene_experts.files.anchors.read import check_networks, for_trained_unit, level_facts, read_folder
@@ -23,7 +24,6 @@ from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.scene.anchors.mlp import Plain
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 from scene_experts.training import run_folder
-from scene_experts.training.config import Data
 from scene_experts.training.state import resume
 from support.files import export_run, write_anchor_ply
 from support.messages import naming

@@ -10,6 +10,7 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
+from scene_experts.data.settings import Data
 from scene_experts.files import registry
 from scene_experts.files.export import write_result_folder
 from scene_experts.files.formats import ply, splat, spz
@@ -19,7 +20,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training import loop as train
 from scene_experts.training import run_folder
-from scene_experts.training.config import Data, RunConfig
+from scene_experts.training.config import RunConfig
 from support.files import export_run
 from support.messages import naming
 from support.synthetic import make_capture

@@ -7,12 +7,12 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
+from scene_experts.data.settings import Data
 from scene_experts.files.formats.ply import read_vertices, write_vertices
 from scene_experts.files.graph import read as graph_reader
 from scene_experts.files.importing import import_files
 from scene_experts.render import choose
 from scene_experts.training import run_folder
-from scene_experts.training.config import Data
 from support.messages import naming
 
 
