@@ -58,9 +58,8 @@ def stands_for(row: Row) -> str:
 
 
 def paragraphs(text: str, width: int) -> str:
-    """Text wrapped to `width`; lines that begin with a blank stay as they are."""
-    parts = text.strip().split("\n\n")
-    return "\n\n".join(part if part.startswith(" ") else wrapped(part, width) for part in parts)
+    """Paragraphs wrapped to `width`; one with indented lines, such as a list, stays as it is."""
+    return "\n\n".join(part if "\n " in part else wrapped(part, width) for part in text.strip().split("\n\n"))
 
 
 def wrapped(text: str, width: int, indent: int = 0) -> str:

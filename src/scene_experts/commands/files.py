@@ -8,12 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from scene_experts.arguments.help import columns
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
 from scene_experts.data.settings import Data
 from scene_experts.files.options import Options
 from scene_experts.files.registry import GAUSSIANS, about, format_named, format_names
+
+FIRST = ("--data", "--out", "--iteration", "--images", "--resolution", "--split")
+"""The options of `import` that people use first, for --help."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +29,11 @@ class ExportCommand:
     format: Annotated[str, Option(value="FORMAT")] = "compact"
     """File format, from the list above."""
     out: Path | None = None
-    """File or folder to write; inside the run folder by default."""
+    """File or folder to write; by default in the run folder."""
     step: int | None = None
-    """Iteration of the checkpoint to export; the newest by default."""
+    """Iteration of the checkpoint to export; by default the newest."""
     data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
-    """Where the capture is now, if it moved. Standard files need it, and so does every measurement."""
+    """Folder of the capture, if it has moved. Standard files and measurements need the capture."""
     options: Annotated[Options, Option(name="")] = Options()
 
 
@@ -43,7 +47,7 @@ class ImportCommand:
     out: Annotated[Path, Option(short="-m", value="RUN")]
     """Run folder to write."""
     iteration: int | None = None
-    """Iteration of the result folder; the newest by default."""
+    """Iteration of the result folder; by default the newest."""
 
 
 def export(args: list[str]) -> int:
@@ -64,8 +68,9 @@ def export(args: list[str]) -> int:
     if bakes:
         reuse_freed()
     line = shlex.join([PROG, "export", *args])
-    with ProgressBar(Console(stderr=True)) if bakes else nullcontext(lambda what, done, total: None) as tell:
-        written = write(run, command.format, command.out, command.options, command=line, tell=tell)
+    with ProgressBar(Console(stderr=True)) if bakes else nullcontext() as bar:
+        tell = bar or (lambda *_: None)
+        written = write(run, command.format, command.out, command.options, tell=tell, command=line)
     for file in written:
         print("\n".join(file.lines))
     return 0
@@ -74,7 +79,7 @@ def export(args: list[str]) -> int:
 def import_(args: list[str]) -> int:
     """Make a run folder of a result folder or a file and print where it is."""
     text = f"{ImportCommand.__doc__}\n\n{formats_help()}"
-    command = parse(ImportCommand, Command(f"{PROG} import", ("--source",), about=text), args)
+    command = parse(ImportCommand, Command(f"{PROG} import", ("--source",), FIRST, text), args)
 
     from scene_experts.files.importing import import_files
     from scene_experts.training.run_folder import named
@@ -86,5 +91,4 @@ def import_(args: list[str]) -> int:
 
 def formats_help() -> str:
     """The list of all formats for a help text."""
-    width = max(map(len, format_names()))
-    return "\n".join(["Formats:", "", *(f"  {name:<{width}}  {about(name)}" for name in format_names())])
+    return "\n".join(["Formats:", *(line for name in format_names() for line in columns(f"  {name}", about(name)))])
