@@ -1,9 +1,9 @@
-"""The methods and ablations of the paper, a few lines each. Nothing that trains, draws or scores knows a recipe by name.
-Recipes of other packages come beside them; `training/recipe_book.py` says how.
+"""The methods and ablations of the paper as recipes. Training, rendering and evaluation do not depend on the names of recipes.
+Other packages can add recipes; see `training/recipe_book.py`.
 
 3DGS: Kerbl et al., SIGGRAPH 2023.  3DGS-MCMC: Kheradmand et al., NeurIPS 2024.
 Scaffold-GS: Lu et al., CVPR 2024.  Octree-GS: Ren et al., 2024.  SAGS: Ververas et al., ECCV 2024.
-MoE-GS: Fu et al., "Scene Experts", AAAI 2026; tables and figures below are that paper's.
+MoE-GS: Fu et al., "Scene Experts", AAAI 2026. Table and figure numbers below refer to this paper.
 """
 
 from __future__ import annotations
@@ -113,4 +113,4 @@ OWN: dict[str, Recipe] = {
 }
 
 RECIPES = RecipeBook(OWN)
-"""All recipes by name: a sentence about each, and its value."""
+"""All recipes by name: a one-sentence description and the value of each."""

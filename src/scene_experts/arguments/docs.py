@@ -1,4 +1,4 @@
-"""The docstrings of a dataclass and of its fields, read from its source: a string below a field says what the field is."""
+"""Read the docstrings of a dataclass and its fields from the source. The docstring of a field is the string below it."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import itertools
 
 
 def of_field(kind: type, name: str) -> str:
-    """What the string below a field says, on one line; empty where there is none."""
+    """Return the docstring of a field on one line, or an empty string."""
     return next((found for owner in kind.__mro__ if (found := _fields(owner).get(name))), "")
 
 
 def of_class(kind: type) -> str:
-    """The docstring of a dataclass; empty where dataclass made one up."""
+    """Return the docstring of a dataclass, or an empty string if `dataclass` generated it."""
     text = inspect.cleandoc(kind.__doc__ or "")
     return "" if text.startswith(f"{kind.__name__}(") else text
 
 
 def title(kind: type) -> str:
-    """The first sentence of a dataclass's docstring."""
+    """Return the first sentence of the docstring of a dataclass."""
     return " ".join(of_class(kind).partition("\n\n")[0].split()).partition(". ")[0].removesuffix(".")
 
 
@@ -41,6 +41,6 @@ def _fields(kind: type) -> dict[str, str]:
 def _classes(module: object) -> list[ast.ClassDef]:
     try:
         source = inspect.getsource(module)  # type: ignore[arg-type]
-    except (OSError, TypeError):  # no source: the help has names and defaults alone
+    except (OSError, TypeError):  # without source, the help shows only names and defaults
         return []
     return [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef)]

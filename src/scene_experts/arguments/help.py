@@ -1,4 +1,4 @@
-"""The help of a command as plain text: how it is written, what it does, and its options in groups."""
+"""Format the help of a command as plain text: its usage, its description and its options in groups."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from scene_experts.arguments.table import Row
 from scene_experts.arguments.values import listed, placeholder, spelled
 
 INDENT = 2
-COLUMN = 26  # where the text beside an option begins
-SMALL = 3  # a dataclass of at most so many options is shown in the group around it
+COLUMN = 26  # column where the text of an option starts
+SMALL = 3  # dataclasses with at most this many options are shown in the enclosing group
 
 
 def page(kind: type, name: str, about: str, table: Sequence[Row], positional: Sequence[str], first: Sequence[str]) -> str:
-    """The help of the command `name`. first: the options to show, in this order; empty for all, in groups."""
+    """Return the help of the command `name`. `first` lists the options to show in order; if it is empty, all are shown in groups."""
     width = page_width()
     by_flag = {row.flag: row for row in table}
     words = [by_flag[flag] for flag in positional]
@@ -38,12 +38,12 @@ def page(kind: type, name: str, about: str, table: Sequence[Row], positional: Se
 
 
 def page_width() -> int:
-    """Columns of the terminal, at most 100."""
+    """Return the width of the terminal in columns, limited to 60 to 100."""
     return max(60, min(shutil.get_terminal_size().columns, 100))
 
 
 def written(name: str, table: Sequence[Row], positional: Sequence[str]) -> str:
-    """How a command is written with what it must be given: "scene-experts info CAPTURE"."""
+    """Return the usage of a command with its positional and required options, for example "scene-experts info CAPTURE"."""
     by_flag = {row.flag: row for row in table}
     first = [by_flag[flag] for flag in positional]
     words = [text if row.required else f"[{text}]" for row in first if (text := stands_for(row))]
@@ -52,13 +52,13 @@ def written(name: str, table: Sequence[Row], positional: Sequence[str]) -> str:
 
 
 def stands_for(row: Row) -> str:
-    """What stands for a row's value: CAPTURE, or what its type says."""
+    """Return the placeholder of an option's value, for example CAPTURE."""
     text = placeholder(row.kind, row.option.value)
     return text.removesuffix(" ...") if row.option.repeat else text
 
 
 def paragraphs(text: str, width: int) -> str:
-    """Paragraphs wrapped to `width`; one with indented lines, such as a list, stays as it is."""
+    """Wrap paragraphs to `width`. Paragraphs with indented lines, such as lists, are not changed."""
     return "\n\n".join(part if "\n " in part else wrapped(part, width) for part in text.strip().split("\n\n"))
 
 
@@ -70,12 +70,12 @@ def wrapped(text: str, width: int, indent: int = 0) -> str:
 
 
 def groups(kind: type, shown: Sequence[Row]) -> list[tuple[str, list[Row]]]:
-    """Rows under their headings: the dataclass that declares them, or, of a small one, the dataclass around it."""
+    """Group rows by the dataclass that declares them. Rows of a small dataclass belong to the enclosing dataclass."""
     out: dict[tuple[str, type | None], list[Row]] = {}
     for row in shown:
         out.setdefault(_group(row), []).append(row)
     titles = []
-    for (prefix, owner), rows in sorted(out.items(), key=lambda item: bool(item[0][0])):  # parts of the value come last
+    for (prefix, owner), rows in sorted(out.items(), key=lambda item: bool(item[0][0])):  # nested dataclasses come last
         name, text = prefix.removesuffix("."), docs.title(owner) if owner and owner is not kind else ""
         titles.append((f"{name}: {text}" if name and text else name or text or "Options", rows))
     return titles
@@ -87,7 +87,7 @@ def _prefix(row: Row) -> str:
 
 
 def _is_small(row: Row) -> bool:
-    """Whether the dataclass of a row is too small for a heading of its own."""
+    """Whether the dataclass of a row is too small for its own heading."""
     return "." in _prefix(row)[:-1] and len(fields(row.owner)) <= SMALL
 
 
@@ -102,14 +102,14 @@ def group(title: str, rows: Sequence[Row], width: int) -> str:
 
 
 def entry(row: Row, width: int, word: bool = False) -> list[str]:
-    """The lines of one option: its name and, beside or below it, what it does."""
-    switch = row.negative if row.default is True else ""  # the form that changes something
+    """Return the lines of one option: its name, with its description beside or below it."""
+    switch = row.negative if row.default is True else ""  # shown because the default is on
     names = ", ".join(name for name in (row.option.short, row.flag, switch) if name)
     return columns(" " * INDENT + (stands_for(row) if word else f"{names} {stands_for(row)}".rstrip()), described(row), width)
 
 
 def columns(left: str, text: str, width: int | None = None) -> list[str]:
-    """A name with its text in a column beside it, or below where the name is long."""
+    """Return the lines of a name with its text in a second column. The text starts below a long name."""
     lines = textwrap.wrap(text, (width or page_width()) - COLUMN, break_on_hyphens=False, break_long_words=False)
     if lines and len(left) + 2 <= COLUMN:
         left, lines = left.ljust(COLUMN) + lines[0], lines[1:]
@@ -117,7 +117,7 @@ def columns(left: str, text: str, width: int | None = None) -> list[str]:
 
 
 def described(row: Row) -> str:
-    """What an option does, and its default where the text does not say it."""
+    """Return the description of an option, with its default if the text does not contain it."""
     text = docs.of_field(row.owner, row.place[-1])
     if text and row.within and _is_small(row):
         above = docs.of_field(*row.within).partition(". ")[0].removesuffix(".")

@@ -1,4 +1,4 @@
-"""What a dataclass field says about its command-line option."""
+"""Annotation that describes the command-line option of a dataclass field."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Option:
-    """Annotation of a dataclass field, as in `out: Annotated[Path, Option(short="-m", value="RUN")]`.
+    """Annotation of a dataclass field, for example `out: Annotated[Path, Option(short="-m", value="RUN")]`.
 
-    A field without it becomes the option that its name spells: `max_views` is `--max-views`.
+    The name of an option defaults to the name of the field: `max_views` becomes `--max-views`.
     """
 
     name: str | None = None

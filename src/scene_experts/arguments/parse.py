@@ -1,4 +1,4 @@
-"""Words of a command line to a dataclass. Every command reads its options here, so all of them accept and refuse words alike."""
+"""Parse command-line arguments into a dataclass. All commands use this parser, so they accept and reject the same syntax."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ HELP, HELP_ALL = ("-h", "--help"), "--help-all"
 
 
 class HelpAsked(Exception):
-    """The words ask for help instead of a command; the text is the exception's argument."""
+    """The arguments request help. The help text is the argument of the exception."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """What `parse` knows of a command beside its options."""
+    """Description of a command for `parse`, without its options."""
 
     name: str
     """As it is typed: "scene-experts eval"."""
@@ -40,9 +40,9 @@ class Command:
 
 
 def parse(kind: type[T], command: Command, args: Sequence[str]) -> T:
-    """The dataclass that `args` describe.
+    """Parse `args` into an instance of the dataclass `kind`.
 
-    Raises InputError, in one sentence, for words that do not fit, and HelpAsked for -h, --help and --help-all.
+    Raises InputError if the arguments are invalid, and HelpAsked for -h, --help and --help-all.
     """
     table = rows(kind, command.defaults)
     if any(arg in HELP or arg == HELP_ALL for arg in args):
@@ -56,7 +56,7 @@ def parse(kind: type[T], command: Command, args: Sequence[str]) -> T:
 
 
 class _Reader:
-    """Walks once over the words and keeps the value of each option that they give."""
+    """Reads the arguments in one pass and collects the values of the options."""
 
     def __init__(self, command: Command, table: Sequence[Row]) -> None:
         self.command = command
@@ -95,7 +95,7 @@ class _Reader:
             takes = " ".join(map(stands_for, self.waiting)) or "options"
             raise InputError(f"expected only {takes} after `{self.command.name}`, found also '{args[0]}'; leave it out")
         row = left[0]
-        before = self.given.pop(row.place, ())  # words of a list may stand before and after an option
+        before = self.given.pop(row.place, ())  # the values of a list may precede and follow an option
         value = self._value(row, stands_for(row), _take(row, args))
         self._keep(row, stands_for(row), before + value if before else value)
 
@@ -124,12 +124,12 @@ class _Reader:
 
 
 def is_name(word: str) -> bool:
-    """Whether a word is an option's name, and no value: a negative number is a value."""
+    """Whether an argument is the name of an option. Negative numbers are values."""
     return len(word) > 1 and word.startswith("-") and not NUMBER.match(word)
 
 
 def _take(row: Row, args: list[str]) -> list[str]:
-    """The words of a row's value, taken away from the front of `args`."""
+    """Remove the values of an option from the front of `args` and return them."""
     most = 1 if row.option.repeat or (args and args[0] in NONE and without_none(row.kind)[1]) else count(row.kind)[1]
     end = next((i for i, word in enumerate(args) if is_name(word)), len(args))
     end = end if most is None else min(end, most)
@@ -139,7 +139,7 @@ def _take(row: Row, args: list[str]) -> list[str]:
 
 
 def _both(missing: Sequence[Row], command: Command) -> str:
-    """The options that are missing, as "--data and --out"."""
+    """Return the names of the missing options, for example "--data and --out"."""
     *some, last = [stands_for(row) if row.flag in command.positional else row.flag for row in missing]
     return f"{', '.join(some)} and {last}" if some else last
 

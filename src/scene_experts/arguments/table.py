@@ -1,4 +1,4 @@
-"""The options of a dataclass: one row for each field, with its name, type and default; and the value that given options make."""
+"""List the options of a dataclass, one row per field with name, type and default, and create the dataclass from given values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from scene_experts.arguments.option import Option
 
 Place = tuple[str, ...]
-"""Names of the fields from the root to a value, as ("cfg", "scene", "voxel_size")."""
+"""Field names from the root to a value, for example ("cfg", "scene", "voxel_size")."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Row:
 
     @property
     def negative(self) -> str:
-        """The name that turns a switch off, `--growth.no-elimination`; empty for other types."""
+        """The name that turns a switch off, for example `--growth.no-elimination`. Empty for other types."""
         before, dot, last = self.flag.rpartition(".")
         if self.kind is not bool:
             return ""
@@ -51,10 +51,13 @@ class Row:
 
 
 def rows(kind: type, defaults: Mapping[str, Any]) -> list[Row]:
-    """The options of a dataclass and of the dataclasses in it, in the order of their fields.
+    """Return the options of a dataclass and its nested dataclasses, in the order of the fields.
 
-    defaults: values by dotted place ("data.split") that replace those of the fields. A field that may hold one of several dataclasses
-    has the options of its default's class.
+    A field that accepts several dataclasses has the options of the class of its default.
+
+    Args:
+        kind: The dataclass.
+        defaults: Values by dotted path ("data.split") that replace the defaults of the fields.
     """
     return _rows(kind, MISSING, "", (), defaults, None)
 
@@ -77,7 +80,7 @@ def _rows(kind: type, value: Any, prefix: str, place: Place, defaults: Mapping[s
 
 
 def make(kind: type, given: Mapping[Place, Any], defaults: Mapping[str, Any]) -> Any:
-    """The value of a dataclass whose fields are `given` by place, else their defaults."""
+    """Create a dataclass from the `given` values by place. Other fields have their defaults."""
     return _make(kind, MISSING, (), given, defaults)
 
 
@@ -114,7 +117,7 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def _annotation(kind: type, name: str) -> tuple[Option, Any]:
-    """The Option of a field, and its type."""
+    """Return the Option of a field and its type."""
     hint = _hints(kind)[name]
     if typing.get_origin(hint) is not Annotated:
         return Option(), hint
@@ -123,7 +126,7 @@ def _annotation(kind: type, name: str) -> tuple[Option, Any]:
 
 
 def _dataclass_of(kind: Any, default: Any) -> type | None:
-    """The dataclass whose fields are the options of a field, or None where the field is an option itself."""
+    """Return the dataclass whose fields are the options of a field, or None if the field itself is an option."""
     if is_dataclass(default) and not isinstance(default, type):
         return type(default)
     return kind if default is MISSING and isinstance(kind, type) and is_dataclass(kind) else None
@@ -134,6 +137,6 @@ def _may_be_dataclass(kind: Any) -> bool:
 
 
 def members(kind: Any) -> tuple[Any, ...]:
-    """The types of a union; of any other type, the type alone."""
+    """Return the types of a union, or a tuple with the type if it is not a union."""
     union = typing.get_origin(kind) in (typing.Union, types.UnionType)
     return typing.get_args(kind) if union else (kind,)

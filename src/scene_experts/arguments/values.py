@@ -1,4 +1,4 @@
-"""Words of a command line to values of a field's type. One sentence for a word that does not fit."""
+"""Convert command-line arguments to the type of a field. Errors are one sentence."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from scene_experts.core.errors import InputError, nearest
 
 NONE = ("none", "None")
 LONG = 40  # characters; longer choices are listed in the text beside an option
-FEW = 4  # of so few choices none is named again as the nearest
+FEW = 4  # with at most this many choices, errors do not suggest the nearest one
 WORDS: dict[Any, tuple[str, str, Callable[[str], Any]]] = {
     int: ("a whole number", "N", int),
     float: ("a number", "X", float),
     str: ("a value", "TEXT", str),
     Path: ("a path", "PATH", Path),
 }
-"""Of the plain types: how a sentence calls them, how the help writes them, and how a word becomes one."""
+"""Basic types: their name in messages, their placeholder in the help, and the function that converts an argument."""
 
 
 def count(kind: Any) -> tuple[int, int | None]:
-    """How many words a value takes: at least, at most (None: any number)."""
+    """Return the minimum and maximum number of arguments of a value. A maximum of None means any number."""
     inner, optional = without_none(kind)
     if inner is bool:
         return 0, 0
@@ -34,9 +34,9 @@ def count(kind: Any) -> tuple[int, int | None]:
 
 
 def convert(kind: Any, words: Sequence[str], name: str, example: str) -> Any:
-    """The value that words spell; "none" is None, or an empty list.
+    """Convert arguments to a value of type `kind`. "none" becomes None or an empty tuple.
 
-    Raises InputError, naming the option `name` and giving an `example` of what is right.
+    Raises InputError, which names the option `name` and shows a valid `example`, if an argument is invalid.
     """
     inner, optional = without_none(kind)
     many = count(inner)[1] is None
@@ -67,7 +67,7 @@ def _one(kind: Any, word: str, name: str, example: str) -> Any:
 
 
 def described(kind: Any) -> str:
-    """What a sentence calls a value of the type: "a whole number", "auto, cpu or cuda"."""
+    """Return the name of a type in messages, for example "a whole number" or "auto, cpu or cuda"."""
     inner, _ = without_none(kind)
     if typing.get_origin(inner) is Literal:
         *some, last = map(str, typing.get_args(inner))
@@ -79,7 +79,7 @@ def described(kind: Any) -> str:
 
 
 def listed(kind: Any) -> str:
-    """The choices of a type whose placeholder does not show them: "a, b or c"; else empty."""
+    """Return the choices of a type, "a, b or c", or an empty string if the placeholder shows them."""
     inner, _ = without_none(kind)
     if typing.get_origin(inner) is tuple:
         inner = typing.get_args(inner)[0]
@@ -87,7 +87,7 @@ def listed(kind: Any) -> str:
 
 
 def placeholder(kind: Any, name: str = "") -> str:
-    """What stands for the value in the help: "N", "auto|cpu|cuda", "N ...". name: in place of the type's own."""
+    """Return the placeholder of a value in the help: "N", "auto|cpu|cuda", "N ...". `name` replaces the name of the type."""
     inner, _ = without_none(kind)
     if inner is bool:
         return ""
@@ -104,14 +104,14 @@ def placeholder(kind: Any, name: str = "") -> str:
 
 
 def spelled(value: Any) -> str:
-    """A value as one writes it on the command line."""
+    """Format a value as on the command line."""
     if isinstance(value, tuple):
         return " ".join(map(spelled, value)) or NONE[0]
     return "none" if value is None else f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else str(value)
 
 
 def without_none(kind: Any) -> tuple[Any, bool]:
-    """The type that is no None, and whether None is a value too."""
+    """Return the type without None, and whether None is allowed. Raises TypeError for a union of several other types."""
     rest = [each for each in members(kind) if each is not type(None)]
     if len(rest) != 1:
         raise TypeError(f"an option cannot be one of {rest}")

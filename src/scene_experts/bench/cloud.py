@@ -15,7 +15,7 @@ import torch
 from scene_experts.core.types import Camera, Gaussians
 from scene_experts.geometry.neighbours import knn_d2
 
-POINTS = 138_766  # of the synthetic cloud: as many as in the garden capture
+POINTS = 138_766  # number of points of the synthetic cloud, as in the garden capture
 
 
 @dataclass(frozen=True)

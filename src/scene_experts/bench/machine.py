@@ -12,16 +12,16 @@ from scene_experts.bench import peer
 from scene_experts.bench.measure import Clock, choose_clock, measure_minima
 from scene_experts.native import library as native
 
-CHUNKS = 100  # of the arithmetic loop: about a millisecond
+CHUNKS = 100  # chunks of the arithmetic loop: about a millisecond
 
 
 @dataclass(frozen=True)
 class Machine:
-    """The machine of the measurements. Rates are of one thread, and None without the compiled library that measures them."""
+    """The machine of the measurements. Rates are for one thread, and None without the compiled library that measures them."""
 
     processor: str
     cores: int  # available to this process
-    threads: int  # that the figures of "all threads" use
+    threads: int  # used for the figures of "all threads"
     level: str | None  # instruction set of the compiled library in use
     levels: tuple[str, ...]  # installed libraries that this processor runs
     torch: str

@@ -43,10 +43,15 @@ def choose_clock(threads: int) -> Clock:
 def measure_minima(
     subjects: Mapping[str, Subject], seconds: float, clock: Clock, runs: Mapping[str, int] | None = None
 ) -> dict[str, tuple[float, ...]]:
-    """Minimum seconds of each part of each subject, over rounds that run every subject once until `seconds` of wall time have passed.
+    """Return the minimum time of each part of each subject, s. Each round runs every subject once, until `seconds` have passed.
 
-    runs: the largest number of runs of a slow subject; its time does not count. The others run at least twice, because the first run finds
-    cold memory.
+    Subjects run at least twice, because memory is cold in the first run.
+
+    Args:
+        subjects: Functions that run once and return the seconds of their parts, by name.
+        seconds: Budget of wall time, s.
+        clock: The clock for the measurements.
+        runs: Maximum number of runs of slow subjects, by name. Their time does not count towards the budget.
     """
     best: dict[str, tuple[float, ...]] = {}
     spent, turn, limits = 0.0, 0, runs or {}

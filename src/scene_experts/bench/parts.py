@@ -24,7 +24,7 @@ ONE_IN_TORCH = "one network in torch"
 
 
 def make_scene(config: Anchors, anchors: int, seen: float = 0.5) -> tuple[AnchorScene, Tensor]:
-    """Random anchors with features like trained ones, and `anchors` rows of them in view, the share `seen`."""
+    """Create random anchors with features similar to trained ones, and the `anchors` visible rows, which are the share `seen`."""
     torch.manual_seed(0)
     total = round(anchors / seen)
     params = {
@@ -69,7 +69,7 @@ class Decode:
 
 
 def measure_decode(anchors: int, machine: Machine, seconds: float) -> list[Result]:
-    """The paper's Top-2 of 5 and one network, each compiled and in torch. Ratios are to one network in torch."""
+    """Measure Top-2 of 5 experts (the paper) and one network, compiled and in torch. Ratios are to one network in torch."""
     one, top2 = Anchors(decoder=Plain()), Anchors(decoder=Experts(num=5, top_k=2))
     kinds = {ONE_IN_TORCH: (one, "composed"), "Top-2 of 5 in torch": (top2, "composed")}
     if machine.level is not None:
@@ -96,7 +96,7 @@ def count_multiply_adds(config: Anchors, experts: int) -> int:
 
 
 def measure_loss(width: int, height: int, machine: Machine, seconds: float) -> list[Result]:
-    """L1 + SSIM with its gradient, in one compiled call and in plain torch."""
+    """Measure L1 + SSIM with its gradient, in one compiled call and in plain torch."""
     torch.manual_seed(0)
     target = torch.rand(height, width, 3)
     image = (target + 0.05 * torch.randn_like(target)).clamp(0, 1)

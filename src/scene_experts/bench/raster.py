@@ -56,7 +56,7 @@ def time_draw(rasterize: Rasterizer, scene: Picture, clock: Clock) -> tuple[floa
 
 
 def measure(scene: Picture, machine: Machine, seconds: float) -> list[Result]:
-    """Times forward and backward, their ratios to both peers, cycles per pair, and the share of the arithmetic bound."""
+    """Measure forward and backward times, their ratios to both peers, cycles per pair, and the share of the arithmetic bound."""
     subjects: dict[str, Subject] = {}
     if machine.level is not None:
         subjects[machine.level] = partial(time_draw, CpuRasterizer(level=machine.level, threads=1), scene)

@@ -77,7 +77,7 @@ class Work:
 
 
 def make_work(recipe: str, anchors: int, width: int, height: int, rasterize: Rasterizer | None = None, seen: float = 0.5) -> Work:
-    """A step on random anchors: the share `seen` of them fills the image of one camera, the rest lies behind it.
+    """Create a step on random anchors. The share `seen` of them fills the image of one camera. The others lie behind the camera.
 
     The networks are freshly initialised. The features are random, so that anchors choose different experts.
     """
@@ -98,12 +98,12 @@ def make_work(recipe: str, anchors: int, width: int, height: int, rasterize: Ras
 
 @torch.no_grad()
 def copy_networks(mixture: Work, base: Work) -> None:
-    """Copy a baseline's anchors to a mixture, and its networks to every expert. Both then draw the same Gaussians except for rounding."""
+    """Copy the anchors of a baseline to a mixture, and its networks to every expert. Both then decode the same Gaussians up to rounding."""
     for name, value in mixture.training.scene.table.params.items():
         value.copy_(base.training.scene.table.params[name])
     networks = base.training.scene.network_tensors()
     for name, value in mixture.training.scene.network_tensors().items():
-        if name in networks:  # [E, ...] from [1, ...]; routers are the mixture's own
+        if name in networks:  # [E, ...] from [1, ...]; only the mixture has routers
             value.copy_(networks[name].expand_as(value))
 
 

@@ -1,8 +1,7 @@
-"""Checkpoints: named tensors and a JSON description in one safetensors file, written whole or not at all, checked when read.
+"""Checkpoints: named tensors and JSON metadata in one safetensors file. Files are written atomically and verified when they are read.
 
-A file is a safetensors file whose header carries one JSON string under "scene_experts": {"kind", "format", "sha256", "meta"}. The digest
-covers every tensor's name, dtype, shape and bytes, so a file that was cut, overwritten or damaged is told from a whole one. Nothing is
-pickled.
+The header of the file holds one JSON string under "scene_experts": {"kind", "format", "sha256", "meta"}. The digest covers the name,
+dtype, shape and bytes of every tensor, so truncated, overwritten and damaged files are detected. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -36,9 +35,21 @@ log: logging.Logger = logging.getLogger(__name__)
 def save(folder: Path, step: int, tensors: dict[str, Tensor], meta: dict[str, Any], keep: int = 2) -> Path:
     """Write `folder/ckpt_<step>.safetensors` atomically, then remove all but the newest `keep` files up to this step.
 
-    tensors: any dtype that safetensors has (float64 to bfloat16, integers, bool), any device; they may share memory.
-    meta: plain JSON values without NaN. What a killed save left behind is removed first.
-    Raises RunError when the disk is full or not writable; the checkpoints before this one are then untouched.
+    Temporary files of an interrupted save are removed first.
+
+    Args:
+        folder: The folder of the checkpoints.
+        step: The iteration.
+        tensors: Tensors of any dtype that safetensors supports (float64 to bfloat16, integers, bool), on any device. They may share
+            memory.
+        meta: Plain JSON values without NaN.
+        keep: Number of checkpoints to keep, at least 1.
+
+    Returns:
+        The path of the checkpoint.
+
+    Raises:
+        RunError: The disk is full or not writable. Earlier checkpoints are unchanged.
     """
     folder = Path(folder)
     for leftover in folder.glob(".ckpt_*.part"):
@@ -52,15 +63,15 @@ def save(folder: Path, step: int, tensors: dict[str, Tensor], meta: dict[str, An
 
 
 def latest(folder: Path) -> Path | None:
-    """The newest checkpoint in `folder` that is whole, or None; files cut short or damaged are skipped with a warning."""
+    """Return the newest valid checkpoint in `folder`, or None. Truncated and damaged files are skipped with a warning."""
     found = _whole(folder)
     return found[0] if found else None
 
 
 def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-    """Tensors and meta of the newest whole checkpoint, read once; None where there is none.
+    """Load the tensors and metadata of the newest valid checkpoint. Return None if there is none.
 
-    Raises InputError for another format version.
+    Raises InputError if the format version differs.
     """
     found = _whole(folder)
     if found is None:
@@ -81,19 +92,22 @@ def _whole(folder: Path) -> tuple[Path, dict[str, Tensor], dict[str, Any]] | Non
 
 
 def load(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors (CPU) and meta of a checkpoint. Raises InputError when it is absent, damaged, of another format version, or none at all."""
+    """Load the tensors (on the CPU) and metadata of a checkpoint.
+
+    Raises InputError if the file does not exist, is damaged, is not a checkpoint or has another format version.
+    """
     return read_tensors(path, KIND, FORMAT)
 
 
 def expect(meta: dict[str, Any], *, recipe: str) -> None:
-    """Raises InputError when the checkpoint that `meta` describes was trained with another recipe."""
+    """Raise InputError if the checkpoint of `meta` was trained with another recipe."""
     found = meta.get("recipe")
     if found != recipe:
         raise InputError(f"expected a checkpoint of recipe '{recipe}', found one of '{found}'; use that recipe, or start in another folder")
 
 
 def _numbered(folder: Path) -> list[tuple[int, Path]]:
-    """(step, file) of every checkpoint in `folder`, newest first, whole or not."""
+    """Return (step, file) of every checkpoint in `folder`, newest first, without verifying the files."""
     if not folder.is_dir():
         return []
     found = [(_NAME.fullmatch(file.name), file) for file in folder.iterdir()]
@@ -104,23 +118,24 @@ def _numbered(folder: Path) -> list[tuple[int, Path]]:
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], kind: str, version: int, meta: dict[str, Any]) -> None:
-    """Write tensors and meta to a safetensors file of `kind`, atomically. Raises RunError when the disk is full or not writable."""
+    """Write tensors and metadata to a safetensors file of `kind` atomically. Raises RunError if the disk is full or not writable."""
     plain = _separate(tensors)
     text = json.dumps({"kind": kind, "format": version, "sha256": digest(plain), "meta": meta}, allow_nan=False)
 
     def write(temporary: Path) -> None:
         try:
             save_file(plain, temporary, metadata={KEY: text})
-        except SafetensorError as error:  # the library reports a full disk in its own type
+        except SafetensorError as error:  # safetensors reports a full disk with its own exception
             raise OSError(str(error)) from error
 
     write_atomic(Path(path), write)
 
 
 def read_tensors(path: Path, kind: str, version: int | None = None) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors (CPU, in memory of their own) and meta that `write_tensors` wrote; `version` None admits every format version.
+    """Read the tensors (on the CPU, without shared memory) and metadata that `write_tensors` wrote.
 
-    Raises InputError: no such file, not one of ours, of another kind or version, cut short, or damaged.
+    A `version` of None accepts every format version.
+    Raises InputError if the file does not exist, is truncated or damaged, or has another type, kind or version.
     """
     path = Path(path)
     what = f"a {kind} file"
@@ -150,7 +165,7 @@ def _expect_format(head: dict[str, Any], kind: str, version: int, path: Path) ->
 
 
 def _head(text: str | None, kind: str, path: Path) -> dict[str, Any]:
-    """The description in a file's header, its form checked."""
+    """Parse and check the metadata in the header of a file."""
     try:
         head = json.loads(text) if text else None
     except json.JSONDecodeError:
@@ -163,7 +178,7 @@ def _head(text: str | None, kind: str, path: Path) -> dict[str, Any]:
 
 
 def digest(tensors: dict[str, Tensor]) -> str:
-    """SHA-256 of names, dtypes, shapes and bytes of CPU tensors, in the order of names."""
+    """Return the SHA-256 of the names, dtypes, shapes and bytes of CPU tensors, sorted by name."""
     sha = hashlib.sha256()
     for name in sorted(tensors):
         value = tensors[name]
@@ -173,7 +188,7 @@ def digest(tensors: dict[str, Tensor]) -> str:
 
 
 def _separate(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors on the CPU, contiguous, each in memory of its own, as safetensors wants them."""
+    """Return contiguous CPU tensors that share no memory, as safetensors requires."""
     seen: set[int] = set()
     out = {}
     for name, value in tensors.items():

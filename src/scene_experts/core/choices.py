@@ -1,4 +1,4 @@
-"""Names of devices and rasterisers, as commands and the Python API take them."""
+"""Names of devices and rasterisers that the commands and the Python API accept."""
 
 from typing import Literal
 

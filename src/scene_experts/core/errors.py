@@ -1,4 +1,4 @@
-"""The two ways a command ends badly. Every message says what was expected, what was found and what to do, in one sentence."""
+"""The two errors that end a command. Each message states in one sentence what was expected, what was found and what to do."""
 
 import difflib
 from collections.abc import Iterable, Sequence
@@ -13,14 +13,14 @@ class RunError(Exception):
 
 
 def expect_at_least(numbers: list[tuple[str, float, float]]) -> None:
-    """Raises InputError for the first (flag, value, least) whose value is below."""
+    """Raise InputError for the first (flag, value, least) whose value is below `least` or NaN."""
     for flag, value, least in numbers:
         if not value >= least:
             raise InputError(f"expected {flag} of at least {least}, found {value}; give a larger number or leave it out")
 
 
 def nearest(word: str, words: Iterable[str]) -> str:
-    """A hint at the known words most like an unknown one: "; did you mean 'moe-gs'?", or nothing."""
+    """Return a hint with the known words closest to `word`, for example "; did you mean 'moe-gs'?", or an empty string."""
     like = difflib.get_close_matches(word, list(words), 3, 0.6)  # best first
     alike = [difflib.SequenceMatcher(None, found, word).ratio() for found in like]
     close = [found for found, ratio in zip(like, alike) if ratio > alike[0] - 0.05]
@@ -28,5 +28,5 @@ def nearest(word: str, words: Iterable[str]) -> str:
 
 
 def few(names: Sequence[str], most: int = 3) -> str:
-    """The first of many names, and how many more there are."""
+    """Return the first `most` names, joined by commas, and the number of the remaining names."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

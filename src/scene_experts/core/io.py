@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and locks."""
+"""Atomic file writes, and lock files."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from scene_experts.core.errors import InputError, RunError
 
 
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write(temporary)` make a file beside `path`, then move it onto `path` in one step.
+    """Write a file atomically: `write(temporary)` writes to a temporary file beside `path`, which then replaces `path`.
 
-    The bytes are synced before the move, so after a crash or a power cut `path` is either the old file or the new one.
-    Raises RunError (the old file untouched, the temporary removed) when the disk is full or not writable.
+    The data is synced to disk first, so after a crash or a power failure `path` is either the old file or the new one.
+    Raises RunError if the disk is full or not writable. The old file is then unchanged and the temporary file is removed.
     """
     path = Path(path)
     try:
@@ -51,7 +51,7 @@ _PLACE = (
     errno.EACCES,
     errno.EPERM,
     errno.EROFS,
-)  # the place's fault, not its room's
+)  # errors of the path, not of free space
 
 
 def _unwritable(path: Path, error: OSError) -> RunError:
@@ -60,7 +60,7 @@ def _unwritable(path: Path, error: OSError) -> RunError:
 
 
 def check_writable(path: Path) -> None:
-    """Make the folder of `path` and see that a file can be made there, before long work is done for it. Raises RunError where it cannot."""
+    """Create the folder of `path` and check that files can be created in it. Raises RunError if not. Call it before long work."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
@@ -71,13 +71,13 @@ def check_writable(path: Path) -> None:
 
 @contextmanager
 def locked(path: Path, busy: str) -> Iterator[None]:
-    """Hold the lock file `path` for this process; one that dies lets go. Raises InputError(busy) where another holds it."""
+    """Hold the lock file `path`. The lock ends with the process. Raises InputError(busy) if another process holds it."""
     lock = FileLock(path)
     try:
         lock.acquire(blocking=False)
     except Timeout:
         raise InputError(busy) from None
-    except NotImplementedError:  # some network file systems know no locks
+    except NotImplementedError:  # some network file systems do not support locks
         yield
         return
     try:
@@ -87,14 +87,14 @@ def locked(path: Path, busy: str) -> Iterator[None]:
 
 
 def new_file_mode(most: int) -> int:
-    """The permissions of a new file or folder: `most` less what this process's umask takes away; temporaries are made with fewer."""
+    """Return the permissions of a new file or folder: `most` without the bits of the umask. Temporary files are created with fewer."""
     umask = os.umask(0)
     os.umask(umask)
     return most & ~umask
 
 
 def cache_dir() -> Path:
-    """This user's cache folder of the project."""
+    """Return the cache folder of scene-experts for the current user."""
     if sys.platform == "win32":
         root = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
     elif sys.platform == "darwin":
@@ -110,15 +110,15 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write `value` as indented JSON to `path` atomically. NaN is refused: JSON has no word for it."""
+    """Write `value` as indented JSON to `path` atomically. Raises ValueError for NaN and infinity, which JSON does not support."""
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: Path, what: str) -> Any:
-    """The JSON in `path`. `what` names it in the error, e.g. "run configuration"."""
+    """Read the JSON file `path`. Raises InputError if it does not exist or is invalid; `what` names it, for example "run configuration"."""
     path = Path(path)
     try:
-        return json.loads(path.read_bytes())  # UTF-8 whatever the locale, with or without a mark at its beginning
+        return json.loads(path.read_bytes())  # UTF-8 in every locale, with or without a byte order mark
     except FileNotFoundError as error:
         raise InputError(f"expected a {what} at {path}, found no such file; check the path") from error
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

@@ -1,4 +1,4 @@
-"""Dataclasses to plain JSON values and back."""
+"""Convert dataclasses to plain JSON values and back."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from scene_experts.core.parts import Part, find, names_of
 
 
 class UnknownPart(InputError):
-    """A configuration names a part that nobody has registered."""
+    """A configuration contains a part that is not registered."""
 
 
 def to_json(value: Any) -> Any:
-    """Plain JSON values of a tree of dataclasses. Each dataclass carries its class name under "type"."""
+    """Convert nested dataclasses to plain JSON values. Each dataclass stores its class name under "type"."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         out = {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"type": type(value).__name__, **out}
@@ -29,9 +29,9 @@ def to_json(value: Any) -> Any:
 
 
 def from_json(kind: Any, value: Any, where: str = "config") -> Any:
-    """The value of type `kind` that `to_json` wrote. A field that accepts a part accepts every registered kind of it.
+    """Convert a value that `to_json` wrote to the type `kind`. A field for a part accepts all registered subclasses of its type.
 
-    Raises InputError naming the place that does not fit, UnknownPart for the name of a part that is not registered.
+    Raises InputError, which names the location, if a value does not fit, and UnknownPart if a part is not registered.
     """
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, pytypes.UnionType):
@@ -62,7 +62,7 @@ def from_json(kind: Any, value: Any, where: str = "config") -> Any:
 
 
 def _part_named(kind: type[Part], value: Any, where: str) -> type[Part]:
-    """The part that `value` names."""
+    """Return the class of the part that `value` names."""
     _expect(isinstance(value, dict), "an object", where, value)
     name = value.get("type", kind.__name__)
     part = find(name, kind)
@@ -86,7 +86,7 @@ def _from_union(args: tuple[Any, ...], value: Any, where: str) -> Any:
 
 def _from_object(kind: Any, value: Any, where: str) -> Any:
     _expect(isinstance(value, dict), "an object", where, value)
-    hints = typing.get_type_hints(kind)  # annotations for the command line are left out
+    hints = typing.get_type_hints(kind)  # without the annotations for the command line
     known = {f.name for f in dataclasses.fields(kind)}
     unknown = set(value) - known - {"type"}
     _expect(not unknown, f"only the keys {sorted(known)}", where, sorted(unknown))
@@ -101,7 +101,7 @@ def _expect(fits: bool, what: str, where: str, found: Any) -> None:
 
 
 def first_difference(old: Any, new: Any, where: str = "") -> str:
-    """The first place where two trees of plain values differ, as "loss.load was 0.01, is now 0.5"; empty where they are equal."""
+    """Return the first difference of two nested values, for example "loss.load was 0.01, is now 0.5", or an empty string."""
     if isinstance(old, dict) and isinstance(new, dict) and old.keys() == new.keys():
         return next((found for key in old if (found := first_difference(old[key], new[key], f"{where}.{key}".lstrip(".")))), "")
     return "" if old == new else f"{where} was {old}, is now {new}"

@@ -1,4 +1,4 @@
-"""When things happen and how fast: intervals and learning rates."""
+"""Schedules: intervals and learning rates."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class Every:
         return self.start < step < self.stop and step % self.interval == 0
 
     def count(self, last: int) -> int:
-        """How often it is true in iterations 1 to `last`."""
+        """Return the number of iterations from 1 to `last` at which it is true."""
         return sum(self.due(step) for step in range(self.interval, min(self.stop, last + 1), self.interval))
 
     def scaled(self, factor: float) -> Every:
-        """The same window in a training `factor` times as long; the interval stays."""
+        """Return the window for a training that is `factor` times as long. The interval does not change."""
         return replace(self, start=round(self.start * factor), stop=round(self.stop * factor))
 
 
@@ -39,7 +39,7 @@ class Rate:
     """At the last iteration."""
 
     def at(self, step: int, total: int) -> float:
-        """The rate at `step` (1-based) of `total`: exp((1 - t/T) ln first + (t/T) ln last), t clipped to [0, T]."""
+        """Return the rate at `step` (1-based) of `total`: exp((1 - t/T) ln first + (t/T) ln last), with t clipped to [0, T]."""
         if self.first == 0.0 and self.last == 0.0:
             return 0.0
         if self.first == self.last:

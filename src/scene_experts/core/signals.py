@@ -1,4 +1,4 @@
-"""What ends a command from outside: signals, and the end of the process that started it."""
+"""Stop a command on signals, and when the process that started it has ended."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 PARENT = "SCENE_EXPERTS_PARENT"
-"""Environment variable with the number of the process that a command must not outlive; `reproduce` sets it for its runs."""
+"""Environment variable with the ID of the parent process. The command stops when it ends. `reproduce` sets it for its runs."""
 
 
 def ending() -> list[signal.Signals]:
-    """Ctrl-C's signal, SIGTERM, and that of a closed terminal, unless somebody has it ignored (`nohup`)."""
+    """Return the signals that end a command: SIGINT, SIGTERM, and SIGHUP unless it is ignored (`nohup`)."""
     out = [signal.SIGINT, signal.SIGTERM]
-    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # Windows has none
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # not on Windows
         out.append(signal.SIGHUP)
     return out
 
 
 @contextmanager
 def handled(handler: Callable[[int, object], None]) -> Iterator[None]:
-    """Call `handler` on the signals that end a command; afterwards they do what they did before."""
+    """Call `handler` on the signals that end a command. The previous handlers are restored afterwards."""
     previous = {number: signal.signal(number, handler) for number in ending()}
     try:
         yield
@@ -33,7 +33,10 @@ def handled(handler: Callable[[int, object], None]) -> Iterator[None]:
 
 
 def follow_parent(every: float = 1.0) -> None:
-    """End by SIGTERM, which saves, once the process that PARENT names is no longer this one's parent: it was killed."""
+    """Watch the parent process that PARENT names. If it has ended, send SIGTERM to this process, which saves and stops.
+
+    `every` is the time between checks, s.
+    """
     parent = os.environ.pop(PARENT, "")
     if not parent.isdecimal() or os.getppid() != int(parent):
         return

@@ -1,4 +1,4 @@
-"""Rows that grow and shrink during training: parameters, facts and statistics kept aligned, with Adam's moments."""
+"""A table whose rows are added and removed during training. Parameters, facts, statistics and Adam's moments stay aligned."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 
 class Table(nn.Module):
-    """N rows of named columns; every value is [N, ...].
+    """A table of N rows with named columns [N, ...].
 
-    `params` are learned, `facts` are fixed at birth (positions on the lattice, levels), `stats` are what density control counts. Growing
-    and pruning go through `append` and `keep` alone, so no column and no optimiser moment can fall out of step with the rest.
+    `params` are learned. `facts` are constant for each row (positions on the lattice, levels). `stats` are the statistics for
+    densification. Rows are added only by `append` and removed only by `keep`, which keep all columns and moments aligned.
     """
 
     params: nn.ParameterDict
@@ -34,18 +34,21 @@ class Table(nn.Module):
         return next(iter(self.columns().values())).shape[0]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """What `.to(...)` and the like do: move parameters, facts and statistics alike. Integer columns keep their dtype."""
+        """Apply `.to(...)` and similar methods to parameters, facts and statistics. Integer columns keep their dtype."""
         super()._apply(fn, recurse)
         self.facts = {name: fn(value) for name, value in self.facts.items()}
         self.stats = {name: fn(value) for name, value in self.stats.items()}
         return self
 
     def columns(self) -> dict[str, Tensor]:
-        """Parameters and facts by name (not the statistics): what a new row must have."""
+        """Return parameters and facts by name, without statistics. New rows must have these columns."""
         return {**dict(self.params.items()), **self.facts}
 
     def attach(self, optimizer: torch.optim.Optimizer) -> None:
-        """Keep the moments of `optimizer` (Adam or the like) aligned from now on; it must hold each parameter in a group of its own."""
+        """Keep the moments of `optimizer` aligned with the rows from now on.
+
+        Raises ValueError if a parameter does not have its own parameter group.
+        """
         for name, parameter in self.params.items():
             if not any(len(group["params"]) == 1 and group["params"][0] is parameter for group in optimizer.param_groups):
                 raise ValueError(f"expected an optimiser group that holds column '{name}' alone, found none")
@@ -53,14 +56,14 @@ class Table(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the columns are."""
+        """The device of the columns."""
         return next(iter(self.columns().values())).device
 
     @torch.no_grad()
     def append(self, new: dict[str, Tensor]) -> None:
-        """Add rows. `new` has exactly the table's columns; statistics and Adam's moments of the new rows start at zero.
+        """Add rows. Their statistics and Adam's moments start at zero.
 
-        Raises KeyError naming both sets of columns when they differ.
+        `new` must have the same columns as the table. Raises KeyError, which names both sets of columns, if they differ.
         """
         if new.keys() != self.columns().keys():
             raise KeyError(f"expected columns {sorted(self.columns())}, found {sorted(new)}")
@@ -76,7 +79,7 @@ class Table(nn.Module):
 
     @torch.no_grad()
     def keep(self, mask: Tensor) -> None:
-        """Keep the rows where `mask` [N] (bool) is true, in order."""
+        """Keep the rows where `mask` [N] (bool) is true, in order. Raises ValueError for another dtype or shape."""
         if mask.dtype != torch.bool or mask.shape != (len(self),):
             raise ValueError(f"expected a bool mask of shape ({len(self)},), found {mask.dtype} {tuple(mask.shape)}")
         rows = mask.nonzero().squeeze(1)
@@ -87,14 +90,20 @@ class Table(nn.Module):
 
     @torch.no_grad()
     def assign(self, name: str, value: Tensor) -> None:
-        """Overwrite a parameter column and clear its moments."""
+        """Overwrite a parameter column and set its moments to zero. Raises ValueError if the shapes differ."""
         if value.shape != self.params[name].shape:
             raise ValueError(f"expected shape {tuple(self.params[name].shape)} for column '{name}', found {tuple(value.shape)}")
         self._replace(name, value.clone(), torch.zeros_like)
 
     @torch.no_grad()
     def overwrite(self, rows: Tensor, values: dict[str, Tensor], clear: bool = False) -> None:
-        """Overwrite `rows` [R] (each once) of some parameter columns in place; `clear`: their moments, in every column, begin anew."""
+        """Overwrite rows of some parameter columns in place.
+
+        Args:
+            rows: [R] int64 without duplicates.
+            values: [R, ...] new values by column.
+            clear: Set the moments of these rows to zero in all parameter columns.
+        """
         for name, value in values.items():
             self.params[name].index_copy_(0, rows, value.to(self.params[name].dtype))
         if not clear or self._optimizer is None:
@@ -105,7 +114,7 @@ class Table(nn.Module):
                     item.index_fill_(0, rows, 0.0)
 
     def _replace(self, name: str, value: Tensor, edit) -> None:
-        """Put a fresh parameter (no gradient) in place, moments edited by `edit`: Adam's step counter is kept."""
+        """Replace a parameter with a new one without gradient. `edit` changes the moments; Adam's step counter is kept."""
         old = self.params[name]
         new = nn.Parameter(value)
         self.params[name] = new

@@ -1,4 +1,4 @@
-"""Tensors to a device without making the host wait for it."""
+"""Copy tensors to a device without synchronisation."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from torch import Tensor
 
 
 def upload(tensor: Tensor, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Tensor:
-    """`tensor` on `device`, of `dtype` (None: as it is).
+    """Return `tensor` on `device` with `dtype`. None keeps the current device or dtype.
 
-    From the CPU to CUDA it goes through page-locked memory in its own dtype and is converted there: a copy from other memory would make the
-    host wait until the device has done all it was given, and a conversion on the way would be the CPU's.
+    A copy from the CPU to CUDA uses page-locked memory, and the dtype is converted on the GPU. A copy from pageable memory would block
+    the host until the GPU has finished all queued work.
     """
     if device is not None and torch.device(device).type == "cuda" and tensor.device.type == "cpu" and not tensor.requires_grad:
         return tensor.contiguous().pin_memory().to(device, non_blocking=True).to(dtype=dtype or tensor.dtype)

@@ -1,4 +1,4 @@
-"""The values that flow between the parts, and the one key to shapes, frames and units.
+"""The values that modules exchange, and the definitions of shapes, frames and units.
 
 Dimensions
     N rows of a table (anchors or Gaussians)   K slots per row (Gaussians per anchor)
@@ -8,9 +8,9 @@ Dimensions
 Frames and units
     World: the capture's frame after `data.prepare` (scaled and shifted; `Capture.world` undoes it). Lengths are in world units.
     Camera: OpenCV axes (x right, y down, z forward); `world_to_cam` maps homogeneous world points to camera points.
-    Pixels: pixel (column i, row j) has its centre at (i + 0.5, j + 0.5); `K` is in that convention, as COLMAP's is.
+    Pixels: pixel (column i, row j) has its centre at (i + 0.5, j + 0.5). `K` uses this convention, as in COLMAP.
     Images: float RGB in [0, 1], [H, W, 3].  Quaternions: (w, x, y, z).
-    2D gradients: d loss / d (mean in NDC), i.e. the pixel gradient times (W/2, H/2), in every backend.
+    2D gradients: d loss / d (mean in NDC), which is the pixel gradient times (W/2, H/2), in all backends.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from scene_experts.core.transfer import upload
 
 
 class Mode(enum.Enum):
-    """What a scene is used for. Everything in a scene that is random or adapts obeys this value, and nothing else.
+    """The use of a scene. Only this value controls randomness and adaptive state in a scene.
 
-    `nn.Module.train()` and `eval()` have no effect on a scene, and neither has whether gradients are enabled.
+    `nn.Module.train()`, `nn.Module.eval()` and the gradient mode have no effect on them.
     """
 
     TRAIN = "train"
-    """Routers draw noise, biases of the router move, and a coarse-to-fine training uses the levels that it has reached."""
+    """Routers add noise, router biases are updated, and coarse-to-fine training uses only the levels reached so far."""
     DRAW = "draw"
-    """Nothing is random and nothing changes: for pictures, evaluation and measurements, with or without gradients."""
+    """Deterministic and without changes of state: for rendering, evaluation and measurements, with or without gradients."""
 
 
 @dataclass(frozen=True)
@@ -46,18 +46,18 @@ class Camera:
     K: Tensor  # [3, 3] float32, px: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
     width: int
     height: int
-    near: float = 0.2  # world units; nothing closer than this along z is drawn
+    near: float = 0.2  # world units; Gaussians closer than this along z are not rendered
     id: int = 0  # index of the view in its capture
 
     @property
     def position(self) -> Tensor:
-        """Camera centre in the world, [3]."""
+        """Camera centre in world coordinates, [3]."""
         R, t = self.world_to_cam[:3, :3], self.world_to_cam[:3, 3]
         return -(R.transpose(0, 1) @ t)
 
     @functools.cached_property
     def pinhole(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy, px. Read once, before the camera goes to a device: reading from there waits for all that the device has to do."""
+        """fx, fy, cx, cy, px. They are cached before a copy to a device, because reading them from a device would synchronise with it."""
         (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
         return fx, fy, cx, cy
 
@@ -79,11 +79,11 @@ class Camera:
 
     @property
     def fov(self) -> float:
-        """Vertical field of view of a camera with its principal point in the middle, radians."""
+        """Vertical field of view, radians, if the principal point is at the image centre."""
         return 2.0 * math.atan(self.height / (2.0 * self.fy))
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
-        """The same camera with its tensors on `device` and of `dtype`."""
+        """Return the camera with its tensors on `device` and with `dtype`."""
         K = self.K.to(dtype=dtype)
         known = self.pinhole if K.dtype == self.K.dtype else replace(self, K=K).pinhole
         moved = replace(self, world_to_cam=upload(self.world_to_cam, device, dtype), K=upload(K, device))
@@ -101,7 +101,7 @@ class Points:
 
 @dataclass(frozen=True)
 class Gaussians:
-    """What a rasteriser draws: M Gaussians with fixed colours."""
+    """Input of a rasteriser: M Gaussians with fixed colours."""
 
     means: Tensor  # [M, 3] world
     quats: Tensor  # [M, 4] (w, x, y, z), unit length
@@ -116,21 +116,21 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Render:
-    """A picture and what the strategies need to know about how it was made.
+    """A rendered image and the values that densification needs.
 
-    `mean2d_grad` is a plain tensor of zeros that the backward pass of the picture fills in.
+    `mean2d_grad` is a tensor of zeros that the backward pass of the image fills.
     """
 
-    image: Tensor  # [H, W, 3], the background blended in, not clamped
+    image: Tensor  # [H, W, 3], blended with the background, not clamped
     alpha: Tensor  # [H, W] = 1 - final transmittance
     depth: Tensor  # [H, W] expected depth: sum_i T_i alpha_i z_i (not divided by alpha)
-    radii: Tensor  # [M] int32 px, ceil(3 sigma), as the published rasteriser has it; 0 where nothing was drawn
+    radii: Tensor  # [M] int32 px, ceil(3 sigma), as in the published rasteriser; 0 if the Gaussian was not rendered
     mean2d_grad: Tensor  # [M, 2] NDC units
 
 
 @dataclass(frozen=True)
 class Routing:
-    """How the anchors of one view were shared among the experts of one attribute."""
+    """Assignment of the anchors of one view to the experts of one attribute."""
 
     gates: Tensor  # [A, E], rows sum to 1 (paper eq. 3)
     chosen: Tensor | None  # [A, k] int64, None while dense
@@ -138,11 +138,11 @@ class Routing:
 
 @dataclass(frozen=True)
 class Decoded:
-    """A scene seen by one camera, before rasterising."""
+    """The decoded scene of one camera, before rasterisation."""
 
     gaussians: Gaussians
     rows: Tensor  # [A] int64, rows of the table that were decoded
     raw_opacity: Tensor | None  # [A, K] before masking; None for explicit scenes
     routing: dict[str, Routing]  # by attribute; empty without experts
-    scene_opacity: Tensor | None = None  # [N, K] of every anchor, seen or not; only where the objective asks for it
-    population: tuple[Tensor, Tensor] | None = None  # explicit scenes: opacity logits [N], log-scales [N, 3] of every Gaussian, seen or not
+    scene_opacity: Tensor | None = None  # [N, K] of all anchors, visible or not; only if the loss needs it
+    population: tuple[Tensor, Tensor] | None = None  # explicit scenes: opacity logits [N], log-scales [N, 3] of all Gaussians

@@ -1,4 +1,4 @@
-"""Where the capture of a run is: written so that the run finds it again from any folder, and after both have moved together."""
+"""Store the location of a run's capture. The run finds the capture from any folder, also after both have moved together."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ KEY = "capture_from_run"
 
 
 def absolute(path: Path) -> Path:
-    """The path from the root, without `..`; links stay as they are."""
+    """Return the absolute path without `..`. Symbolic links are not resolved."""
     return Path(os.path.abspath(path))
 
 
 def from_run(run: Path, path: Path) -> str | None:
-    """The path of a capture relative to its run folder; None where there is none, as between two drives of Windows."""
+    """Return the path of a capture relative to its run folder, or None if there is none (two drives on Windows)."""
     try:
         return Path(os.path.relpath(path, run)).as_posix()
     except ValueError:
@@ -23,11 +23,18 @@ def from_run(run: Path, path: Path) -> str | None:
 
 
 def find(run: Path, path: Path, relative: str | None) -> Path:
-    """The capture of a run. path, relative: what its config.json says.
+    """Return the folder of a run's capture.
 
-    An absolute path is tried first, then the path relative to the run folder. Earlier runs keep the path as their training was given
-    it; if that is relative, it is tried from the current folder, from the run folder and from each folder above that.
-    Returns `path` where none of these exists.
+    An absolute path is tried first, then the path relative to the run folder. Earlier runs store the path as it was given on the
+    command line. If that path is relative, it is tried from the current folder, the run folder and each parent of the run folder.
+
+    Args:
+        run: The run folder.
+        path: Path of the capture in config.json.
+        relative: Path of the capture relative to the run folder in config.json, or None.
+
+    Returns:
+        The first path that exists, as an absolute path, or `path` if none exists.
     """
     here = absolute(run)
     places = [path] if path.is_absolute() else [path, *(folder / path for folder in (here, *here.parents))]

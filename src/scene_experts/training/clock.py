@@ -1,4 +1,4 @@
-"""What a training costs: wall time, CPU time, and how busy its machine is. Checkpoints keep all three."""
+"""Measure wall time, CPU time and machine load of a training. Checkpoints store all three."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 
 
 def load_average() -> float | None:
-    """Processes that run or wait to run on this machine, mean over the last minute; None where the system does not say (Windows)."""
+    """Return the load average of the last minute, or None if the system does not report it (Windows)."""
     return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
 
 
 @dataclass
 class Clock:
-    """The time that iterations take, summed over resumes. Saving, previews and evaluation do not count."""
+    """Total time of the iterations, including those before a resume. Excludes saving, previews and evaluation."""
 
     seconds: float = 0.0
     """Wall time, s."""
@@ -28,7 +28,7 @@ class Clock:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Count the time of the block."""
+        """Add the time of the block to the clock."""
         wall, cpu = time.perf_counter(), time.process_time()
         yield
         self.seconds += time.perf_counter() - wall
@@ -36,10 +36,10 @@ class Clock:
             self.cpu_seconds += time.process_time() - cpu
 
     def meta(self) -> dict[str, Any]:
-        """What a checkpoint keeps; its time of writing is the end of the training so far."""
+        """Return the values that a checkpoint stores. The current load average is stored as `end`."""
         return {"seconds": self.seconds, "cpu_seconds": self.cpu_seconds, "load": {**self.load, "end": load_average()}}
 
     @classmethod
     def of(cls, meta: dict[str, Any]) -> Clock:
-        """The clock of a checkpoint."""
+        """Create the clock from the metadata of a checkpoint."""
         return cls(float(meta["seconds"]), meta.get("cpu_seconds"), meta.get("load", {}))

@@ -1,4 +1,4 @@
-"""A training as one typed value: everything that changes its numbers."""
+"""Configuration of a training: one typed value with every setting that affects the results."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from scene_experts.strategy.grow import GrowAnchors
 from scene_experts.training.losses import Weights
 from scene_experts.training.optim import Adam, Optimizer
 
-SCHEDULE = 30_000  # the iterations that schedule constants are written for, unless a recipe says otherwise
-LARGEST_SEED = 2**63 - 2  # torch takes signed 64 bits, and growth draws from the seed after this one
+SCHEDULE = 30_000  # default length of the schedule, iterations; recipes may override it
+LARGEST_SEED = 2**63 - 2  # torch accepts signed 64-bit seeds, and densification uses seed + 1
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Train:
     """The iterations that this recipe's windows are written for."""
 
     def scaled(self) -> Train:
-        """The same with every window of the schedule in iterations of this training (x iterations / schedule)."""
+        """Return a copy whose schedule is scaled by iterations / schedule. Raises InputError if `iterations` is below 1."""
         if self.iterations < 1:
             raise InputError(f"expected at least 1 iteration, found {self.iterations}; use --iterations 30000")
         factor = self.iterations / self.schedule
@@ -68,7 +68,7 @@ class Train:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What a run folder's config.json says: enough to evaluate, resume and repeat the run."""
+    """Contents of a run folder's config.json: everything needed to evaluate, resume and repeat the run."""
 
     train: Train
     data: Data
@@ -79,7 +79,7 @@ class RunConfig:
 
 
 def check(cfg: Train) -> None:
-    """Raises InputError, naming the flag, for invalid settings."""
+    """Check the settings. Raises InputError, which names the flag, if a setting is invalid."""
     expect_at_least([("--iterations", cfg.iterations, 1), ("--seed", cfg.seed, 0), ("--max-anchors", cfg.max_anchors, 0)])
     if cfg.seed > LARGEST_SEED:
         raise InputError(f"expected --seed of at most {LARGEST_SEED}, found {cfg.seed}; give a smaller number")
@@ -98,7 +98,7 @@ def check(cfg: Train) -> None:
 
 
 def unregistered(value: Any) -> list[str]:
-    """Names of the parts in a recipe that config.json could not name: without `register`, a run could not be opened again."""
+    """Return the class names of the parts of `value` that are not registered. A run with such a part cannot be opened again."""
     if not dataclasses.is_dataclass(value):
         return []
     below = [name for f in dataclasses.fields(value) for name in unregistered(getattr(value, f.name))]
@@ -107,7 +107,7 @@ def unregistered(value: Any) -> list[str]:
 
 
 def with_numbers(cfg: Train, numbers: Sequence[tuple[str, Any]]) -> Train:
-    """`cfg` with values at dotted places, as ("scene.voxel_size", 0.001); places that this recipe does not have are passed over."""
+    """Return a copy of `cfg` with new values at dotted paths, for example ("scene.voxel_size", 0.001). Ignores unknown paths."""
     for place, value in numbers:
         if _has(cfg, place):
             cfg = _put(cfg, place.split("."), value)
@@ -115,13 +115,13 @@ def with_numbers(cfg: Train, numbers: Sequence[tuple[str, Any]]) -> Train:
 
 
 def flags_of(cfg: Train, numbers: Sequence[tuple[str, Any]]) -> list[str]:
-    """The arguments of `train` that say the same."""
+    """Return the command-line arguments of `train` for the same values. Ignores unknown paths."""
     found = [(place, value) for place, value in numbers if _has(cfg, place)]
     return [word for place, value in found for word in (flag(place), str(value))]
 
 
 def flag(place: str) -> str:
-    """The flag of a dotted place, as --scene.voxel-size."""
+    """Return the flag of a dotted path, for example --scene.voxel-size."""
     return f"--{place.replace('_', '-')}"
 
 

@@ -1,4 +1,4 @@
-"""The training loop: yields events, saves, resumes; knows no method by name."""
+"""The training loop. It yields events, saves checkpoints and resumes runs. It does not depend on any method."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ from scene_experts.training.memory import anchor_cap
 from scene_experts.training.state import Training, resume, save
 
 log: logging.Logger = logging.getLogger(__name__)
-ROUTED = 16_384  # anchors whose routing a training's figures are of: their shares are within half a percent of all anchors'
+ROUTED = 16_384  # anchors sampled for the routing statistics; the shares are within 0.5 % of those of all anchors
 
 
 @dataclass(frozen=True)
 class Run:
-    """Where and how a training runs; nothing here changes its numbers but `stop_at`."""
+    """Options of a training run that do not affect its results, except for `stop_at`."""
 
     config: RunConfig
-    out: Path | None = None  # the run folder; None keeps nothing
+    out: Path | None = None  # the run folder; None writes no files
     device: str = "cpu"
-    dtype: torch.dtype = torch.float32  # float64 with the reference rasteriser shows what rounding does; not for real trainings
+    dtype: torch.dtype = torch.float32  # float64 is for tests of rounding errors with the reference rasteriser
     resume: bool = False
     save_every: int = 5000  # iterations between checkpoints; the last iteration is always saved
-    preview_every: int = 0  # iterations between pictures of one held-out view; 0: none
+    preview_every: int = 0  # iterations between previews of one held-out view; 0: none
     log_every: int = 10  # iterations between Stepped events
-    max_memory: float = 0.0  # GiB of memory (resident, or reserved on the GPU) at which growth stops; 0: no cap
-    keep: int = 2  # checkpoints kept
+    max_memory: float = 0.0  # GiB of memory (resident, or reserved on the GPU) at which densification stops; 0: no limit
+    keep: int = 2  # number of checkpoints to keep
     begin: Callable[[Training], None] = lambda training: None  # called once, before the first event
-    watch: Callable[[Training], None] = lambda training: None  # called between iterations, outside their time; a viewer draws here
-    stop: list[str] = field(default_factory=list)  # put a reason here (a signal handler does) to save and stop
+    watch: Callable[[Training], None] = lambda training: None  # called between iterations and not timed; the viewer renders here
+    stop: list[str] = field(default_factory=list)  # append a reason to save and stop, for example from a signal handler
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """What one iteration saw and did."""
+    """Inputs and results of one iteration."""
 
     decoded: Decoded
     render: Render
@@ -60,7 +60,21 @@ class Iteration:
 
 
 def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iterator[Event]:
-    """Train `cfg` (as the user wrote it; windows are scaled here) on a capture, from scratch or from the run's newest whole checkpoint."""
+    """Train a scene on a capture, from scratch or from the newest valid checkpoint of the run.
+
+    Args:
+        cfg: The settings before scaling. This function scales the schedule.
+        run: Options of the run.
+        capture: The views and points to train on.
+        rasterize: The rasteriser.
+
+    Yields:
+        The events of the training. The first is `Started`; the last is `Finished` or `Stopped`.
+
+    Raises:
+        InputError: The settings, the capture or the checkpoint cannot be used.
+        RunError: The loss is not finite, or a checkpoint cannot be written.
+    """
     cfg = cfg.scaled()
     folder = run.out / "checkpoints" if run.out else None
     training = resume(cfg, folder, run.device) if run.resume and folder else None
@@ -87,7 +101,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
             check_finite(step, parts)
             yield Saved(step, save(training, folder, run.keep))
             saved = step
-        del done  # before the next frame needs its memory
+        del done  # frees its memory before the next frame
         run.watch(training)
     if folder and saved != training.step:
         check_finite(training.step, parts)
@@ -99,7 +113,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
 
 
 def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Iteration:
-    """One iteration, in the paper's order: rates, view, decode, draw, losses, gradients, density control, Adam."""
+    """Run one iteration, in the order of the paper: learning rates, view, decoding, rendering, loss, gradients, densification, Adam."""
     cfg, scene = training.cfg, training.scene
     training.step += 1
     training.set_rates()
@@ -130,7 +144,11 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
 
 
 def step_optimizer(training: Training, decoded: Decoded, edit: Edit | None) -> None:
-    """One step of the optimiser: under `sparse_adam` of the decoded rows alone, unless rows came or went, or the objective reaches all."""
+    """Run one optimiser step.
+
+    With `sparse_adam`, only the decoded rows are updated. All rows are updated if densification added or removed rows, or if the loss
+    has a gradient for rows that were not decoded.
+    """
     cfg = training.cfg
     if cfg.sparse_adam and edit is None and not cfg.loss.reaches_every_row(decoded):
         training.optimizer.step(rows=decoded.rows)  # type: ignore[call-arg]
@@ -140,7 +158,7 @@ def step_optimizer(training: Training, decoded: Decoded, edit: Edit | None) -> N
 
 
 def without_graph(value: Any) -> Any:
-    """The same value with every tensor in it cut from its graph, whose buffers go with the last reference to it."""
+    """Return the same value with every tensor detached, so that the buffers of the autograd graph can be freed."""
     if isinstance(value, Tensor):
         return value.detach()
     if isinstance(value, (tuple, list)):
@@ -153,7 +171,7 @@ def without_graph(value: Any) -> Any:
 
 
 def check_finite(step: int, parts: dict[str, Tensor]) -> None:
-    """Raises RunError when the losses are no longer numbers: nothing is saved over the last good checkpoint."""
+    """Check the losses before saving. Raises RunError if one is not finite, so that the last valid checkpoint is kept."""
     bad = [name for name, value in parts.items() if not math.isfinite(value)]
     if bad:
         raise RunError(
@@ -164,7 +182,7 @@ def check_finite(step: int, parts: dict[str, Tensor]) -> None:
 
 @torch.no_grad()
 def stepped(training: Training, done: Iteration) -> Stepped:
-    """The figures of the iteration just made."""
+    """Compute the statistics of the last iteration."""
     decoded = done.decoded
     error = done.render.image.clamp(0, 1).sub_(done.target).square_()
     mse = float(error.mean() if done.mask is None else (error.mean(2) * done.mask).sum() / done.mask.sum().clamp_min(1e-12))
@@ -193,7 +211,7 @@ def stepped(training: Training, done: Iteration) -> Stepped:
 
 
 def use(r: Routing) -> list[float]:
-    """Each expert's share of the assignments, or of the gates while dense."""
+    """Return each expert's share of the assignments, or its mean gate while routing is dense, [E]."""
     A, E = r.gates.shape
     share = r.gates.sum(0) / max(A, 1) if r.chosen is None else torch.bincount(r.chosen.reshape(-1), minlength=E) / max(r.chosen.numel(), 1)
     return [round(float(c), 4) for c in share]
@@ -201,7 +219,7 @@ def use(r: Routing) -> list[float]:
 
 @torch.no_grad()
 def preview(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Previewed:
-    """A picture of one held-out view (a training view where none is held out)."""
+    """Render one held-out view, or a training view if none is held out."""
     index = (capture.test or capture.train)[0]
     camera = capture.views[index].camera.to(run.device, run.dtype)
     decoded = training.scene(camera, training.step, Mode.DRAW, rasterize.visible)

@@ -1,7 +1,7 @@
-"""The objective: a sum of named terms. A new term is one function and one entry in `Weights.terms`.
+"""The training loss: a sum of named terms. A new term needs one function and one entry in `Weights.terms`.
 
-Pictures are [H, W, 3] float RGB in [0, 1]. The mean of nothing (no Gaussian, no anchor, no pixel that counts) is 0.
-Equation numbers are those of "Scene Experts" (MoE-GS, AAAI 2026); the photometric part is 3DGS's.
+Images are [H, W, 3] float RGB in [0, 1]. The mean over an empty set (no Gaussians, anchors or pixels) is 0.
+Equation numbers refer to "Scene Experts" (MoE-GS, AAAI 2026). The photometric loss is that of 3DGS.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from scene_experts.training.photometric import photometric
 
 @dataclass(frozen=True)
 class Sample:
-    """What the objective sees of one iteration."""
+    """Inputs of the loss in one iteration."""
 
     decoded: Decoded
     render: Render
     target: Tensor  # [H, W, 3], the photograph
-    mask: Tensor | None = None  # [H, W] in [0, 1], 1 = counts
-    step: int | None = None  # the iteration, for terms that start or end; None: all are on
+    mask: Tensor | None = None  # [H, W] in [0, 1]; pixels with 0 are ignored
+    step: int | None = None  # the iteration, for terms that start or end; None: all terms are active
 
 
 Term = Callable[["Weights", Sample], dict[str, Tensor]]
-"""Weights and a sample to weighted terms by name, each []; empty where the term is off or has nothing to act on."""
+"""Function that maps weights and a sample to weighted terms by name, each []. Empty if the term is off or does not apply."""
 
 
 @register
@@ -74,19 +74,19 @@ class Weights(Part):
     """Last iteration with the opacity hinge; none means the last iteration of the training."""
 
     def scaled(self, factor: float) -> Self:
-        """The same in a training `factor` times as long: the window of the opacity hinge scales."""
+        """Return the weights for a training that is `factor` times as long. The window of the opacity hinge is scaled."""
         until = None if self.opacity_until is None else round(self.opacity_until * factor)
         return replace(self, opacity_from=round(self.opacity_from * factor), opacity_until=until)
 
     def check(self) -> None:
-        """Raises InputError, naming the flag, for a weight below 0, or a share of 1 - SSIM above 1."""
+        """Check the weights. Raises InputError, which names the flag, if a weight is below 0 or `dssim` is above 1."""
         names = ("dssim", "scale", "opacity", "load", "mean_opacity", "mean_size")
         expect_at_least([(f"--loss.{name.replace('_', '-')}", getattr(self, name), 0) for name in names])
         if self.dssim > 1:
             raise InputError(f"expected --loss.dssim of at most 1, found {self.dssim}; L1 gets the rest of 1, so give a smaller number")
 
     def has_hinge(self, step: int | None) -> bool:
-        """Whether the opacity hinge acts at `step` (None: its window is ignored)."""
+        """Whether the opacity hinge is active at `step`. None ignores its window."""
         on = step is None or (step >= self.opacity_from and (self.opacity_until is None or step <= self.opacity_until))
         return self.opacity != 0 and on
 
@@ -95,31 +95,31 @@ class Weights(Part):
         return self.opacity_scope == "all" and self.has_hinge(step)
 
     def reaches_every_row(self, decoded: Decoded) -> bool:
-        """Whether the objective has a gradient for rows of the table that the view did not decode."""
+        """Whether the loss has a gradient for rows of the table that the view did not decode."""
         population = decoded.population is not None and bool(self.mean_opacity or self.mean_size)
         routing = any(len(r.gates) != len(decoded.rows) for r in decoded.routing.values())
         return decoded.scene_opacity is not None or population or routing
 
 
 def compute_terms(sample: Sample, weights: Weights) -> dict[str, Tensor]:
-    """The weighted terms of the objective by name, each []; their sum is what training minimises."""
+    """Compute the weighted loss terms by name, each []. The training minimises their sum."""
     out: dict[str, Tensor] = {}
     for term in weights.terms:
         out |= term(weights, sample)
     return out
 
 
-# --- the terms: weights and sample to {name: weighted value} ------------------------------------------------------------------------------
+# --- terms: weights and sample to {name: weighted value} ----------------------------------------------------------------------------------
 
 
 def photometric_terms(w: Weights, sample: Sample) -> dict[str, Tensor]:
-    """L1 and 1 - SSIM, whose weights sum to 1."""
+    """L1 and 1 - SSIM. Their weights sum to 1."""
     l1, dssim = photometric(sample.render.image, sample.target, w.dssim, sample.mask)
     return ({"l1": l1} if w.dssim != 1 else {}) | ({"dssim": dssim} if w.dssim != 0 else {})
 
 
 def volume_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
-    """The mean volume of the drawn Gaussians (Scaffold-GS)."""
+    """The mean volume of the rendered Gaussians (Scaffold-GS)."""
     return {"volume": w.scale * volume(sample.decoded.gaussians.scales)} if w.scale != 0 else {}
 
 
@@ -131,7 +131,7 @@ def hinge_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
 
 
 def mean_opacity_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
-    """The mean opacity over all explicit Gaussians, seen or not (3DGS-MCMC)."""
+    """The mean opacity of all explicit Gaussians, visible or not (3DGS-MCMC)."""
     if w.mean_opacity == 0 or sample.decoded.population is None:
         return {}
     logits = sample.decoded.population[0]
@@ -139,7 +139,7 @@ def mean_opacity_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
 
 
 def mean_size_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
-    """The mean scale over all explicit Gaussians and axes, seen or not (3DGS-MCMC)."""
+    """The mean scale over all explicit Gaussians and axes, visible or not (3DGS-MCMC)."""
     if w.mean_size == 0 or sample.decoded.population is None:
         return {}
     log_scales = sample.decoded.population[1]
@@ -147,18 +147,18 @@ def mean_size_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
 
 
 def load_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
-    """The load balance of the experts (eq. 6, 7)."""
+    """The load-balancing loss of the experts (eq. 6, 7)."""
     return {"load": w.load * load(sample.decoded.routing, w)} if w.load != 0 and sample.decoded.routing else {}
 
 
 Weights.terms = (photometric_terms, volume_term, hinge_term, mean_opacity_term, mean_size_term, load_term)
 
 
-# --- what they are made of ----------------------------------------------------------------------------------------------------------------
+# --- functions that the terms use ---------------------------------------------------------------------------------------------------------
 
 
 def hinge_opacities(decoded: Decoded, render: Render, w: Weights) -> Tensor:
-    """The raw opacities [.., K] that the hinge sees under `w.opacity_scope`. "all" expects them in `decoded.scene_opacity`."""
+    """Return the raw opacities [.., K] that `w.opacity_scope` selects. "all" requires `decoded.scene_opacity`, else ValueError."""
     assert decoded.raw_opacity is not None
     if w.opacity_scope == "visible":
         return decoded.raw_opacity
@@ -172,7 +172,7 @@ def hinge_opacities(decoded: Decoded, render: Render, w: Weights) -> Tensor:
 
 
 def volume(scales: Tensor) -> Tensor:
-    """Mean of sx sy sz over Gaussians [M, 3], []: Scaffold-GS's volume regulariser."""
+    """Mean of sx sy sz over the scales [M, 3], []: the volume regulariser of Scaffold-GS."""
     if native_terms.covers(scales):
         return native_terms.sum_volumes(scales) / max(len(scales), 1)
     x, y, z = scales.unbind(1)
@@ -180,33 +180,41 @@ def volume(scales: Tensor) -> Tensor:
 
 
 def opacity_hinge(raw_opacity: Tensor, tau: float = 0.0) -> Tensor:
-    """Mean of max(0, tau - sigma) over all K Gaussians of the decoded anchors, drawn or not (eq. 8); raw_opacity [A, K]."""
+    """Mean of max(0, tau - sigma) over all K Gaussians of the decoded anchors, rendered or not (eq. 8), []. raw_opacity is [A, K]."""
     if native_terms.covers(raw_opacity):
         return native_terms.sum_hinge(raw_opacity, tau) / max(raw_opacity.numel(), 1)
     return functional.relu(tau - raw_opacity).sum() / max(raw_opacity.numel(), 1)
 
 
 def load_sparse(gates: Tensor, chosen: Tensor) -> Tensor:
-    """E sum_i pi_i P_i (eq. 6), []: pi_i the share of anchors that chose expert i (no gradient), P_i the mean gate.
+    """E sum_i pi_i P_i (eq. 6), [].
 
-    gates [A, E], chosen [A, k]. Perfect balance is k, collapse on one expert nearly E.
+    pi_i is the share of anchors that chose expert i (without gradient), and P_i is its mean gate.
+    The loss is k for perfect balance and nearly E if the routing collapses to one expert.
+
+    Args:
+        gates: [A, E] gates of all experts.
+        chosen: [A, k] int64 indices of the chosen experts.
     """
     A, E = gates.shape
     if chosen.device.type == "cpu":
         counts = torch.bincount(chosen.reshape(-1), minlength=E)
-    else:  # where bincount makes the host wait
+    else:  # bincount synchronises with the device
         counts = (chosen[..., None] == torch.arange(E, device=chosen.device)).sum((0, 1))
     share = counts.to(gates.dtype) / max(A, 1)
     return E * (share * _mean(gates)).sum()
 
 
 def load_dense(gates: Tensor) -> Tensor:
-    """E sum_i C_i^2 (eq. 7), [], with C_i the mean gate; gates [A, E]. Perfect balance is 1, collapse on one expert E."""
+    """E sum_i C_i^2 (eq. 7), []. C_i is the mean gate of expert i, and gates is [A, E]. 1 is perfect balance, E is full collapse."""
     return gates.shape[1] * _mean(gates).square().sum()
 
 
 def load(routing: dict[str, Routing], w: Weights) -> Tensor:
-    """The load balance over all attributes with experts, each in the phase it is in; routing must not be empty."""
+    """Load-balancing loss over all attributes with experts, []. Each attribute uses eq. 7 while dense, else eq. 6 (`load_phase`).
+
+    `routing` must not be empty.
+    """
     values = []
     for r in routing.values():
         if r.chosen is None:
@@ -221,5 +229,5 @@ def load(routing: dict[str, Routing], w: Weights) -> Tensor:
 
 
 def _mean(gates: Tensor) -> Tensor:
-    """Mean over anchors, [E]; 0 without anchors."""
+    """Mean over the anchors, [E]. It is 0 without anchors."""
     return gates.sum(0) / max(len(gates), 1)

@@ -1,4 +1,4 @@
-"""How much memory a training holds and will hold: the cap on anchors that `--max-memory` sets; and that freed memory is used again."""
+"""Estimate the memory of a training, limit the number of anchors for `--max-memory`, and reuse freed memory."""
 
 from __future__ import annotations
 
@@ -14,65 +14,73 @@ from scene_experts.core.types import Decoded, Render
 from scene_experts.native import library as native
 from scene_experts.scene import Scene
 
-_SPARE = 9 / 8  # the rasteriser's buffers grow an eighth beyond what is asked for
-_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of mallopt in glibc
+_SPARE = 9 / 8  # the rasteriser allocates one eighth more than requested
+_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # parameters of mallopt in glibc
 _LARGE, _KEPT = 1 << 30, 256 << 20  # bytes
-_TILES = 8  # (Gaussian, tile) pairs a Gaussian, where nobody has counted
+_TILES = 8  # assumed number of (Gaussian, tile) pairs per Gaussian
 
 
 @dataclass
 class Largest:
-    """The largest frame so far: Gaussians drawn and pixels."""
+    """The largest frame so far: number of rendered Gaussians and number of pixels."""
 
     gaussians: int = 0
     pixels: int = 0
 
     def see(self, decoded: Decoded, render: Render) -> None:
-        """Count one frame in."""
+        """Update the maxima with one frame."""
         self.gaussians = max(self.gaussians, len(decoded.gaussians))
         self.pixels = max(self.pixels, render.alpha.numel())
 
 
 def gaussian_bytes(pairs: float = _TILES) -> float:
-    """Bytes that one drawn Gaussian takes during a step on the CPU; `pairs`: picture tiles that it touches.
+    """Return the bytes that one rendered Gaussian needs during a step on the CPU. `pairs` is the number of tiles that it overlaps.
 
-    68 as decoded (14 floats, its length, its slot), 76 of gradients, radius and 2D gradient; in the rasteriser 64 of its record, 16 of its
-    rectangle and key, 64 of sums per thread, and 8 a pair (its place in a list, the masks and checkpoints of its batch).
+    The decoded Gaussian takes 68 bytes (14 floats, its length, its slot). Its gradients, radius and 2D gradient take 76 bytes.
+    The rasteriser uses 64 bytes for its record, 16 for its rectangle and key, 64 per thread for sums, and 8 per pair
+    (its place in a list, the masks and checkpoints of its batch).
     """
     sums = 64 * min(native.count_threads(), 4)
     return 68 + 76 + _SPARE * (64 + 16 + sums + 8 * pairs)
 
 
 def frame_bytes(gaussians: int, pixels: int, pairs: float = _TILES) -> int:
-    """Bytes of all the buffers of one frame, forward and backward, on the CPU.
+    """Return the bytes of all buffers of one frame on the CPU, forward and backward.
 
-    A pixel takes 20 of picture, alpha and depth, 24 of target and gradient, and in the rasteriser 4 of transmittance and 8 of its tile's.
+    A pixel takes 20 bytes for image, alpha and depth, and 24 for target and gradient. The rasteriser uses 4 bytes per pixel for the
+    transmittance and 8 for the data of its tile.
     """
     return int(gaussians * gaussian_bytes(pairs) + pixels * (44 + _SPARE * 12))
 
 
 def row_bytes(scene: Scene) -> int:
-    """Bytes of one row of the table in training: values, gradients, both moments, statistics."""
+    """Return the bytes of one row of the table during training: values, gradients, both moments and statistics."""
     columns = scene.table.columns().values()
     return sum(v.element_size() * v[:1].numel() * (4 if v.requires_grad else 1) for v in columns) + 4 * (2 + 2 * scene.K)
 
 
 def anchor_cap(scene: Scene, cap: int, max_memory: float, largest: Largest) -> int:
-    """The cap on anchors now: the user's own, and what still fits below `max_memory` GiB (0: no cap); see `used_bytes`.
+    """Return the current limit on the number of anchors; 0 means no limit.
 
-    Room is kept for another of the largest frames, and each new row brings its share of Gaussians into it.
+    The memory of one more frame of the largest size is reserved. Each new row adds its share of Gaussians to that frame.
+
+    Args:
+        scene: The scene.
+        cap: The limit that the user set; 0 means no limit.
+        max_memory: Limit on the memory that `used_bytes` reports, GiB; 0 means no limit.
+        largest: The largest frame so far.
     """
     if max_memory <= 0:
         return cap
     n = len(scene.table)
     share = largest.gaussians / max(n, 1)
     left = max_memory * 2**30 - used_bytes(scene.table.device) - frame_bytes(largest.gaussians, largest.pixels)
-    room = max(0, int(left / (2 * row_bytes(scene) + share * gaussian_bytes())))  # twice: a row edit holds old and new columns at once
+    room = max(0, int(left / (2 * row_bytes(scene) + share * gaussian_bytes())))  # 2: an edit holds old and new columns at once
     return min(n + room, cap) if cap else max(n + room, 1)
 
 
 def used_bytes(device: torch.device) -> int:
-    """Memory that this process holds, bytes: of the GPU for a CUDA device, else resident; 0 where the system does not tell."""
+    """Return the memory of this process, bytes: reserved GPU memory for CUDA, else resident memory. 0 if the system does not report it."""
     if device.type == "cuda":
         return torch.cuda.memory_reserved(device)
     try:
@@ -82,7 +90,7 @@ def used_bytes(device: torch.device) -> int:
 
 
 def _most_used() -> int:
-    """The most that this process ever held resident, where the system tells that alone (macOS)."""
+    """Return the peak resident memory of this process, bytes, for systems that report only the peak (macOS). 0 if unknown."""
     try:
         import resource
     except ImportError:
@@ -91,10 +99,12 @@ def _most_used() -> int:
 
 
 def reuse_freed() -> bool:
-    """Let the C library use freed arrays again, up to 256 MiB of them, instead of giving each one back and asking for new pages.
+    """Let the C library keep up to 256 MiB of freed memory for reuse instead of returning it to the system.
 
-    Gradients of a million Gaussians are made anew in every iteration: to touch new pages was a quarter of its time. Returns whether
-    it took: not where the C library is another than glibc, or where the user has set it up through the environment.
+    Each iteration allocates new gradients. With a million Gaussians, page faults of new memory took a quarter of its time.
+
+    Returns:
+        Whether the setting is active. It is not if the C library is not glibc, or if environment variables configure malloc.
     """
     if not sys.platform.startswith("linux") or any(name.startswith("MALLOC_") for name in os.environ) or "GLIBC_TUNABLES" in os.environ:
         return False

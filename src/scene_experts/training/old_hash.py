@@ -1,6 +1,6 @@
-"""The hash of a configuration that checkpoints held before they held the configuration itself. It lets such a run resume.
+"""Compute the configuration hash of older checkpoints, so that their runs can resume. Newer checkpoints store the configuration.
 
-Nothing here ever changes: newer settings count only where they differ from their defaults.
+This file must not change. Settings that are newer than the hash count only if they differ from their defaults.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ _FIELDS = {
 
 
 def old_hash(cfg: Any) -> str:
-    """The hash of `cfg`, a scaled `Train`, as older versions wrote it into checkpoints."""
+    """Return the hash of a scaled `Train` value, as older versions stored it in checkpoints."""
     return hashlib.sha256(json.dumps(_plain(cfg), sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _plain(value: Any) -> Any:
-    """`to_json` without the newer fields that are at their defaults."""
+    """Convert a value as `to_json` does, without newer fields that have their default value."""
     if not dataclasses.is_dataclass(value):
         return to_json(value)
     counted = _FIELDS.get(type(value).__name__, "").split()

@@ -1,6 +1,6 @@
-"""Optimisers. Adam is native on the CPU: one call and one pass over memory for all parameters, bit for bit torch's own fused Adam.
+"""Optimisers. On the CPU, Adam is one native call for all parameters, with bit-identical results to torch's fused Adam.
 
-State names are torch's (`exp_avg`, `exp_avg_sq`, `step`), so a checkpoint does not know which of them wrote it.
+The state uses torch's names (`exp_avg`, `exp_avg_sq`, `step`), so checkpoints work with both implementations.
 """
 
 from __future__ import annotations
@@ -30,10 +30,13 @@ class Optimizer(Part, ABC):
 
     @abstractmethod
     def build(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-        """The optimiser of `groups`: {"params": tensors, "name": str, "lr": 0.0, "by_row": whether they are columns of the table}.
+        """Build the optimiser.
 
-        The training sets "lr" before every step. The state of a parameter holds tensors only: of the parameter's shape, whose rows come
-        and go with the table's, or of no dimension.
+        The training sets "lr" before every step. The state of a parameter may hold only scalar tensors and tensors of the
+        parameter's shape. Densification adds and removes rows of the latter together with the rows of the table.
+
+        Args:
+            groups: {"params": tensors, "name": str, "lr": 0.0, "by_row": whether the parameters are columns of the table}.
         """
 
 
@@ -61,13 +64,19 @@ class Adam(Optimizer):
 
 
 class FusedAdam(torch.optim.Adam):
-    """Adam without weight decay; all groups have one pair of betas and one eps.
+    """Adam without weight decay. All groups share the betas and eps.
 
-    A group with `by_row` true holds tables [N, ...] of which `step(rows=...)` moves some rows only.
+    Groups with `by_row` hold parameters [N, ...]. `step(rows=...)` updates only the given rows of these parameters.
     """
 
     def __init__(self, groups: Iterable[dict[str, Any]], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15) -> None:
-        """groups: {"params": tensors, "lr": float, "by_row": bool (False where absent), ...}."""
+        """Create the optimiser.
+
+        Args:
+            groups: {"params": tensors, "lr": float, "by_row": bool (default: False), ...}.
+            betas: Decay rates of the first and second moment.
+            eps: Term added to the denominator.
+        """
         groups = [{"by_row": False, **group} for group in groups]
         every = [p for group in groups for p in group["params"]]
         self._native = all(p.device.type == "cpu" and p.dtype == torch.float32 for p in every) and native.load() is not None
@@ -76,10 +85,15 @@ class FusedAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None, *, rows: Tensor | None = None) -> Any:
-        """One step for every parameter that has a gradient.
+        """Update every parameter that has a gradient.
 
-        rows [A] int64, each at most once: only these rows of the `by_row` groups move, values and moments both ("sparse" or "selective"
-        Adam); the bias correction counts every step. None: all rows.
+        Args:
+            closure: Function that evaluates the loss again and returns it, as in torch.
+            rows: [A] int64 without duplicates. Only these rows of the `by_row` groups are updated, values and moments both ("sparse"
+                or "selective" Adam). The bias correction counts every step. None updates all rows.
+
+        Returns:
+            The loss that `closure` returns, or None.
         """
         if rows is None and not self._native:
             return super().step(closure)
@@ -96,7 +110,7 @@ class FusedAdam(torch.optim.Adam):
         return loss
 
     def _prepared(self, parameter: Tensor, group: dict[str, Any], rows: Tensor | None) -> tuple[Tensor, Tensor | None, float, float, dict]:
-        """Counts the step: (parameter, its rows or None for all, step size, root of the second bias correction, group)."""
+        """Count the step. Return (parameter, its rows or None for all, step size, root of the second bias correction, group)."""
         state = self.state[parameter]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
@@ -114,7 +128,7 @@ class FusedAdam(torch.optim.Adam):
             assert gradient is not None
             gradient = gradient.contiguous()
             rows = None if rows is None else rows.contiguous()
-            alive += [gradient, rows]  # until the call is over
+            alive += [gradient, rows]  # kept alive until the call returns
             to.value, to.gradient, to.rows = (native.pointer(t).value for t in (parameter.detach(), gradient, rows))
             to.first, to.second = native.pointer(state["exp_avg"]).value, native.pointer(state["exp_avg_sq"]).value
             to.count, to.width = (parameter.numel(), 1) if rows is None else (len(rows), parameter[:1].numel())
@@ -124,7 +138,7 @@ class FusedAdam(torch.optim.Adam):
 
 
 def _by_torch(parameter: Tensor, state: dict[str, Tensor], rows: Tensor | None, step_size: float, root: float, group: dict) -> None:
-    """The same step in plain torch, for any device and dtype."""
+    """Run the same step in plain torch, on any device and with any dtype."""
     beta1, beta2 = group["betas"]
     gradient = parameter.grad
     assert gradient is not None

@@ -1,6 +1,6 @@
-"""L1 and SSIM: 3DGS's photometric loss as two terms.
+"""L1 and SSIM: the photometric loss of 3DGS as two terms.
 
-Pictures are [H, W, 3] float RGB in [0, 1]. float32 on the CPU is one call of the compiled library; the rest is plain torch.
+Images are [H, W, 3] float RGB in [0, 1]. float32 on the CPU uses one call of the compiled library. Other inputs use plain torch.
 """
 
 from __future__ import annotations
@@ -23,22 +23,26 @@ def l1(image: Tensor, target: Tensor) -> Tensor:
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity, [], 1 for equal pictures.
+    """Structural similarity, []. It is 1 for equal images.
 
-    11 x 11 Gaussian window of sigma 1.5, zero padding, per channel, biased variances, mean over pixels and channels (Wang et al. 2004 with
-    the padding of 3DGS). image, target [H, W, 3] of any size, device and floating dtype; differentiable in both.
+    The window is an 11 x 11 Gaussian with sigma 1.5 and zero padding. Variances are biased. The result is the mean over pixels and
+    channels (Wang et al. 2004 with the padding of 3DGS). It is differentiable in both images.
+
+    Args:
+        image: [H, W, 3] of any size, device and floating-point dtype.
+        target: [H, W, 3], the same shape, device and dtype.
     """
     return 1 - dissimilarity(image, target)
 
 
 def dissimilarity(image: Tensor, target: Tensor) -> Tensor:
-    """1 - SSIM, [], written so that float32 loses nothing of it where the pictures agree.
+    """1 - SSIM, []. The formula does not lose float32 precision if the images are nearly equal.
 
-    With the sum s and the difference d of the pictures: S = (1 - p)(1 - q), p = E[d]^2 / (mx^2 + my^2 + C1) and
-    q = var(d) / (var(x) + var(y) + C2), where mx^2 + my^2 = (E[s]^2 + E[d]^2) / 2 and the same for the variances.
+    With the sum s and the difference d of the images: S = (1 - p)(1 - q), p = E[d]^2 / (mx^2 + my^2 + C1) and
+    q = var(d) / (var(x) + var(y) + C2), where mx^2 + my^2 = (E[s]^2 + E[d]^2) / 2. The same identity holds for the variances.
     """
     s, d = (image + target - 1).movedim(2, 0), (image - target).movedim(2, 0)  # [3, H, W]
-    # The sum minus 1 (and its padding with it) has the same variance, from smaller squares.
+    # Subtracting 1 from the sum and its padding keeps the variance and makes the squares smaller.
     s, d = functional.pad(s, [TAPS // 2] * 4, value=-1.0), functional.pad(d, [TAPS // 2] * 4)
     window = _window(s.dtype, s.device)
     maps = torch.cat([s, d, s * s, d * d])[None]
@@ -52,18 +56,24 @@ def dissimilarity(image: Tensor, target: Tensor) -> Tensor:
 
 @cache
 def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The window's one-dimensional factor for each of 12 maps, shaped [12, 1, TAPS]."""
+    """Return the one-dimensional factor of the window, repeated for 12 maps, [12, 1, TAPS]."""
     t = torch.arange(TAPS, dtype=torch.float64) - TAPS // 2
     w = torch.exp(-t * t / (2 * SIGMA * SIGMA))
     return (w / w.sum()).to(device, dtype).repeat(12, 1, 1)
 
 
 def photometric(image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """((1 - lambda) L1, lambda (1 - SSIM)), both []: 3DGS's photometric loss as two terms.
+    """Photometric loss of 3DGS as two terms: (1 - lambda) L1 and lambda (1 - SSIM), both [].
 
-    image, target [H, W, 3]. With mask [H, W] (1 = counts), the render is replaced by the target where nothing counts and both terms are
-    divided by the share that counts. float32 on the CPU is one call of the compiled library for values and gradient; anything else, and
-    a target that needs a gradient, is plain torch.
+    float32 on the CPU uses one call of the compiled library for values and gradient. Other inputs, and a target that requires a
+    gradient, use plain torch.
+
+    Args:
+        image: [H, W, 3], the rendered image.
+        target: [H, W, 3], the photograph.
+        lambda_dssim: Weight of 1 - SSIM, 0 to 1.
+        mask: [H, W] in [0, 1]; pixels with 0 are ignored. The target replaces the image at ignored pixels, and both terms are divided
+            by the mean of the mask.
     """
     if mask is not None:
         image = torch.lerp(target, image, mask.to(image.dtype)[..., None])
@@ -79,7 +89,7 @@ def photometric(image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor
 
 
 class _Photometric(torch.autograd.Function):
-    """Both terms and the gradient of their sum in one pass over the picture; the backward pass only scales it."""
+    """Compute both terms and the gradient of their sum in one pass over the image. The backward pass only scales the gradient."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, lambda_dssim: float) -> tuple[Tensor, Tensor]:
@@ -102,6 +112,6 @@ class _Photometric(torch.autograd.Function):
         x, y, gradient = ctx.saved_tensors
         by_l1, by_dssim = (float(g) for g in upstream)
         out = gradient if by_dssim == 1 else gradient * by_dssim
-        if by_l1 != by_dssim:  # the stored sum holds both terms in equal parts; L1's share is cheap to make again
+        if by_l1 != by_dssim:  # the stored gradient weighs both terms equally; the L1 part is cheap to recompute
             out = torch.add(out, (x - y).sign_(), alpha=(by_l1 - by_dssim) * ctx.l1_weight / x.numel())
         return out, None, None

@@ -1,4 +1,4 @@
-"""Recipes by name: this package's own, and those of other packages, which are imported when they are first needed."""
+"""Recipes by name: those of this package and those of other packages, which are imported on first use."""
 
 from __future__ import annotations
 
@@ -11,28 +11,32 @@ from scene_experts.training.config import Train
 
 GROUP = "scene_experts.recipes"
 Recipe = tuple[str, Train]
-"""A sentence about the recipe, and its value."""
+"""A one-sentence description of the recipe, and its value."""
 
 log: logging.Logger = logging.getLogger(__name__)
 
 
 class RecipeBook(Mapping[str, Recipe]):
-    """Recipes by name. A package adds its own by entry points of the group `scene_experts.recipes`, in its pyproject.toml:
+    """Recipes by name. Other packages add recipes with entry points of the group `scene_experts.recipes` in their pyproject.toml:
 
         [project.entry-points."scene_experts.recipes"]
         my-method = "my_package.recipes:my_method"
 
-    The object is a `Train` value, a pair of a sentence and a `Train` value, or a dictionary of such pairs by name. A package that cannot
-    be used is left out, with one warning.
+    The object is a `Train` value, a pair of a description and a `Train` value, or a dictionary of these by name. Packages that
+    cannot be loaded are skipped with one warning.
     """
 
     def __init__(self, own: Mapping[str, Recipe]) -> None:
-        """own: recipes that are there without any import."""
+        """Create the book.
+
+        Args:
+            own: Recipes that are available without imports.
+        """
         self._own = own
         self._others: dict[str, Recipe] | None = None
 
     def load(self) -> dict[str, Recipe]:
-        """The recipes of other packages, imported on the first call. Their parts are registered from then on."""
+        """Return the recipes of other packages. The first call imports these packages, which also registers their parts."""
         if self._others is None:
             self._others = {}
             for entry in entry_points(group=GROUP):
@@ -41,7 +45,7 @@ class RecipeBook(Mapping[str, Recipe]):
                     if taken := [name for name in found if name in self._own or name in self._others]:
                         raise ValueError(f"there already is a recipe {taken[0]!r}")
                     self._others |= found
-                except Exception as error:  # whatever another package does, our own recipes stay usable
+                except Exception as error:  # an error in another package must not affect our own recipes
                     where = f"{entry.name!r} ({entry.value})"
                     log.warning("cannot use the recipe %s of another package: %s; update or uninstall that package", where, error)
         return self._others
@@ -58,7 +62,7 @@ class RecipeBook(Mapping[str, Recipe]):
 
 
 def read_entry(entry: EntryPoint) -> dict[str, Recipe]:
-    """The recipes that an entry point offers. Raises TypeError for another object, and whatever its import raises."""
+    """Return the recipes of an entry point. Raises TypeError for an object of another type. Errors of the import are passed on."""
     value = entry.load()
     recipes = value if isinstance(value, Mapping) else {entry.name: value}
     out: dict[str, Recipe] = {}

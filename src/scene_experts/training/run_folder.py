@@ -1,11 +1,11 @@
-"""A run folder: what a training leaves behind, and how the other commands open it.
+"""The run folder of a training: its files, and functions that write and open it.
 
 RUN/config.json                      recipe, numbers, capture, command, versions
 RUN/metrics.jsonl                    one line per logged iteration
 RUN/checkpoints/ckpt_NNNNNN.safetensors
-RUN/point_cloud/iteration_N/, RUN/cameras.json      the Scaffold-GS layout, in the capture's own frame
+RUN/point_cloud/iteration_N/, RUN/cameras.json      the Scaffold-GS layout, in the coordinate frame of the capture
 RUN/previews/, RUN/test/, RUN/results.json, RUN/per_view.json
-RUN/.lock                            held by the training that writes there
+RUN/.lock                            held by the training that writes to this folder
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.state import scene_from
 
 FORMAT = 1
-PICTURES = ("renders", "gt", "errors", "side_by_side", "masks", "experts")  # the folders of an evaluation's pictures
+PICTURES = ("renders", "gt", "errors", "side_by_side", "masks", "experts")  # folders with the images of an evaluation
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class OpenRun:
     scene: Scene
     step: int
     clock: Clock  # of the training
-    capture: str = ""  # fingerprint of the capture it was trained on; empty where nothing says it
+    capture: str = ""  # fingerprint of the capture that the run was trained on; empty if unknown
 
 
 def versions() -> dict[str, str]:
-    """What the run was made with."""
+    """Return the versions of the software and the machine type that a run records."""
     return {
         "scene-experts": scene_experts.__version__,
         "torch": torch.__version__,
@@ -67,9 +67,11 @@ def versions() -> dict[str, str]:
 
 
 def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -> None:
-    """Raises InputError where a run may not go to `out`: over another run, or on from one of another recipe, capture or numbers.
+    """Check that a run can be written to `out`. Changes nothing on disk.
 
-    Changes nothing on disk.
+    Raises:
+        InputError: The folder holds another run or foreign files, the settings are not finite, or the run to resume has another
+            recipe, other capture settings or other training settings.
     """
     place = next(p for p in (out, *out.absolute().parents) if p.exists())
     if not place.is_dir():
@@ -95,7 +97,7 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
 
 
 def _foreign(out: Path) -> str:
-    """The first thing in a folder that is no run of ours; empty where there is nothing to lose."""
+    """Return the first file name in a folder that is not a run folder, or an empty string if nothing can be lost."""
     if any((out / "checkpoints").glob("ckpt_*.safetensors")):
         return ""
     try:
@@ -108,7 +110,7 @@ def _foreign(out: Path) -> str:
 
 
 def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
-    """Whether a run can go on with `config`: everything that changes its numbers as it was; the capture may have moved."""
+    """Raise InputError if a setting that affects the results differs between two configurations. The capture may have moved."""
     if found.train.recipe != config.train.recipe:
         raise InputError(
             f"expected a run of '{config.train.recipe}' to resume in {out}, found one of '{found.train.recipe}'; "
@@ -126,7 +128,7 @@ def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
 
 @contextmanager
 def held(out: Path) -> Iterator[None]:
-    """Hold `out` for one training; a process that dies lets go. Raises InputError where another training writes there."""
+    """Lock `out` for one training. The lock ends with the process. Raises InputError if another training holds the lock."""
     out.mkdir(parents=True, exist_ok=True)
     busy = f"expected a run folder that nobody writes to, found a training at work in {out}; choose another --out"
     with locked(out / ".lock", busy):
@@ -134,7 +136,7 @@ def held(out: Path) -> Iterator[None]:
 
 
 def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False, exported: Iterable[Path] = ()) -> None:
-    """Make `out` ready for a run that `check` admits: an overwritten run's checkpoints and results go, config.json is written."""
+    """Prepare `out` for a run: call `check`, remove the checkpoints and results of an overwritten run, and write config.json."""
     check(out, config, resume, overwrite)
     if overwrite:
         results = [out / f"{name}{suffix}.json" for name in ("results", "per_view") for suffix in ("", "_train", "_half")]
@@ -150,7 +152,7 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False,
 
 
 def _write_config(out: Path, config: RunConfig) -> None:
-    """Write config.json with the path of the capture from the root and from the run folder."""
+    """Write config.json with the absolute path of the capture and its path relative to the run folder."""
     path = capture_place.absolute(named(config.data).path)
     relative = capture_place.from_run(out, path)
     beside = {} if relative is None else {capture_place.KEY: relative}
@@ -159,7 +161,7 @@ def _write_config(out: Path, config: RunConfig) -> None:
 
 
 def read_config(run: Path) -> RunConfig:
-    """The configuration of a run folder, with the path of its capture where it is now. Raises InputError when it is none."""
+    """Read the configuration of a run folder and find its capture. Raises InputError if the folder is not a run folder."""
     if not (run / "config.json").is_file():
         raise InputError(f"expected a run folder with config.json at {run}, found none; give the folder that `train --out` wrote")
     value = read_json(run / "config.json", "run configuration")
@@ -168,7 +170,7 @@ def read_config(run: Path) -> RunConfig:
     relative = value.pop(capture_place.KEY, None)
     try:
         config = from_json(RunConfig, value)
-    except UnknownPart:  # of another package, perhaps
+    except UnknownPart:  # another package may define the part
         RECIPES.load()
         config = from_json(RunConfig, value)
     path = capture_place.find(run, config.data.path, relative if isinstance(relative, str) else None)
@@ -176,13 +178,16 @@ def read_config(run: Path) -> RunConfig:
 
 
 def named(data: Data) -> Data:
-    """`data` with `catalog:SCENE` replaced by the scene's folder and, where they are "auto", the paper's resolution and split."""
+    """Replace `catalog:SCENE` with the folder of the scene. A resolution or split of "auto" is replaced with that of the paper."""
     path, resolution, split = resolve(data.path, data.resolution, data.split)
     return replace(data, path=path, resolution=resolution, split=split)
 
 
 def load_capture(data: Data, seed: int = 0, look: bool = False) -> Capture:
-    """The capture that `data` describes; `look` admits one without points, which nothing can be trained on."""
+    """Load the capture that `data` describes. `look` accepts a capture without points, which cannot be trained on.
+
+    Raises InputError if `background` is not in [0, 1], if `near` is not positive, or if the capture cannot be read.
+    """
     if data.background and not all(math.isfinite(v) and 0 <= v <= 1 for v in data.background):
         raise InputError(f"expected --background as three numbers between 0 and 1, found {list(data.background)}; correct them")
     if data.near is not None and not 0 < data.near < math.inf:
@@ -207,9 +212,10 @@ def load_capture(data: Data, seed: int = 0, look: bool = False) -> Capture:
 
 
 def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
-    """The capture that a run was trained on; data: where it is now, if it moved.
+    """Load the capture that a run was trained on. `data` is its new location if it has moved.
 
-    Raises InputError, naming --data, where it is gone, and where there are other views (its world would be another).
+    Raises InputError, which names --data, if the capture does not exist or has other views. Other views would define another world
+    frame.
     """
     where = named(run.config.data if data is None else replace(run.config.data, path=data))
     if data is None and not where.path.exists():
@@ -222,14 +228,14 @@ def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
 
 
 def with_capture(run: OpenRun, data: Path | None) -> OpenRun:
-    """The run with its capture at `data` (a folder or catalog:SCENE); as it is where that is None."""
+    """Return the run with its capture at `data` (a folder or catalog:SCENE). None returns the run unchanged."""
     if data is None:
         return run
     return replace(run, config=replace(run.config, data=replace(run.config.data, path=named(Data(data)).path)))
 
 
 def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun:
-    """The newest whole checkpoint of a run (or the one at `step`). Raises InputError when there is none."""
+    """Open the newest valid checkpoint of a run, or the one at `step`. Raises InputError if there is none."""
     config = read_config(run)
     folder = run / "checkpoints"
     tensors, meta = newest(folder) if step is None else at_step(folder, step)
@@ -240,7 +246,7 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
 
 
 def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and meta of the newest whole checkpoint."""
+    """Load the tensors and metadata of the newest valid checkpoint. Raises InputError if there is none."""
     found = checkpoint.newest(folder)
     if found is None and any(folder.glob("ckpt_*.safetensors")):
         raise InputError(f"expected a whole checkpoint in {folder}, found only damaged ones; copy one back or train again")
@@ -252,7 +258,7 @@ def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def at_step(folder: Path, step: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and meta of the checkpoint at a step."""
+    """Load the tensors and metadata of the checkpoint at a step. Raises InputError if there is none."""
     path = folder / f"ckpt_{step:06d}.safetensors"
     if not path.is_file():
         kept = ", ".join(str(int(p.stem[5:])) for p in sorted(folder.glob("ckpt_*.safetensors")) if p.stem[5:].isdigit()) or "none"

@@ -1,4 +1,4 @@
-"""The state of a training: everything that a resumed run must find again, to and from checkpoints."""
+"""The state of a training. It is saved to checkpoints and restored from them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log: logging.Logger = logging.getLogger(__name__)
 
 
 class Training:
-    """Everything that a resumed run must find again: scene, optimiser, random streams, the queue of views, the clock."""
+    """The state of a training: scene, optimiser, random number generators, queue of views and clock."""
 
     cfg: Train
     scene: Scene
@@ -41,8 +41,8 @@ class Training:
         self.clock = Clock()
         self.queue: list[int] = []
         self.capture_id = ""  # fingerprint of the capture
-        self.views_rng = torch.Generator().manual_seed(cfg.seed)  # order of the views, backgrounds
-        self.growth_rng = torch.Generator().manual_seed(cfg.seed + 1)  # all that growth draws
+        self.views_rng = torch.Generator().manual_seed(cfg.seed)  # for the order of views and for backgrounds
+        self.growth_rng = torch.Generator().manual_seed(cfg.seed + 1)  # for densification
         columns = scene.table.params
         named = scene.rate_groups().items()
         groups = [{"params": params, "name": name, "lr": 0.0, "by_row": name in columns} for name, params in named]
@@ -51,7 +51,10 @@ class Training:
 
     @classmethod
     def start(cls, cfg: Train, capture: Capture, device: str, dtype: torch.dtype = torch.float32) -> Training:
-        """A fresh training of `cfg` (already scaled) on a capture. Raises InputError when the capture has no points or no training view."""
+        """Create a new training of `cfg`, which must be scaled, on a capture.
+
+        Raises InputError if the capture has no points or no training views, or if the scene starts with more than `max_anchors` rows.
+        """
         if capture.points is None:
             raise InputError("expected 3D points in the capture, found none; use --init random, or run structure from motion again")
         if not capture.train:
@@ -68,7 +71,7 @@ class Training:
         return cls(cfg, scene.to(device, dtype))
 
     def next_view(self, train: tuple[int, ...], ahead: int = 3) -> tuple[int, list[int]]:
-        """The next training view and the few after it: each view once per epoch, in random order."""
+        """Return the next training view and the `ahead` views after it. Each epoch uses every view once, in random order."""
         while len(self.queue) < ahead + 1:
             self.queue += [train[i] for i in torch.randperm(len(train), generator=self.views_rng).tolist()]
         return self.queue.pop(0), self.queue[:ahead]
@@ -78,11 +81,11 @@ class Training:
             group["lr"] = self.cfg.rates.at(group["name"], self.step, self.cfg.iterations, self.scene.extent)
 
     def rates(self) -> dict[str, float]:
-        """The learning rates in force, by group."""
+        """Return the current learning rates by group."""
         return {group["name"]: group["lr"] for group in self.optimizer.param_groups}
 
     def tensors(self) -> dict[str, Tensor]:
-        """The state as named tensors."""
+        """Return the state as named tensors."""
         table = self.scene.table
         out = {f"params.{k}": v.detach() for k, v in table.params.items()}
         out |= {f"facts.{k}": v for k, v in table.facts.items()} | {f"stats.{k}": v for k, v in table.stats.items()}
@@ -110,7 +113,7 @@ class Training:
 
     @classmethod
     def restore(cls, cfg: Train, tensors: dict[str, Tensor], meta: dict[str, Any], device: str) -> Training:
-        """The training that `tensors` and `meta` were taken from. Raises InputError when they are of another configuration."""
+        """Restore a training from a checkpoint. Raises InputError if the checkpoint has another configuration."""
         check_same(cfg, meta)
         scene = scene_from(cfg, tensors, meta)
         scene.table.stats = {k.removeprefix("stats."): v for k, v in tensors.items() if k.startswith("stats.")}
@@ -133,7 +136,7 @@ class Training:
 
 
 def scene_from(cfg: Train, tensors: dict[str, Tensor], meta: dict[str, Any]) -> Scene:
-    """A scene from a checkpoint's tensors; `cfg` must be scaled."""
+    """Create a scene from the tensors of a checkpoint. `cfg` must be scaled. Raises InputError if the networks do not match."""
     pick = lambda prefix: {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
     scene = cfg.scene.load(Table(pick("params."), pick("facts.")), meta)
     stored, wanted = pick("network."), scene.network_tensors()
@@ -146,13 +149,13 @@ def scene_from(cfg: Train, tensors: dict[str, Tensor], meta: dict[str, Any]) -> 
 
 
 def check_same(cfg: Train, meta: dict[str, Any]) -> None:
-    """Raises InputError where the checkpoint that `meta` describes was trained with other settings than `cfg` (scaled).
+    """Raise InputError if the checkpoint of `meta` was trained with settings other than `cfg`, which must be scaled.
 
-    A setting that is newer than the checkpoint counts as its default.
+    Settings that are newer than the checkpoint have their defaults.
     """
     if "train" in meta:
         other = first_difference(to_json(from_json(Train, meta["train"])), to_json(cfg))
-    else:  # an older checkpoint: a hash alone
+    else:  # an older checkpoint, which stores only a hash
         other = "" if meta["config"] == old_hash(cfg) else "it does not say which"
     if other:
         raise InputError(
@@ -162,13 +165,16 @@ def check_same(cfg: Train, meta: dict[str, Any]) -> None:
 
 
 def save(training: Training, folder: Path, keep: int) -> Path:
-    """Write a checkpoint, whole or not at all."""
+    """Write a checkpoint atomically and return its path. The newest `keep` checkpoints are kept."""
     tensors = {k: v.detach().cpu().contiguous() for k, v in training.tensors().items()}
     return checkpoint.save(folder, training.step, tensors, training.meta(), keep=keep)
 
 
 def resume(cfg: Train, folder: Path, device: str) -> Training | None:
-    """The newest whole checkpoint of a run, or None where there is none yet. Raises InputError where all that there are are damaged."""
+    """Restore the newest valid checkpoint of a run. Return None if there is no checkpoint.
+
+    Raises InputError if all checkpoints are damaged or if the configuration differs.
+    """
     found = checkpoint.newest(folder)
     if found is None and any(folder.glob("ckpt_*.safetensors")):
         raise InputError(f"expected a whole checkpoint in {folder}, found only damaged ones; copy one back, or begin anew with --overwrite")
