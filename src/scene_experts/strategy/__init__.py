@@ -1,4 +1,4 @@
-"""Strategies: how a scene's rows grow and shrink during training (densification)."""
+"""Densification strategies: they add rows to a scene and remove rows from it during training."""
 
 from __future__ import annotations
 
@@ -18,19 +18,20 @@ S = TypeVar("S", bound=Scene, default=Any)
 
 @dataclass(frozen=True)
 class Edit:
-    """What one densification step did."""
+    """Result of one densification step, in rows."""
 
     grown: int
     pruned: int
-    anchors: int  # rows afterwards
-    capped: bool = False  # the cap on rows held some back
+    anchors: int  # number of rows after the step
+    capped: bool = False  # the limit on the number of rows rejected some candidates
 
 
 @dataclass(frozen=True)
 class Strategy(Part, Generic[S], ABC):
-    """Hyper-parameters of a growth rule for scenes of class S; flags under --growth. What it remembers is in `table.stats`.
+    """Hyper-parameters of a densification strategy for scenes of class S. The flags are under --growth.
 
-    Called once per iteration, after the backward pass: first `observe`, then `update`; after the optimiser's step, `finish`.
+    The strategy keeps its running statistics in `table.stats`. Each iteration calls `observe` and then `update` after the
+    backward pass, and `finish` after the optimiser's step.
     """
 
     grows: ClassVar[str]
@@ -42,18 +43,19 @@ class Strategy(Part, Generic[S], ABC):
     """Whether rows are added and removed at all."""
 
     def count_steps(self, iterations: int) -> int | None:
-        """How often the rule densifies in a training of `iterations`; None where it does not say."""
+        """Number of densification steps in a training of `iterations` iterations; None if unknown."""
         return None
 
     def observe(self, scene: S, decoded: Decoded, render: Render, step: int) -> None:
-        """Count one view. By default nothing is counted."""
+        """Add one view to the statistics. The default does nothing."""
 
     @abstractmethod
     def update(self, scene: S, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
-        """Add and remove rows where that is due at `step`; None where nothing was due.
+        """Add and remove rows if densification is due at `step`. Returns None if it is not due.
 
-        generator: the only source of randomness.  cap: never more rows than this now (`max_anchors`, or what memory allows); 0 is no cap.
+        generator: the only source of randomness.
+        cap: maximum number of rows at this step (`max_anchors`, or the number that fits in memory); 0 means no limit.
         """
 
     def finish(self, scene: S, step: int, rates: dict[str, float], generator: torch.Generator) -> None:
-        """Called after the optimiser's step; rates: the learning rates in use, by group. By default nothing is done."""
+        """Run after the optimiser's step. The default does nothing. rates: the current learning rates by group."""

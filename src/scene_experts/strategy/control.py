@@ -1,4 +1,4 @@
-"""What density control of every anchor method has in common: when it counts, when it acts, and which anchors it removes (Scaffold-GS)."""
+"""Density control shared by all anchor methods (Scaffold-GS): the statistics, the schedule and the removal of anchors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ L = TypeVar("L", bound=LatticeScene, default=LatticeScene)
 
 @dataclass(frozen=True)
 class AnchorControl(Strategy[L]):
-    """Hyper-parameters of density control. A method adds `grow`."""
+    """Hyper-parameters of density control for anchors. Subclasses implement `grow`."""
 
     grows = "anchors"
 
@@ -40,19 +40,19 @@ class AnchorControl(Strategy[L]):
     """Maximum number of anchors; 0 means no limit. Anchors with the largest gradients are created first."""
 
     def scaled(self, factor: float) -> Self:
-        """The same in a training `factor` times as long: windows scale; interval, gates and thresholds stay."""
+        """Scale the schedule to a training `factor` times as long. The interval, gates and thresholds do not change."""
         return replace(self, start_stat=round(self.start_stat * factor), adjust=self.adjust.scaled(factor))
 
     def count_steps(self, iterations: int) -> int:
-        """How often rows are added and removed in a training of `iterations`."""
+        """Number of densification steps in a training of `iterations` iterations."""
         return self.adjust.count(iterations)
 
     def check(self) -> None:
-        """Raises InputError, naming the flag, for invalid settings."""
+        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
         expect_at_least([("--growth.adjust.interval", self.adjust.interval, 1), ("--growth.max-anchors", self.max_anchors, 0)])
 
     def observe(self, scene: L, decoded: Decoded, render: Render, step: int) -> None:
-        """Count one view, after its backward pass."""
+        """Add one view to the statistics, after its backward pass."""
         if not self.enabled or not self.start_stat < step < self.adjust.stop:
             return
         if "visits" not in scene.table.stats:
@@ -60,30 +60,39 @@ class AnchorControl(Strategy[L]):
         observe.observe(scene.table, decoded, render)
 
     def update(self, scene: L, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
-        """Grow and prune when due. `generator` draws the random elimination."""
+        """Create and remove anchors if densification is due at `step`. Returns None if it is not due.
+
+        `generator` selects the candidates that random elimination removes.
+        """
         if step >= self.adjust.stop:
             observe.stop(scene.table)
         if not self.enabled or not self.adjust.due(step) or "visits" not in scene.table.stats:
             return None
         for column in scene.table.params.values():
-            column.grad = None  # Scaffold-GS's anchors miss the step of an adjustment, whether it changed a row or not
+            column.grad = None  # in Scaffold-GS, the optimiser skips all anchors in a densification step
         grown, capped = self.grow(scene, generator, step, cap)
         pruned = self.prune(scene)
         return Edit(grown, pruned, len(scene.table), capped)
 
     def grow(self, scene: L, generator: torch.Generator, step: int = 0, cap: int = 0) -> tuple[int, bool]:
-        """Create anchors, never more than `cap` in all (0: no cap). Returns how many, and whether the cap held some back."""
+        """Create anchors, up to `cap` anchors in total (0: no limit).
+
+        Returns the number of new anchors and whether the limit rejected candidates.
+        """
         raise NotImplementedError
 
     def gate(self) -> float:
-        """Slots drawn more often than this can create anchors: 40 of 100."""
+        """Number of views that must draw a slot before the slot can create an anchor: more than 40 of 100 by default."""
         return self.adjust.interval * self.success_threshold * 0.5
 
     @torch.no_grad()
     def prune(self, scene: L) -> int:
-        """Remove anchors seen often enough and found faint; start the count of the well-seen ones anew; clamp sizes."""
+        """Remove anchors that were seen often enough and have a low mean opacity. Returns the number of removed anchors.
+
+        Also resets the statistics of all anchors that were seen often enough, and clamps the sizes of the Gaussians.
+        """
         table = scene.table
-        seen = table.stats["visits"] > self.adjust.interval * self.success_threshold  # 80 of 100
+        seen = table.stats["visits"] > self.adjust.interval * self.success_threshold  # 80 of 100 by default
         faint = seen & (table.stats["opacity"] < self.min_opacity * table.stats["visits"])
         for name in ("visits", "opacity"):
             table.stats[name][seen] = 0.0

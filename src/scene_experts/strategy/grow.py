@@ -1,7 +1,7 @@
-"""Growing and pruning anchors (Scaffold-GS), on an integer lattice.
+"""Densification of anchors on an integer lattice (Scaffold-GS).
 
-Every `interval` iterations, offsets whose mean 2D gradient is large create anchors in empty cells of three lattices, coarse to
-fine; anchors whose offsets stay faint are removed. Cells are integers throughout, so no device disagrees about which is taken.
+Every `interval` iterations, offsets with a large mean 2D gradient create anchors in the empty cells of three lattices, from
+coarse to fine. Anchors with a low mean opacity are removed. Cells are integers, so all devices agree on which cells are occupied.
 """
 
 from __future__ import annotations
@@ -34,30 +34,39 @@ class GrowAnchors(AnchorControl[L]):
     """Reproduce a quirk of Scaffold-GS: skip the finer levels while a step has created no anchor yet."""
 
     def check(self) -> None:
-        """Raises InputError, naming the flag, for invalid settings."""
+        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
         super().check()
         expect_at_least([("--growth.hierarchy-factor", self.hierarchy_factor, 2), ("--growth.init-factor", self.init_factor, 1)])
         expect_at_least([("--growth.levels", self.levels, 1)])
 
     def cell_factors(self) -> list[int]:
-        """Cell edges of the levels in fine voxels, coarse to fine (16, 4, 1); levels whose factor would be 0 do not exist."""
+        """Cell edges of the levels, coarse to fine, in units of the scene's voxel size: [16, 4, 1] by default.
+
+        Levels with a factor of 0 are left out.
+        """
         factors = [self.init_factor // self.hierarchy_factor**level for level in range(self.levels)]
         return [f for f in factors if f > 0]
 
     @torch.no_grad()
     def grow(self, scene: L, generator: torch.Generator, step: int = 0, cap: int = 0) -> tuple[int, bool]:
-        """Create anchors where gradients are large. Returns how many, and whether the cap held some back."""
-        rows, born, capped = self.search(scene, generator, cap)  # what that needs is gone before columns are copied
+        """Create anchors where gradients are large, up to `cap` anchors in total (0: no limit).
+
+        Returns the number of new anchors and whether the limit rejected candidates.
+        """
+        rows, born, capped = self.search(scene, generator, cap)  # `search` frees its buffers before the columns are copied
         if rows:
             scene.table.append({name: torch.cat([row[name] for row in rows]) for name in rows[0]})
         return born, capped
 
     def search(self, scene: L, generator: torch.Generator, cap: int = 0) -> tuple[list[dict[str, Tensor]], int, bool]:
-        """The rows to append, level by level, how many they are, and whether the cap held some back; restarts the counts."""
+        """Find the anchors to create and reset the statistics of the slots that were seen often enough.
+
+        Returns the new rows by level, their number, and whether the limit rejected candidates.
+        """
         table, stats = scene.table, scene.table.stats
-        eligible = (stats["count"].view(-1) > self.gate()).nonzero().squeeze(1)  # flat slots, row * K + k
+        eligible = (stats["count"].view(-1) > self.gate()).nonzero().squeeze(1)  # flat slot index: row * K + k
         g = stats["grad"].view(-1).index_select(0, eligible) / stats["count"].view(-1).index_select(0, eligible).clamp_min(1)
-        strong = (g >= self.grad_threshold).nonzero().squeeze(1)  # the first threshold is the lowest
+        strong = (g >= self.grad_threshold).nonzero().squeeze(1)  # the first level has the lowest threshold
         slots, g = eligible.index_select(0, strong), g.index_select(0, strong)
         parents = torch.div(slots, scene.K, rounding_mode="floor")
         points = scene.slot_points(slots, parents)
@@ -86,7 +95,10 @@ class GrowAnchors(AnchorControl[L]):
 
 
 def strongest(strength: Tensor, cap: int, rows: int) -> Tensor:
-    """Which of the candidates [n] still fit, beside `rows` rows, under `cap` (0: no cap): the strongest, in their order."""
+    """Indices of the candidates to keep so that a table of `rows` rows stays within `cap` rows (0: no limit).
+
+    strength [n]: gradients of the candidates. The strongest candidates are kept, in their original order.
+    """
     if not cap or rows + len(strength) <= cap:
         return torch.arange(len(strength), device=strength.device)
     return strength.argsort(descending=True, stable=True)[: max(0, cap - rows)].sort().values
@@ -95,16 +107,17 @@ def strongest(strength: Tensor, cap: int, rows: int) -> Tensor:
 def empty_cells(
     features: Tensor, taken: Tensor, fine: Tensor, parents: Tensor, g: Tensor, factor: int
 ) -> tuple[Tensor, Tensor, Tensor] | None:
-    """Cells (in units of `factor` voxels) that candidate points [P, 3] fall into and none of the `taken` fine cells [N, 3] is in.
+    """Find the empty cells, in units of `factor` voxels, that contain candidate points.
 
-    features [N, F] of the table; fine: the points in units of fine voxels, float64; parents [P] their rows; g [P] their gradients.
-    Returns cells [n, 3] int64, features [n, F] (element-wise maximum over the parents of all points in the cell) and the
-    largest gradient [n]; None for no cell.
+    features [N, F]: features of the table.  taken [N, 3]: occupied fine cells.
+    fine [P, 3] float64: candidate points in units of fine voxels.  parents [P]: their rows.  g [P]: their gradients.
+    Returns cells [n, 3] int64, features [n, F] (element-wise maximum over the parents of all points in a cell) and the largest
+    gradient per cell [n]. Returns None if there is no empty cell.
     """
     if len(fine) == 0:
         return None
-    fine = torch.floor(fine + 0.5)  # rounded once; coarser cells follow in integers, as the anchors' own do
-    inside = (fine.abs() < AXIS_LIMIT - factor).all(1)  # an offset that ran away founds nothing
+    fine = torch.floor(fine + 0.5)  # round once; integer arithmetic derives the coarser cells, as for the anchors
+    inside = (fine.abs() < AXIS_LIMIT - factor).all(1)  # points outside the lattice create no anchors
     cells, parents, g = coarsen(fine[inside].long(), factor), parents[inside], g[inside]
     if len(cells) == 0:
         return None
