@@ -1,7 +1,8 @@
-"""Growing anchors on the levels of an octree (Octree-GS).
+"""Densification of anchors on the levels of an octree (Octree-GS).
 
-Offsets with a middling mean 2D gradient found anchors on their parent's level, those with a large one on the next finer level. Anchors
-whose gradients are large on average also ask for finer levels from then on. Removal is Scaffold-GS's.
+Offsets with a medium mean 2D gradient create anchors on their parent's level. Offsets with a large mean 2D gradient create
+anchors on the next finer level. Anchors whose gradients are large on average also request finer levels from then on. Anchors
+are removed as in Scaffold-GS.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from scene_experts.strategy.grow import empty_cells, strongest
 @register
 @dataclass(frozen=True)
 class GrowOctree(AnchorControl[AnchorScene]):
-    """Densification of Octree-GS: thresholds rise by u = fork^update_ratio per level."""
+    """Densification of Octree-GS: gradient thresholds grow by the factor fork^update_ratio per level."""
 
     grows = "anchors on levels"
 
@@ -41,19 +42,22 @@ class GrowOctree(AnchorControl[AnchorScene]):
     """Reproduce a bug of Octree-GS: add the level increment once per level instead of once."""
 
     def check(self) -> None:
-        """Raises InputError, naming the flag, for invalid settings."""
+        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
         super().check()
         if not self.update_ratio >= 0:
             raise InputError(f"expected --growth.update-ratio of at least 0, found {self.update_ratio}; give a larger number")
 
     @torch.no_grad()
     def grow(self, scene: AnchorScene, generator: torch.Generator, step: int = 0, cap: int = 0) -> tuple[int, bool]:
-        """Create anchors level by level, coarse to fine. Returns how many, and whether the cap held some back."""
+        """Create anchors level by level, coarse to fine, up to `cap` anchors in total (0: no limit).
+
+        Returns the number of new anchors and whether the limit rejected candidates.
+        """
         table, levels = scene.table, scene.select.lattices
         assert levels is not None
         refine = self.parity_coarse_gate or not scene.select.coarse(step)
         eligible, g, mean = self.gradients(table.stats)
-        slots = (g.view(-1) >= self.grad_threshold).nonzero().squeeze(1)  # level 0's threshold is the lowest
+        slots = (g.view(-1) >= self.grad_threshold).nonzero().squeeze(1)  # level 0 has the lowest threshold
         strength, parents = g.view(-1).index_select(0, slots), torch.div(slots, scene.K, rounding_mode="floor")
         points, own = scene.slot_points(slots, parents), table.facts["level"].index_select(0, parents)
         cells = [table.facts["cell"][table.facts["level"] == level] for level in range(levels.count)]
@@ -87,17 +91,24 @@ class GrowOctree(AnchorControl[AnchorScene]):
         return born, capped
 
     def gradients(self, stats: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Eligible slots [N, K] (bool), their mean gradients [N, K] (0 elsewhere), and the anchors' means [N] over eligible slots."""
+        """Mean gradients per slot and per anchor.
+
+        Returns the eligible slots [N, K] (bool), their mean gradients [N, K] (0 for other slots), and the mean of each anchor over
+        its eligible slots [N].
+        """
         eligible = stats["count"] > self.gate()
         g = torch.where(eligible, stats["grad"] / stats["count"].clamp_min(1), 0.0)
         return eligible, g, g.sum(1) / (eligible.sum(1) + 1e-6)
 
     def threshold(self, level: int, levels: Levels) -> float:
-        """The gradient from which slots of `level` found anchors; from the next level's on, they found them there."""
+        """Mean 2D gradient (NDC units) above which slots of `level` create anchors.
+
+        Slots above the threshold of `level + 1` create their anchors on that level.
+        """
         return self.grad_threshold * float(levels.fork) ** (self.update_ratio * level)
 
     def extra(self, mean: Tensor, level: Tensor, levels: Levels) -> Tensor:
-        """What is added [N] to the level that anchors of mean gradient `mean` [N] ask for."""
+        """Increments [N] of the level that anchors request, from their mean gradients `mean` [N] and levels `level` [N]."""
         thresholds = self.extra_ratio * mean.new_tensor([self.threshold(i, levels) for i in range(levels.count)])
         if self.parity_extra_level:
             times = sum(((mean >= thresholds[int(i)]).to(mean.dtype) for i in level.unique()), start=torch.zeros_like(mean))

@@ -1,4 +1,4 @@
-"""Growing and pruning graph points (SAGS): Scaffold-GS's rules with one Gaussian a row, whose place a network gives."""
+"""Densification of graph points (SAGS): the rules of Scaffold-GS with one Gaussian per row, placed by a network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scene_experts.strategy.grow import GrowAnchors
 @register
 @dataclass(frozen=True)
 class GrowPoints(GrowAnchors):
-    """Densification of SAGS: as for anchors, except for what counts as a visit; sizes are not clamped."""
+    """Densification of SAGS. It differs from that of anchors in the definition of a visit, and it does not clamp sizes."""
 
     grows = "graph points"
 
@@ -27,11 +27,11 @@ class GrowPoints(GrowAnchors):
     for all points that it decodes."""
 
     def observe(self, scene: LatticeScene, decoded: Decoded, render: Render, step: int) -> None:
-        """Count one view, after its backward pass."""
+        """Add one view to the statistics, after its backward pass."""
         super().observe(scene, self.counted(decoded, render), render, step)
 
     def counted(self, decoded: Decoded, render: Render) -> Decoded:
-        """`decoded` as far as its rows count as visited."""
+        """Restrict `decoded` to the rows that count as visited."""
         if self.visits == "seen":
             return decoded
         drawn = (render.radii > 0).nonzero().squeeze(1)

@@ -1,6 +1,6 @@
-"""Density control as sampling (3DGS as Markov chain Monte Carlo, Kheradmand et al. 2024): relocate the dead, add, disturb.
+"""Densification by sampling (3DGS as Markov chain Monte Carlo, Kheradmand et al. 2024): relocate, add and perturb Gaussians.
 
-The two regularisers that belong to it are loss weights: `Weights.mean_opacity` and `Weights.mean_size`.
+The method's two regularisers are loss weights: `Weights.mean_opacity` and `Weights.mean_size`.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from scene_experts.native import library as native
 from scene_experts.scene.gaussians import GaussianScene
 from scene_experts.strategy import Edit, Strategy
 
-MOST = 51  # Gaussians that one is shared among at most
-_SHARP = 100.0  # how steeply the noise fades with opacity
+MOST = 51  # maximum number of Gaussians that replace one Gaussian
+_SHARP = 100.0  # slope of the sigmoid that reduces the noise of opaque Gaussians
 
 
 @register
@@ -44,15 +44,15 @@ class MCMC(Strategy[GaussianScene]):
     """Maximum number of Gaussians; 0 means no limit."""
 
     def scaled(self, factor: float) -> Self:
-        """The same in a training `factor` times as long: the window scales; the interval stays."""
+        """Scale the schedule to a training `factor` times as long. The interval does not change."""
         return replace(self, adjust=self.adjust.scaled(factor))
 
     def count_steps(self, iterations: int) -> int:
-        """How often rows are added and removed in a training of `iterations`."""
+        """Number of densification steps in a training of `iterations` iterations."""
         return self.adjust.count(iterations)
 
     def check(self) -> None:
-        """Raises InputError, naming the flag, for invalid settings."""
+        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
         expect_at_least(
             [
                 ("--growth.adjust.interval", self.adjust.interval, 1),
@@ -63,18 +63,21 @@ class MCMC(Strategy[GaussianScene]):
         )
 
     def update(self, scene: GaussianScene, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
-        """Relocate and add when due. `generator` draws who is shared."""
+        """Relocate and add Gaussians if densification is due at `step`. Returns None if it is not due.
+
+        `generator` samples the Gaussians to copy.
+        """
         if not self.enabled or not self.adjust.due(step) or len(scene.table) == 0:
             return None
         self.relocate(scene, generator)
         grown, capped = self.add(scene, generator, cap)
         for column in scene.table.params.values():
-            column.grad = None  # as in 3DGS, Gaussians miss the step of an adjustment
+            column.grad = None  # as in 3DGS, the optimiser skips all Gaussians in a densification step
         return Edit(grown, 0, len(scene.table), capped)
 
     @torch.no_grad()
     def relocate(self, scene: GaussianScene, generator: torch.Generator) -> int:
-        """Every dead Gaussian becomes a share of a live one, drawn by opacity. Returns how many were dead."""
+        """Move each dead Gaussian onto a live one, sampled in proportion to opacity. Returns the number of moved Gaussians."""
         table = scene.table
         opacity = table.params["raw_opacity"].sigmoid()
         dead = (opacity <= self.min_opacity).nonzero().squeeze(1)
@@ -88,7 +91,10 @@ class MCMC(Strategy[GaussianScene]):
 
     @torch.no_grad()
     def add(self, scene: GaussianScene, generator: torch.Generator, cap: int = 0) -> tuple[int, bool]:
-        """Add shares of Gaussians drawn by opacity. Returns how many, and whether the cap held some back."""
+        """Add copies of Gaussians sampled in proportion to opacity, up to `cap` Gaussians in total (0: no limit).
+
+        Returns the number of new Gaussians and whether the limit rejected some.
+        """
         table, n = scene.table, len(scene.table)
         wanted = int(self.growth * n)
         target = min(cap, wanted) if cap else wanted
@@ -100,7 +106,10 @@ class MCMC(Strategy[GaussianScene]):
         return target - n, target < wanted
 
     def share(self, scene: GaussianScene, sources: Tensor) -> None:
-        """Make each of the Gaussians `sources` [D] (repeats count) one of as many as were drawn and itself; its moments begin anew."""
+        """Adjust the opacity and scale of the Gaussians `sources` [D] for their copies, and reset their optimiser moments.
+
+        An index that occurs c times in `sources` has c copies, so c + 1 Gaussians replace the original one.
+        """
         rows, drawn = sources.unique(return_counts=True)
         p = scene.table.params
         opacity = p["raw_opacity"].index_select(0, rows).sigmoid()
@@ -111,7 +120,10 @@ class MCMC(Strategy[GaussianScene]):
 
     @torch.no_grad()
     def finish(self, scene: GaussianScene, step: int, rates: dict[str, float], generator: torch.Generator) -> None:
-        """After the optimiser's step: noise on the positions, shaped like each Gaussian, on faint ones alone."""
+        """Add noise to the positions after the optimiser's step.
+
+        The noise follows the covariance of each Gaussian and vanishes for opaque Gaussians.
+        """
         size = self.noise * rates["means"]
         if not self.enabled or size == 0:
             return
@@ -128,7 +140,7 @@ class MCMC(Strategy[GaussianScene]):
 
 
 def disturb(means: Tensor, quats: Tensor, log_scales: Tensor, raw_opacity: Tensor, eta: Tensor, size: float, faint: float) -> None:
-    """means += Sigma eta size sigmoid(-100 (opacity - faint)) in place, in plain torch, for any device and dtype."""
+    """Compute means += Sigma eta size sigmoid(-100 (opacity - faint)) in place, in PyTorch, for any device and dtype."""
     gate = torch.sigmoid(-_SHARP * (raw_opacity.sigmoid() - faint))
     turn = quat_to_matrix(normalise_quats(quats))
     along = (turn.transpose(1, 2) @ eta[..., None]).squeeze(-1) * (2 * log_scales).exp()
@@ -136,17 +148,19 @@ def disturb(means: Tensor, quats: Tensor, log_scales: Tensor, raw_opacity: Tenso
 
 
 def draw(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """`count` indices [count] drawn with replacement in proportion to `weight` [N] >= 0; some weight must be positive."""
+    """Sample indices [count] with replacement, in proportion to `weight` [N] >= 0. At least one weight must be positive."""
     total = weight.double().cumsum(0)
     at = torch.rand(count, generator=generator, dtype=torch.float64).to(total.device) * total[-1]
     return torch.searchsorted(total, at, right=True).clamp_max_(int(weight.nonzero()[-1]))
 
 
 def shared(opacity: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity and factor on the scales, both [D], of each of n [D] (at most 51) Gaussians that together look like one of `opacity` [D].
+    """Opacity and scale factor, both [D], of n [D] (at most 51) equal Gaussians that replace one Gaussian of `opacity` [D].
 
-    o' = 1 - (1 - o)^(1/n) and o / Q with Q = sum_{i=1..n} sum_{k=0..i-1} binom(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1) (eq. 9 of the
-    paper). By the hockey-stick identity Q = sum_{j=1..n} binom(n, j) (-1)^(j-1) o'^j / sqrt(j); in float64, as its signs alternate.
+    The new opacity is o' = 1 - (1 - o)^(1/n). The scale factor is o / Q with
+    Q = sum_{i=1..n} sum_{k=0..i-1} binom(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1) (eq. 9 of the paper).
+    The hockey-stick identity gives Q = sum_{j=1..n} binom(n, j) (-1)^(j-1) o'^j / sqrt(j). The signs alternate, so the sum is
+    computed in float64.
     """
     n, o = n.clamp(1, MOST), opacity.double()
     new = 1 - (1 - o) ** (1 / n)
@@ -157,6 +171,6 @@ def shared(opacity: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
 
 @functools.cache
 def _signed_binomials() -> Tensor:
-    """binom(n, j) (-1)^(j-1) / sqrt(j) for n = 0 .. MOST (rows) and j = 1 .. MOST (columns), float64."""
+    """Table of binom(n, j) (-1)^(j-1) / sqrt(j) for n = 0 .. MOST (rows) and j = 1 .. MOST (columns), float64."""
     rows = [[math.comb(n, j) * (-1) ** (j - 1) / math.sqrt(j) for j in range(1, MOST + 1)] for n in range(MOST + 1)]
     return torch.tensor(rows, dtype=torch.float64)

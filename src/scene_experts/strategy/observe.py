@@ -1,7 +1,11 @@
-"""What density control counts, gathered once per iteration for every anchor method.
+"""Densification statistics, collected once per iteration for all anchor methods.
 
-Statistics of a table ([N] or [N, K]): `visits` views that saw the anchor; `opacity` sum over visits of its positive opacities;
-`grad` sum of the norms of the 2D-mean gradients (NDC units) of each slot; `count` how often that slot was drawn.
+Statistics of a table:
+
+- `visits` [N]: number of views that saw the anchor.
+- `opacity` [N]: sum of the anchor's positive opacities over these views.
+- `grad` [N, K]: sum of the norms of the slot's 2D-mean gradients (NDC units).
+- `count` [N, K]: number of views that drew the slot.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ STATS = ("visits", "opacity", "grad", "count")
 
 
 def start(table: Table, K: int) -> None:
-    """Begin counting from zero, in the parameters' dtype."""
+    """Create the statistics, filled with zeros, in the dtype of the parameters."""
     like = next(iter(table.params.values()))
     for name, shape in (("visits", ()), ("opacity", ()), ("grad", (K,)), ("count", (K,))):
         table.stats[name] = like.new_zeros(len(table), *shape)
@@ -31,9 +35,10 @@ def stop(table: Table) -> None:
 
 @torch.no_grad()
 def observe(table: Table, decoded: Decoded, render: Render) -> None:
-    """Add one view, after its backward pass. A slot counts when its opacity is positive and its splat touched the picture.
+    """Add one view, after its backward pass. A slot counts if its opacity is positive and its splat overlaps the image.
 
-    Rows and slots of a view are each at most once, so the compiled library adds them in parallel; the bits are the same without it.
+    Each row and slot occurs at most once per view, so the compiled library adds them in parallel. Its results are bit-identical
+    to the PyTorch implementation.
     """
     assert decoded.raw_opacity is not None
     raw, library = decoded.raw_opacity.detach(), native.load()
@@ -49,7 +54,7 @@ def observe(table: Table, decoded: Decoded, render: Render) -> None:
 
 @torch.no_grad()
 def observe_drawn(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:
-    """Add to `grad` and `count` (one value a slot) alone what one view drew: all that explicit Gaussians need."""
+    """Add one view to `grad` and `count` only (one value per slot). Explicit Gaussians need no other statistics."""
     columns, library = [stats["grad"], stats["count"]], native.load()
     parts = [*columns, render.mean2d_grad]
     if library is None or not all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in parts):
@@ -60,7 +65,7 @@ def observe_drawn(stats: dict[str, Tensor], decoded: Decoded, render: Render) ->
 
 
 def _by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:
-    """The same in plain torch, for any device and dtype."""
+    """PyTorch implementation of `observe`, for any device and dtype."""
     rows = decoded.rows
     assert decoded.raw_opacity is not None
     stats["visits"].index_add_(0, rows, torch.ones_like(rows, dtype=stats["visits"].dtype))
@@ -71,6 +76,6 @@ def _by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> Non
 def _drawn_by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:
     drawn, source = render.radii > 0, decoded.gaussians.source
     norms = render.mean2d_grad.norm(dim=1)
-    # Zeros for what was not drawn, instead of picking out the others: on a GPU the host would wait for their number.
+    # Add zeros for slots that were not drawn. Selecting the drawn slots would synchronise the host with the GPU.
     stats["grad"].view(-1).index_add_(0, source, torch.where(drawn, norms, 0.0))
     stats["count"].view(-1).index_add_(0, source, drawn.to(norms.dtype))

@@ -1,6 +1,9 @@
-"""Density control of explicit Gaussians (3DGS, Kerbl et al. 2023, section 5): clone, split, prune, reset opacities.
+"""Densification of explicit Gaussians (3DGS, Kerbl et al. 2023, section 5): clone, split, prune, reset opacities.
 
-Statistics: `grad` [N] sum of the norms of the 2D-mean gradients (NDC units) over the views that drew the Gaussian, `count` [N] how many.
+Statistics:
+
+- `grad` [N]: sum of the norms of the 2D-mean gradients (NDC units) over the views that drew the Gaussian.
+- `count` [N]: number of these views.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from scene_experts.geometry.rotation import normalise_quats, quat_to_matrix
 from scene_experts.scene.gaussians import GaussianScene
 from scene_experts.strategy import Edit, Strategy, observe
 
-SHRINK = 1.6  # a half of a split Gaussian is this much smaller (3DGS: 0.8 N for N = 2 halves)
+SHRINK = 1.6  # factor by which a split divides the scales (3DGS: 0.8 N for N = 2 new Gaussians)
 
 
 @register
@@ -52,17 +55,20 @@ class SplitClone(Strategy[GaussianScene]):
     """Maximum number of Gaussians; 0 means no limit. Gaussians with the largest gradients are added first."""
 
     def scaled(self, factor: float) -> Self:
-        """The same in a training `factor` times as long: windows and, down to `reset_least`, the interval of resets scale."""
+        """Scale the schedule to a training `factor` times as long.
+
+        The reset interval scales too, but not below `reset_least`. The densification interval does not change.
+        """
         least = min(self.reset_least, self.reset.interval)
         reset = replace(self.reset.scaled(factor), interval=max(1, least, round(self.reset.interval * factor)))
         return replace(self, adjust=self.adjust.scaled(factor), reset=reset)
 
     def count_steps(self, iterations: int) -> int:
-        """How often rows are added and removed in a training of `iterations`."""
+        """Number of densification steps in a training of `iterations` iterations."""
         return self.adjust.count(iterations)
 
     def check(self) -> None:
-        """Raises InputError, naming the flag, for invalid settings."""
+        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
         intervals = [("--growth.adjust.interval", self.adjust.interval, 1), ("--growth.reset.interval", self.reset.interval, 1)]
         intervals += [("--growth.reset-least", self.reset_least, 1)]
         expect_at_least([*intervals, ("--growth.max-anchors", self.max_anchors, 0)])
@@ -70,7 +76,7 @@ class SplitClone(Strategy[GaussianScene]):
             raise InputError(f"expected --growth.reset-opacity between 0 and 1, found {self.reset_opacity}; correct it")
 
     def observe(self, scene: GaussianScene, decoded: Decoded, render: Render, step: int) -> None:
-        """Count one view, after its backward pass."""
+        """Add one view to the statistics, after its backward pass."""
         if not self.enabled or step >= self.adjust.stop:
             return
         stats = scene.table.stats
@@ -80,7 +86,10 @@ class SplitClone(Strategy[GaussianScene]):
         observe.observe_drawn(stats, decoded, render)
 
     def update(self, scene: GaussianScene, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
-        """Grow, prune and reset when due. `generator` draws where the halves of a split Gaussian go."""
+        """Clone, split, remove and reset Gaussians if due at `step`. Returns None if densification is not due.
+
+        `generator` samples the positions of the two halves of a split Gaussian.
+        """
         table = scene.table
         if step >= self.adjust.stop:
             table.stats = {}
@@ -93,7 +102,7 @@ class SplitClone(Strategy[GaussianScene]):
             for name in ("grad", "count"):
                 table.stats[name].zero_()
             for column in table.params.values():
-                column.grad = None  # 3DGS's Gaussians miss the step of an adjustment, whether it changed a row or not
+                column.grad = None  # in 3DGS, the optimiser skips all Gaussians in a densification step
             edit = Edit(grown, pruned, len(table), capped)
         if self.reset.due(step) or (self.reset_at_start and step == self.adjust.start):
             self.press_opacities(scene)
@@ -101,7 +110,10 @@ class SplitClone(Strategy[GaussianScene]):
 
     @torch.no_grad()
     def grow(self, scene: GaussianScene, generator: torch.Generator, cap: int = 0) -> tuple[int, bool]:
-        """Clone small Gaussians with large gradients, split large ones. Returns the rows gained, and whether the cap held some back."""
+        """Clone small Gaussians and split large ones where gradients are large, up to `cap` Gaussians in total (0: no limit).
+
+        Returns the number of Gaussians gained and whether the limit rejected candidates.
+        """
         table = scene.table
         g = table.stats["grad"] / table.stats["count"].clamp_min(1)
         chosen = (g >= self.grad_threshold).nonzero().squeeze(1)
@@ -124,7 +136,7 @@ class SplitClone(Strategy[GaussianScene]):
 
     @torch.no_grad()
     def prune(self, scene: GaussianScene, step: int) -> int:
-        """Remove faint Gaussians and, after the first reset, huge ones. Returns how many."""
+        """Remove Gaussians of low opacity and, after the first reset, very large ones. Returns the number of removed Gaussians."""
         p = scene.table.params
         gone = p["raw_opacity"].sigmoid() < self.min_opacity
         if step > self.reset.interval:
@@ -135,13 +147,16 @@ class SplitClone(Strategy[GaussianScene]):
 
     @torch.no_grad()
     def press_opacities(self, scene: GaussianScene) -> None:
-        """No opacity above `reset_opacity`; Adam's moments of opacities begin anew."""
+        """Clamp all opacities to at most `reset_opacity` and reset Adam's moments of the opacities."""
         most = math.log(self.reset_opacity / (1 - self.reset_opacity))
         scene.table.assign("raw_opacity", scene.table.params["raw_opacity"].detach().clamp_max(most))
 
 
 def split_rows(params: torch.nn.ParameterDict, rows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-    """Two halves of each of the Gaussians `rows` [S], first halves first: drawn from it, 1.6 times smaller, otherwise like it."""
+    """Split each of the Gaussians `rows` [S] into two; returns columns of 2 S rows, all first halves before all second halves.
+
+    Each half has a mean sampled from the original Gaussian and scales divided by 1.6. Its other columns are copies.
+    """
     halves = {name: torch.cat([column.index_select(0, rows)] * 2) for name, column in params.items()}
     quats, scales = halves["quats"], halves["log_scales"].exp()
     draw = torch.randn(scales.shape, generator=generator).to(scales)
