@@ -1,4 +1,4 @@
-"""Scenes: what a camera looks at and what a training changes. The interface that training, evaluation and export use."""
+"""Base classes of scenes: the interface that training, evaluation and export use."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 Cull = Callable[[Tensor, Tensor, Camera], Tensor]
 """The rasteriser's visibility test: means [n, 3], scales [n, 3], camera -> [n] bool."""
 Draws = Callable[[Camera, int, Mode, Cull], Decoded]
-"""What a scene does when it is called: (camera, step, mode, cull) -> Decoded."""
+"""Signature of a scene's forward pass: (camera, step, mode, cull) -> Decoded."""
 
 
 @dataclass(frozen=True)
 class Traits:
-    """What a scene is and can do. Other parts read these values and never ask for the scene's class."""
+    """Properties and capabilities of a scene. Other modules read these values and never test the scene's class."""
 
     family: str
     """Key of the scene's family: "anchors", "gaussians", "graph". `files` looks up readers and writers by it."""
@@ -53,7 +53,10 @@ class Traits:
 
 
 class Scene(nn.Module):
-    """Rows of a table that decode into Gaussians for a camera. A family subclasses it; the defaults suit a scene without extras."""
+    """Rows of a table that decode into Gaussians for a camera. Each family has a subclass.
+
+    The default methods suit a scene without experts, levels of detail or an opacity network.
+    """
 
     table: Table
     extent: float
@@ -61,7 +64,7 @@ class Scene(nn.Module):
     codes: Codes | None  # appearance codes; None where `traits.appearance` is 0
 
     def __init__(self, table: Table, extent: float) -> None:
-        """extent: the capture's R, trained world units."""
+        """extent: the extent R of the capture, in trained world units."""
         super().__init__()
         self.table, self.extent = table, extent
         self.codes = None
@@ -69,7 +72,7 @@ class Scene(nn.Module):
     @property
     @abstractmethod
     def traits(self) -> Traits:
-        """What this scene is and can do."""
+        """Properties and capabilities of this scene."""
 
     @property
     @abstractmethod
@@ -79,12 +82,12 @@ class Scene(nn.Module):
     @property
     @abstractmethod
     def file_values(self) -> int:
-        """float32 values of a row in the file of the scene's family."""
+        """Number of float32 values per row in the family's file format."""
 
     @property
     @abstractmethod
     def positions(self) -> Tensor:
-        """Where the rows are, [N, 3], trained world."""
+        """Positions of the rows [N, 3], in trained world units."""
 
     @abstractmethod
     def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
@@ -92,57 +95,60 @@ class Scene(nn.Module):
 
     @abstractmethod
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Every parameter, by the name of its learning rate."""
+        """All parameters, grouped by the name of their learning rate."""
 
     @abstractmethod
     def meta(self) -> dict[str, Any]:
-        """The plain values that a checkpoint keeps to build the scene again (`voxel`, `extent`, ...)."""
+        """Plain values that a checkpoint stores to rebuild the scene (`voxel`, `extent`, ...)."""
 
     def network_tensors(self) -> dict[str, Tensor]:
-        """Every learned tensor that is not a column of the table, by name."""
+        """All learned tensors that are not columns of the table, by name."""
         return {}
 
     def routing(self, step: int, most: int | None = None, mode: Mode = Mode.DRAW) -> dict[str, Routing]:
-        """Routing of every row (of at most `most` rows, evenly spread), by attribute; empty without experts."""
+        """Routing of all rows, or of at most `most` evenly spaced rows, by attribute. Empty for a scene without experts."""
         return {}
 
     def scene_opacity(self, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Tensor | None:
-        """Raw opacities [N, K] of every row from `camera`, seen or not; None where no network decides opacities."""
+        """Raw opacities [N, K] of all rows for `camera`, visible or not. None if no network predicts opacities."""
         return None
 
     def rows_by_level(self) -> list[int]:
-        """How many rows each level of detail holds, coarse to fine; empty without levels."""
+        """Number of rows per level of detail, coarse to fine. Empty for a scene without levels."""
         return []
 
     def at_level(self, level: int | None) -> AbstractContextManager[None]:
-        """Within the block the scene draws no finer level than `level` (0 is the coarsest; None: all).
+        """Context manager that limits drawing to levels up to `level` (0 is the coarsest; None draws all levels).
 
-        A scene without levels draws as always.
+        It has no effect on a scene without levels.
         """
         return nullcontext()
 
     def frozen(self, step: int) -> Draws:
-        """The scene prepared for drawing at `step` without gradients: the same pictures, faster. Do not train it meanwhile."""
+        """Prepare the scene for faster drawing at `step` without gradients. The images do not change.
+
+        Do not train the scene while the result is in use.
+        """
         return self
 
 
 class LatticeScene(Scene):
-    """A scene whose rows lie at the cells of a lattice; growth adds rows at empty cells. The table has a fact `cell` [N, 3] int64."""
+    """A scene whose rows lie on a lattice. Densification adds rows at empty cells. The table has a fact `cell` [N, 3] int64."""
 
-    voxel: float  # edge of the finest lattice cell, trained world units
+    voxel: float  # edge of the finest lattice cell, in trained world units
 
     @abstractmethod
     def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
-        """Columns of new rows at cells [n, 3] of `level`, with scaling `size` and features [n, F]."""
+        """Columns of new rows at the cells [n, 3] of `level`, with scaling `size` (trained world units) and features [n, F]."""
 
     @abstractmethod
     def slot_points(self, slots: Tensor, rows: Tensor) -> Tensor:
-        """Where the Gaussians of flat `slots` [P] (row * K + slot) of `rows` [P] are, [P, 3] float64."""
+        """Positions [P, 3] float64 of the Gaussians at the flat `slots` [P] (row * K + slot) of `rows` [P]."""
 
 
 @dataclass(frozen=True)
 class SceneConfig(Part, ABC):
-    """What a scene is made of; its fields are the recipe's flags under --scene."""
+    """Settings of a scene. The fields are the recipe's flags under --scene."""
 
     family: ClassVar[str]
     """Key of the family, as in `Traits.family`."""
@@ -150,35 +156,35 @@ class SceneConfig(Part, ABC):
     @property
     @abstractmethod
     def grown_as(self) -> str:
-        """What growth rules for this scene name in `Strategy.grows`, for example "anchors on levels"."""
+        """Value of `Strategy.grows` that strategies for this scene must have, for example "anchors on levels"."""
 
     @property
     def dense_until(self) -> int:
-        """The last iteration of the experts' dense warm-up; 0 without one."""
+        """Last iteration of the experts' dense warm-up. 0 if there is none."""
         return 0
 
     @abstractmethod
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> Scene:
-        """A new scene from a point cloud and the cameras of the training views; some families do not need the cameras."""
+        """Create a scene from a point cloud and the cameras of the training views. Some families ignore the cameras."""
 
     @abstractmethod
     def load(self, table: Table, meta: dict[str, Any]) -> Scene:
-        """The scene that a checkpoint's table and `Scene.meta()` describe; the caller fills in the tensors of its networks."""
+        """Build a scene from a checkpoint's table and `Scene.meta()`. The caller loads the tensors of its networks."""
 
 
 @dataclass(frozen=True)
 class LearningRates(Part, ABC):
-    """Learning rates of a family's scenes: one `Rate` for each group of `Scene.rate_groups`; flags under --rates."""
+    """Learning rates of a family: one `Rate` for each group of `Scene.rate_groups`. The flags are under --rates."""
 
     family: ClassVar[str]
     """Key of the family, as in `Traits.family`."""
 
     @abstractmethod
     def at(self, group: str, step: int, total: int, extent: float) -> float:
-        """The rate of `group` at `step` of `total`; extent: the scene's R, trained world units."""
+        """Learning rate of `group` at `step` of `total`. extent: the extent R of the scene, in trained world units."""
 
     def check(self) -> None:
-        """Raises InputError, naming the flag, for a rate that is not positive throughout or 0 throughout."""
+        """Raises InputError with the name of the flag unless each rate is either always positive or always 0."""
         for name, rate in vars(self).items():
             if isinstance(rate, Rate) and not (rate.first > 0 < rate.last or rate.first == rate.last == 0):
                 flag = f"--rates.{name.replace('_', '-')}"

@@ -1,7 +1,8 @@
-"""Explicit Gaussians (3DGS, Kerbl et al. 2023): every row of the table is one Gaussian whose colour is a sum of spherical harmonics.
+"""Explicit Gaussians (3DGS, Kerbl et al. 2023): each row is one Gaussian with its colour in spherical harmonics.
 
-Columns: means [N, 3], log_scales [N, 3], quats [N, 4] (w, x, y, z; normalised at use), raw_opacity [N] (logits), and the harmonics
-sh_dc [N, 3] and sh_rest [N, (degree + 1)^2 - 1, 3]. The degree in use grows from 0 by one every `sh_ramp` iterations.
+Columns: means [N, 3], log_scales [N, 3], quats [N, 4] (w, x, y, z; normalised when decoded), raw_opacity [N] (logits),
+sh_dc [N, 3] and sh_rest [N, (degree + 1)^2 - 1, 3] (spherical harmonics).
+The active degree starts at 0 and increases by one every `sh_ramp` iterations.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from scene_experts.geometry.sh_colors import compute_sh_colors
 from scene_experts.scene import Cull, LearningRates, Scene, SceneConfig, Traits
 
 COLUMNS = ("means", "log_scales", "quats", "raw_opacity", "sh_dc", "sh_rest")
-FILE_VALUES = 3 + 3 + 1 + 3 + 4  # position, normal, opacity, scale and rotation of a row of the 3DGS file; the harmonics come on top
+FILE_VALUES = 3 + 3 + 1 + 3 + 4  # position, normal, opacity, scale and rotation in the 3DGS file, without the harmonics
 _EPS = 1e-12
-_ROUND = 1.001  # a Gaussian is looked for as a ball of its largest axis and this, so that rounding loses none
+_ROUND = 1.001  # margin of the bounding ball in the visibility test, against rounding errors
 
 
 @register
@@ -52,7 +53,7 @@ class Explicit(SceneConfig):
         return "Gaussians"
 
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> GaussianScene:
-        """One Gaussian per point of the cloud. Raises InputError when there are none."""
+        """Create one Gaussian per point of the cloud. Raises InputError if the cloud is empty."""
         if len(points.xyz) == 0:
             raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
         n = len(points.xyz)
@@ -70,17 +71,17 @@ class Explicit(SceneConfig):
         return GaussianScene(self, Table(params, {}), extent)
 
     def load(self, table: Table, meta: dict[str, Any]) -> GaussianScene:
-        """The scene of a checkpoint. Raises InputError where its columns are others."""
+        """Build the scene of a checkpoint. Raises InputError if the table does not have the expected columns."""
         if set(table.params) != set(COLUMNS) or table.params["sh_rest"].shape[1] != (self.sh_degree + 1) ** 2 - 1:
             raise InputError("expected the columns of explicit Gaussians in the checkpoint, found others; use its own run folder")
         return GaussianScene(self, table, float(meta["extent"]))
 
     def scaled(self, factor: float) -> Self:
-        """The same in a training `factor` times as long."""
+        """Scale `sh_ramp` to a training `factor` times as long."""
         return replace(self, sh_ramp=max(1, round(self.sh_ramp * factor)))
 
     def check(self) -> None:
-        """Raises InputError, naming the flag, for invalid settings."""
+        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
         expect_at_least([("--scene.sh-degree", self.sh_degree, 0), ("--scene.sh-ramp", self.sh_ramp, 1)])
         if self.sh_degree > MAX_DEGREE:
             raise InputError(f"expected --scene.sh-degree of at most {MAX_DEGREE}, found {self.sh_degree}; give a lower degree")
@@ -91,10 +92,10 @@ class Explicit(SceneConfig):
 
 
 class GaussianScene(Scene):
-    """N Gaussians as rows of a table (see the module's text for its columns)."""
+    """N Gaussians as rows of a table (see the module's docstring for the columns)."""
 
     def __init__(self, config: Explicit, table: Table, extent: float) -> None:
-        """extent: the scene's R in trained world units."""
+        """extent: the extent R of the scene, in trained world units."""
         super().__init__(table, extent)
         self.config = config
 
@@ -108,7 +109,7 @@ class GaussianScene(Scene):
 
     @property
     def file_values(self) -> int:
-        """float32 values that a row takes in the 3DGS file: 62 at degree 3."""
+        """Number of float32 values per row in the 3DGS file: 62 at degree 3."""
         return FILE_VALUES + 3 * (self.config.sh_degree + 1) ** 2
 
     @property
@@ -116,14 +117,16 @@ class GaussianScene(Scene):
         return self.table.params["means"].detach()
 
     def degree(self, step: int) -> int:
-        """The degree of the harmonics in use at `step`: all of them at 0, where a training has none yet and a file that does not say
-        how long it was trained has what it has."""
+        """Active degree of the spherical harmonics at `step`.
+
+        Step 0 uses the full degree: a new scene has zero higher harmonics, and a file may not record its iteration.
+        """
         return min(self.config.sh_degree, step // self.config.sh_ramp) if step else self.config.sh_degree
 
     def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
-        """The Gaussians that may touch the picture of `camera`; `cull` is the rasteriser's visibility test.
+        """Decode the Gaussians that may overlap the image of `camera`. `cull` is the rasteriser's visibility test.
 
-        Each is looked for as a ball of its largest axis, which holds the Gaussian: what is left out would not have been drawn.
+        The test uses a ball with the radius of the largest axis. The ball contains the Gaussian, so no visible Gaussian is lost.
         """
         p = self.table.params
         with torch.no_grad():
@@ -132,7 +135,7 @@ class GaussianScene(Scene):
         return replace(self.decode(rows, camera, step), population=(p["raw_opacity"], p["log_scales"]))
 
     def decode(self, rows: Tensor, camera: Camera, step: int) -> Decoded:
-        """Gaussians of the given rows [A], as `camera` sees their colours at `step`."""
+        """Decode the given rows [A] into Gaussians, with the colours that `camera` sees at `step`."""
         p = self.table.params
         means = p["means"].index_select(0, rows)
         gaussians = Gaussians(
@@ -146,7 +149,7 @@ class GaussianScene(Scene):
         return Decoded(gaussians, rows, None, {})
 
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by the name of their learning rate: one group per column."""
+        """All parameters, grouped by the name of their learning rate: one group per column."""
         return {name: [self.table.params[name]] for name in COLUMNS}
 
     def meta(self) -> dict[str, Any]:
@@ -156,7 +159,7 @@ class GaussianScene(Scene):
 @register
 @dataclass(frozen=True)
 class ExplicitRates(LearningRates):
-    """Learning rates of 3DGS. `means` is multiplied by the scene's extent R."""
+    """Learning rates of 3DGS. The rate of `means` is multiplied by the scene's extent R."""
 
     family = "gaussians"
 
@@ -174,6 +177,6 @@ class ExplicitRates(LearningRates):
     """Learning rate of the higher spherical harmonics."""
 
     def at(self, group: str, step: int, total: int, extent: float) -> float:
-        """The rate of a group of `rate_groups` at `step` of `total`."""
+        """Learning rate of `group`, a key of `rate_groups`, at `step` of `total`."""
         rate: Rate = getattr(self, group)
         return rate.at(step, total) * (extent if group == "means" else 1.0)

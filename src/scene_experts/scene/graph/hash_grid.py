@@ -1,7 +1,8 @@
-"""A multi-resolution hash grid (Mueller et al., Instant Neural Graphics Primitives, 2022): a place in, learned features out.
+"""Multi-resolution hash grid (Mueller et al., Instant Neural Graphics Primitives, 2022): maps positions to learned features.
 
-Level l divides the unit cube in N_l = floor(base growth^l) cells an axis. Features sit at the cells' corners and are blended trilinearly.
-A level with more corners than the table has rows shares rows among them by a hash. The compiled library does the same where there is one.
+Level l divides the unit cube into N_l = floor(base growth^l) cells per axis. Features are stored at the corners of the cells and
+interpolated trilinearly. If a level has more corners than table rows, a hash maps corners to shared rows. The compiled library is
+used if it is available.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.native import library as native
 
 PRIMES = (1, 2_654_435_761, 805_459_861)  # eq. 4 of the paper
-INITIAL = 1e-4  # features start uniform in +-INITIAL
-LARGEST = 24  # 2^24 rows a level, the most that the paper tries
+INITIAL = 1e-4  # features are initialised uniformly in [-INITIAL, INITIAL]
+LARGEST = 24  # 2^24 rows per level, the largest size in the paper
 
 
 @dataclass(frozen=True)
@@ -40,22 +41,22 @@ class HashGrid:
 
     @property
     def width(self) -> int:
-        """Features of a place."""
+        """Number of features per position."""
         return self.levels * self.features
 
     def check(self) -> None:
-        """Raises InputError for sizes that no grid can have."""
+        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
         names = ("levels", "features", "log2_table", "base", "growth")
         expect_at_least([(f"--scene.grid.{name.replace('_', '-')}", getattr(self, name), 1) for name in names])
         if self.log2_table > LARGEST:
             raise InputError(f"expected --scene.grid.log2-table of at most {LARGEST}, found {self.log2_table}; give a smaller number")
 
     def resolutions(self) -> list[int]:
-        """Cells an axis of every level."""
+        """Number of cells per axis of each level."""
         return [math.floor(self.base * self.growth**level) for level in range(self.levels)]
 
     def rows(self) -> list[int]:
-        """Rows of every level's table: its corners, or 2^log2_table where there are more."""
+        """Number of table rows of each level: its number of corners, at most 2^log2_table."""
         return [min((cells + 1) ** 3, 1 << self.log2_table) for cells in self.resolutions()]
 
     def build(self, low: tuple[float, ...], edge: float) -> Grid:
@@ -63,7 +64,7 @@ class HashGrid:
 
 
 class Grid(nn.Module):
-    """The learned table [rows of all levels, features] and the cube that it covers: its low corner and its edge, world units."""
+    """Learned table [rows of all levels, features] and the low corner and edge (world units) of the cube that it covers."""
 
     config: HashGrid
     low: tuple[float, ...]
@@ -76,23 +77,26 @@ class Grid(nn.Module):
         self.table = nn.Parameter(torch.empty(sum(config.rows()), config.features).uniform_(-INITIAL, INITIAL))
 
     def unit(self, xyz: Tensor) -> Tensor:
-        """World places [A, 3] in the grid's own coordinates: in [0, 1] within the cube, clamped to it outside."""
+        """Convert world positions [A, 3] to grid coordinates, clamped to [0, 1]; unchanged if `coordinates` is "world"."""
         if self.config.coordinates == "world":
             return xyz
         return ((xyz - xyz.new_tensor(self.low)) / self.edge).clamp(0, 1)
 
     def forward(self, xyz: Tensor) -> Tensor:
-        """Features [A, levels * features] (level by level) at world places [A, 3], which get no gradient."""
+        """Features [A, levels * features], level by level, at world positions [A, 3]. Positions get no gradient."""
         return encode(self.table, self.unit(xyz), self.config)
 
 
 def encode(table: Tensor, unit: Tensor, config: HashGrid) -> Tensor:
-    """Features [A, levels * features] at places `unit` [A, 3] of the grid's own coordinates; differentiable in the table alone."""
+    """Features [A, levels * features] at positions `unit` [A, 3] in grid coordinates. Differentiable in the table only."""
     return _Encode.apply(table, unit, config)  # type: ignore[return-value]
 
 
 def corners(unit: Tensor, cells: int, rows: int) -> tuple[Tensor, Tensor]:
-    """Table rows [A, 8] int64 and trilinear weights [A, 8] of the corners around places `unit` [A, 3] on a level of `cells` an axis."""
+    """Table rows [A, 8] int64 and trilinear weights [A, 8] of the corners around positions `unit` [A, 3].
+
+    The level has `cells` cells per axis and `rows` table rows.
+    """
     place = unit * cells
     low = place.floor()
     part = place - low
@@ -100,7 +104,7 @@ def corners(unit: Tensor, cells: int, rows: int) -> tuple[Tensor, Tensor]:
     share = torch.stack([1 - part, part], dim=2)
     x, y, z = axis[:, 0, :, None, None], axis[:, 1, None, :, None], axis[:, 2, None, None, :]
     if (cells + 1) ** 3 <= rows:
-        row = (x + (cells + 1) * (y + (cells + 1) * z)) % rows  # a corner's own; outside the cube it wraps around
+        row = (x + (cells + 1) * (y + (cells + 1) * z)) % rows  # one row per corner; indices outside the cube wrap around
     else:
         row = ((x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])) & (rows - 1)
     weight = share[:, 0, :, None, None] * share[:, 1, None, :, None] * share[:, 2, None, None, :]
@@ -108,7 +112,7 @@ def corners(unit: Tensor, cells: int, rows: int) -> tuple[Tensor, Tensor]:
 
 
 class _Encode(torch.autograd.Function):
-    """The blend, level by level; indices are found again in the backward pass, which keeps 3 numbers a place and not 256."""
+    """Interpolation, level by level. The backward pass recomputes the indices, to store 3 numbers per position instead of 256."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, unit: Tensor, config: HashGrid) -> Tensor:
@@ -137,7 +141,7 @@ class _Encode(torch.autograd.Function):
 
 
 def _forward(table: Tensor, unit: Tensor, config: HashGrid, out: Tensor) -> None:
-    """Fills `out` [A, levels, features] in plain torch, for any device and dtype."""
+    """Fill `out` [A, levels, features] in PyTorch, for any device and dtype."""
     columns, first = table.t().contiguous(), 0  # [features, rows]
     for level, (cells, rows) in enumerate(zip(config.resolutions(), config.rows())):
         row, weight = corners(unit, cells, rows)
@@ -148,7 +152,7 @@ def _forward(table: Tensor, unit: Tensor, config: HashGrid, out: Tensor) -> None
 
 
 def _backward(unit: Tensor, grad: Tensor, config: HashGrid) -> Tensor:
-    """The table's gradient in plain torch."""
+    """Gradient of the table, in PyTorch."""
     out, first = grad.new_zeros(config.features, sum(config.rows())), 0
     for level, (cells, rows) in enumerate(zip(config.resolutions(), config.rows())):
         row, weight = corners(unit, cells, rows)
