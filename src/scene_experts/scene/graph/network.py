@@ -1,6 +1,6 @@
-"""A graph over points, and what a point learns from its neighbours (Ververas et al., SAGS, ECCV 2024).
+"""Neighbourhood graph of points and the aggregation of features along it (Ververas et al., SAGS, ECCV 2024).
 
-Points do not move, so the graph changes only when rows come and go; a camera uses the part of it among the points it sees.
+Points do not move, so the graph changes only when rows are added or removed. A camera uses the subgraph of the points it sees.
 """
 
 from __future__ import annotations
@@ -14,28 +14,32 @@ from torch import Tensor
 from scene_experts.geometry.neighbours import find_neighbours
 from scene_experts.native import library as native
 
-NEAREST = 1e-8  # points in one place count as so far apart
+NEAREST = 1e-8  # lower bound of the distance between two points
 
 
 @dataclass(frozen=True)
 class Graph:
-    """Each point's neighbours, itself first: `index` [N, k] int64, `closeness` [N, k] float32, 1 / distance and 0 for itself."""
+    """Neighbours of each point: `index` [N, k] int64 and `closeness` [N, k] (1 / distance).
+
+    The first neighbour is the point itself, with closeness 0.
+    """
 
     index: Tensor
     closeness: Tensor
 
     @classmethod
     def of(cls, xyz: Tensor, k: int) -> Graph:
-        """The exact graph of points [N, 3] with their k - 1 nearest others; found from the places alone, so twice the same."""
+        """Build the exact graph of points [N, 3] with their k - 1 nearest neighbours. The result depends on the positions only."""
         d2, others = find_neighbours(xyz, k - 1)
         me = torch.arange(len(xyz), device=xyz.device)[:, None]
         close = 1 / d2.sqrt().clamp_min(NEAREST)
         return cls(torch.cat([me, others], dim=1), torch.cat([d2.new_zeros(len(xyz), 1), close], dim=1).to(xyz.dtype))
 
     def among(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """The graph among `rows` [A]: neighbours [A, k] as places in `rows`, -1 where a neighbour is not one; weights [A, k].
+        """Subgraph of `rows` [A]: neighbours [A, k] as indices into `rows` (-1 if the neighbour is not in `rows`) and weights [A, k].
 
-        Weights of a point's neighbours are their closeness over its sum, divided by how many neighbours it has, itself among them.
+        The weight of a neighbour is its closeness, divided by the sum over all neighbours and by the number of neighbours,
+        including the point itself.
         """
         place = torch.full((len(self.index),), -1, dtype=torch.int64, device=rows.device)
         place[rows] = torch.arange(len(rows), device=rows.device)
@@ -49,14 +53,14 @@ class Graph:
 def blended(feature: Tensor, found: Tensor, weight: Tensor, share: float = 0.5) -> Tensor:
     """f_u + share * sum_v w_uv h_v, with h_v = max over the points u that have v as a neighbour of (f_v - f_u), element-wise; [A, F].
 
-    feature [A, F]; found [A, k] (-1: no neighbour) and weight [A, k] of `Graph.among`. Differentiable in the features; where several
-    points attain a maximum its gradient is shared evenly.
+    feature [A, F]; found [A, k] (-1: no neighbour) and weight [A, k] of `Graph.among`. Differentiable in the features. If several
+    points attain a maximum, they share its gradient equally.
     """
     return _Blend.apply(feature, found, weight, share)  # type: ignore[return-value]
 
 
 class _Blend(torch.autograd.Function):
-    """By the compiled library where it fits, else in plain torch."""
+    """Uses the compiled library for float32 tensors on the CPU, and PyTorch otherwise."""
 
     @staticmethod
     def forward(ctx: Any, feature: Tensor, found: Tensor, weight: Tensor, share: float) -> Tensor:
@@ -90,7 +94,10 @@ class _Blend(torch.autograd.Function):
 
 
 def _forward(feature: Tensor, found: Tensor, weight: Tensor, share: float) -> tuple[Tensor, Tensor]:
-    """The minima over those who know a point and the blend, [A, F] each, neighbour by neighbour: nothing of size A k F is held."""
+    """Returns the minima over the points that have a point as a neighbour, and the blended features, [A, F] each.
+
+    Works neighbour by neighbour, to avoid tensors of size A k F.
+    """
     least = feature.clone()  # min over u of f_u; a point is a neighbour of itself
     for me, other, _ in _columns(found, weight):
         least.scatter_reduce_(0, other[:, None].expand(-1, feature.shape[1]), feature.index_select(0, me), "amin")
@@ -101,8 +108,8 @@ def _forward(feature: Tensor, found: Tensor, weight: Tensor, share: float) -> tu
 
 
 def _backward(feature: Tensor, found: Tensor, weight: Tensor, least: Tensor, grad: Tensor, share: float) -> Tensor:
-    """The gradient of the features."""
-    to, ties = torch.zeros_like(feature), torch.zeros_like(feature)  # gradients of h; how many attain each minimum
+    """Gradient of the features [A, F]."""
+    to, ties = torch.zeros_like(feature), torch.zeros_like(feature)  # gradients of h; number of points that attain each minimum
     for me, other, w in _columns(found, weight):
         where = other[:, None].expand(-1, grad.shape[1])
         to.scatter_add_(0, where, grad.index_select(0, me).mul_(share * w[:, None]))
@@ -115,7 +122,7 @@ def _backward(feature: Tensor, found: Tensor, weight: Tensor, least: Tensor, gra
 
 
 def _columns(found: Tensor, weight: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """For the j-th neighbours: the points that have one, who that is, and its weight."""
+    """For each j: the points that have a j-th neighbour, this neighbour, and its weight."""
     out = []
     for j in range(found.shape[1]):
         me = (found[:, j] >= 0).nonzero().squeeze(1)

@@ -1,8 +1,8 @@
-"""Points that learn from their neighbours in a graph (Ververas et al., SAGS: Structure-Aware 3D Gaussian Splatting, ECCV 2024).
+"""Points that aggregate features over a graph (Ververas et al., SAGS: Structure-Aware 3D Gaussian Splatting, ECCV 2024).
 
-Each row is one Gaussian: a point that does not move, a feature and a log-scaling. Seen from a camera, the features of the visible points
-are blended along the graph among them and joined by their element-wise maximum and a hash grid's features of the place; four small
-networks without biases turn that into the Gaussian.
+Each row is one Gaussian: a fixed point with a feature and a log-scaling. For each camera, the features of the visible points are
+blended along their graph and concatenated with their element-wise maximum and with the hash grid's features at the point. Four
+small networks without biases decode the result into the Gaussian.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from scene_experts.scene.anchors.select import visible_rows
 from scene_experts.scene.graph.hash_grid import Grid, HashGrid
 from scene_experts.scene.graph.network import Graph, blended
 
-PROBES = 1000  # points whose first opacity is looked at
-HALF = 2  # midpoints lie on a lattice of half the voxel
+PROBES = 1000  # approximate number of points that `face` evaluates
+HALF = 2  # midpoints lie on a lattice of half the voxel size
 
 
 @register
@@ -71,7 +71,7 @@ class GraphPoints(SceneConfig):
         return "graph points"
 
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> GraphScene:
-        """The occupied voxels of the point cloud and the midpoints between them. Raises InputError when there are no points."""
+        """Create points at the occupied voxels of the cloud and midpoints between them. Raises InputError if the cloud is empty."""
         if len(points.xyz) == 0:
             raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
         voxel = self.voxel_size or choose_voxel_size(points.xyz, self.voxel_rule)
@@ -89,12 +89,12 @@ class GraphPoints(SceneConfig):
         return scene
 
     def load(self, table: Table, meta: dict[str, Any]) -> GraphScene:
-        """The scene of a checkpoint, its networks fresh."""
+        """Build the scene of a checkpoint, with newly initialised networks."""
         corner, edge = tuple(float(v) for v in meta["grid_low"]), float(meta["grid_edge"])
         return GraphScene(self, table, float(meta["voxel"]), float(meta["extent"]), corner, edge)
 
     def check(self) -> None:
-        """Raises InputError, naming the flag, for invalid settings."""
+        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
         names = ("F", "hidden", "offset_hidden", "neighbours", "low")
         expect_at_least([(f"--scene.{name.replace('_', '-')}", getattr(self, name), 1) for name in names])
         expect_at_least([(f"--scene.{name.replace('_', '-')}", getattr(self, name), 0) for name in ("high", "voxel_size")])
@@ -102,7 +102,7 @@ class GraphPoints(SceneConfig):
 
 
 class Unbiased(nn.Module):
-    """Linear layers without biases, Glorot-uniform at first."""
+    """Linear layers without biases, with Glorot uniform initialisation."""
 
     layers: nn.ParameterList
 
@@ -111,14 +111,14 @@ class Unbiased(nn.Module):
         self.layers = nn.ParameterList(nn.init.xavier_uniform_(torch.empty(b, a)) for a, b in pairwise(sizes))
 
     def product(self) -> Tensor:
-        """The one linear map that the layers are when nothing stands between them, [out, in]."""
+        """Product of all layers without activations, [out, in]."""
         out = self.layers[0]
         for layer in list(self.layers)[1:]:
             out = layer @ out
         return out
 
     def after_first(self, h: Tensor) -> Tensor:
-        """The outputs from what the first layer gave, with a ReLU before every other one."""
+        """Apply the remaining layers to the output of the first layer, with a ReLU before each of them."""
         for layer in list(self.layers)[1:]:
             h = functional.linear(functional.relu(h), layer)
         return h
@@ -148,7 +148,7 @@ class GraphScene(LatticeScene):
 
     @property
     def file_values(self) -> int:
-        """Float32 values of a row in a file: position, normal, feature, opacity, scaling, rotation (SAGS's layout)."""
+        """Number of float32 values per row in a file: position, normal, feature, opacity, scaling, rotation (SAGS's layout)."""
         return 3 + 3 + self.config.F + 1 + 6 + 4
 
     def __init__(self, config: GraphPoints, table: Table, voxel: float, extent: float, corner: tuple[float, ...], edge: float) -> None:
@@ -158,14 +158,14 @@ class GraphScene(LatticeScene):
         self.grid = config.grid.build(corner, edge)
         width = 2 * config.F + config.grid.width
         self.alpha, self.beta = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
-        inner = [width + 4, config.hidden, config.hidden]  # with direction and distance
+        inner = [width + 4, config.hidden, config.hidden]  # 4: direction and distance
         heads = {name: Unbiased([*inner, size]) for name, size in CHANNELS.items()}
         self.heads: Mapping[str, Unbiased] = nn.ModuleDict(heads)  # type: ignore[assignment]
         self.offsets = Unbiased([width, config.offset_hidden, 3])
-        self._graph: tuple[Tensor, Graph] | None = None  # of the places it was made of
+        self._graph: tuple[Tensor, Graph] | None = None  # the positions and the graph built from them
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """What `.to(...)` does; the graph is made again when it is next needed."""
+        """Move the tensors, as for `.to(...)`, and discard the graph. It is rebuilt on its next use."""
         self._graph = None
         return super()._apply(fn, recurse)
 
@@ -173,15 +173,16 @@ class GraphScene(LatticeScene):
         return {"voxel": self.voxel, "extent": self.extent, "grid_low": list(self.grid.low), "grid_edge": self.grid.edge}
 
     def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
-        """Rows for points born at lattice cells [n, 3] with scaling `size` and features [n, F]."""
+        """Columns of new points at lattice cells [n, 3] with scaling `size` and features [n, F]."""
         xyz = (cells.double() * self.voxel).to(feature.dtype)
         return {"cell": cells, "xyz": xyz, "feature": feature, "log_scaling": feature.new_full((len(cells), 6), math.log(size))}
 
     @torch.no_grad()
     def face(self, cameras: Sequence[Camera]) -> None:
-        """Turn the opacity network's sign where its first opacities are negative on average, as most would be from every camera then.
+        """Flip the sign of the opacity network if its initial opacities are negative on average over the cameras.
 
-        Without biases or features it sees little but distances, and where all is hidden no gradient would ever show it.
+        The initial features are zero and the network has no biases, so its inputs are mostly distances, and the opacities have
+        the same sign for most points. Points with negative opacities are not drawn and would get no gradient.
         """
         rows = torch.arange(0, len(self.table), max(1, len(self.table) // PROBES))
         own, strongest = self.encode(rows)
@@ -190,23 +191,24 @@ class GraphScene(LatticeScene):
             next(reversed(list(self.heads["opacity"].parameters()))).neg_()
 
     def graph(self) -> Graph:
-        """The graph over all points, made anew when rows have come or gone."""
+        """Graph of all points. It is rebuilt after rows are added or removed."""
         xyz = self.table.facts["xyz"]
         if self._graph is None or self._graph[0] is not xyz:
-            self._graph = None  # before the next one needs its memory
+            self._graph = None  # free the memory before the new graph is built
             self._graph = xyz, Graph.of(xyz, self.config.neighbours)
         return self._graph[1]
 
     def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
-        """The Gaussians that `camera` sees. `cull(means, scales, camera)` is the rasteriser's visibility test."""
+        """Decode the Gaussians that `camera` sees. `cull(means, scales, camera)` is the rasteriser's visibility test."""
         table = self.table
         rows = visible_rows(None, table.facts["xyz"], table.params["log_scaling"].detach()[:, :3].exp(), camera, cull)
         return self.decode(rows, camera)
 
     def encode(self, rows: Tensor, told: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """What the networks see of points [A], from the graph among them: each one's own [A, grid + F], and what all share [F].
+        """Inputs of the networks for the points `rows` [A], from their subgraph.
 
-        With `told` [P], of rows[told] alone.
+        Returns the inputs of each point [A, grid + F] and the shared maximum of the features [F]. With `told` [P], the inputs are
+        those of `rows[told]` only, [P, grid + F].
         """
         feature = self.table.params["feature"].index_select(0, rows)
         near = blended(feature, *self.graph().among(rows), self.config.blend)
@@ -216,9 +218,10 @@ class GraphScene(LatticeScene):
         return torch.cat([self.grid(self.table.facts["xyz"].index_select(0, rows)), near], dim=1), strongest
 
     def folded(self, weight: Tensor, strongest: Tensor) -> tuple[Tensor, Tensor]:
-        """A first layer [H, 2 F + grid (+ 4)] for `encode`'s rows (and a view's 4): [H, grid + F (+ 4)] and the bias [H] of the rest.
+        """Fold the affine layer and the shared features into a first layer `weight` [H, 2 F + grid (+ 4 view channels)].
 
-        weight ([own, strongest] alpha + beta) in other brackets: nothing of size A is scaled, and what all share is multiplied once.
+        Returns a weight [H, grid + F (+ 4)] and a bias [H] that give weight ([own, strongest] alpha + beta). This avoids scaling
+        tensors of size A, and it multiplies the shared features only once.
         """
         width, own = len(self.alpha), len(self.alpha) - self.config.F
         encoded = weight[:, :width] * self.alpha
@@ -226,23 +229,23 @@ class GraphScene(LatticeScene):
         return torch.cat([encoded[:, :own], weight[:, width:]], dim=1), bias
 
     def opacity(self, x: Tensor, strongest: Tensor) -> Tensor:
-        """Raw opacities [A, 1] of rows and view x [A, grid + F + 4]."""
+        """Raw opacities [A, 1], in [-1, 1], for the inputs and views x [A, grid + F + 4]."""
         head = self.heads["opacity"]
         return head.after_first(functional.linear(x, *self.folded(head.layers[0], strongest))).tanh()
 
     def offset(self, own: Tensor, strongest: Tensor) -> Tensor:
-        """Offsets [A, 3], in units of the scaling, of rows own [A, grid + F]."""
+        """Offsets [A, 3], in units of the scaling, for the inputs own [A, grid + F]."""
         return functional.linear(own, *self.folded(self.offsets.product(), strongest))
 
     def decode(self, rows: Tensor, camera: Camera) -> Decoded:
-        """Gaussians of the given points [A]: opacity first, the rest for those whose opacity is positive."""
+        """Decode the given points [A]. Shape and colour are computed only for Gaussians with positive opacity."""
         own, strongest = self.encode(rows)
         x = torch.cat([own, self.view(rows, camera)], dim=1)
         raw = self.opacity(x, strongest)
         keep = (raw > 0).view(-1).nonzero().squeeze(1)
         x, source = x.index_select(0, keep), rows.index_select(0, keep)
         cov, color = (self.heads[name] for name in ("cov", "color"))
-        first = functional.linear(x, *self.folded(torch.cat([cov.layers[0], color.layers[0]]), strongest))  # both in one product
+        first = functional.linear(x, *self.folded(torch.cat([cov.layers[0], color.layers[0]]), strongest))  # both in one matrix product
         shape, rgb = (head.after_first(h) for head, h in zip((cov, color), first.chunk(2, dim=1)))
         scaling = self.table.params["log_scaling"].index_select(0, source).exp()
         offset = self.offset(x[:, : own.shape[1]], strongest) * scaling[:, :3]
@@ -257,32 +260,32 @@ class GraphScene(LatticeScene):
         return Decoded(gaussians, rows, raw, {})
 
     def view(self, rows: Tensor, camera: Camera) -> Tensor:
-        """Unit direction camera -> point and distance, [A, 4]."""
+        """Unit direction from the camera to each point, and distance, [A, 4]."""
         v = self.table.facts["xyz"].index_select(0, rows) - camera.position.to(self.table.facts["xyz"])
         distance = v.norm(dim=1, keepdim=True)
         return torch.cat([v / distance.clamp_min(EPS), distance], dim=1)
 
     @torch.no_grad()
     def slot_points(self, slots: Tensor, rows: Tensor) -> Tensor:
-        """Where the Gaussians of `rows` [P] are, [P, 3] float64: from the whole graph, as there is no camera."""
+        """Positions [P, 3] float64 of the Gaussians of `rows` [P]. Uses the whole graph, because there is no camera."""
         everyone = torch.arange(len(self.table), device=rows.device)
         offset = self.offset(*self.encode(everyone, rows)) * self.table.params["log_scaling"].index_select(0, rows)[:, :3].exp()
         return self.table.facts["xyz"].index_select(0, rows).double() + offset.double()
 
     def scene_opacity(self, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Tensor:
-        """Raw opacities [N, 1] of every point from `camera`, whether it sees them or not."""
+        """Raw opacities [N, 1] of all points for `camera`, visible or not."""
         everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
         own, strongest = self.encode(everyone)
         return self.opacity(torch.cat([own, self.view(everyone, camera)], dim=1), strongest)
 
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Every parameter, by the name of its learning rate."""
+        """All parameters, grouped by the name of their learning rate."""
         groups = {name: [self.table.params[name]] for name in ("feature", "log_scaling")}
         groups |= {name: list(head.parameters()) for name, head in self.heads.items()}
         return groups | {"offsets": list(self.offsets.parameters()), "grid": [self.grid.table], "affine": [self.alpha, self.beta]}
 
     def network_tensors(self) -> dict[str, Tensor]:
-        """Every learned tensor that is no column, by name (`opacity.0`, `grid.table`, ...), for files."""
+        """All learned tensors that are not columns of the table, by name (`opacity.0`, `grid.table`, ...), for files."""
         named = {**dict(self.heads.items()), "offsets": self.offsets}
         layers = {f"{name}.{i}": layer for name, head in named.items() for i, layer in enumerate(head.parameters())}
         return {**layers, "grid.table": self.grid.table, "affine.alpha": self.alpha, "affine.beta": self.beta}
@@ -313,6 +316,6 @@ class GraphRates(LearningRates):
     """Learning rate of the affine layers."""
 
     def at(self, group: str, step: int, total: int, extent: float) -> float:
-        """The rate of a group of `rate_groups` at `step` of `total`."""
+        """Learning rate of `group`, a key of `rate_groups`, at `step` of `total`."""
         rate: Rate = getattr(self, group)
         return rate.at(step, total)
