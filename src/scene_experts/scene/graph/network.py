@@ -19,7 +19,7 @@ NEAREST = 1e-8  # lower bound of the distance between two points
 
 @dataclass(frozen=True)
 class Graph:
-    """Neighbours of each point: `index` [N, k] int64 and `closeness` [N, k] (1 / distance).
+    """Neighbours of each point: `index` [N, k] int64 and `closeness` [N, k] float32 (1 / distance).
 
     The first neighbour is the point itself, with closeness 0.
     """
