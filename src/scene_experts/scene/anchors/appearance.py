@@ -1,7 +1,7 @@
-"""Appearance codes: a learned vector per training view that the colour network sees, for captures whose light or camera settings change.
+"""Appearance codes: one learned vector per training view, for captures whose light or camera settings change.
 
-A code is the same for every anchor of a view, so for the first layer of the colour network it is only another bias: `fold` puts it there,
-and kernels that know nothing of codes decode such scenes too.
+The colour network receives the code. All anchors of a view share it, so it acts as a bias of the network's first layer. `fold` adds it
+to that bias, so kernels without support for codes decode these scenes too.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TestRule = Literal["mean", "index"]
 
 
 class Codes(nn.Module):
-    """One code per training view, standard normal at the start (Scaffold-GS).
+    """One code per training view, initialized from a standard normal distribution (Scaffold-GS).
 
     views: the training cameras' ids. rule: the code of any other camera: the mean of all codes, or (what Scaffold-GS does) that of the
     training view with the test view's number among the test views. `fitted` holds codes of other cameras, by id, that an evaluation
@@ -44,16 +44,16 @@ class Codes(nn.Module):
         return self
 
     def forward(self, camera: Camera, mode: Mode = Mode.DRAW) -> Tensor:
-        """The code [dim] of a camera. Fitted codes are for drawing only."""
+        """Return the code [dim] of a camera. Fitted codes are used only for drawing."""
         if mode is Mode.DRAW and camera.id in self.fitted:
             return self.fitted[camera.id]
         row = self.row.get(camera.id)
-        if row is None and self.rule == "index" and camera.id >= 0:  # below 0: a free camera, at no view's place
+        if row is None and self.rule == "index" and camera.id >= 0:  # below 0: a free camera that belongs to no view
             row = (camera.id - sum(view < camera.id for view in self.views)) % len(self.views)  # its number among the other views
         return self.table.mean(dim=0) if row is None else self.table[row]
 
 
 def fold(weights: HeadWeights, code: Tensor) -> HeadWeights:
-    """The same head for inputs without the code [dim], which are w1's last columns: w1 [x, code] + b1 = w1' x + b1'."""
+    """Fold the code [dim], the last inputs of w1, into the first bias: w1 [x, code] + b1 = w1' x + b1'."""
     D = weights.w1.shape[2] - len(code)
     return replace(weights, w1=weights.w1[:, :, :D], b1=weights.b1 + weights.w1[:, :, D:] @ code)

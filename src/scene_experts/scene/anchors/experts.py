@@ -82,7 +82,7 @@ class Experts(Decoder):
         return self.load_scope == "all"
 
     def scaled(self, factor: float) -> Self:
-        """The same in a training `factor` times as long: the dense warm-up scales."""
+        """Return the settings for a training run that is `factor` times as long. The dense warm-up scales with it."""
         return replace(self, warmup=round(self.warmup * factor))
 
     def check(self) -> None:
@@ -96,7 +96,7 @@ class Experts(Decoder):
             )
 
     def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> MixtureHead | MLP:
-        """The head of an attribute: [A, inputs] and features [A, feature] to [A, outputs]. Raises InputError as `check` does."""
+        """Build the head of an attribute: [A, inputs] and features [A, feature] to [A, outputs]. Raises InputError as `check` does."""
         self.check()
         if self.num == 1 or attribute not in self.attributes:
             return MLP(attribute, inputs, hidden, outputs)
@@ -105,12 +105,12 @@ class Experts(Decoder):
         return self.head()(self, attribute, inputs, hidden, outputs, feature)
 
     def head(self) -> type[MixtureHead]:
-        """What decodes an attribute that has experts; variants of the routing give their own."""
+        """Return the class of the head for attributes with experts. Routing variants override it."""
         return MixtureHead
 
 
 def top_k(logits: Tensor, k: int) -> Tensor:
-    """Indices [A, k] of the k largest logits [A, E], largest first, ties to the lowest index on every device."""
+    """Return indices [A, k] of the k largest logits [A, E], largest first. Ties go to the lowest index on every device."""
     remaining, chosen = logits.detach(), []
     for _ in range(k):
         best = remaining.argmax(dim=1, keepdim=True)  # the first of equal maxima
@@ -152,11 +152,11 @@ class MixtureHead(nn.Module):
                 nn.init.zeros_(self.router_b)
 
     def k(self, step: int) -> int | None:
-        """Experts per anchor at `step`; None while dense. The first `warmup` iterations (1 .. warmup) are dense."""
+        """Return the number of experts per anchor at `step`, or None if dense. Iterations 1 .. warmup are dense."""
         return None if self.config.top_k is None or step <= self.config.warmup else self.config.top_k
 
     def logits(self, feature: Tensor, position: Tensor | None, mode: Mode = Mode.DRAW) -> Tensor:
-        """The router's outputs [A, E], with noise in training."""
+        """Return the router's logits [A, E]. Noise is added in training."""
         router = self.config.router
         x = feature.detach() if router.detach_feature else feature
         if router.input_pos:
@@ -169,7 +169,7 @@ class MixtureHead(nn.Module):
         return y
 
     def route(self, feature: Tensor, step: int, position: Tensor | None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor]:
-        """Routing, and the mixture's weights: [A, E] while dense, [A, k] after."""
+        """Return the routing and the mixture weights: [A, E] if dense, [A, k] otherwise."""
         logits = self.logits(feature, position, mode)
         gates = logits.softmax(dim=1)  # eq. 3
         k = self.k(step)
@@ -180,7 +180,7 @@ class MixtureHead(nn.Module):
         return Routing(gates, chosen), picked
 
     def choose(self, logits: Tensor, k: int) -> Tensor:
-        """Indices [A, k] of the experts that decode each anchor, from logits [A, E]."""
+        """Return indices [A, k] of the experts that decode each anchor, given logits [A, E]."""
         return top_k(logits, k)
 
     def routing(self, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW) -> Routing:
@@ -200,16 +200,16 @@ class MixtureHead(nn.Module):
         return (ACTIVATIONS[self.attribute](y) if self.config.mix == "pre_activation" else y), routing
 
     def expert(self, i: int, x: Tensor) -> Tensor:
-        """One expert's outputs, activated unless the mixture is taken before the activation."""
+        """Return one expert's outputs. They are activated unless outputs are mixed before the activation."""
         y = functional.linear(functional.relu(functional.linear(x, self.w1[i], self.b1[i])), self.w2[i], self.b2[i])
         return ACTIVATIONS[self.attribute](y) if self.config.mix == "post_activation" else y
 
     def all_experts(self, x: Tensor, w: Tensor) -> Tensor:
-        """sum_i w_i E_i(x) with every expert computed; w [A, E]."""
+        """Compute all experts and return sum_i w_i E_i(x). w [A, E]."""
         return sum((w[:, i : i + 1] * self.expert(i, x) for i in range(self.config.num)), start=x.new_zeros(()))  # type: ignore[return-value]
 
     def chosen_experts(self, x: Tensor, chosen: Tensor, w: Tensor) -> Tensor:
-        """The same with each expert computed for the anchors that chose it: anchors sorted by expert, results added back."""
+        """Return the same sum, but compute each expert only for the anchors that chose it, sorted by expert."""
         A, k = chosen.shape
         order = chosen.reshape(-1).argsort(stable=True)
         counts = torch.bincount(chosen.reshape(-1), minlength=self.config.num).tolist()
@@ -223,7 +223,7 @@ class MixtureHead(nn.Module):
     def aligned(
         self, x: Tensor, feature: Tensor, step: int, position: Tensor | None, K: int, mode: Mode = Mode.DRAW
     ) -> tuple[Tensor, Routing]:
-        """Covariance outputs [A, K * 7] mixed after flipping quaternions into the hemisphere of each anchor's first expert."""
+        """Return mixed covariance outputs [A, K * 7]. Quaternions are first flipped to the hemisphere of the anchor's first expert."""
         routing, w = self.route(feature, step, position, mode)
         if routing.chosen is not None:
             w = torch.zeros_like(routing.gates).scatter(1, routing.chosen, w)

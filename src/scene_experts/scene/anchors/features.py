@@ -1,6 +1,6 @@
-"""What the decoders see of an anchor: its own feature, or a blend of what it learned at several resolutions (Scaffold-GS's feature bank).
+"""Features that decoders receive: the anchor's own feature, or a blend of several resolutions (Scaffold-GS's feature bank).
 
-Routers always see the raw feature, so that routing stays a property of the anchor and not of the view.
+Routers always receive the raw feature. Routing therefore depends on the anchor and not on the view.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scene_experts.scene.anchors.mlp import linear_init
 
 
 class Mixer(Protocol):
-    """The features of the anchors `rows` [A] for one camera. A module: its parameters follow the rate called `mix`."""
+    """A module that computes the features of anchors `rows` [A] for one camera. The `mix` rate applies to its parameters."""
 
     def __call__(self, table: Table, rows: Tensor, direction: Tensor, distance: Tensor) -> Tensor:
         """direction [A, 3] of unit length, camera to anchor; distance [A, 1] in trained world units -> [A, width]."""
@@ -29,15 +29,15 @@ class Mixer(Protocol):
 
 @dataclass(frozen=True)
 class FeatureMix(Part, ABC):
-    """What the decoders see of an anchor's feature."""
+    """Settings of the features that decoders receive."""
 
     @abstractmethod
     def width(self, F: int) -> int:
-        """Size of what the decoders see, for features of size F."""
+        """Return the size of the decoders' features, for anchor features of size F."""
 
     @abstractmethod
     def build(self, F: int) -> nn.Module | None:
-        """The `Mixer`; None hands the feature on as it is."""
+        """Build the `Mixer`. None passes the feature on unchanged."""
 
     def check_size(self, F: int) -> None:
         """Raises InputError, naming the flag, for invalid settings with features of size F. By default every setting is valid."""
@@ -46,13 +46,13 @@ class FeatureMix(Part, ABC):
 @register
 @dataclass(frozen=True)
 class OwnFeature(FeatureMix):
-    """The anchor's own feature as it is."""
+    """The anchor's own feature, unchanged."""
 
     def width(self, F: int) -> int:
         return F
 
     def build(self, F: int) -> None:
-        """None: nothing is learned."""
+        """Return None: the feature is passed on unchanged."""
 
 
 @register
@@ -60,7 +60,7 @@ class OwnFeature(FeatureMix):
 class FeatureBank(FeatureMix):
     """The feature bank of Scaffold-GS.
 
-    It blends every fourth, every second and all channels of the feature by weights that depend on the camera.
+    It blends every fourth, every second and all channels of the feature with camera-dependent weights.
     """
 
     hidden: int = 32
@@ -73,7 +73,7 @@ class FeatureBank(FeatureMix):
         return Bank(self.hidden)
 
     def check_size(self, F: int) -> None:
-        """Raises InputError for a feature size that is no multiple of 4."""
+        """Raises InputError for a feature size that is not a multiple of 4."""
         expect_at_least([("--scene.mix.hidden", self.hidden, 1)])
         if F % 4:
             raise InputError(f"expected --scene.F as a multiple of 4 for the feature bank, found {F}; give another size")
@@ -82,7 +82,7 @@ class FeatureBank(FeatureMix):
 class Bank(nn.Module):
     """(w0, w1, w2) = softmax(network(u, d)); f <- w0 tile(f[::4], 4) + w1 tile(f[::2], 2) + w2 f  (Scaffold-GS).
 
-    `tile` repeats the whole strided vector. Tensors are stacked with a leading axis of 1, as every head's are.
+    `tile` repeats the whole strided vector. Tensors have a leading axis of 1, as in every head.
     """
 
     w1: nn.Parameter

@@ -1,4 +1,4 @@
-"""A decoder head: anchor feature and viewing direction in, K values of one attribute out (Scaffold-GS's network, two linear layers)."""
+"""Decoder heads. A head maps an anchor's feature and the viewing direction to K values of one attribute (as in Scaffold-GS)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.parts import Part, register
 from scene_experts.core.types import Mode, Routing
 
-ATTRIBUTES = ("opacity", "cov", "color")  # what is decoded, in the compiled library's order
+ATTRIBUTES = ("opacity", "cov", "color")  # decoded attributes, in the compiled library's order
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid}
 """Activation of the last layer of each attribute."""
 CHANNELS = {"opacity": 1, "cov": 7, "color": 3}  # values per Gaussian: opacity; 3 scale + 4 rotation; RGB
@@ -24,12 +24,12 @@ CHANNELS = {"opacity": 1, "cov": 7, "color": 3}  # values per Gaussian: opacity;
 
 @dataclass(frozen=True)
 class HeadWeights:
-    """The tensors of a head, for kernels and files. A plain network is E = 1 without a router.
+    """The tensors of a head, for kernels and files. A plain network has E = 1 and no router.
 
-    k: experts chosen per anchor; None means dense (all of them, weighted by their gates).
+    k: number of experts chosen per anchor. None means dense: all experts are used, weighted by their gates.
     """
 
-    router_w: Tensor | None  # [E, F], or [E, F + 3] where the router sees the anchor's position
+    router_w: Tensor | None  # [E, F], or [E, F + 3] if the router receives the anchor's position
     router_b: Tensor | None  # [E]
     w1: Tensor  # [E, H, D]
     b1: Tensor  # [E, H]
@@ -38,11 +38,11 @@ class HeadWeights:
     k: int | None
     middle_w: Tensor | None = None  # [E, L, H, H]: L hidden layers between the first and the last
     middle_b: Tensor | None = None  # [E, L, H]
-    position: bool = False  # the router sees the anchor's position, divided by the scene's extent
+    position: bool = False  # the router receives the anchor's position, divided by the scene's extent
 
 
 class Head(Protocol):
-    """What decodes one attribute; the form of the arithmetic hides behind it."""
+    """Interface of a network that decodes one attribute."""
 
     experts: int  # number of experts; 0 without a mixture
 
@@ -53,11 +53,11 @@ class Head(Protocol):
         ...
 
     def weights(self, step: int) -> HeadWeights | None:
-        """The tensors in use at `step`, or None where they do not say all (unusual switches)."""
+        """Return the tensors used at `step`, or None if they do not describe the head completely."""
         ...
 
     def routing(self, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW) -> Routing | None:
-        """Who decodes what; None without experts. It depends on the anchor's feature alone, never on the view."""
+        """Return the routing, or None without experts. It depends only on the anchor's feature, never on the view."""
         ...
 
 
@@ -69,7 +69,7 @@ def linear_init(shape: tuple[int, ...], fan_in: int) -> nn.Parameter:
 
 @dataclass(frozen=True)
 class Decoder(Part, ABC):
-    """What turns an anchor's feature into its Gaussians: builds one head per attribute."""
+    """Settings of the networks that decode anchors. Builds one head per attribute."""
 
     @property
     def with_experts(self) -> tuple[str, ...]:
@@ -83,12 +83,12 @@ class Decoder(Part, ABC):
 
     @property
     def balances_all(self) -> bool:
-        """Whether the load of the experts is balanced over all anchors, and not over the visible ones."""
+        """Whether the experts' load is balanced over all anchors instead of the visible ones."""
         return False
 
     @abstractmethod
     def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> nn.Module:
-        """The head of an attribute, a `Head`: [A, inputs] and features [A, feature] to [A, outputs]."""
+        """Build the `Head` of an attribute. It maps inputs [A, inputs] and features [A, feature] to outputs [A, outputs]."""
 
 
 @register

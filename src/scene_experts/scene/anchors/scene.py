@@ -36,8 +36,8 @@ from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, Decoder, 
 from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, faded, visible_rows
 
 log: logging.Logger = logging.getLogger(__name__)
-NEARLY_ALL = 0.95  # share of points that are alone in their voxel from which the lattice has almost no effect
-EPS = 1e-12  # keeps directions and quaternions finite where their length is 0
+NEARLY_ALL = 0.95  # the lattice has almost no effect if this share of the points is alone in its voxel
+EPS = 1e-12  # keeps directions and quaternions finite if their length is 0
 
 
 @register
@@ -85,15 +85,15 @@ class Anchors(SceneConfig):
         return self.decoder.dense_until
 
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
-        """One anchor per occupied voxel of the point cloud."""
+        """Create a scene with one anchor per occupied voxel of the point cloud."""
         return AnchorScene.from_points(self, points, extent, cameras)
 
     def load(self, table: Table, meta: dict[str, Any]) -> AnchorScene:
-        """The scene of a checkpoint, its networks fresh."""
+        """Create the scene of a checkpoint with newly initialized networks."""
         return AnchorScene(self, table, float(meta["voxel"]), float(meta["extent"]), self.select.restored(meta), meta.get("views", ()))
 
     def scaled(self, factor: float) -> Self:
-        """The same in a training `factor` times as long."""
+        """Return the settings for a training run that is `factor` times as long."""
         return replace(self, decoder=self.decoder.scaled(factor), select=self.select.scaled(factor))
 
     def check(self) -> None:
@@ -109,7 +109,10 @@ class Anchors(SceneConfig):
 
 
 class AnchorScene(LatticeScene):
-    """N anchors and three decoder heads. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], offsets [N,K,3], log_scaling [N,6]."""
+    """N anchors with three decoder heads.
+
+    Columns: cell [N, 3] int64, xyz [N, 3]; feature [N, F], offsets [N, K, 3], log_scaling [N, 6].
+    """
 
     config: Anchors
     mix: Any
@@ -153,7 +156,7 @@ class AnchorScene(LatticeScene):
 
     @property
     def file_values(self) -> int:
-        """float32 values that an anchor takes in the Scaffold-GS file: 79 for K = 10, F = 32."""
+        """Number of float32 values per anchor in a Scaffold-GS file: 79 for K = 10, F = 32."""
         return 3 + 3 + 3 * self.K + self.config.F + 1 + 6 + 4  # position, normal, offsets, feature, opacity, scaling, rotation
 
     def meta(self) -> dict[str, Any]:
@@ -162,7 +165,7 @@ class AnchorScene(LatticeScene):
 
     @classmethod
     def from_points(cls, config: Anchors, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
-        """One anchor per occupied voxel of the point cloud (of each level). Raises InputError when there are no points."""
+        """Create one anchor per occupied voxel of the point cloud, on each level. Raises InputError if there are no points."""
         if len(points.xyz) == 0:
             raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
         voxel = config.voxel_size or choose_voxel_size(points.xyz, config.voxel_rule)
@@ -181,7 +184,7 @@ class AnchorScene(LatticeScene):
         return cls(config, table, voxel, extent, select, [c.id for c in cameras])
 
     def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
-        """Rows for anchors born at lattice cells [n, 3] of `level` with scaling `size` and features [n, F]; offsets start at 0."""
+        """Return rows for new anchors at lattice cells [n, 3] of `level`, with scaling `size`, features [n, F] and zero offsets."""
         n = len(cells)
         facts = self.select.places(cells, self.voxel, level)
         return {
@@ -198,16 +201,16 @@ class AnchorScene(LatticeScene):
         return self.table.facts["xyz"].index_select(0, rows).double() + (offsets * scaling).double()
 
     def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
-        """The Gaussians that `camera` sees at `step`. `cull(means, scales, camera)` is the rasteriser's visibility test."""
+        """Return the Gaussians visible from `camera` at `step`. `cull(means, scales, camera)` is the rasteriser's visibility test."""
         table = self.table
-        scales = table.params["log_scaling"].detach()[:, :3].contiguous().exp()  # with gaps between its rows exp takes 7 times as long
+        scales = table.params["log_scaling"].detach()[:, :3].contiguous().exp()  # exp takes 7 times as long on a non-contiguous tensor
         rows = visible_rows(self.select(table, camera, step, mode), table.facts["xyz"], scales, camera, cull)
         decoded = self.decode(rows, camera, step, mode)
         decoded = faded(decoded, self.select.fade(table, rows, camera, step, mode), len(table), self.K)
         return self.with_global_routing(decoded, step) if mode is Mode.TRAIN else decoded
 
     def decode(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:
-        """Gaussians of the given anchors [A], by the device's fused kernels where they cover the scene, else in plain torch."""
+        """Decode the given anchors [A]. Uses the device's fused kernels if they support the scene, otherwise PyTorch."""
         weights = self.native_weights(step)
         if weights is None:
             return self.decode_composed(rows, camera, step, mode)
@@ -221,7 +224,7 @@ class AnchorScene(LatticeScene):
         return Decoded(made[0], rows, made[1], made[2])
 
     def native_weights(self, step: int) -> dict[str, HeadWeights] | None:
-        """The heads' tensors for the fused decode (compiled on the CPU, Triton on CUDA), or None where it does not apply."""
+        """Return the heads' tensors for the fused decode (compiled on the CPU, Triton on CUDA), or None if it does not apply."""
         feature = self.table.params["feature"]
         why = no_kernels(feature.device)
         why = why or ("--scene.quat-align" if self.config.quat_align else "a feature bank" if self.mix is not None else None)
@@ -240,13 +243,13 @@ class AnchorScene(LatticeScene):
         return None if without else weights  # type: ignore[return-value]
 
     def inputs(self, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-        """Feature [A, F], unit direction camera -> anchor [A, 3], distance [A, 1]."""
+        """Return features [A, F], unit directions from camera to anchor [A, 3] and distances [A, 1]."""
         v = self.table.facts["xyz"].index_select(0, rows) - camera.position.to(self.table.facts["xyz"])
         distance = v.norm(dim=1, keepdim=True)
         return self.table.params["feature"].index_select(0, rows), v / distance.clamp_min(EPS), distance
 
     def decode_composed(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:
-        """The definition, in plain torch: one head call per attribute, then mask, activate and place."""
+        """Reference decode in PyTorch: call one head per attribute, then mask, activate and place the Gaussians."""
         p, K = self.table.params, self.K
         feature, direction, distance = self.inputs(rows, camera)
         seen = feature if self.mix is None else self.mix(self.table, rows, direction, distance)
@@ -265,7 +268,7 @@ class AnchorScene(LatticeScene):
             if found is not None:
                 routing[attribute] = found
         raw = out["opacity"]  # [A, K]
-        keep = (raw > 0).reshape(-1).nonzero().squeeze(1)  # strictly positive opacity is drawn
+        keep = (raw > 0).reshape(-1).nonzero().squeeze(1)  # only slots of strictly positive opacity are drawn
         anchor = torch.div(keep, K, rounding_mode="floor")
         row = rows.index_select(0, anchor)
         scaling = p["log_scaling"].index_select(0, row).exp()
@@ -283,7 +286,7 @@ class AnchorScene(LatticeScene):
         return Decoded(gaussians, rows, raw, routing)
 
     def scene_opacity(self, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Tensor:
-        """Raw opacities [N, K] of every anchor from `camera`, whether it sees them or not."""
+        """Return the raw opacities [N, K] of all anchors for `camera`, including anchors that are not visible."""
         everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
         feature, direction, distance = self.inputs(everyone, camera)
         seen = feature if self.mix is None else self.mix(self.table, everyone, direction, distance)
@@ -291,19 +294,19 @@ class AnchorScene(LatticeScene):
         return self.heads["opacity"](x, feature, step, self.table.facts["xyz"] / self.extent, mode)[0]
 
     def routing(self, step: int, most: int | None = None, mode: Mode = Mode.DRAW) -> dict[str, Routing]:
-        """Routing of every anchor (of at most `most`, evenly spread), by attribute: it does not depend on the camera."""
+        """Return the routing by attribute for all anchors, or for at most `most` evenly spaced ones. It is independent of the camera."""
         every = max(1, -(-len(self.table) // most)) if most else 1
         feature, position = self.table.params["feature"][::every], self.table.facts["xyz"][::every] / self.extent
         found = {a: self.heads[a].routing(feature, step, position, mode) for a in ATTRIBUTES}
         return {a: r for a, r in found.items() if r is not None}
 
     def rows_by_level(self) -> list[int]:
-        """How many anchors each level of detail holds, coarse to fine; empty without levels."""
+        """Return the number of anchors per level of detail, coarse to fine. Empty without levels."""
         return self.table.facts["level"].bincount().tolist() if self.select.count else []
 
     @contextmanager
     def at_level(self, level: int | None) -> Iterator[None]:
-        """Within the block the scene draws no finer level than `level`; see `Scene.at_level`."""
+        """Context manager in which the scene draws no level finer than `level`. See `Scene.at_level`."""
         whole = self.select
         self.select = whole.capped(level)
         try:
@@ -312,20 +315,20 @@ class AnchorScene(LatticeScene):
             self.select = whole
 
     def frozen(self, step: int) -> Draws:
-        """The scene with its routing computed once, where the native decode covers it; else the scene itself."""
+        """Return the scene with precomputed routing if the native decode supports it, otherwise the scene itself."""
         if not len(self.table) or self.table.device.type != "cpu":
             return self
         weights = self.native_weights(step)
         return self if weights is None else Frozen(self, weights, step)
 
     def with_global_routing(self, decoded: Decoded, step: int) -> Decoded:
-        """For `load_scope = all`: the routing of all anchors in place of the visible ones', so that L_load balances the whole scene."""
+        """With `load_scope = all`, replace the routing by that of all anchors, so that L_load balances the whole scene."""
         if self.config.decoder.balances_all and decoded.routing:
             return replace(decoded, routing=self.routing(step, mode=Mode.TRAIN))
         return decoded
 
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by the name of their learning rate: one group per column, per head and per router."""
+        """Return the parameters by learning rate name: one group per column, head and router."""
         groups = {name: [self.table.params[name]] for name in ("feature", "offsets", "log_scaling")}
         for attribute in ATTRIBUTES:
             head = self.heads[attribute]
@@ -341,13 +344,13 @@ class AnchorScene(LatticeScene):
         return groups
 
     def network_tensors(self) -> dict[str, Tensor]:
-        """Every tensor of the decoder by name (`opacity.w1`, ...), for files."""
+        """Return all tensors of the decoder by name (`opacity.w1`, ...), for files."""
         parts: dict[str, Any] = {**self.heads, "mix": self.mix, "appearance": self.codes}
         return {f"{part}.{name}": p for part, module in parts.items() if module is not None for name, p in module.named_parameters()}
 
 
 def no_kernels(device: torch.device) -> str | None:
-    """None where `device` has fused kernels; else why not."""
+    """Return None if `device` has fused kernels, otherwise the reason why it has none."""
     if device.type == "cuda":
         return triton_decode.available()
     return native.explain_missing() if device.type == "cpu" else f"no kernels for {device.type}"
@@ -380,7 +383,7 @@ class Rates(LearningRates):
     """Factor of a router's learning rate over that of its attribute."""
 
     def at(self, group: str, step: int, total: int, extent: float) -> float:
-        """The rate of a group of `rate_groups` at `step` of `total`."""
+        """Return the learning rate of a group of `rate_groups` at `step` of `total`."""
         attribute, _, router = group.partition(".")
         rate: Rate = getattr(self, attribute)
         factor = self.router_scale if router else extent if attribute == "offsets" else 1.0

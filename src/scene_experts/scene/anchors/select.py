@@ -1,4 +1,4 @@
-"""Which anchors a camera uses, before the visibility filter: all anchors, or those of the levels that its distance needs (Octree-GS)."""
+"""Anchor selection before the visibility filter: all anchors, or the levels of detail that match the distance (Octree-GS)."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from scene_experts.scene.anchors.levels import LevelRule, Levels, blended, whole
 
 
 class Selector(Protocol):
-    """Which anchors are drawn, and where anchors may be."""
+    """Selects the anchors to draw and defines the lattices on which anchors lie."""
 
     @property
     def lattices(self) -> Levels | None:
-        """The levels of detail; None without."""
+        """The levels of detail, or None if the scene has none."""
         ...
 
     @property
@@ -37,50 +37,50 @@ class Selector(Protocol):
         ...
 
     def coarse(self, step: int) -> bool:
-        """Whether finer levels are still to come into use after `step`."""
+        """Whether coarse-to-fine training still adds finer levels after `step`."""
         ...
 
     def capped(self, level: int | None) -> Selector:
-        """The same with no finer level than `level`; None lifts the cap."""
+        """Return a copy that uses no level finer than `level`. None removes the cap."""
         ...
 
     def __call__(self, table: Table, camera: Camera, step: int, mode: Mode) -> Tensor | None:
-        """Row indices [S] int64, ascending, that may be drawn, or None for all of them."""
+        """Return the ascending row indices [S] int64 of the selected anchors, or None for all anchors."""
         ...
 
     def fade(self, table: Table, rows: Tensor, camera: Camera, step: int, mode: Mode) -> Tensor | None:
-        """Factors [A] in [0, 1] on the opacities of `rows`, or None for 1 throughout."""
+        """Return opacity factors [A] in [0, 1] for `rows`, or None if all factors are 1."""
         ...
 
     def places(self, cells: Tensor, voxel: float, level: int) -> dict[str, Tensor]:
-        """The facts of anchors born at cells [n, 3] of `level`; positions in float64."""
+        """Return the facts of new anchors at cells [n, 3] of `level`. Positions are float64."""
         ...
 
     def meta(self) -> dict[str, Any]:
-        """What a checkpoint must keep beside the table."""
+        """Return the values that a checkpoint stores in addition to the table."""
         ...
 
 
 @dataclass(frozen=True)
 class Selection(Part, ABC):
-    """Which anchors a camera uses: makes the scene's `Selector`."""
+    """Settings of anchor selection. Creates the scene's `Selector`."""
 
     has_levels: ClassVar[bool] = False
     """Whether anchors lie on levels of detail."""
 
     @abstractmethod
     def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
-        """The first anchors for points [P, 3]: facts of the rows, the finest cell's edge, the selector."""
+        """Create the initial anchors from points [P, 3]. Returns the facts of the rows, the edge of the finest cell and the selector."""
 
     @abstractmethod
     def restored(self, meta: dict[str, Any]) -> Selector:
-        """The selector that `Selector.meta()` describes."""
+        """Restore the selector from the values of `Selector.meta()`."""
 
 
 @register
 @dataclass(frozen=True)
 class AllAnchors(Selection):
-    """Every anchor, as in Scaffold-GS."""
+    """Select all anchors, as in Scaffold-GS."""
 
     @property
     def lattices(self) -> None:
@@ -109,7 +109,7 @@ class AllAnchors(Selection):
         return {}
 
     def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
-        """One anchor per occupied voxel of points [P, 3]: facts of the rows, the finest cell's edge, the selector."""
+        """Create one anchor per occupied voxel of points [P, 3]. Returns the row facts, the edge of the finest cell and the selector."""
         cells, _ = find_unique_cells(to_lattice(points, voxel))
         return self.places(cells, voxel, 0), voxel, self
 
@@ -120,7 +120,7 @@ class AllAnchors(Selection):
 @register
 @dataclass(frozen=True)
 class Octree(Selection):
-    """Levels of detail (Ren et al., Octree-GS): anchors on several lattices; near cameras use finer levels."""
+    """Levels of detail (Ren et al., Octree-GS). Anchors lie on several lattices; near cameras use finer levels."""
 
     has_levels = True
 
@@ -152,7 +152,10 @@ class Octree(Selection):
     """Reproduce a quirk of Octree-GS: scale the cube about the origin instead of its centre."""
 
     def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
-        """Anchors in the occupied cells of every level, weeded: facts of the rows, the finest cell's edge, the selector."""
+        """Create anchors in the occupied cells of every level and remove those that too few cameras select.
+
+        Returns the facts of the rows, the edge of the finest cell and the selector.
+        """
         levels = self.levels(points, voxel, cameras)
         cells, level = lattices.occupied(levels, points)
         xyz = torch.cat([levels.positions(cells[level == i], i) for i in range(levels.count)])
@@ -163,8 +166,10 @@ class Octree(Selection):
         return facts, levels.size(levels.count - 1), LevelSelector(self, levels)
 
     def levels(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> Levels:
-        """The lattices for points [P, 3] and training cameras. Raises InputError where there is no
-        camera, and for more cells than can be told apart."""
+        """Create the lattices for points [P, 3] and training cameras.
+
+        Raises InputError if there is no camera, or if an axis has more cells than the lattice can index.
+        """
         if not cameras:
             raise InputError("expected training cameras to choose levels of detail from, found none; choose another --split")
         far, near = lattices.distances(points, cameras, self.dist_ratio)
@@ -192,7 +197,7 @@ class Octree(Selection):
         return replace(self, coarse_until=round(self.coarse_until * factor))
 
     def turns(self, levels: Levels) -> list[float]:
-        """The iterations after which one more level is in use: turns shrink by `coarse_factor`, the last ends at `coarse_until`."""
+        """Iterations after which one more level is used. Intervals shrink by `coarse_factor`; the last ends at `coarse_until`."""
         m, q = levels.count - 1 - levels.first, 1.0 / self.coarse_factor
         if m < 1:
             return []
@@ -217,7 +222,7 @@ class Octree(Selection):
 
 @dataclass(frozen=True)
 class LevelSelector:
-    """The levels of a scene in use: an anchor is drawn where its level is no finer than what its distance asks for."""
+    """Selects the anchors whose level is no finer than the level of detail for their distance."""
 
     config: Octree
     lattices: Levels
@@ -236,11 +241,11 @@ class LevelSelector:
         return torch.where(level == asked.floor().long(), asked.frac(), torch.ones_like(asked))
 
     def asked(self, xyz: Tensor, level: Tensor, extra: Tensor, camera: Camera) -> Tensor:
-        """Real-valued levels [n] with each anchor's own addition."""
+        """Return the real-valued levels of detail [n], including each anchor's `extra_level`."""
         return self.lattices.asked(xyz, level, camera.position) + extra
 
     def top(self, step: int, mode: Mode) -> int:
-        """Levels in use: all of them, or while a coarse-to-fine training lasts, those let in before `step`."""
+        """Return the number of levels in use. During coarse-to-fine training, these are the levels added before `step`."""
         count = self.lattices.count
         if mode is Mode.TRAIN and self.config.coarse_to_fine:
             count = self.lattices.first + 1 + sum(turn < step for turn in self.config.turns(self.lattices))
@@ -251,11 +256,11 @@ class LevelSelector:
         return self.lattices.count
 
     def capped(self, level: int | None) -> LevelSelector:
-        """The same with no finer level than `level`; None lifts the cap."""
+        """Return a copy that uses no level finer than `level`. None removes the cap."""
         return replace(self, cap=level)
 
     def coarse(self, step: int) -> bool:
-        """Whether finer levels are still being let in at `step`."""
+        """Whether coarse-to-fine training still adds levels at `step`."""
         turns = self.config.turns(self.lattices) if self.config.coarse_to_fine else []
         return bool(turns) and step <= turns[-1]
 
@@ -269,12 +274,12 @@ class LevelSelector:
 
 
 def capped(scene: Any, level: int | None) -> AbstractContextManager[None]:
-    """`scene.at_level(level)`."""
+    """Return the context manager `scene.at_level(level)`."""
     return scene.at_level(level)
 
 
 def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera: Camera, cull: Cull) -> Tensor:
-    """Rows [A] of the selected anchors whose own ellipsoid touches the picture. means [N, 3], scales [N, 3]; no gradient."""
+    """Return rows [A] of the selected anchors whose ellipsoid overlaps the image. means [N, 3], scales [N, 3]; no gradient."""
     with torch.no_grad():
         if selected is None:
             return cull(means, scales, camera).nonzero().squeeze(1)
@@ -282,7 +287,7 @@ def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera:
 
 
 def faded(decoded: Decoded, fade: Tensor | None, rows: int, K: int) -> Decoded:
-    """`decoded` with the opacities of its anchors, raw and drawn, times `fade` [A]; `rows`: of the whole table."""
+    """Multiply the raw and drawn opacities of `decoded` by `fade` [A]. rows: number of rows of the whole table."""
     if fade is None or decoded.raw_opacity is None:
         return decoded
     of_row = fade.new_ones(rows).index_copy(0, decoded.rows, fade)
