@@ -1,6 +1,6 @@
 """Experts kept in use without a loss (Wang et al. 2024, "Auxiliary-loss-free load balancing strategy for mixture-of-experts").
 
-Each expert has a bias b_i that counts where experts are chosen and nowhere else:
+Each expert has a bias b_i that affects only the choice of experts:
     I = Top-k of g_i + b_i,   w_i = g_i / sum_{j in I} g_j,   then   b_i <- b_i + speed sign(mean_j c_j - c_i)
 with c_i the anchors of the view that chose expert i: no gradient of a balancing loss bends the features. L_load is the alternative.
 """
@@ -22,7 +22,7 @@ from scene_experts.scene.anchors.experts import Experts, MixtureHead, top_k
 @register
 @dataclass(frozen=True)
 class BalancedExperts(Experts):
-    """A mixture of experts that biases keep in balance."""
+    """A mixture of experts balanced by biases."""
 
     speed: float = 0.001
     """Change of a bias per iteration; gates are between 0 and 1."""
@@ -51,7 +51,7 @@ class BalancedHead(MixtureHead):
         return top_k(logits.softmax(dim=1) + self.router_balance, k)
 
     def route(self, feature: Tensor, step: int, position: Tensor | None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor]:
-        """As a mixture; in training the biases then move, once per step."""
+        """Route as `MixtureHead` does. In training, then update the biases once per step."""
         routing, w = super().route(feature, step, position, mode)
         if mode is Mode.TRAIN and routing.chosen is not None and step != self.moved_at:
             count = torch.bincount(routing.chosen.reshape(-1), minlength=self.config.num).to(w.dtype)

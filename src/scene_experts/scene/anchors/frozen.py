@@ -1,4 +1,4 @@
-"""A trained anchor scene made ready for drawing: what no camera changes is computed once.
+"""A trained anchor scene prepared for drawing: values independent of the camera are computed once.
 
 Routing depends on the anchor alone, so each anchor's experts and their weights are kept. The Gaussians are those of the native decode,
 bit for bit. Symbols as in `types.py`; S experts an anchor (k, or E while dense, or 1).
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Kept:
-    """What an attribute's anchors have for every camera."""
+    """Camera-independent routing of one attribute."""
 
     gates: Tensor | None  # [N, E], while dense
     chosen: Tensor | None  # [N, k] int64
@@ -61,7 +61,7 @@ class Frozen:
 
     @property
     def bytes(self) -> int:
-        """Memory beyond the scene's own."""
+        """Memory in bytes in addition to the scene's own."""
         return sum(kept.bytes for kept in self.kept) + self.scales.numel() * 4
 
     @torch.no_grad()
@@ -93,7 +93,7 @@ class Frozen:
         )
 
     def _call(self, rows: Tensor, position: Tensor, heads: dict[str, HeadWeights]) -> tuple:
-        """The library's arguments, and the tensors that they point to."""
+        """Return the library's arguments and the tensors that they point to."""
         plan = native_decode.planned(rows, self.xyz, position, heads, self.with_dist, self.scene.extent, False)
         weights = [getattr(heads[a], name) for a in ATTRIBUTES for name in native_decode.TENSORS]
         return native_decode.prepared(plan, self.columns, weights), (plan, weights)

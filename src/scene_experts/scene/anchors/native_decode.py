@@ -27,14 +27,14 @@ T = len(TENSORS)
 
 @dataclass(frozen=True)
 class Plan:
-    """What is not differentiated."""
+    """Inputs that are not differentiated."""
 
     rows: Tensor  # [A] int64
     xyz: Tensor  # [N, 3]
     camera: Tensor  # [3]
     k: tuple[int, int, int]  # 0: dense
     distance: tuple[int, int, int]
-    position: tuple[int, int, int]  # the router sees it
+    position: tuple[int, int, int]  # whether the router receives the position
     extent: float
     ascending: bool
 
@@ -112,7 +112,7 @@ def _check(xyz: Tensor, feature: Tensor, log_scaling: Tensor, offsets: Tensor, h
 
 
 def route(call: SeDecode) -> None:
-    """Fills in the gates, chosen experts and weights that `set_routing` points to, and nothing else."""
+    """Compute only the gates, chosen experts and weights, into the tensors given to `set_routing`."""
     native.check(native.require().se_decode_route(ctypes.byref(call)), WHAT)
 
 
@@ -178,7 +178,7 @@ class _DecodeFunction(torch.autograd.Function):
 
 
 def prepared(plan: Plan, columns: Any, weights: Any) -> SeDecode:
-    """The structure with all inputs in it. The tensors must outlive the call."""
+    """Return the structure with all inputs. The tensors must outlive the call."""
     feature, log_scaling, offsets = columns
     call = SeDecode(
         A=len(plan.rows), N=len(plan.xyz), K=offsets.shape[1], F=feature.shape[1], threads=native.count_threads(), ascending=plan.ascending

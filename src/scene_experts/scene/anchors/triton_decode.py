@@ -49,33 +49,33 @@ def available() -> str | None:
 
 
 def covers(attribute: str, h: HeadWeights, F: int, K: int) -> bool:
-    """Whether the kernels have code and room for a network (two layers, held in registers) and for its number of experts."""
+    """Whether the kernels support a network (two layers, held in registers) and its number of experts."""
     E, H = h.w1.shape[:2]
     fits = padded(F + 5) <= 64 and padded(H) <= 64 and padded(K * CHANNELS[attribute]) <= WIDEST
     return h.middle_w is None and fits and E <= MOST_EXPERTS
 
 
 def padded(n: int, least: int = 16) -> int:
-    """The power of two that a tile's side of n needs."""
+    """Return the smallest power of two that is at least n and `least`."""
     return max(least, 1 << (n - 1).bit_length())
 
 
 @dataclass(frozen=True)
 class _Head:
-    """One attribute as the kernels see it."""
+    """The kernels' view of one attribute."""
 
     attribute: str
     E: int
     k: int  # 0: dense, or no router
     routed: bool
     distance: bool
-    position: bool  # the router sees it
+    position: bool  # whether the router receives the position
     sizes: dict[str, Any]  # the compile-time constants of its three kernels
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is not differentiated."""
+    """Inputs that are not differentiated."""
 
     rows: Tensor  # [A] int64
     xyz: Tensor  # [N, 3]
