@@ -215,7 +215,7 @@ def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Ten
 
 
 def _forward(plan: _Plan, i: int, routes: Any, feature: Tensor, weights: Any, dst: Tensor, out: Tensor) -> None:
-    """Fills `out` with attribute i of every slot (opacity) or of the drawn ones."""
+    """Write attribute i to `out`, for all slots (opacity) or for the drawn slots only."""
     A = len(plan.rows)
     if not out.numel():
         return

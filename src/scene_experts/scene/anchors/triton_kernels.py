@@ -89,7 +89,7 @@ def relu(z):
 
 @triton.jit
 def members(key, inside, e, SPARSE: tl.constexpr):
-    """Which anchors of the block expert e decodes, [B]; `key` [B] has a bit for each chosen expert."""
+    """Mask [B] of the block's anchors that expert e decodes; `key` [B] has a bit for each chosen expert."""
     if SPARSE:
         inside = inside & (((key >> e) & 1) == 1)
     return inside
