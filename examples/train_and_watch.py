@@ -1,4 +1,4 @@
-"""Train, print the PSNR of a held-out view, and stop once it no longer rises.
+"""Train, print the PSNR of a held-out view, and stop once it falls. The view is then no fair test: score such a run on others.
 
 python examples/train_and_watch.py CAPTURE RUN --iterations 7000
 """
