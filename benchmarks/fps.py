@@ -68,7 +68,7 @@ def measure_runs(folders: list[Path]) -> None:
     print("| run | own decode ms | frozen ms | raster ms | FPS, own decode | FPS, frozen |\n|---|---|---|---|---|---|")
     for folder in folders:
         run = open_run(folder)
-        capture = load_capture(run.config.data, run.cfg.seed)
+        capture = load_capture(run.config.data, run.config.train.seed)
         cameras = [capture.views[i].camera for i in capture.test or capture.train]
         background = torch.tensor(capture.background)
         s = timing.measure_speed(run.scene, cameras, run.step, choose("auto", "cpu"), background)

@@ -96,7 +96,7 @@ def measure_anchors(count: int) -> list[Row]:
         folder = Path(name)
         rows.add("save", lambda: save(work.training, folder, 1), again=False)
         rows.add("load", lambda: restore(work.training, folder), again=False)
-        run = OpenRun(folder, RunConfig(work.training.cfg, Data(folder)), work.training.cfg, scene, step.AT, 0.0)
+        run = OpenRun(folder, RunConfig(work.training.cfg, Data(folder)), scene, step.AT, 0.0)
         file = folder / "scene.compact"
         rows.add("export compact", lambda: compact.write(file, FAMILY.contents(run, World(), {}), {}), again=False)
     return rows.rows

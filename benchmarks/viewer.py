@@ -170,8 +170,8 @@ def main() -> None:
     args = parser.parse_args()
     run = run_folder.open_run(args.run, "cpu")
     data = run.config.data if args.data is None else replace(run.config.data, path=args.data)
-    capture = run_folder.load_capture(data, run.cfg.seed)
-    rasterize = replace(choose("auto", "cpu"), antialias=run.cfg.antialias)  # type: ignore[type-var]
+    capture = run_folder.load_capture(data, run.config.train.seed)
+    rasterize = replace(choose("auto", "cpu"), antialias=run.config.train.antialias)  # type: ignore[type-var]
     size = (args.width, args.height)
     try:
         measure_serving(run, capture, rasterize, args.seconds, size)

@@ -25,7 +25,7 @@ from support.scenes import start_scene
 def run_in_memory(recipe: str, step: int = 30_000) -> OpenRun:
     """The untrained scene of a recipe as a run of `step` iterations, without a folder."""
     cfg = RECIPES[recipe][1]
-    return OpenRun(Path("nowhere"), RunConfig(cfg, Data(Path("nowhere"))), cfg, start_scene(recipe), step, Clock())
+    return OpenRun(Path("nowhere"), RunConfig(cfg, Data(Path("nowhere"))), start_scene(recipe), step, Clock())
 
 
 def export_run(

@@ -14,9 +14,9 @@ from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.score import evaluate
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
+from scene_experts.scene import restore_scene
 from scene_experts.training.config import Train
 from scene_experts.training.events import Adjusted, Finished, Started
-from scene_experts.training.state import scene_from
 from support.lanes import slow_except
 from support.places import DEMO
 from support.trainings import assert_same, events, last_tensors
@@ -59,7 +59,7 @@ def test_it_trains_grows_resumes_to_the_bit_and_is_scored(recipe, buddha, tmp_pa
     assert_same(last_tensors(whole), last_tensors(parts))
 
     tensors, meta = checkpoint.load(checkpoint.latest(parts / "checkpoints"))
-    scene = scene_from(cfg.scaled(), tensors, meta)
+    scene = restore_scene(cfg.scaled_scene(), tensors, meta)
     evaluate(scene, buddha, choose("auto", "cpu", deterministic=True), tmp_path, EvalOptions(lpips=False), step=LAST)
     results, per_view = (json.loads((tmp_path / name).read_text()) for name in ("results.json", "per_view.json"))
     assert math.isfinite(results["psnr"]) and results["anchors"] == counts[-1]

@@ -82,7 +82,7 @@ class Run:
     ) -> None:
         """capture: that of the run, where it is loaded already.  data: where it is now, if it moved.  training: of a scene in memory."""
         self._opened, self._device, self._capture, self._data, self._training = opened, device, capture, data, training
-        self._rasterize = as_trained(rasterize, opened.cfg.antialias)
+        self._rasterize = as_trained(rasterize, opened.config.train.antialias)
         self._draws: Draws | None = None
 
     @property

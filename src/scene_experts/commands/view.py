@@ -45,7 +45,7 @@ def view(args: list[str]) -> int:
     import_viser()  # reports a missing package before anything is read
     device, rasterize = backend(command.device, command.rasterizer, False, False)
     opened = run_folder.open_run(command.run, device, command.step)
-    rasterize = as_trained(rasterize, opened.cfg.antialias)
+    rasterize = as_trained(rasterize, opened.config.train.antialias)
     capture = run_folder.capture_of(opened, command.data)
     label = f"{opened.config.train.recipe} on {capture.name}"
     viewer = Viewer(

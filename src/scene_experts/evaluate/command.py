@@ -24,7 +24,7 @@ def evaluate_run(
     The rasteriser antialiases as the run's recipe does, if it can. Raises InputError if run, checkpoint, capture and options do not fit.
     """
     opened = run_folder.open_run(run, device, step)
-    rasterize = as_trained(rasterize, opened.cfg.antialias)
+    rasterize = as_trained(rasterize, opened.config.train.antialias)
     capture = run_folder.capture_of(opened, data)
     try:
         with ProgressBar(Console(stderr=True)) as tell:
@@ -37,8 +37,8 @@ def about(run: OpenRun) -> About:
     """What the results file says of the training of an opened run."""
     return About(
         recipe=run.config.train.recipe,
-        iterations=run.cfg.iterations if run.step else 0,  # an imported file that says nothing of its training
-        seed=run.cfg.seed,
+        iterations=run.config.train.iterations if run.step else 0,  # an imported file that says nothing of its training
+        seed=run.config.train.seed,
         train_seconds=run.clock.seconds,
         cpu_seconds=run.clock.cpu_seconds,
         load=run.clock.load,

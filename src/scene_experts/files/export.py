@@ -317,7 +317,7 @@ def _describe(work: _Work, contents: Any, level: int | None) -> dict[str, Any]:
         "step": run.step,
         "capture": run.capture,
         "frame": work.options.frame,
-        "antialias": run.cfg.antialias,
+        "antialias": run.config.train.antialias,
         "gaussians": len(contents),
         "sh_degree": contents.degree,
         **({} if level is None else {"level": level}),

@@ -92,7 +92,7 @@ def cost(
         why = where if capture is None else why_no_views(capture)
         return Cost(lines=(f"{why}: what the file costs in PSNR was not measured",))
     drawn = {"run": (run.scene, run.step), **scenes()}
-    painters = {name: Painter.of(scene, step, rasterize, run.cfg.antialias) for name, (scene, step) in drawn.items()}
+    painters = {name: Painter.of(scene, step, rasterize, run.config.train.antialias) for name, (scene, step) in drawn.items()}
     found = scores(painters, capture, views, tell)
     before, after = found["run"].photographs, found["file"].photographs
     words = {"closed_form": "means over the views", "bake": "refined" if "closed_form" in found else "means over the views"}

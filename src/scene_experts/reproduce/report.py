@@ -123,7 +123,7 @@ def draw_experts(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
     capture = run_folder.load_capture(replace(opened.config.data, path=spec.scene.path), spec.seed)
     try:
         index = (capture.test or capture.train)[0]
-        rasterize = choose("auto", "cpu", antialias=opened.cfg.antialias)
+        rasterize = choose("auto", "cpu", antialias=opened.config.train.antialias)
         background = torch.tensor(capture.background)
         sheet = draw_expert_strip(opened.scene, capture.views[index].camera, opened.step, rasterize, background, attribute)
     finally:

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import torch
 from torch import Tensor, nn
 
 from scene_experts.core.errors import InputError
@@ -169,7 +170,29 @@ class SceneConfig(Part, ABC):
 
     @abstractmethod
     def load(self, table: Table, meta: dict[str, Any]) -> Scene:
-        """Build a scene from a checkpoint's table and `Scene.meta()`. The caller loads the tensors of its networks."""
+        """Build a scene from a checkpoint's table and `Scene.meta()`. `restore_scene` loads the tensors of its networks."""
+
+
+def restore_scene(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[str, Any]) -> Scene:
+    """Build a scene from the tensors and the metadata of a checkpoint.
+
+    Args:
+        config: Settings of the scene, scaled to the length of the training.
+        tensors: Columns `params.NAME` and `facts.NAME` of the table, and networks `network.NAME`. Other tensors are ignored.
+        meta: The values of `Scene.meta()`. Other values are ignored.
+
+    Raises:
+        InputError: The networks have other names or shapes than those of `config`.
+    """
+    pick = lambda prefix: {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
+    scene = config.load(Table(pick("params."), pick("facts.")), meta)
+    stored, wanted = pick("network."), scene.network_tensors()
+    if stored.keys() != wanted.keys() or any(stored[k].shape != wanted[k].shape for k in wanted):
+        raise InputError("expected the networks of this recipe in the checkpoint, found others; evaluate it with its own run folder")
+    with torch.no_grad():
+        for name, parameter in wanted.items():
+            parameter.copy_(stored[name])
+    return scene
 
 
 @dataclass(frozen=True)

@@ -58,12 +58,19 @@ class Train:
 
     def scaled(self) -> Train:
         """Return a copy whose schedule is scaled by iterations / schedule. Raises InputError if `iterations` is below 1."""
-        if self.iterations < 1:
-            raise InputError(f"expected at least 1 iteration, found {self.iterations}; use --iterations 30000")
-        factor = self.iterations / self.schedule
+        factor = self._factor()
         growth = replace(self.growth.scaled(factor), max_anchors=self.max_anchors or self.growth.max_anchors)
         scaled = {name: getattr(self, name).scaled(factor) for name in ("scene", "loss", "rates", "optimizer")}
         return replace(self, **scaled, growth=growth)
+
+    def scaled_scene(self) -> SceneConfig:
+        """Return the scene's settings of `scaled()`: all that drawing a trained scene needs. Raises InputError as `scaled` does."""
+        return self.scene.scaled(self._factor())
+
+    def _factor(self) -> float:
+        if self.iterations < 1:
+            raise InputError(f"expected at least 1 iteration, found {self.iterations}; use --iterations 30000")
+        return self.iterations / self.schedule
 
 
 @dataclass(frozen=True)

@@ -33,11 +33,10 @@ from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
 from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
-from scene_experts.scene import Scene
+from scene_experts.scene import Scene, restore_scene
 from scene_experts.training import capture_place
 from scene_experts.training.clock import Clock
-from scene_experts.training.config import RunConfig, Train
-from scene_experts.training.state import scene_from
+from scene_experts.training.config import RunConfig
 
 FORMAT = 1
 PICTURES = ("renders", "gt", "errors", "side_by_side", "masks", "experts")  # folders with the images of an evaluation
@@ -49,7 +48,6 @@ class OpenRun:
 
     path: Path
     config: RunConfig
-    cfg: Train  # scaled
     scene: Scene
     step: int
     clock: Clock  # of the training
@@ -220,7 +218,7 @@ def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
     where = named(run.config.data if data is None else replace(run.config.data, path=data))
     if data is None and not where.path.exists():
         raise InputError(f"expected the run's capture at {where.path}, found nothing there; say where it is with --data")
-    capture = load_capture(where, run.cfg.seed)
+    capture = load_capture(where, run.config.train.seed)
     if run.capture not in ("", capture.fingerprint()):
         capture.images.close()
         raise InputError(f"expected the capture that {run.path} was trained on, found other views in {capture.root}; give the right --data")
@@ -240,9 +238,8 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     folder = run / "checkpoints"
     tensors, meta = newest(folder) if step is None else at_step(folder, step)
     checkpoint.expect(meta, recipe=config.train.recipe)
-    cfg = config.train.scaled()
-    scene = scene_from(cfg, tensors, meta).to(device)
-    return OpenRun(run, config, cfg, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""))
+    scene = restore_scene(config.train.scaled_scene(), tensors, meta).to(device)
+    return OpenRun(run, config, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""))
 
 
 def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

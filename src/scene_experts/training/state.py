@@ -12,9 +12,8 @@ from torch import Tensor
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.core.plain import first_difference, from_json, to_json
-from scene_experts.core.table import Table
 from scene_experts.data.capture import Capture
-from scene_experts.scene import Scene
+from scene_experts.scene import Scene, restore_scene
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import Train
 from scene_experts.training.memory import Largest
@@ -115,7 +114,7 @@ class Training:
     def restore(cls, cfg: Train, tensors: dict[str, Tensor], meta: dict[str, Any], device: str) -> Training:
         """Restore a training from a checkpoint. Raises InputError if the checkpoint has another configuration."""
         check_same(cfg, meta)
-        scene = scene_from(cfg, tensors, meta)
+        scene = restore_scene(cfg.scene, tensors, meta)
         scene.table.stats = {k.removeprefix("stats."): v for k, v in tensors.items() if k.startswith("stats.")}
         training = cls(cfg, scene.to(device))
         table = training.scene.table
@@ -133,19 +132,6 @@ class Training:
         training.queue = tensors["queue"].tolist()
         training.step, training.clock, training.capture_id = int(meta["step"]), Clock.of(meta), meta.get("capture", "")
         return training
-
-
-def scene_from(cfg: Train, tensors: dict[str, Tensor], meta: dict[str, Any]) -> Scene:
-    """Create a scene from the tensors of a checkpoint. `cfg` must be scaled. Raises InputError if the networks do not match."""
-    pick = lambda prefix: {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
-    scene = cfg.scene.load(Table(pick("params."), pick("facts.")), meta)
-    stored, wanted = pick("network."), scene.network_tensors()
-    if stored.keys() != wanted.keys() or any(stored[k].shape != wanted[k].shape for k in wanted):
-        raise InputError("expected the networks of this recipe in the checkpoint, found others; evaluate it with its own run folder")
-    with torch.no_grad():
-        for name, parameter in wanted.items():
-            parameter.copy_(stored[name])
-    return scene
 
 
 def check_same(cfg: Train, meta: dict[str, Any]) -> None:

@@ -57,7 +57,7 @@ class Film:
             camera = camera.to(device)
             tiles = []
             for run, draws in zip(self.runs, frozen):
-                draw = as_trained(rasterize, run.cfg.antialias)
+                draw = as_trained(rasterize, run.config.train.antialias)
                 tiles += [paint(run.scene, camera, run.step, draw, background, look, draws) for look in looks]
             yield to_8bit(join_pictures(tiles) if len(tiles) > 1 else tiles[0])
             progress("rendering", i + 1, len(self.path.cameras))

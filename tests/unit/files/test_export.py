@@ -120,7 +120,7 @@ def test_written_and_read_back_it_draws_the_same_picture(run, tmp_path, form):
     assert written.path.is_relative_to(target) and written.bytes > 1000
     back = import_files(target, Data(run.config.data.path), tmp_path / "back")
     again = run_folder.open_run(back)
-    assert again.cfg == run.cfg and again.step == run.step and again.scene.voxel == run.scene.voxel
+    assert again.config.train == run.config.train and again.step == run.step and again.scene.voxel == run.scene.voxel
     rows = lambda s: sorted(map(tuple, s.table.facts["xyz"].tolist()))  # noqa: E731
     assert rows(again.scene) == rows(run.scene), "positions bit for bit"
     capture = run_folder.load_capture(again.config.data)

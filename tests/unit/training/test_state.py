@@ -8,8 +8,9 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.data.capture import load
 from scene_experts.recipes import RECIPES
+from scene_experts.scene import restore_scene
 from scene_experts.training.old_hash import old_hash
-from scene_experts.training.state import Training, resume, save, scene_from
+from scene_experts.training.state import Training, resume, save
 from support.messages import naming
 from support.synthetic import make_capture
 
@@ -68,7 +69,7 @@ def test_another_configuration_is_refused(capture):
 def test_networks_of_another_recipe_are_refused(capture):
     training = started(capture)
     with pytest.raises(InputError):
-        scene_from(RECIPES["scaffold-gs"][1].scaled(), training.tensors(), training.meta())
+        restore_scene(RECIPES["scaffold-gs"][1].scene, training.tensors(), training.meta())
 
 
 def test_saved_is_found_again_and_none_is_none(capture, tmp_path):

@@ -27,12 +27,11 @@ from scene_experts.files.anchors.write import BANK_DISTANCE, LEVEL_COLUMNS, MOE_
 from scene_experts.files.formats.ply import numbered_names, property_names, read_vertices, stack
 from scene_experts.files.registry import Imported, recognise
 from scene_experts.files.result_folder import expect_world, world_in
-from scene_experts.scene import Scene
+from scene_experts.scene import Scene, restore_scene
 from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS
 from scene_experts.training.config import Train, from_json
 from scene_experts.training.run_folder import OpenRun, load_capture
-from scene_experts.training.state import scene_from
 
 MOST_LEVELS = 64  # of detail
 
@@ -79,7 +78,7 @@ def scene(run: OpenRun, contents: AnchorData, world: World) -> tuple[Scene, int]
     networks = by_attribute(contents.networks)
     check_networks(networks, "the file")
     tensors = tensors_of(contents, networks, world, run.scene.traits.voxel)
-    return scene_from(run.cfg, tensors, run.scene.meta()).eval(), run.step
+    return restore_scene(run.config.train.scaled_scene(), tensors, run.scene.meta()).eval(), run.step
 
 
 # --- the trained world --------------------------------------------------------------------------------------------------------------------

@@ -72,7 +72,7 @@ def bake(run: OpenRun, capture: Capture, how: Bake, rasterize: Rasterizer | None
     rasterize: None for the fastest one on this CPU. Raises InputError where no Gaussian contributes
     to any training view, and for a capture without training views.
     """
-    scene, painter = run.scene, Painter.of(run.scene, run.step, rasterize, run.cfg.antialias)
+    scene, painter = run.scene, Painter.of(run.scene, run.step, rasterize, run.config.train.antialias)
     generator = torch.Generator().manual_seed(how.seed)
     views = Views.of(capture)
     cameras, slots = views.for_sums(generator), len(scene.positions) * scene.K

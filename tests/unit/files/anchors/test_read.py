@@ -104,7 +104,7 @@ def test_an_imported_run_cannot_be_resumed(tmp_path, folder):
     published(tmp_path / "result")
     out = import_files(tmp_path / "result", Data(folder), tmp_path / "run")
     with pytest.raises(InputError, match="--out"):
-        resume(run_folder.open_run(out).cfg, out / "checkpoints", "cpu")
+        resume(run_folder.open_run(out).config.train.scaled(), out / "checkpoints", "cpu")
     with pytest.raises(InputError, match="--out"):
         import_files(tmp_path / "result", Data(folder), out)
 

@@ -40,7 +40,7 @@ def test_the_files_alone_give_the_same_picture_in_the_capture_s_own_frame(made):
     xyz = stack(*"xyz")
     assert capture.world.scale != 1
     facts = {"xyz": xyz, "cell": torch.zeros(len(xyz), 3, dtype=torch.int64)}
-    scene = GraphScene(opened.cfg.scene, Table(params, facts), 1.0, 1.0, tuple(about["grid"]["low"]), about["grid"]["edge"])
+    scene = GraphScene(opened.config.train.scene, Table(params, facts), 1.0, 1.0, tuple(about["grid"]["low"]), about["grid"]["edge"])
     with torch.no_grad():
         for name, value in scene.network_tensors().items():
             value.copy_(tensors[name])
