@@ -117,9 +117,10 @@ SE_EXPORT int32_t se_raster_backward(void* state, const SeRasterBackward* a) {
     const bool slots = a->deterministic || (a->threads > 4 && a->threads * s.visible > s.pairs);
     const int rows = slots ? 0 : std::max(1, a->threads);
     StageTimer timer(s.seconds + 3);
-    blend_backward(s, a->background, {a->g_image, a->g_alpha, a->g_depth}, a->d_background, rows, a->threads);
+    blend_backward(s, a->background, {a->g_image, a->g_alpha, a->g_depth}, a->d_background, rows, a->absolute != 0, a->threads);
     timer.record();
-    project_backward(s, inputs_of(*a), {a->d_means, a->d_quats, a->d_scales, a->d_opacities, a->d_colors, a->d_mean2d}, rows, a->threads);
+    const Gradients out{a->d_means, a->d_quats, a->d_scales, a->d_opacities, a->d_colors, a->d_mean2d, a->absolute != 0};
+    project_backward(s, inputs_of(*a), out, rows, a->threads);
     timer.record();
     return 0;
   } catch (const std::exception&) {

@@ -61,12 +61,13 @@ using Entry = uint64_t;
 constexpr int kMaxPartChunks = 65536 / kChunk;  // chunks per part, at most
 
 // Sums over pixels for one Gaussian, with W = d loss / d power at a pixel: W, W dx, W dy, W dx^2, W dx dy, W
-// dy^2, then colour and depth. The entries below kSums, except kDepth, are 0: a tile keeps the Gaussian's own
-// numbers there, in the same cache line.
+// dy^2, then colour and depth. kAbsoluteX and kAbsoluteY are the sums of |W dp / du| and |W dp / dv| / (2 ln 2), where p is the power and
+// (u, v) the centre; 0 unless asked for. The other entries below kSums are 0: a tile keeps the Gaussian's own numbers there, in the same
+// cache line.
 struct alignas(64) Sums {
   float x[16];
 };
-enum { kDepth = 4, kS = 7, kSx, kSy, kSxx, kSxy, kSyy, kRed, kGreen, kBlue, kSums = kS };
+enum { kAbsoluteX = 0, kAbsoluteY = 1, kDepth = 4, kS = 7, kSx, kSy, kSxx, kSxy, kSyy, kRed, kGreen, kBlue, kSums = kS };
 
 // Uninitialised memory that only grows. Large buffers ask for huge pages, because random reads would miss the
 // TLB otherwise.
@@ -172,6 +173,7 @@ struct Upstream {
 
 struct Gradients {
   float *means, *quats, *scales, *opacities, *colors, *mean2d;
+  bool absolute;  // mean2d: the sums of the absolute values of the pixels' gradients
 };
 
 // Project all Gaussians: fill records, items, groups per chunk, and radii [m].
@@ -181,8 +183,9 @@ void project_visible(const SeCamera& camera, const float* means, const float* sc
 // Sort by depth and fill the lists of the tiles.
 void bin(State& s, int threads);
 void blend(State& s, const float* background, const Outputs& out, int threads);
-// Fill `sums` and the background's gradient. `rows`: rows of sums per Gaussian (0: one slot per pair).
-void blend_backward(State& s, const float* background, const Upstream& up, float* g_background, int rows, int threads);
+// Fill `sums` and the background's gradient. `rows`: rows of sums per Gaussian (0: one slot per pair). `absolute`: fill the sums of absolute
+// values too.
+void blend_backward(State& s, const float* background, const Upstream& up, float* g_background, int rows, bool absolute, int threads);
 void project_backward(State& s, const Inputs& in, const Gradients& out, int rows, int threads);
 
 }  // namespace se::raster

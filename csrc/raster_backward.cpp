@@ -23,6 +23,7 @@ struct Work {
   // Of one block's list: w, and alpha, which W replaces.
   F32x16 w[kBatch + 16], alpha[kBatch + 16];
   float depth[kBatch + 16];  // the batch's sums of depth
+  float absolute[2][kBatch + 16];  // the batch's sums kAbsoluteX, kAbsoluteY
 };
 
 // Upstream gradients of one block by column: lane l of column c is the pixel in column c of the row of l.
@@ -75,6 +76,40 @@ struct Moments {
     xy = fma(three, row1[3] - row1[0], row1[2] - row1[1]);
   }
 };
+
+// Sum sixteen registers over their lanes.
+F32x16 sum_lanes(const F32x16 (&r)[16]) {
+  F32x16 part[4];
+  for (int j = 0; j < 4; ++j) {
+    F32x16 c[4] = {r[4 * j], r[4 * j + 1], r[4 * j + 2], r[4 * j + 3]};
+    transpose4(c);
+    part[j] = (c[0] + c[1]) + (c[2] + c[3]);
+  }
+  return sum_quarters(part);
+}
+
+// Add the absolute values of W times the gradient of the power in the centre over one block. With e = l1 dy + l2 dx, the gradient of
+// -e^2 - (l3 dx)^2 is -2 (l2 e + l3^2 dx, l1 e).
+void reduce_absolute(Work& work, int first, int block, const Tile& tile, const Record* records, const uint32_t* from) {
+  const uint16_t* place = work.batch.list.place + first;
+  alignas(64) static const float x[16] = {-7.5f, -6.5f, -5.5f, -4.5f, -7.5f, -6.5f, -5.5f, -4.5f,
+                                          -7.5f, -6.5f, -5.5f, -4.5f, -7.5f, -6.5f, -5.5f, -4.5f};
+  const F32x16 column = load(x) + broadcast(tile.centre_x + 4.0f * static_cast<float>(block % 4));
+  const F32x16 row = block_y(block / 4) + broadcast(tile.centre_y), zero = broadcast(0.0f);
+  F32x16 along_x[16], along_y[16];
+  for (int k = 0; k < 16; ++k) {
+    const int n = place[k] / kPlace;
+    const Record& r = records[from[n < kBatch ? n : 0]];  // the rows that pad the list have W = 0
+    const F32x16 dx = broadcast(r.u) - column, dy = broadcast(r.v) - row, W = work.alpha[first + k];
+    const F32x16 e = fma(broadcast(r.l1), dy, broadcast(r.l2) * dx);
+    const F32x16 gx = W * fma(broadcast(r.l2), e, broadcast(r.l3 * r.l3) * dx), gy = W * (broadcast(r.l1) * e);
+    along_x[k] = max(gx, zero - gx), along_y[k] = max(gy, zero - gy);
+  }
+  alignas(64) float value[2][16];
+  store(value[0], sum_lanes(along_x)), store(value[1], sum_lanes(along_y));
+  for (int axis = 0; axis < 2; ++axis)
+    for (int k = 0; k < 16; ++k) work.absolute[axis][place[k] / kPlace] += value[axis][k];
+}
 
 // Add the sums over one block to the rows of sixteen Gaussians of its list.
 template <bool Depth>
@@ -133,8 +168,15 @@ void compute_weights(Work& work, int count, int block, const float* checkpoint, 
   }
 }
 
-template <bool Depth>
-void differentiate_block(Work& work, int count, int block, const float* checkpoint, Pixels& px, const Tile& tile, const Exp2& exp2) {
+// The records of the Gaussians of a batch, for the sums of absolute values.
+struct Originals {
+  const Record* records;
+  const uint32_t* from;
+};
+
+template <bool Depth, bool Absolute>
+void differentiate_block(Work& work, int count, int block, const float* checkpoint, Pixels& px, const Tile& tile, const Originals& originals,
+                         const Exp2& exp2) {
   const Batch& batch = work.batch;
   compute_weights(work, count, block, checkpoint, exp2);
   const F32x16 most = broadcast(kMaxAlpha), zero = broadcast(0.0f), one = broadcast(1.0f);
@@ -152,7 +194,10 @@ void differentiate_block(Work& work, int count, int block, const float* checkpoi
     behind = fma(one - alpha, behind, alpha * s);  // the only dependency from Gaussian to Gaussian: one step long
   }
   store(px.behind + at, behind);
-  for (int first = 0; first < count; first += 16) reduce<Depth>(work, first, by, block, tile);
+  for (int first = 0; first < count; first += 16) {
+    reduce<Depth>(work, first, by, block, tile);
+    if constexpr (Absolute) reduce_absolute(work, first, block, tile, originals.records, originals.from);
+  }
 }
 
 // Load the upstream gradients of a tile in block order, the value behind all Gaussians, and the background's
@@ -207,7 +252,7 @@ struct Sink {
   }
 };
 
-template <bool Depth>
+template <bool Depth, bool Absolute>
 void differentiate_tile(State& s, int number, Work& work, const float* background, const Upstream& up, const Sink& sink, const Exp2& exp2) {
   const Tile tile = tile_at(s, number);
   Pixels px;
@@ -229,12 +274,14 @@ void differentiate_tile(State& s, int number, Work& work, const float* backgroun
     for (int k = 0; k < n; ++k) __builtin_prefetch(&s.records.data()[from[k + kAhead]]);
     batch.load_rows(s.records.data(), from, any, n, tile);
     if constexpr (Depth) std::fill(work.depth, work.depth + kBatch, 0.0f);
+    if constexpr (Absolute)
+      for (auto& sums : work.absolute) std::fill(sums, sums + kBatch, 0.0f);
     if (sink.own)
       for (int k = 0; k < n; ++k) __builtin_prefetch(&sink.own[from[k]], 1);
     for (const int b : kBlockOrder) {
       if (!drawn[b]) continue;
       batch.fill_list(touched, b, n);
-      differentiate_block<Depth>(work, drawn[b], b, checkpoint, px, tile, exp2);
+      differentiate_block<Depth, Absolute>(work, drawn[b], b, checkpoint, px, tile, {s.records.data(), from}, exp2);
     }
     for (int first = 0; first < n; first += 16) {
       if (!sink.own) {  // every slot must be written
@@ -245,6 +292,7 @@ void differentiate_tile(State& s, int number, Work& work, const float* backgroun
         const int k = first + __builtin_ctz(left);
         F32x16 sums = load_from<kSums>(&batch.rows[k].l1);
         if constexpr (Depth) sums = sums + at_lane(kDepth, work.depth[k]);
+        if constexpr (Absolute) sums = sums + at_lane(kAbsoluteX, work.absolute[0][k]) + at_lane(kAbsoluteY, work.absolute[1][k]);
         sink.add(from[k], tile, sums);
       }
     }
@@ -282,19 +330,16 @@ void prepare_sums(State& s, int rows, int threads) {
 
 }  // namespace
 
-void blend_backward(State& s, const float* background, const Upstream& up, float* g_background, int rows, int threads) {
+void blend_backward(State& s, const float* background, const Upstream& up, float* g_background, int rows, bool absolute, int threads) {
+  const auto differentiate = absolute ? (up.depth ? differentiate_tile<true, true> : differentiate_tile<false, true>)
+                                      : (up.depth ? differentiate_tile<true, false> : differentiate_tile<false, false>);
   prepare_sums(s, rows, threads);
   double* total = s.background.get(static_cast<size_t>(s.tiles()) * 3);
   distribute_tiles(s, threads, [&](int begin, int end, int worker) {
     Work& work = thread_scratch<Work>();
     const Exp2 exp2;
     const Sink sink{s, rows ? s.sums.data() + worker * s.places() : nullptr};
-    for (int t = begin; t < end; ++t) {
-      if (up.depth)
-        differentiate_tile<true>(s, t, work, background, up, sink, exp2);
-      else
-        differentiate_tile<false>(s, t, work, background, up, sink, exp2);
-    }
+    for (int t = begin; t < end; ++t) differentiate(s, t, work, background, up, sink, exp2);
   });
   for (int c = 0; c < 3; ++c) {
     double sum = 0;

@@ -8,6 +8,8 @@
 namespace se::raster {
 namespace {
 
+constexpr float kPowerSlope = 1.38629436f;  // 2 ln 2, the factor that kAbsoluteX and kAbsoluteY leave out
+
 // Add up the sums of one visible Gaussian over the workers' rows or over its tiles' slots, always in the same
 // order.
 F32x16 sum_gradients(const State& s, uint32_t place, int rows) {
@@ -141,7 +143,13 @@ void differentiate_group(const State& s, const Inputs& in, const Gradients& out,
   put(out.scales + 3 * i, C3{{gradient.scale[0], gradient.scale[1], gradient.scale[2]}});
   put(out.opacities + i, C1{{sum[kS] / opacity[0]}});
   put(out.colors + 3 * i, C3{{sum[kRed], sum[kGreen], sum[kBlue]}});
-  put(out.mean2d + 2 * i, C2{{gradient.mean2d[0], gradient.mean2d[1]}});
+  if (out.absolute) {
+    const F32x16 x = broadcast(kPowerSlope * 0.5f * static_cast<float>(s.camera.width));
+    const F32x16 y = broadcast(kPowerSlope * 0.5f * static_cast<float>(s.camera.height));
+    put(out.mean2d + 2 * i, C2{{sum[kAbsoluteX] * x, sum[kAbsoluteY] * y}});
+  } else {
+    put(out.mean2d + 2 * i, C2{{gradient.mean2d[0], gradient.mean2d[1]}});
+  }
 }
 
 }  // namespace

@@ -53,6 +53,7 @@ typedef struct {
 
 typedef struct {
   int32_t deterministic, threads;
+  int32_t absolute;  // 1: d_mean2d is the sum over pixels of the absolute values of a pixel's gradient, for each axis
   const float *means, *quats, *scales, *opacities, *colors;  // those of the forward pass
   const float* background;
   const float *g_image, *g_alpha, *g_depth;                                                // gradients of the outputs; null: zero

@@ -118,7 +118,8 @@ class Gaussians:
 class Render:
     """A rendered image and the values that densification needs.
 
-    `mean2d_grad` is a tensor of zeros that the backward pass of the image fills.
+    `mean2d_grad` is a tensor of zeros that the backward pass of the image fills: with d loss / d mean2d, or, from a rasteriser with
+    `absolute`, with the sums over the pixels of |d loss / d mean2d| through each pixel alone (AbsGS), for each axis.
     """
 
     image: Tensor  # [H, W, 3], blended with the background, not clamped

@@ -10,7 +10,7 @@ import ctypes
 from ctypes import POINTER, Structure, c_double, c_float, c_int32, c_int64, c_void_p
 from typing import Any
 
-ABI_VERSION = 6
+ABI_VERSION = 7
 
 HEAD_TENSORS = ("router_w", "router_b", "w1", "b1", "middle_w", "middle_b", "w2", "b2")
 """The weights of a decoder head, in the order of `SeDecodeHead`."""
@@ -41,7 +41,7 @@ class SeRasterForward(Structure):
 
 class SeRasterBackward(Structure):
     _fields_ = [
-        *_fields(c_int32, "deterministic", "threads"),
+        *_fields(c_int32, "deterministic", "threads", "absolute"),
         *_fields(c_void_p, *_GAUSSIANS, "background", "g_image", "g_alpha", "g_depth"),
         *_fields(c_void_p, *(f"d_{name}" for name in (*_GAUSSIANS, "mean2d", "background"))),
     ]

@@ -75,6 +75,15 @@ def as_trained(rasterize: Rasterizer, antialias: bool) -> Rasterizer:
     return rasterize
 
 
+def for_growth(rasterize: Rasterizer, absolute: bool) -> Rasterizer:
+    """Return the rasteriser whose `mean2d_grad` holds sums of absolute values if `absolute`. Raises InputError if it has none."""
+    if not absolute:
+        return rasterize
+    if not hasattr(rasterize, "absolute"):
+        raise InputError(f"the rasteriser `{rasterize.name}` has no absolute gradients: use --growth.gradient signed")
+    return replace(rasterize, absolute=True)  # type: ignore[type-var]
+
+
 def _best(device: torch.device) -> str:
     if device.type == "cuda":
         from scene_experts.render.gsplat import explain_missing

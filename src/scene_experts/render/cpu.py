@@ -25,7 +25,7 @@ class CpuRasterizer:
 
     `deterministic`: gradients are bit-identical from run to run and for any number of threads, on one machine and instruction set (images
     always are). `level`: the instruction set, one of `native.LEVELS` (None: the best of this processor). `threads`: None for torch's
-    setting. Raises InputError if the library cannot be loaded.
+    setting. `absolute`: `mean2d_grad` holds the sums of absolute values. Raises InputError if the library cannot be loaded.
     """
 
     antialias: bool = False
@@ -33,6 +33,7 @@ class CpuRasterizer:
     level: str | None = None
     threads: int | None = None
     name: str = "cpu"
+    absolute: bool = False
 
     def __post_init__(self) -> None:
         if native.load(self.level) is None:
@@ -101,7 +102,7 @@ class _Draw(torch.autograd.Function):
         outputs = [torch.empty_like(t) for t in plain[:5]] + [ctx.mean2d_grad, torch.empty(3)]
         how: CpuRasterizer = ctx.how
         where = [None if t is None else t.data_ptr() for t in (*plain, *up, *outputs)]
-        args = SeRasterBackward(how.deterministic, how._count_threads(), *where)
+        args = SeRasterBackward(how.deterministic, how._count_threads(), how.absolute, *where)
         code = ctx.state.library.se_raster_backward(ctypes.c_void_p(ctx.state.address), ctypes.byref(args))
         native.check(code, "the backward pass of the image")
         return *outputs[:5], outputs[6], None, None, None

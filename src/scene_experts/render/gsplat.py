@@ -18,6 +18,7 @@ import importlib
 import inspect
 from dataclasses import dataclass, field
 from types import ModuleType
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -52,6 +53,7 @@ class GsplatRasterizer:
 
     antialias: bool = False
     name: str = field(default="gsplat", init=False)
+    absolute: bool = False
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
         """Draw M Gaussians over `background` [3], see `types.Render`. Raises InputError if gsplat cannot run."""
@@ -80,9 +82,11 @@ class GsplatRasterizer:
         if self.antialias:
             opacities = opacities * compensations.clamp_min(MIN_COMPENSATION)
         mean2d = means2d[0]
-        grad = record_mean2d_grad(mean2d, (g.scales, g.quats, g.opacities, g.colors), camera, len(g), slice(None))
+        instead = (lambda: centres.absgrad[0]) if self.absolute else None  # gsplat's backward pass sets `absgrad`
+        grad = record_mean2d_grad(mean2d, (g.scales, g.quats, g.opacities, g.colors), camera, len(g), slice(None), instead)
+        centres: Any = mean2d[None]
         colors = torch.cat([g.colors, depths[0, :, None]], dim=1)[None]  # [1, M, 4]
-        picture, alpha = _rasterize(library, mean2d[None], conics, colors, opacities, extents, depths, camera, background)
+        picture, alpha = _rasterize(library, centres, conics, colors, opacities, extents, depths, camera, background, self.absolute)
         return Render(picture[..., :3], alpha, picture[..., 3], radii, grad)
 
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
@@ -108,13 +112,18 @@ def _rasterize(
     depths: Tensor,
     camera: Camera,
     background: Tensor,
+    absolute: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Sort into tiles and blend one view. Returns the picture [H, W, 4] (colour and depth) and alpha [H, W]."""
+    """Sort into tiles and blend one view. Returns the picture [H, W, 4] (colour and depth) and alpha [H, W].
+
+    `absolute`: the backward pass sets `means2d.absgrad` to the sums of the absolute values of the pixels' gradients.
+    """
     across, down = -(-camera.width // TILE), -(-camera.height // TILE)
     _, keys, order = library.isect_tiles(means2d, extents, depths, TILE, across, down)
     offsets = library.isect_offset_encode(keys, 1, across, down).reshape(1, down, across)
     behind = torch.cat([background.to(colors), colors.new_zeros(1)])[None]  # the background has depth 0
+    asked = {"absgrad": True} if absolute else {}
     picture, alpha = library.rasterize_to_pixels(
-        means2d, conics, colors, opacities, camera.width, camera.height, TILE, offsets, order, backgrounds=behind
+        means2d, conics, colors, opacities, camera.width, camera.height, TILE, offsets, order, backgrounds=behind, **asked
     )
     return picture[0], alpha[0, ..., 0]

@@ -29,7 +29,9 @@ to 0.99; there it passes the clamp (see `clamp_gradient`).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -67,12 +69,14 @@ class ReferenceRasterizer:
         antialias: Multiply opacities by the compensation of the blur (Mip-Splatting).
         clamp_gradient: Pass the gradient of opacity and shape through the clamp of alpha at 0.99, as the original CUDA code does.
         tile: Edge in px of the blocks that the picture is drawn in (None: one block). It affects speed and memory only.
+        absolute: `mean2d_grad` holds, for each axis, the sum over pixels of the absolute values of a pixel's gradient (AbsGS).
     """
 
     antialias: bool = False
     clamp_gradient: bool = False
     tile: int | None = TILE
     name: str = field(default="reference", init=False)
+    absolute: bool = False
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
         """Draw M Gaussians over `background` [3], see `types.Render`. A backward pass overwrites `mean2d_grad`."""
@@ -82,10 +86,12 @@ class ReferenceRasterizer:
         mean2d, opacity = projected.mean2d[ids], g.opacities[ids]
         if self.antialias:
             opacity = opacity * projected.compensation[ids]
-        grad = record_mean2d_grad(mean2d, (g.scales, g.quats, g.opacities, g.colors), camera, len(g), ids)
+        sums = torch.zeros_like(mean2d) if self.absolute and torch.is_grad_enabled() else None
+        instead = None if sums is None else lambda: sums
+        grad = record_mean2d_grad(mean2d, (g.scales, g.quats, g.opacities, g.colors), camera, len(g), ids, instead)
         columns = [mean2d, projected.conic[ids], opacity[:, None], g.colors[ids], projected.depth[ids, None]]
         reach = _compute_reach(mean2d, projected.cov2d[ids], opacity)
-        out = self._draw_blocks(torch.cat(columns, dim=1), reach, camera)
+        out = self._draw_blocks(torch.cat(columns, dim=1), reach, camera, sums)
         color, depth, transmittance = out[..., :3], out[..., 3], out[..., 4]
         image = color + transmittance[..., None] * background.to(color)
         return Render(image, 1 - transmittance, depth, projected.radii, grad)
@@ -95,13 +101,17 @@ class ReferenceRasterizer:
         """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] are drawn (radius > 0)."""
         return visible(means, scales, camera)
 
-    def _draw_blocks(self, splats: Tensor, reach: Tensor, camera: Camera) -> Tensor:
-        """Return colour, depth and final transmittance [H, W, 5] of splats [V, 10] that are sorted from near to far."""
+    def _draw_blocks(self, splats: Tensor, reach: Tensor, camera: Camera, sums: Tensor | None) -> Tensor:
+        """Return colour, depth and final transmittance [H, W, 5] of splats [V, 10] that are sorted from near to far.
+
+        The backward pass adds the absolute values of the pixels' gradients to `sums` [V, 2].
+        """
         height, width = camera.height, camera.width
         block = (height, width) if self.tile is None or not len(splats) else (self.tile, self.tile)
         down, across = -(-height // block[0]), -(-width // block[1])
         entries, counts = _sort_into_blocks(reach, block, down, across)
         lists = splats[entries].split(counts)  # one gather for all, so that the backward pass is one scatter
+        places = entries.split(counts)
         pairs = len(entries) * block[0] * block[1]
         recompute = torch.is_grad_enabled() and splats.requires_grad and pairs > _CHECKPOINT
         blank = splats.new_tensor([0.0, 0.0, 0.0, 0.0, 1.0]).expand(block[0] * block[1], 5)
@@ -112,10 +122,11 @@ class ReferenceRasterizer:
                 continue
             corner = (number // across * block[0], number % across * block[1])
             pixels = _pixel_centres(corner, block, splats)
+            add = None if sums is None else partial(add_absolute, sums, places[number])
             if recompute:
-                tiles.append(checkpoint(_blend, part, pixels, self.clamp_gradient, use_reentrant=False))
+                tiles.append(checkpoint(_blend, part, pixels, self.clamp_gradient, add, use_reentrant=False))
             else:
-                tiles.append(_blend(part, pixels, self.clamp_gradient))
+                tiles.append(_blend(part, pixels, self.clamp_gradient, add))
         grid = torch.stack(tiles).view(down, across, block[0], block[1], 5).transpose(1, 2)
         return grid.reshape(down * block[0], across * block[1], 5)[:height, :width]
 
@@ -157,10 +168,18 @@ def visible(means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
     return project(means, quats, scales, camera).radii > 0
 
 
-def record_mean2d_grad(mean2d: Tensor, others: tuple[Tensor, ...], camera: Camera, total: int, ids: Tensor | slice) -> Tensor:
+def record_mean2d_grad(
+    mean2d: Tensor,
+    others: tuple[Tensor, ...],
+    camera: Camera,
+    total: int,
+    ids: Tensor | slice,
+    instead: Callable[[], Tensor] | None = None,
+) -> Tensor:
     """Return a buffer [total, 2] of zeros. The backward pass writes d loss / d `mean2d` in NDC to its rows `ids`.
 
-    The gradient in NDC is the gradient in px times (W/2, H/2).
+    The gradient in NDC is the gradient in px times (W/2, H/2). `instead` returns sums of absolute values in px; the backward pass writes
+    these instead and sets them to zero.
     """
     buffer = mean2d.new_zeros((total, 2))
     if not torch.is_grad_enabled():
@@ -173,8 +192,11 @@ def record_mean2d_grad(mean2d: Tensor, others: tuple[Tensor, ...], camera: Camer
             if gradient is None:  # autograd found it to be zero
                 buffer[ids] = 0.0
             else:  # column by column: building a tensor from the two numbers would synchronise with a GPU
-                x, y = gradient.detach().unbind(1)
+                sums = gradient.detach() if instead is None else instead()
+                x, y = sums.unbind(1)
                 buffer[ids] = torch.stack([x * (camera.width / 2), y * (camera.height / 2)], dim=1)
+                if instead is not None:
+                    sums.zero_()
 
         mean2d.register_hook(store)
     return buffer
@@ -225,6 +247,11 @@ def _sort_into_blocks(reach: Tensor, block: tuple[int, int], down: int, across: 
     return splat[order], torch.bincount(number, minlength=down * across).tolist()
 
 
+def add_absolute(sums: Tensor, places: Tensor, axis: int, gradient: Tensor) -> None:
+    """Add the sums over pixels of |gradient| [P, S] to column `axis` of `sums` [V, 2] at `places` [S]."""
+    sums[:, axis].index_add_(0, places, gradient.detach().abs().sum(0))
+
+
 def _pixel_centres(corner: tuple[int, int], block: tuple[int, int], like: Tensor) -> Tensor:
     """Return the pixel centres [P, 2] (x, y) of a block whose first pixel is `corner` (row, column)."""
     rows = torch.arange(block[0], device=like.device, dtype=like.dtype) + (corner[0] + 0.5)
@@ -233,10 +260,16 @@ def _pixel_centres(corner: tuple[int, int], block: tuple[int, int], like: Tensor
     return torch.stack([x.flatten(), y.flatten()], dim=1)
 
 
-def _blend(splats: Tensor, pixels: Tensor, clamp_gradient: bool) -> Tensor:
-    """Blend sorted splats [S, 10] front to back at pixels [P, 2]. Returns colour, depth and final transmittance [P, 5]."""
+def _blend(splats: Tensor, pixels: Tensor, clamp_gradient: bool, see: Callable[[int, Tensor], None] | None = None) -> Tensor:
+    """Blend sorted splats [S, 10] front to back at pixels [P, 2]. Returns colour, depth and final transmittance [P, 5].
+
+    The backward pass calls `see` with each axis and the gradients [P, S] of the pixels in the splats' centres along it.
+    """
     u, v, a, b, c, opacity = splats[:, :6].unbind(1)
     dx, dy = u - pixels[:, :1], v - pixels[:, 1:]  # [P, S]
+    if see is not None and dx.requires_grad:
+        for axis, offset in enumerate((dx, dy)):
+            offset.register_hook(partial(see, axis))
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
     raw = opacity * power.clamp_max(0).exp()
     alpha = raw.clamp_max(MAX_ALPHA)

@@ -42,6 +42,11 @@ class Strategy(Part, Generic[S], ABC):
     enabled: bool = True
     """Whether rows are added and removed at all."""
 
+    @property
+    def absolute(self) -> bool:
+        """Whether the statistics use absolute pixel gradients (`types.Render.mean2d_grad`)."""
+        return False
+
     def count_steps(self, iterations: int) -> int | None:
         """Number of densification steps in a training of `iterations` iterations; None if unknown."""
         return None

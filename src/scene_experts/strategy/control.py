@@ -30,6 +30,8 @@ class AnchorControl(Strategy[L]):
     """When densification runs."""
     grad_threshold: float = 0.0002
     """Mean 2D gradient (NDC units) above which new anchors are created."""
+    gradient: Literal["signed", "absolute"] = "signed"
+    """signed: the gradients of a Gaussian's pixels cancel where they differ in sign. absolute: their absolute values are added (AbsGS)."""
     success_threshold: float = 0.8
     """Share of the interval in which an anchor must be seen before it can be removed; half of it before it can grow."""
     min_opacity: float = 0.005
@@ -38,6 +40,11 @@ class AnchorControl(Strategy[L]):
     """Upper bound of the Gaussians' sizes after each densification step: 0.05 in log space, 0.05 in linear units, or off."""
     max_anchors: int = 0
     """Maximum number of anchors; 0 means no limit. Anchors with the largest gradients are created first."""
+
+    @property
+    def absolute(self) -> bool:
+        """Whether the statistics use absolute pixel gradients."""
+        return self.gradient == "absolute"
 
     def scaled(self, factor: float) -> Self:
         """Scale the schedule to a training `factor` times as long. The interval, gates and thresholds do not change."""

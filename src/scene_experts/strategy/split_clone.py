@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Literal, Self
 
 import torch
 from torch import Tensor
@@ -37,6 +37,8 @@ class SplitClone(Strategy[GaussianScene]):
     """When densification runs."""
     grad_threshold: float = 0.0002
     """Mean 2D gradient (NDC units) above which a Gaussian is cloned or split."""
+    gradient: Literal["signed", "absolute"] = "signed"
+    """signed: the gradients of a Gaussian's pixels cancel where they differ in sign. absolute: their absolute values are added (AbsGS)."""
     dense_size: float = 0.01
     """Largest size of a cloned Gaussian, as a share of the scene's extent; larger ones are split."""
     min_opacity: float = 0.005
@@ -53,6 +55,11 @@ class SplitClone(Strategy[GaussianScene]):
     """Also reset at adjust.start, as 3DGS does for captures with a white background."""
     max_anchors: int = 0
     """Maximum number of Gaussians; 0 means no limit. Gaussians with the largest gradients are added first."""
+
+    @property
+    def absolute(self) -> bool:
+        """Whether the statistics use absolute pixel gradients."""
+        return self.gradient == "absolute"
 
     def scaled(self, factor: float) -> Self:
         """Scale the schedule to a training `factor` times as long.

@@ -16,7 +16,7 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.transfer import upload
 from scene_experts.core.types import Decoded, Mode, Render, Routing
 from scene_experts.data.capture import Capture
-from scene_experts.render import Rasterizer
+from scene_experts.render import Rasterizer, for_growth
 from scene_experts.strategy import Edit
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.events import Adjusted, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
@@ -82,6 +82,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
     training = training or Training.start(cfg, capture, run.device, run.dtype)
     training.capture_id = capture.fingerprint()
+    rasterize = for_growth(rasterize, cfg.growth.absolute)
     total = min(cfg.iterations, run.config.stop_at or cfg.iterations)
     run.begin(training)
     yield Started(training.step, total, len(training.scene.table), training.scene.traits)

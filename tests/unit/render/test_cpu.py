@@ -59,7 +59,8 @@ def relative(expected: Tensor, found: Tensor) -> float:
 
 
 def agree(inputs: tuple[Tensor, ...], camera: Camera, tolerance: float = 1e-5, parts: str = "image alpha depth", **kw: object) -> None:
-    expected, grads = draw(ReferenceRasterizer(antialias=bool(kw.get("antialias"))), inputs, camera, torch.float64, parts)
+    reference = ReferenceRasterizer(antialias=bool(kw.get("antialias")), absolute=bool(kw.get("absolute")))
+    expected, grads = draw(reference, inputs, camera, torch.float64, parts)
     found, ours = draw(CpuRasterizer(**kw), inputs, camera, torch.float32, parts)  # type: ignore[arg-type]
     assert found.image.shape == (camera.height, camera.width, 3) and found.image.is_contiguous()
     for part in ("image", "alpha", "depth"):
@@ -168,6 +169,27 @@ def test_deterministic_whatever_the_threads(level: str) -> None:
         values = [render.image, render.alpha, render.depth, *grads.values()]
         first = first or values
         assert all(torch.equal(a, b) for a, b in zip(first, values, strict=True))
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("parts", ["image", "image alpha depth"])
+def test_absolute_gradients_agree_with_float64(level: str, deterministic: bool, parts: str) -> None:
+    agree(*make(m=3000), absolute=True, level=level, deterministic=deterministic, parts=parts)
+    agree(*make(m=200, size=1.5, aspect=40), tolerance=1e-4, absolute=True, level=level, deterministic=deterministic, antialias=True)
+
+
+def test_absolute_gradients_change_no_other_bits() -> None:
+    inputs, camera = make(m=5000)
+    first = None
+    for threads in (1, 3):
+        draws = [CpuRasterizer(deterministic=True, absolute=absolute, threads=threads) for absolute in (False, True)]
+        (_, signed), (_, absolute) = [draw(how, inputs, camera, torch.float32) for how in draws]
+        assert all(torch.equal(signed[name], absolute[name]) for name in NAMES[:-1])
+        size = signed["mean2d"].abs()
+        assert (absolute["mean2d"] >= size * (1 - 1e-4) - 1e-5).all() and (absolute["mean2d"] > size).any()
+        first = absolute["mean2d"] if first is None else first
+        assert torch.equal(first, absolute["mean2d"])
 
 
 def test_fast_mode_with_threads_agrees() -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from functools import partial
 from types import ModuleType
 
 import pytest
@@ -11,7 +12,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.render import gsplat as adapter
-from scene_experts.render.reference import ReferenceRasterizer, _blend, _pixel_centres, project
+from scene_experts.render.reference import ReferenceRasterizer, _blend, _pixel_centres, add_absolute, project
 from support.gaussians import make_camera, make_scene
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
@@ -86,11 +87,15 @@ class FakeGsplat(ModuleType):
         isect_offsets: Tensor,
         flatten_ids: Tensor,
         backgrounds: Tensor | None = None,
+        absgrad: bool = False,
     ) -> tuple[Tensor, Tensor]:
         assert isect_offsets.shape == (1, -(-image_height // tile_size), -(-image_width // tile_size))
         assert backgrounds is not None and backgrounds.shape == (1, colors.shape[2]) and opacities.shape == colors.shape[:2]
         splats = torch.cat([means2d[0], conics[0], opacities[0, :, None], colors[0]], dim=1)[flatten_ids]
-        out = _blend(splats, _pixel_centres((0, 0), (image_height, image_width), splats), False)
+        if absgrad:
+            means2d.absgrad = torch.zeros_like(means2d)  # type: ignore[attr-defined]
+        see = partial(add_absolute, means2d.absgrad[0], flatten_ids) if absgrad else None  # type: ignore[attr-defined]
+        out = _blend(splats, _pixel_centres((0, 0), (image_height, image_width), splats), False, see)
         out = out.view(1, image_height, image_width, 5)
         return out[..., :4] + out[..., 4:] * backgrounds[:, None, None], 1 - out[..., 4:]
 
@@ -109,12 +114,14 @@ def backward(render: Render, g: Gaussians) -> list[Tensor]:
     return [render.mean2d_grad, *(getattr(g, n).grad for n in NAMES)]
 
 
+@pytest.mark.parametrize("absolute", [False, True])
 @pytest.mark.parametrize("antialias", [False, True])
-def test_the_adapter_converts_arguments_and_results(fake: FakeGsplat, antialias: bool) -> None:
+def test_the_adapter_converts_arguments_and_results(fake: FakeGsplat, antialias: bool, absolute: bool) -> None:
     scene, camera = make_scene(80, size=0.05), make_camera(45, 37, 14.2, 25.1, near=0.33).to(dtype=torch.float32)
     scene.means[-1, 0] = 50.0  # far outside: the 3 sigma rule gives it no radius
     results = []
-    for rasterizer in (adapter.GsplatRasterizer(antialias=antialias), ReferenceRasterizer(antialias=antialias)):
+    how = {"antialias": antialias, "absolute": absolute}
+    for rasterizer in (adapter.GsplatRasterizer(**how), ReferenceRasterizer(**how)):
         g = single(scene, grad=True)
         render = rasterizer(g, camera, BACKGROUND)
         results.append([render.image, render.alpha, render.depth, render.radii, *backward(render, g)])
@@ -191,14 +198,16 @@ def real() -> None:
 
 @pytest.mark.gpu
 @pytest.mark.usefixtures("real")
+@pytest.mark.parametrize("absolute", [False, True])
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("center", [(None, None), (301.0, 95.5)], ids=["centred", "off-centre"])
-def test_the_real_gsplat_agrees_with_the_reference(antialias: bool, center: tuple[float | None, float | None]) -> None:
+def test_the_real_gsplat_agrees_with_the_reference(antialias: bool, center: tuple[float | None, float | None], absolute: bool) -> None:
     scene = make_scene(3000, size=0.04)
     scene = replace(scene, opacities=scene.opacities.clamp_max(0.98))  # below both clamps of alpha
     camera = make_camera(333, 217, *center, f=300.0).to("cuda", torch.float32)
     results = []
-    for rasterizer in (adapter.GsplatRasterizer(antialias=antialias), ReferenceRasterizer(antialias=antialias)):
+    how = {"antialias": antialias, "absolute": absolute}
+    for rasterizer in (adapter.GsplatRasterizer(**how), ReferenceRasterizer(**how)):
         g = single(scene, "cuda", grad=True)
         render = rasterizer(g, camera, BACKGROUND.cuda())
         results.append((render, backward(render, g)))

@@ -1,6 +1,7 @@
 """The choice of a rasteriser: `auto`, and rasterisers that cannot be used."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from scene_experts import render
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Gaussians
 from scene_experts.native import library as native
-from scene_experts.render import NAMES, as_trained, choose
+from scene_experts.render import NAMES, as_trained, choose, for_growth
 from support.messages import naming
 
 
@@ -71,6 +72,13 @@ def test_a_rasteriser_is_as_the_run_was_trained():
     assert as_trained(draw, False) is draw and as_trained(draw, True) == replace(draw, antialias=True)  # type: ignore[type-var]
     plain = object()  # a rasteriser without compensation
     assert as_trained(plain, True) is plain  # type: ignore[arg-type]
+
+
+def test_growth_asks_for_absolute_gradients():
+    draw = choose("reference", "cpu")
+    assert for_growth(draw, False) is draw and for_growth(draw, True) == replace(draw, absolute=True)  # type: ignore[type-var]
+    with pytest.raises(InputError, match=r"--growth\.gradient"):
+        for_growth(SimpleNamespace(name="mine"), True)  # type: ignore[arg-type]
 
 
 def test_gsplat_says_that_it_is_not_deterministic():

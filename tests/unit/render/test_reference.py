@@ -227,6 +227,27 @@ def test_mean2d_gradient_is_in_ndc_units() -> None:
     torch.testing.assert_close(render.mean2d_grad[0], torch.tensor([pixel[0] * 33 / 2, pixel[1] * 21 / 2], dtype=F64), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("limit", [1 << 24, 0])
+def test_absolute_gradients_are_sums_over_pixels(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scene_experts.render.reference._CHECKPOINT", limit)
+    g, camera = one(x=0.05, y=0.1, size=0.3), plain_camera()
+    means = g.means.clone().requires_grad_()
+    weights = torch.randn(21, 33, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
+    draw = ReferenceRasterizer(absolute=True)
+    render = draw(replace(g, means=means), camera, BLACK)
+    assert (render.mean2d_grad == 0).all()
+    loss = (render.image * weights).sum()
+    loss.backward(retain_graph=True)
+    h, expected = 1e-5, []
+    for dx, dy, side in ((h, 0.0, 33), (0.0, h, 21)):  # inside the limits of the Jacobian, the principal point moves only the centre
+        up, down = (draw(g, plain_camera(cx=16.5 + s * dx, cy=10.5 + s * dy), BLACK).image for s in (1, -1))
+        moved = ((up - down).abs() < 1e-3).all(2)  # not the pixels whose alpha passes 1/255 between the two
+        expected.append((((up - down) / (2 * h) * weights).sum(2) * moved).abs().sum() * side / 2)
+    torch.testing.assert_close(render.mean2d_grad[0], torch.stack(expected), rtol=1e-6, atol=1e-9)
+    loss.backward()  # overwrites
+    torch.testing.assert_close(render.mean2d_grad[0], torch.stack(expected), rtol=1e-6, atol=1e-9)
+
+
 def test_mean2d_gradient_without_gradients_of_the_means() -> None:
     scales = one().scales.requires_grad_()
     render = ReferenceRasterizer()(replace(one(x=0.05), scales=scales), plain_camera(), BLACK)
