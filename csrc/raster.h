@@ -30,6 +30,7 @@ namespace se::raster {
 
 constexpr int kTile = 16;             // pixels
 constexpr int kArea = 4;              // tiles
+constexpr int kMaxTiles = 65535;      // of a side: coordinates of tiles have 16 bits
 constexpr int kMaxAreas = 65536;      // of an image: 268 million pixels
 constexpr int kChunk = 4096;          // Gaussians per job of the projection; a multiple of 16
 constexpr int kBatch = 512;           // Gaussians of a tile processed at a time: the end of a batch costs every block some hundred cycles

@@ -118,7 +118,7 @@ void project_chunk(State& s, const Inputs& in, int32_t* radii, int64_t begin, in
 }  // namespace
 
 void project(State& s, const Inputs& in, int32_t* radii, int threads) {
-  if (s.areas() > kMaxAreas) throw std::bad_alloc();
+  if (std::max(s.tiles_x, s.tiles_y) > kMaxTiles || s.areas() > kMaxAreas) throw std::bad_alloc();
   const size_t places = static_cast<size_t>(s.places());
   s.records.get(places), s.items.get(places), s.chunk_entries.get(places / kChunk);
   s.group_mask.get(places / 16), s.group_first.get(places / 16), s.chunk_count.get(places / kChunk);

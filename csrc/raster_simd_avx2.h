@@ -136,7 +136,8 @@ inline void split_exponent(F32x16 a, F32x16& m, F32x16& e) {
 inline void load_pairs(const float* const (&p)[16], F32x16& first, F32x16& second) {
   const auto four = [&](int k) {
     const auto two = [&](int j) {
-      return _mm_loadh_pd(_mm_load_sd(reinterpret_cast<const double*>(p[j])), reinterpret_cast<const double*>(p[j + 1]));
+      const __m128i low = _mm_loadl_epi64(reinterpret_cast<const __m128i_u*>(p[j]));  // aligned to four bytes only
+      return _mm_loadh_pd(_mm_castsi128_pd(low), reinterpret_cast<const double*>(p[j + 1]));
     };
     return _mm256_castpd_ps(_mm256_insertf128_pd(_mm256_castpd128_pd256(two(k)), two(k + 2), 1));
   };

@@ -170,7 +170,8 @@ inline void load_pairs(const float* const (&p)[16], F32x16& first, F32x16& secon
   __m512d quarter[4];
   for (int i = 0; i < 4; ++i) {
     const auto two = [&](int k) {
-      return _mm_loadh_pd(_mm_load_sd(reinterpret_cast<const double*>(p[k])), reinterpret_cast<const double*>(p[k + 1]));
+      const __m128i low = _mm_loadl_epi64(reinterpret_cast<const __m128i_u*>(p[k]));  // aligned to four bytes only
+      return _mm_loadh_pd(_mm_castsi128_pd(low), reinterpret_cast<const double*>(p[k + 1]));
     };
     quarter[i] = _mm512_castpd256_pd512(_mm256_insertf128_pd(_mm256_castpd128_pd256(two(4 * i)), two(4 * i + 2), 1));
   }

@@ -142,8 +142,8 @@ typedef struct {
   double step_size, root;  // learning rate / (1 - beta1^t), sqrt(1 - beta2^t)
 } SeAdamTensor;
 
-// Update `count` tensors by one step of Adam.
-SE_EXPORT void se_adam_step(const SeAdamTensor* tensors, int64_t count, double beta1, double beta2, double eps, int32_t threads);
+// Update `count` tensors by one step of Adam. Return the number of the first tensor of which a new value or moment is not finite, or -1.
+SE_EXPORT int64_t se_adam_step(const SeAdamTensor* tensors, int64_t count, double beta1, double beta2, double eps, int32_t threads);
 
 // ---- Spherical harmonics --------------------------------------------------------------------------------------------------------
 

@@ -96,7 +96,7 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "se_volume_backward": (None, (_P, _L, _F, _P, _I)),
     "se_hinge_forward": (None, (_P, _L, _F, _P, _I)),
     "se_hinge_backward": (None, (_P, _L, _F, _F, _P, _I)),
-    "se_adam_step": (None, (POINTER(SeAdamTensor), _L, _D, _D, _D, _I)),
+    "se_adam_step": (_L, (POINTER(SeAdamTensor), _L, _D, _D, _D, _I)),
     "se_sh_forward": (None, (_P, _P, _P, _P, _L, _L, _I, _P, _P, _I)),
     "se_sh_backward": (None, (*[_P] * 10, _L, _L, _I, _I)),
     "se_graph_reverse": (None, (_P, _L, _L, _P, _P)),

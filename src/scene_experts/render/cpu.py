@@ -44,6 +44,7 @@ class CpuRasterizer:
         """Render M Gaussians over `background` [3]; see `types.Render`. The backward pass overwrites `mean2d_grad`."""
         inputs = (g.means, g.quats, g.scales, g.opacities, g.colors)
         _check(inputs)
+        _check_size(camera)
         mean2d_grad = torch.zeros((len(g), 2))
         image, alpha, depth, radii = _Draw.apply(*inputs, background, self, camera, mean2d_grad)
         return Render(image, alpha, depth, radii, mean2d_grad)
@@ -122,6 +123,17 @@ def _check(inputs: tuple[Tensor, ...]) -> None:
         if tensor.shape != expected or not tensor.is_cpu:
             found = f"{tuple(tensor.shape)} on {tensor.device}"
             raise InputError(f"expected {name} of shape {expected} on the CPU, found {found}")
+
+
+def _check_size(camera: Camera) -> None:
+    """Raise InputError if an image has more tiles of 16 x 16 pixels than the library can number."""
+    tiles = [-(-side // 16) for side in (camera.width, camera.height)]
+    areas = [-(-count // 4) + 1 for count in tiles]
+    if max(tiles) > 65_535 or areas[0] * areas[1] > 65_536:
+        raise InputError(
+            f"expected an image of at most 1,048,560 px a side and 260 million px in total, found {camera.width:,} x {camera.height:,} px; "
+            "choose a smaller size"
+        )
 
 
 def _convert(tensor: Tensor) -> Tensor:

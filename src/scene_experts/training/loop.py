@@ -20,6 +20,7 @@ from scene_experts.render import Rasterizer, for_growth
 from scene_experts.strategy import Edit
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.events import Adjusted, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
+from scene_experts.training.guard import explain, find_broken
 from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
 from scene_experts.training.memory import anchor_cap
 from scene_experts.training.state import Training, resume, save
@@ -73,7 +74,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
 
     Raises:
         InputError: The settings, the capture or the checkpoint cannot be used.
-        RunError: The loss is not finite, or a checkpoint cannot be written.
+        RunError: A loss or a parameter is not finite, or a checkpoint cannot be written.
     """
     cfg = cfg.scaled()
     folder = run.out / "checkpoints" if run.out else None
@@ -91,6 +92,9 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
         with training.clock.running():
             done = iterate(training, run, capture, rasterize)
         step, parts = training.step, done.terms
+        if broken := find_broken(training.optimizer, step):
+            check_finite(step, parts)
+            raise RunError(explain(f"the parameter '{broken}' or its gradient", step, folder))
         if done.edit is not None:
             yield Adjusted(step, done.edit)
         if step % run.log_every == 0 or step == total:

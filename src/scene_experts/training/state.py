@@ -16,6 +16,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.scene import Scene, restore_scene
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import Train
+from scene_experts.training.guard import check_state
 from scene_experts.training.memory import Largest
 from scene_experts.training.old_hash import old_hash
 
@@ -151,8 +152,12 @@ def check_same(cfg: Train, meta: dict[str, Any]) -> None:
 
 
 def save(training: Training, folder: Path, keep: int) -> Path:
-    """Write a checkpoint atomically and return its path. The newest `keep` checkpoints are kept."""
+    """Write a checkpoint atomically and return its path. The newest `keep` checkpoints are kept.
+
+    Raises RunError if a number of the state is not finite. Earlier checkpoints are then unchanged.
+    """
     tensors = {k: v.detach().cpu().contiguous() for k, v in training.tensors().items()}
+    check_state(tensors, training.step, folder)
     return checkpoint.save(folder, training.step, tensors, training.meta(), keep=keep)
 
 

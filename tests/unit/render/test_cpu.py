@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -266,3 +267,17 @@ def test_wrong_shapes_are_refused() -> None:
     inputs, camera = make(m=10)
     with pytest.raises(InputError, match=naming("quats", "(10, 4)", "(5, 4)")):
         CpuRasterizer()(Gaussians(inputs[0], inputs[1][:5], *inputs[2:], torch.arange(10)), camera, BACKGROUND)
+
+
+@pytest.mark.parametrize("size", [(1_100_000, 1), (1, 1_100_000), (20_000, 20_000), (2**31 - 1, 1)])
+def test_an_image_with_too_many_tiles_is_refused(size: tuple[int, int]) -> None:
+    inputs, camera = make(m=10)
+    with pytest.raises(InputError, match=naming(f"{size[0]:,} x {size[1]:,}")):
+        CpuRasterizer()(Gaussians(*inputs, torch.arange(10)), replace(camera, width=size[0], height=size[1]), BACKGROUND)
+
+
+def test_the_largest_side_is_drawn() -> None:
+    inputs, camera = make(m=10)
+    camera = replace(camera, width=65_535 * 16, height=1, K=torch.tensor([[9e5, 0, 5e5], [0, 9e5, 0.5], [0, 0, 1]]))
+    render = CpuRasterizer()(Gaussians(*inputs, torch.arange(10)), camera, BACKGROUND)
+    assert render.image.shape == (1, 65_535 * 16, 3) and bool(render.image.isfinite().all())

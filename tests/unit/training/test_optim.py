@@ -120,3 +120,25 @@ def test_the_part_builds_it_with_its_numbers():
     for wrong in (Adam(betas=(1.0, 0.9)), Adam(eps=-1.0)):
         with pytest.raises(InputError, match="--optimizer"):
             wrong.check()
+
+
+@pytest.mark.skipif(native.load() is None, reason="no compiled library")
+@pytest.mark.parametrize("rows", [None, torch.tensor([0, 1, 2, 7, 63])])
+@pytest.mark.parametrize("level", native.LEVELS)
+def test_the_native_step_names_the_first_parameter_that_is_not_finite(rows, level, monkeypatch):
+    if native.load(level) is None:
+        pytest.skip("not of this processor")
+    monkeypatch.setattr(native, "require", lambda chosen=None, of=native.require: of(level))
+    for bad, value in ((i, value) for i in range(6) for value in (float("nan"), float("inf"), 1e25)):
+        tensors = parameters()
+        optimizer = trained(
+            FusedAdam([{**group, "name": f"p{i}"} for i, group in enumerate(groups(tensors))]), tensors, range(2), rows=rows
+        )
+        assert optimizer.broken == ""
+        for p, g in zip(tensors, gradients(2)):
+            p.grad = g
+        for i in {bad, 5}:
+            row = 63 if rows is not None and i < 3 else -1  # the last element that the step reads
+            tensors[i].grad.reshape(len(tensors[i]), -1)[row, -1] = value
+        optimizer.step(rows=rows)
+        assert optimizer.broken == f"p{bad}", value
