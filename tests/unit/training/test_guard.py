@@ -70,6 +70,7 @@ def test_a_gradient_whose_square_overflows_is_found_too(sparse, folder, tmp_path
 @pytest.mark.parametrize("factor", [1e18, 1e30, 1e37])
 def test_points_far_away_train_or_stop_but_are_never_saved_broken(recipe, factor, folder, tmp_path):
     capture = load(folder)
+    assert capture.points is not None
     far = replace(capture, points=replace(capture.points, xyz=capture.points.xyz * factor))
     with suppress(RunError, InputError):
         list(events(config(recipe), folder, tmp_path, world=far, stop_at=20))

@@ -200,7 +200,7 @@ def test_losses_that_are_no_numbers_end_the_run_and_keep_its_checkpoint(folder, 
     with pytest.raises(RunError, match=naming("l1", 9)):  # Adam finds it before the losses are told or saved
         list(events(config(), folder, tmp_path, stop_at=60, log_every=20, save_every=11, resume=True))
     assert_same(before, last_tensors(tmp_path))
-    with pytest.raises(RunError, match=naming(10)):  # stopped
+    with pytest.raises(RunError, match=naming("l1", 9)):  # before the stop
         stop: list[str] = []
         for event in events(config(), folder, tmp_path, stop_at=60, log_every=20, preview_every=10, stop=stop, resume=True):
             stop += ["SIGTERM"] if isinstance(event, Previewed) else []
