@@ -9,6 +9,7 @@ The losses that keep experts in use, L_load^S and L_load^D (eq. 6, 7), are in `l
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass, replace
 from typing import Literal, Self
 
@@ -60,8 +61,9 @@ class Experts(Decoder):
     """Attributes that have experts: opacity, cov, color. The others have one network."""
     mix: Literal["post_activation", "pre_activation"] = "post_activation"
     """Mix the outputs of the experts after or before the activation function."""
-    expert_init: Literal["independent", "clone_jitter"] = "independent"
-    """independent: initialise each expert on its own. clone_jitter: copies of one network with small noise."""
+    expert_init: Literal["independent", "clone_jitter", "variance"] = "independent"
+    """independent: initialise each expert on its own. clone_jitter: copies of one network with small noise. variance: independent, with
+    the last layers times sqrt(num), so that the outputs of the dense mixture vary as much as those of one network."""
     load_scope: Literal["visible", "all"] = "visible"
     """Anchors over which L_load balances the experts: the visible ones, or all."""
     form: Literal["fast", "masked"] = "fast"
@@ -143,6 +145,9 @@ class MixtureHead(nn.Module):
         if config.expert_init == "clone_jitter":
             for p in (self.w1, self.b1, self.w2, self.b2):
                 p.data[1:] = p.data[:1] * (1.0 + 0.01 * torch.randn_like(p.data[1:]))
+        if config.expert_init == "variance":  # a mean of E independent outputs has 1 / E of their variance
+            self.w2.data.mul_(math.sqrt(E))
+            self.b2.data.mul_(math.sqrt(E))
         router_inputs = feature + (3 if config.router.input_pos else 0)
         self.router_w = linear_init((E, router_inputs), router_inputs)
         self.router_b = linear_init((E,), router_inputs) if config.router.bias else None
