@@ -79,6 +79,14 @@ OWN: dict[str, Recipe] = {
         "Scaffold-GS with the opacity hinge ('w/o MoE' in Table 4; row 2 of Table 3)",
         replace(scaffold_gs, recipe="scaffold-gs-opacity", loss=Weights(scale=0.01, opacity=0.01)),
     ),
+    "scaffold-gs-wide": (
+        "Scaffold-GS with the opacity hinge and networks as wide as five experts together (control; not in the paper)",
+        replace(_scaffold("scaffold-gs-wide", hidden=160), loss=Weights(scale=0.01, opacity=0.01)),
+    ),
+    "scaffold-gs-dist": (
+        "Scaffold-GS whose decoders also see the distance (control of moe-gs-dist)",
+        _scaffold("scaffold-gs-dist", add_dist=ATTRIBUTES),
+    ),
     "moe-gs-no-cl": ("Without the curriculum: Top-2 from the first iteration (Table 4)", _moe("moe-gs-no-cl", warmup=0)),
     "moe-gs-no-load": ("Without the load-balancing losses (Table 4)", _moe("moe-gs-no-load", loss=replace(moe_gs.loss, load=0.0))),
     "moe-gs-no-opacity": ("Without the opacity hinge (Table 4)", _moe("moe-gs-no-opacity", loss=replace(moe_gs.loss, opacity=0.0))),

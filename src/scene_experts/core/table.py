@@ -13,18 +13,21 @@ class Table(nn.Module):
     """A table of N rows with named columns [N, ...].
 
     `params` are learned. `facts` are constant for each row (positions on the lattice, levels). `stats` are the statistics for
-    densification. Rows are added only by `append` and removed only by `keep`, which keep all columns and moments aligned.
+    densification. `averages` are averages of the parameters over the training, if there are any. Rows are added only by `append`
+    and removed only by `keep`, which keep all columns and moments aligned.
     """
 
     params: nn.ParameterDict
     facts: dict[str, Tensor]
     stats: dict[str, Tensor]
+    averages: dict[str, Tensor]
 
     def __init__(self, params: dict[str, Tensor], facts: dict[str, Tensor], stats: dict[str, Tensor] | None = None) -> None:
         super().__init__()
         self.params = nn.ParameterDict({name: nn.Parameter(value) for name, value in params.items()})
         self.facts = dict(facts)
         self.stats = dict(stats or {})
+        self.averages = {}
         self._optimizer: torch.optim.Optimizer | None = None
         lengths = {name: value.shape[0] for name, value in self.columns().items()}
         if len(set(lengths.values())) > 1:
@@ -38,6 +41,7 @@ class Table(nn.Module):
         super()._apply(fn, recurse)
         self.facts = {name: fn(value) for name, value in self.facts.items()}
         self.stats = {name: fn(value) for name, value in self.stats.items()}
+        self.averages = {name: fn(value) for name, value in self.averages.items()}
         return self
 
     def columns(self) -> dict[str, Tensor]:
@@ -61,7 +65,7 @@ class Table(nn.Module):
 
     @torch.no_grad()
     def append(self, new: dict[str, Tensor]) -> None:
-        """Add rows. Their statistics and Adam's moments start at zero.
+        """Add rows. Their statistics and Adam's moments start at zero, their averages at their values.
 
         `new` must have the same columns as the table. Raises KeyError, which names both sets of columns, if they differ.
         """
@@ -76,6 +80,8 @@ class Table(nn.Module):
             self.facts[name] = torch.cat([old, new[name].to(old.dtype)])
         for name, old in self.stats.items():
             self.stats[name] = torch.cat([old, old.new_zeros(count, *old.shape[1:])])
+        for name, old in self.averages.items():
+            self.averages[name] = torch.cat([old, new[name].to(old.dtype)])
 
     @torch.no_grad()
     def keep(self, mask: Tensor) -> None:
@@ -87,17 +93,20 @@ class Table(nn.Module):
             self._replace(name, self.params[name].data.index_select(0, rows), lambda m: m.index_select(0, rows))
         self.facts = {name: value.index_select(0, rows) for name, value in self.facts.items()}
         self.stats = {name: value.index_select(0, rows) for name, value in self.stats.items()}
+        self.averages = {name: value.index_select(0, rows) for name, value in self.averages.items()}
 
     @torch.no_grad()
     def assign(self, name: str, value: Tensor) -> None:
-        """Overwrite a parameter column and set its moments to zero. Raises ValueError if the shapes differ."""
+        """Overwrite a parameter column and its average, and set its moments to zero. Raises ValueError if the shapes differ."""
         if value.shape != self.params[name].shape:
             raise ValueError(f"expected shape {tuple(self.params[name].shape)} for column '{name}', found {tuple(value.shape)}")
         self._replace(name, value.clone(), torch.zeros_like)
+        if name in self.averages:
+            self.averages[name] = value.clone()
 
     @torch.no_grad()
     def overwrite(self, rows: Tensor, values: dict[str, Tensor], clear: bool = False) -> None:
-        """Overwrite rows of some parameter columns in place.
+        """Overwrite rows of some parameter columns in place, and their averages.
 
         Args:
             rows: [R] int64 without duplicates.
@@ -106,6 +115,8 @@ class Table(nn.Module):
         """
         for name, value in values.items():
             self.params[name].index_copy_(0, rows, value.to(self.params[name].dtype))
+            if name in self.averages:
+                self.averages[name].index_copy_(0, rows, value.to(self.averages[name].dtype))
         if not clear or self._optimizer is None:
             return
         for parameter in self.params.values():

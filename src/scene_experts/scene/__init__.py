@@ -173,18 +173,22 @@ class SceneConfig(Part, ABC):
         """Build a scene from a checkpoint's table and `Scene.meta()`. `restore_scene` loads the tensors of its networks."""
 
 
-def restore_scene(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[str, Any]) -> Scene:
+def restore_scene(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[str, Any], averaged: bool = False) -> Scene:
     """Build a scene from the tensors and the metadata of a checkpoint.
 
     Args:
         config: Settings of the scene, scaled to the length of the training.
         tensors: Columns `params.NAME` and `facts.NAME` of the table, and networks `network.NAME`. Other tensors are ignored.
         meta: The values of `Scene.meta()`. Other values are ignored.
+        averaged: Use the averages of the weights (`average.params.NAME`, `average.network.NAME`), if there are any, in place of the
+            last weights.
 
     Raises:
         InputError: The networks have other names or shapes than those of `config`.
     """
     pick = lambda prefix: {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
+    if averaged:
+        tensors = tensors | pick("average.")
     scene = config.load(Table(pick("params."), pick("facts.")), meta)
     stored, wanted = pick("network."), scene.network_tensors()
     if stored.keys() != wanted.keys() or any(stored[k].shape != wanted[k].shape for k in wanted):

@@ -17,6 +17,7 @@ from scene_experts.scene import LearningRates, SceneConfig
 from scene_experts.scene.anchors.scene import Anchors, Rates
 from scene_experts.strategy import Strategy
 from scene_experts.strategy.grow import GrowAnchors
+from scene_experts.training.average import Average
 from scene_experts.training.losses import Weights
 from scene_experts.training.optim import Adam, Optimizer
 
@@ -40,6 +41,8 @@ class Train:
     """Learning rates."""
     optimizer: Optimizer = Adam()
     """The optimiser."""
+    average: Average = Average()
+    """An average of the weights, which is evaluated and exported in place of the last weights."""
     iterations: int = SCHEDULE
     """Number of training iterations. Another number rescales the whole schedule (learning rates, densification, warm-up)."""
     seed: int = 0
@@ -90,7 +93,7 @@ def check(cfg: Train) -> None:
     expect_at_least([("--iterations", cfg.iterations, 1), ("--seed", cfg.seed, 0), ("--max-anchors", cfg.max_anchors, 0)])
     if cfg.seed > LARGEST_SEED:
         raise InputError(f"expected --seed of at most {LARGEST_SEED}, found {cfg.seed}; give a smaller number")
-    for part in (cfg.scene, cfg.loss, cfg.growth, cfg.rates, cfg.optimizer):
+    for part in (cfg.scene, cfg.loss, cfg.growth, cfg.rates, cfg.optimizer, cfg.average):
         part.check()
     if unknown := unregistered(cfg):
         raise InputError(f"expected registered parts in the recipe, found {unknown[0]}; decorate its class with @register")

@@ -145,6 +145,7 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     edit = cfg.growth.update(scene, training.step, training.growth_rng, cap)
     step_optimizer(training, decoded, edit)
     cfg.growth.finish(scene, training.step, training.rates(), training.growth_rng)
+    training.update_averages()
     return Iteration(decoded, render, parts, target, mask, edit)
 
 
@@ -227,6 +228,7 @@ def preview(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     """Render one held-out view, or a training view if none is held out."""
     index = (capture.test or capture.train)[0]
     camera = capture.views[index].camera.to(run.device, run.dtype)
-    decoded = training.scene(camera, training.step, Mode.DRAW, rasterize.visible)
+    with training.averaged():
+        decoded = training.scene(camera, training.step, Mode.DRAW, rasterize.visible)
     picture = rasterize(decoded.gaussians, camera, torch.tensor(capture.background, device=run.device, dtype=run.dtype)).image
     return Previewed(training.step, index, picture.clamp(0, 1).cpu())

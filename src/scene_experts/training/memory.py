@@ -54,8 +54,8 @@ def frame_bytes(gaussians: int, pixels: int, pairs: float = _TILES) -> int:
 
 
 def row_bytes(scene: Scene) -> int:
-    """Return the bytes of one row of the table during training: values, gradients, both moments and statistics."""
-    columns = scene.table.columns().values()
+    """Return the bytes of one row of the table during training: values, gradients, both moments, averages and statistics."""
+    columns = [*scene.table.columns().values(), *scene.table.averages.values()]
     return sum(v.element_size() * v[:1].numel() * (4 if v.requires_grad else 1) for v in columns) + 4 * (2 + 2 * scene.K)
 
 

@@ -238,7 +238,7 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     folder = run / "checkpoints"
     tensors, meta = newest(folder) if step is None else at_step(folder, step)
     checkpoint.expect(meta, recipe=config.train.recipe)
-    scene = restore_scene(config.train.scaled_scene(), tensors, meta).to(device)
+    scene = restore_scene(config.train.scaled_scene(), tensors, meta, averaged=True).to(device)
     return OpenRun(run, config, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.plain import first_difference, from_json, to_json
 from scene_experts.data.capture import Capture
 from scene_experts.scene import Scene, restore_scene
+from scene_experts.training.average import Averages
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import Train
 from scene_experts.training.guard import check_state
@@ -24,7 +26,7 @@ log: logging.Logger = logging.getLogger(__name__)
 
 
 class Training:
-    """The state of a training: scene, optimiser, random number generators, queue of views and clock."""
+    """The state of a training: scene, optimiser, averages, random number generators, queue of views and clock."""
 
     cfg: Train
     scene: Scene
@@ -48,6 +50,7 @@ class Training:
         groups = [{"params": params, "name": name, "lr": 0.0, "by_row": name in columns} for name, params in named]
         self.optimizer = cfg.optimizer.build(groups)
         scene.table.attach(self.optimizer)
+        self.averages = Averages(scene) if cfg.average.span > 0 else None
 
     @classmethod
     def start(cls, cfg: Train, capture: Capture, device: str, dtype: torch.dtype = torch.float32) -> Training:
@@ -80,6 +83,19 @@ class Training:
         for group in self.optimizer.param_groups:
             group["lr"] = self.cfg.rates.at(group["name"], self.step, self.cfg.iterations, self.scene.extent)
 
+    def update_averages(self) -> None:
+        """Update the averages of the weights after an iteration, if they are due."""
+        if self.averages is not None and self.cfg.average.due(self.step):
+            self.averages.update(self.cfg.average.weight(self.step, self.cfg.iterations))
+
+    def averaged(self) -> AbstractContextManager[None]:
+        """Context manager in which the scene has its averaged weights, as in the saved run. No effect without averages."""
+        return nullcontext() if self.averages is None else self.averages.swapped()
+
+    def averaged_scene(self) -> Scene:
+        """Return a copy of the scene with its averaged weights."""
+        return restore_scene(self.cfg.scene, self.tensors(), self.meta(), averaged=True).to(self.scene.table.device)
+
     def rates(self) -> dict[str, float]:
         """Return the current learning rates by group."""
         return {group["name"]: group["lr"] for group in self.optimizer.param_groups}
@@ -98,6 +114,8 @@ class Training:
         out |= {"rng.torch": torch.get_rng_state(), "rng.views": self.views_rng.get_state(), "rng.growth": self.growth_rng.get_state()}
         if table.device.type == "cuda":
             out["rng.cuda"] = torch.cuda.get_rng_state(table.device)
+        if self.averages is not None:
+            out |= self.averages.tensors()
         out["queue"] = torch.tensor(self.queue, dtype=torch.int64)
         return out
 
@@ -125,6 +143,8 @@ class Training:
                 state = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
                 if state:
                     training.optimizer.state[parameter] = {k: v.to(device) for k, v in state.items()}
+        if training.averages is not None:
+            training.averages.restore(tensors)
         torch.set_rng_state(tensors["rng.torch"])
         if "rng.cuda" in tensors and table.device.type == "cuda":
             torch.cuda.set_rng_state(tensors["rng.cuda"], table.device)

@@ -23,6 +23,7 @@ from scene_experts.core.types import Mode, Routing
 from scene_experts.scene.anchors.mlp import ACTIVATIONS, ATTRIBUTES, MLP, Decoder, HeadWeights, linear_init
 
 log: logging.Logger = logging.getLogger(__name__)
+MARGIN = 1e-4  # keeps the weights finite where all gates are equal
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,9 @@ class Router:
     """Scale the weights of the chosen experts to sum to 1 (eq. 5). With k = 1 the router then gets gradients from L_load only."""
     noise_std: float = 0.0
     """Standard deviation of the Gaussian noise on the logits during training."""
+    weights: Literal["softmax", "margin"] = "softmax"
+    """Weights of the chosen experts. softmax: eq. 5. margin: proportional to a gate minus the largest gate that is not chosen, so that no
+    weight jumps where two experts change ranks."""
     detach_feature: bool = False
     """Stop gradients from the gates to the anchor features."""
     input_pos: bool = False
@@ -66,6 +70,8 @@ class Experts(Decoder):
     the last layers times sqrt(num), so that the outputs of the dense mixture vary as much as those of one network."""
     load_scope: Literal["visible", "all"] = "visible"
     """Anchors over which L_load balances the experts: the visible ones, or all."""
+    shared: bool = False
+    """Add an expert that decodes every anchor beside the chosen ones. The router weighs it against them; L_load ignores it."""
     form: Literal["fast", "masked"] = "fast"
     """How PyTorch computes Top-k. fast: gather the anchors of each expert. masked: run all experts and zero the weights of the others (slow
     reference)."""
@@ -137,7 +143,8 @@ class MixtureHead(nn.Module):
     def __init__(self, config: Experts, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> None:
         super().__init__()
         self.config, self.attribute = config, attribute
-        self.experts = E = config.num
+        self.experts = config.num
+        E = config.num + config.shared  # the shared expert is the last
         self.w1 = nn.Parameter(torch.cat([linear_init((1, hidden, inputs), inputs).data for _ in range(E)]))
         self.b1 = nn.Parameter(torch.cat([linear_init((1, hidden), inputs).data for _ in range(E)]))
         self.w2 = nn.Parameter(torch.cat([linear_init((1, outputs, hidden), hidden).data for _ in range(E)]))
@@ -175,14 +182,30 @@ class MixtureHead(nn.Module):
 
     def route(self, feature: Tensor, step: int, position: Tensor | None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor]:
         """Return the routing and the mixture weights: [A, E] if dense, [A, k] otherwise."""
-        logits = self.logits(feature, position, mode)
+        every = self.logits(feature, position, mode)
+        logits, k = every[:, : self.experts], self.k(step)
         gates = logits.softmax(dim=1)  # eq. 3
-        k = self.k(step)
         if k is None:
-            return Routing(gates, None), gates
+            return Routing(gates, None), every.softmax(dim=1) if self.config.shared else gates
         chosen = self.choose(logits, k)
-        picked = logits.gather(1, chosen).softmax(dim=1) if self.config.router.renormalise else gates.gather(1, chosen)  # eq. 5
-        return Routing(gates, chosen), picked
+        return Routing(gates, chosen), self.weigh(every, gates, chosen)
+
+    def weigh(self, logits: Tensor, gates: Tensor, chosen: Tensor) -> Tensor:
+        """Return the weights of the chosen experts [A, k], or [A, k + 1] with the shared expert last. logits [A, E], gates [A, num]."""
+        shared = logits[:, self.experts :]  # [A, 1], or [A, 0]
+        if self.config.router.weights == "margin":
+            rest = gates.scatter(1, chosen, 0.0).amax(dim=1, keepdim=True)
+            margin = gates.gather(1, chosen) - rest + MARGIN
+            weights = margin / margin.sum(dim=1, keepdim=True)
+            part = shared.sigmoid()
+            return torch.cat([weights * (1.0 - part), part], dim=1) if self.config.shared else weights
+        if self.config.router.renormalise:
+            return torch.cat([logits.gather(1, chosen), shared], dim=1).softmax(dim=1)  # eq. 5
+        return logits.softmax(dim=1).gather(1, self.with_shared(chosen))
+
+    def with_shared(self, chosen: Tensor) -> Tensor:
+        """Append the index of the shared expert, if there is one, to chosen [A, k]."""
+        return functional.pad(chosen, (0, 1), value=self.experts) if self.config.shared else chosen
 
     def choose(self, logits: Tensor, k: int) -> Tensor:
         """Return indices [A, k] of the experts that decode each anchor, given logits [A, E]."""
@@ -199,10 +222,14 @@ class MixtureHead(nn.Module):
         if routing.chosen is None:
             y = self.all_experts(x, w)
         elif self.config.form == "masked":
-            y = self.all_experts(x, torch.zeros_like(routing.gates).scatter(1, routing.chosen, w))
+            y = self.all_experts(x, self.spread(routing.chosen, w))
         else:
-            y = self.chosen_experts(x, routing.chosen, w)
+            y = self.chosen_experts(x, self.with_shared(routing.chosen), w)
         return (ACTIVATIONS[self.attribute](y) if self.config.mix == "pre_activation" else y), routing
+
+    def spread(self, chosen: Tensor, w: Tensor) -> Tensor:
+        """Return weights [A, E] of all experts, 0 for those that are not chosen. chosen [A, k], w [A, k], or [A, k + 1] if shared."""
+        return w.new_zeros(len(w), len(self.w1)).scatter(1, self.with_shared(chosen), w)
 
     def expert(self, i: int, x: Tensor) -> Tensor:
         """Return one expert's outputs. They are activated unless outputs are mixed before the activation."""
@@ -211,13 +238,13 @@ class MixtureHead(nn.Module):
 
     def all_experts(self, x: Tensor, w: Tensor) -> Tensor:
         """Compute all experts and return sum_i w_i E_i(x). w [A, E]."""
-        return sum((w[:, i : i + 1] * self.expert(i, x) for i in range(self.config.num)), start=x.new_zeros(()))  # type: ignore[return-value]
+        return sum((w[:, i : i + 1] * self.expert(i, x) for i in range(len(self.w1))), start=x.new_zeros(()))  # type: ignore[return-value]
 
     def chosen_experts(self, x: Tensor, chosen: Tensor, w: Tensor) -> Tensor:
         """Return the same sum, but compute each expert only for the anchors that chose it, sorted by expert."""
         A, k = chosen.shape
         order = chosen.reshape(-1).argsort(stable=True)
-        counts = torch.bincount(chosen.reshape(-1), minlength=self.config.num).tolist()
+        counts = torch.bincount(chosen.reshape(-1), minlength=len(self.w1)).tolist()
         rows = torch.div(order, k, rounding_mode="floor")
         parts = [self.expert(i, part) for i, part in enumerate(x.index_select(0, rows).split(counts)) if len(part)]
         if not parts:
@@ -231,8 +258,8 @@ class MixtureHead(nn.Module):
         """Return mixed covariance outputs [A, K * 7]. Quaternions are first flipped to the hemisphere of the anchor's first expert."""
         routing, w = self.route(feature, step, position, mode)
         if routing.chosen is not None:
-            w = torch.zeros_like(routing.gates).scatter(1, routing.chosen, w)
-        y = torch.stack([self.expert(i, x) for i in range(self.config.num)], dim=1).reshape(len(x), self.config.num, K, 7)
+            w = self.spread(routing.chosen, w)
+        y = torch.stack([self.expert(i, x) for i in range(len(self.w1))], dim=1).reshape(len(x), len(self.w1), K, 7)
         first = routing.gates.argmax(dim=1)[:, None, None, None].expand(-1, 1, K, 4)
         reference = y[..., 3:].gather(1, first)
         sign = torch.where((y[..., 3:] * reference).sum(-1, keepdim=True) < 0, -1.0, 1.0)
@@ -242,5 +269,7 @@ class MixtureHead(nn.Module):
     def weights(self, step: int) -> HeadWeights | None:
         r = self.config.router
         if self.config.mix != "post_activation" or not r.renormalise or r.noise_std > 0 or r.detach_feature:
+            return None
+        if self.config.shared or r.weights != "softmax":
             return None
         return HeadWeights(self.router_w, self.router_b, self.w1, self.b1, self.w2, self.b2, self.k(step), position=r.input_pos)

@@ -72,6 +72,11 @@ class Anchors(SceneConfig):
     """What the decoders see of an anchor's feature."""
     appearance: int = 0
     """Size of the appearance code per training view; 0 means no codes."""
+    dropout: float = 0.0
+    """Share of the anchors that a training view leaves out from iteration `dropout_full` on; it rises linearly from 0. Meant for few
+    photographs (after DropGaussian, Park et al. 2025)."""
+    dropout_full: int = 30_000
+    """Iteration at which the share of dropped anchors is reached. --iterations rescales it."""
     test_appearance: TestRule = "mean"
     """Appearance code of a held-out view. mean: the mean of all codes. index: the code of the training view with the same index, as in
     Scaffold-GS."""
@@ -94,12 +99,16 @@ class Anchors(SceneConfig):
 
     def scaled(self, factor: float) -> Self:
         """Return the settings for a training run that is `factor` times as long."""
-        return replace(self, decoder=self.decoder.scaled(factor), select=self.select.scaled(factor))
+        full = max(1, round(self.dropout_full * factor)) if self.dropout else self.dropout_full
+        return replace(self, decoder=self.decoder.scaled(factor), select=self.select.scaled(factor), dropout_full=full)
 
     def check(self) -> None:
         """Raises InputError, naming the flag, for invalid settings."""
         expect_at_least([(f"--scene.{name}", getattr(self, name), 1) for name in ("K", "F", "hidden")])
         expect_at_least([("--scene.voxel-size", self.voxel_size, 0), ("--scene.appearance", self.appearance, 0)])
+        expect_at_least([("--scene.dropout", self.dropout, 0), ("--scene.dropout-full", self.dropout_full, 1)])
+        if self.dropout >= 1:
+            raise InputError(f"expected --scene.dropout below 1, found {self.dropout}; it is a share of the anchors")
         self.decoder.check()
         self.select.check()
         self.mix.check_size(self.F)
@@ -205,6 +214,9 @@ class AnchorScene(LatticeScene):
         table = self.table
         scales = table.params["log_scaling"].detach()[:, :3].contiguous().exp()  # exp takes 7 times as long on a non-contiguous tensor
         rows = visible_rows(self.select(table, camera, step, mode), table.facts["xyz"], scales, camera, cull)
+        if self.config.dropout and mode is Mode.TRAIN:
+            share = self.config.dropout * min(1.0, step / self.config.dropout_full)
+            rows = rows[torch.rand(len(rows), device=rows.device) >= share]
         decoded = self.decode(rows, camera, step, mode)
         decoded = faded(decoded, self.select.fade(table, rows, camera, step, mode), len(table), self.K)
         return self.with_global_routing(decoded, step) if mode is Mode.TRAIN else decoded

@@ -181,3 +181,81 @@ def test_nonsense_is_refused():
 def test_with_distance_the_three_plain_networks_sum_to_7182():
     shapes = [("opacity", 10), ("cov", 70), ("color", 30)]
     assert sum(p.numel() for a, o in shapes for p in Plain().build(a, 36, 32, o, 32).parameters()) == 7182
+
+
+def test_experts_of_one_network_s_variance():
+    torch.manual_seed(0)
+    x, f = torch.randn(400, D), torch.randn(400, F)
+    spread = {}
+    for init in ("independent", "variance"):
+        made = []
+        for _ in range(20):
+            h = Experts(expert_init=init, router=Router(init="zeros")).build("cov", D, H, 70, F)
+            made.append(h(x, f, 1)[0].detach())
+        spread[init] = float(torch.stack(made).var())
+    one = float(torch.stack([MLP("cov", D, H, 70)(x, f, 1)[0].detach() for _ in range(20)]).var())
+    assert spread["variance"] == pytest.approx(one, rel=0.1)
+    assert spread["independent"] == pytest.approx(one / 5, rel=0.1)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_margin_weights_as_written(k):
+    h = head(top_k=k, router=Router(weights="margin"))
+    x, f = data()
+    routing, w = h.route(f, SPARSE, None)
+    for a in range(A):
+        g = sorted(routing.gates[a].tolist(), reverse=True)
+        margins = [value - g[k] + 1e-4 for value in g[:k]]
+        torch.testing.assert_close(w[a], torch.tensor([m / sum(margins) for m in margins], dtype=w.dtype))
+    assert h.weights(SPARSE) is None
+
+
+def test_margin_weights_have_no_jump():
+    """Where two experts swap ranks at the edge of Top-k, the outputs on both sides agree; with softmax weights they do not."""
+    jump = {}
+    for weights in ("softmax", "margin"):
+        h = head(top_k=2, router=Router(weights=weights))
+        x, f = data()
+        w, b = torch.zeros(5, F, dtype=torch.float64), torch.tensor([3.0, 1.0, 1.0, -1.0, -1.0], dtype=torch.float64)
+        w[1, 0], w[2, 0] = 1.0, -1.0
+        h.router_w.data, h.router_b.data = w, b
+        sides = []
+        for shift in (1e-7, -1e-7):
+            f = f.clone()
+            f[:, 0] = shift
+            sides.append(h(x, f, SPARSE)[0])
+        jump[weights] = float((sides[0] - sides[1]).abs().max())
+    assert jump["margin"] < 1e-4 < 1e-3 < jump["softmax"]
+
+
+@pytest.mark.parametrize("weights", ["softmax", "margin"])
+@pytest.mark.parametrize("form", ["fast", "masked"])
+@pytest.mark.parametrize("step", [1, SPARSE])
+def test_a_shared_expert_decodes_every_anchor(weights, form, step):
+    h = head(top_k=2, shared=True, form=form, router=Router(weights=weights))
+    x, f = data()
+    y, routing = h(x, f, step)
+    assert routing.gates.shape == (A, 5) and len(h.w1) == 6 and h.experts == 5
+    logits = f @ h.router_w.T + h.router_b
+    every = [h.expert(i, x) for i in range(6)]
+    for a in range(A):
+        if step == 1:
+            shares = dict(enumerate(torch.softmax(logits[a], 0)))
+        else:
+            assert 5 not in routing.chosen[a]
+            chosen = routing.chosen[a].tolist()
+            if weights == "softmax":
+                shares = dict(zip([*chosen, 5], torch.softmax(logits[a, [*chosen, 5]], 0)))
+            else:
+                g = torch.softmax(logits[a, :5], 0)
+                margins = g[chosen] - g.sort(descending=True).values[2] + 1e-4
+                part = torch.sigmoid(logits[a, 5])
+                shares = {**dict(zip(chosen, (1 - part) * margins / margins.sum())), 5: part}
+        torch.testing.assert_close(y[a], sum(share * every[i][a] for i, share in shares.items()))
+
+
+def test_gradients_of_margin_weights_and_the_shared_expert():
+    h = head(top_k=2, shared=True, router=Router(weights="margin"))
+    x, f = data()
+    f = f[:4].requires_grad_()
+    assert torch.autograd.gradcheck(lambda feature: h(x[:4], feature, SPARSE)[0], (f,), eps=1e-7, atol=1e-5)
