@@ -43,9 +43,8 @@ def test_the_mean_of_all_then_an_exponential_average(recipe, capture):
     name = next(iter(training.scene.table.params))
     start = training.scene.table.params[name].detach().clone()
     move(training, 100)
-    expected, updates = 0.0, 0
-    for value in range(2, 101, 2):  # the weights are start + value
-        updates += 1
+    expected = 0.0
+    for updates, value in enumerate(range(2, 101, 2), 1):  # the weights are start + value
         expected += max(1 / updates, 2 / (0.5 * 100)) * (value - expected)
     torch.testing.assert_close(training.scene.table.averages[name], start + expected)
 

@@ -201,7 +201,7 @@ def test_experts_of_one_network_s_variance():
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_margin_weights_as_written(k):
     h = head(top_k=k, router=Router(weights="margin"))
-    x, f = data()
+    f = data()[1]
     routing, w = h.route(f, SPARSE, None)
     for a in range(A):
         g = sorted(routing.gates[a].tolist(), reverse=True)
