@@ -19,6 +19,7 @@ from scene_experts.core.parts import Part, register
 from scene_experts.core.types import Decoded, Render, Routing
 from scene_experts.native import terms as native_terms
 from scene_experts.training.photometric import photometric
+from scene_experts.training.robust import weigh_residuals
 
 
 @dataclass(frozen=True)
@@ -72,11 +73,19 @@ class Weights(Part):
     """First iteration with the opacity hinge."""
     opacity_until: int | None = None
     """Last iteration with the opacity hinge; none means the last iteration of the training."""
+    residual_quantile: float = 1.0
+    """Share of each picture's pixels that count in full, those with the smallest residuals; 1 means all. Below 1, things that move between
+    the photographs count less."""
+    residual_weight: float = 0.0
+    """Weight of the pixels with larger residuals."""
+    residual_from: int = 1500
+    """First iteration in which pixels with large residuals count less."""
 
     def scaled(self, factor: float) -> Self:
-        """Return the weights for a training that is `factor` times as long. The window of the opacity hinge is scaled."""
+        """Return the weights for a training that is `factor` times as long. The windows are scaled."""
         until = None if self.opacity_until is None else round(self.opacity_until * factor)
-        return replace(self, opacity_from=round(self.opacity_from * factor), opacity_until=until)
+        starts = {name: round(getattr(self, name) * factor) for name in ("opacity_from", "residual_from")}
+        return replace(self, **starts, opacity_until=until)
 
     def check(self) -> None:
         """Check the weights. Raises InputError, which names the flag, if a weight is below 0 or `dssim` is above 1."""
@@ -84,6 +93,9 @@ class Weights(Part):
         expect_at_least([(f"--loss.{name.replace('_', '-')}", getattr(self, name), 0) for name in names])
         if self.dssim > 1:
             raise InputError(f"expected --loss.dssim of at most 1, found {self.dssim}; L1 gets the rest of 1, so give a smaller number")
+        for name in ("residual_quantile", "residual_weight"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"expected --loss.{name.replace('_', '-')} from 0 to 1, found {getattr(self, name)}; correct it")
 
     def has_hinge(self, step: int | None) -> bool:
         """Whether the opacity hinge is active at `step`. None ignores its window."""
@@ -114,7 +126,10 @@ def compute_terms(sample: Sample, weights: Weights) -> dict[str, Tensor]:
 
 def photometric_terms(w: Weights, sample: Sample) -> dict[str, Tensor]:
     """L1 and 1 - SSIM. Their weights sum to 1."""
-    l1, dssim = photometric(sample.render.image, sample.target, w.dssim, sample.mask)
+    mask = sample.mask
+    if w.residual_quantile < 1 and (sample.step is None or sample.step >= w.residual_from):
+        mask = weigh_residuals(sample.render.image, sample.target, w.residual_quantile, w.residual_weight, mask)
+    l1, dssim = photometric(sample.render.image, sample.target, w.dssim, mask)
     return ({"l1": l1} if w.dssim != 1 else {}) | ({"dssim": dssim} if w.dssim != 0 else {})
 
 
