@@ -16,7 +16,7 @@ import torch
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera
 from scene_experts.native import library as native
-from scene_experts.scene.graph.network import Graph, blended
+from scene_experts.scene.graph.network import Graph, blend_neighbours
 from scene_experts.scene.graph.scene import GraphPoints, GraphScene
 
 
@@ -65,7 +65,7 @@ def main() -> None:
         xyz, feature = scene.table.facts["xyz"][rows], scene.table.params["feature"][rows].detach().requires_grad_()
 
         def blend() -> None:
-            blended(feature, found, weight).sum().backward()  # noqa: B023
+            blend_neighbours(feature, found, weight).sum().backward()  # noqa: B023
 
         def grid() -> None:
             scene.grid(xyz).sum().backward()  # noqa: B023

@@ -26,7 +26,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training import memory
 from scene_experts.training.config import RunConfig
-from scene_experts.training.events import Adjusted
+from scene_experts.training.events import Densified
 from scene_experts.training.loop import Run, iterate, train
 from scene_experts.training.state import Training
 
@@ -98,7 +98,7 @@ def main() -> None:
             if read_status("VmHWM") > peak:
                 peak = read_status("VmHWM")
                 print(f"  {(peak - level) / 1e6:8.1f} MB above it at {event}"[:150])
-            rows = event.edit.anchors if isinstance(event, Adjusted) else rows
+            rows = event.edit.anchors if isinstance(event, Densified) else rows
     print_report(cfg, capture, rows, rasterize, read_status("VmHWM") - level)
     capture.images.close()
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from scene_experts.api.trainer import train as train
     from scene_experts.core.errors import InputError as InputError
     from scene_experts.core.errors import RunError as RunError
-    from scene_experts.training.events import Adjusted as Adjusted
+    from scene_experts.training.events import Densified as Densified
     from scene_experts.training.events import Event as Event
     from scene_experts.training.events import Exported as Exported
     from scene_experts.training.events import Finished as Finished
@@ -49,9 +49,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "Adjusted",
     "Camera",
     "Capture",
+    "Densified",
     "Event",
     "Exported",
     "Finished",
@@ -83,7 +83,7 @@ _MODULES = {
     "api.run": ("Layers", "Run", "Scores", "import_run", "open_run"),
     "api.trainer": ("Trainer", "train"),
     "core.errors": ("InputError", "RunError"),
-    "training.events": ("Adjusted", "Event", "Exported", "Finished", "Previewed", "Saved", "Started", "Stepped", "Stopped"),
+    "training.events": ("Densified", "Event", "Exported", "Finished", "Previewed", "Saved", "Started", "Stepped", "Stopped"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from PIL import Image
 
 from scene_experts.core.io import write_json
-from scene_experts.training.config import to_json
+from scene_experts.core.plain import to_json
 from support.records import record
 
 

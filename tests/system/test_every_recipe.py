@@ -16,7 +16,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene import restore_scene
 from scene_experts.training.config import Train
-from scene_experts.training.events import Adjusted, Finished, Started
+from scene_experts.training.events import Densified, Finished, Started
 from support.lanes import slow_except
 from support.places import DEMO
 from support.trainings import assert_same, events, last_tensors
@@ -43,7 +43,7 @@ def rows(cfg: Train, capture: Capture, out: Path, **run) -> tuple[list[int], lis
     """How many rows a training begins with and has after each adjustment, and the iterations that it begins and ends at."""
     seen = list(events(cfg, BUDDHA, out, world=capture, **run))
     assert isinstance(seen[0], Started) and isinstance(seen[-1], Finished)
-    return [seen[0].anchors, *(e.edit.anchors for e in seen if isinstance(e, Adjusted))], [seen[0].step, seen[-1].step]
+    return [seen[0].anchors, *(e.edit.anchors for e in seen if isinstance(e, Densified))], [seen[0].step, seen[-1].step]
 
 
 @pytest.mark.parametrize("recipe", slow_except(RECIPES, "moe-gs", "3dgs", "octree-gs", "sags"))

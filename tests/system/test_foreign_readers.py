@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from scene_experts.files.formats import ply
-from scene_experts.files.formats.pack import turned
+from scene_experts.files.formats.pack import turn
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import GAUSSIANS, format_named, formats_of, read
 from support.gltf import column, parsed
@@ -61,7 +61,7 @@ def by_gsply(path, tmp_path) -> Splats:
     run(PYTHON, "-c", GSPLY, str(path), str(tmp_path / "gsply.npz"))
     with np.load(tmp_path / "gsply.npz") as found:
         s = Splats(**{name: torch.from_numpy(np.ascontiguousarray(found[name], np.float32)) for name in found})
-    return turned(s, "x") if path.suffix == ".spz" else s  # gsply leaves SPZ's own frame
+    return turn(s, "x") if path.suffix == ".spz" else s  # gsply leaves SPZ's own frame
 
 
 def by_gaussforge(path, tmp_path) -> Splats:
@@ -70,7 +70,7 @@ def by_gaussforge(path, tmp_path) -> Splats:
     kind = path.name.split(".", 1)[1]
     run(PYTHON, "-c", GAUSSFORGE, str(path), str(tmp_path / "gaussforge.ply"), kind)
     s = ply.read(tmp_path / "gaussforge.ply")
-    return turned(s, "x") if path.suffix == ".spz" else s  # so does gaussforge
+    return turn(s, "x") if path.suffix == ".spz" else s  # so does gaussforge
 
 
 def as_ply(path, tmp_path) -> Splats:

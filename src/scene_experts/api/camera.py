@@ -177,7 +177,7 @@ def is_numbers(value: ArrayLike) -> bool:
 def matrix(value: ArrayLike, side: int, name: str) -> NDArray[np.float64]:
     """A read-only copy of a [side, side] matrix of finite numbers. Raises InputError for anything else."""
     if not is_numbers(value) or np.shape(value) != (side, side):
-        raise InputError(f"expected {name} as a {side} x {side} matrix of finite numbers, found {described(value)}; correct it")
+        raise InputError(f"expected {name} as a {side} x {side} matrix of finite numbers, found {describe(value)}; correct it")
     out = np.array(value, dtype=np.float64)
     out.flags.writeable = False
     return out
@@ -186,11 +186,11 @@ def matrix(value: ArrayLike, side: int, name: str) -> NDArray[np.float64]:
 def vector(value: ArrayLike, name: str) -> NDArray[np.float64]:
     """Three finite numbers. Raises InputError for anything else."""
     if not is_numbers(value) or np.shape(value) != (3,):
-        raise InputError(f"expected {name} as three finite numbers, found {described(value)}; correct it")
+        raise InputError(f"expected {name} as three finite numbers, found {describe(value)}; correct it")
     return np.array(value, dtype=np.float64)
 
 
-def described(value: ArrayLike) -> str:
+def describe(value: ArrayLike) -> str:
     return f"an array of shape {np.shape(value)}" if hasattr(value, "shape") else " ".join(repr(value).split())[:60]
 
 

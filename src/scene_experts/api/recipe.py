@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from scene_experts.core.errors import InputError, nearest
+from scene_experts.core.plain import from_json, to_json
 from scene_experts.recipes import RECIPES
-from scene_experts.training.config import Train, check, from_json, to_json
+from scene_experts.training.config import Train, check
 
 Recipe = Train
 
@@ -33,14 +34,14 @@ def recipe(name: str | Recipe, /, **numbers: Any) -> Recipe:
     Raises:
         InputError: The recipe or a name is unknown, or a value has the wrong type or is out of range.
     """
-    value = known(name) if isinstance(name, str) else name
+    value = find_recipe(name) if isinstance(name, str) else name
     for place, number in flat(numbers):
         value = with_number(value, place.split("."), place, number, value)
     check(value)
     return value
 
 
-def known(name: str) -> Recipe:
+def find_recipe(name: str) -> Recipe:
     """The recipe of that name. Raises InputError where there is none."""
     if name not in RECIPES:
         raise InputError(f"expected a recipe, found {name!r}{nearest(name, RECIPES)}; `list_recipes()` names them all")

@@ -9,7 +9,7 @@ from dataclasses import fields
 
 from scene_experts.arguments import docs
 from scene_experts.arguments.table import Row
-from scene_experts.arguments.values import listed, placeholder, spelled
+from scene_experts.arguments.values import format_value, list_choices, placeholder
 
 INDENT = 2
 COLUMN = 26  # column where the text of an option starts
@@ -22,7 +22,7 @@ def page(kind: type, name: str, about: str, table: Sequence[Row], positional: Se
     by_flag = {row.flag: row for row in table}
     words = [by_flag[flag] for flag in positional]
     shown = [by_flag[flag] for flag in first] or [row for row in table if row not in words]
-    usage = f"usage: {written(name, table, positional)}" + (" [options]" if shown else "")
+    usage = f"usage: {format_usage(name, table, positional)}" + (" [options]" if shown else "")
     parts = [
         textwrap.fill(usage, width, subsequent_indent=" " * 7, break_on_hyphens=False),
         paragraphs(about or docs.of_class(kind), width),
@@ -42,7 +42,7 @@ def page_width() -> int:
     return max(60, min(shutil.get_terminal_size().columns, 100))
 
 
-def written(name: str, table: Sequence[Row], positional: Sequence[str]) -> str:
+def format_usage(name: str, table: Sequence[Row], positional: Sequence[str]) -> str:
     """Return the usage of a command with its positional and required options, for example "scene-experts info CAPTURE"."""
     by_flag = {row.flag: row for row in table}
     first = [by_flag[flag] for flag in positional]
@@ -59,10 +59,10 @@ def stands_for(row: Row) -> str:
 
 def paragraphs(text: str, width: int) -> str:
     """Wrap paragraphs to `width`. Paragraphs with indented lines, such as lists, are not changed."""
-    return "\n\n".join(part if "\n " in part else wrapped(part, width) for part in text.strip().split("\n\n"))
+    return "\n\n".join(part if "\n " in part else wrap(part, width) for part in text.strip().split("\n\n"))
 
 
-def wrapped(text: str, width: int, indent: int = 0) -> str:
+def wrap(text: str, width: int, indent: int = 0) -> str:
     space = " " * indent
     return textwrap.fill(
         " ".join(text.split()), width, initial_indent=space, subsequent_indent=space, break_on_hyphens=False, break_long_words=False
@@ -98,14 +98,14 @@ def _group(row: Row) -> tuple[str, type | None]:
 
 
 def group(title: str, rows: Sequence[Row], width: int) -> str:
-    return "\n".join([wrapped(f"{title}:", width), *(line for row in rows for line in entry(row, width))])
+    return "\n".join([wrap(f"{title}:", width), *(line for row in rows for line in entry(row, width))])
 
 
 def entry(row: Row, width: int, word: bool = False) -> list[str]:
     """Return the lines of one option: its name, with its description beside or below it."""
     switch = row.negative if row.default is True else ""  # shown because the default is on
     names = ", ".join(name for name in (row.option.short, row.flag, switch) if name)
-    return columns(" " * INDENT + (stands_for(row) if word else f"{names} {stands_for(row)}".rstrip()), described(row), width)
+    return columns(" " * INDENT + (stands_for(row) if word else f"{names} {stands_for(row)}".rstrip()), describe(row), width)
 
 
 def columns(left: str, text: str, width: int | None = None) -> list[str]:
@@ -116,15 +116,15 @@ def columns(left: str, text: str, width: int | None = None) -> list[str]:
     return [left, *(" " * COLUMN + line for line in lines)]
 
 
-def described(row: Row) -> str:
+def describe(row: Row) -> str:
     """Return the description of an option, with its default if the text does not contain it."""
     text = docs.of_field(row.owner, row.place[-1])
     if text and row.within and _is_small(row):
         above = docs.of_field(*row.within).partition(". ")[0].removesuffix(".")
         text = f"{above}: {text[0].lower()}{text[1:]}" if above else text
-    if choices := listed(row.kind):
+    if choices := list_choices(row.kind):
         text = f"{text} One of {choices}.".strip()
     plain = row.required or row.default is None or row.default is False or row.default == ()
     if plain or "default" in text:
         return text
-    return f"{text} (default: {'on' if row.default is True else spelled(row.default)})".strip()
+    return f"{text} (default: {'on' if row.default is True else format_value(row.default)})".strip()

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field
 from typing import Any, TypeVar
 
-from scene_experts.arguments.help import page, stands_for, written
+from scene_experts.arguments.help import format_usage, page, stands_for
 from scene_experts.arguments.table import Place, Row, make, rows
-from scene_experts.arguments.values import NONE, convert, count, spelled, without_none
+from scene_experts.arguments.values import NONE, convert, count, format_value, without_none
 from scene_experts.core.errors import InputError, nearest
 
 T = TypeVar("T")
@@ -50,7 +50,7 @@ def parse(kind: type[T], command: Command, args: Sequence[str]) -> T:
     given = _Reader(command, table).read(list(args))
     missing = [row for row in table if row.required and row.place not in given]
     if missing:
-        how = written(command.name, table, command.positional)
+        how = format_usage(command.name, table, command.positional)
         raise InputError(f"expected {_both(missing, command)}, found {_none(missing)}; write {how}")
     return make(kind, given, command.defaults)
 
@@ -103,7 +103,7 @@ class _Reader:
         if "" in words:
             raise InputError(f"expected a value after {name}, found an empty one; give one, or leave it out")
         default = row.default if row.default not in (MISSING, None, ()) else None
-        example = f"{row.flag} {stands_for(row) if default is None else spelled(default)}"
+        example = f"{row.flag} {stands_for(row) if default is None else format_value(default)}"
         if not words:
             raise InputError(f"expected a value after {name}, found none; write for example {example}")
         return convert(row.kind, words, name, example)

@@ -57,7 +57,7 @@ def _one(kind: Any, word: str, name: str, example: str) -> Any:
         known = {str(choice): choice for choice in typing.get_args(kind)}
         if word not in known:
             hint = nearest(word, known) if len(known) > FEW else ""
-            raise InputError(f"expected {described(kind)} after {name}, found '{word}'{hint or '; choose one of these'}")
+            raise InputError(f"expected {describe(kind)} after {name}, found '{word}'{hint or '; choose one of these'}")
         return known[word]
     what, _, make = WORDS[kind]
     try:
@@ -66,7 +66,7 @@ def _one(kind: Any, word: str, name: str, example: str) -> Any:
         raise InputError(f"expected {what} after {name}, found '{word}'; write for example {example}") from None
 
 
-def described(kind: Any) -> str:
+def describe(kind: Any) -> str:
     """Return the name of a type in messages, for example "a whole number" or "auto, cpu or cuda"."""
     inner, _ = without_none(kind)
     if typing.get_origin(inner) is Literal:
@@ -74,16 +74,16 @@ def described(kind: Any) -> str:
         return f"{', '.join(some)} or {last}" if some else last
     if typing.get_origin(inner) is tuple:
         each, most = typing.get_args(inner), count(inner)[1]
-        return f"one or more values ({described(each[0])})" if most is None else f"{most} numbers"
+        return f"one or more values ({describe(each[0])})" if most is None else f"{most} numbers"
     return WORDS[inner][0]
 
 
-def listed(kind: Any) -> str:
+def list_choices(kind: Any) -> str:
     """Return the choices of a type, "a, b or c", or an empty string if the placeholder shows them."""
     inner, _ = without_none(kind)
     if typing.get_origin(inner) is tuple:
         inner = typing.get_args(inner)[0]
-    return described(inner) if typing.get_origin(inner) is Literal and placeholder(inner) == "NAME" else ""
+    return describe(inner) if typing.get_origin(inner) is Literal and placeholder(inner) == "NAME" else ""
 
 
 def placeholder(kind: Any, name: str = "") -> str:
@@ -103,10 +103,10 @@ def placeholder(kind: Any, name: str = "") -> str:
     return WORDS[inner][1]
 
 
-def spelled(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Format a value as on the command line."""
     if isinstance(value, tuple):
-        return " ".join(map(spelled, value)) or NONE[0]
+        return " ".join(map(format_value, value)) or NONE[0]
     return "none" if value is None else f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else str(value)
 
 

@@ -135,7 +135,7 @@ def measure_scaling(scene: raster.Picture, machine: Machine, seconds: float) -> 
     n, wall = machine.threads, choose_clock(machine.threads)
     step = make_work(MIXTURE, len(scene.gaussians) * 2 // 5, scene.camera.width, scene.camera.height)
 
-    def stepped(threads: int, clock: Clock) -> tuple[float, ...]:
+    def run_step(threads: int, clock: Clock) -> tuple[float, ...]:
         with use_threads(threads):
             return step(clock)
 
@@ -143,7 +143,7 @@ def measure_scaling(scene: raster.Picture, machine: Machine, seconds: float) -> 
     for threads in (1, n):
         rasterize = CpuRasterizer(level=machine.level, threads=threads)
         subjects[f"rasteriser {threads}"] = partial(raster.time_draw, rasterize, scene)
-        subjects[f"step {threads}"] = partial(stepped, threads)
+        subjects[f"step {threads}"] = partial(run_step, threads)
         subjects[f"arithmetic {threads}"] = partial(_time_arithmetic, machine.level, threads)
     best = {name: sum(parts) for name, parts in measure_minima(subjects, seconds, wall).items()}
     group, out = f"gain of {n} threads over one (wall time)", []

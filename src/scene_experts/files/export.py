@@ -12,6 +12,7 @@ from typing import Any
 import scene_experts
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import check_writable, read_json, write_bytes, write_json
+from scene_experts.core.plain import to_json
 from scene_experts.data.views import Capture, World
 from scene_experts.files.cameras import write_cameras
 from scene_experts.files.measure import Tell, capture_if_there, cost
@@ -19,7 +20,6 @@ from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
 from scene_experts.files.registry import GAUSSIANS, Family, Format, family_named, format_named, format_names, formats_of
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Scene
-from scene_experts.training.config import to_json
 from scene_experts.training.progress import format_duration
 from scene_experts.training.run_folder import OpenRun, capture_of
 

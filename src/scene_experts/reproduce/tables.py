@@ -147,7 +147,7 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
         lengths.setdefault(r.config.train.iterations, set()).add(densifications(r.config.train))
     sizes = sorted({r.config.data.resolution for r in records})
     seeds = sorted({r.seed for r in records})
-    made = ", ".join(f"{n:,} iterations{bracketed(counts)}" for n, counts in sorted(lengths.items()))
+    made = ", ".join(f"{n:,} iterations{bracket(counts)}" for n, counts in sorted(lengths.items()))
     out = [f"{made}; resolution {', '.join(sizes)}; seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}."]
     for name, rows in found.items():
         whole = sorted(complete_seeds(rows))
@@ -193,7 +193,7 @@ def count_range(counts: Iterable[int | None]) -> str:
     return " to ".join(str(n) for n in sorted({min(known), max(known)})) if known else ""
 
 
-def bracketed(counts: Iterable[int | None]) -> str:
+def bracket(counts: Iterable[int | None]) -> str:
     """Write the numbers of densification steps in brackets, or nothing."""
     return f" ({text} densification steps)" if (text := count_range(counts)) else ""
 

@@ -113,7 +113,7 @@ class MCMC(Strategy[GaussianScene]):
         rows, drawn = sources.unique(return_counts=True)
         p = scene.table.params
         opacity = p["raw_opacity"].index_select(0, rows).sigmoid()
-        new, factor = shared(opacity, drawn + 1)
+        new, factor = share_opacity(opacity, drawn + 1)
         new = new.clamp(self.min_opacity, 1 - torch.finfo(torch.float32).eps)
         log_scales = p["log_scales"].index_select(0, rows) + factor.log()[:, None]
         scene.table.overwrite(rows, {"raw_opacity": new.logit(), "log_scales": log_scales}, clear=True)
@@ -154,7 +154,7 @@ def draw(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
     return torch.searchsorted(total, at, right=True).clamp_max_(int(weight.nonzero()[-1]))
 
 
-def shared(opacity: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
+def share_opacity(opacity: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
     """Opacity and scale factor, both [D], of n [D] (at most 51) equal Gaussians that replace one Gaussian of `opacity` [D].
 
     The new opacity is o' = 1 - (1 - o)^(1/n). The scale factor is o / Q with

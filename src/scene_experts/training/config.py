@@ -10,8 +10,6 @@ from typing import Annotated, Any
 from scene_experts.arguments.option import Option
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.parts import Part, find
-from scene_experts.core.plain import from_json as from_json
-from scene_experts.core.plain import to_json as to_json
 from scene_experts.data.settings import Data
 from scene_experts.scene import LearningRates, SceneConfig
 from scene_experts.scene.anchors.scene import Anchors, Rates

@@ -58,7 +58,7 @@ class Stepped:
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class Densified:
     """Densification added or removed rows."""
 
     step: int
@@ -121,4 +121,4 @@ class Finished:
     """Wall time of all iterations, s, without saving and previews."""
 
 
-Event = Started | Stepped | Adjusted | Previewed | Saved | Stopped | Exported | Finished
+Event = Started | Stepped | Densified | Previewed | Saved | Stopped | Exported | Finished

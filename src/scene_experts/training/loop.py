@@ -19,7 +19,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.render import Rasterizer, for_growth
 from scene_experts.strategy import Edit
 from scene_experts.training.config import RunConfig, Train
-from scene_experts.training.events import Adjusted, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
+from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.guard import explain, find_broken
 from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
 from scene_experts.training.memory import anchor_cap
@@ -96,10 +96,10 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
             check_finite(step, parts)
             raise RunError(explain(f"the parameter '{broken}' or its gradient", step, folder))
         if done.edit is not None:
-            yield Adjusted(step, done.edit)
+            yield Densified(step, done.edit)
         if step % run.log_every == 0 or step == total:
             check_finite(step, parts)
-            yield stepped(training, done)
+            yield measure_step(training, done)
         if run.preview_every and (step % run.preview_every == 0 or step == total):
             yield preview(training, run, capture, rasterize)
         if folder and (step % run.save_every == 0 or step == total):
@@ -187,7 +187,7 @@ def check_finite(step: int, parts: dict[str, Tensor]) -> None:
 
 
 @torch.no_grad()
-def stepped(training: Training, done: Iteration) -> Stepped:
+def measure_step(training: Training, done: Iteration) -> Stepped:
     """Compute the statistics of the last iteration."""
     decoded = done.decoded
     error = done.render.image.clamp(0, 1).sub_(done.target).square_()

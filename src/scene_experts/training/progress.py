@@ -11,7 +11,7 @@ from rich.progress import Progress as TaskBar
 from rich.text import Text
 
 from scene_experts.scene import Traits
-from scene_experts.training.events import Adjusted, Event, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
+from scene_experts.training.events import Densified, Event, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
 
 SMOOTHING = 0.9  # weight of the previous value in the running means of loss and PSNR
 
@@ -62,7 +62,7 @@ class TrainingProgress:
                 self.print_line(f"{verb}: {event.anchors:,} {rows}{lattice}, {event.total:,} iterations")
             case Stepped():
                 self.show_step(event)
-            case Adjusted():
+            case Densified():
                 if event.edit.capped:
                     rows = self.traits.rows
                     self.print_line(

@@ -11,7 +11,7 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.io import write_atomic
-from scene_experts.training.events import Adjusted, Event, Previewed, Started, Stepped
+from scene_experts.training.events import Densified, Event, Previewed, Started, Stepped
 
 
 class Recorder:
@@ -53,7 +53,7 @@ class Recorder:
                 self.write_line(asdict(event))
                 if self.board:
                     self.write_scalars(event)
-            case Adjusted():
+            case Densified():
                 self.write_line({"step": event.step, "grown": event.edit.grown, "pruned": event.edit.pruned, "anchors": event.edit.anchors})
             case Previewed():
                 picture = Image.fromarray((event.picture * 255 + 0.5).byte().numpy())

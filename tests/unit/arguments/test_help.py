@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import pytest
 
-from scene_experts.arguments.help import columns, page, written
+from scene_experts.arguments.help import columns, format_usage, page
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.table import rows
 
@@ -79,8 +79,8 @@ def test_the_first_options_alone(monkeypatch):
 
 
 def test_how_a_command_is_written():
-    assert written("se build", rows(Build, {}), ("--run",)) == "se build RUN"
-    assert written("se build", rows(Build, {"run": Path()}), ("--run",)) == "se build [RUN]"
+    assert format_usage("se build", rows(Build, {}), ("--run",)) == "se build RUN"
+    assert format_usage("se build", rows(Build, {"run": Path()}), ("--run",)) == "se build [RUN]"
 
 
 def test_a_long_name_has_its_text_below():

@@ -5,7 +5,7 @@ from typing import Literal
 
 import pytest
 
-from scene_experts.arguments.values import convert, count, described, placeholder, spelled
+from scene_experts.arguments.values import convert, count, describe, format_value, placeholder
 from scene_experts.core.errors import InputError
 
 TRIPLE = tuple[float, float, float]
@@ -58,8 +58,8 @@ def test_how_many_words_a_value_takes():
 
 def test_how_types_and_values_are_written():
     assert [placeholder(kind) for kind in (int, Literal["a", "b"], tuple[Path, ...], TRIPLE, bool)] == ["N", "a|b", "PATH ...", "X X X", ""]
-    assert placeholder(tuple[Path, ...], "RUN") == "RUN ..." and described(int | None) == "a whole number"
-    assert [spelled(value) for value in (None, 0.1, 1e-7, ("a", "b"), 30000)] == ["none", "0.1", "1e-07", "a b", "30000"]
+    assert placeholder(tuple[Path, ...], "RUN") == "RUN ..." and describe(int | None) == "a whole number"
+    assert [format_value(value) for value in (None, 0.1, 1e-7, ("a", "b"), 30000)] == ["none", "0.1", "1e-07", "a b", "30000"]
 
 
 def test_a_type_without_words_is_a_fault_of_the_program():

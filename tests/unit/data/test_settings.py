@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from scene_experts.core.plain import to_json
 from scene_experts.data.settings import Data
-from scene_experts.training.config import to_json
 
 
 def test_settings_are_everything_but_the_path():

@@ -10,7 +10,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.geometry.rotation import covariance
 from scene_experts.native import library as native
 from scene_experts.strategy import mcmc
-from scene_experts.strategy.mcmc import MCMC, MOST, draw, shared
+from scene_experts.strategy.mcmc import MCMC, MOST, draw, share_opacity
 from support.explicit import make_gaussians, moments
 
 
@@ -24,21 +24,21 @@ def as_written(o: float, n: int) -> tuple[float, float]:
 @pytest.mark.parametrize("n", [1, 2, 3, 10, 51])
 @pytest.mark.parametrize("o", [0.006, 0.3, 0.9, 0.9999])
 def test_shares_are_those_of_the_formula(o, n):
-    new, factor = shared(torch.tensor([o], dtype=torch.float64), torch.tensor([n]))
+    new, factor = share_opacity(torch.tensor([o], dtype=torch.float64), torch.tensor([n]))
     assert (float(new), float(factor)) == pytest.approx(as_written(o, n), rel=1e-6)
     assert n > 1 or (float(new), float(factor)) == pytest.approx((o, 1.0))
 
 
 def test_more_than_51_are_shared_as_51():
     o = torch.tensor([0.7])
-    assert torch.equal(shared(o, torch.tensor([MOST]))[0], shared(o, torch.tensor([400]))[0])
+    assert torch.equal(share_opacity(o, torch.tensor([MOST]))[0], share_opacity(o, torch.tensor([400]))[0])
 
 
 @pytest.mark.parametrize("o", [0.3, 0.9])
 def test_shares_together_hide_as_much_as_the_one_did(o):
     """Along a ray through the middle exactly; in all, as the scales are chosen: the integral of what is hidden stays."""
     n = 4
-    new, factor = (float(v) for v in shared(torch.tensor([o], dtype=torch.float64), torch.tensor([n])))
+    new, factor = (float(v) for v in share_opacity(torch.tensor([o], dtype=torch.float64), torch.tensor([n])))
     assert 1 - (1 - new) ** n == pytest.approx(o)
     x = torch.linspace(-12, 12, 20_001, dtype=torch.float64)
     one, many = o * torch.exp(-x * x / 2), 1 - (1 - new * torch.exp(-x * x / (2 * factor**2))) ** n

@@ -19,8 +19,8 @@ from scene_experts.scene.gaussians import Explicit
 from scene_experts.scene.graph.scene import GraphPoints
 from scene_experts.strategy.split_clone import SplitClone
 from scene_experts.training.config import RunConfig
-from scene_experts.training.events import Adjusted, Finished, Previewed, Saved, Started, Stepped, Stopped
-from scene_experts.training.loop import Run, iterate, stepped, without_graph
+from scene_experts.training.events import Densified, Finished, Previewed, Saved, Started, Stepped, Stopped
+from scene_experts.training.loop import Run, iterate, measure_step, without_graph
 from scene_experts.training.state import Training
 from support.golden import recorded_text
 from support.lanes import slow_except
@@ -38,7 +38,7 @@ def folder(tmp_path_factory) -> Path:
 @pytest.mark.parametrize("recipe", slow_except(METHODS, "moe-gs", "3dgs"))
 def test_resumed_equals_uninterrupted_bit_for_bit_while_rows_come_and_go(recipe, folder, tmp_path):
     cfg = config(recipe)
-    edits = [e for e in events(cfg, folder, tmp_path / "whole", stop_at=120) if isinstance(e, Adjusted)]
+    edits = [e for e in events(cfg, folder, tmp_path / "whole", stop_at=120) if isinstance(e, Densified)]
     assert any(e.edit.grown for e in edits)
     list(events(cfg, folder, tmp_path / "parts", stop_at=50))
     kinds = [type(e) for e in events(cfg, folder, tmp_path / "parts", stop_at=90, resume=True)]
@@ -111,13 +111,13 @@ def test_losses_follow_the_golden_curve(recipe, tmp_path):
 @pytest.mark.slow
 def test_anchor_cap_holds(folder):
     n = next(e for e in events(config(), folder, stop_at=1) if isinstance(e, Started)).anchors
-    capped = [e for e in events(config(max_anchors=n + 30), folder, stop_at=200) if isinstance(e, Adjusted)]
+    capped = [e for e in events(config(max_anchors=n + 30), folder, stop_at=200) if isinstance(e, Densified)]
     assert max(e.edit.anchors for e in capped) <= n + 30 and any(e.edit.capped for e in capped)
 
 
 @pytest.mark.slow
 def test_memory_cap_stops_growth(folder):
-    capped = [e for e in events(config(), folder, stop_at=100, max_memory=0.001) if isinstance(e, Adjusted)]
+    capped = [e for e in events(config(), folder, stop_at=100, max_memory=0.001) if isinstance(e, Densified)]
     assert capped and not any(e.edit.grown for e in capped) and any(e.edit.capped for e in capped)
 
 
@@ -163,8 +163,8 @@ def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count(folder):
     half[:, : half.shape[1] // 2] = 1
     columns = half[0] > 0
     mse = float((done.render.image.detach().clamp(0, 1) - done.target)[:, columns].square().mean())
-    assert stepped(training, replace(done, mask=half)).psnr == pytest.approx(-10 * math.log10(mse), rel=1e-5)
-    assert stepped(training, done).psnr != pytest.approx(-10 * math.log10(mse), rel=1e-5)
+    assert measure_step(training, replace(done, mask=half)).psnr == pytest.approx(-10 * math.log10(mse), rel=1e-5)
+    assert measure_step(training, done).psnr != pytest.approx(-10 * math.log10(mse), rel=1e-5)
 
 
 def test_steps_tell_the_balance_of_the_experts(folder):

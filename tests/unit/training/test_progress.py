@@ -5,7 +5,7 @@ from rich.console import Console
 
 from scene_experts.scene import Traits
 from scene_experts.strategy import Edit
-from scene_experts.training.events import Adjusted, Finished, Saved, Started, Stepped, Stopped
+from scene_experts.training.events import Densified, Finished, Saved, Started, Stepped, Stopped
 from scene_experts.training.progress import ProgressBar, TrainingProgress, format_duration
 
 
@@ -14,7 +14,7 @@ def test_a_log_file_gets_plain_lines():
     with TrainingProgress(Console(file=out, width=200), every=0.0) as show:
         show(Started(0, 200, 1234, Traits("anchors", "anchors", 0.02, activation=True)))
         show(Stepped(10, {"l1": 0.05, "dssim": 0.02}, 21.5, 1300, 800, 4000, 0.61, 1.0, {}))
-        show(Adjusted(100, Edit(10, 0, 1310, capped=True)))
+        show(Densified(100, Edit(10, 0, 1310, capped=True)))
         show(Saved(200, Path("a/b")))
         show(Finished(200, 75.0))
         show(Stopped(100, "SIGINT"))
@@ -41,7 +41,7 @@ def test_rows_have_the_name_that_the_traits_state():
     with TrainingProgress(Console(file=out, width=200), every=0.0) as show:
         show(Started(0, 200, 1234, Traits("gaussians", "Gaussians")))
         show(Stepped(10, {"l1": 0.05}, 21.5, 1300, 800, 800, 0.0, 1.0, {}))
-        show(Adjusted(100, Edit(10, 0, 1310, capped=True)))
+        show(Densified(100, Edit(10, 0, 1310, capped=True)))
     text = out.getvalue()
     assert all(fact in text for fact in ("1,234", "200", "1,300"))
     assert "anchors" not in text and "active" not in text and "lattice" not in text

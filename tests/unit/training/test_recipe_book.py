@@ -19,7 +19,7 @@ from scene_experts.recipes import RECIPES, moe_gs
 from scene_experts.render import choose
 from scene_experts.training import recipe_book, run_folder
 from scene_experts.training.config import RunConfig, check
-from scene_experts.training.events import Adjusted, Finished, Stepped
+from scene_experts.training.events import Densified, Finished, Stepped
 from scene_experts.training.loop import Run, train
 from scene_experts.training.recipe_book import GROUP, RecipeBook
 from support import outside
@@ -86,7 +86,7 @@ def test_it_trains_resumes_and_opens(monkeypatch, tmp_path):
     events = first + list(train(cfg, Run(config, out=out, resume=True, log_every=1), capture, draw))
     steps = [e for e in events if isinstance(e, Stepped)]
     assert [e.step for e in steps] == list(range(1, 13)) and set(steps[0].terms) == {"l1", "dssim", "size"}
-    assert [e.edit.grown - e.edit.pruned < 0 for e in events if isinstance(e, Adjusted)] == [True, True]
+    assert [e.edit.grown - e.edit.pruned < 0 for e in events if isinstance(e, Densified)] == [True, True]
     assert isinstance(events[-1], Finished)
     opened = run_folder.open_run(out)
     assert opened.scene.traits.family == "dots" and opened.config.train == cfg

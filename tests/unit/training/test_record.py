@@ -7,7 +7,7 @@ from PIL import Image
 from scene_experts.core.errors import RunError
 from scene_experts.scene import Traits
 from scene_experts.strategy import Edit
-from scene_experts.training.events import Adjusted, Previewed, Started, Stepped
+from scene_experts.training.events import Densified, Previewed, Started, Stepped
 from scene_experts.training.record import Recorder
 from support.messages import naming
 
@@ -27,7 +27,7 @@ def test_metrics_previews_and_what_a_resumed_run_writes_again(tmp_path):
         record(Started(0, 30, 10, TRAITS))
         for i in (10, 20, 30):
             record(step(i))
-        record(Adjusted(30, Edit(5, 1, 14)))
+        record(Densified(30, Edit(5, 1, 14)))
         record(Previewed(30, 0, torch.tensor([[[0.0, 0.5, 1.0]]])))
     assert [v["step"] for v in lines(tmp_path)] == [10, 20, 30, 30] and lines(tmp_path)[-1]["grown"] == 5
     assert Image.open(tmp_path / "previews" / "000030.png").getpixel((0, 0)) == (0, 128, 255)

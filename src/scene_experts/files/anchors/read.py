@@ -17,6 +17,7 @@ from torch import Tensor
 
 from scene_experts.core.checkpoint import read_tensors
 from scene_experts.core.errors import InputError
+from scene_experts.core.plain import from_json
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.files import result_folder
@@ -30,7 +31,7 @@ from scene_experts.files.result_folder import expect_world, world_in
 from scene_experts.scene import Scene, restore_scene
 from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS
-from scene_experts.training.config import Train, from_json
+from scene_experts.training.config import Train
 from scene_experts.training.run_folder import OpenRun, load_capture
 
 MOST_LEVELS = 64  # of detail

@@ -21,7 +21,7 @@ from scene_experts.core.checkpoint import write_tensors
 from scene_experts.data.views import World
 from scene_experts.files.anchors import torchscript
 from scene_experts.files.anchors.data import FILE_NAMES, AnchorData, by_attribute
-from scene_experts.files.formats.ply import Columns, floats, numbered, write_vertices
+from scene_experts.files.formats.ply import Columns, floats, numbered_columns, write_vertices
 from scene_experts.scene.anchors.mlp import ATTRIBUTES
 from scene_experts.scene.anchors.scene import AnchorScene
 from scene_experts.training.run_folder import OpenRun
@@ -125,7 +125,7 @@ def describe(run: OpenRun, world: World) -> dict[str, Any]:
         "activations": torchscript.ACTIVATIONS,
         "voxel_size": {"trained": scene.voxel, "input": scene.voxel / world.scale},
         "world": {"scale": world.scale, "shift": list(world.shift)},
-        "feature_bank": scene.mix is not None,
+        "feature_bank": scene.bank is not None,
         "extent": scene.extent,
         "scene": scene.meta(),
     }
@@ -178,10 +178,10 @@ def vertices(data: AnchorData) -> Columns:
     columns: Columns = dict(zip("xyz", floats(c["xyz"])))
     levels = {name: floats(c[name][:, None])[0] for name in LEVEL_COLUMNS if name in c}
     columns |= levels or dict.fromkeys(("nx", "ny", "nz"), zero)
-    columns |= numbered("f_offset_", c["offsets"].transpose(1, 2).flatten(1))
-    columns |= numbered("f_anchor_feat_", c["feature"])
+    columns |= numbered_columns("f_offset_", c["offsets"].transpose(1, 2).flatten(1))
+    columns |= numbered_columns("f_anchor_feat_", c["feature"])
     columns["opacity"] = np.full(n, INERT_OPACITY, np.float32)
-    columns |= numbered("scale_", c["log_scaling"])
+    columns |= numbered_columns("scale_", c["log_scaling"])
     return columns | {"rot_0": one, "rot_1": zero, "rot_2": zero, "rot_3": zero}
 
 

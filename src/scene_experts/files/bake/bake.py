@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.plain import to_json
 from scene_experts.data.views import Capture
 from scene_experts.files.bake.observe import Sums, fit_harmonics, omission, sum_views
 from scene_experts.files.bake.refine import Refine, refine
@@ -29,7 +30,6 @@ from scene_experts.files.gaussians.read import DRAWN_AT, scene_of
 from scene_experts.files.measure import Painter, Tell
 from scene_experts.render import Rasterizer
 from scene_experts.scene.gaussians import GaussianScene
-from scene_experts.training.config import to_json
 from scene_experts.training.run_folder import OpenRun
 
 __all__ = ["DRAWN_AT", "Bake", "Baked", "Refine", "bake"]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_experts.core.io import write_bytes
-from scene_experts.files.formats.pack import Floats, alphas, damaged, logits, tensor, to_bytes, turned, unit_quats
+from scene_experts.files.formats.pack import Floats, alphas, damaged, logits, tensor, to_bytes, turn, unit_quats
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import Format
 from scene_experts.geometry.sh import C0
@@ -95,7 +95,7 @@ def read(path: Path) -> Splats:
 
 def _columns(splats: Splats) -> dict[str, NDArray[Any]]:
     """The attributes in the frame of glTF, by name."""
-    s = turned(splats, "z")
+    s = turn(splats, "z")
     dc, opacity = s.sh[:, 0].double().numpy(), alphas(s)
     quats = unit_quats(splats) @ _HALF_TURN.T
     columns: dict[str, NDArray[Any]] = {
@@ -114,7 +114,7 @@ def _columns(splats: Splats) -> dict[str, NDArray[Any]]:
 def _splats(means: Floats, scales: Floats, quats: Floats, opacity: Floats, sh: Floats) -> Splats:
     """From the frame and units of glTF to ours."""
     wxyz = quats[:, [3, 0, 1, 2]] @ _HALF_TURN  # its transpose undoes the turn
-    turned_wrong = turned(
+    turned_wrong = turn(
         Splats(tensor(means), tensor(np.log(np.maximum(scales, 1e-30))), tensor(wxyz), tensor(logits(opacity)), tensor(sh)), "z"
     )
     return Splats(turned_wrong.means, turned_wrong.log_scales, tensor(wxyz), turned_wrong.opacity_logit, turned_wrong.sh)

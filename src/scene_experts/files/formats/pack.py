@@ -104,7 +104,7 @@ def logits(opacity: Floats, edge: float = 1e-7) -> NDArray[np.float32]:
     return np.log(a / (1 - a)).astype(np.float32)
 
 
-def turned(splats: Splats, axis: Literal["x", "z"]) -> Splats:
+def turn(splats: Splats, axis: Literal["x", "z"]) -> Splats:
     """The Gaussians after half a turn of the frame about an axis. Applied twice it changes nothing.
     Scales keep their axes."""
     signs = np.array(_SIGNS[axis])

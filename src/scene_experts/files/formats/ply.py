@@ -133,7 +133,7 @@ def floats(value: Tensor) -> list[NDArray[np.float32]]:
     return list(value.detach().cpu().float().numpy().T)
 
 
-def numbered(prefix: str, value: Tensor) -> Columns:
+def numbered_columns(prefix: str, value: Tensor) -> Columns:
     """The columns of a tensor [N, C] as prefix0, prefix1, ..."""
     return {f"{prefix}{i}": column for i, column in enumerate(floats(value))}
 
@@ -207,10 +207,10 @@ def write(path: Path, splats: Splats, note: Mapping[str, Any], normals: bool = T
     columns: Columns = dict(zip("xyz", floats(splats.means)))
     if normals:
         columns |= {name: np.zeros(n, np.float32) for name in ("nx", "ny", "nz")}
-    columns |= numbered("f_dc_", splats.sh[:, 0])
-    columns |= numbered("f_rest_", splats.sh[:, 1:].transpose(1, 2).flatten(1))
+    columns |= numbered_columns("f_dc_", splats.sh[:, 0])
+    columns |= numbered_columns("f_rest_", splats.sh[:, 1:].transpose(1, 2).flatten(1))
     columns["opacity"] = floats(splats.opacity_logit[:, None])[0]
-    columns |= numbered("scale_", splats.log_scales) | numbered("rot_", splats.quats)
+    columns |= numbered_columns("scale_", splats.log_scales) | numbered_columns("rot_", splats.quats)
     write_vertices(path, columns, note_comments(note))
 
 

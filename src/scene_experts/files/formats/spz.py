@@ -32,7 +32,7 @@ from scene_experts.files.formats.pack import (
     smallest_three,
     tensor,
     to_bytes,
-    turned,
+    turn,
     unit_quats,
 )
 from scene_experts.files.formats.splats import Splats
@@ -62,7 +62,7 @@ def spz_bytes(splats: Splats, first_step: int = 1, rest_step: int = 1, antialias
     against its own picture; 1 keeps all that a byte holds. Positions have as many fraction bits as
     their range leaves, 12 for a range of 2 km.
     """
-    s = turned(splats.rows(morton_order(splats.means)), "x")
+    s = turn(splats.rows(morton_order(splats.means)), "x")
     means = s.means.double().numpy()
     reach = float(np.abs(means).max()) if len(s) else 1.0
     bits = max(0, min(_MAX_BITS, 22 - int(np.floor(np.log2(max(reach, 1e-9))))))
@@ -106,7 +106,7 @@ def decode(data: bytes, path: Path) -> Splats:
     used = min(degree, 3)
     sh = np.concatenate([dc, rest[:, : (used + 1) ** 2 - 1]], 1)
     scales = streams["scales"].reshape(n, 3) / 16.0 - 10
-    return turned(Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(streams["alphas"])), tensor(sh)), "x")
+    return turn(Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(streams["alphas"])), tensor(sh)), "x")
 
 
 # --- containers ---------------------------------------------------------------------------------------------------------------------------

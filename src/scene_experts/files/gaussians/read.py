@@ -13,6 +13,7 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json
+from scene_experts.core.plain import from_json
 from scene_experts.core.table import Table
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
@@ -24,7 +25,7 @@ from scene_experts.files.registry import Imported, recognise
 from scene_experts.recipes import gs_3d
 from scene_experts.scene import Scene
 from scene_experts.scene.gaussians import Explicit, GaussianScene
-from scene_experts.training.config import Train, from_json
+from scene_experts.training.config import Train
 from scene_experts.training.run_folder import OpenRun, load_capture
 
 log: logging.Logger = logging.getLogger(__name__)
@@ -44,7 +45,7 @@ def read(source: Path, data: Data, iteration: int | None) -> Imported:
     folder says otherwise. Raises InputError where a description says that the file is in another
     frame.
     """
-    antialias = antialiased(source)
+    antialias = is_antialiased(source)
     about = result_folder.read_description(source.parent) or {}
     capture = load_capture(data)
     capture.images.close()
@@ -114,7 +115,7 @@ def beside(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def antialiased(path: Path) -> bool:
+def is_antialiased(path: Path) -> bool:
     """Whether the description beside a file, or without one the file itself, says that it is drawn
     with antialiasing.
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from scene_experts.core.checkpoint import read_tensors
 from scene_experts.core.errors import InputError
+from scene_experts.core.plain import from_json
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.files import result_folder
@@ -25,7 +26,7 @@ from scene_experts.files.registry import Imported
 from scene_experts.files.result_folder import expect_world, world_in
 from scene_experts.geometry.voxel import coarsen
 from scene_experts.scene.graph.scene import CHANNELS, HALF
-from scene_experts.training.config import Train, from_json
+from scene_experts.training.config import Train
 from scene_experts.training.run_folder import load_capture
 
 

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.checkpoint import write_tensors
+from scene_experts.core.plain import to_json
 from scene_experts.data.views import World
-from scene_experts.files.formats.ply import Columns, floats, numbered, write_vertices
+from scene_experts.files.formats.ply import Columns, floats, numbered_columns, write_vertices
 from scene_experts.scene.graph.scene import GraphScene
-from scene_experts.training.config import to_json
 from scene_experts.training.run_folder import OpenRun
 
 KIND, DESCRIPTION_FORMAT = "graph points", 1
@@ -68,9 +68,9 @@ def vertices(scene: GraphScene, world: World) -> Columns:
     n = len(xyz)
     columns: Columns = dict(zip("xyz", floats(xyz)))
     columns |= {name: np.zeros(n, np.float32) for name in ("nx", "ny", "nz")}
-    columns |= numbered("feats_", p["feature"])
+    columns |= numbered_columns("feats_", p["feature"])
     columns["opacity"] = np.full(n, INERT_OPACITY, np.float32)
-    columns |= numbered("scale_", scaling)
+    columns |= numbered_columns("scale_", scaling)
     return columns | {f"rot_{i}": np.full(n, float(i == 0), np.float32) for i in range(4)}
 
 

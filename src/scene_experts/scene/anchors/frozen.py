@@ -17,7 +17,7 @@ from scene_experts.scene import Cull
 from scene_experts.scene.anchors import native_decode
 from scene_experts.scene.anchors.appearance import fold
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, HeadWeights
-from scene_experts.scene.anchors.select import faded, visible_rows
+from scene_experts.scene.anchors.select import fade_opacities, visible_rows
 
 if TYPE_CHECKING:
     from scene_experts.scene.anchors.scene import AnchorScene
@@ -29,11 +29,11 @@ class Kept:
 
     gates: Tensor | None  # [N, E], while dense
     chosen: Tensor | None  # [N, k] int64
-    mix: Tensor | None  # [N, k]
+    chosen_weight: Tensor | None  # [N, k]
 
     @property
     def bytes(self) -> int:
-        return sum(t.numel() * t.element_size() for t in (self.gates, self.chosen, self.mix) if t is not None)
+        return sum(t.numel() * t.element_size() for t in (self.gates, self.chosen, self.chosen_weight) if t is not None)
 
 
 class Frozen:
@@ -56,7 +56,7 @@ class Frozen:
         self.xyz = scene.table.facts["xyz"].contiguous()
         self.scales = self.columns[1][:, :3].contiguous().exp()
         self.with_dist = {a: a in scene.config.add_dist for a in ATTRIBUTES}
-        self.weights = {a: _detached(w) for a, w in weights.items()}
+        self.weights = {a: _detach(w) for a, w in weights.items()}
         self.kept = self._keep()
 
     @property
@@ -72,7 +72,7 @@ class Frozen:
         scene = self.scene
         rows = visible_rows(scene.select(scene.table, camera, step, mode), self.xyz, self.scales, camera, cull)
         decoded = self.decode(rows, camera)
-        return faded(decoded, scene.select.fade(scene.table, rows, camera, step, mode), len(scene.table), scene.K)
+        return fade_opacities(decoded, scene.select.fade(scene.table, rows, camera, step, mode), len(scene.table), scene.K)
 
     @torch.no_grad()
     def decode(self, rows: Tensor, camera: Camera) -> Decoded:
@@ -80,7 +80,7 @@ class Frozen:
         call, alive = self._call(rows, camera.position, self._at(camera))
         call.frozen = 1
         for head, kept in zip(call.heads, self.kept):
-            native_decode.set_pointers(head, gates=kept.gates, chosen=kept.chosen, chosen_weight=kept.mix)
+            native_decode.set_pointers(head, gates=kept.gates, chosen=kept.chosen, chosen_weight=kept.chosen_weight)
         made, raw, _, _ = native_decode.run(call)
         del alive
         return Decoded(Gaussians(*made), rows, raw, {})
@@ -88,31 +88,29 @@ class Frozen:
     def _at(self, camera: Camera) -> dict[str, HeadWeights]:
         """The heads that `camera` sees: its appearance, where there are any, is a part of the colour's first bias."""
         codes = self.scene.codes
-        return (
-            self.weights if codes is None else {**self.weights, "color": _detached(fold(self.weights["color"], codes(camera, Mode.DRAW)))}
-        )
+        return self.weights if codes is None else {**self.weights, "color": _detach(fold(self.weights["color"], codes(camera, Mode.DRAW)))}
 
     def _call(self, rows: Tensor, position: Tensor, heads: dict[str, HeadWeights]) -> tuple:
         """Return the library's arguments and the tensors that they point to."""
-        plan = native_decode.planned(rows, self.xyz, position, heads, self.with_dist, self.scene.extent, False)
+        plan = native_decode.make_plan(rows, self.xyz, position, heads, self.with_dist, self.scene.extent, False)
         weights = [getattr(heads[a], name) for a in ATTRIBUTES for name in native_decode.TENSORS]
-        return native_decode.prepared(plan, self.columns, weights), (plan, weights)
+        return native_decode.make_call(plan, self.columns, weights), (plan, weights)
 
     def _keep(self) -> tuple[Kept, ...]:
         heads, N, nowhere = self.weights, len(self.xyz), torch.zeros(3)
         if self.scene.codes is not None:  # which code does not matter: it touches neither routing nor the feature's part
-            heads = {**heads, "color": _detached(fold(heads["color"], self.scene.codes.table[0]))}
+            heads = {**heads, "color": _detach(fold(heads["color"], self.scene.codes.table[0]))}
         call, alive = self._call(torch.arange(N), nowhere, heads)
         routed = [h.router_w is not None for h in heads.values()]
         gates = [torch.empty(N, head.E) if r else None for r, head in zip(routed, call.heads)]
         chosen = [torch.empty(N, head.k, dtype=torch.int64) if r and head.k else None for r, head in zip(routed, call.heads)]
-        mix = [torch.empty(N, head.k) if r and head.k else None for r, head in zip(routed, call.heads)]
-        native_decode.set_routing(call, gates, chosen, mix)
+        chosen_weight = [torch.empty(N, head.k) if r and head.k else None for r, head in zip(routed, call.heads)]
+        native_decode.set_routing(call, gates, chosen, chosen_weight)
         native_decode.route(call)
         del alive
-        return tuple(Kept(None if c is not None else g, c, m) for g, c, m in zip(gates, chosen, mix))
+        return tuple(Kept(None if c is not None else g, c, m) for g, c, m in zip(gates, chosen, chosen_weight))
 
 
-def _detached(w: HeadWeights) -> HeadWeights:
+def _detach(w: HeadWeights) -> HeadWeights:
     values: dict[str, Any] = {name: value.detach().contiguous() for name, value in vars(w).items() if isinstance(value, Tensor)}
     return replace(w, **values)

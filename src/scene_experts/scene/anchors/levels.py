@@ -88,12 +88,12 @@ def whole(asked: Tensor, rule: LevelRule, top: int) -> Tensor:
     `blend` uses one more level than `floor`: the finest level, which fades in.
     """
     if rule == "blend":
-        return blended(asked, top).floor().long()
+        return blend_levels(asked, top).floor().long()
     rounded = {"round": torch.round, "floor": torch.floor, "ceil": torch.ceil}[rule](asked)
     return rounded.clamp(0, top - 1).long()
 
 
-def blended(asked: Tensor, top: int) -> Tensor:
+def blend_levels(asked: Tensor, top: int) -> Tensor:
     """Return level + 1 [n], clamped to [0.9999, top - 0.0001]. Its floor is the finest level, its fraction that level's weight."""
     return (asked + 1).clamp(0.9999, top - 1 + 0.9999)
 

@@ -66,7 +66,7 @@ def decode(
         low, high = (int(rows[0]), int(rows[-1])) if ascending else (int(rows.min()), int(rows.max()))
         if low < 0 or high >= len(xyz):
             raise IndexError(f"expected rows from 0 to {len(xyz) - 1}, found {low} to {high}")
-    plan = planned(rows, xyz, camera_position, heads, with_dist, extent, ascending)
+    plan = make_plan(rows, xyz, camera_position, heads, with_dist, extent, ascending)
     weights = [getattr(h, name) for h in found for name in TENSORS]
     out = _DecodeFunction.apply(plan, feature, log_scaling, offsets, *weights)
     means, quats, scales, opacities, colors, source, raw = out[:7]
@@ -74,7 +74,7 @@ def decode(
     return Gaussians(means, quats, scales, opacities, colors, source), raw, routing
 
 
-def planned(
+def make_plan(
     rows: Tensor, xyz: Tensor, camera: Tensor, heads: dict[str, HeadWeights], with_dist: dict[str, bool], extent: float, ascending: bool
 ) -> Plan:
     """Plain values for the library; arguments as those of `decode`."""
@@ -137,20 +137,20 @@ class _DecodeFunction(torch.autograd.Function):
         columns = [t.detach().contiguous() for t in (feature, log_scaling, offsets)]
         weights = tuple(None if t is None else t.detach().contiguous() for t in weights)
         A = len(plan.rows)
-        call = prepared(plan, columns, weights)
-        gates, chosen, mix = [], [], []
+        call = make_call(plan, columns, weights)
+        gates, chosen, chosen_weight = [], [], []
         for i, k in enumerate(plan.k):
             routed, E = weights[T * i] is not None, call.heads[i].E
             gates.append(torch.empty(A, E) if routed else None)
             chosen.append(torch.empty(A, k, dtype=torch.int64) if routed and k else None)
-            mix.append(torch.empty(A, k) if routed and k else None)
-        set_routing(call, gates, chosen, mix)
+            chosen_weight.append(torch.empty(A, k) if routed and k else None)
+        set_routing(call, gates, chosen, chosen_weight)
         (means, quats, scales, opacities, colors, source), raw, starts, per_length = run(call)
         made = (means, quats, scales, opacities, colors)
         ctx.plan = plan
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(source, *(c for c in chosen if c is not None))
-        ctx.save_for_backward(*columns, *weights, raw, starts, *made, per_length, *gates, *chosen, *mix)
+        ctx.save_for_backward(*columns, *weights, raw, starts, *made, per_length, *gates, *chosen, *chosen_weight)
         return means, quats, scales, opacities, colors, source, raw, *gates, *chosen
 
     @staticmethod
@@ -159,7 +159,7 @@ class _DecodeFunction(torch.autograd.Function):
         saved = ctx.saved_tensors
         columns, weights, made, routing = saved[:3], saved[3 : 3 + 3 * T], saved[3 + 3 * T : 11 + 3 * T], saved[11 + 3 * T :]
         raw, starts, means, quats, scales, opacities, colors, per_length = made
-        call = prepared(plan, columns, weights)
+        call = make_call(plan, columns, weights)
         set_pointers(
             call, raw=raw, starts=starts, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, per_length=per_length
         )
@@ -177,7 +177,7 @@ class _DecodeFunction(torch.autograd.Function):
         return None, *(g if want else None for g, want in zip([*d_columns, *d_weights], wanted))
 
 
-def prepared(plan: Plan, columns: Any, weights: Any) -> SeDecode:
+def make_call(plan: Plan, columns: Any, weights: Any) -> SeDecode:
     """Return the structure with all inputs. The tensors must outlive the call."""
     feature, log_scaling, offsets = columns
     call = SeDecode(
@@ -199,6 +199,6 @@ def set_pointers(structure: ctypes.Structure, **tensors: Tensor | None) -> None:
         setattr(structure, name, native.pointer(tensor))
 
 
-def set_routing(call: SeDecode, gates: Any, chosen: Any, mix: Any) -> None:
-    for head, g, c, m in zip(call.heads, gates, chosen, mix):
+def set_routing(call: SeDecode, gates: Any, chosen: Any, chosen_weight: Any) -> None:
+    for head, g, c, m in zip(call.heads, gates, chosen, chosen_weight):
         set_pointers(head, gates=g, chosen=c, chosen_weight=m)

@@ -33,7 +33,7 @@ from scene_experts.scene.anchors.experts import MixtureHead
 from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
 from scene_experts.scene.anchors.frozen import Frozen
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, Decoder, HeadWeights, Plain
-from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, faded, visible_rows
+from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, fade_opacities, visible_rows
 
 log: logging.Logger = logging.getLogger(__name__)
 NEARLY_ALL = 0.95  # the lattice has almost no effect if this share of the points is alone in its voxel
@@ -95,7 +95,7 @@ class Anchors(SceneConfig):
 
     def load(self, table: Table, meta: dict[str, Any]) -> AnchorScene:
         """Create the scene of a checkpoint with newly initialized networks."""
-        return AnchorScene(self, table, float(meta["voxel"]), float(meta["extent"]), self.select.restored(meta), meta.get("views", ()))
+        return AnchorScene(self, table, float(meta["voxel"]), float(meta["extent"]), self.select.restore(meta), meta.get("views", ()))
 
     def scaled(self, factor: float) -> Self:
         """Return the settings for a training run that is `factor` times as long."""
@@ -124,7 +124,7 @@ class AnchorScene(LatticeScene):
     """
 
     config: Anchors
-    mix: Any
+    bank: Any  # the feature bank; None without one
     voxel: float
     codes: Codes | None
 
@@ -140,7 +140,7 @@ class AnchorScene(LatticeScene):
             inputs = config.mix.width(config.F) + 3 + (attribute in config.add_dist) + (config.appearance if attribute == "color" else 0)
             heads[attribute] = config.decoder.build(attribute, inputs, config.hidden, config.K * CHANNELS[attribute], config.F)
         self.heads: Mapping[str, MLP | MixtureHead] = nn.ModuleDict(heads)  # type: ignore[assignment]
-        self.mix = config.mix.build(config.F)
+        self.bank = config.mix.build(config.F)
         self.codes = Codes(config.appearance, views, config.test_appearance) if config.appearance else None
 
     @property
@@ -218,7 +218,7 @@ class AnchorScene(LatticeScene):
             share = self.config.dropout * min(1.0, step / self.config.dropout_full)
             rows = rows[torch.rand(len(rows), device=rows.device) >= share]
         decoded = self.decode(rows, camera, step, mode)
-        decoded = faded(decoded, self.select.fade(table, rows, camera, step, mode), len(table), self.K)
+        decoded = fade_opacities(decoded, self.select.fade(table, rows, camera, step, mode), len(table), self.K)
         return self.with_global_routing(decoded, step) if mode is Mode.TRAIN else decoded
 
     def decode(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:
@@ -239,7 +239,7 @@ class AnchorScene(LatticeScene):
         """Return the heads' tensors for the fused decode (compiled on the CPU, Triton on CUDA), or None if it does not apply."""
         feature = self.table.params["feature"]
         why = no_kernels(feature.device)
-        why = why or ("--scene.quat-align" if self.config.quat_align else "a feature bank" if self.mix is not None else None)
+        why = why or ("--scene.quat-align" if self.config.quat_align else "a feature bank" if self.bank is not None else None)
         why = why or (f"tensors of {feature.dtype}" if feature.dtype != torch.float32 else None)
         if self.config.decode == "composed" or why:
             if self.config.decode == "native":
@@ -264,7 +264,7 @@ class AnchorScene(LatticeScene):
         """Reference decode in PyTorch: call one head per attribute, then mask, activate and place the Gaussians."""
         p, K = self.table.params, self.K
         feature, direction, distance = self.inputs(rows, camera)
-        seen = feature if self.mix is None else self.mix(self.table, rows, direction, distance)
+        seen = feature if self.bank is None else self.bank(self.table, rows, direction, distance)
         position = self.table.facts["xyz"].index_select(0, rows) / self.extent
         out: dict[str, Tensor] = {}
         routing: dict[str, Routing] = {}
@@ -301,7 +301,7 @@ class AnchorScene(LatticeScene):
         """Return the raw opacities [N, K] of all anchors for `camera`, including anchors that are not visible."""
         everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
         feature, direction, distance = self.inputs(everyone, camera)
-        seen = feature if self.mix is None else self.mix(self.table, everyone, direction, distance)
+        seen = feature if self.bank is None else self.bank(self.table, everyone, direction, distance)
         x = torch.cat([seen, direction] + ([distance] if "opacity" in self.config.add_dist else []), dim=1)
         return self.heads["opacity"](x, feature, step, self.table.facts["xyz"] / self.extent, mode)[0]
 
@@ -320,7 +320,7 @@ class AnchorScene(LatticeScene):
     def at_level(self, level: int | None) -> Iterator[None]:
         """Context manager in which the scene draws no level finer than `level`. See `Scene.at_level`."""
         whole = self.select
-        self.select = whole.capped(level)
+        self.select = whole.with_cap(level)
         try:
             yield
         finally:
@@ -349,15 +349,15 @@ class AnchorScene(LatticeScene):
             routers = [p for name, p in named.items() if name.startswith("router")]
             if routers:
                 groups[f"{attribute}.router"] = routers
-        if self.mix is not None:
-            groups["mix"] = list(self.mix.parameters())
+        if self.bank is not None:
+            groups["mix"] = list(self.bank.parameters())
         if self.codes is not None:
             groups["appearance"] = [self.codes.table]
         return groups
 
     def network_tensors(self) -> dict[str, Tensor]:
         """Return all tensors of the decoder by name (`opacity.w1`, ...), for files."""
-        parts: dict[str, Any] = {**self.heads, "mix": self.mix, "appearance": self.codes}
+        parts: dict[str, Any] = {**self.heads, "mix": self.bank, "appearance": self.codes}
         return {f"{part}.{name}": p for part, module in parts.items() if module is not None for name, p in module.named_parameters()}
 
 

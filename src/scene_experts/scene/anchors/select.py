@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any, ClassVar, Protocol, Self
@@ -20,7 +19,7 @@ from scene_experts.core.types import Camera, Decoded, Mode
 from scene_experts.geometry.voxel import find_unique_cells, to_lattice
 from scene_experts.scene import Cull
 from scene_experts.scene.anchors import levels as lattices
-from scene_experts.scene.anchors.levels import LevelRule, Levels, blended, whole
+from scene_experts.scene.anchors.levels import LevelRule, Levels, blend_levels, whole
 
 
 class Selector(Protocol):
@@ -40,7 +39,7 @@ class Selector(Protocol):
         """Whether coarse-to-fine training still adds finer levels after `step`."""
         ...
 
-    def capped(self, level: int | None) -> Selector:
+    def with_cap(self, level: int | None) -> Selector:
         """Return a copy that uses no level finer than `level`. None removes the cap."""
         ...
 
@@ -73,7 +72,7 @@ class Selection(Part, ABC):
         """Create the initial anchors from points [P, 3]. Returns the facts of the rows, the edge of the finest cell and the selector."""
 
     @abstractmethod
-    def restored(self, meta: dict[str, Any]) -> Selector:
+    def restore(self, meta: dict[str, Any]) -> Selector:
         """Restore the selector from the values of `Selector.meta()`."""
 
 
@@ -93,7 +92,7 @@ class AllAnchors(Selection):
     def coarse(self, step: int) -> bool:
         return False
 
-    def capped(self, level: int | None) -> AllAnchors:
+    def with_cap(self, level: int | None) -> AllAnchors:
         return self
 
     def __call__(self, table: Table, camera: Camera, step: int, mode: Mode) -> Tensor | None:
@@ -113,7 +112,7 @@ class AllAnchors(Selection):
         cells, _ = find_unique_cells(to_lattice(points, voxel))
         return self.places(cells, voxel, 0), voxel, self
 
-    def restored(self, meta: dict[str, Any]) -> Selector:
+    def restore(self, meta: dict[str, Any]) -> Selector:
         return self
 
 
@@ -190,7 +189,7 @@ class Octree(Selection):
         threshold = max(self.visible_threshold, 0.0)
         return Levels(count, first, self.fork, edge, (low, low, low), far, self.rule, threshold, lattices.centres(cameras))
 
-    def restored(self, meta: dict[str, Any]) -> Selector:
+    def restore(self, meta: dict[str, Any]) -> Selector:
         return LevelSelector(self, Levels.from_meta(meta["levels"]))
 
     def scaled(self, factor: float) -> Self:
@@ -237,7 +236,7 @@ class LevelSelector:
         if self.lattices.rule != "blend":
             return None
         xyz, level, extra = (table.facts[name].index_select(0, rows) for name in ("xyz", "level", "extra_level"))
-        asked = blended(self.asked(xyz, level, extra, camera), self.top(step, mode))
+        asked = blend_levels(self.asked(xyz, level, extra, camera), self.top(step, mode))
         return torch.where(level == asked.floor().long(), asked.frac(), torch.ones_like(asked))
 
     def asked(self, xyz: Tensor, level: Tensor, extra: Tensor, camera: Camera) -> Tensor:
@@ -255,7 +254,7 @@ class LevelSelector:
     def count(self) -> int:
         return self.lattices.count
 
-    def capped(self, level: int | None) -> LevelSelector:
+    def with_cap(self, level: int | None) -> LevelSelector:
         """Return a copy that uses no level finer than `level`. None removes the cap."""
         return replace(self, cap=level)
 
@@ -273,11 +272,6 @@ class LevelSelector:
         return {"levels": self.lattices.meta()}
 
 
-def capped(scene: Any, level: int | None) -> AbstractContextManager[None]:
-    """Return the context manager `scene.at_level(level)`."""
-    return scene.at_level(level)
-
-
 def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera: Camera, cull: Cull) -> Tensor:
     """Return rows [A] of the selected anchors whose ellipsoid overlaps the image. means [N, 3], scales [N, 3]; no gradient."""
     with torch.no_grad():
@@ -286,7 +280,7 @@ def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera:
         return selected[cull(means.index_select(0, selected), scales.index_select(0, selected), camera)]
 
 
-def faded(decoded: Decoded, fade: Tensor | None, rows: int, K: int) -> Decoded:
+def fade_opacities(decoded: Decoded, fade: Tensor | None, rows: int, K: int) -> Decoded:
     """Multiply the raw and drawn opacities of `decoded` by `fade` [A]. rows: number of rows of the whole table."""
     if fade is None or decoded.raw_opacity is None:
         return decoded

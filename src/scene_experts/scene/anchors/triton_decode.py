@@ -51,11 +51,11 @@ def available() -> str | None:
 def covers(attribute: str, h: HeadWeights, F: int, K: int) -> bool:
     """Whether the kernels support a network (two layers, held in registers) and its number of experts."""
     E, H = h.w1.shape[:2]
-    fits = padded(F + 5) <= 64 and padded(H) <= 64 and padded(K * CHANNELS[attribute]) <= WIDEST
+    fits = pad(F + 5) <= 64 and pad(H) <= 64 and pad(K * CHANNELS[attribute]) <= WIDEST
     return h.middle_w is None and fits and E <= MOST_EXPERTS
 
 
-def padded(n: int, least: int = 16) -> int:
+def pad(n: int, least: int = 16) -> int:
     """Return the smallest power of two that is at least n and `least`."""
     return max(least, 1 << (n - 1).bit_length())
 
@@ -132,7 +132,7 @@ def _head(attribute: str, h: HeadWeights, distance: bool, F: int, K: int) -> _He
         raise ValueError(f"expected k between 1 and {E} for {attribute}, found {h.k}")
     sizes: dict[str, Any] = {"E": E, "F": F, "H": H, "K": K, "C": C, "DISTANCE": int(distance), "ROUTED": routed}
     sizes |= {"SPARSE": routed and h.k is not None, "ACT": ACTIVATION[attribute], "COMPACT": attribute != "opacity"}
-    sizes |= {"XP": padded(D + 1), "HP": padded(H), "COLS": padded(K * C), "PRECISION": PRECISION}
+    sizes |= {"XP": pad(D + 1), "HP": pad(H), "COLS": pad(K * C), "PRECISION": PRECISION}
     return _Head(attribute, E, (h.k or 0) if routed else 0, routed, distance, h.position, sizes)
 
 
@@ -165,7 +165,7 @@ class _Decode(torch.autograd.Function):
         source = torch.empty(M, dtype=torch.int64, device=raw.device)
         if M:
             arguments = (plan.rows, plan.xyz, columns[2], columns[1], raw, cov, dst, means, quats, scales, opacities, source, A)
-            _kernels().place[(-(-A // BLOCK),)](*arguments, K=K, B=BLOCK, KP=padded(K, 1))
+            _kernels().place[(-(-A // BLOCK),)](*arguments, K=K, B=BLOCK, KP=pad(K, 1))
         gates, chosen = [r[0] for r in routes], [r[2] for r in routes]
         ctx.plan = plan
         ctx.mark_non_differentiable(source, *(c for c in chosen if c is not None))
@@ -186,7 +186,7 @@ class _Decode(torch.autograd.Function):
         if A:
             given = (plan.rows, columns[2], columns[1], cov, dst, quats, d_means, d_quats, d_scales, d_opacities, d_raw)
             grid = (-(-A // BLOCK),)
-            _kernels().place_backward[grid](*given, d_offsets, d_log_scaling, d_cov, d_all, A, K=K, B=BLOCK, KP=padded(K, 1))
+            _kernels().place_backward[grid](*given, d_offsets, d_log_scaling, d_cov, d_all, A, K=K, B=BLOCK, KP=pad(K, 1))
         d_weights: list[Tensor | None] = []
         for i, d_out in enumerate((d_all, d_cov, d_colors)):
             d_weights += _backward(plan, i, routes[i], columns[0], weights, dst, d_out, d_gates[i], d_feature)
@@ -195,23 +195,23 @@ class _Decode(torch.autograd.Function):
 
 
 def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Tensor | None, ...]:
-    """gates [A, E], mix [A, E] (the gates while dense), chosen [A, k], keys [A] and order [A]; None for what a head has not."""
+    """gates [A, E], weight [A, E] (the gates while dense), chosen [A, k], keys [A] and order [A]; None for what a head has not."""
     if not head.routed:
         return (None,) * 5
     A, device = len(plan.rows), feature.device
     gates = feature.new_empty(A, head.E)
-    mix, chosen, keys = gates, None, None
+    weight, chosen, keys = gates, None, None
     if head.k:
-        mix, chosen = torch.empty_like(gates), torch.empty(A, head.k, dtype=torch.int64, device=device)
+        weight, chosen = torch.empty_like(gates), torch.empty(A, head.k, dtype=torch.int64, device=device)
         keys = torch.empty(A, dtype=torch.int32, device=device)
     if A:
         bias = weights[1]
         sizes = {"F": feature.shape[1], "E": head.E, "TOP": head.k, "BIAS": bias is not None, "POSITION": head.position}
-        sizes |= {"FP": padded(feature.shape[1]), "EP": padded(head.E), "B": BLOCK, "PRECISION": PRECISION}
+        sizes |= {"FP": pad(feature.shape[1]), "EP": pad(head.E), "B": BLOCK, "PRECISION": PRECISION}
         unused = plan.rows  # stands for arrays that a kernel's constants say it does not touch
-        arguments = [plan.rows, plan.xyz, feature, weights[0], bias, gates, mix, chosen, keys]
+        arguments = [plan.rows, plan.xyz, feature, weights[0], bias, gates, weight, chosen, keys]
         _kernels().route[(-(-A // BLOCK),)](*(unused if t is None else t for t in arguments), A, plan.extent, **sizes)
-    return gates, mix, chosen, keys, None if keys is None else plan.order(keys)
+    return gates, weight, chosen, keys, None if keys is None else plan.order(keys)
 
 
 def _forward(plan: _Plan, i: int, routes: Any, feature: Tensor, weights: Any, dst: Tensor, out: Tensor) -> None:
@@ -219,8 +219,8 @@ def _forward(plan: _Plan, i: int, routes: Any, feature: Tensor, weights: Any, ds
     A = len(plan.rows)
     if not out.numel():
         return
-    _, mix, _, keys, order = routes[i]
-    arguments = [plan.rows, order, keys, mix, plan.xyz, feature, plan.camera, *weights[6 * i + 2 : 6 * i + 6], dst, out]
+    _, weight, _, keys, order = routes[i]
+    arguments = [plan.rows, order, keys, weight, plan.xyz, feature, plan.camera, *weights[6 * i + 2 : 6 * i + 6], dst, out]
     _kernels().head_forward[(-(-A // BLOCK),)](*(plan.rows if t is None else t for t in arguments), A, **plan.heads[i].sizes, B=BLOCK)
 
 
@@ -229,15 +229,15 @@ def _backward(
 ) -> list[Tensor | None]:
     """The gradients of attribute i's six tensors; adds its part to `d_feature`."""
     head, own, A = plan.heads[i], weights[6 * i : 6 * i + 6], len(plan.rows)
-    gates, mix, _, keys, order = route
+    gates, weight, _, keys, order = route
     if not A:
         return [None if t is None else torch.zeros_like(t) for t in own]
     d_logits = None if gates is None else torch.empty_like(gates)
-    shared = [plan.rows, order, keys, mix]
+    shared = [plan.rows, order, keys, weight]
     arguments = [*shared, gates, plan.xyz, feature, plan.camera, own[0], *own[2:], dst, d_out, d_gates, d_logits, d_feature]
     grid = (-(-A // BLOCK),)
     _kernels().head_backward[grid](
-        *(plan.rows if t is None else t for t in arguments), A, **head.sizes, B=BLOCK, EP=padded(head.E), POSITION=head.position
+        *(plan.rows if t is None else t for t in arguments), A, **head.sizes, B=BLOCK, EP=pad(head.E), POSITION=head.position
     )
     blocks = -(-A // BLOCK_WEIGHTS)
     parts = [t.new_empty(_parts(t.device, head.E, blocks), *t.shape) for t in own[2:]]

@@ -121,11 +121,11 @@ def outputs(dst, anchor, inside, K: tl.constexpr, C: tl.constexpr, COLS: tl.cons
 
 @triton.jit
 def route(
-    rows, xyz, feature, router_w, router_b, gates, mix, chosen, keys, A, extent,
+    rows, xyz, feature, router_w, router_b, gates, weight, chosen, keys, A, extent,
     F: tl.constexpr, E: tl.constexpr, TOP: tl.constexpr, BIAS: tl.constexpr, POSITION: tl.constexpr,
     B: tl.constexpr, FP: tl.constexpr, EP: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Gates [A, E] (eq. 3); with TOP > 0 also the chosen [A, TOP] (ties to the lowest), their weights `mix` [A, E] (eq. 5) and keys.
+    """Gates [A, E] (eq. 3); with TOP > 0 also the chosen [A, TOP] (ties to the lowest), their `weight` [A, E] (eq. 5) and keys.
 
     POSITION: the router also sees xyz / extent.
     """
@@ -156,13 +156,13 @@ def route(
             key = key | (1 << best)
             logits = tl.where(expert == best[:, None], -float("inf"), logits)
         p = tl.where(((key[:, None] >> expert) & 1) == 1, p, 0.0)
-        tl.store(mix + anchor[:, None] * E + expert, p / tl.sum(p, axis=1)[:, None], mask=there)
+        tl.store(weight + anchor[:, None] * E + expert, p / tl.sum(p, axis=1)[:, None], mask=there)
         tl.store(keys + anchor, key, mask=inside)
 
 
 @triton.jit
 def head_forward(
-    rows, order, keys, mix, xyz, feature, camera, w1, b1, w2, b2, dst, out, A,
+    rows, order, keys, weight, xyz, feature, camera, w1, b1, w2, b2, dst, out, A,
     E: tl.constexpr, F: tl.constexpr, H: tl.constexpr, K: tl.constexpr, C: tl.constexpr,
     DISTANCE: tl.constexpr, ROUTED: tl.constexpr, SPARSE: tl.constexpr, ACT: tl.constexpr, COMPACT: tl.constexpr,
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, PRECISION: tl.constexpr,
@@ -178,7 +178,7 @@ def head_forward(
             w, b = second_layer(w2, b2, e, H, K * C, HP, COLS)
             a = activate(tl.dot(h, w, input_precision=PRECISION) + b[None, :], ACT)
             if ROUTED:
-                a = a * tl.load(mix + anchor * E + e, mask=mine, other=0.0)[:, None]
+                a = a * tl.load(weight + anchor * E + e, mask=mine, other=0.0)[:, None]
             y += tl.where(mine[:, None], a, 0.0)
     at, there = outputs(dst, anchor, inside, K, C, COLS, COMPACT)
     tl.store(out + at, y, mask=there)
@@ -186,7 +186,7 @@ def head_forward(
 
 @triton.jit
 def head_backward(
-    rows, order, keys, mix, gates, xyz, feature, camera, router_w, w1, b1, w2, b2, dst, d_out, d_gates, d_logits, d_feature, A,
+    rows, order, keys, weight, gates, xyz, feature, camera, router_w, w1, b1, w2, b2, dst, d_out, d_gates, d_logits, d_feature, A,
     E: tl.constexpr, F: tl.constexpr, H: tl.constexpr, K: tl.constexpr, C: tl.constexpr,
     DISTANCE: tl.constexpr, ROUTED: tl.constexpr, SPARSE: tl.constexpr, ACT: tl.constexpr, COMPACT: tl.constexpr,
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, EP: tl.constexpr, POSITION: tl.constexpr,
@@ -198,7 +198,7 @@ def head_backward(
     at, there = outputs(dst, anchor, inside, K, C, COLS, COMPACT)
     dy = tl.load(d_out + at, mask=there, other=0.0)
     expert, column = tl.arange(0, EP)[None, :], tl.arange(0, XP)[None, :]
-    dx, d_mix = tl.zeros((B, XP), tl.float32), tl.zeros((B, EP), tl.float32)
+    dx, d_weight = tl.zeros((B, XP), tl.float32), tl.zeros((B, EP), tl.float32)
     for e in range(E):
         mine = members(key, inside, e, SPARSE)
         if tl.max(mine.to(tl.int32), axis=0) > 0:
@@ -208,16 +208,16 @@ def head_backward(
             a = activate(tl.dot(h, w, input_precision=PRECISION) + b[None, :], ACT)
             back = tl.where(mine[:, None], dy, 0.0)
             if ROUTED:
-                d_mix = tl.where((expert == e) & mine[:, None], tl.sum(back * a, axis=1)[:, None], d_mix)
-                back = back * tl.load(mix + anchor * E + e, mask=mine, other=0.0)[:, None]
+                d_weight = tl.where((expert == e) & mine[:, None], tl.sum(back * a, axis=1)[:, None], d_weight)
+                back = back * tl.load(weight + anchor * E + e, mask=mine, other=0.0)[:, None]
             dh = tl.dot(back * slope(a, ACT), tl.trans(w), input_precision=PRECISION)
             dx += tl.dot(tl.where(h > 0, dh, 0.0), tl.trans(first), input_precision=PRECISION)
     if ROUTED:
         real = inside[:, None] & (expert < E)
         g = tl.load(gates + anchor[:, None] * E + expert, mask=real, other=0.0)
-        m = tl.load(mix + anchor[:, None] * E + expert, mask=real, other=0.0)
+        m = tl.load(weight + anchor[:, None] * E + expert, mask=real, other=0.0)
         d_g = tl.load(d_gates + anchor[:, None] * E + expert, mask=real, other=0.0)
-        d_logit = m * (d_mix - tl.sum(m * d_mix, axis=1)[:, None]) + g * (d_g - tl.sum(g * d_g, axis=1)[:, None])  # two softmaxes
+        d_logit = m * (d_weight - tl.sum(m * d_weight, axis=1)[:, None]) + g * (d_g - tl.sum(g * d_g, axis=1)[:, None])  # two softmaxes
         tl.store(d_logits + anchor[:, None] * E + expert, d_logit, mask=real)
         expert_down = tl.arange(0, EP)[:, None]
         r = tl.load(router_w + expert_down * (F + 3 * POSITION) + column, mask=(expert_down < E) & (column < F), other=0.0)
@@ -229,7 +229,7 @@ def head_backward(
 
 @triton.jit
 def weight_backward(
-    rows, order, keys, mix, xyz, feature, camera, w1, b1, w2, b2, dst, d_out, d_w1, d_b1, d_w2, d_b2, A, blocks,
+    rows, order, keys, weight, xyz, feature, camera, w1, b1, w2, b2, dst, d_out, d_w1, d_b1, d_w2, d_b2, A, blocks,
     E: tl.constexpr, F: tl.constexpr, H: tl.constexpr, K: tl.constexpr, C: tl.constexpr,
     DISTANCE: tl.constexpr, ROUTED: tl.constexpr, SPARSE: tl.constexpr, ACT: tl.constexpr, COMPACT: tl.constexpr,
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, PRECISION: tl.constexpr,
@@ -250,7 +250,7 @@ def weight_backward(
             at, there = outputs(dst, anchor, mine, K, C, COLS, COMPACT)
             back = tl.load(d_out + at, mask=there, other=0.0)
             if ROUTED:
-                back = back * tl.load(mix + anchor * E + e, mask=mine, other=0.0)[:, None]
+                back = back * tl.load(weight + anchor * E + e, mask=mine, other=0.0)[:, None]
             back = back * slope(a, ACT)
             sum_b += tl.sum(back, axis=0)
             sum2 += tl.dot(tl.trans(h), back, input_precision=PRECISION)

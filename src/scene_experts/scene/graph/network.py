@@ -50,7 +50,7 @@ class Graph:
         return found, close / total.clamp_min(torch.finfo(close.dtype).tiny)
 
 
-def blended(feature: Tensor, found: Tensor, weight: Tensor, share: float = 0.5) -> Tensor:
+def blend_neighbours(feature: Tensor, found: Tensor, weight: Tensor, share: float = 0.5) -> Tensor:
     """f_u + share * sum_v w_uv h_v, with h_v = max over the points u that have v as a neighbour of (f_v - f_u), element-wise; [A, F].
 
     feature [A, F]; found [A, k] (-1: no neighbour) and weight [A, k] of `Graph.among`. Differentiable in the features. If several

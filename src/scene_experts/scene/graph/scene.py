@@ -30,7 +30,7 @@ from scene_experts.scene.anchors.mlp import CHANNELS
 from scene_experts.scene.anchors.scene import EPS
 from scene_experts.scene.anchors.select import visible_rows
 from scene_experts.scene.graph.hash_grid import Grid, HashGrid
-from scene_experts.scene.graph.network import Graph, blended
+from scene_experts.scene.graph.network import Graph, blend_neighbours
 
 PROBES = 1000  # approximate number of points that `face` evaluates
 HALF = 2  # midpoints lie on a lattice of half the voxel size
@@ -211,13 +211,13 @@ class GraphScene(LatticeScene):
         those of `rows[told]` only, [P, grid + F].
         """
         feature = self.table.params["feature"].index_select(0, rows)
-        near = blended(feature, *self.graph().among(rows), self.config.blend)
+        near = blend_neighbours(feature, *self.graph().among(rows), self.config.blend)
         strongest = feature.amax(0) if len(rows) else feature.new_zeros(self.config.F)
         if told is not None:
             near, rows = near.index_select(0, told), rows.index_select(0, told)
         return torch.cat([self.grid(self.table.facts["xyz"].index_select(0, rows)), near], dim=1), strongest
 
-    def folded(self, weight: Tensor, strongest: Tensor) -> tuple[Tensor, Tensor]:
+    def fold(self, weight: Tensor, strongest: Tensor) -> tuple[Tensor, Tensor]:
         """Fold the affine layer and the shared features into a first layer `weight` [H, 2 F + grid (+ 4 view channels)].
 
         Returns a weight [H, grid + F (+ 4)] and a bias [H] that give weight ([own, strongest] alpha + beta). This avoids scaling
@@ -231,11 +231,11 @@ class GraphScene(LatticeScene):
     def opacity(self, x: Tensor, strongest: Tensor) -> Tensor:
         """Raw opacities [A, 1], in [-1, 1], for the inputs and views x [A, grid + F + 4]."""
         head = self.heads["opacity"]
-        return head.after_first(functional.linear(x, *self.folded(head.layers[0], strongest))).tanh()
+        return head.after_first(functional.linear(x, *self.fold(head.layers[0], strongest))).tanh()
 
     def offset(self, own: Tensor, strongest: Tensor) -> Tensor:
         """Offsets [A, 3], in units of the scaling, for the inputs own [A, grid + F]."""
-        return functional.linear(own, *self.folded(self.offsets.product(), strongest))
+        return functional.linear(own, *self.fold(self.offsets.product(), strongest))
 
     def decode(self, rows: Tensor, camera: Camera) -> Decoded:
         """Decode the given points [A]. Shape and colour are computed only for Gaussians with positive opacity."""
@@ -245,7 +245,7 @@ class GraphScene(LatticeScene):
         keep = (raw > 0).view(-1).nonzero().squeeze(1)
         x, source = x.index_select(0, keep), rows.index_select(0, keep)
         cov, color = (self.heads[name] for name in ("cov", "color"))
-        first = functional.linear(x, *self.folded(torch.cat([cov.layers[0], color.layers[0]]), strongest))  # both in one matrix product
+        first = functional.linear(x, *self.fold(torch.cat([cov.layers[0], color.layers[0]]), strongest))  # both in one matrix product
         shape, rgb = (head.after_first(h) for head, h in zip((cov, color), first.chunk(2, dim=1)))
         scaling = self.table.params["log_scaling"].index_select(0, source).exp()
         offset = self.offset(x[:, : own.shape[1]], strongest) * scaling[:, :3]

@@ -146,7 +146,7 @@ def test_a_published_feature_bank_and_codes_are_drawn(tmp_path, folder):
     scene = AnchorScene(config, wanted.table, VOXEL, 5.0, views=capture.train)
     networks = {a: dict(scene.heads[a].named_parameters()) for a in ("opacity", "cov", "color")}
     torchscript.write(
-        iteration, {**networks, "feature_bank": dict(scene.mix.named_parameters()), "appearance": {"table": scene.codes.table}}
+        iteration, {**networks, "feature_bank": dict(scene.bank.named_parameters()), "appearance": {"table": scene.codes.table}}
     )
     opened = run_folder.open_run(import_files(tmp_path / "result", Data(folder), tmp_path / "run"))
     assert opened.scene.config.appearance == 4 and opened.scene.codes.views == tuple(capture.train)

@@ -71,7 +71,7 @@ def test_positions_move_lengths_scale_and_networks_see_the_files_distances():
     x, y = torch.randn(5, 4), torch.ones(4)
     y[3] = 2.5
     w1 = write.networks(bank.scene, 2.5)["feature_bank.experts.w1"]
-    torch.testing.assert_close(x @ w1[0].T, (x * y) @ bank.scene.mix.w1[0].T)
+    torch.testing.assert_close(x @ w1[0].T, (x * y) @ bank.scene.bank.w1[0].T)
 
 
 def test_the_description_says_experts_phases_and_the_world():

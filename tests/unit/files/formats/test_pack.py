@@ -19,14 +19,14 @@ from support.splat_quanta import scene
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_a_turned_frame_shows_the_same_scene(axis, signs, degree):
     s = scene(40, degree)
-    t = pack.turned(s, axis)
+    t = pack.turn(s, axis)
     turn, look = torch.diag(torch.tensor(signs)), torch.randn(40, 3)
     torch.testing.assert_close(t.means, s.means @ turn)
     unit = lambda x: torch.nn.functional.normalize(x.quats, dim=1)  # noqa: E731
     ours = covariance(unit(s), s.log_scales.exp())
     torch.testing.assert_close(covariance(unit(t), t.log_scales.exp()), turn @ ours @ turn, rtol=1e-4, atol=1e-7)
     torch.testing.assert_close(sh_to_rgb(t.sh, look @ turn, degree), sh_to_rgb(s.sh, look, degree), rtol=1e-4, atol=1e-5)
-    again = pack.turned(t, axis)
+    again = pack.turn(t, axis)
     assert all(torch.equal(getattr(again, name), getattr(s, name)) for name in ("means", "quats", "sh"))
 
 

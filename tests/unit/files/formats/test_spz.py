@@ -46,7 +46,7 @@ def test_old_versions(tmp_path, version):
     s = scene(40, 1)
     raw = gzip.decompress(spz.spz_bytes(s))
     now = spz.decode(spz.spz_bytes(s), tmp_path)
-    flipped = spz.turned(now, "x")
+    flipped = spz.turn(now, "x")
     places = flipped.means.numpy().astype("<f2").tobytes() if version == 1 else raw[16 : 16 + 9 * 40]
     q = torch.nn.functional.normalize(flipped.quats, dim=1)
     q = q * torch.where(q[:, :1] < 0, -1.0, 1.0)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from scene_experts.scene.anchors.levels import Levels, blended, cube, distances, level_count, occupied, whole, within_reach
+from scene_experts.scene.anchors.levels import Levels, blend_levels, cube, distances, level_count, occupied, whole, within_reach
 from support.octree import camera_at, slow_level
 
 LEVELS = Levels(4, 2, 2, 0.8, (-1.0, -1.0, -1.0), 8.0, "round", 0.5, ((0.0, 0.0, -1.0), (0.0, 0.0, -9.0), (3.0, 0.0, 0.5)))
@@ -26,7 +26,7 @@ def test_whole_levels():
     assert whole(asked, "floor", 4).tolist() == [0, 0, 0, 1, 1, 3]
     assert whole(asked, "ceil", 4).tolist() == [0, 1, 1, 2, 2, 3]
     assert whole(asked, "blend", 4).tolist() == [0, 1, 1, 2, 2, 3]
-    torch.testing.assert_close(blended(asked, 4), torch.tensor([0.9999, 1.4, 1.6, 2.2, 2.7, 3.9999]))
+    torch.testing.assert_close(blend_levels(asked, 4), torch.tensor([0.9999, 1.4, 1.6, 2.2, 2.7, 3.9999]))
 
 
 def test_shares_and_weeding_by_counting():

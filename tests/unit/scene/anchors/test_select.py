@@ -9,7 +9,7 @@ from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.levels import Levels
-from scene_experts.scene.anchors.select import AllAnchors, LevelSelector, Octree, faded, visible_rows
+from scene_experts.scene.anchors.select import AllAnchors, LevelSelector, Octree, fade_opacities, visible_rows
 from support.messages import naming
 from support.octree import camera_at, slow_level
 
@@ -69,10 +69,10 @@ def test_levels_are_let_in_one_by_one():
 def test_a_viewer_may_hold_the_level():
     rows, select = table(), LevelSelector(Octree(), LEVELS)
     near = camera_at(2.0, 2.0, 2.0)
-    capped = select.capped(1)(rows, near, 20_000, Mode.DRAW)
+    capped = select.with_cap(1)(rows, near, 20_000, Mode.DRAW)
     assert (rows.facts["level"][capped] <= 1).all() and len(capped) == int((rows.facts["level"] <= 1).sum())
-    assert torch.equal(select.capped(1).capped(None)(rows, near, 20_000, Mode.DRAW), select(rows, near, 20_000, Mode.DRAW))
-    assert len(select.capped(0)(rows, near, 20_000, Mode.DRAW)) == int((rows.facts["level"] == 0).sum())
+    assert torch.equal(select.with_cap(1).with_cap(None)(rows, near, 20_000, Mode.DRAW), select(rows, near, 20_000, Mode.DRAW))
+    assert len(select.with_cap(0)(rows, near, 20_000, Mode.DRAW)) == int((rows.facts["level"] == 0).sum())
 
 
 def test_blending_fades_the_finest_level_in():
@@ -93,10 +93,10 @@ def test_blending_fades_the_finest_level_in():
 def test_fading_scales_raw_and_drawn_opacities():
     g = Gaussians(*(torch.zeros(3, c) for c in (3, 4, 3)), torch.tensor([0.5, 0.25, 1.0]), torch.zeros(3, 3), torch.tensor([4, 5, 8]))
     decoded = Decoded(g, torch.tensor([2, 4]), torch.tensor([[0.5, 0.25], [1.0, -1.0]]), {})
-    out = faded(decoded, torch.tensor([0.5, 0.1]), rows=6, K=2)
+    out = fade_opacities(decoded, torch.tensor([0.5, 0.1]), rows=6, K=2)
     torch.testing.assert_close(out.gaussians.opacities, torch.tensor([0.25, 0.125, 0.1]))
     torch.testing.assert_close(out.raw_opacity, torch.tensor([[0.25, 0.125], [0.1, -0.1]]))
-    assert faded(decoded, None, 6, 2) is decoded
+    assert fade_opacities(decoded, None, 6, 2) is decoded
 
 
 XYZ = torch.rand(300, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * torch.tensor([2.0, 2, 8])
@@ -147,8 +147,8 @@ def test_newborn_anchors_have_the_facts_and_checkpoints_the_levels():
     born = select.places(torch.tensor([[3, 2, 1]]), 0.0, 2)
     assert born.keys() == facts.keys() and born["level"].tolist() == [2] and born["extra_level"].tolist() == [0.0]
     torch.testing.assert_close(born["xyz"], select.lattices.positions(torch.tensor([[3, 2, 1]]), 2))
-    assert Octree().restored(json.loads(json.dumps(select.meta()))) == select
-    assert AllAnchors().meta() == {} and AllAnchors().restored({}) == AllAnchors()
+    assert Octree().restore(json.loads(json.dumps(select.meta()))) == select
+    assert AllAnchors().meta() == {} and AllAnchors().restore({}) == AllAnchors()
 
 
 def test_impossible_numbers_are_refused():

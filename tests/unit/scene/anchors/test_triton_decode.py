@@ -191,7 +191,7 @@ def test_what_does_not_fit_is_refused_or_left_to_torch():
 
 
 def test_tiles_are_powers_of_two():
-    assert [triton_decode.padded(n) for n in (1, 16, 17, 36, 70)] == [16, 16, 32, 64, 128] and triton_decode.padded(5, 1) == 8
+    assert [triton_decode.pad(n) for n in (1, 16, 17, 36, 70)] == [16, 16, 32, 64, 128] and triton_decode.pad(5, 1) == 8
 
 
 def test_absent_triton_is_a_sentence(monkeypatch):

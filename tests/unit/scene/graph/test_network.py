@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from scene_experts.native import library as native
-from scene_experts.scene.graph.network import Graph, blended
+from scene_experts.scene.graph.network import Graph, blend_neighbours
 
 
 def points(n: int = 40, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -38,14 +38,14 @@ def slow(xyz: torch.Tensor, rows: list[int], f: torch.Tensor, k: int, share: flo
 def test_the_blend_is_that_of_the_text(seen, k, share):
     xyz, rows = points(), torch.randperm(40, generator=torch.Generator().manual_seed(1))[:seen].sort().values
     f = features(seen)
-    found = blended(f, *Graph.of(xyz, k).among(rows), share)
+    found = blend_neighbours(f, *Graph.of(xyz, k).among(rows), share)
     torch.testing.assert_close(found, slow(xyz, rows.tolist(), f, k, share))
 
 
 def test_its_gradient_by_finite_differences():
     found, weight = Graph.of(points(), 7).among(torch.arange(0, 40, 2))
     f = features(20, 3).requires_grad_()
-    assert torch.autograd.gradcheck(lambda f: blended(f, found, weight, 0.7), (f,))
+    assert torch.autograd.gradcheck(lambda f: blend_neighbours(f, found, weight, 0.7), (f,))
 
 
 def test_equal_features_share_the_gradient_of_a_minimum():
@@ -54,7 +54,7 @@ def test_equal_features_share_the_gradient_of_a_minimum():
     found, weight = Graph.of(xyz, 2).among(torch.arange(3))
     assert found.tolist() == [[0, 1], [1, 0], [2, 1]]
     f = torch.zeros(3, 1, dtype=torch.float64, requires_grad=True)
-    blended(f, found, weight, 1.0)[0].sum().backward()
+    blend_neighbours(f, found, weight, 1.0)[0].sum().backward()
     # out_0 = f_0 + h_1 / 2 with h_1 = f_1 - min(f_0, f_1, f_2)
     assert f.grad is not None and f.grad.view(-1).tolist() == pytest.approx([1 - 1 / 6, 1 / 2 - 1 / 6, -1 / 6])
 
@@ -71,16 +71,16 @@ def test_few_points(n):
     found, weight = Graph.of(points(n), 10).among(torch.arange(n))
     assert found.shape == weight.shape == (n, max(min(10, n), 1))
     f = features(n)
-    assert torch.isfinite(blended(f, found, weight)).all()
+    assert torch.isfinite(blend_neighbours(f, found, weight)).all()
     if n == 1:
-        assert torch.equal(blended(f, found, weight), f)
+        assert torch.equal(blend_neighbours(f, found, weight), f)
 
 
 def test_points_in_one_place_stay_finite():
     xyz = torch.zeros(4, 3)
     found, weight = Graph.of(xyz, 4).among(torch.arange(4))
     assert torch.isfinite(weight).all() and weight.sum(1).tolist() == pytest.approx([0.25] * 4)
-    assert torch.isfinite(blended(features(4).float(), found, weight)).all()
+    assert torch.isfinite(blend_neighbours(features(4).float(), found, weight)).all()
 
 
 @pytest.mark.skipif(native.load() is None, reason="needs the compiled library")
@@ -91,7 +91,7 @@ def test_the_compiled_form_is_the_plain_one(n, seen, F, monkeypatch):
     up = torch.randn(seen, F)
 
     def both() -> tuple[torch.Tensor, torch.Tensor]:
-        out = blended(f, found, weight)
+        out = blend_neighbours(f, found, weight)
         return out.detach(), torch.autograd.grad(out, f, up)[0]
 
     compiled = both()

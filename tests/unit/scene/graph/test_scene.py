@@ -11,7 +11,7 @@ from scene_experts.geometry.curvature import curvature, find_flat
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.graph.hash_grid import HashGrid
-from scene_experts.scene.graph.network import Graph, blended
+from scene_experts.scene.graph.network import Graph, blend_neighbours
 from scene_experts.scene.graph.scene import GraphPoints, GraphRates, GraphScene
 from support.graph_scenes import CAMERA, cloud, everyone, start_graph
 from support.messages import naming
@@ -64,7 +64,7 @@ def test_no_points_and_points_of_one_voxel():
 def slow(scene: GraphScene, rows: torch.Tensor) -> dict[str, torch.Tensor]:
     """The decode as the text has it, row by row; offsets and all networks for every row."""
     f, xyz, found = scene.table.params["feature"][rows], scene.table.facts["xyz"][rows], {}
-    near = blended(f, *Graph.of(scene.table.facts["xyz"], 10).among(rows), 0.5)
+    near = blend_neighbours(f, *Graph.of(scene.table.facts["xyz"], 10).among(rows), 0.5)
     weights = {k: v.detach() for k, v in scene.network_tensors().items()}
     for i, x in enumerate(xyz):
         encoded = torch.cat([scene.grid(x[None])[0], near[i], f.max(0).values]) * weights["affine.alpha"] + weights["affine.beta"]
