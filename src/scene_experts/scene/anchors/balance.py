@@ -1,8 +1,9 @@
-"""Experts kept in use without a loss (Wang et al. 2024, "Auxiliary-loss-free load balancing strategy for mixture-of-experts").
+"""Load balancing without a loss (Wang et al. 2024, "Auxiliary-loss-free load balancing strategy for mixture-of-experts").
 
 Each expert has a bias b_i that affects only the choice of experts:
     I = Top-k of g_i + b_i,   w_i = g_i / sum_{j in I} g_j,   then   b_i <- b_i + speed sign(mean_j c_j - c_i)
-with c_i the anchors of the view that chose expert i: no gradient of a balancing loss bends the features. L_load is the alternative.
+where c_i is the number of anchors in the view that chose expert i. The features get no gradient from a balancing loss. The alternative
+is the loss L_load.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ class BalancedExperts(Experts):
     """A mixture of experts balanced by biases."""
 
     speed: float = 0.001
-    """Change of a bias per iteration; gates are between 0 and 1."""
+    """Change of a bias per iteration. Gates are between 0 and 1."""
 
     def head(self) -> type[BalancedHead]:
         return BalancedHead
@@ -36,7 +37,7 @@ class BalancedExperts(Experts):
 
 
 class BalancedHead(MixtureHead):
-    """A mixture whose choice is biased. `router_balance` [E] is no parameter of the optimiser: it moves with every training view."""
+    """A mixture that chooses experts by biased gates. The optimiser does not update `router_balance` [E]; every training view does."""
 
     config: BalancedExperts  # type: ignore[assignment]
     router_balance: Tensor
@@ -47,11 +48,11 @@ class BalancedHead(MixtureHead):
         self.moved_at: int | None = None
 
     def choose(self, logits: Tensor, k: int) -> Tensor:
-        """Indices [A, k] of the largest biased gates, largest first."""
+        """Return the indices [A, k] of the largest biased gates, largest first."""
         return top_k(logits.softmax(dim=1) + self.router_balance, k)
 
     def route(self, feature: Tensor, step: int, position: Tensor | None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor]:
-        """Route as `MixtureHead` does. In training, then update the biases once per step."""
+        """Route as `MixtureHead` does. In training, also update the biases once per step."""
         routing, w = super().route(feature, step, position, mode)
         if mode is Mode.TRAIN and routing.chosen is not None and step != self.moved_at:
             count = torch.bincount(routing.chosen.reshape(-1), minlength=self.config.num).to(w.dtype)
@@ -60,4 +61,4 @@ class BalancedHead(MixtureHead):
         return routing, w
 
     def weights(self, step: int) -> None:
-        """None: the kernels choose by the gates alone, so the composed form decodes."""
+        """Return None: the kernels choose experts by unbiased gates, so the composed form decodes."""

@@ -1,9 +1,9 @@
-"""The paper's mixture of experts (section 3.2) on one page: router, dense mixture, Top-k mixture, curriculum.
+"""The mixture of experts of the paper (section 3.2): router, dense mixture, Top-k mixture, curriculum.
 
-Symbols: A anchors, F feature size, D input size, E experts, k chosen. g = softmax(R(f)) (eq. 3) depends on the anchor's feature alone.
+Symbols: A anchors, F feature size, D input size, E experts, k chosen experts. g = softmax(R(f)) (eq. 3) depends only on the feature.
     dense  (eq. 4)  y = sum_i g_i E_i(z)                          for the first `warmup` iterations
-    sparse (eq. 5)  y = sum_{i in Top-k} w_i E_i(z),  w_i = g_i / sum_{j in Top-k} g_j, which is the softmax over the k chosen logits
-The losses that keep experts in use, L_load^S and L_load^D (eq. 6, 7), are in `losses.py`.
+    sparse (eq. 5)  y = sum_{i in Top-k} w_i E_i(z),  w_i = g_i / sum_{j in Top-k} g_j, the softmax over the k chosen logits
+The load-balancing losses L_load^S and L_load^D (eq. 6, 7) are in `losses.py`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""A trained anchor scene prepared for drawing: values independent of the camera are computed once.
+"""A trained anchor scene prepared for drawing: values that do not depend on the camera are computed once.
 
-Routing depends on the anchor alone, so each anchor's experts and their weights are kept. The Gaussians are those of the native decode,
-bit for bit. Symbols as in `types.py`; S experts an anchor (k, or E while dense, or 1).
+Routing depends only on the anchor, so the chosen experts of each anchor and their weights are stored. The Gaussians are the same bits as
+those of the native decode. Symbols as in `types.py`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Kept:
 
 
 class Frozen:
-    """Draws one scene at one step without gradients; routing is left out of what it returns (`AnchorScene.routing` has it)."""
+    """Draws a scene at one step without gradients. The result contains no routing (`AnchorScene.routing` returns it)."""
 
     scene: AnchorScene
     step: int
@@ -61,14 +61,14 @@ class Frozen:
 
     @property
     def bytes(self) -> int:
-        """Memory in bytes in addition to the scene's own."""
+        """Memory in bytes, in addition to that of the scene."""
         return sum(kept.bytes for kept in self.kept) + self.scales.numel() * 4
 
     @torch.no_grad()
     def __call__(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
-        """As `AnchorScene.forward`. Raises ValueError for another step, and for training."""
+        """Do the same as `AnchorScene.forward`. Raises ValueError for another step or another mode than DRAW."""
         if mode is not Mode.DRAW or step != self.step:
-            raise ValueError(f"expected to draw step {self.step}, found {mode} at step {step}; freeze the scene again")
+            raise ValueError(f"expected to draw step {self.step}, found {mode} at step {step}; call `Scene.frozen` again")
         scene = self.scene
         rows = visible_rows(scene.select(scene.table, camera, step, mode), self.xyz, self.scales, camera, cull)
         decoded = self.decode(rows, camera)
@@ -76,7 +76,7 @@ class Frozen:
 
     @torch.no_grad()
     def decode(self, rows: Tensor, camera: Camera) -> Decoded:
-        """The Gaussians of rows [A], as `AnchorScene.decode`."""
+        """Return the Gaussians of rows [A], as `AnchorScene.decode` does."""
         call, alive = self._call(rows, camera.position, self._at(camera))
         call.frozen = 1
         for head, kept in zip(call.heads, self.kept):
@@ -86,19 +86,19 @@ class Frozen:
         return Decoded(Gaussians(*made), rows, raw, {})
 
     def _at(self, camera: Camera) -> dict[str, HeadWeights]:
-        """The heads that `camera` sees: its appearance, where there are any, is a part of the colour's first bias."""
+        """Return the heads for `camera`. Its appearance code, if the scene has codes, is added to the first bias of the colour network."""
         codes = self.scene.codes
         return self.weights if codes is None else {**self.weights, "color": _detach(fold(self.weights["color"], codes(camera, Mode.DRAW)))}
 
     def _call(self, rows: Tensor, position: Tensor, heads: dict[str, HeadWeights]) -> tuple:
-        """Return the library's arguments and the tensors that they point to."""
+        """Return the arguments of the library and the tensors that they point to."""
         plan = native_decode.make_plan(rows, self.xyz, position, heads, self.with_dist, self.scene.extent, False)
         weights = [getattr(heads[a], name) for a in ATTRIBUTES for name in native_decode.TENSORS]
         return native_decode.make_call(plan, self.columns, weights), (plan, weights)
 
     def _keep(self) -> tuple[Kept, ...]:
         heads, N, nowhere = self.weights, len(self.xyz), torch.zeros(3)
-        if self.scene.codes is not None:  # which code does not matter: it touches neither routing nor the feature's part
+        if self.scene.codes is not None:  # any code will do: the routing does not depend on it
             heads = {**heads, "color": _detach(fold(heads["color"], self.scene.codes.table[0]))}
         call, alive = self._call(torch.arange(N), nowhere, heads)
         routed = [h.router_w is not None for h in heads.values()]

@@ -1,8 +1,8 @@
-"""The decode of an anchor scene as one operation of the compiled CPU library: gather -> direction -> routing -> experts -> Gaussians.
+"""Decode of an anchor scene in the compiled CPU library: gather -> direction -> routing -> experts -> Gaussians.
 
-The same mathematics as `AnchorScene.decode_composed` (its oracle), forward and backward, with the anchors of each expert gathered so that
-Top-k costs k networks instead of E. Backward computes the hidden layers again instead of storing them. Gradients are the same bits for
-every number of threads. Symbols as in `types.py`; D inputs, H hidden units and L middle layers of a head.
+Forward and backward compute the same function as `AnchorScene.decode_composed`, the reference. The anchors of each expert are gathered, so
+Top-k evaluates k networks per anchor instead of E. The backward pass recomputes the hidden layers. Gradients are the same bits for every
+number of threads. Symbols as in `types.py`. A head has D inputs, H hidden units and L middle layers.
 """
 
 from __future__ import annotations
@@ -50,12 +50,28 @@ def decode(
     with_dist: dict[str, bool],
     extent: float = 1.0,
 ) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
-    """Gaussians of positive opacity in the order of (row, slot), raw opacities [A, K], and routing of the heads that have a router.
+    """Decode anchors into Gaussians.
 
-    rows [A] int64, each at most once; xyz [N, 3], feature [N, F], log_scaling [N, 6], offsets [N, K, 3], camera_position [3]; heads and
-    with_dist by attribute ("opacity", "cov", "color"), D = F + 3 (+ 1 with the distance); a router that sees positions sees xyz / extent.
-    All float32 on the CPU. Differentiable in feature, log_scaling, offsets and every tensor of the heads; not in xyz and the camera. Raises
-    ValueError for shapes that do not fit, IndexError for rows outside of the table.
+    Differentiable with respect to feature, log_scaling, offsets and the tensors of the heads, but not xyz and the camera. All tensors are
+    float32 on the CPU unless noted.
+
+    Args:
+        rows: [A] int64, without duplicates.
+        xyz: Positions [N, 3].
+        feature: Features [N, F].
+        log_scaling: Logarithms of the scalings [N, 6].
+        offsets: Offsets [N, K, 3].
+        camera_position: Camera centre [3].
+        heads: Tensors of the networks by attribute ("opacity", "cov", "color").
+        with_dist: Whether the network of an attribute receives the distance to the camera.
+        extent: Routers that receive positions receive xyz / extent.
+
+    Returns:
+        The Gaussians of positive opacity, ordered by (row, slot); the raw opacities [A, K]; the routing of the heads that have a router.
+
+    Raises:
+        ValueError: The shapes do not match.
+        IndexError: A row is outside the table.
     """
     found = [heads[a] for a in ATTRIBUTES]
     distance = tuple(int(with_dist[a]) for a in ATTRIBUTES)
@@ -77,7 +93,7 @@ def decode(
 def make_plan(
     rows: Tensor, xyz: Tensor, camera: Tensor, heads: dict[str, HeadWeights], with_dist: dict[str, bool], extent: float, ascending: bool
 ) -> Plan:
-    """Plain values for the library; arguments as those of `decode`."""
+    """Collect the inputs that are not differentiated. The arguments are those of `decode`; ascending: whether `rows` are sorted."""
     found = [heads[a] for a in ATTRIBUTES]
     k = tuple(h.k or 0 if h.router_w is not None else 0 for h in found)
     distance, position = tuple(int(with_dist[a]) for a in ATTRIBUTES), tuple(int(h.position) for h in found)
@@ -117,8 +133,11 @@ def route(call: SeDecode) -> None:
 
 
 def run(call: SeDecode) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor]:
-    """Decodes what `prepared` and `set_routing` put together: the fields of Gaussians, raw opacities [A, K], and for the backward pass the
-    first Gaussian of each chunk and the inverse lengths of the quaternions before their normalisation [M]."""
+    """Decode with the inputs of `make_call` and the outputs of `set_routing`.
+
+    Returns the fields of `Gaussians` and the raw opacities [A, K]; for the backward pass, the first Gaussian of each chunk and the inverse
+    lengths [M] of the quaternions before normalisation.
+    """
     library = native.require()
     raw, starts = torch.empty(call.A, call.K), torch.zeros(library.se_decode_chunks(call.A) + 1, dtype=torch.int64)
     set_pointers(call, raw=raw, starts=starts)
@@ -166,7 +185,7 @@ class _DecodeFunction(torch.autograd.Function):
         set_routing(call, routing[:3], routing[3:6], routing[6:])
         given = [None if g is None else g.contiguous() for g in upstream]
         set_pointers(call, d_means=given[0], d_quats=given[1], d_scales=given[2], d_opacities=given[3], d_colors=given[4], d_raw=given[6])
-        # Ascending rows: the library writes every row of the table, zeros where nothing was seen.
+        # If the rows are sorted, the library writes every row of the gradients, with zeros for rows that are not decoded.
         fresh = torch.empty_like if plan.ascending else torch.zeros_like
         d_columns, d_weights = [fresh(t) for t in columns], [None if t is None else torch.empty_like(t) for t in weights]
         set_pointers(call, d_feature=d_columns[0], d_log_scaling=d_columns[1], d_offsets=d_columns[2])

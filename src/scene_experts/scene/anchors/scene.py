@@ -1,8 +1,8 @@
 """Anchors (Scaffold-GS): select -> cull -> decode -> Gaussians.
 
-An anchor v sits on an integer voxel lattice and carries a feature f, a log-scaling l and K offsets O. Seen from a camera,
-three heads turn (f, viewing direction) into the opacity, covariance and colour of K Gaussians at
-mu = x_v + O_v * exp(l_v)[0:3]  (paper eq. 2). Anchors never move; `strategy.grow` adds and removes them.
+An anchor v lies on an integer voxel lattice. It has a feature f, a log-scaling l and K offsets O. For a camera, three heads compute the
+opacity, covariance and colour of K Gaussians from f and the viewing direction. The Gaussians lie at
+mu = x_v + O_v * exp(l_v)[0:3] (paper eq. 2). Anchors do not move; `strategy.grow` adds and removes them.
 """
 
 from __future__ import annotations

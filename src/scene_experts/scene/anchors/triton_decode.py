@@ -1,8 +1,9 @@
-"""The decode of an anchor scene on CUDA as a few Triton kernels: gather -> direction -> routing -> experts -> Gaussians.
+"""Decode of an anchor scene on CUDA with Triton kernels: gather -> direction -> routing -> experts -> Gaussians.
 
-The same mathematics as `AnchorScene.decode_composed` (its oracle), forward and backward. Anchors are sorted by their set of chosen experts,
-so that Top-k costs k networks instead of E and no [A, k, outputs] is ever stored; the host waits once, for the number of Gaussians.
-Backward computes the hidden layers again. No sum uses atomics: the same inputs give the same bits on one device. Symbols as in `types.py`.
+Forward and backward compute the same function as `AnchorScene.decode_composed`, the reference. Anchors are sorted by their set of chosen
+experts. Top-k therefore evaluates k networks per anchor instead of E, and no tensor [A, k, outputs] is stored. The host waits for the
+device once, for the number of Gaussians. The backward pass recomputes the hidden layers. No sum uses atomics: on one device, the same
+inputs give the same bits. Symbols as in `types.py`.
 """
 
 from __future__ import annotations
@@ -19,21 +20,22 @@ from torch import Tensor
 from scene_experts.core.types import Gaussians, Routing
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, HeadWeights
 
-ACTIVATION = {"opacity": 0, "cov": 1, "color": 2}  # tanh, none, sigmoid of triton_kernels.py
+ACTIVATION = {"opacity": 0, "cov": 1, "color": 2}  # TANH, NONE, SIGMOID of triton_kernels.py
 TENSORS = ("router_w", "router_b", "w1", "b1", "w2", "b2")
-PRECISION = "ieee"  # of the products: "ieee" is float32 throughout, "tf32x3" nearly so on tensor cores, "tf32" is not
-BLOCK = 32  # anchors a program works on: with the paper's sizes the largest that keeps (nearly) all in registers
-BLOCK_WEIGHTS = 16  # the same in the kernel of the weights' gradients, which holds a network's gradient in registers
-MOST_EXPERTS = 30  # a set of experts is the bits of an int32
-WIDEST = 256  # outputs, padded
+PRECISION = "ieee"  # of matrix products: "ieee" is float32, "tf32x3" is nearly float32 on tensor cores, "tf32" is less precise
+BLOCK = 32  # anchors per program; with the paper's sizes, the largest block whose tiles fit in registers
+BLOCK_WEIGHTS = 16  # anchors per step of `weight_backward`, which also keeps the gradient of a network in registers
+MOST_EXPERTS = 30  # a set of experts is stored as the bits of an int32
+WIDEST = 256  # largest padded number of outputs
 
 
 @functools.cache
 def available() -> str | None:
-    """None where the kernels can run; else one sentence that says why not and what to do. A CUDA device is not asked for."""
+    """Return None if the kernels can run, otherwise one sentence with the reason and the remedy. Without a CUDA device, only the import is
+    checked."""
     try:
         importlib.import_module("triton")
-    except Exception as error:  # a broken installation raises almost anything
+    except Exception as error:  # a broken installation can raise any exception
         reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
         return f"triton cannot be imported ({reason[0]}): install it with `pip install scene-experts[cuda]`, or decode in plain torch"
     if not torch.cuda.is_available():
@@ -84,7 +86,7 @@ class _Plan:
     extent: float
 
     def order(self, keys: Tensor) -> Tensor:
-        """The anchors sorted by their sets of experts, [A] int64."""
+        """Return the indices [A] int64 that sort the anchors by their sets of experts."""
         return keys.argsort(stable=True)
 
 
@@ -99,12 +101,27 @@ def decode(
     with_dist: dict[str, bool],
     extent: float = 1.0,
 ) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
-    """Gaussians of positive opacity in the order of (row, slot), raw opacities [A, K], and routing of the heads that have a router.
+    """Decode anchors into Gaussians.
 
-    rows [A] int64, each at most once and inside of the table (not checked: that would wait for the device); xyz [N, 3], feature [N, F],
-    log_scaling [N, 6], offsets [N, K, 3], camera_position [3]; heads and with_dist by attribute ("opacity", "cov", "color"), D = F + 3
-    (+ 1 with the distance); a router that sees positions sees xyz / extent. All float32 on one device. Differentiable in feature,
-    log_scaling, offsets and every tensor of the heads; not in xyz and the camera. Raises ValueError for shapes that do not fit.
+    Differentiable with respect to feature, log_scaling, offsets and the tensors of the heads, but not xyz and the camera. All tensors are
+    float32 on one device unless noted.
+
+    Args:
+        rows: [A] int64, without duplicates and inside the table. This is not checked, because the check would wait for the device.
+        xyz: Positions [N, 3].
+        feature: Features [N, F].
+        log_scaling: Logarithms of the scalings [N, 6].
+        offsets: Offsets [N, K, 3].
+        camera_position: Camera centre [3].
+        heads: Tensors of the networks by attribute ("opacity", "cov", "color").
+        with_dist: Whether the network of an attribute receives the distance to the camera.
+        extent: Routers that receive positions receive xyz / extent.
+
+    Returns:
+        The Gaussians of positive opacity, ordered by (row, slot); the raw opacities [A, K]; the routing of the heads that have a router.
+
+    Raises:
+        ValueError: The shapes do not match, or the kernels do not support a network.
     """
     F, K = feature.shape[1], offsets.shape[1]
     made = tuple(_head(a, heads[a], with_dist[a], F, K) for a in ATTRIBUTES)
@@ -141,7 +158,7 @@ def _kernels() -> ModuleType:
 
 
 def _parts(device: torch.device, experts: int, blocks: int) -> int:
-    """Programs that share the weights' gradient of one expert: enough for the device, the same number on every run."""
+    """Number of programs that share the weight gradients of one expert. It depends only on the device, the experts and the blocks."""
     units = torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 2
     return max(1, min(blocks, 2 * units // experts))
 
@@ -156,7 +173,7 @@ class _Decode(torch.autograd.Function):
         raw = feature.new_empty(A, K)
         _forward(plan, 0, routes, columns[0], weights, raw, raw)
         counted = (raw > 0).view(-1).cumsum(0, dtype=torch.int32)
-        M = int(counted[-1]) if A else 0  # the one place where the host waits for the device
+        M = int(counted[-1]) if A else 0  # the host waits for the device only here
         dst = torch.where(raw.view(-1) > 0, counted - 1, -1)
         cov, colors = feature.new_empty(M, 7), feature.new_empty(M, 3)
         _forward(plan, 1, routes, columns[0], weights, dst, cov)
@@ -195,7 +212,7 @@ class _Decode(torch.autograd.Function):
 
 
 def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Tensor | None, ...]:
-    """gates [A, E], weight [A, E] (the gates while dense), chosen [A, k], keys [A] and order [A]; None for what a head has not."""
+    """Return gates [A, E], weights [A, E] (the gates while dense), chosen experts [A, k], keys [A], order [A]. None: unused."""
     if not head.routed:
         return (None,) * 5
     A, device = len(plan.rows), feature.device
@@ -208,7 +225,7 @@ def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Ten
         bias = weights[1]
         sizes = {"F": feature.shape[1], "E": head.E, "TOP": head.k, "BIAS": bias is not None, "POSITION": head.position}
         sizes |= {"FP": pad(feature.shape[1]), "EP": pad(head.E), "B": BLOCK, "PRECISION": PRECISION}
-        unused = plan.rows  # stands for arrays that a kernel's constants say it does not touch
+        unused = plan.rows  # placeholder for arrays that the kernel does not access
         arguments = [plan.rows, plan.xyz, feature, weights[0], bias, gates, weight, chosen, keys]
         _kernels().route[(-(-A // BLOCK),)](*(unused if t is None else t for t in arguments), A, plan.extent, **sizes)
     return gates, weight, chosen, keys, None if keys is None else plan.order(keys)
@@ -227,7 +244,7 @@ def _forward(plan: _Plan, i: int, routes: Any, feature: Tensor, weights: Any, ds
 def _backward(
     plan: _Plan, i: int, route: Any, feature: Tensor, weights: Any, dst: Tensor, d_out: Tensor, d_gates: Tensor | None, d_feature: Tensor
 ) -> list[Tensor | None]:
-    """The gradients of attribute i's six tensors; adds its part to `d_feature`."""
+    """Return the gradients of the six tensors of attribute i, and add its part to `d_feature`."""
     head, own, A = plan.heads[i], weights[6 * i : 6 * i + 6], len(plan.rows)
     gates, weight, _, keys, order = route
     if not A:

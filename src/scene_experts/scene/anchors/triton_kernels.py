@@ -1,11 +1,13 @@
 # pyright: basic, reportMissingImports=false
 """Triton kernels of the CUDA decode; `triton_decode` calls them. This file alone imports triton.
 
-A program works on a block of B anchors. Anchors come sorted by their set of chosen experts, so that a block needs k experts, two sets at
-a border, and mixes them in registers; no sum is made with atomics, so that results are the same bits from run to run.
-Tiles are padded to powers of two: XP inputs, HP hidden units, COLS outputs, EP experts, KP slots. A network's input is
-x = (feature, unit direction, distance if any, 1), the 1 for the bias, so that one product makes the first layer and one its gradient.
-Activations: TANH, NONE, SIGMOID. `dst` [A * K] is the place of a slot among the drawn Gaussians, -1 for one that is not drawn.
+Each program processes a block of B anchors. The anchors are sorted by their set of chosen experts. Most blocks therefore evaluate only
+k experts, and the program mixes their outputs in registers. No sum uses atomics, so the results are the same bits in every run.
+
+Tiles are padded to powers of two: XP inputs, HP hidden units, COLS outputs, EP experts, KP slots. The input of a network is
+x = (feature, unit direction, distance if used, 1). The 1 multiplies the bias, so one matrix product computes the first layer and one
+its gradient. Activations: TANH, NONE, SIGMOID. `dst` [A * K] is the index of each slot among the drawn Gaussians, or -1 if the slot is
+not drawn.
 """
 
 from __future__ import annotations
@@ -14,18 +16,18 @@ import triton
 import triton.language as tl
 
 TANH, NONE, SIGMOID = 0, 1, 2
-EPS = tl.constexpr(1e-12)  # keeps directions and quaternions finite where their length is 0, as `anchors.EPS` does
+EPS = tl.constexpr(1e-12)  # keeps directions and quaternions finite if their length is 0; equals EPS of scene.py
 
 
 @triton.jit
 def probe(to):
-    """Writes a 1: whether anything can be compiled and run here."""
+    """Write a 1. The call shows whether kernels compile and run on this machine."""
     tl.store(to, 1.0)
 
 
 @triton.jit
 def activate(y, ACT: tl.constexpr):
-    """The last layer's activation. tanh keeps its relative precision at 0 (a polynomial fitted on [0, 0.625], relative error 8e-8)."""
+    """Activation of the last layer. Near 0, tanh is a polynomial fitted on [0, 0.625] with a relative error of 8e-8."""
     if ACT == 0:
         z = y * y
         small = y + y * z * (-0.3333328 + z * (0.13331442 + z * (-0.05373971 + z * (0.020639075 - 0.0057049743 * z))))
@@ -38,7 +40,7 @@ def activate(y, ACT: tl.constexpr):
 
 @triton.jit
 def slope(a, ACT: tl.constexpr):
-    """The activation's derivative, from its value."""
+    """Derivative of the activation, computed from its value `a`."""
     if ACT == 0:
         return 1.0 - a * a
     if ACT == 2:
@@ -48,7 +50,7 @@ def slope(a, ACT: tl.constexpr):
 
 @triton.jit
 def inputs(feature, xyz, camera, row, mine, F: tl.constexpr, DISTANCE: tl.constexpr, XP: tl.constexpr):
-    """x [B, XP] of the anchors at `row` [B] of the table; 0 where not `mine` [B], so that what is broken there stays there."""
+    """Inputs x [B, XP] of the anchors in rows `row` [B] of the table. Rows outside the mask `mine` [B] are 0: NaN there does not spread."""
     column = tl.arange(0, XP)[None, :]
     x = tl.load(feature + row[:, None] * F + column, mask=mine[:, None] & (column < F), other=0.0)
     vx = tl.load(xyz + row * 3, mask=mine, other=0.0) - tl.load(camera)
@@ -67,7 +69,7 @@ def inputs(feature, xyz, camera, row, mine, F: tl.constexpr, DISTANCE: tl.conste
 
 @triton.jit
 def first_layer(w1, b1, e, H: tl.constexpr, D: tl.constexpr, HP: tl.constexpr, XP: tl.constexpr):
-    """Weights of expert e as [XP, HP], the bias in row D."""
+    """Weights [XP, HP] of the first layer of expert e. Row D is the bias."""
     column, unit = tl.arange(0, XP)[:, None], tl.arange(0, HP)[None, :]
     w = tl.load(w1 + (e * H + unit) * D + column, mask=(column < D) & (unit < H), other=0.0)
     b = tl.load(b1 + e * H + unit, mask=unit < H, other=0.0)
@@ -76,7 +78,7 @@ def first_layer(w1, b1, e, H: tl.constexpr, D: tl.constexpr, HP: tl.constexpr, X
 
 @triton.jit
 def second_layer(w2, b2, e, H: tl.constexpr, OUT: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr):
-    """Weights of expert e as [HP, COLS] and its bias [COLS]."""
+    """Weights [HP, COLS] and bias [COLS] of the second layer of expert e."""
     unit, column = tl.arange(0, HP)[:, None], tl.arange(0, COLS)
     w = tl.load(w2 + (e * OUT + column[None, :]) * H + unit, mask=(unit < H) & (column[None, :] < OUT), other=0.0)
     return w, tl.load(b2 + e * OUT + column, mask=column < OUT, other=0.0)
@@ -84,12 +86,12 @@ def second_layer(w2, b2, e, H: tl.constexpr, OUT: tl.constexpr, HP: tl.constexpr
 
 @triton.jit
 def relu(z):
-    return tl.where(z < 0, 0.0, z)  # not a maximum, which would hide what is no number
+    return tl.where(z < 0, 0.0, z)  # maximum would replace NaN by 0
 
 
 @triton.jit
 def members(key, inside, e, SPARSE: tl.constexpr):
-    """Mask [B] of the block's anchors that expert e decodes; `key` [B] has a bit for each chosen expert."""
+    """Mask [B] of the anchors in the block that expert e decodes. Bit e of `key` [B] is set if expert e is chosen."""
     if SPARSE:
         inside = inside & (((key >> e) & 1) == 1)
     return inside
@@ -97,7 +99,7 @@ def members(key, inside, e, SPARSE: tl.constexpr):
 
 @triton.jit
 def block_of(order, keys, rows, block, A, B: tl.constexpr, SPARSE: tl.constexpr):
-    """The block's anchors [B] (places in `rows`), their rows of the table, their keys, and which of them exist."""
+    """Anchors of a block: indices into `rows`, rows of the table, keys, and a mask of those that exist, [B] each."""
     place = block * B + tl.arange(0, B)
     inside = place < A
     anchor, key = place.to(tl.int64), place
@@ -109,7 +111,7 @@ def block_of(order, keys, rows, block, A, B: tl.constexpr, SPARSE: tl.constexpr)
 
 @triton.jit
 def outputs(dst, anchor, inside, K: tl.constexpr, C: tl.constexpr, COLS: tl.constexpr, COMPACT: tl.constexpr):
-    """Where the K * C outputs of each anchor lie, [B, COLS], and which of them exist: one place per drawn Gaussian, or one per slot."""
+    """Addresses [B, COLS] of the K * C outputs of each anchor, and a mask. COMPACT: drawn Gaussians only, otherwise all slots."""
     column = tl.arange(0, COLS)[None, :]
     there = inside[:, None] & (column < K * C)
     at = anchor[:, None] * (K * C) + column
@@ -125,9 +127,9 @@ def route(
     F: tl.constexpr, E: tl.constexpr, TOP: tl.constexpr, BIAS: tl.constexpr, POSITION: tl.constexpr,
     B: tl.constexpr, FP: tl.constexpr, EP: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Gates [A, E] (eq. 3); with TOP > 0 also the chosen [A, TOP] (ties to the lowest), their `weight` [A, E] (eq. 5) and keys.
+    """Compute the gates [A, E] (eq. 3). If TOP > 0, also the chosen experts [A, TOP], their weights [A, E] (eq. 5) and the keys [A].
 
-    POSITION: the router also sees xyz / extent.
+    Ties go to the lowest index. POSITION: the router also receives xyz / extent.
     """
     anchor = tl.program_id(0) * B + tl.arange(0, B)
     inside = anchor < A
@@ -151,7 +153,7 @@ def route(
     if TOP > 0:
         key = tl.zeros((B,), tl.int32)
         for j in tl.static_range(TOP):
-            best = tl.minimum(tl.argmax(logits, axis=1), E - 1)  # what is no number must not choose an expert that is not there
+            best = tl.minimum(tl.argmax(logits, axis=1), E - 1)  # keeps the index in range if a logit is NaN
             tl.store(chosen + anchor * TOP + j, best.to(tl.int64), mask=inside)
             key = key | (1 << best)
             logits = tl.where(expert == best[:, None], -float("inf"), logits)
@@ -167,7 +169,7 @@ def head_forward(
     DISTANCE: tl.constexpr, ROUTED: tl.constexpr, SPARSE: tl.constexpr, ACT: tl.constexpr, COMPACT: tl.constexpr,
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """One attribute of a block of anchors: gather, direction, the experts of the block, mixture; written to `out`."""
+    """Compute one attribute of a block of anchors (gather, direction, experts, mixture) and write it to `out`."""
     anchor, row, key, inside = block_of(order, keys, rows, tl.program_id(0), A, B, SPARSE)
     x = inputs(feature, xyz, camera, row, inside, F, DISTANCE, XP)
     y = tl.zeros((B, COLS), tl.float32)
@@ -192,7 +194,7 @@ def head_backward(
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, EP: tl.constexpr, POSITION: tl.constexpr,
     PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """What one attribute adds to the features' gradient (through networks and router), and the logits' gradient [A, E]."""
+    """Add the gradient of one attribute, through networks and router, to `d_feature`. Write the gradient of the logits [A, E]."""
     anchor, row, key, inside = block_of(order, keys, rows, tl.program_id(0), A, B, SPARSE)
     x = inputs(feature, xyz, camera, row, inside, F, DISTANCE, XP)
     at, there = outputs(dst, anchor, inside, K, C, COLS, COMPACT)
@@ -234,7 +236,7 @@ def weight_backward(
     DISTANCE: tl.constexpr, ROUTED: tl.constexpr, SPARSE: tl.constexpr, ACT: tl.constexpr, COMPACT: tl.constexpr,
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Program (e, p) adds up the weights' gradient of expert e over every P-th block: part p of d_w1 [P, E, H, D] and the others."""
+    """Program (e, p) sums the weight gradients of expert e over every P-th block. It writes part p of d_w1 [P, E, H, D] etc."""
     e, part = tl.program_id(0), tl.program_id(1)
     D: tl.constexpr = F + 3 + DISTANCE
     first = first_layer(w1, b1, e, H, D, HP, XP)
@@ -271,7 +273,7 @@ def place(
     rows, xyz, offsets, log_scaling, raw, cov, dst, means, quats, scales, opacities, source, A,
     K: tl.constexpr, B: tl.constexpr, KP: tl.constexpr,
 ):  # fmt: skip
-    """The drawn Gaussians but for their colours: means (eq. 2), scales and unit quaternions from `cov` [M, 7], opacities, sources."""
+    """Write the drawn Gaussians except their colours: means (eq. 2), scales and unit quaternions from `cov` [M, 7], opacities, sources."""
     anchor = tl.program_id(0) * B + tl.arange(0, B)
     inside = anchor < A
     row = tl.load(rows + anchor, mask=inside, other=0)
@@ -304,7 +306,7 @@ def place_backward(
     d_offsets, d_log_scaling, d_cov, d_opacity_head, A,
     K: tl.constexpr, B: tl.constexpr, KP: tl.constexpr,
 ):  # fmt: skip
-    """From the Gaussians' gradients those of offsets, log-scaling, `cov` [M, 7] and of every slot's opacity [A, K]."""
+    """Compute the gradients of offsets, log-scaling, `cov` [M, 7] and the opacities [A, K] of all slots from those of the Gaussians."""
     anchor = tl.program_id(0) * B + tl.arange(0, B)
     inside = anchor < A
     row = tl.load(rows + anchor, mask=inside, other=0)
