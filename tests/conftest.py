@@ -1,4 +1,4 @@
-"""What every test shares: one thread, the markers that depend on the place or the machine, and the number of processes."""
+"""Settings of all tests: one thread, markers that depend on the folder or the machine, and the number of processes."""
 
 import math
 import os
@@ -28,7 +28,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def cores() -> int:
-    """The cores that this process may use: those it is bound to, less where its container has a smaller quota."""
+    """Return the number of cores that this process may use: its CPU affinity, limited by the quota of its container."""
     bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()

@@ -1,4 +1,4 @@
-"""No module imports itself through others: the imports at module level form no circle."""
+"""Imports at module level form no circle."""
 
 import ast
 from collections.abc import Iterator
@@ -53,7 +53,7 @@ def graph(root: Path) -> dict[str, set[str]]:
 
 
 def circle(edges: dict[str, set[str]]) -> list[str]:
-    """One circle of imports, its first module named again at the end; empty where there is none."""
+    """Return one circle of imports with its first module repeated at the end, or an empty list."""
     done: set[str] = set()
 
     def visit(name: str, path: list[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""The capture made in code is what it claims to be."""
+"""The synthetic capture has the properties that its documentation states."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def oracle(rows, columns, camera, heads, with_dist):
 
 
 def leaves(columns, heads):
-    """What is differentiated, as fresh leaves by name, and the same structures made of them."""
+    """Return new leaf tensors by name, and the same structures built from them."""
     columns = {name: v.clone().requires_grad_(name != "xyz") for name, v in columns.items()}
     heads = {
         a: replace(h, **{n: v.clone().requires_grad_() for n, v in vars(h).items() if isinstance(v, torch.Tensor)})
@@ -101,7 +101,7 @@ def leaves(columns, heads):
 
 
 def objective(gaussians, raw, gates, seed=5):
-    """A random linear function of everything differentiable, so that every gradient is tried."""
+    """Return a random linear function of all differentiable outputs, so that every gradient is tested."""
     g = torch.Generator().manual_seed(seed)
     values = [
         gaussians.means,

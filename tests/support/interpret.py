@@ -1,4 +1,4 @@
-"""Where the tests of the Triton kernels run: on the GPU where there is one, else in Triton's interpreter on the CPU."""
+"""Run tests of the Triton kernels on the GPU if there is one, otherwise in Triton's interpreter on the CPU."""
 
 import os
 
@@ -9,7 +9,7 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def kernels():
-    """The module of kernels, made for DEVICE. Skips the test where triton is not installed (it is no part of `make test`)."""
+    """Import the kernels for DEVICE. Skips the test if triton is not installed (`make test` does not need it)."""
     if DEVICE == "cpu":
         os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined
     pytest.importorskip("triton", reason="triton is not installed")

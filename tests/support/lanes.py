@@ -1,4 +1,4 @@
-"""Parametrised tests of which a few cases are fast and stand for the others in `make test-fast`."""
+"""Parametrised tests with a few fast cases, which `make test-fast` runs."""
 
 from collections.abc import Iterable
 

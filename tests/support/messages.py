@@ -1,4 +1,4 @@
-"""What a test may ask of an error message: the facts in it, not its wording."""
+"""Check the facts in an error message and not its wording."""
 
 import re
 

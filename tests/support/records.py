@@ -1,4 +1,4 @@
-"""Records of runs made up for tests: scores that are known."""
+"""Records of invented runs with known scores."""
 
 from dataclasses import replace
 from pathlib import Path

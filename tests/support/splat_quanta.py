@@ -1,4 +1,4 @@
-"""Gaussians to write, and how near to them each format's file must be: its quantum, from the format's own bit widths."""
+"""Test Gaussians, and the largest rounding error of each format, computed from its bit widths."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scene_experts.geometry.sh import C0
 
 
 def scene(n: int = 700, degree: int = 3, seed: int = 0, size: float = 3.0) -> Splats:
-    """Gaussians with values such as trained ones have."""
+    """Gaussians with values like those of a trained scene."""
     g = torch.Generator().manual_seed(seed)
     new = lambda *shape: torch.randn(*shape, generator=g)  # noqa: E731
     sh = torch.cat([new(n, 1, 3), 0.15 * new(n, (degree + 1) ** 2 - 1, 3)], 1)
@@ -32,7 +32,7 @@ def in_file_order(format: str, s: Splats) -> Splats:
 
 
 def differences(found: Splats, wanted: Splats) -> dict[str, Tensor]:
-    """|found - wanted| of every attribute: opacities as such, quaternions of length 1 and up to their sign."""
+    """Return |found - wanted| of every attribute. Opacities are compared after the sigmoid, unit quaternions up to their sign."""
     q, p = (functional.normalize(x.quats.double(), dim=1) for x in (found, wanted))
     return {
         "means": (found.means.double() - wanted.means.double()).abs(),
@@ -44,7 +44,7 @@ def differences(found: Splats, wanted: Splats) -> dict[str, Tensor]:
 
 
 def quanta(format: str, s: Splats) -> dict[str, Tensor | float]:
-    """The largest difference that the format's rounding may make, for rows in file order; `sh` for as many harmonics as the file has."""
+    """Return the largest rounding error of the format, for rows in the order of the file. `sh` covers the harmonics in the file."""
     float32 = {"means": 0.0, "log_scales": 2e-5, "opacity": 1e-6, "quats": 1e-6, "sh": 0.0}
     if format in ("ply", "glb"):
         return float32
@@ -52,7 +52,7 @@ def quanta(format: str, s: Splats) -> dict[str, Tensor | float]:
 
 
 def _splat(s: Splats) -> dict[str, Tensor | float]:
-    # readers differ by half a step in what a byte of a quaternion means
+    # readers differ by half a step in how they decode the bytes of a quaternion
     dc = s.sh[:, :1].double()
     beyond = (dc.abs() - 0.5 / C0).clamp_min(0)  # colours are cut to 0 .. 1
     return {"means": 0.0, "log_scales": 2e-5, "opacity": 0.51 / 255, "quats": 2 * 1.02 / 127, "sh": 0.51 / 255 / C0 + beyond}

@@ -6,7 +6,7 @@ from scene_experts.files.formats.splats import Splats
 
 
 def splats(n=5, degree=3, seed=0) -> Splats:
-    """n Gaussians whose every value is drawn from a normal distribution."""
+    """Return n Gaussians with normally distributed values."""
     g = torch.Generator().manual_seed(seed)
     new = lambda *shape: torch.randn(*shape, generator=g)  # noqa: E731
     return Splats(new(n, 3), new(n, 3), new(n, 4), new(n), new(n, (degree + 1) ** 2, 3))

@@ -1,4 +1,4 @@
-"""A web server on this machine for tests of downloads: with and without ranges, cutting answers short, redirecting, sending web pages."""
+"""A local web server for tests of downloads: range requests, truncated answers, redirects, web pages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 
 class Server(ThreadingHTTPServer):
-    """Serves `files`; `cuts` end one answer each after so many bytes, `ranges` says whether it can continue one."""
+    """Serves `files`. Each number in `cuts` ends one answer after that many bytes. ranges: whether it supports range requests."""
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: help, one-sentence errors, exit codes."""
+"""The command line: help, one-sentence errors, exit codes."""
 
 import json
 import re
@@ -100,7 +100,7 @@ WRONG = {
 @pytest.mark.parametrize("case", list(WRONG))
 @pytest.mark.parametrize("command", [*(name for name in COMMANDS), "train moe-gs", "train 3dgs", "trian", "train moegs"])
 def test_words_that_do_not_fit_are_one_sentence(command, case, capsys):
-    """Some of these words are right for some commands: none of the commands here can succeed, for their files are absent."""
+    """Some of these options are valid for some commands. No command can succeed, because the files do not exist."""
     if (command, case) in RUNS_WITHOUT_WORDS:
         return
     code, out, err = run(capsys, *command.split(), *WRONG[case])

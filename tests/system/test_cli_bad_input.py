@@ -149,7 +149,7 @@ def test_captures(case, capture, tmp_path, capsys):
 
 
 def test_a_photograph_that_breaks_while_training(capture, tmp_path, capsys):
-    """JPEG headers are whole where the pixels are not: it shows when the view's turn comes, and what was saved stays."""
+    """A photograph with a valid header and damaged pixels fails when its view is used. Saved checkpoints remain."""
     from PIL import Image
 
     for i in range(9):

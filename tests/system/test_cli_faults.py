@@ -1,4 +1,4 @@
-"""What happens to a run when its machine fails it: the disk fills up, the process is killed."""
+"""A run survives a full disk and a killed process."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from support.places import DEMO
 from support.trainings import assert_same, events, last_tensors
 
 BUDDHA = DEMO / "buddha"
-LAST, STOP = 40, 14  # rows are adjusted on both sides of the stop and statistics half gathered at it; Top-k and all levels are in use
+LAST, STOP = 40, 14  # densification runs before and after the stop; Top-k and all levels are in use
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def buddha():
 
 
 def short(recipe: str) -> Train:
-    """The whole schedule in 40 iterations, rows adjusted every fourth instead of every hundredth."""
+    """The whole schedule in 40 iterations, with densification every 4 instead of every 100 iterations."""
     cfg = replace(RECIPES[recipe][1], iterations=LAST)
     return replace(cfg, growth=replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=4)))
 

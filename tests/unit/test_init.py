@@ -1,4 +1,4 @@
-"""What `import scene_experts` gives, and how little it costs."""
+"""The names and the cost of `import scene_experts`."""
 
 import ast
 import inspect

@@ -37,7 +37,7 @@ class Whole:
 
 def test_names_defaults_and_places():
     table = {row.flag: row for row in rows(Whole, {})}
-    assert list(table) == ["--data", "--max-views", "--part.edge"]  # a part that may be absent, and is, has no options
+    assert list(table) == ["--data", "--max-views", "--part.edge"]  # an optional part that is absent has no options
     assert table["--data"].required and table["--data"].default is MISSING and table["--data"].names == ("--data", "-s")
     assert table["--part.edge"].place == ("part", "edge") and table["--part.edge"].default == 0.5 and table["--part.edge"].owner is Small
 

@@ -1,4 +1,4 @@
-"""Words to values."""
+"""Convert the words of a command line to values."""
 
 from pathlib import Path
 from typing import Literal

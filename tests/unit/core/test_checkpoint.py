@@ -195,7 +195,7 @@ for line in sys.stdin:  # one child per line: saves without pause from that step
 
 @pytest.mark.slow
 def test_killed_at_random_points_of_saving_nothing_is_lost(tmp_path):
-    """A process that saves without pause is killed with SIGKILL: what it had reported as saved is still there, whole."""
+    """After SIGKILL of a process that saves continuously, every checkpoint that it reported is complete."""
     rng, step, midway = random.Random(0), 1, 0
     server = subprocess.Popen([sys.executable, "-c", SAVER, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert server.stdin is not None and server.stdout is not None

@@ -178,7 +178,7 @@ def test_gradients_are_those_of_finite_differences(antialias: bool, center: tupl
     g = join(g, wide, flat)
     inputs = [x.clone().requires_grad_() for x in (g.means, g.quats, g.scales, g.opacities, g.colors, torch.rand(3, dtype=F64))]
 
-    # Every input against random sums of the outputs: as strict as output by output, in a hundredth of the backward passes.
+    # Gradients of random sums of the outputs: as strict as output by output, with a hundredth of the backward passes.
     gen = torch.Generator().manual_seed(1)
     mixes = [torch.randn(6, 17 * 13 * channels, generator=gen, dtype=F64) for channels in (3, 1, 1)]
 

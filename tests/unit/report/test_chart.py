@@ -1,4 +1,4 @@
-"""Charts: every point where the axes say it is; nothing where there is nothing to draw."""
+"""Charts: points lie where the axes say. Without data, nothing is drawn."""
 
 import itertools
 import re

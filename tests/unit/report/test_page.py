@@ -1,4 +1,4 @@
-"""The page: whole, self-contained, of one run and of several."""
+"""The report of one run and of several is complete and self-contained."""
 
 import base64
 import io

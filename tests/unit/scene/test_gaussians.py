@@ -1,4 +1,4 @@
-"""Explicit Gaussians: how they start, what a camera sees of them, and that nothing it would draw is left out."""
+"""Explicit Gaussians: initialisation, and visibility, which misses no Gaussian that would be drawn."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Every recipe's scene keeps the interface: it starts from points, decodes, and is built again from its table and plain values."""
+"""The scene of every recipe implements the interface: it starts from points, decodes, and is restored from its table and metadata."""
 
 from dataclasses import fields, is_dataclass
 

@@ -1,4 +1,4 @@
-"""What every anchor method's density control shares; the rules of growth have their own files."""
+"""Density control that all anchor methods share. The growth rules have their own files."""
 
 import math
 from dataclasses import replace

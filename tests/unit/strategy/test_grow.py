@@ -1,4 +1,4 @@
-"""Growing and pruning against a slow reading of Scaffold-GS's rule."""
+"""Growing and pruning against a slow implementation of Scaffold-GS's rule."""
 
 import math
 
@@ -29,7 +29,7 @@ def make(n=60, seed=0) -> AnchorScene:
 
 
 def slow_growth(scene: AnchorScene, rule: GrowAnchors):
-    """Cell by cell with dictionaries: {cell in fine voxels: (level factor, feature)} of the anchors that must be born."""
+    """Return the expected new anchors, cell by cell: {cell in fine voxels: (level factor, feature)}."""
     table, born = scene.table, {}
     stats = table.stats
     taken = [tuple(c) for c in table.facts["cell"].tolist()]

@@ -1,4 +1,4 @@
-"""Growth on levels against a slow reading of Octree-GS's rule, one slot at a time."""
+"""Growth on levels against a slow implementation of Octree-GS's rule, one slot at a time."""
 
 import math
 from dataclasses import replace
@@ -43,7 +43,7 @@ def make(n=320, empty: int | None = None) -> AnchorScene:
 
 
 def slow_growth(scene: AnchorScene, refine: bool = True) -> dict[tuple[int, tuple[int, ...]], torch.Tensor]:
-    """{(level, cell): feature} of the anchors that must be born."""
+    """Return the expected new anchors: {(level, cell): feature}."""
     table, u, born = scene.table, 2**0.2, {}
     taken = {(int(j), tuple(c)) for j, c in zip(table.facts["level"], table.facts["cell"].tolist())}
     for level in range(COUNT):

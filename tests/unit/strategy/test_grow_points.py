@@ -1,4 +1,4 @@
-"""What counts as a visit of a graph point, and where its Gaussian founds new ones."""
+"""Visits of graph points, and the positions of new points."""
 
 from dataclasses import replace
 

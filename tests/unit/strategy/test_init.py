@@ -1,4 +1,4 @@
-"""Every recipe's strategy keeps the interface that the loop calls."""
+"""The strategy of every recipe implements the interface that the loop calls."""
 
 from dataclasses import replace
 

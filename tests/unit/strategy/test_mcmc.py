@@ -1,4 +1,4 @@
-"""Density control as sampling, against the formulas as they are written and against pictures."""
+"""MCMC densification against its formulas and against pictures."""
 
 import math
 from dataclasses import replace
@@ -36,7 +36,7 @@ def test_more_than_51_are_shared_as_51():
 
 @pytest.mark.parametrize("o", [0.3, 0.9])
 def test_shares_together_hide_as_much_as_the_one_did(o):
-    """Along a ray through the middle exactly; in all, as the scales are chosen: the integral of what is hidden stays."""
+    """Exact along a ray through the centre. In total, the scales keep the integral of the opacity."""
     n = 4
     new, factor = (float(v) for v in share_opacity(torch.tensor([o], dtype=torch.float64), torch.tensor([n])))
     assert 1 - (1 - new) ** n == pytest.approx(o)

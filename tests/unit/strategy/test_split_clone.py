@@ -1,4 +1,4 @@
-"""3DGS's density control against a reading of its rule, Gaussian by Gaussian."""
+"""Density control of 3DGS against its rule, Gaussian by Gaussian."""
 
 import math
 from dataclasses import replace
@@ -29,7 +29,7 @@ def test_small_gaussians_are_cloned_and_large_ones_split():
     assert grown == len(clones) + len(splits) and not capped and len(scene.table) == n + grown
     kept = [i for i in range(n) if i not in splits]
     for name, value in p.items():
-        assert torch.equal(value[: len(kept)], old[name][kept]), name  # what was neither moves up, otherwise as it was
+        assert torch.equal(value[: len(kept)], old[name][kept]), name  # the other rows move up unchanged
         assert torch.equal(value[len(kept) : len(kept) + len(clones)], old[name][clones]), name  # exact copies
     halves = slice(len(kept) + len(clones), None)
     for name in ("quats", "raw_opacity", "sh_dc", "sh_rest"):
@@ -73,7 +73,7 @@ def test_opacities_are_pressed_and_their_moments_cleared():
 
 
 def test_when_things_happen():
-    """Adjustments after 500 at multiples of 100 below 15,000; resets at multiples of 3000 below 15,000; statistics begin anew."""
+    """Densification after 500 at multiples of 100 below 15,000. Resets at multiples of 3000 below 15,000. Statistics restart."""
     rule = SplitClone(grad_threshold=math.inf, min_opacity=0.0, max_size=math.inf)
     for step, adjusts, resets in ((500, 0, 0), (600, 1, 0), (650, 0, 0), (3000, 1, 1), (14_900, 1, 0), (15_000, 0, 0)):
         scene = make_gaussians(20)

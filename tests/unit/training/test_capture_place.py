@@ -1,4 +1,4 @@
-"""Where a run finds its capture."""
+"""A run finds its capture."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The events that a training tells."""
+"""The events of a training."""
 
 from dataclasses import FrozenInstanceError, fields, is_dataclass
 from typing import get_args

@@ -99,7 +99,7 @@ def test_losses_follow_the_golden_curve(recipe, tmp_path):
         cfg = replace(cfg, growth=replace(cfg.growth, reset_least=1)) if isinstance(cfg.growth, SplitClone) else cfg
     elif isinstance(cfg.scene, Anchors) and isinstance(cfg.scene.decoder, Experts):
         cfg = replace(cfg, scene=replace(cfg.scene, decoder=replace(cfg.scene.decoder, warmup=50)))
-    # Adam's first steps leave SAGS's features in near-ties; which of them its maxima take is soon a matter of the last bit.
+    # Adam's first steps leave SAGS's features in near-ties; rounding soon decides which of them the maxima take.
     until = 25 if isinstance(cfg.scene, GraphPoints) else 100
     folder = make_capture(tmp_path, views=8, size=(48, 32), points=400).folder
     seen = events(cfg, folder, rasterizer="reference", stop_at=until, log_every=5, dtype=torch.float64)
@@ -197,7 +197,7 @@ def test_losses_that_are_no_numbers_end_the_run_and_keep_its_checkpoint(folder, 
     with pytest.raises(RunError, match=naming("l1", "nan", 9)):
         list(events(config(), folder, tmp_path, stop_at=60, log_every=1, resume=True))
     assert_same(before, last_tensors(tmp_path))
-    with pytest.raises(RunError, match=naming("l1", 9)):  # Adam finds it before the losses are told or saved
+    with pytest.raises(RunError, match=naming("l1", 9)):  # Adam finds it before the losses are reported or saved
         list(events(config(), folder, tmp_path, stop_at=60, log_every=20, save_every=11, resume=True))
     assert_same(before, last_tensors(tmp_path))
     with pytest.raises(RunError, match=naming("l1", 9)):  # before the stop

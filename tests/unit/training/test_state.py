@@ -1,4 +1,4 @@
-"""The state of a training: to named tensors and back, with nothing lost and nothing of another configuration let in."""
+"""The state of a training becomes named tensors and back without loss. A state of another configuration is refused."""
 
 from dataclasses import replace
 

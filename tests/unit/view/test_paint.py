@@ -1,4 +1,4 @@
-"""What a picture shows, against the definitions."""
+"""Each kind of picture against its definition."""
 
 import pytest
 import torch

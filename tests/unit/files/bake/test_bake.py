@@ -36,7 +36,7 @@ def capture(tmp_path_factory):
 
 def test_what_is_kept_contributes_most():
     weight, opacity = torch.tensor([5.0, 0.0, 1.0, 90.0, 3.0, 1.0]), torch.tensor([0.5, 0.5, 0.5, 0.5, 0.5, 0.5 * LEAST_ALPHA])
-    assert choose(weight, opacity, Bake()).tolist() == [0, 2, 3, 4]  # nothing that shows nowhere, nothing too faint to be drawn
+    assert choose(weight, opacity, Bake()).tolist() == [0, 2, 3, 4]  # no invisible and no faint Gaussians
     assert choose(weight, opacity, Bake(max_gaussians=2)).tolist() == [0, 3]
     assert choose(weight, opacity, Bake(prune=0.05)).tolist() == [0, 3]
     assert choose(weight, opacity, Bake(prune=0.5)).tolist() == [3]

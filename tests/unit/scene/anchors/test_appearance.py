@@ -73,7 +73,7 @@ def test_native_and_composed_decode_agree_with_codes(recipe):
     torch.testing.assert_close(c1, c2, rtol=1e-4, atol=1e-5)
     for a, b in zip(g1, g2):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5)
-    assert g1[0][2].any() and not g1[0][0].any()  # the code of the view that was seen, and no other
+    assert g1[0][2].any() and not g1[0][0].any()  # only the code of the view
 
 
 def test_a_checkpoint_remembers_which_views_have_codes():

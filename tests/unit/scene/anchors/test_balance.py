@@ -1,4 +1,4 @@
-"""Experts kept in use by biases: the rule of Wang et al. (2024) by hand, its state, and the promise that such a part takes two files."""
+"""Load balancing by biases: the rule of Wang et al. (2024) by hand, and its state. Such a part needs only two files."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The mixture of experts against the paper's equations, written out slowly."""
+"""The mixture of experts against the paper's equations, anchor by anchor."""
 
 import pytest
 import torch

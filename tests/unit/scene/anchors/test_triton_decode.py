@@ -1,4 +1,4 @@
-"""The Triton decode against a slow float64 decode written from the paper's equations (test_scene_native_decode's), and against torch."""
+"""The Triton decode against a slow float64 decode written from the paper's equations (that of test_native_decode.py), and against torch."""
 
 from dataclasses import replace
 
@@ -165,7 +165,7 @@ def test_without_gradients():
 
 @pytest.mark.usefixtures("triton")
 def test_the_tf32_forms_are_a_choice(monkeypatch):
-    monkeypatch.setattr(triton_decode, "PRECISION", "tf32x3")  # the interpreter takes it, and computes in float32
+    monkeypatch.setattr(triton_decode, "PRECISION", "tf32x3")  # the interpreter accepts it and computes in float32
     data = problem(A=20)
     exact = oracle(*data)[0]
     compare(run(*data)[0].colors, exact.colors, 1e-4, "colors")
@@ -249,7 +249,7 @@ def test_on_cuda_a_scene_decodes_with_triton(triton):
     assert triton_decode.available() is None and made.native_weights(5) is not None
     ours, exact = made.decode(rows, camera, 5), made.decode_composed(rows, camera, 5)
     agree = torch.isin(ours.gaussians.source, exact.gaussians.source)
-    assert agree.float().mean() > 0.9999  # but where rounding moves an opacity across 0 or two logits past each other
+    assert agree.float().mean() > 0.9999  # except where rounding changes the sign of an opacity or the order of two logits
     assert (ours.raw_opacity - exact.raw_opacity).abs().mean() < 1e-5
 
 

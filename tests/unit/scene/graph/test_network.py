@@ -16,7 +16,7 @@ def features(n: int, F: int = 5) -> torch.Tensor:
 
 
 def slow(xyz: torch.Tensor, rows: list[int], f: torch.Tensor, k: int, share: float) -> torch.Tensor:
-    """The encoder's steps 1 to 3 as the text has them; f [A, F] of `rows`."""
+    """Steps 1 to 3 of the encoder as the paper states them; features f [A, F] of `rows`."""
     distance = torch.cdist(xyz, xyz)
     near = {u: [v for v in distance[u].argsort()[:k].tolist() if v in rows] for u in rows}  # edges to points unseen vanish
     place = {u: i for i, u in enumerate(rows)}

@@ -62,7 +62,7 @@ def test_no_points_and_points_of_one_voxel():
 
 
 def slow(scene: GraphScene, rows: torch.Tensor) -> dict[str, torch.Tensor]:
-    """The decode as the text has it, row by row; offsets and all networks for every row."""
+    """The decode as the paper states it, row by row, with offsets and all networks for every row."""
     f, xyz, found = scene.table.params["feature"][rows], scene.table.facts["xyz"][rows], {}
     near = blend_neighbours(f, *Graph.of(scene.table.facts["xyz"], 10).among(rows), 0.5)
     weights = {k: v.detach() for k, v in scene.network_tensors().items()}
