@@ -18,4 +18,4 @@ arguments = parser.parse_args()
 run = se.open_run(arguments.run)
 camera = run.test_cameras[0]
 both = np.hstack([run.capture.photo(camera), run.render(camera)])  # float32 [H, 2 W, 3] in [0, 1]
-Image.fromarray(np.rint(255 * both).astype(np.uint8)).save(arguments.out)
+Image.fromarray((255 * both + 0.5).astype(np.uint8)).save(arguments.out)

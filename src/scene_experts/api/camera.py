@@ -75,7 +75,8 @@ class Camera:
         Args:
             eye: [3] Centre of the camera.
             target: [3] Point in the middle of the picture.
-            up: [3] Direction that points upwards in the picture. If it is the line of sight, a direction across it is used.
+            up: [3] Direction that points upwards in the picture. If it is parallel to the line of sight, the coordinate axis that is most
+                perpendicular to the line of sight replaces it.
             width: Width of the picture, px.
             height: Height of the picture, px.
             fov: Vertical field of view, degrees, between 0 and 180.
@@ -89,7 +90,7 @@ class Camera:
             raise InputError(f"expected a target away from the eye, found both at {place.tolist()}; move one of them")
         forward = forward / np.linalg.norm(forward)
         right = np.cross(forward, upward)
-        if not np.linalg.norm(right) > 1e-6 * np.linalg.norm(upward):  # along the line of sight: take the axis that is most across it
+        if not np.linalg.norm(right) > 1e-6 * np.linalg.norm(upward):  # parallel to the line of sight
             right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
         right = right / np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward])

@@ -134,7 +134,8 @@ class Capture:
         Args:
             eye: [3] Centre of the camera.
             target: [3] Point in the middle of the picture. Default: `centre`.
-            up: [3] Direction that points upwards in the picture. Default: `up`.
+            up: [3] Direction that points upwards in the picture. Default: `up`. If it is parallel to the line of sight, the coordinate
+                axis that is most perpendicular to the line of sight replaces it.
             size: Width and height of the picture, px. Default: those of the median training camera.
             fov: Vertical field of view, degrees, between 0 and 180. Default: that of the median training camera.
 

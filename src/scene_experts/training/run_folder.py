@@ -83,15 +83,15 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
     if foreign := _foreign(out):
         raise InputError(f"expected a new or empty folder or an earlier run at {out}, found {foreign} in it; choose another --out")
     if resume and overwrite:
-        raise InputError("expected --resume (go on) or --overwrite (begin anew), found both; leave one out")
+        raise InputError("expected resume (continue the run) or overwrite (begin anew), found both; leave one out")
     if resume and not (out / "config.json").is_file():
-        raise InputError(f"expected an earlier run to resume in {out}, found none; leave out --resume to begin one, or correct --out")
+        raise InputError(f"expected an earlier run to resume in {out}, found none; begin one without resume, or correct the folder (--out)")
     if resume:
         _check_same(out, read_config(out), config)
     elif not overwrite and any((out / "checkpoints").glob("ckpt_*.safetensors")):
         imported = config.command.startswith("import ")
-        advice = "choose another --out" if imported else "add --resume to go on, --overwrite to begin anew, or choose another --out"
-        raise InputError(f"expected a new or empty run folder, found checkpoints in {out}; {advice}")
+        go_on = "" if imported else "continue it (--resume or resume=True), replace it (--overwrite or overwrite=True), or "
+        raise InputError(f"expected a new or empty run folder, found checkpoints in {out}; {go_on}choose another folder (--out)")
 
 
 def _foreign(out: Path) -> str:
