@@ -83,9 +83,9 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
     if foreign := _foreign(out):
         raise InputError(f"expected a new or empty folder or an earlier run at {out}, found {foreign} in it; choose another --out")
     if resume and overwrite:
-        raise InputError("expected resume (continue the run) or overwrite (begin anew), found both; leave one out")
+        raise InputError("expected either resume (--resume) or overwrite (--overwrite), found both; leave one out")
     if resume and not (out / "config.json").is_file():
-        raise InputError(f"expected an earlier run to resume in {out}, found none; begin one without resume, or correct the folder (--out)")
+        raise InputError(f"expected an earlier run to resume in {out}, found none; begin one without --resume, or correct --out")
     if resume:
         _check_same(out, read_config(out), config)
     elif not overwrite and any((out / "checkpoints").glob("ckpt_*.safetensors")):
