@@ -51,6 +51,16 @@ def quanta(format: str, s: Splats) -> dict[str, Tensor | float]:
     return {"splat": _splat, "compressed-ply": _compressed, "spz": _spz, "html": _spz, "sog": _sog}[format](s)
 
 
+def _smallest_three(step: float) -> float:
+    """Return the largest error of a unit quaternion whose three smallest components are rounded to multiples of `step`.
+
+    The worst case has four components of 1/2: every rounding error changes the computed component in the same direction.
+    """
+    half = 0.51 * step
+    computed = math.sqrt(1 - 3 * (0.5 + half) ** 2)
+    return math.sqrt(3 * half**2 + (0.5 - computed) ** 2)
+
+
 def _splat(s: Splats) -> dict[str, Tensor | float]:
     # readers differ by half a step in how they decode the bytes of a quaternion
     dc = s.sh[:, :1].double()
@@ -71,7 +81,7 @@ def _compressed(s: Splats) -> dict[str, Tensor | float]:
         "means": 0.51 * _ranges(s.means) / steps + 1e-6 * s.means.abs().double(),
         "log_scales": 0.51 * _ranges(s.log_scales.clamp(-20, 20)) / steps + 1e-5 + (s.log_scales.abs() - 20).clamp_min(0),
         "opacity": 0.51 / 255,
-        "quats": 4 * 0.51 / 1023,
+        "quats": _smallest_three(math.sqrt(2) / 1023),
         "sh": torch.cat([colour[:, None], rest], 1),
     }
 
@@ -85,7 +95,7 @@ def _spz(s: Splats) -> dict[str, Tensor | float]:
         "means": 0.51 / 2**bits + 1e-7 * s.means.abs().double(),
         "log_scales": 0.51 / 16 + (-10 - s.log_scales).clamp_min(0) + (s.log_scales - 5.93).clamp_min(0),
         "opacity": 0.51 / 255,
-        "quats": 4 * 0.51 / 511,
+        "quats": _smallest_three(math.sqrt(0.5) / 511),
         "sh": torch.cat([0.51 / 255 / 0.15 + (dc.abs() - 0.5 / 0.15).clamp_min(0), rest], 1),
     }
 
@@ -103,7 +113,7 @@ def _sog(s: Splats) -> dict[str, Tensor | float]:
         "means": (1 + s.means.double().abs()) * step * 1.01 + 1e-6,
         "log_scales": _gap(s.log_scales),
         "opacity": 0.51 / 255,
-        "quats": 4 * 0.51 / 255,
+        "quats": _smallest_three(math.sqrt(2) / 255),
         "sh": torch.cat([_gap(s.sh[:, :1]), torch.full_like(s.sh[:, 1:].double(), float(wide))], 1),
     }
 
