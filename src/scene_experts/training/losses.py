@@ -84,8 +84,9 @@ class Weights(Part):
     def scaled(self, factor: float) -> Self:
         """Return the weights for a training that is `factor` times as long. The windows are scaled."""
         until = None if self.opacity_until is None else round(self.opacity_until * factor)
-        starts = {name: round(getattr(self, name) * factor) for name in ("opacity_from", "residual_from")}
-        return replace(self, **starts, opacity_until=until)
+        opacity, residual = round(self.opacity_from * factor), round(self.residual_from * factor)
+        residual = residual if self.residual_quantile < 1 else self.residual_from  # unused: older checkpoints do not have it
+        return replace(self, opacity_from=opacity, opacity_until=until, residual_from=residual)
 
     def check(self) -> None:
         """Check the weights. Raises InputError, which names the flag, if a weight is below 0 or `dssim` is above 1."""

@@ -71,7 +71,8 @@ def test_the_loss_ignores_large_residuals_from_its_first_iteration_on():
 
 
 def test_settings():
-    assert Weights().scaled(0.1).residual_from == 150
+    assert Weights(residual_quantile=0.9).scaled(0.1).residual_from == 150
+    assert Weights().scaled(0.1).residual_from == 1500
     for bad in ({"residual_quantile": 1.5}, {"residual_weight": -0.1}):
         with pytest.raises(InputError, match="residual"):
             Weights(**bad).check()
