@@ -12,6 +12,7 @@ from typing_extensions import TypeVar
 from scene_experts.core.parts import Part
 from scene_experts.core.types import Decoded, Render
 from scene_experts.scene import Scene
+from scene_experts.strategy.survey import Survey
 
 S = TypeVar("S", bound=Scene, default=Any)
 
@@ -30,7 +31,7 @@ class Edit:
 class Strategy(Part, Generic[S], ABC):
     """Hyper-parameters of a densification strategy for scenes of class S. The flags are under --growth.
 
-    The strategy keeps its running statistics in `table.stats`. Each iteration calls `observe` and then `update` after the
+    The strategy keeps its running statistics in `table.stats`. Each iteration calls `observe`, `survey` and then `update` after the
     backward pass, and `finish` after the optimiser's step.
     """
 
@@ -53,6 +54,9 @@ class Strategy(Part, Generic[S], ABC):
 
     def observe(self, scene: S, decoded: Decoded, render: Render, step: int) -> None:
         """Add one view to the statistics. The default does nothing."""
+
+    def survey(self, scene: S, survey: Survey, step: int, generator: torch.Generator) -> None:
+        """Look at further training views before `update`. The default does nothing. generator: the only source of randomness."""
 
     @abstractmethod
     def update(self, scene: S, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:

@@ -9,11 +9,12 @@ from typing import Literal, Self
 import torch
 from typing_extensions import TypeVar
 
-from scene_experts.core.errors import expect_at_least
+from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.schedule import Every
 from scene_experts.core.types import Decoded, Render
 from scene_experts.scene import LatticeScene
-from scene_experts.strategy import Edit, Strategy, observe
+from scene_experts.strategy import Edit, Strategy, errors, observe
+from scene_experts.strategy.survey import Survey
 
 L = TypeVar("L", bound=LatticeScene, default=LatticeScene)
 
@@ -38,6 +39,22 @@ class AnchorControl(Strategy[L]):
     """Anchors whose mean opacity is lower are removed."""
     scale_clamp: Literal["log0.05", "linear0.05", "off"] = "log0.05"
     """Upper bound of the Gaussians' sizes after each densification step: 0.05 in log space, 0.05 in linear units, or off."""
+    error_views: int = 0
+    """Number of random training views whose errors decide at each densification step where anchors are created (FastGS); 0 means that
+    errors do not count."""
+    error_quantile: float = 0.7
+    """Quantile of a view's pixel errors above which an error is high."""
+    error_share: float = 0.3
+    """Share of a Gaussian's contribution that must lie on pixels with high errors before it can create an anchor."""
+    least_contribution: float = 0.0
+    """Anchors that contribute less than this many pixels to each of at least 8 of the error views are removed; 0 removes none."""
+    mask_contribution: float = 0.0
+    """Gaussians of an anchor that contribute less than this many pixels to every training view are no longer drawn, and anchors without
+    others are removed; 0 masks none."""
+    mask_at: tuple[int, ...] = (20_000, 30_000)
+    """Iterations at which Gaussians are masked."""
+    mask_views: int = 0
+    """Number of random training views that a mask looks at; 0 means all."""
     max_anchors: int = 0
     """Maximum number of anchors; 0 means no limit. Anchors with the largest gradients are created first."""
 
@@ -48,7 +65,9 @@ class AnchorControl(Strategy[L]):
 
     def scaled(self, factor: float) -> Self:
         """Scale the schedule to a training `factor` times as long. The interval, gates and thresholds do not change."""
-        return replace(self, start_stat=round(self.start_stat * factor), adjust=self.adjust.scaled(factor))
+        used = factor if self.mask_contribution > 0 else 1.0  # older checkpoints do not have an unused value
+        at = tuple(round(step * used) for step in self.mask_at)
+        return replace(self, start_stat=round(self.start_stat * factor), adjust=self.adjust.scaled(factor), mask_at=at)
 
     def count_steps(self, iterations: int) -> int:
         """Number of densification steps in a training of `iterations` iterations."""
@@ -56,7 +75,13 @@ class AnchorControl(Strategy[L]):
 
     def check(self) -> None:
         """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
-        expect_at_least([("--growth.adjust.interval", self.adjust.interval, 1), ("--growth.max-anchors", self.max_anchors, 0)])
+        names = ("max_anchors", "error_views", "error_share", "least_contribution", "mask_contribution", "mask_views")
+        least = [(f"--growth.{name.replace('_', '-')}", getattr(self, name), 0) for name in names]
+        expect_at_least([("--growth.adjust.interval", self.adjust.interval, 1), *least])
+        if not 0 <= self.error_quantile < 1:
+            raise InputError(f"expected --growth.error-quantile from 0 to below 1, found {self.error_quantile}; correct it")
+        if self.least_contribution > 0 and not self.error_views:
+            raise InputError("expected --growth.error-views with --growth.least-contribution, found none; give for example 8 views")
 
     def observe(self, scene: L, decoded: Decoded, render: Render, step: int) -> None:
         """Add one view to the statistics, after its backward pass."""
@@ -66,20 +91,35 @@ class AnchorControl(Strategy[L]):
             observe.start(scene.table, scene.K)
         observe.observe(scene.table, decoded, render)
 
+    def survey(self, scene: L, survey: Survey, step: int, generator: torch.Generator) -> None:
+        """Measure errors over random training views before densification, and the contributions of all slots before a mask."""
+        if self.error_views and self.grows_at(scene, step):
+            errors.observe_errors(scene, survey, self.error_views, self.error_quantile, step, generator)
+        if self.mask_contribution > 0 and self.enabled and step in self.mask_at:
+            scene.table.stats["contribution"] = errors.measure_contributions(scene, survey, self.mask_views, step, generator)
+
+    def grows_at(self, scene: L, step: int) -> bool:
+        """Whether densification is due at `step`."""
+        return self.enabled and self.adjust.due(step) and "visits" in scene.table.stats
+
     def update(self, scene: L, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
-        """Create and remove anchors if densification is due at `step`. Returns None if it is not due.
+        """Create and remove anchors if densification or a mask is due at `step`. Returns None if neither is due.
 
         `generator` selects the candidates that random elimination removes.
         """
         if step >= self.adjust.stop:
             observe.stop(scene.table)
-        if not self.enabled or not self.adjust.due(step) or "visits" not in scene.table.stats:
-            return None
+            for name in errors.STATS:
+                scene.table.stats.pop(name, None)
+        contribution = scene.table.stats.pop("contribution", None)
+        masked = None if contribution is None else errors.mask_slots(scene.table, contribution, self.mask_contribution)
+        if not self.grows_at(scene, step):
+            return None if masked is None else Edit(0, masked, len(scene.table))
         for column in scene.table.params.values():
             column.grad = None  # in Scaffold-GS, the optimiser skips all anchors in a densification step
         grown, capped = self.grow(scene, generator, step, cap)
         pruned = self.prune(scene)
-        return Edit(grown, pruned, len(scene.table), capped)
+        return Edit(grown, pruned + (masked or 0), len(scene.table), capped)
 
     def grow(self, scene: L, generator: torch.Generator, step: int = 0, cap: int = 0) -> tuple[int, bool]:
         """Create anchors, up to `cap` anchors in total (0: no limit).
@@ -101,6 +141,8 @@ class AnchorControl(Strategy[L]):
         table = scene.table
         seen = table.stats["visits"] > self.adjust.interval * self.success_threshold  # 80 of 100 by default
         faint = seen & (table.stats["opacity"] < self.min_opacity * table.stats["visits"])
+        if self.least_contribution > 0 and "reach" in table.stats:
+            faint |= errors.find_unneeded(table.stats, self.least_contribution)
         for name in ("visits", "opacity"):
             table.stats[name][seen] = 0.0
         pruned = int(faint.sum())

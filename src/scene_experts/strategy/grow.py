@@ -15,6 +15,7 @@ from scene_experts.core.errors import expect_at_least
 from scene_experts.core.parts import register
 from scene_experts.geometry.voxel import AXIS_LIMIT, coarsen, in_set, pack, scatter_max
 from scene_experts.strategy.control import AnchorControl, L
+from scene_experts.strategy.errors import find_wrong
 
 
 @register
@@ -66,7 +67,10 @@ class GrowAnchors(AnchorControl[L]):
         table, stats = scene.table, scene.table.stats
         eligible = (stats["count"].view(-1) > self.gate()).nonzero().squeeze(1)  # flat slot index: row * K + k
         g = stats["grad"].view(-1).index_select(0, eligible) / stats["count"].view(-1).index_select(0, eligible).clamp_min(1)
-        strong = (g >= self.grad_threshold).nonzero().squeeze(1)  # the first level has the lowest threshold
+        strong = g >= self.grad_threshold  # the first level has the lowest threshold
+        if self.error_views and "wrong" in stats:
+            strong &= find_wrong(stats, self.error_share).view(-1).index_select(0, eligible)
+        strong = strong.nonzero().squeeze(1)
         slots, g = eligible.index_select(0, strong), g.index_select(0, strong)
         parents = torch.div(slots, scene.K, rounding_mode="floor")
         points = scene.slot_points(slots, parents)

@@ -18,6 +18,7 @@ from scene_experts.core.schedule import Every
 from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.scene import AnchorScene
 from scene_experts.strategy.control import AnchorControl
+from scene_experts.strategy.errors import find_wrong
 from scene_experts.strategy.grow import empty_cells, strongest
 
 
@@ -57,7 +58,10 @@ class GrowOctree(AnchorControl[AnchorScene]):
         assert levels is not None
         refine = self.parity_coarse_gate or not scene.select.coarse(step)
         eligible, g, mean = self.gradients(table.stats)
-        slots = (g.view(-1) >= self.grad_threshold).nonzero().squeeze(1)  # level 0 has the lowest threshold
+        strong = g >= self.grad_threshold  # level 0 has the lowest threshold
+        if self.error_views and "wrong" in table.stats:
+            strong &= find_wrong(table.stats, self.error_share)
+        slots = strong.view(-1).nonzero().squeeze(1)
         strength, parents = g.view(-1).index_select(0, slots), torch.div(slots, scene.K, rounding_mode="floor")
         points, own = scene.slot_points(slots, parents), table.facts["level"].index_select(0, parents)
         cells = [table.facts["cell"][table.facts["level"] == level] for level in range(levels.count)]

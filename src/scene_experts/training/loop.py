@@ -18,6 +18,7 @@ from scene_experts.core.types import Decoded, Mode, Render, Routing
 from scene_experts.data.capture import Capture
 from scene_experts.render import Rasterizer, for_growth
 from scene_experts.strategy import Edit
+from scene_experts.strategy.survey import Photo, Survey
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.guard import explain, find_broken
@@ -142,11 +143,24 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     training.largest.see(decoded, render)
     cap = anchor_cap(scene, cfg.growth.max_anchors, run.max_memory, training.largest)
     cfg.growth.observe(scene, decoded, render, training.step)
+    cfg.growth.survey(scene, survey_of(training, run, capture, rasterize), training.step, training.growth_rng)
     edit = cfg.growth.update(scene, training.step, training.growth_rng, cap)
     step_optimizer(training, decoded, edit)
     cfg.growth.finish(scene, training.step, training.rates(), training.growth_rng)
     training.update_averages()
     return Iteration(decoded, render, parts, target, mask, edit)
+
+
+def survey_of(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Survey:
+    """Return the training views as densification can look at them."""
+
+    def photo(index: int) -> Photo:
+        frame = capture.frame(index)
+        mask = None if frame.mask is None else upload(frame.mask, run.device, run.dtype)
+        image = upload(frame.rgb, run.device, run.dtype).div_(255.0)
+        return Photo(capture.views[index].camera.to(run.device, run.dtype), image, mask)
+
+    return Survey(capture.train, photo, rasterize, torch.tensor(capture.background))
 
 
 def step_optimizer(training: Training, decoded: Decoded, edit: Edit | None) -> None:

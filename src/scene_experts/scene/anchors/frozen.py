@@ -17,7 +17,7 @@ from scene_experts.scene import Cull
 from scene_experts.scene.anchors import native_decode
 from scene_experts.scene.anchors.appearance import fold
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, HeadWeights
-from scene_experts.scene.anchors.select import fade_opacities, visible_rows
+from scene_experts.scene.anchors.select import drop_masked, fade_opacities, visible_rows
 
 if TYPE_CHECKING:
     from scene_experts.scene.anchors.scene import AnchorScene
@@ -72,7 +72,8 @@ class Frozen:
         scene = self.scene
         rows = visible_rows(scene.select(scene.table, camera, step, mode), self.xyz, self.scales, camera, cull)
         decoded = self.decode(rows, camera)
-        return fade_opacities(decoded, scene.select.fade(scene.table, rows, camera, step, mode), len(scene.table), scene.K)
+        decoded = fade_opacities(decoded, scene.select.fade(scene.table, rows, camera, step, mode), len(scene.table), scene.K)
+        return drop_masked(decoded, scene.table.facts.get("slots"))
 
     @torch.no_grad()
     def decode(self, rows: Tensor, camera: Camera) -> Decoded:

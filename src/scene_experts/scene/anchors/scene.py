@@ -33,7 +33,7 @@ from scene_experts.scene.anchors.experts import MixtureHead
 from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
 from scene_experts.scene.anchors.frozen import Frozen
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, Decoder, HeadWeights, Plain
-from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, fade_opacities, visible_rows
+from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, drop_masked, fade_opacities, visible_rows
 
 log: logging.Logger = logging.getLogger(__name__)
 NEARLY_ALL = 0.95  # the lattice has almost no effect if this share of the points is alone in its voxel
@@ -196,6 +196,8 @@ class AnchorScene(LatticeScene):
         """Return rows for new anchors at lattice cells [n, 3] of `level`, with scaling `size`, features [n, F] and zero offsets."""
         n = len(cells)
         facts = self.select.places(cells, self.voxel, level)
+        if "slots" in self.table.facts:
+            facts = {**facts, "slots": torch.ones(n, self.K, dtype=torch.bool, device=cells.device)}
         return {
             **{name: value.to(feature.dtype) if value.is_floating_point() else value for name, value in facts.items()},
             "feature": feature,
@@ -219,6 +221,7 @@ class AnchorScene(LatticeScene):
             rows = rows[torch.rand(len(rows), device=rows.device) >= share]
         decoded = self.decode(rows, camera, step, mode)
         decoded = fade_opacities(decoded, self.select.fade(table, rows, camera, step, mode), len(table), self.K)
+        decoded = drop_masked(decoded, table.facts.get("slots"))
         return self.with_global_routing(decoded, step) if mode is Mode.TRAIN else decoded
 
     def decode(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:

@@ -15,7 +15,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.parts import Part, register
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Decoded, Mode
+from scene_experts.core.types import Camera, Decoded, Gaussians, Mode
 from scene_experts.geometry.voxel import find_unique_cells, to_lattice
 from scene_experts.scene import Cull
 from scene_experts.scene.anchors import levels as lattices
@@ -289,3 +289,12 @@ def fade_opacities(decoded: Decoded, fade: Tensor | None, rows: int, K: int) -> 
     factor = of_row.index_select(0, torch.div(gaussians.source, K, rounding_mode="floor"))
     gaussians = replace(gaussians, opacities=gaussians.opacities * factor)
     return replace(decoded, gaussians=gaussians, raw_opacity=decoded.raw_opacity * fade[:, None])
+
+
+def drop_masked(decoded: Decoded, slots: Tensor | None) -> Decoded:
+    """Leave out the Gaussians of masked slots. slots [N, K] bool: the slots that are drawn; None: all. Raw opacities do not change."""
+    if slots is None:
+        return decoded
+    g = decoded.gaussians
+    kept = slots.view(-1).index_select(0, g.source).nonzero().squeeze(1)
+    return replace(decoded, gaussians=Gaussians(**{name: value.index_select(0, kept) for name, value in vars(g).items()}))
