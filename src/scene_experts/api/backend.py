@@ -25,7 +25,7 @@ def backend(device: Device, raster: Raster, antialias: bool, deterministic: bool
 
 
 def device_of(device: str) -> Literal["cpu", "cuda"]:
-    """ "cpu" or "cuda"; "auto" is CUDA where torch finds it. Raises InputError for another name, and for CUDA where there is none."""
+    """Return "cpu" or "cuda". "auto" is CUDA if torch finds it. Raises InputError for another name, and for "cuda" without CUDA."""
     available = torch.cuda.is_available()
     if device == "cuda" and not available:
         raise InputError("expected a CUDA device, found none that torch can use; run `scene-experts doctor`, or use --device cpu")

@@ -1,4 +1,4 @@
-"""`Camera`: where a picture is taken from, and through which lens."""
+"""`Camera`: the pose and the lens of a picture."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def command_of(cfg: Train, data: Data, out: Path | None, deterministic: bool, st
 
 
 def changes(old: Any, new: Any, above: str = "") -> list[tuple[str, Any]] | None:
-    """Dotted places and values of the numbers in which two dataclasses differ; None where a part is of another kind."""
+    """Return dotted names and values of the numbers in which two dataclasses differ, or None if a part is of another kind."""
     out = []
     for field in dataclasses.fields(new):
         was, now = getattr(old, field.name), getattr(new, field.name)

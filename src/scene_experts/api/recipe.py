@@ -42,7 +42,7 @@ def recipe(name: str | Recipe, /, **numbers: Any) -> Recipe:
 
 
 def find_recipe(name: str) -> Recipe:
-    """The recipe of that name. Raises InputError where there is none."""
+    """Return the recipe `name`. Raises InputError, with the nearest names, if it does not exist."""
     if name not in RECIPES:
         raise InputError(f"expected a recipe, found {name!r}{nearest(name, RECIPES)}; `list_recipes()` names them all")
     return RECIPES[name][1]

@@ -28,7 +28,7 @@ def train(run: loop.Run, capture: Capture, rasterize: Rasterizer, *, overwrite: 
     the Scaffold-GS layout (or that of the recipe's family). Nothing is written before the first event. Without one, nothing is written.
 
     overwrite: start again in a folder that holds an earlier run.  tensorboard: write `run.out`/tensorboard too.
-    Raises InputError for a folder that cannot hold the run, RunError where a file cannot be written.
+    Raises InputError if the folder cannot hold the run, and RunError if a file cannot be written.
     """
     if run.out is None:
         yield from loop.train(run.config.train, run, capture, rasterize)

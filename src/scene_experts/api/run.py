@@ -80,7 +80,7 @@ class Run:
         data: Path | None = None,
         training: Training | None = None,
     ) -> None:
-        """capture: that of the run, where it is loaded already.  data: where it is now, if it moved.  training: of a scene in memory."""
+        """capture: the capture of the run, if it is already loaded. data: its new location. training: the training of a scene in memory."""
         self._opened, self._device, self._capture, self._data, self._training = opened, device, capture, data, training
         self._rasterize = as_trained(rasterize, opened.config.train.antialias)
         self._draws: Draws | None = None
@@ -312,7 +312,7 @@ class Run:
         return view.to(self._device), torch.tensor(capture.background, dtype=torch.float32, device=self._device)
 
     def _frozen(self) -> Draws:
-        """The scene ready for drawing: what no camera changes is computed once, where it is not being trained."""
+        """The scene prepared for drawing. Unless it is being trained, values that do not depend on the camera are computed once."""
         if self._training:
             return self._training.scene
         if self._draws is None:

@@ -36,7 +36,7 @@ class Command:
     defaults: Mapping[str, Any] = field(default_factory=dict)
     """Values by dotted place that replace the dataclass's own: {"data.normalise": "none"}."""
     elsewhere: Callable[[str], str] = lambda flag: ""
-    """What to say of an option that is none here: where it belongs, or nothing."""
+    """Returns a hint for an unknown option: what it belongs to, or an empty string."""
 
 
 def parse(kind: type[T], command: Command, args: Sequence[str]) -> T:

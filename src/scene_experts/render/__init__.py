@@ -40,7 +40,7 @@ class Rasterizer(Protocol):
 def choose(name: str, device: torch.device | str, antialias: bool = False, deterministic: bool = False) -> Rasterizer:
     """The rasteriser called `name` for tensors on `device`.
 
-    `auto`: gsplat on CUDA where it can be imported, the compiled one on the CPU where it loads, else the reference, with one warning.
+    `auto`: gsplat on CUDA if it can be imported, the compiled rasteriser on the CPU if it loads, otherwise the reference with one warning.
     `antialias` multiplies opacities by the share of the 2D Gaussian's area that the 0.3 px blur left (Mip-Splatting's compensation).
     `deterministic`: bit-identical gradients from run to run, where the backend can. Raises InputError for what cannot be had.
     """
@@ -69,7 +69,7 @@ def choose(name: str, device: torch.device | str, antialias: bool = False, deter
 
 
 def as_trained(rasterize: Rasterizer, antialias: bool) -> Rasterizer:
-    """The rasteriser with the compensation that a run was trained with, where it has any."""
+    """Return the rasteriser with the antialiasing that a run was trained with, if it supports it."""
     if getattr(rasterize, "antialias", antialias) != antialias:
         return replace(rasterize, antialias=antialias)  # type: ignore[type-var]
     return rasterize

@@ -106,7 +106,7 @@ def ticks(low: float, high: float, count: int = 5) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Return logarithms of round numbers between two logarithms: 1, 2, 5 of each decade, or some of the decades where there are many."""
+    """Return logarithms of round numbers between two logarithms: 1, 2, 5 of each decade, or some decades if there are many."""
     decades = range(math.floor(low), math.ceil(high) + 1)
     every = max(1, math.ceil(len(decades) / 6))
     factors = (1, 2, 5) if len(decades) <= 4 else (1,)

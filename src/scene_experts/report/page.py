@@ -47,7 +47,7 @@ class Source:
 def write(runs: Sequence[Path], out: Path | None = None) -> Path:
     """Write the page of evaluated runs and return its path, by default RUN/report.html for a single run.
 
-    Raises InputError where a run is not evaluated, and for several runs without `out`.
+    Raises InputError if a run is not evaluated, and for several runs without `out`.
     """
     if not runs:
         raise InputError("expected at least one run folder, found none; name the folders that `scene-experts train --out` wrote")
@@ -60,7 +60,7 @@ def write(runs: Sequence[Path], out: Path | None = None) -> Path:
 
 
 def read_run(run: Path) -> Source:
-    """Read a run folder. Raises InputError where it is not evaluated or its scores by view are something else."""
+    """Read a run folder. Raises InputError if it is not evaluated or its scores by view are invalid."""
     config, results = run_folder.read_config(run), load_results(run)
     path = run / "per_view.json"
     per_view = read_json(path, "scores by view") if path.is_file() else {}
@@ -195,7 +195,7 @@ def show_views(sources: Sequence[Source], prefix: str) -> tuple[str, dict[str, s
 
 
 def encode_picture(path: Path, longest: int = LONGEST) -> str:
-    """Return a picture as the data URL of a JPEG of at most `longest` px a side. Raises InputError where it is unreadable."""
+    """Return a picture as the data URL of a JPEG of at most `longest` px a side. Raises InputError if it is unreadable."""
     picture = Image.fromarray(read_picture(path))
     picture.thumbnail((longest, longest), Image.Resampling.LANCZOS)
     stream = io.BytesIO()
