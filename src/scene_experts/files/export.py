@@ -18,6 +18,7 @@ from scene_experts.files.cameras import write_cameras
 from scene_experts.files.measure import Tell, capture_if_there, cost
 from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
 from scene_experts.files.registry import GAUSSIANS, Family, Format, family_named, format_named, format_names, formats_of
+from scene_experts.files.result_folder import capture_settings
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Scene
 from scene_experts.training.progress import format_duration
@@ -241,7 +242,8 @@ def write_scene_folder(run: OpenRun, family: Family, world: World, out: Path) ->
     settings = family.write(run, world, folder, about)
     write_json(folder / DESCRIPTION, about)
     if settings:
-        text = ", ".join(f"{name}={value!r}" for name, value in settings.items())
+        every = settings | capture_settings(run.config.data)
+        text = ", ".join(f"{name}={value!r}" for name, value in every.items())
         write_bytes(out / "cfg_args", f"Namespace({text})".encode())
     return folder
 

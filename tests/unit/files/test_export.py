@@ -22,6 +22,7 @@ from scene_experts.files.gaussians.write import splats_of
 from scene_experts.files.importing import import_files
 from scene_experts.files.measure import Painter
 from scene_experts.files.registry import GAUSSIANS, format_named, formats_of
+from scene_experts.files.result_folder import read_settings
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.anchors.features import FeatureBank
@@ -93,6 +94,15 @@ def test_the_layout_is_in_the_input_frame(run, folder):
     assert str(folder) not in json.dumps(sidecar), "no path of this machine leaves the project"
     assert sidecar["add_dist"] == {"opacity": False, "cov": True, "color": True}
     assert sidecar["phase"]["cov"] == ("sparse" if run.config.train.recipe == "moe-gs" else "single")
+
+
+def test_the_original_tools_find_every_setting_that_they_read(run, folder):
+    settings = read_settings(run.path / "point_cloud" / f"iteration_{STEPS}")
+    published = "sh_degree feat_dim n_offsets voxel_size update_depth update_init_factor update_hierachy_factor use_feat_bank source_path"
+    published += " images resolution white_background data_device eval lod appearance_dim ratio"
+    assert {*published.split(), "add_opacity_dist", "add_cov_dist", "add_color_dist"} == settings.keys()
+    assert settings["source_path"] == str(folder) and settings["ratio"] == 1 and settings["n_offsets"] == run.scene.K
+    assert [settings[name] for name in ("update_depth", "update_init_factor", "update_hierachy_factor")] == [3, 16, 4]
 
 
 def test_the_distance_column_is_in_the_input_unit(run):

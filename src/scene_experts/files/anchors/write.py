@@ -150,6 +150,7 @@ def write(run: OpenRun, world: World, folder: Path, about: dict[str, Any]) -> di
         stale -= {MOE_FILE}
     for name in stale:  # from an earlier export to this folder
         (folder / name).unlink(missing_ok=True)
+    growth = run.config.train.growth
     return {
         "sh_degree": 3,
         "feat_dim": about["F"],
@@ -158,6 +159,10 @@ def write(run: OpenRun, world: World, folder: Path, about: dict[str, Any]) -> di
         "use_feat_bank": about["feature_bank"],
         "appearance_dim": about["appearance_dim"],
         **{f"add_{attribute}_dist": used for attribute, used in about["add_dist"].items()},
+        "ratio": 1,  # every point of the capture is used
+        "update_depth": getattr(growth, "levels", 3),
+        "update_init_factor": getattr(growth, "init_factor", 16),
+        "update_hierachy_factor": getattr(growth, "hierarchy_factor", 4),  # spelt as in the published code
     }
 
 

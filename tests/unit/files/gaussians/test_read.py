@@ -16,6 +16,7 @@ from scene_experts.files.export import write_result_folder
 from scene_experts.files.formats import ply, splat, spz
 from scene_experts.files.formats.ply import read_vertices, write_vertices
 from scene_experts.files.importing import import_files
+from scene_experts.files.result_folder import read_settings
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training import loop as train
@@ -86,7 +87,8 @@ def test_a_file_comes_back_as_a_run_that_draws_the_same_picture(made, tmp_path):
 def test_our_own_folder_keeps_recipe_and_step(made, tmp_path):
     run, folder = made
     layout = write_result_folder(run_folder.open_run(run), run_folder.load_capture(Data(folder)), tmp_path / "result")
-    assert layout.name == "iteration_90" and (tmp_path / "result" / "cfg_args").read_text() == "Namespace(sh_degree=3)"
+    settings = read_settings(layout)
+    assert layout.name == "iteration_90" and settings["sh_degree"] == 3 and settings["source_path"] == str(folder)
     out = import_files(tmp_path / "result", Data(folder), tmp_path / "again")
     opened = run_folder.open_run(out)
     assert opened.step == 90 and opened.config.train == run_folder.open_run(run).config.train
