@@ -24,7 +24,7 @@ from scene_experts.files import result_folder
 from scene_experts.files.anchors import torchscript
 from scene_experts.files.anchors.data import AnchorData, Network, by_attribute, by_file_name
 from scene_experts.files.anchors.published import cells_of, meta_of, recipe_of, recover_voxel
-from scene_experts.files.anchors.write import BANK_DISTANCE, LEVEL_COLUMNS, MOE_FILE, MOE_FORMAT, MOE_KIND
+from scene_experts.files.anchors.write import BANK_DISTANCE, LEVEL_COLUMNS, MOE_FILE, MOE_FORMAT, MOE_KIND, SLOT_BITS, SLOTS, unpack_slots
 from scene_experts.files.formats.ply import numbered_names, property_names, read_vertices, stack
 from scene_experts.files.registry import Imported, recognise
 from scene_experts.files.result_folder import expect_world, world_in
@@ -105,6 +105,7 @@ def tensors_of(
     scaling = (c["log_scaling"].double() + math.log(world.scale)).float()
     out = {"params.feature": c["feature"], "params.offsets": c["offsets"], "params.log_scaling": scaling}
     out |= {f"facts.{name}": value for name, value in place.items()}
+    out |= {"facts.slots": c["slots"]} if "slots" in c else {}
     return out | {f"network.{a}.{name}": value for a, n in trained.items() for name, value in n.items()}
 
 
@@ -198,6 +199,8 @@ def read_anchors(path: Path) -> dict[str, Tensor]:
         if not all(value.isfinite().all() for value in levels.values()) or not ((level >= 0) & (level <= MOST_LEVELS)).all():
             raise InputError(f"expected finite levels between 0 and {MOST_LEVELS} in {path}, found others; export the result again")
         out |= levels | {"level": level.round().long()}
+    if masks := numbered_names(columns, SLOTS):
+        out["slots"] = unpack_slots(stack(columns, masks, path).nan_to_num(0).clamp(0, (1 << SLOT_BITS) - 1), out["offsets"].shape[1])
     return out
 
 

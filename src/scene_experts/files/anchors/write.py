@@ -30,6 +30,7 @@ DESCRIPTION_FORMAT = 1
 MOE_FILE, MOE_KIND, MOE_FORMAT = "moe.safetensors", "mixture of experts", 1
 INERT_OPACITY = math.log(0.1 / 0.9)  # logit(0.1): Scaffold-GS stores it per anchor and never uses it
 LEVEL_COLUMNS = ("level", "extra_level", "info")  # of Octree-GS
+SLOTS, SLOT_BITS = "slots_", 16  # columns of the masks, and slots per column
 BANK_DISTANCE = 3  # index of the distance in the feature bank's input, after the direction
 _LATTICE_TOLERANCE = 1e-3  # voxels
 
@@ -53,6 +54,8 @@ def contents(run: OpenRun, world: World, about: dict[str, Any]) -> AnchorData:
             "extra_level": facts["extra_level"].cpu().float(),
             "info": level_info(scene, world.scale),
         }
+    if "slots" in facts:
+        columns["slots"] = facts["slots"].cpu()
     on_lattice = not run.scene.traits.levels and is_on_lattice(cells, xyz, scene.voxel)
     return AnchorData(
         columns,
@@ -176,7 +179,8 @@ def vertices(data: AnchorData) -> Columns:
 
     Offsets are stored component by component: f_offset_{c * K + k} is component c of offset k.
     Normals are 0, the opacity is inert, the rotation is the identity. With levels of detail, level,
-    extra_level and info replace the normals, as in Octree-GS.
+    extra_level and info replace the normals, as in Octree-GS. Masks of slots are further columns,
+    which other readers ignore.
     """
     c, n = data.columns, len(data.columns["xyz"])
     zero, one = np.zeros(n, np.float32), np.ones(n, np.float32)
@@ -187,7 +191,19 @@ def vertices(data: AnchorData) -> Columns:
     columns |= numbered_columns("f_anchor_feat_", c["feature"])
     columns["opacity"] = np.full(n, INERT_OPACITY, np.float32)
     columns |= numbered_columns("scale_", c["log_scaling"])
-    return columns | {"rot_0": one, "rot_1": zero, "rot_2": zero, "rot_3": zero}
+    columns |= {"rot_0": one, "rot_1": zero, "rot_2": zero, "rot_3": zero}
+    return columns | (numbered_columns(SLOTS, pack_slots(c["slots"])) if "slots" in c else {})
+
+
+def pack_slots(slots: Tensor) -> Tensor:
+    """Masks [N, K] bool as whole numbers [N, ceil(K / 16)] float32; bit i of number j is slot 16 j + i."""
+    groups = torch.nn.functional.pad(slots, (0, -slots.shape[1] % SLOT_BITS)).view(len(slots), -1, SLOT_BITS)
+    return (groups.long() << torch.arange(SLOT_BITS)).sum(2).float()
+
+
+def unpack_slots(numbers: Tensor, K: int) -> Tensor:
+    """The inverse of `pack_slots`."""
+    return (numbers.long()[..., None] >> torch.arange(SLOT_BITS) & 1).bool().flatten(1)[:, :K].contiguous()
 
 
 @torch.no_grad()
@@ -196,8 +212,9 @@ def warnings(run: OpenRun) -> list[str]:
     of Scaffold-GS cannot express."""
     scene = cast(AnchorScene, run.scene)
     plain = networks(scene, 1.0)
+    masked = ["warning: other readers of the Scaffold-GS layout also draw the masked Gaussians"] if "slots" in scene.table.facts else []
     if not is_plain(plain):
-        return []
+        return masked
     others = []
     for attribute, network in by_attribute(plain).items():
         if attribute not in ATTRIBUTES:
@@ -207,6 +224,6 @@ def warnings(run: OpenRun) -> list[str]:
         if not torch.allclose(own, torchscript.sequential(attribute, network)(x), atol=1e-4, rtol=1e-4):
             others.append(attribute)
     if not others:
-        return []
+        return masked
     what = f"the {', '.join(others)} networks of '{run.config.train.recipe}' are not Linear, ReLU, ..., Linear"
-    return [f"warning: {what}, the only form that the Scaffold-GS layout can express: other readers will draw another scene"]
+    return [*masked, f"warning: {what}, the only form that the Scaffold-GS layout can express: other readers will draw another scene"]

@@ -4,8 +4,9 @@ The networks are stored as they are. An anchor takes 316 bytes in Scaffold-GS's 
 constants (normals, opacity, rotation) and 12 a position on a known lattice. Here a position is an
 integer cell (1 to 4 bytes, exact), features and offsets are half precision, and log-scalings are
 16-bit fixed point per channel, because halves are coarse where scalings lie (steps of 0.004 between
-4 and 8, 0.2 % of a length). Bytes are grouped by significance and deflated. The file is a
-safetensors file with a checksum. Rows come back in another order, which does not change pictures.
+4 and 8, 0.2 % of a length). Offsets of masked Gaussians are left out; one bit per Gaussian marks
+them. Bytes are grouped by significance and deflated. The file is a safetensors file with a
+checksum. Rows come back in another order, which does not change pictures.
 
 Cells are sorted along the Morton curve, which interleaves the bits of the axes so that near cells
 have near keys, and stored as steps along it, each in as many 7-bit groups as it needs.
@@ -84,10 +85,15 @@ def write(path: Path, data: AnchorData, note: dict[str, Any], coding: Coding = C
     keys = morton(place - low)
     order = np.argsort(keys, kind="stable")
     blobs = {"cells": deflate(encode_steps(keys[order]))}
-    codes, n = {}, len(place)
+    codes, n, slots = {}, len(place), data.columns.get("slots")
+    drawn = None if slots is None else slots.cpu().numpy()[order]
+    if drawn is not None:
+        blobs["slots"] = deflate(np.packbits(drawn, axis=1))
     for name in ("feature", "offsets", "log_scaling"):
         value = data.columns[name]
         array = value.detach().cpu().float().numpy().reshape(n, int(np.prod(value.shape[1:])))[order]
+        if drawn is not None and name == "offsets":  # those of masked slots are left out
+            array = array.reshape(n, -1, 3)[drawn]
         if not np.isfinite(array).all():
             raise InputError(f"expected finite {name}, found others in {(~np.isfinite(array)).any(1).sum():,} anchors; train again")
         codes[name], parts = _encode(array, getattr(coding, name))
@@ -117,10 +123,9 @@ def read(path: Path) -> AnchorData:
         n, K, F = int(meta["N"]), int(meta["K"]), int(meta["F"])
         keys = decode_steps(inflate(tensors["cells"].numpy(), 9 * n, exact=False))
         place = unmorton(keys) + np.array(meta["low"], np.int64)
-        columns = {
-            name: _decode(tensors, name, meta["codes"][name], n, width)
-            for name, width in (("feature", F), ("offsets", 3 * K), ("log_scaling", 6))
-        }
+        slots = _decode_slots(tensors["slots"], n, K) if "slots" in tensors else None
+        sizes = {"feature": (n, F), "offsets": (n, 3 * K) if slots is None else (int(slots.sum()), 3), "log_scaling": (n, 6)}
+        columns = {name: _decode(tensors, name, meta["codes"][name], *size) for name, size in sizes.items()}
         x, y, z = (float(v) for v in meta["origin"])
         voxel, about = float(meta["voxel"]), dict(meta["scene"])
         if place.shape != (n, 3) or not voxel > 0:
@@ -132,6 +137,9 @@ def read(path: Path) -> AnchorData:
         ) from None
     networks = {name.removeprefix("network."): value for name, value in tensors.items() if name.startswith("network.")}
     cells = torch.from_numpy(place)
+    if slots is not None:
+        columns["slots"] = slots
+        columns["offsets"] = torch.zeros(n, K, 3).index_put_((slots,), columns["offsets"])
     columns["offsets"] = columns["offsets"].reshape(n, K, 3)
     columns = {"xyz": (cells.double() * voxel + torch.tensor([x, y, z], dtype=torch.float64)).float()} | columns
     return AnchorData(columns, networks, about, cells, voxel, (x, y, z), add_dist, step)
@@ -180,6 +188,12 @@ def _decode(tensors: dict[str, Tensor], name: str, code: str, n: int, width: int
         low, step = tensors[f"{name}.low"].numpy(), tensors[f"{name}.step"].numpy()
         values = values * step + low
     return torch.from_numpy(np.ascontiguousarray(values.astype(np.float32)))
+
+
+def _decode_slots(blob: Tensor, n: int, K: int) -> Tensor:
+    """The masks [N, K] bool of slots."""
+    planes = inflate(blob.numpy(), n * -(-K // 8)).reshape(-1, n)
+    return torch.from_numpy(np.ascontiguousarray(np.unpackbits(planes.T, axis=1, count=K).astype(bool)))
 
 
 def deflate(array: NDArray[Any]) -> NDArray[np.uint8]:

@@ -13,7 +13,7 @@ from scene_experts.core.io import write_json
 from scene_experts.data.views import World
 from scene_experts.files.anchors import FAMILY, torchscript, write
 from scene_experts.files.anchors.data import by_attribute
-from scene_experts.files.anchors.read import read_folder
+from scene_experts.files.anchors.read import read_folder, tensors_of
 from support.files import run_in_memory
 from support.messages import naming
 
@@ -50,6 +50,24 @@ def test_a_folder_there_and_back(recipe, tmp_path):
     experts = recipe.startswith(("moe", "octree-moe"))
     assert names >= ({"moe.safetensors"} if experts else set(torchscript.FILES.values())) and "point_cloud.ply" in names
     assert PlyData.read(folder / "point_cloud.ply")["vertex"].count == len(run.scene.positions)
+
+
+@pytest.mark.parametrize("K", [1, 10, 16, 37])
+def test_masks_of_slots_as_numbers_and_back(K):
+    slots = torch.rand(50, K, generator=torch.Generator().manual_seed(0)) < 0.5
+    numbers = write.pack_slots(slots)
+    assert numbers.shape == (50, -(-K // 16)) and numbers.max() < 2**16
+    assert torch.equal(write.unpack_slots(numbers, K), slots)
+
+
+def test_masked_slots_are_in_the_folder(tmp_path):
+    run = run_in_memory("moe-gs")
+    slots = torch.rand(len(run.scene.positions), run.scene.K, generator=torch.Generator().manual_seed(0)) < 0.5
+    run.scene.table.facts["slots"] = slots
+    found = read_folder(folder_of(run, tmp_path))
+    assert torch.equal(found.columns["slots"], slots)
+    tensors = tensors_of(found, by_attribute(found.networks), WORLD, run.scene.voxel)
+    assert torch.equal(tensors["facts.slots"], slots)
 
 
 def test_positions_move_lengths_scale_and_networks_see_the_files_distances():

@@ -1,5 +1,7 @@
 """The compact file: positions are exact, the rest within its stated precision, under 150 bytes per anchor."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -77,6 +79,20 @@ def test_exact_with_float32(tmp_path):
     assert there.keys() == wanted.keys()
     assert all(torch.equal(there[a][k], wanted[a][k]) for a in wanted for k in wanted[a])
     assert torch.equal(columns["xyz"], (found.cells.double() * 0.0013 + torch.tensor(ORIGIN, dtype=torch.float64)).float())
+
+
+def test_masked_slots_take_no_room(tmp_path):
+    s = scene()
+    columns = {"xyz": torch.zeros(2000, 3), **{name: s[name] for name in ("feature", "log_scaling", "offsets")}}
+    slots = torch.rand(2000, K, generator=torch.Generator().manual_seed(2)) < 0.4
+    data = AnchorData(columns, by_file_name(networks()), ABOUT, s["cells"], 0.0013, ORIGIN)
+    whole = compact.write(tmp_path / "a", data, {})
+    masked = compact.write(tmp_path / "b", replace(data, columns={**columns, "slots": slots}), {})
+    found = read(tmp_path / "b").columns
+    order = matched(found)
+    assert torch.equal(found["slots"], slots[order]) and "slots" not in read(tmp_path / "a").columns
+    assert torch.equal(found["offsets"], (s["offsets"] * slots[..., None])[order].half().float())
+    assert masked.per_anchor < whole.per_anchor - 0.6 * 2 * 3 * K + 4  # the masks take 2 bytes
 
 
 @pytest.mark.parametrize("spread", [3, 300, 2**20 - 2])
