@@ -22,7 +22,7 @@ class ViewCommand:
     port: int = 8080
     """Port to listen on."""
     host: str = "127.0.0.1"
-    """Address to listen on. 0.0.0.0 accepts other machines, without a password."""
+    """Address to listen on. 0.0.0.0 accepts other machines that know the token in the printed address."""
     data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
     """Folder of the capture, if it has moved."""
     step: int | None = None
@@ -39,6 +39,7 @@ def view(args: list[str]) -> int:
     from scene_experts.api.backend import backend
     from scene_experts.render import as_trained
     from scene_experts.training import run_folder
+    from scene_experts.view.gate import is_local
     from scene_experts.view.server import Viewer, check_port, import_viser
 
     check_port(command.port)
@@ -60,6 +61,12 @@ def view(args: list[str]) -> int:
     )
     if viewer.moved:
         print(f"warning: port {command.port} is taken, the scene is shown on another", file=sys.stderr)
+    if not is_local(command.host):
+        print(
+            "warning: other machines can reach this viewer. It serves those that know the token in the address below; the connection is "
+            "not encrypted, so use it in networks that you trust",
+            file=sys.stderr,
+        )
     print(f"{label}: {viewer.url} (Ctrl-C to stop)", flush=True)
     try:
         viewer.serve()

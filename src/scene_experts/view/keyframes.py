@@ -19,6 +19,7 @@ from scene_experts.view import path_files
 from scene_experts.view.paths import CameraPath
 
 SIZE = (1280, 720)  # width and height of the saved path, px
+MOST_KEYS = 200
 
 
 @dataclass
@@ -29,6 +30,7 @@ class Keyframes:
     capture: Capture
     folder: Path | None = None  # folder that paths are saved in; None: the working directory
     keys: list[Camera] = field(default_factory=list)
+    playing: set[int] = field(default_factory=set)  # clients that move along the path; they stop when they are removed from here
 
     def __post_init__(self) -> None:
         gui = self.server.gui
@@ -46,6 +48,9 @@ class Keyframes:
     def add(self, client: Any) -> None:
         """Add the camera of a client as a keyframe."""
         if client is None:
+            return
+        if len(self.keys) >= MOST_KEYS:
+            self.words.content = f"a path has at most {MOST_KEYS} keyframes"
             return
         seen = client.camera
         quat = torch.tensor(np.asarray(seen.wxyz), dtype=torch.float64)
@@ -80,15 +85,25 @@ class Keyframes:
         if client is None or len(self.keys) < 2:
             self.words.content = "add at least two keyframes to play"
             return
-        threading.Thread(target=self.move_client, args=(client,), daemon=True).start()
+        if client.client_id not in self.playing:
+            threading.Thread(target=self.move_client, args=(client,), daemon=True).start()
 
     def move_client(self, client: Any, fps: float = 15.0) -> None:
-        """Move a client along the path; returns at its end."""
+        """Move a client along the path; returns at its end or when the client leaves."""
+        self.playing.add(client.client_id)
+        try:
+            self._move_client(client, fps)
+        finally:
+            self.playing.discard(client.client_id)
+
+    def _move_client(self, client: Any, fps: float) -> None:
         rotations = torch.stack([key.world_to_cam[:3, :3].T.double() for key in self.keys])
         places = torch.stack([key.position.double() for key in self.keys])
         gaps = len(self.keys) - (0 if self.loop.value else 1)
         frames = max(2, round(gaps * float(self.seconds.value) * fps))
         for made in interpolate_poses(places, rotations, frames, loop=bool(self.loop.value)):
+            if client.client_id not in self.playing:
+                return
             rotation, place = made[:3, :3].T, -(made[:3, :3].T @ made[:3, 3])
             with client.atomic():
                 client.camera.wxyz = tuple(matrix_to_quat(rotation).tolist())

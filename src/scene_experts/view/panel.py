@@ -73,6 +73,7 @@ class Panel:
         self.server, self.capture, self.current, self.changed, self.go_to_view = server, capture, current, changed, go_to_view
         self.curves: dict[str, list[float]] = {"step": [], "psnr": [], "loss": []}
         self.status_time, self.curve_time, self.charts, self.pause = 0.0, 0.0, [], None
+        self.jobs: dict[str, Callable[[], None]] = {}
         self.status = server.gui.add_markdown("")
         scene, step = current()
         self.traits = scene.traits
@@ -96,6 +97,16 @@ class Panel:
         """Return `control`, whose changes now cause a new picture."""
         control.on_update(lambda _: self.changed())
         return control
+
+    def queue(self, name: str, job: Callable[[], None]) -> None:
+        """Let the drawing thread do a longer job, whose time then counts as drawing. A job of the same name that waits is replaced."""
+        self.jobs[name] = job
+        self.changed()
+
+    def run_jobs(self) -> None:
+        """Do the jobs that wait."""
+        for name in list(self.jobs):
+            self.jobs.pop(name)()
 
     def add_expert_controls(self, scene: Scene, step: int) -> None:
         """Add a choice of the attribute and a switch for each expert."""
@@ -124,8 +135,8 @@ class Panel:
             self.wipe = self.redraw_on_change(gui.add_slider("photograph", min=0.0, max=1.0, step=0.01, initial_value=0.0))
             frusta = gui.add_checkbox("cameras", initial_value=False)
             rows = gui.add_checkbox(self.traits.rows, initial_value=False)
-        frusta.on_update(lambda _: self.show_frusta(frusta.value))
-        rows.on_update(lambda _: self.show_rows(rows.value))
+        frusta.on_update(lambda _: self.queue("frusta", lambda: self.show_frusta(frusta.value)))
+        rows.on_update(lambda _: self.queue("rows", lambda: self.show_rows(rows.value)))
         self.chosen, self.names = chosen, names
 
     def add_crop_controls(self, scene: Scene) -> None:
@@ -237,6 +248,10 @@ class Panel:
     def is_paused(self) -> bool:
         """Return whether the user paused the training."""
         return bool(self.pause is not None and self.pause.value)
+
+    def end_pause(self) -> None:
+        """Let a paused training go on."""
+        self.pause.value = False
 
     def follow(self, event: Event) -> None:
         """Update the curves and the status line from an event of the training."""

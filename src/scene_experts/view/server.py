@@ -10,7 +10,8 @@ import logging
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from scene_experts.geometry.poses import make_pose, with_fov
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Draws, Scene
+from scene_experts.view.gate import Gate, guarding, is_local
 from scene_experts.view.paint import paint
 from scene_experts.view.panel import Panel
 from scene_experts.view.paths import analyse_cameras, choose_best_view
@@ -35,6 +37,7 @@ log: logging.Logger = logging.getLogger(__name__)
 
 REST = 0.15  # seconds without movement after which a full-size picture is drawn
 GOAL = 1 / 25  # seconds per picture while the client moves
+MOST_PIXELS = 4_000_000  # of a picture
 SMALLEST = 0.2  # smallest side of a picture while the client moves, as a fraction of the full size
 
 
@@ -45,6 +48,19 @@ def import_viser() -> Any:
     except ImportError as error:
         raise InputError("showing scenes in a browser requires viser: pip install 'scene-experts[viewer]'") from error
     return module
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Hide what viser prints when it starts and stops. Its address would lack the token."""
+    from rich import get_console
+
+    console, before = get_console(), get_console().quiet
+    console.quiet = True
+    try:
+        yield
+    finally:
+        console.quiet = before
 
 
 def check_port(port: int) -> None:
@@ -74,7 +90,8 @@ class Client:
 class Viewer:
     """Serves a scene to browsers.
 
-    `current()` returns the scene and the step at which it is drawn. Both change during training.
+    `current()` returns the scene and the step at which it is drawn. Both change during training. `gate` decides who is served; by
+    default only pages of this server on this machine, and beyond it those that know the token in `url`.
     """
 
     capture: Capture
@@ -86,6 +103,7 @@ class Viewer:
     height: int = 1080  # largest height of a picture, px
     paths: Path | None = None  # folder that camera paths are saved in
     draws: Draws | None = None  # the frozen scene, if it is not being trained
+    gate: Gate = None  # type: ignore[assignment]  # None: the default of `host`
     clients: dict[int, Client] = field(default_factory=dict)
     changed: threading.Event = field(default_factory=threading.Event)
 
@@ -93,8 +111,10 @@ class Viewer:
         module = import_viser()
         logging.getLogger("websockets").setLevel(logging.CRITICAL)  # a browser that disconnects is not an error
         warnings.filterwarnings("ignore", message=r"Queued an? \w+ on a closed connection")
+        self.gate = self.gate or Gate(self.host)
         try:
-            self.server: Any = module.ViserServer(host=self.host, port=self.port, label=self.label, verbose=False)
+            with quiet(), guarding(self.gate, f"viser-v{module.__version__}"):
+                self.server: Any = module.ViserServer(host=self.host, port=self.port, label=self.label, verbose=False)
         except OSError as error:
             raise RunError(f"cannot serve on {self.host}:{self.port}: {error.strerror or error}; choose another --port") from error
         self.lock: threading.Lock = threading.Lock()
@@ -105,6 +125,7 @@ class Viewer:
         self.reach: float = float((rig.positions - rig.centre).norm(dim=1).median())
         self.first: int = choose_best_view(self.capture)  # where clients start
         self.panel: Panel = Panel(self.server, self.capture, self.current, self.request_redraw, self.go_to_view, self.paths)
+        self.gate.gui = self.server.gui
         self.server.on_client_connect(self.connect)
         self.server.on_client_disconnect(self.disconnect)
 
@@ -115,8 +136,10 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Address of the page."""
-        return f"http://{'localhost' if self.host in ('127.0.0.1', '0.0.0.0') else self.host}:{self.server.get_port()}"
+        """Address of the page, with the token if one is needed."""
+        name = "localhost" if is_local(self.host) or self.host in ("", "0.0.0.0", "::") else self.host
+        address = f"http://{f'[{name}]' if ':' in name else name}:{self.server.get_port()}"
+        return f"{address}/?token={self.gate.token}" if self.gate.token else address
 
     # --- clients
 
@@ -139,6 +162,7 @@ class Viewer:
         """Remove a client."""
         with self.lock:
             self.clients.pop(handle.client_id, None)
+        self.panel.keyframes.playing.discard(handle.client_id)
 
     def request_redraw(self) -> None:
         """Draw a new picture for every client."""
@@ -172,9 +196,14 @@ class Viewer:
         with self.lock:
             return [c for c in self.clients.values() if c.wanted or (not c.full and not c.is_moving(now))]
 
+    def has_work(self, now: float) -> bool:
+        """Return whether `draw` would do anything."""
+        return bool(self.panel.jobs or self.find_due(now))
+
     def draw(self, budget: float = float("inf")) -> float:
         """Draw for every client that is due and return the seconds taken. The last picture may exceed `budget` seconds."""
         began = time.monotonic()
+        self.panel.run_jobs()
         for client in self.find_due(began):
             if time.monotonic() - began >= budget:
                 self.changed.set()
@@ -243,6 +272,7 @@ class Viewer:
         if not fine or float(quat.norm()) < 1e-6 or not 0.01 < fov < 3.1 or not 0.1 < aspect < 10:
             raise ValueError("invalid camera")
         height = max(16, min(self.height, int(getattr(seen, "image_height", 0) or self.height), self.panel.read_height()))
+        height = min(height, int((MOST_PIXELS / aspect) ** 0.5))
         width = max(16, round(height * aspect))
         model = self.capture.views[0].camera
         model = replace(model, world_to_cam=make_pose(place, quat_to_matrix(quat / quat.norm())).float())
@@ -262,4 +292,5 @@ class Viewer:
 
     def close(self) -> None:
         """Stop the server."""
-        self.server.stop()
+        with quiet():
+            self.server.stop()
