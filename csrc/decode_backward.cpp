@@ -90,13 +90,13 @@ class Backward {
     copy_block_inputs(w_, s_, g, from, n);
     float *h = compute_hidden(expert, s_, i, L, n, w_), *dh = h + layer, *other = dh + layer, *y = w_.out,
           *dy = y + int64_t(BLOCK + SLACK) * Op;
-    if (!has_one_expert(head) && i != 1) {
+    if (!has_one_expert(head) && !mixes_linearly(head, i)) {
       compute_outputs(expert, s_, i, n, h, y);
       activate(i, y, n * Op);
     }
     compute_output_gradients(i, n, anchor, place, weight, expert.b2.data(), y, dy);
     multiply(n, Hp, s_.out[i], dy, Op, expert.w2.data(), Hp, nullptr, Store{dh, Hp});
-    if (i == 1 && !has_one_expert(head))
+    if (mixes_linearly(head, i) && !has_one_expert(head))
       apply_weights(n, Hp, Op, place, weight, h, dh, dy, sums_ + at.b2);
     else {
       mask_relu(n * Hp, h, dh);
@@ -118,13 +118,13 @@ class Backward {
     multiply(n, s_.Fp, H, dh, Hp, expert.w1.data(), s_.Fp, nullptr, AddToRows{w_.feature, s_.Fp, rows});
   }
 
-  // Compute the gradients of one expert's outputs before their activation (covariance: before the mixture weight
-  // is applied) and <gradient, outputs> for the gradient of the mixture weights (covariance: only the bias's
-  // part).
+  // Compute the gradients of one expert's outputs before their activation (linear mixtures: before the mixture
+  // weight is applied) and <gradient, outputs> for the gradient of the mixture weights (linear mixtures: only the
+  // bias's part).
   void compute_output_gradients(int i, int n, const int* anchor, const int* place, const float* weight, const float* bias, const float* y,
                                 float* dy) {
     const int Op = s_.Op[i];
-    const bool single = has_one_expert(d_.heads[i]);
+    const bool single = has_one_expert(d_.heads[i]), linear = mixes_linearly(d_.heads[i], i);
     for (int t = 0; t < n; ++t, y += Op, dy += Op) {
       const float* given = w_.mixed[i] + int64_t(anchor[t]) * Op;
       const Vec share = broadcast(weight[t]);
@@ -133,7 +133,7 @@ class Backward {
         const Vec g = load(given + o);
         if (single) {
           store(dy + o, g);
-        } else if (i == 1) {
+        } else if (linear) {
           along = fma(g, load(bias + o), along);
           store(dy + o, g);
         } else {
@@ -150,7 +150,7 @@ class Backward {
     for (int j = 0; j < n; j += LANES) store(dh + j, select_greater(load(h + j), broadcast(0.f), load(dh + j), broadcast(0.f)));
   }
 
-  // The covariance head is linear, so <dy, y> = <dh, h> + <dy, b2> and its outputs need not be recomputed. Then
+  // The mixture is linear, so <dy, y> = <dh, h> + <dy, b2> and its outputs need not be recomputed. Then
   // apply the mixture weights.
   void apply_weights(int n, int Hp, int Op, const int* place, const float* weight, float* h, float* dh, const float* dy, float* b2) {
     for (int t = 0; t < n; ++t, h += Hp, dh += Hp) {

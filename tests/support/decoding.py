@@ -13,7 +13,7 @@ ACTIVATIONS = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid
 EXTENT = 3.0
 
 
-def problem(A=70, N=100, K=4, F=8, H=16, E=3, k=2, distance=(), bias=True, seed=0, shuffled=False, depth=2, position=()):
+def problem(A=70, N=100, K=4, F=8, H=16, E=3, k=2, distance=(), bias=True, seed=0, shuffled=False, depth=2, position=(), linear=(), margin=()):
     """Float64 inputs of a random scene; `k` is per attribute or one for all, 0 for a plain network."""
     g = torch.Generator().manual_seed(seed)
     randn = lambda *shape: torch.randn(*shape, generator=g, dtype=torch.float64).float().double()  # noqa: E731
@@ -34,6 +34,8 @@ def problem(A=70, N=100, K=4, F=8, H=16, E=3, k=2, distance=(), bias=True, seed=
             randn(experts, depth - 2, H, H) / 3 if depth > 2 else None,
             randn(experts, depth - 2, H) / 3 if depth > 2 else None,
             a in position,
+            a in linear,
+            a in margin,
         )
     rows = rows if shuffled else rows.sort().values
     return rows, columns, torch.tensor([0.3, -0.2, 2.5], dtype=torch.float64), heads, {a: a in distance for a in ATTRIBUTES}
@@ -55,16 +57,21 @@ def oracle(rows, columns, camera, heads, with_dist):
                 u = (h.w1[e] @ z + h.b1[e]).relu()
                 for w, b in [] if h.middle_w is None else zip(h.middle_w[e], h.middle_b[e]):
                     u = (w @ u + b).relu()
-                return ACTIVATIONS[a](h.w2[e] @ u + h.b2[e])
+                y = h.w2[e] @ u + h.b2[e]
+                return y if h.linear else ACTIVATIONS[a](y)
 
             if h.router_w is None:
-                y[a] = expert(0)
+                y[a] = ACTIVATIONS[a](expert(0)) if h.linear else expert(0)
                 continue
             seen = torch.cat([f, columns["xyz"][row] / EXTENT]) if h.position else f
             logits = h.router_w @ seen + (0 if h.router_b is None else h.router_b)
             g = logits.softmax(0)
             picked = range(len(g)) if h.k is None else sorted(range(len(g)), key=lambda e: (-float(logits[e].detach()), e))[: h.k]
-            y[a] = sum(g[e] / sum(g[j] for j in picked) * expert(e) for e in picked)
+            share = g
+            if h.margin and h.k is not None:
+                share = g + 1e-4 - max([g[e] for e in range(len(g)) if e not in picked], default=0.0)
+            y[a] = sum(share[e] / sum(share[j] for j in picked) * expert(e) for e in picked)
+            y[a] = ACTIVATIONS[a](y[a]) if h.linear else y[a]
             gates[a].append(g)
             chosen[a].append(list(picked))
         raws.append(y["opacity"])
@@ -149,5 +156,9 @@ CASES = {
     "routers that see positions": {"position": ATTRIBUTES},
     "one router that does": {"position": ("cov",), "F": 12, "distance": ("color",)},
     "rows in any order": {"shuffled": True},
+    "mixed before the activation": {"linear": ATTRIBUTES, "E": 5},
+    "one mixed before, dense": {"linear": ("color",), "k": None},
+    "margin weights": {"margin": ATTRIBUTES, "E": 5},
+    "margin weights, others": {"margin": ("cov", "color"), "linear": ("opacity", "color"), "E": 16, "k": (2, 5, 16)},
     "one anchor": {"A": 1, "N": 1, "seed": 1},
 }

@@ -23,6 +23,7 @@ from scene_experts.core.types import Mode, Routing
 from scene_experts.scene.anchors.mlp import ACTIVATIONS, ATTRIBUTES, MLP, Decoder, HeadWeights, linear_init
 
 log: logging.Logger = logging.getLogger(__name__)
+MOST_MARGINS = 64  # experts of a head with margin weights in the compiled library
 MARGIN = 1e-4  # keeps the weights finite where all gates are equal
 
 
@@ -267,9 +268,11 @@ class MixtureHead(nn.Module):
         return (w[:, :, None, None] * y).sum(1).reshape(len(x), K * 7), routing
 
     def weights(self, step: int) -> HeadWeights | None:
-        r = self.config.router
-        if self.config.mix != "post_activation" or not r.renormalise or r.noise_std > 0 or r.detach_feature:
+        config, router = self.config, self.config.router
+        margin = router.weights == "margin"
+        if config.shared or router.noise_std > 0 or router.detach_feature or not (router.renormalise or margin):
             return None
-        if self.config.shared or r.weights != "softmax":
+        if margin and self.experts > MOST_MARGINS:
             return None
-        return HeadWeights(self.router_w, self.router_b, self.w1, self.b1, self.w2, self.b2, self.k(step), position=r.input_pos)
+        tensors = (self.router_w, self.router_b, self.w1, self.b1, self.w2, self.b2)
+        return HeadWeights(*tensors, self.k(step), position=router.input_pos, linear=config.mix == "pre_activation", margin=margin)

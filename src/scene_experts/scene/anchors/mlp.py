@@ -39,6 +39,8 @@ class HeadWeights:
     middle_w: Tensor | None = None  # [E, L, H, H]: L hidden layers between the first and the last
     middle_b: Tensor | None = None  # [E, L, H]
     position: bool = False  # the router receives the anchor's position, divided by the scene's extent
+    linear: bool = False  # the experts' outputs are mixed before the activation
+    margin: bool = False  # the weights of the chosen experts are margins, see `Router.weights`
 
 
 class Head(Protocol):

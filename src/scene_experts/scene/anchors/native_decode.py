@@ -35,6 +35,8 @@ class Plan:
     k: tuple[int, int, int]  # 0: dense
     distance: tuple[int, int, int]
     position: tuple[int, int, int]  # whether the router receives the position
+    linear: tuple[int, int, int]  # whether outputs are mixed before the activation
+    margin: tuple[int, int, int]  # whether the weights are margins
     extent: float
     ascending: bool
 
@@ -96,9 +98,10 @@ def make_plan(
     """Collect the inputs that are not differentiated. The arguments are those of `decode`; ascending: whether `rows` are sorted."""
     found = [heads[a] for a in ATTRIBUTES]
     k = tuple(h.k or 0 if h.router_w is not None else 0 for h in found)
-    distance, position = tuple(int(with_dist[a]) for a in ATTRIBUTES), tuple(int(h.position) for h in found)
+    distance = tuple(int(with_dist[a]) for a in ATTRIBUTES)
+    flags = [tuple(int(getattr(h, name)) for h in found) for name in ("position", "linear", "margin")]
     camera = camera.detach().to(torch.float32).contiguous()
-    return Plan(rows.contiguous(), xyz.detach().contiguous(), camera, k, distance, position, extent, ascending)  # type: ignore[arg-type]
+    return Plan(rows.contiguous(), xyz.detach().contiguous(), camera, k, distance, *flags, extent=extent, ascending=ascending)  # type: ignore[arg-type]
 
 
 def _check(xyz: Tensor, feature: Tensor, log_scaling: Tensor, offsets: Tensor, heads: list[HeadWeights], distance: tuple[int, ...]) -> None:
@@ -210,6 +213,7 @@ def make_call(plan: Plan, columns: Any, weights: Any) -> SeDecode:
         head.E, head.H, head.out = own["w1"].shape[0], own["w1"].shape[1], own["w2"].shape[1]
         head.L = 0 if own["middle_w"] is None else own["middle_w"].shape[1]
         head.k, head.distance, head.position = plan.k[i], plan.distance[i], plan.position[i]
+        head.linear, head.margin = plan.linear[i], plan.margin[i]
     return call
 
 
