@@ -6,7 +6,7 @@
 // ask for it. Each of the three heads (opacity, covariance, colour) has E experts W2 relu(.. relu(W1 z)) + b2,
 // followed by tanh, identity or sigmoid. Their outputs are mixed with weights: none (one network), all gates
 // (dense), or the softmax over the k largest logits (ties go to the lowest index). Heads with `linear` mix before
-// the activation. Heads with `margin` have other weights: a chosen gate minus the largest gate that is not chosen.
+// the activation. With `shared`, the last expert is always among the k chosen. Heads with `margin` have other weights: a chosen gate minus the largest gate that is not chosen.
 //
 // The work is divided into chunks of CHUNK anchors. Within a chunk, the anchors of one expert are gathered, so
 // that its weights stay in the L1 cache (products.h). Covariance and colour are computed only for anchors that

@@ -95,7 +95,9 @@ void route(const Decode& d, const Sizes& s, const Packed& packed, const Chunk& c
     for (int a = 0; a < n; ++a)
       for (int e = 0; e < E; ++e) gates[a * E + e] = mine[e * CHUNK + a];
     if (!k) continue;
-    choose(copy, E, k, n, values, places);
+    choose(copy, E - head.shared, k - head.shared, n, values, places);
+    if (head.shared)
+      for (int a = 0; a < n; ++a) values[(k - 1) * CHUNK + a] = copy[(E - 1) * CHUNK + a], places[(k - 1) * CHUNK + a] = E - 1;
     if (head.margin)
       weigh_by_margin(mine, E, k, n, places, values);
     else

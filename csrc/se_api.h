@@ -85,6 +85,7 @@ typedef struct {
   int64_t E, k, H, L, out;                                                               // out: outputs of an expert
   int64_t distance, position;  // 1 if the first layer sees the distance; 1 if the router sees the position
   int64_t linear;              // 1: outputs are mixed before the activation, not after it
+  int64_t shared;              // 1: the last expert decodes every anchor; it is the last of the k chosen
   int64_t margin;              // 1: mixture weights are proportional to a gate minus the largest gate that is not chosen, plus 1e-4
 } SeDecodeHead;
 

@@ -13,7 +13,24 @@ ACTIVATIONS = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid
 EXTENT = 3.0
 
 
-def problem(A=70, N=100, K=4, F=8, H=16, E=3, k=2, distance=(), bias=True, seed=0, shuffled=False, depth=2, position=(), linear=(), margin=()):
+def problem(
+    A=70,
+    N=100,
+    K=4,
+    F=8,
+    H=16,
+    E=3,
+    k=2,
+    distance=(),
+    bias=True,
+    seed=0,
+    shuffled=False,
+    depth=2,
+    position=(),
+    linear=(),
+    margin=(),
+    shared=(),
+):
     """Float64 inputs of a random scene; `k` is per attribute or one for all, 0 for a plain network."""
     g = torch.Generator().manual_seed(seed)
     randn = lambda *shape: torch.randn(*shape, generator=g, dtype=torch.float64).float().double()  # noqa: E731
@@ -35,6 +52,7 @@ def problem(A=70, N=100, K=4, F=8, H=16, E=3, k=2, distance=(), bias=True, seed=
             randn(experts, depth - 2, H) / 3 if depth > 2 else None,
             a in position,
             a in linear,
+            a in shared,
             a in margin,
         )
     rows = rows if shuffled else rows.sort().values
@@ -66,14 +84,17 @@ def oracle(rows, columns, camera, heads, with_dist):
             seen = torch.cat([f, columns["xyz"][row] / EXTENT]) if h.position else f
             logits = h.router_w @ seen + (0 if h.router_b is None else h.router_b)
             g = logits.softmax(0)
-            picked = range(len(g)) if h.k is None else sorted(range(len(g)), key=lambda e: (-float(logits[e].detach()), e))[: h.k]
+            routed = len(g) - h.shared
+            picked = range(len(g))
+            if h.k is not None:
+                picked = sorted(range(routed), key=lambda e: (-float(logits[e].detach()), e))[: h.k - h.shared] + [routed] * h.shared
             share = g
             if h.margin and h.k is not None:
                 share = g + 1e-4 - max([g[e] for e in range(len(g)) if e not in picked], default=0.0)
             y[a] = sum(share[e] / sum(share[j] for j in picked) * expert(e) for e in picked)
             y[a] = ACTIVATIONS[a](y[a]) if h.linear else y[a]
-            gates[a].append(g)
-            chosen[a].append(list(picked))
+            gates[a].append(logits[:routed].softmax(0))
+            chosen[a].append(list(picked)[: len(picked) - h.shared])
         raws.append(y["opacity"])
         size = columns["log_scaling"][row].exp()
         for slot in range(K):
@@ -158,6 +179,9 @@ CASES = {
     "rows in any order": {"shuffled": True},
     "mixed before the activation": {"linear": ATTRIBUTES, "E": 5},
     "one mixed before, dense": {"linear": ("color",), "k": None},
+    "a shared expert": {"shared": ATTRIBUTES, "E": 5},
+    "one shared expert, dense": {"shared": ("cov",), "k": None, "linear": ("cov", "color")},
+    "a shared expert, more": {"shared": ("opacity", "color"), "linear": ("opacity",), "E": 6, "k": (4, 2, 6)},
     "margin weights": {"margin": ATTRIBUTES, "E": 5},
     "margin weights, others": {"margin": ("cov", "color"), "linear": ("opacity", "color"), "E": 16, "k": (2, 5, 16)},
     "one anchor": {"A": 1, "N": 1, "seed": 1},

@@ -51,7 +51,7 @@ class SeDecodeHead(Structure):
     _fields_ = [
         *_fields(c_void_p, *HEAD_TENSORS, "gates", "chosen", "chosen_weight"),
         *_fields(c_void_p, *(f"d_{name}" for name in (*HEAD_TENSORS, "gates"))),
-        *_fields(c_int64, "E", "k", "H", "L", "out", "distance", "position", "linear", "margin"),
+        *_fields(c_int64, "E", "k", "H", "L", "out", "distance", "position", "linear", "shared", "margin"),
     ]
 
 

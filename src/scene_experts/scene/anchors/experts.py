@@ -269,10 +269,11 @@ class MixtureHead(nn.Module):
 
     def weights(self, step: int) -> HeadWeights | None:
         config, router = self.config, self.config.router
-        margin = router.weights == "margin"
-        if config.shared or router.noise_std > 0 or router.detach_feature or not (router.renormalise or margin):
+        margin, k = router.weights == "margin", self.k(step)
+        if router.noise_std > 0 or router.detach_feature or not (router.renormalise or margin):
             return None
-        if margin and self.experts > MOST_MARGINS:
+        if margin and (config.shared or self.experts > MOST_MARGINS):
             return None
         tensors = (self.router_w, self.router_b, self.w1, self.b1, self.w2, self.b2)
-        return HeadWeights(*tensors, self.k(step), position=router.input_pos, linear=config.mix == "pre_activation", margin=margin)
+        flags = {"position": router.input_pos, "linear": config.mix == "pre_activation", "shared": config.shared, "margin": margin}
+        return HeadWeights(*tensors, None if k is None else k + config.shared, **flags)

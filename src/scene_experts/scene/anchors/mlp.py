@@ -26,7 +26,8 @@ CHANNELS = {"opacity": 1, "cov": 7, "color": 3}  # values per Gaussian: opacity;
 class HeadWeights:
     """The tensors of a head, for kernels and files. A plain network has E = 1 and no router.
 
-    k: number of experts chosen per anchor. None means dense: all experts are used, weighted by their gates.
+    E counts the shared expert, which is the last.
+    k: number of experts that decode an anchor, the shared one included. None means dense: all, weighted by their gates.
     """
 
     router_w: Tensor | None  # [E, F], or [E, F + 3] if the router receives the anchor's position
@@ -40,6 +41,7 @@ class HeadWeights:
     middle_b: Tensor | None = None  # [E, L, H]
     position: bool = False  # the router receives the anchor's position, divided by the scene's extent
     linear: bool = False  # the experts' outputs are mixed before the activation
+    shared: bool = False  # the last expert decodes every anchor
     margin: bool = False  # the weights of the chosen experts are margins, see `Router.weights`
 
 

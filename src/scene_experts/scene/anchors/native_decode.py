@@ -36,6 +36,7 @@ class Plan:
     distance: tuple[int, int, int]
     position: tuple[int, int, int]  # whether the router receives the position
     linear: tuple[int, int, int]  # whether outputs are mixed before the activation
+    shared: tuple[int, int, int]  # whether the last expert decodes every anchor
     margin: tuple[int, int, int]  # whether the weights are margins
     extent: float
     ascending: bool
@@ -88,8 +89,18 @@ def decode(
     weights = [getattr(h, name) for h in found for name in TENSORS]
     out = _DecodeFunction.apply(plan, feature, log_scaling, offsets, *weights)
     means, quats, scales, opacities, colors, source, raw = out[:7]
-    routing = {a: Routing(gates, chosen) for a, gates, chosen in zip(ATTRIBUTES, out[7:10], out[10:13]) if gates is not None}
+    routing = {
+        a: drop_shared(gates, chosen) if heads[a].shared else Routing(gates, chosen)
+        for a, gates, chosen in zip(ATTRIBUTES, out[7:10], out[10:13])
+        if gates is not None
+    }
     return Gaussians(means, quats, scales, opacities, colors, source), raw, routing
+
+
+def drop_shared(gates: Tensor, chosen: Tensor | None) -> Routing:
+    """Return the routing among the other experts, given the gates [A, E] and the experts [A, k] with the shared expert last."""
+    routed = gates[:, :-1]
+    return Routing(routed / routed.sum(dim=1, keepdim=True), None if chosen is None else chosen[:, :-1])
 
 
 def make_plan(
@@ -99,7 +110,7 @@ def make_plan(
     found = [heads[a] for a in ATTRIBUTES]
     k = tuple(h.k or 0 if h.router_w is not None else 0 for h in found)
     distance = tuple(int(with_dist[a]) for a in ATTRIBUTES)
-    flags = [tuple(int(getattr(h, name)) for h in found) for name in ("position", "linear", "margin")]
+    flags = [tuple(int(getattr(h, name)) for h in found) for name in ("position", "linear", "shared", "margin")]
     camera = camera.detach().to(torch.float32).contiguous()
     return Plan(rows.contiguous(), xyz.detach().contiguous(), camera, k, distance, *flags, extent=extent, ascending=ascending)  # type: ignore[arg-type]
 
@@ -118,7 +129,7 @@ def _check(xyz: Tensor, feature: Tensor, log_scaling: Tensor, offsets: Tensor, h
             if E != 1:
                 raise ValueError(f"expected one expert for {a} without a router, found {E}")
             continue
-        if h.k is not None and not 1 <= h.k <= E:
+        if h.k is not None and not 1 + h.shared <= h.k <= E:
             raise ValueError(f"expected k between 1 and {E} for {a}, found {h.k}")
         wanted += [(f"{a}.router_w", h.router_w, (E, F + 3 * h.position))] + (
             [] if h.router_b is None else [(f"{a}.router_b", h.router_b, (E,))]
@@ -213,7 +224,7 @@ def make_call(plan: Plan, columns: Any, weights: Any) -> SeDecode:
         head.E, head.H, head.out = own["w1"].shape[0], own["w1"].shape[1], own["w2"].shape[1]
         head.L = 0 if own["middle_w"] is None else own["middle_w"].shape[1]
         head.k, head.distance, head.position = plan.k[i], plan.distance[i], plan.position[i]
-        head.linear, head.margin = plan.linear[i], plan.margin[i]
+        head.linear, head.shared, head.margin = plan.linear[i], plan.shared[i], plan.margin[i]
     return call
 
 

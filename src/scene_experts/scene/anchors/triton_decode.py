@@ -54,7 +54,7 @@ def covers(attribute: str, h: HeadWeights, F: int, K: int) -> bool:
     """Whether the kernels support a network (two layers, held in registers) and its number of experts."""
     E, H = h.w1.shape[:2]
     fits = pad(F + 5) <= 64 and pad(H) <= 64 and pad(K * CHANNELS[attribute]) <= WIDEST
-    return h.middle_w is None and fits and E <= MOST_EXPERTS and not h.linear and not h.margin
+    return h.middle_w is None and fits and E <= MOST_EXPERTS and not (h.linear or h.shared or h.margin)
 
 
 def pad(n: int, least: int = 16) -> int:

@@ -128,7 +128,8 @@ def test_switches():
     x, f = data()
     pre = head(mix="pre_activation")
     assert not torch.allclose(pre(x, f, SPARSE)[0], head()(x, f, SPARSE)[0])
-    assert pre.weights(SPARSE) is None and head().weights(SPARSE).k == 2 and head().weights(1).k is None
+    assert pre.weights(SPARSE).linear and head().weights(SPARSE).k == 2 and head().weights(1).k is None
+    assert head(shared=True).weights(SPARSE).k == 3 and head(shared=True, router=Router(weights="margin")).weights(SPARSE) is None
     assert head(router=Router(bias=False)).router_b is None
     assert not head(router=Router(init="zeros")).router_w.any()
     jitter = head(expert_init="clone_jitter")
@@ -207,7 +208,7 @@ def test_margin_weights_as_written(k):
         g = sorted(routing.gates[a].tolist(), reverse=True)
         margins = [value - g[k] + 1e-4 for value in g[:k]]
         torch.testing.assert_close(w[a], torch.tensor([m / sum(margins) for m in margins], dtype=w.dtype))
-    assert h.weights(SPARSE) is None
+    assert h.weights(SPARSE).margin
 
 
 def test_margin_weights_have_no_jump():
