@@ -70,8 +70,10 @@ def test_every_recipe_draws_the_same_bits(recipe):
         Anchors(decoder=Experts(num=16, top_k=5, router=Router(input_pos=True, bias=False))),
         Anchors(appearance=6),
         Anchors(appearance=6, decoder=Experts(top_k=None)),
+        Anchors(decoder=Experts(router=Router(weights="margin"), mix="pre_activation")),
+        Anchors(decoder=Experts(shared=True, top_k=1)),
     ],
-    ids=["odd sizes", "top-1 of one attribute", "positions", "appearance", "appearance, dense"],
+    ids=["odd sizes", "top-1 of one attribute", "positions", "appearance", "appearance, dense", "margins", "shared"],
 )
 def test_other_heads_draw_the_same_bits(config):
     scene = trained(config)
@@ -115,6 +117,6 @@ def test_another_step_and_training_are_refused():
 
 
 def test_what_the_native_decode_does_not_cover_stays_itself():
-    for config in (Anchors(decode="composed"), Anchors(quat_align=True), Anchors(decoder=Experts(mix="pre_activation"))):
+    for config in (Anchors(decode="composed"), Anchors(quat_align=True), Anchors(decoder=Experts(router=Router(noise_std=0.1)))):
         scene = trained(config, n=20)
         assert scene.frozen(7) is scene

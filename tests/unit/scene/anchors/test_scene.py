@@ -176,7 +176,7 @@ def test_new_rows_have_the_columns_of_the_table():
 def test_the_native_decode_refuses_heads_it_has_no_code_for():
     if native.load() is None:
         pytest.skip("no compiled library")
-    wanted = Anchors(decode="native", decoder=Experts(mix="pre_activation"))
+    wanted = Anchors(decode="native", decoder=Experts(router=Router(noise_std=0.1)))
     with pytest.raises(InputError, match=r"--scene\.decode auto"):
         scene(wanted)(camera(), 1, Mode.TRAIN, EVERYTHING)
 
