@@ -43,7 +43,7 @@ def socket(viewer, path="", host=None, protocol=PROTOCOL, **more):
         headers = dict(more.get("headers", {}))
         url = f"ws://{host or 'localhost'}:{port}{path}"
         try:
-            made = await open_async(url, host="127.0.0.1", port=port, subprotocols=[protocol], additional_headers=headers, proxy=None)
+            made = await open_async(url, host="127.0.0.1", port=port, subprotocols=[protocol], additional_headers=headers, proxy=None)  # type: ignore[list-item]
         except InvalidStatus as error:
             return error.response.status_code
         await made.close()

@@ -6,6 +6,7 @@ import gzip
 import lzma
 import shutil
 import stat
+import struct
 import tarfile
 import tempfile
 import zipfile
@@ -24,6 +25,19 @@ MOST_BYTES = 64 << 30  # per scene; the largest in the catalog has about 3 GB
 MOST_FILES = 100_000
 SPARE = 64 << 20  # bytes of disk left free
 _DAMAGE = (zipfile.BadZipFile, tarfile.TarError, gzip.BadGzipFile, zlib.error, lzma.LZMAError)
+_MALFORMED = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RecursionError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
+"""What zipfile and tarfile raise for archives that they do not expect."""
 _CLUTTER = ("__MACOSX", ".DS_Store")
 
 
@@ -56,8 +70,8 @@ def open_archive(archive: Path) -> Iterator[list[Member]]:
             return
         with tarfile.open(archive) as opened:
             yield [_from_tar(opened, info) for info in opened.getmembers()]
-    except (*_DAMAGE, EOFError, NotImplementedError) as error:
-        reason = str(error).partition("\n")[0].rstrip(":")
+    except (*_DAMAGE, *_MALFORMED, EOFError, NotImplementedError) as error:
+        reason = "".join(c for c in str(error).partition("\n")[0] if c.isprintable()).rstrip(":")[:200] or type(error).__name__
         raise RunError(
             f"expected a complete zip or tar archive at {archive}, found a damaged one ({reason}); remove it and run the command again"
         ) from error

@@ -9,7 +9,9 @@ import json
 import os
 import re
 import shutil
+import socket
 import ssl
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -17,6 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.progress import ByteProgress
@@ -25,6 +28,10 @@ Say = Callable[[str], None]
 TRIES = 4  # attempts without progress at one address before the next address is tried
 PATIENCE = 1.0  # seconds before the second attempt; doubles with each attempt
 SPARE = 64 << 20  # bytes of disk left free
+MOST_BYTES = 256 << 30  # of a file whose size nobody states; the largest of the catalog has 12 GB
+ANSWER = 120.0  # seconds until a server must have sent the head of its answer
+SLOWEST, WINDOW = 1024, 60.0  # bytes per second that must arrive, measured over so many seconds
+GAIN = 64 << 10  # bytes of progress after which an interrupted download does not count as a failed attempt
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,10 @@ class _Partial:
 
 class _Refused(Exception):
     """The address does not serve the file, and trying again would not help."""
+
+
+class _TooLong(_Refused):
+    """The address sends more bytes than the file has."""
 
 
 def sha256(path: Path) -> str:
@@ -121,13 +132,17 @@ def _download(url: str, part: Path, digest: str | None, size: int | None, progre
         try:
             begun = _continue(url, part, digest is not None, size, progress)
             break
+        except _TooLong:
+            _remove_part(part)
+            raise
         except urllib.error.HTTPError as error:
             if error.code < 500 and error.code not in (408, 429):
                 raise _Refused(f"the server answered {error.code}") from error
             reason = f"the server answered {error.code}"
         except (urllib.error.URLError, http.client.HTTPException, ConnectionError, TimeoutError, ssl.SSLError) as error:
-            reason = str(getattr(error, "reason", None) or error or type(error).__name__)
-        tries = tries + 1 if not part.is_file() or part.stat().st_size <= before else 1
+            reason = _one_line(str(getattr(error, "reason", None) or error or type(error).__name__))
+        have = part.stat().st_size if part.is_file() else 0
+        tries = tries + 1 if have < before + GAIN else 1
         if tries >= TRIES:
             raise _Refused(reason)
         time.sleep(PATIENCE * 2 ** (tries - 1))
@@ -165,7 +180,7 @@ def _continue(url: str, part: Path, known: bool, size: int | None, progress: Byt
         if begun.url == url and begun.version:
             headers["If-Range"] = begun.version
     try:
-        answer = urllib.request.urlopen(urllib.request.Request(check_web_address(url), headers=headers), timeout=60)
+        answer = _ask(check_web_address(url), headers)
     except urllib.error.HTTPError as error:
         if error.code != 416 or not have:  # 416: no bytes follow those we have
             raise
@@ -174,30 +189,123 @@ def _continue(url: str, part: Path, known: bool, size: int | None, progress: Byt
         _remove_part(part)
         return _continue(url, part, known, size, progress)
     with answer:
+        if answer.status not in (200, 206):
+            raise _Refused(f"the server answered {answer.status}")
         resumed = answer.status == 206 and (answer.headers.get("Content-Range") or f"bytes {have}-").startswith(f"bytes {have}-")
         if answer.status == 206 and not resumed:
             raise _Refused("the server sent another byte range than requested")
         have = have if resumed else 0
-        total = have + int(answer.headers.get("Content-Length") or 0)
+        total = have + _read_length(answer.headers)
         _expect_file(answer.headers.get("Content-Type") or "", total if total > have else 0, size)
         _expect_room(part, total - have)
         if not resumed:
             begun = _Partial(url, _read_version(answer.headers), _read_md5(answer.headers))
             _note_path(part).write_text(json.dumps(asdict(begun)))
-        have = _append(answer, part, have, total if total > have else 0, progress)
+        have = _append(answer, part, have, total if total > have else 0, size or MOST_BYTES, progress)
     if have < total:
         raise ConnectionError(f"the connection ended after {have} of {total} bytes")
     return begun
 
 
-def _append(answer: http.client.HTTPResponse, part: Path, have: int, total: int, progress: ByteProgress | None) -> int:
+def _append(answer: http.client.HTTPResponse, part: Path, have: int, total: int, most: int, progress: ByteProgress | None) -> int:
+    """Append the answer to `part`, at most up to `most` bytes, and return the new length.
+
+    Raises _Refused if more bytes come, and TimeoutError if they come slower than SLOWEST.
+    """
     with part.open("ab" if have else "wb") as stream:
-        while block := answer.read(1 << 20):
+        began, at = time.monotonic(), have
+        while block := _read(answer):
+            if have + len(block) > most:
+                raise _TooLong(f"expected at most {most:,} bytes, found more")
             stream.write(block)
             have += len(block)
             if progress:
                 progress(have, total)
+            if (elapsed := time.monotonic() - began) > WINDOW:
+                if have - at < SLOWEST * elapsed:
+                    raise TimeoutError(f"the server sends less than {SLOWEST} bytes per second")
+                began, at = time.monotonic(), have
     return have
+
+
+# --- the network: whatever a server does, it ends in one of the errors that `_download` expects
+
+
+class _WebRedirects(urllib.request.HTTPRedirectHandler):
+    """Follows redirects to web addresses only."""
+
+    def redirect_request(self, req, fp, code, msg, headers, newurl):
+        if not re.match(r"https?://[^/\s]+", newurl):
+            raise _Refused("the server redirects to something other than a web address")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+def _ask(url: str, headers: dict[str, str]) -> http.client.HTTPResponse:
+    """Send a request and return the answer when its head has arrived. Raises TimeoutError if that takes longer than ANSWER seconds."""
+    sockets: list[socket.socket] = []
+
+    def connect(address: tuple[str, int], timeout: float | None = None, source: tuple[str, int] | None = None) -> socket.socket:
+        sockets.append(socket.create_connection(address, timeout, source))
+        return sockets[-1]
+
+    def end() -> None:
+        for opened in sockets:
+            with suppress(OSError):
+                opened.shutdown(socket.SHUT_RDWR)
+
+    def watched(base: type[http.client.HTTPConnection]) -> Callable[..., http.client.HTTPConnection]:
+        def make(*args: Any, **options: Any) -> http.client.HTTPConnection:
+            made = base(*args, **options)
+            made._create_connection = connect  # type: ignore[attr-defined] - http.client keeps it for tests and tunnels
+            return made
+
+        return make
+
+    class Http(urllib.request.HTTPHandler):
+        def http_open(self, req: urllib.request.Request) -> http.client.HTTPResponse:
+            return self.do_open(watched(http.client.HTTPConnection), req)  # type: ignore[arg-type]
+
+    class Https(urllib.request.HTTPSHandler):
+        def https_open(self, req: urllib.request.Request) -> http.client.HTTPResponse:
+            return self.do_open(watched(http.client.HTTPSConnection), req)  # type: ignore[arg-type]
+
+    late = threading.Timer(ANSWER, end)
+    late.daemon = True
+    late.start()
+    try:
+        with _plain_errors():
+            opener = urllib.request.build_opener(Http, Https, _WebRedirects)
+            return opener.open(urllib.request.Request(url, headers=headers), timeout=60)
+    finally:
+        late.cancel()
+
+
+def _read(answer: http.client.HTTPResponse) -> bytes:
+    """Return the bytes of the answer that have arrived, at least one unless it is at its end."""
+    with _plain_errors():
+        return answer.read1(1 << 20)
+
+
+@contextmanager
+def _plain_errors() -> Iterator[None]:
+    """Turn what http.client and urllib raise for malformed answers (ValueError, UnicodeError, AssertionError...) into HTTPException."""
+    try:
+        yield
+    except (OSError, http.client.HTTPException, _Refused):
+        raise
+    except Exception as error:
+        raise http.client.HTTPException(f"a malformed answer ({type(error).__name__}: {error})") from error
+
+
+def _one_line(text: str) -> str:
+    """Return what a server said as one short line without control characters, which a terminal would obey."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:200]
+
+
+def _read_length(headers: http.client.HTTPMessage) -> int:
+    """Return the length of the answer in bytes; 0 if the server does not state it as a number."""
+    text = (headers.get("Content-Length") or "").strip()
+    return int(text) if re.fullmatch(r"[0-9]{1,18}", text) else 0
 
 
 def _find_resumable(url: str, part: Path, known: bool) -> tuple[int, _Partial]:
@@ -216,6 +324,8 @@ def _expect_file(kind: str, total: int, size: int | None) -> None:
         raise _Refused("the server sent a web page instead of the file (the file moved, or its download quota is used up)")
     if size is not None and total and total != size:
         raise _Refused(f"expected {size:,} bytes, found {total:,}")
+    if total > MOST_BYTES:
+        raise _Refused(f"expected at most {MOST_BYTES:,} bytes, found {total:,}")
 
 
 def _expect_room(part: Path, missing: int) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gzip
 import io
+import lzma
 import os
+import random
 import stat
 import zipfile
 from pathlib import Path
@@ -114,3 +117,23 @@ def test_an_entry_longer_than_declared_is_rejected() -> None:
         archive._copy(member.open(), io.BytesIO(), member, 0, 4, None)
     with pytest.raises(EOFError, match="x"):
         archive._copy(io.BytesIO(b"123"), io.BytesIO(), member, 0, 4, None)
+
+
+@pytest.mark.parametrize("kind", ["zip", "tar", "tar.gz", "tar.xz"])
+def test_a_damaged_archive_gives_the_scene_or_one_sentence(tmp_path: Path, kind: str) -> None:
+    rng = random.Random(kind)
+    if kind == "zip":
+        whole = write_zip(tmp_path / "a", in_folder("truck")).read_bytes()
+    else:
+        whole = gzip.decompress(write_tar(tmp_path / "a", in_folder("truck"), {"truck/link": "x"}).read_bytes())
+        whole = {"tar": bytes, "tar.gz": gzip.compress, "tar.xz": lzma.compress}[kind](whole)
+    for number in range(200):
+        data = bytearray(whole)
+        for _ in range(rng.randrange(1, 6)):
+            at = rng.randrange(len(data))
+            data[at : at + rng.choice([0, 1, 4])] = rng.choice([b"", b"\0", b"\xff\xff\xff\xff", rng.randbytes(rng.randrange(1, 9))])
+        (tmp_path / "a").write_bytes(data)
+        try:
+            archive.extract(tmp_path / "a", "truck", tmp_path / str(number))
+        except RunError as error:
+            assert str(error).isprintable() and not (tmp_path / str(number)).exists()
