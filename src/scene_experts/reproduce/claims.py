@@ -89,10 +89,11 @@ def describe(d: Difference) -> str:
     """Write a difference with its interval and its numbers of captures, views and seeds."""
     number = "+.2f" if d.metric == "psnr" else "+.4f"
     fitted = "" if d.fit is None or d.metric != "psnr" else f"; on training views {d.fit:+.2f} dB"
+    across = "" if d.over_captures is None else f"; over capture means {d.over_captures[0]:{number}} to {d.over_captures[1]:{number}}"
     where = "1 capture" if d.captures == 1 else f"higher on {d.gains} of {d.captures} captures"
     seeds = count(d.seeds[1], "seed") if d.seeds[0] == d.seeds[1] else f"{d.seeds[0]} to {d.seeds[1]} seeds"
     return (
-        f"{d.mean:{number}}{' dB' if d.metric == 'psnr' else ''} (95 % interval {d.low:{number}} to {d.high:{number}}; "
+        f"{d.mean:{number}}{' dB' if d.metric == 'psnr' else ''} (95 % interval {d.low:{number}} to {d.high:{number}}{across}; "
         f"{where}, {count(d.views, 'view')}, {seeds}{fitted})"
     )
 

@@ -24,6 +24,8 @@ BEYOND = {
     "3DGS, MCMC": "3dgs-mcmc",
     "Scaffold-GS": "scaffold-gs",
     "Scaffold-GS, feature bank": "scaffold-gs-bank",
+    "Scaffold-GS with the distance": "scaffold-gs-dist",
+    "w/o MoE, as wide as five experts": "scaffold-gs-wide",
     "Octree-GS": "octree-gs",
     "Octree-GS with experts": "octree-moe-gs",
     "MoE-GS": "moe-gs",
@@ -44,6 +46,7 @@ class Experiment:
     added: tuple[str, ...] = ()  # columns that the paper does not have; shown where every record has a value
     scenes: tuple[str, ...] | None = None  # of the data sets; None: all
     paper: str | None = None  # the section of paper.yaml with the paper's numbers
+    baselines: tuple[str, ...] = ()  # recipes; tables of the other recipes' differences from each are added
 
     def shows(self, dataset: str, scene: str) -> bool:
         return dataset in self.datasets and scene in self.scenes_of(dataset)

@@ -18,8 +18,8 @@ class ReproduceOptions:
     """
 
     experiments: Annotated[tuple[str, ...], Option(value="EXPERIMENT")]
-    """table1, table2, table3, table4, fig1b, fig3, fig5, fig6, fig7, appendix, all of these (all), or extras: recipes that the paper does
-    not have."""
+    """table1, table2, table3, table4, fig1b, fig3, fig5, fig6, fig7, appendix, all of these (all), extras (recipes that the paper does not
+    have), or compare (the recipes of --recipes)."""
     captures: Annotated[tuple[Path, ...], Option(value="CAPTURE")] = ()
     """Your own captures instead of the paper's scenes."""
     data: Path | None = None
@@ -45,7 +45,9 @@ class ReproduceOptions:
     devices: Annotated[tuple[str, ...], Option(value="INDEX")] = ()
     """Indices of the CUDA devices that the workers share."""
     recipes: Annotated[tuple[str, ...], Option(value="RECIPE")] = ()
-    """Run only the rows of these recipes."""
+    """Run only the rows of these recipes. With compare: the recipes to compare, any recipe of `scene-experts train`."""
+    baseline: Annotated[tuple[str, ...], Option(value="RECIPE")] = ()
+    """With compare: show the differences from these recipes; by default from the first of --recipes."""
     discard: bool = False
     """Delete each run folder when its record is written."""
     adopt: Annotated[tuple[Path, ...], Option(value="RUN")] = ()

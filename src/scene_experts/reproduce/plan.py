@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
@@ -21,7 +22,29 @@ from scene_experts.reproduce.experiments import Experiment
 from scene_experts.training.config import Train, flags_of, with_numbers
 
 COLLECTIONS = {"mipnerf360": "MipNeRF360", "tandt": "TanksAndTemples", "db": "DeepBlending", "bungeenerf": "BungeeNeRF"}
-NEWER = ("optimizer",)  # settings of Train that the first records do not have: a default value does not change a run's hash
+NEWER = {
+    "optimizer",
+    "average",
+    "loss.residual_quantile",
+    "loss.residual_weight",
+    "loss.residual_from",
+    "growth.gradient",
+    "growth.error_views",
+    "growth.error_quantile",
+    "growth.error_share",
+    "growth.least_contribution",
+    "growth.mask_contribution",
+    "growth.mask_at",
+    "growth.mask_views",
+    "rates.networks",
+    "rates.anneal",
+    "rates.anneal_from",
+    "scene.dropout",
+    "scene.dropout_full",
+    "scene.decoder.shared",
+    "scene.decoder.router.weights",
+}
+"""Settings of Train that the first records do not have. Their default values do not change a run's hash: add each new setting here."""
 OWN = "captures"  # the data set of the user's own captures
 
 
@@ -125,10 +148,21 @@ class Spec:
 
 def identity(scene: str, train: Train, data: Data) -> str:
     """Return the hash that names a run: of the scene's name, the recipe with all numbers and how the capture is read, not of its path."""
-    plain, default = to_json(train), to_json(Train(train.recipe))
-    kept = {name: value for name, value in plain.items() if name not in NEWER or value != default[name]}
-    text = json.dumps([scene, kept, data.settings()], sort_keys=True)
+    text = json.dumps([scene, without_newer(to_json(train), train), data.settings()], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def without_newer(plain: dict[str, Any], part: Any, place: str = "") -> dict[str, Any]:
+    """Return `plain`, the JSON of a dataclass `part` of Train, without the settings of NEWER that have their defaults."""
+    kept = dict(plain)
+    for f in dataclasses.fields(part):
+        name, value = f"{place}{f.name}", getattr(part, f.name)
+        default = f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
+        if name in NEWER and value == default:
+            del kept[f.name]
+        elif dataclasses.is_dataclass(value):
+            kept[f.name] = without_newer(plain[f.name], value, f"{name}.")
+    return kept
 
 
 def find_own_scenes(captures: Sequence[Path]) -> list[Scene]:

@@ -14,6 +14,7 @@ from scene_experts.evaluate.experts import draw_expert_strip
 from scene_experts.evaluate.tables import ResultTable
 from scene_experts.render import choose
 from scene_experts.reproduce import claims, figures, store, tables
+from scene_experts.reproduce.compare import COMPARE, make_difference_tables
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN, Scene, Spec
 from scene_experts.reproduce.statistics import SEED_SD, SEED_WEIGHT, on_common_scenes
@@ -39,10 +40,13 @@ def write(
         written += made
         page += [f"## {experiment.title}", "", ", ".join(f"[{p.name}]({p.name})" for p in made) or "No run is finished yet.", ""]
         page += [f"![{p.stem}]({p.name})\n" for p in made if p.suffix == ".png"]
-    page += ["## The paper's claims", "", *caveat(records), claims.to_markdown(claims.check(records))]
+    if any(experiment.name != COMPARE for experiment in experiments):
+        page += ["## The paper's claims", "", *caveat(records), claims.to_markdown(claims.check(records))]
     noise = f"{SEED_SD['psnr']} dB with {SEED_WEIGHT} degrees of freedom"
     page += [
         "Differences are paired by view and seed. The interval covers other views and other seeds of these captures (Student's t).",
+        "The interval over capture means covers other captures: Student's t with the captures as the sample, from three captures on. "
+        "Verdicts use the first interval, so they are about these captures.",
         f"The standard deviation over seeds is the same for all captures. It is pooled from the measured seeds and from {noise}.",
         '"On training views" is the difference in PSNR on training views over the second half of the trainings, paired by iteration.',
         "",
@@ -85,6 +89,7 @@ def write_tables(out: Path, experiment: Experiment, scenes: Sequence[Scene], rec
                 table = replace(table, notes=(*table.notes, f"Not in the means, as not every row has a run there: {missed}."))
             made[f"{dataset}: means over {', '.join(even)}"] = table
             made[f"{dataset}: scene by scene"] = tables.by_scene(experiment, records, done)
+            made |= {f"{dataset}: {name}": table for name, table in make_difference_tables(experiment, records, done).items()}
         if experiment.name == "fig3":
             shares = {name: found for name in done if (found := tables.expert_shares(experiment, records, name))}
             made |= {f"{name}: share of the assignments at the end, %": found for name, found in shares.items()}

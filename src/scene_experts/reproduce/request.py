@@ -8,6 +8,7 @@ from pathlib import Path
 from scene_experts.core.errors import InputError, nearest
 from scene_experts.data.fetch import catalog
 from scene_experts.data.fetch.obtain import captures_dir
+from scene_experts.reproduce.compare import COMPARE, make_comparison
 from scene_experts.reproduce.experiments import EXPERIMENTS, OURS, Experiment
 from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.plan import Scale, Scene, Spec, check_folders, drop_repeated, find_own_scenes, find_paper_scenes, list_runs
@@ -55,15 +56,17 @@ def choose_rows(experiments: list[Experiment], recipes: tuple[str, ...]) -> list
 def choose_experiments(options: ReproduceOptions) -> list[Experiment]:
     """The experiments of the options. Raises InputError for an unknown name."""
     if not options.experiments:
-        raise InputError(f"expected one or more of {', '.join(EXPERIMENTS)} or all, found none; name what to reproduce")
+        raise InputError(f"expected one or more of {', '.join(EXPERIMENTS)}, {COMPARE} or all, found none; name what to reproduce")
     names = list(dict.fromkeys(options.experiments))
+    if options.baseline and COMPARE not in names:
+        raise InputError(f"expected the experiment {COMPARE} with --baseline, found {', '.join(names)}; add it or leave --baseline out")
     if "all" in names:  # on other captures table 2 equals table 1
         names = [name for name in EXPERIMENTS if name not in OURS and (name != "table2" or not options.captures)]
     for name in names:
-        if name not in EXPERIMENTS:
-            hint = nearest(name, EXPERIMENTS)
-            raise InputError(f"expected one of {', '.join(EXPERIMENTS)} or all, found '{name}'{hint}; change it")
-    return [EXPERIMENTS[name] for name in names]
+        if name not in EXPERIMENTS and name != COMPARE:
+            hint = nearest(name, [*EXPERIMENTS, COMPARE])
+            raise InputError(f"expected one of {', '.join(EXPERIMENTS)}, {COMPARE} or all, found '{name}'{hint}; change it")
+    return [make_comparison(options) if name == COMPARE else EXPERIMENTS[name] for name in names]
 
 
 def choose_scenes(options: ReproduceOptions) -> list[Scene]:
@@ -88,7 +91,7 @@ def written_command(options: ReproduceOptions, scenes: list[Scene]) -> str:
     words = ["scene-experts", "reproduce", *options.experiments]
     if options.captures:
         words += ["--captures", *(f"CAPTURES/{scene.name}" for scene in scenes)]
-    for name in ("scenes", "scale", "iterations", "resolution", "seeds", "recipes"):
+    for name in ("scenes", "scale", "iterations", "resolution", "seeds", "recipes", "baseline"):
         value = getattr(options, name)
         if value != getattr(ReproduceOptions(()), name):
             words += [f"--{name}", *(map(str, value) if isinstance(value, tuple) else [str(value)])]

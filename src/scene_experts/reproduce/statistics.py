@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -18,6 +18,8 @@ VIEW_SD = {"psnr": 0.4, "ssim": 0.003, "lpips_3dgs": 0.004}
 """The same over the views of a capture. Used for captures with a single view."""
 SEED_WEIGHT = 4
 """Degrees of freedom of SEED_SD where it is pooled with the variance of the measured seeds."""
+QUANTILES = {2: 4.302653, 3: 3.182446, 4: 2.776445, 5: 2.570582, 6: 2.446912}
+"""97.5 % quantiles of Student's t by degrees of freedom, where `student` is too coarse for the second decimal of an interval."""
 Verdict = Literal["confirmed", "contradicted", "undecided"]
 
 
@@ -79,6 +81,13 @@ class Difference:
     fit: float | None = None
     """A - B in PSNR (dB) on training views in the second half of the trainings: tells whether A fits the training views better."""
     metric: str = "psnr"
+    by_capture: dict[str, float] = field(default_factory=dict)
+    """A - B on each capture: mean over seeds and views."""
+
+    @property
+    def over_captures(self) -> tuple[float, float] | None:
+        """Ends of the 95 % interval of the mean with captures as the sample; None with fewer than three."""
+        return estimate_over_captures(list(self.by_capture.values()))
 
     def verdict(self, sign: int) -> Verdict:
         """Judge the claim that A - B has a sign (+1 or -1).
@@ -111,7 +120,8 @@ def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -
     centre, half = estimate(grids, SEED_SD[metric], VIEW_SD[metric])
     counts = [len(grid) for grid in grids]
     views, gains = sum(grid.shape[1] for grid in grids), sum(bool(grid.mean() > 0) for grid in grids)
-    return Difference(centre, centre - half, centre + half, len(grids), (min(counts), max(counts)), views, gains, compare_fit(a, b), metric)
+    seeds, means = (min(counts), max(counts)), {scene: float(grid.mean()) for scene, grid in zip(blocks, grids)}
+    return Difference(centre, centre - half, centre + half, len(grids), seeds, views, gains, compare_fit(a, b), metric, means)
 
 
 def estimate(grids: Sequence[NDArray[np.float64]], seed_sd: float, view_sd: float) -> tuple[float, float]:
@@ -134,6 +144,19 @@ def estimate(grids: Sequence[NDArray[np.float64]], seed_sd: float, view_sd: floa
     total = sum(variance for variance, _ in terms)
     together = total**2 / sum(variance**2 / degrees for variance, degrees in terms)
     return float(np.mean([grid.mean() for grid in grids])), student(together) * total**0.5
+
+
+def estimate_over_captures(means: Sequence[float]) -> tuple[float, float] | None:
+    """Return the ends of the 95 % interval of the mean of capture means, by Student's t. None for fewer than three captures.
+
+    The captures are the sample, so the interval is about captures like these and not only about these.
+    """
+    if len(means) < 3:
+        return None
+    freedom = len(means) - 1
+    quantile = QUANTILES.get(freedom) or student(freedom)
+    centre, half = statistics.fmean(means), quantile * statistics.stdev(means) / len(means) ** 0.5
+    return centre - half, centre + half
 
 
 def student(freedom: float) -> float:

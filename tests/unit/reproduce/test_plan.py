@@ -7,11 +7,26 @@ import pytest
 
 from scene_experts.commands.train import parse_train
 from scene_experts.core.errors import InputError
+from scene_experts.core.plain import to_json
 from scene_experts.data.fetch import catalog
 from scene_experts.data.images import check_policy, target_size
+from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS
-from scene_experts.reproduce.plan import COLLECTIONS, OWN, Scale, Scene, Spec, find_own_scenes, find_paper_scenes, list_runs, shrink
+from scene_experts.reproduce.plan import (
+    COLLECTIONS,
+    NEWER,
+    OWN,
+    Scale,
+    Scene,
+    Spec,
+    find_own_scenes,
+    find_paper_scenes,
+    identity,
+    list_runs,
+    shrink,
+    without_newer,
+)
 from scene_experts.training.config import flags_of
 
 FOX = Scene("fox", OWN, Path("captures/fox"))
@@ -47,6 +62,18 @@ def test_what_changes_numbers_changes_the_key_and_the_place_does_not():
     ]
     assert len({spec.key, *(o.key for o in others)}) == 7
     assert replace(spec, scene=replace(FOX, path=Path("/elsewhere/fox"))).key == spec.key
+
+
+def test_every_newer_setting_is_left_out_at_its_default_and_counts_otherwise():
+    cfg = Spec(FOX, "moe-gs", 0, Scale()).train
+    text = str(without_newer(to_json(cfg), cfg))
+    assert not any(f"'{name.rpartition('.')[2]}'" in text for name in NEWER)
+    for changed in (
+        replace(cfg, average=replace(cfg.average, span=0.25)),
+        replace(cfg, growth=replace(cfg.growth, gradient="absolute")),
+        replace(cfg, scene=replace(cfg.scene, decoder=replace(cfg.scene.decoder, shared=True))),
+    ):
+        assert identity("fox", changed, Data(FOX.path)) != identity("fox", cfg, Data(FOX.path))
 
 
 def test_scale():

@@ -3,7 +3,9 @@
 import pytest
 
 from scene_experts.reproduce import report
+from scene_experts.reproduce.compare import make_comparison
 from scene_experts.reproduce.experiments import EXPERIMENTS
+from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.plan import OWN, Scene
 from support.records import record
 
@@ -31,6 +33,18 @@ def test_means_are_over_the_captures_that_every_row_has(tmp_path):
     means, by_scene = (tmp_path / "table4.md").read_text().split("scene by scene")
     assert "means over fox\n" in means and "| MoE-GS | **30.00** |" in means and "fern" in means and "10.00" not in means
     assert "10.00" in by_scene
+
+
+def test_a_comparison_has_no_claims_and_the_differences_from_its_baseline(tmp_path):
+    scenes = [Scene(name, OWN, tmp_path / name) for name in ("fox", "fern", "box")]
+    experiment = make_comparison(ReproduceOptions(("compare",), recipes=("moe-gs-balance", "3dgs", "scaffold-gs"), baseline=("3dgs",)))
+    runs = [record(r, s.name, psnr=p) for s in scenes for r, p in (("moe-gs-balance", 30.5), ("3dgs", 30.0))]
+    runs.append(record("scaffold-gs", "fox", psnr=29.0))
+    report.write(tmp_path, [experiment], scenes, runs)
+    assert "claims" not in (tmp_path / "README.md").read_text()
+    text = (tmp_path / "compare.md").read_text()
+    assert "PSNR minus that of 3dgs" in text and "| moe-gs-balance | +0.50 | +0.50 | +0.50 | +0.50 |" in text
+    assert "| scaffold-gs | -1.00 | - | - | -1.00 |" in text and "no pair of runs on fern, box" in text
 
 
 def test_short_trainings_are_said_to_be_no_judges():

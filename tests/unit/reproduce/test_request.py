@@ -8,6 +8,24 @@ from scene_experts.reproduce.request import choose_experiments, choose_scenes, m
 from support.messages import naming
 
 
+@pytest.mark.parametrize(
+    ("given", "fact"),
+    [
+        ({"recipes": ("moe-gs",)}, "--recipes"),
+        ({"recipes": ("moe-gs", "scafold-gs")}, "'scaffold-gs'"),
+        ({"recipes": ("moe-gs", "scaffold-gs"), "baseline": ("3dgs",)}, "--baseline"),
+    ],
+)
+def test_comparisons_that_cannot_be(given, fact):
+    with pytest.raises(InputError, match=fact):
+        choose_experiments(ReproduceOptions(("compare",), **given))
+
+
+def test_a_baseline_needs_a_comparison():
+    with pytest.raises(InputError, match="--baseline"):
+        choose_experiments(ReproduceOptions(("table1",), recipes=("moe-gs", "scaffold-gs"), baseline=("moe-gs",)))
+
+
 def test_names_that_are_none(tmp_path):
     (tmp_path / "box").mkdir()
     (tmp_path / "note").touch()

@@ -5,7 +5,17 @@ import math
 import numpy as np
 import pytest
 
-from scene_experts.reproduce.statistics import SEED_SD, SEED_WEIGHT, complete_seeds, difference, estimate, mean, on_common_scenes, student
+from scene_experts.reproduce.statistics import (
+    SEED_SD,
+    SEED_WEIGHT,
+    complete_seeds,
+    difference,
+    estimate,
+    estimate_over_captures,
+    mean,
+    on_common_scenes,
+    student,
+)
 from support.records import record
 
 
@@ -51,6 +61,21 @@ def test_intervals_hold_the_truth_as_often_as_they_say(captures, seeds, views):
         centre, half = estimate(list(truth[:, None, None] + seed + view + rest), SEED_SD["psnr"], 0.4)
         held += abs(centre - truth.mean()) <= half
     assert held / 600 >= 0.93
+
+
+def test_the_interval_over_captures_is_students_of_their_means():
+    found = estimate_over_captures([1.0, 2.0, 3.0])
+    assert found == pytest.approx((2 - 4.302653 / math.sqrt(3), 2 + 4.302653 / math.sqrt(3)))
+    assert estimate_over_captures([1.0, 2.0]) is None
+    a = [record("moe-gs", scene=s, seed=k, psnr=30 + gain) for s, gain in zip("xyz", (1, 2, 3)) for k in (0, 1)]
+    d = difference(a, [record("scaffold-gs", scene=s, seed=k) for s in "xyz" for k in (0, 1)])
+    assert d is not None and d.by_capture == pytest.approx({"x": 1, "y": 2, "z": 3}) and d.over_captures == pytest.approx(found)
+
+
+def test_the_interval_over_captures_holds_the_mean_of_all_captures_as_often_as_it_says():
+    random = np.random.default_rng(0)
+    ends = [estimate_over_captures(list(random.normal(0.2, 0.3, 7))) for _ in range(2000)]
+    assert sum(low <= 0.2 <= high for low, high in ends) / 2000 == pytest.approx(0.95, abs=0.015)
 
 
 def test_gains_here_and_losses_there_are_undecided():
