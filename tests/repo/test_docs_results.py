@@ -94,6 +94,8 @@ def test_the_claims_are_quoted_as_they_were_judged():
         measured = next(text for name, text in claims.items() if name.startswith("MoE-GS") and claim in name)
         gain, low, high = re.search(rf"{number}(?: dB)? \(95 % interval {number} to {number};", measured).groups()
         assert len(gain.partition(".")[2]) == digits and re.search(rf"{re.escape(gain)}(?: dB)?\s+\({claimed(low, high)}", page), claim
+        across = re.search(rf"over capture means {number} to {number};", measured)
+        assert across is not None and f"{across[1]} to {across[2]}" in page, claim
         assert digits > 2 or f"{gain[1:]} dB more (95 % interval {low} to {high})" in front
     moe, scaffold = re.search(r"([\d.]+) MB against ([\d.]+) MB", claims["MoE-GS is at most as large as Scaffold-GS"]).groups()
     assert all(f"at {moe} against {scaffold} MB" in text for text in (front, page))
