@@ -14,16 +14,22 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_atomic
+from scene_experts.core.reading.budget import CHECKPOINT, Damaged
+from scene_experts.core.reading.plain import parse_json
+from scene_experts.core.reading.source import guarding, shorten
+from scene_experts.core.reading.tensors import find_not_finite, read_metadata, read_safetensors
 
 FORMAT = 1
 KIND = "checkpoint"
 KEY = "scene_experts"
+FINITE = ("params.", "facts.", "network.", "feature", "offsets", "log_scaling", "cells")
+"""Prefixes of the tensors of a scene, whose values must be finite. Statistics and states of an optimiser are not among them."""
 _NAME = re.compile(r"ckpt_(\d{6,})\.safetensors")
 
 log: logging.Logger = logging.getLogger(__name__)
@@ -77,8 +83,7 @@ def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
     if found is None:
         return None
     path, tensors, meta = found
-    with safe_open(path, framework="pt", device="cpu") as file:
-        _expect_format(_head((file.metadata() or {}).get(KEY), KIND, path), KIND, FORMAT, path)
+    _expect_format(_head(read_metadata(path, CHECKPOINT), KIND, path), KIND, FORMAT, path)
     return tensors, meta
 
 
@@ -138,42 +143,37 @@ def read_tensors(path: Path, kind: str, version: int | None = None) -> tuple[dic
     Raises InputError if the file does not exist, is truncated or damaged, or has another type, kind or version.
     """
     path = Path(path)
-    what = f"a {kind} file"
-    if not path.is_file():
-        raise InputError(f"expected {what} at {path}, found none; check the path")
-    try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            head = _head((file.metadata() or {}).get(KEY), kind, path)
-            if version is not None:
-                _expect_format(head, kind, version, path)
-            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except (SafetensorError, OSError) as error:
-        raise InputError(
-            f"expected {what} at {path}, found one cut short or damaged ({error}); use an older one or copy it again"
-        ) from error
-    if digest(tensors) != head["sha256"]:
-        raise InputError(f"expected {what} at {path}, found one whose contents are damaged (checksum); use an older one or copy it again")
-    return tensors, head["meta"]
+    with guarding(path, CHECKPOINT, f"{kind} file"):
+        if version is not None and path.is_file():
+            _expect_format(_head(read_metadata(path, CHECKPOINT, f"{kind} file"), kind, path), kind, version, path)
+        tensors, metadata = read_safetensors(path, CHECKPOINT, f"{kind} file")
+        head = _head(metadata, kind, path)
+        if digest(tensors) != head["sha256"]:
+            raise Damaged("one whose contents are damaged (checksum)")
+        if name := find_not_finite(tensors, FINITE):
+            raise Damaged(f"values that are not finite in {name}")
+        return tensors, head["meta"]
 
 
 def _expect_format(head: dict[str, Any], kind: str, version: int, path: Path) -> None:
     if head["format"] != version:
         raise InputError(
-            f"expected a {kind} file of format {version} at {path}, found format {head['format']}; "
+            f"expected a {kind} file of format {version} at {path}, found format {shorten(str(head['format']), 60)}; "
             f"use the version of scene-experts that wrote it, or write it again"
         )
 
 
-def _head(text: str | None, kind: str, path: Path) -> dict[str, Any]:
-    """Parse and check the metadata in the header of a file."""
+def _head(metadata: dict[str, str], kind: str, path: Path) -> dict[str, Any]:
+    """Parse and check the description in the metadata of a file."""
     try:
-        head = json.loads(text) if text else None
-    except json.JSONDecodeError:
+        text = metadata.get(KEY)
+        head = parse_json(text) if text else None
+    except (ValueError, RecursionError):
         head = None
     if not isinstance(head, dict) or not {"kind", "format", "sha256", "meta"} <= head.keys() or not isinstance(head["meta"], dict):
         raise InputError(f"expected a {kind} file of scene-experts at {path}, found another safetensors file; check the path")
     if head["kind"] != kind:
-        raise InputError(f"expected a {kind} file at {path}, found a {head['kind']} file; check the path")
+        raise InputError(f"expected a {kind} file at {path}, found a {shorten(str(head['kind']), 60)} file; check the path")
     return head
 
 

@@ -15,6 +15,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.reading.plain import read_json as read_json
 
 
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
@@ -112,16 +113,3 @@ def write_bytes(path: Path, data: bytes) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write `value` as indented JSON to `path` atomically. Raises ValueError for NaN and infinity, which JSON does not support."""
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
-
-
-def read_json(path: Path, what: str) -> Any:
-    """Read the JSON file `path`. Raises InputError if it does not exist or is invalid; `what` names it, for example "run configuration"."""
-    path = Path(path)
-    try:
-        return json.loads(path.read_bytes())  # UTF-8 in every locale, with or without a byte order mark
-    except FileNotFoundError as error:
-        raise InputError(f"expected a {what} at {path}, found no such file; check the path") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"expected a {what} in JSON at {path}, found something unreadable ({error}); restore or remove the file"
-        ) from error

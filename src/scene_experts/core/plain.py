@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.parts import Part, find, names_of
+from scene_experts.core.reading.source import shorten
 
 
 class UnknownPart(InputError):
@@ -41,8 +42,8 @@ def from_json(kind: Any, value: Any, where: str = "config") -> Any:
     if dataclasses.is_dataclass(kind):
         return _from_object(kind, value, where)
     if origin is Literal:
-        if value not in args:
-            raise InputError(f"expected one of {list(args)} at {where}, found {value!r}; correct the file")
+        if not isinstance(value, (str, int, float, bool, type(None))) or value not in args:
+            raise InputError(f"expected one of {list(args)} at {where}, found {_shown(value)}; correct the file")
         return value
     if origin is tuple:
         _expect(isinstance(value, list), "a list", where, value)
@@ -65,9 +66,11 @@ def _part_named(kind: type[Part], value: Any, where: str) -> type[Part]:
     """Return the class of the part that `value` names."""
     _expect(isinstance(value, dict), "an object", where, value)
     name = value.get("type", kind.__name__)
-    part = find(name, kind)
+    part = find(name, kind) if isinstance(name, str) else None
     if part is None:
-        raise UnknownPart(f"expected one of {names_of(kind)} at {where}, found {name!r}; install or import the package that defines it")
+        raise UnknownPart(
+            f"expected one of {names_of(kind)} at {where}, found {_shown(name)}; install or import the package that defines it"
+        )
     return part
 
 
@@ -81,7 +84,9 @@ def _from_union(args: tuple[Any, ...], value: Any, where: str) -> Any:
         if isinstance(value, dict) and getattr(option, "__name__", None) == value.get("type"):
             return from_json(option, value, where)
     found = value["type"] if isinstance(value, dict) and "type" in value else value
-    raise InputError(f"expected one of {[getattr(o, '__name__', str(o)) for o in options]} at {where}, found {found!r}; correct the file")
+    raise InputError(
+        f"expected one of {[getattr(o, '__name__', str(o)) for o in options]} at {where}, found {_shown(found)}; correct the file"
+    )
 
 
 def _from_object(kind: Any, value: Any, where: str) -> Any:
@@ -97,7 +102,11 @@ def _from_object(kind: Any, value: Any, where: str) -> Any:
 
 def _expect(fits: bool, what: str, where: str, found: Any) -> None:
     if not fits:
-        raise InputError(f"expected {what} at {where}, found {found!r}; correct the file or start a new run")
+        raise InputError(f"expected {what} at {where}, found {_shown(found)}; correct the file or start a new run")
+
+
+def _shown(value: Any) -> str:
+    return shorten(repr(value))
 
 
 def first_difference(old: Any, new: Any, where: str = "") -> str:

@@ -11,6 +11,9 @@ import numpy as np
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.reading.budget import CAPTURE
+from scene_experts.core.reading.numbers import FARTHEST, expect_range, number
+from scene_experts.core.reading.source import guarding
 from scene_experts.core.types import Camera
 from scene_experts.data import prepare
 from scene_experts.data.images import FrameSource, check_policy, probe
@@ -66,25 +69,39 @@ def load(
     """
     root = Path(path)
     policy = check_policy(resolution)
+    with guarding(root, CAPTURE):  # a reader of another package may raise anything
+        raw, capture = _read(root, images, policy, missing, ignore_principal_point, background, cache_bytes)
+        if max_views is not None:
+            capture = prepare.limit_views(capture, max_views)
+        capture = prepare.drop_outlier_views(capture)
+        auto = "files" if capture.states_split or capture.test else "mod8"
+        capture = prepare.measure_extent(prepare.hold_out(capture, auto if split == "auto" else split))
+        if normalise == "extent":
+            capture = prepare.normalise(capture)
+        capture = prepare.drop_outliers(capture)
+        if init == "random" or (capture.points is None and capture.bounds is not None):
+            capture = _add_random_points(capture, seed, warn=init != "random")
+        elif capture.points is None:
+            capture = _check_no_points(capture, raw.points_source, allow_no_points)
+        return _finish(prepare.downscale(capture, policy))
+
+
+def _read(
+    root: Path,
+    images: str | None,
+    policy: str,
+    missing: Literal["error", "drop"],
+    centred: bool,
+    background: Vector | None,
+    cache_bytes: int | None,
+) -> tuple[RawCapture, Capture]:
+    """Read the capture in `root` in its own frame, at the resolution of its files."""
     options = ReadOptions(_find_image_folder(root, images, policy), background, missing)
     reader = find_reader(root)
     if reader is None:
         raise unrecognised_error(root)
     raw = reader.read(root, options)
-    capture = _assemble(root, reader.name, raw, ignore_principal_point, background, cache_bytes)
-    if max_views is not None:
-        capture = prepare.limit_views(capture, max_views)
-    capture = prepare.drop_outlier_views(capture)
-    auto = "files" if capture.states_split or capture.test else "mod8"
-    capture = prepare.measure_extent(prepare.hold_out(capture, auto if split == "auto" else split))
-    if normalise == "extent":
-        capture = prepare.normalise(capture)
-    capture = prepare.drop_outliers(capture)
-    if init == "random" or (capture.points is None and capture.bounds is not None):
-        capture = _add_random_points(capture, seed, warn=init != "random")
-    elif capture.points is None:
-        capture = _check_no_points(capture, raw.points_source, allow_no_points)
-    return _finish(prepare.downscale(capture, policy))
+    return raw, _assemble(root, reader.name, raw, centred, background, cache_bytes)
 
 
 def _find_image_folder(root: Path, images: str | None, policy: str) -> str | None:
@@ -174,6 +191,12 @@ def _check_no_points(capture: Capture, source: str, allow: bool) -> Capture:
 def _finish(capture: Capture) -> Capture:
     """Convert cameras to float32 and add the warnings that concern the whole capture."""
     views = tuple(replace(v, camera=v.camera.to(dtype=torch.float32)) for v in capture.views)
+    for view in views:
+        expect_range(view.camera.world_to_cam, "camera poses", -FARTHEST, FARTHEST)
+        expect_range(view.camera.K, "camera parameters")
+    if capture.points is not None:
+        expect_range(capture.points.xyz, "positions of points", -FARTHEST, FARTHEST)
+    number(capture.extent, "the extent of the cameras", 1e-12, FARTHEST)
     notes = list(capture.warnings)
     if 0 < len(capture.test) < 5:
         notes.append(f"only {len(capture.test)} test views: mean scores are unreliable")

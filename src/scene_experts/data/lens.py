@@ -30,6 +30,7 @@ MODELS: dict[str, tuple[str, ...]] = {
     "THIN_PRISM_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
 }
 FISHEYE = frozenset(name for name in MODELS if name.endswith("FISHEYE"))
+_LARGEST, _LONGEST = 1e9, 1 << 20  # of a parameter, and of a side in pixels
 _LARGEST_ANGLE = math.radians(88.0)  # rays further from the axis are not usable on a flat image
 
 
@@ -53,10 +54,11 @@ class Lens:
             raise InputError(
                 f"expected {len(MODELS[self.model])} parameters for camera model {self.model}, found {len(self.params)}; restore the file"
             )
-        if not all(math.isfinite(p) for p in self.params) or self.fx <= 0 or self.fy <= 0 or self.width < 1 or self.height < 1:
+        fits = all(abs(p) <= _LARGEST for p in self.params) and max(self.width, self.height) <= _LONGEST  # False for NaN
+        if not fits or self.fx <= 0 or self.fy <= 0 or self.width < 1 or self.height < 1:
             raise InputError(
-                f"expected a camera with a positive size and focal length and finite parameters, found {self.model} "
-                f"{self.width}x{self.height} {self.params}; remove it or reconstruct the capture again"
+                f"expected a camera with a positive size and focal length and finite parameters in range, found {self.model} "
+                f"{self.width:.9g}x{self.height:.9g} {self.params}; remove it or reconstruct the capture again"
             )
 
     def value(self, name: str) -> float:

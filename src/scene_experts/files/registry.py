@@ -21,6 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from scene_experts.core.errors import InputError, nearest
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.source import guarding, opening
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -220,10 +222,8 @@ def recognise(path: Path) -> tuple[str, Format]:
 
     Raises InputError for a missing file and for one of no known format.
     """
-    if not path.is_file():
-        raise InputError(f"expected a file at {path}, found none; check the path")
-    with path.open("rb") as stream:
-        head = stream.read(HEAD)
+    with opening(path, budget.HEAD) as source:
+        head = source.head(HEAD)
     found = {name: format_named(name) for name in format_names()}
     for name, format in sorted(found.items(), key=lambda item: not item[1].marks):  # stable: signatures first
         if format.read is None or not (format.marks or format.looks_like):
@@ -239,7 +239,8 @@ def read(path: Path) -> Any:
     damaged files."""
     format = recognise(Path(path))[1]
     assert format.read is not None
-    return format.read(Path(path))
+    with guarding(path, budget.HEAD):  # a format of another package may raise anything
+        return format.read(Path(path))
 
 
 def exported_files(folder: Path) -> list[Path]:

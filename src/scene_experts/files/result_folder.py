@@ -6,20 +6,23 @@ Published folders have no description. Everything in a folder is in the capture'
 
 from __future__ import annotations
 
-import ast
-import math
 import re
 from pathlib import Path
 from typing import Any
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.numbers import FARTHEST, number, whole_number
+from scene_experts.core.reading.plain import parse_namespace
+from scene_experts.core.reading.source import guarding, opening
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 
 DESCRIPTION, DESCRIPTION_FORMAT = "scene.json", 1
 SETTINGS = "cfg_args"
-_SETTINGS_LIMIT = 1 << 20
+MOST_STEPS = 1 << 40  # iterations of a training
 
 
 def is_result(path: Path) -> bool:
@@ -70,16 +73,27 @@ def read_description(folder: Path) -> dict[str, Any] | None:
     absent = {"K", "F", "voxel_size", "world", "recipe"} - value.keys()
     if absent:
         raise InputError(f"expected {', '.join(sorted(absent))} in the scene description {path}, found none; write the scene again")
-    try:
-        numbers = [*map(float, value["voxel_size"].values()), float(value["world"]["scale"]), *map(float, value["world"]["shift"])]
-        others = [float(value.get("extent", 1)), int(value.get("step", 0)), *dict(value.get("scene", {}))]
-        if len(numbers) != 6 or not numbers[2] > 0 or not others[0] > 0:
-            raise ValueError
-    except (AttributeError, KeyError, TypeError, ValueError):
-        raise InputError(
-            f"expected voxel_size, world, extent and step as numbers in the scene description {path}, found others; write it again"
-        ) from None
+    with guarding(path, budget.JSON, "scene description"):
+        check_description(value)
     return value
+
+
+def check_description(value: dict[str, Any]) -> None:
+    """Raise Damaged unless the numbers of a description are in range."""
+    size, world = value["voxel_size"], value["world"]
+    if not isinstance(size, dict) or not isinstance(world, dict) or not isinstance(world.get("shift"), list):
+        raise Damaged("a voxel_size or a world of another form")
+    lengths = [number(v, "voxel_size", 0, FARTHEST) for v in size.values()]
+    shift = [number(v, "the shift of the world", -FARTHEST, FARTHEST) for v in world["shift"]]
+    if len(lengths) != 2 or len(shift) != 3:
+        raise Damaged("another number of lengths in voxel_size and world")
+    number(world.get("scale"), "the scale of the world", 1e-15, FARTHEST)
+    number(value.get("extent", 1), "the extent", 1e-15, FARTHEST)
+    whole_number(value.get("step", 0), "step", 0, MOST_STEPS)
+    whole_number(value["K"], "K", 0, 1 << 16)
+    whole_number(value["F"], "F", 0, 1 << 16)
+    if not isinstance(value.get("scene", {}), dict) or not isinstance(value["recipe"], str):
+        raise Damaged("a recipe or a scene of another form")
 
 
 def world_in(about: dict[str, Any]) -> World:
@@ -136,24 +150,11 @@ def read_settings(folder: Path) -> dict[str, Any]:
     path = folder.parent.parent / SETTINGS
     if not path.is_file():
         return {}
-    wrong = f"expected the text Namespace(name=value, ...) in {path}, found something else; remove the file to go on without it"
-    try:
-        text = path.read_bytes()[: _SETTINGS_LIMIT + 1].decode()
-        call = ast.parse(text.strip(), mode="eval").body if len(text) <= _SETTINGS_LIMIT else None
-    except (SyntaxError, ValueError, MemoryError, RecursionError):
-        raise InputError(wrong) from None
-    if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace" and not call.args):
-        raise InputError(wrong)
-    out: dict[str, Any] = {}
-    for keyword in call.keywords:
-        try:
-            if keyword.arg is not None:
-                out[keyword.arg] = ast.literal_eval(keyword.value)
-        except (ValueError, TypeError, MemoryError, RecursionError):
-            continue
-    return out
+    with opening(path, budget.SETTINGS) as source:
+        return parse_namespace(source.read().decode())
 
 
-def number(value: Any) -> float | None:
-    """A finite number among the settings; None for anything else."""
-    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else None
+def positive(value: Any) -> float | None:
+    """A finite number above 0 among the settings; None for anything else."""
+    fits = isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value <= FARTHEST
+    return float(value) if fits else None

@@ -13,7 +13,7 @@ from scene_experts.files.result_folder import (
     is_result,
     iteration_folder,
     iteration_of,
-    number,
+    positive,
     read_description,
     read_settings,
     world_in,
@@ -95,7 +95,7 @@ def test_the_reading_of_a_capture_in_the_published_settings(tmp_path):
 
 def test_no_settings(tmp_path):
     assert read_settings(iteration(tmp_path)) == {}
-    assert [number(value) for value in (2, 0.5, "2", None, float("nan"), float("inf"))] == [2.0, 0.5, None, None, None, None]
+    assert [positive(value) for value in (2, 0.5, "2", None, float("nan"), float("inf"), -1)] == [2.0, 0.5, *[None] * 5]
 
 
 def test_the_newest_or_a_given_iteration(tmp_path):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from scene_experts.core.reading.budget import CAPTURE
+from scene_experts.core.reading.source import guarding
 from scene_experts.data.readers import transforms
 from scene_experts.data.readers.reader import PosedImage, RawCapture, ReadOptions
 
@@ -25,6 +27,10 @@ class BlenderReader:
 
         Frames without an image are dropped with a warning. Raises InputError if a file is damaged or no frame is left.
         """
+        with guarding(folder, CAPTURE):
+            return self._read(folder, options)
+
+    def _read(self, folder: Path, options: ReadOptions) -> RawCapture:
         images: list[PosedImage | None] = []
         names: list[str] = []
         warnings: list[str] = []

@@ -8,6 +8,8 @@ from pathlib import Path
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.reading.budget import CAPTURE
+from scene_experts.core.reading.source import guarding
 from scene_experts.core.types import Points
 from scene_experts.data.match import absent_error, find_mask, match_images
 from scene_experts.data.readers.colmap_model import find_model, read_model
@@ -29,6 +31,10 @@ class ColmapReader:
         Raises InputError if a file of the reconstruction is damaged, an image is listed twice, or photographs are absent
         (with `options.missing == "drop"`: if all are).
         """
+        with guarding(folder, CAPTURE):
+            return self._read(folder, options)
+
+    def _read(self, folder: Path, options: ReadOptions) -> RawCapture:
         place = find_model(folder)
         assert place is not None
         model = read_model(place)

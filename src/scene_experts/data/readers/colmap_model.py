@@ -7,6 +7,7 @@ points3D: u64 count, then u64 id, f64 xyz, u8 rgb, f64 error, u64 n, n x (i32 im
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -17,6 +18,9 @@ from numpy.typing import NDArray
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
+from scene_experts.core.reading.budget import COLMAP
+from scene_experts.core.reading.numbers import FARTHEST, expect_range, usable_rows
+from scene_experts.core.reading.source import Source, opening, shorten
 from scene_experts.data.lens import MODELS, Lens
 
 _NAMES = tuple(MODELS)
@@ -86,17 +90,19 @@ def read_model(folder: Path, observations: bool = False) -> Model:
         if found is None:
             raise InputError(f"expected {name}.bin or {name}.txt in {folder}, found neither; copy the whole reconstruction there")
     assert cameras_file is not None and images_file is not None
-    cameras = dict(_read_cameras_bin(cameras_file) if cameras_file.suffix == ".bin" else _read_cameras_txt(cameras_file))
+    with opening(cameras_file, COLMAP) as source:
+        cameras = dict(_read_cameras_bin(source) if cameras_file.suffix == ".bin" else _read_cameras_txt(source))
     if not cameras:
         raise InputError(f"expected at least one camera in {cameras_file}, found none; reconstruct the capture again")
-    rows = list(
-        _read_images_bin(images_file, observations) if images_file.suffix == ".bin" else _read_images_txt(images_file, observations)
-    )
-    images = tuple(image for image, _ in rows)
-    _check_images(images, cameras, images_file)
+    with opening(images_file, COLMAP) as source:
+        rows = list(_read_images_bin(source, observations) if images_file.suffix == ".bin" else _read_images_txt(source, observations))
+        images = tuple(image for image, _ in rows)
+        _check_images(images, cameras, images_file)
     points = np.empty(0, _POINT)
     if points_file is not None:
-        points = _read_points_bin(points_file) if points_file.suffix == ".bin" else _read_points_txt(points_file)
+        with opening(points_file, COLMAP) as source:
+            points = _read_points_bin(source) if points_file.suffix == ".bin" else _read_points_txt(source)
+            points = points[usable_rows(points["xyz"], points_file)]
     return Model(
         cameras,
         images,
@@ -118,19 +124,22 @@ def _check_images(images: tuple[ColmapImage, ...], cameras: dict[int, Lens], pat
     for image in images:
         if not PurePosixPath(image.name).name:
             raise InputError(f"expected a name for every image, found {image.name!r} for image {image.id} in {path}; restore the file")
-        if not np.isfinite((*image.quaternion, *image.translation)).all() or not any(image.quaternion):
-            raise InputError(f"expected a finite pose for every image in {path}, found {image.name} without one; remove that image")
+        length = math.hypot(*image.quaternion)
+        if not 1e-6 <= length <= 1e6 or not all(abs(t) <= FARTHEST for t in image.translation):
+            name = shorten(image.name)
+            raise InputError(f"expected a finite pose for every image in {path}, found {name} without one; remove that image")
         if image.camera_id not in cameras:
             raise InputError(
-                f"expected camera {image.camera_id} of {image.name} in {path.parent}, found no such camera; restore the reconstruction"
+                f"expected camera {image.camera_id} of {shorten(image.name)} in {path.parent}, found no such camera; "
+                "restore the reconstruction"
             )
 
 
 class _Bytes:
     """A cursor over the bytes of a file. Reading past the end raises an InputError that names the file."""
 
-    def __init__(self, path: Path, smallest: int) -> None:
-        self.path, self.data, self.at = path, path.read_bytes(), 0
+    def __init__(self, source: Source, smallest: int) -> None:
+        self.path, self.data, self.at = source.path, source.read(), 0
         (self.count,) = self.take("<Q")
         if self.count * smallest > len(self.data):
             raise self.truncated_error()
@@ -161,17 +170,18 @@ class _Bytes:
         return start
 
 
-def _read_cameras_bin(path: Path) -> Iterator[tuple[int, Lens]]:
-    file = _Bytes(path, 24)
+def _read_cameras_bin(source: Source) -> Iterator[tuple[int, Lens]]:
+    file = _Bytes(source, 24)
     for _ in range(file.count):
         key, model, width, height = file.take("<iiQQ")
         if not 0 <= model < len(_NAMES):
             raise InputError(
-                f"expected a camera model between 0 and {len(_NAMES) - 1} ({', '.join(_NAMES)}), found {model} for camera {key} in {path}; "
+                f"expected a camera model between 0 and {len(_NAMES) - 1} ({', '.join(_NAMES)}), found {model} for camera {key} "
+                f"in {source.path}; "
                 f"convert the reconstruction to one of those"
             )
         name = _NAMES[model]
-        yield key, _make_lens(path, key, name, width, height, file.take(f"<{len(MODELS[name])}d"))
+        yield key, _make_lens(source.path, key, name, width, height, file.take(f"<{len(MODELS[name])}d"))
 
 
 def _make_lens(path: Path, key: int, model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
@@ -181,8 +191,8 @@ def _make_lens(path: Path, key: int, model: str, width: int, height: int, params
         raise InputError(f"camera {key} of {path}: {error}") from None
 
 
-def _read_images_bin(path: Path, observations: bool) -> Iterator[tuple[ColmapImage, NDArray | None]]:
-    file = _Bytes(path, 73)
+def _read_images_bin(source: Source, observations: bool) -> Iterator[tuple[ColmapImage, NDArray | None]]:
+    file = _Bytes(source, 73)
     for _ in range(file.count):
         key, qw, qx, qy, qz, tx, ty, tz, camera = file.take("<i7di")
         name = file.text()
@@ -192,45 +202,45 @@ def _read_images_bin(path: Path, observations: bool) -> Iterator[tuple[ColmapIma
         yield ColmapImage(key, name, (qw, qx, qy, qz), (tx, ty, tz), camera), seen
 
 
-def _read_points_bin(path: Path) -> NDArray:
-    file = _Bytes(path, _POINT.itemsize)
+def _read_points_bin(source: Source) -> NDArray:
+    file = _Bytes(source, _POINT.itemsize)
     data, at, size, length = file.data, file.at, _POINT.itemsize, struct.Struct("<Q").unpack_from
-    heads: list[bytes] = []
+    heads = bytearray()
     try:
         for _ in range(file.count):  # records differ in length, so each is located in turn; tracks are skipped
-            heads.append(data[at : at + size])
+            heads += data[at : at + size]
             at += size + 8 * length(data, at + size - 8)[0]
     except struct.error:
         raise file.truncated_error() from None
     if at > len(data):
         raise file.truncated_error()
-    return np.frombuffer(b"".join(heads), _POINT)
+    points = np.frombuffer(heads, _POINT)
+    points["error"][~np.isfinite(points["error"])] = -1  # unknown, as COLMAP writes it
+    return points
 
 
-def _read_lines(path: Path) -> list[str]:
-    try:
-        return [line for line in path.read_text("utf-8", "surrogateescape").split("\n") if not line.startswith("#")]
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}; check its permissions") from error
+def _read_lines(source: Source) -> list[str]:
+    text = source.read().decode("utf-8", "surrogateescape").replace("\r\n", "\n").replace("\r", "\n")
+    return [line for line in text.split("\n") if not line.startswith("#")]
 
 
 def _bad_line_error(path: Path, line: str) -> InputError:
     return InputError(f"expected a line of a COLMAP {path.name} in {path}, found {line[:60]!r}; restore the file")
 
 
-def _read_cameras_txt(path: Path) -> Iterator[tuple[int, Lens]]:
-    for line in filter(str.strip, _read_lines(path)):
+def _read_cameras_txt(source: Source) -> Iterator[tuple[int, Lens]]:
+    for line in filter(str.strip, _read_lines(source)):
         parts = line.split()
         try:
             key, model, width, height = int(parts[0]), parts[1], int(parts[2]), int(parts[3])
             params = tuple(float(p) for p in parts[4:])
         except (ValueError, IndexError):
-            raise _bad_line_error(path, line) from None
-        yield key, _make_lens(path, key, model, width, height, params)
+            raise _bad_line_error(source.path, line) from None
+        yield key, _make_lens(source.path, key, model, width, height, params)
 
 
-def _read_images_txt(path: Path, observations: bool) -> Iterator[tuple[ColmapImage, NDArray | None]]:
-    lines = _read_lines(path)
+def _read_images_txt(source: Source, observations: bool) -> Iterator[tuple[ColmapImage, NDArray | None]]:
+    lines = _read_lines(source)
     while lines and not lines[-1].strip():
         lines.pop()
     for i in range(0, len(lines), 2):  # two lines per image; the second lists its observations and may be empty
@@ -240,7 +250,7 @@ def _read_images_txt(path: Path, observations: bool) -> Iterator[tuple[ColmapIma
             image = ColmapImage(int(parts[0]), parts[9].strip(), (q[0], q[1], q[2], q[3]), (t[0], t[1], t[2]), int(parts[8]))
             seen = _parse_observations(lines[i + 1] if i + 1 < len(lines) else "") if observations else None
         except (ValueError, IndexError):
-            raise _bad_line_error(path, lines[i]) from None
+            raise _bad_line_error(source.path, lines[i]) from None
         yield image, seen
 
 
@@ -251,12 +261,15 @@ def _parse_observations(line: str) -> NDArray:
     return out
 
 
-def _read_points_txt(path: Path) -> NDArray:
-    rows = [line.split(maxsplit=8)[:8] for line in _read_lines(path) if line.strip()]
+def _read_points_txt(source: Source) -> NDArray:
+    rows = [line.split(maxsplit=8)[:8] for line in _read_lines(source) if line.strip()]
     try:
         numbers = np.array([[float(x) for x in row] for row in rows], dtype=np.float64).reshape(len(rows), 8)
+        numbers[:, 7][~np.isfinite(numbers[:, 7])] = -1
+        expect_range(numbers[:, 0], "numbers of points")
+        expect_range(numbers[:, 4:7], "colours", 0, 255)
     except ValueError:
-        raise _bad_line_error(path, next((" ".join(row) for row in rows if len(row) < 8), " ".join(rows[0]))) from None
+        raise _bad_line_error(source.path, next((" ".join(row) for row in rows if len(row) < 8), " ".join(rows[0]))) from None
     out = np.empty(len(rows), _POINT)
     out["id"], out["xyz"], out["rgb"], out["error"], out["length"] = numbers[:, 0], numbers[:, 1:4], numbers[:, 4:7], numbers[:, 7], 0
     return out

@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.reading.budget import CAPTURE
+from scene_experts.core.reading.numbers import shown
+from scene_experts.core.reading.source import guarding
 from scene_experts.data.match import find_mask
 from scene_experts.data.readers import transforms
 from scene_experts.data.readers.reader import PosedImage, RawCapture, ReadOptions
@@ -25,11 +28,16 @@ class NerfstudioReader:
         `options.images` replaces the first folder of every file path. Frames without an image are dropped with a warning.
         Raises InputError if a file is damaged or no frame is left.
         """
+        with guarding(folder, CAPTURE):
+            return self._read(folder, options)
+
+    def _read(self, folder: Path, options: ReadOptions) -> RawCapture:
         path = folder / "transforms.json"
         meta = transforms.read_meta(path)
         tests = meta.get("test_filenames") or []
         if not isinstance(tests, list):
-            raise InputError(f"expected a list as test_filenames in {path}, found {tests!r}; restore the file")
+            raise InputError(f"expected a list as test_filenames in {path}, found {shown(tests)}; restore the file")
+        tests = {name for name in tests if isinstance(name, str)}
         images: list[PosedImage | None] = []
         names: list[str] = []
         warnings: list[str] = []

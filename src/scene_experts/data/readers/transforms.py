@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json
+from scene_experts.core.reading.numbers import FARTHEST, shown
+from scene_experts.core.reading.source import describe, shorten
 from scene_experts.core.types import Points
 from scene_experts.data.lens import Lens
 from scene_experts.data.match import EXTENSIONS
@@ -43,15 +45,15 @@ def read_file_path(frame: dict[str, Any], index: int, path: Path) -> str:
     """Return the `file_path` of a frame. Raises InputError if it has none."""
     value = frame.get("file_path")
     if not isinstance(value, str) or not value:
-        raise InputError(f"expected a file_path in frame {index} of {path}, found {value!r}; restore the file")
+        raise InputError(f"expected a file_path in frame {index} of {path}, found {shown(value)}; restore the file")
     return value
 
 
 def read_angle(meta: dict[str, Any], frame: dict[str, Any], path: Path) -> float:
     """Return the horizontal field of view in radians of a frame without a focal length. Raises InputError if it has neither."""
     angle = {**meta, **frame}.get("camera_angle_x")
-    if not isinstance(angle, (int, float)) or not 0 < angle < math.pi:
-        raise InputError(f"expected fl_x, or camera_angle_x between 0 and pi, in {path}, found {angle!r}; add the focal length")
+    if not isinstance(angle, (int, float)) or not 1e-6 < angle < math.pi - 1e-6:
+        raise InputError(f"expected fl_x, or camera_angle_x between 0 and pi, in {path}, found {shown(angle)}; add the focal length")
     return float(angle)
 
 
@@ -95,12 +97,12 @@ def read_pose(frame: dict[str, Any], path: Path) -> NDArray[np.float64]:
     The rotation is replaced by the nearest exact rotation, because files hold rounded numbers.
     Raises InputError if the matrix is absent, not finite, or scales or mirrors.
     """
-    where = frame.get("file_path")
+    where = shorten(str(frame.get("file_path")))
     try:
         pose = np.asarray(frame.get("transform_matrix"), dtype=np.float64)
     except (TypeError, ValueError):
         pose = np.empty(0)
-    if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
+    if pose.shape not in ((4, 4), (3, 4)) or not (np.abs(pose) <= FARTHEST).all():  # False for NaN
         raise InputError(f"expected a finite 4x4 transform_matrix for {where} in {path}, found none; remove that frame")
     u, s, v = np.linalg.svd(pose[:3, :3])
     if np.linalg.det(pose[:3, :3]) <= 0 or np.abs(s - 1).max() > 1e-2:
@@ -120,7 +122,7 @@ def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path) -> Lens |
     both = {**meta, **frame}
     model = str(both.get("camera_model", "OPENCV")).upper()
     if model not in _MODELS:
-        raise InputError(f"expected camera_model OPENCV, OPENCV_FISHEYE or PINHOLE in {path}, found {model!r}; convert the capture")
+        raise InputError(f"expected camera_model OPENCV, OPENCV_FISHEYE or PINHOLE in {path}, found {shown(model)}; convert the capture")
     if "fl_x" not in both:
         return None
     try:
@@ -130,7 +132,7 @@ def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path) -> Lens |
         k = [float(both.get(f"k{i}", 0.0) or 0.0) for i in range(1, 7)]
         p = [float(both.get(f"p{i}", 0.0) or 0.0) for i in (1, 2)]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"expected numbers as w, h, fl_x, fl_y, cx and cy in {path}, found {error}; restore the file") from None
+        raise InputError(f"expected numbers as w, h, fl_x, fl_y, cx and cy in {path}, found {describe(error)}; restore the file") from None
     if model in _PINHOLES:
         return Lens("PINHOLE", width, height, (fx, fy, cx, cy))
     if model == "OPENCV_FISHEYE":
@@ -146,7 +148,7 @@ def read_points(root: Path, named: object) -> Points | None:
     Raises InputError if the named file is absent or the file is damaged.
     """
     if isinstance(named, str) and not (root / named).is_file():
-        raise InputError(f"expected the points of {root} in {named}, found no such file; restore it or start with --init random")
+        raise InputError(f"expected the points of {root} in {shorten(named)}, found no such file; restore it or start with --init random")
     for name in (named,) if isinstance(named, str) else PLY_NAMES:
         if (root / name).is_file():
             xyz, rgb = ply.read_points(root / name)

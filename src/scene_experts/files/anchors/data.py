@@ -8,6 +8,9 @@ from typing import Any
 
 from torch import Tensor
 
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.numbers import FARTHEST, LARGEST, LARGEST_LOG, expect_range
+
 Network = dict[str, Tensor]
 """One decoder network by our short names: w1 [E, H, D], b1 [E, H], w2 [E, out, H], b2 [E, out] of E
 experts; with a router router_w [E, F] and router_b [E]; with more than two layers (E = 1)
@@ -44,6 +47,19 @@ class AnchorData:
     """Iterations trained; 0: unknown."""
     settings: dict[str, Any] = field(default_factory=dict)
     """cfg_args of a result folder."""
+
+    def checked(self) -> AnchorData:
+        """This scene. Raises Damaged for values of anchors and networks that are not finite or that no computation in float32 can
+        bear."""
+        expect_range(self.columns["xyz"], "positions", -FARTHEST, FARTHEST)
+        expect_range(self.columns["log_scaling"], "logarithms of scales", -LARGEST, LARGEST_LOG)
+        for name in ("feature", "offsets"):
+            expect_range(self.columns[name], f"values of {name}")
+        for name, value in self.networks.items():
+            if not value.is_floating_point():
+                raise Damaged(f"a network {name} of {value.dtype}")
+            expect_range(value.float(), f"weights of {name}")
+        return self
 
 
 def by_attribute(networks: dict[str, Tensor]) -> dict[str, Network]:

@@ -18,6 +18,8 @@ from torch import Tensor
 from scene_experts.core.checkpoint import read_tensors
 from scene_experts.core.errors import InputError
 from scene_experts.core.plain import from_json
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.source import guarding
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.files import result_folder
@@ -26,7 +28,8 @@ from scene_experts.files.anchors.data import AnchorData, Network, by_attribute, 
 from scene_experts.files.anchors.published import cells_of, meta_of, recipe_of, recover_voxel
 from scene_experts.files.anchors.write import BANK_DISTANCE, LEVEL_COLUMNS, MOE_FILE, MOE_FORMAT, MOE_KIND, SLOT_BITS, SLOTS, unpack_slots
 from scene_experts.files.formats.ply import numbered_names, property_names, read_vertices, stack
-from scene_experts.files.registry import Imported, recognise
+from scene_experts.files.registry import Imported
+from scene_experts.files.registry import read as read_file
 from scene_experts.files.result_folder import expect_world, world_in
 from scene_experts.scene import Scene, restore_scene
 from scene_experts.scene.anchors.levels import Levels
@@ -50,7 +53,12 @@ def read(source: Path, data: Data, iteration: int | None) -> Imported:
     result of ours must meet the world that it was trained in. Raises InputError for scenes that
     cannot be drawn here and for captures that do not fit.
     """
-    found = read_folder(source) if source.is_dir() else recognise(source)[1].read(source)  # type: ignore[misc]
+    with guarding(source, budget.HEAD, "scene of anchors"):
+        return _read(source, data)
+
+
+def _read(source: Path, data: Data) -> Imported:
+    found = read_folder(source) if source.is_dir() else read_file(source)
     networks = by_attribute(found.networks)
     check_networks(networks, str(source))
     about = found.about
@@ -60,6 +68,7 @@ def read(source: Path, data: Data, iteration: int | None) -> Imported:
     if about is None:
         meta, voxel, cfg = meta_of(found, capture), found.voxel, recipe_of(found)
     else:
+        result_folder.check_description(about)
         expect_world(world_in(about), capture.world)
         capture = replace(capture, world=world_in(about))
         meta, voxel = dict(about.get("scene", {})), float(about["voxel_size"]["trained"])
@@ -148,6 +157,11 @@ def level_facts(levels: Levels, xyz: Tensor, columns: dict[str, Tensor], exact: 
 def read_folder(folder: Path) -> AnchorData:
     """The scene in an iteration's folder, published or ours. Raises InputError for whatever is
     missing, damaged or does not fit."""
+    with guarding(folder, budget.HEAD, "scene of anchors"):
+        return _read_folder(folder)
+
+
+def _read_folder(folder: Path) -> AnchorData:
     columns = read_anchors(folder / "point_cloud.ply")
     if (folder / MOE_FILE).is_file():
         networks = by_attribute(read_tensors(folder / MOE_FILE, MOE_KIND, MOE_FORMAT)[0])
@@ -156,21 +170,21 @@ def read_folder(folder: Path) -> AnchorData:
     check_networks(networks, str(folder))
     about, settings = result_folder.read_description(folder), result_folder.read_settings(folder)
     add_dist = distance_inputs(networks, columns, about is None and settings.get("add_level") is True, str(folder))
-    step = int((about or {}).get("step") or result_folder.iteration_of(folder) or 0)
+    step = (about or {}).get("step") or result_folder.iteration_of(folder) or 0
     flat = by_file_name(networks)
     if "level" in columns:  # its own columns state the lattices
-        voxel = about["voxel_size"]["input"] if about else result_folder.number(settings.get("voxel_size"))
-        return AnchorData(columns, flat, about, None, float(voxel or 0.0), add_dist=add_dist, step=step, settings=settings)
+        voxel = about["voxel_size"]["input"] if about else result_folder.positive(settings.get("voxel_size"))
+        return AnchorData(columns, flat, about, None, float(voxel or 0.0), add_dist=add_dist, step=step, settings=settings).checked()
     origin = (0.0, 0.0, 0.0)
     if about is not None:
         world = world_in(about)
         x, y, z = world.shift
         voxel, origin = float(about["voxel_size"]["trained"]) / world.scale, (-x, -y, -z)
     else:
-        voxel = float(result_folder.number(settings.get("voxel_size")) or 0.0)
+        voxel = float(result_folder.positive(settings.get("voxel_size")) or 0.0)
         voxel = voxel if voxel > 0 else recover_voxel(columns["xyz"]) or 0.0  # 0: it was automatic, and no file states it
     cells = cells_of(columns["xyz"], voxel, origin) if voxel > 0 else None
-    return AnchorData(columns, flat, about, cells, voxel, origin, add_dist, step, settings)
+    return AnchorData(columns, flat, about, cells, voxel, origin, add_dist, step, settings).checked()
 
 
 def read_anchors(path: Path) -> dict[str, Tensor]:

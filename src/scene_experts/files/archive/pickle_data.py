@@ -12,10 +12,17 @@ import pickletools
 from dataclasses import dataclass, field
 from typing import Any
 
-SIZE_LIMIT = 64 << 20  # bytes of pickle; network files have a few thousand
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.source import shorten
+
+SIZE_LIMIT = 16 << 20  # bytes of pickle; network files have a few thousand
+STEP_LIMIT = 200_000  # operations of a pickle; network files have a few thousand
+DEPTH_LIMIT = 50
+KEY_LIMIT = 256  # characters of a name
+_KEYS = (str, int, float, bool, type(None))
 
 
-class NotData(ValueError):
+class NotData(Damaged):
     """The bytes are no pickle, a damaged one, or one that does more than describe data."""
 
 
@@ -48,7 +55,6 @@ class Outside:
     key: Any
 
 
-_MARK = object()
 _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
 _EMPTY = {"EMPTY_DICT": dict, "EMPTY_LIST": list}
 _LITERALS = {
@@ -68,72 +74,103 @@ def decode(data: bytes) -> Any:
         raise NotData(f"it has {len(data):,} bytes")
     machine = _Machine()
     try:
-        for opcode, argument, _ in pickletools.genops(data):
+        for count, (opcode, argument, _) in enumerate(pickletools.genops(data)):
             if opcode.name == "STOP":
                 return machine.pop()
+            if count > STEP_LIMIT:
+                raise NotData(f"it has more than {STEP_LIMIT:,} steps")
             machine.step(opcode.name, argument)
     except NotData:
         raise
     except (ValueError, TypeError, LookupError, AttributeError, OverflowError, MemoryError, RecursionError) as error:
-        raise NotData(f"it is damaged: {error}") from None
+        raise NotData(f"it is damaged: {shorten(str(error))}") from None
     raise NotData("it has no end")
 
 
 class _Machine:
-    """The stack and memo of the decoder."""
+    """The stack and memo of the decoder. `deep` has the nesting of every value on the stack, `marks` the places of the marks.
+
+    Values are nested at most DEPTH_LIMIT deep, because Python hashes, compares and prints nested values by recursion.
+    """
 
     def __init__(self) -> None:
         self.stack: list[Any] = []
-        self.memo: dict[int, Any] = {}
+        self.deep: list[int] = []
+        self.marks: list[int] = []
+        self.memo: dict[int, tuple[Any, int]] = {}
+
+    def push(self, value: Any, depth: int = 0) -> None:
+        if depth > DEPTH_LIMIT:
+            raise NotData(f"it is nested more than {DEPTH_LIMIT} deep")
+        self.stack.append(value)
+        self.deep.append(depth)
 
     def pop(self) -> Any:
-        if not self.stack or self.stack[-1] is _MARK:
+        return self.take(1)[0][0]
+
+    def take(self, count: int) -> tuple[list[Any], int]:
+        """Take the last `count` values, and the nesting of a container of them."""
+        at = len(self.stack) - count
+        if at < (self.marks[-1] if self.marks else 0):
             raise NotData("it is damaged: its stack is empty")
-        return self.stack.pop()
+        values, depth = self.stack[at:], max(self.deep[at:], default=-1) + 1
+        del self.stack[at:], self.deep[at:]
+        return values, depth
 
-    def since_mark(self) -> list[Any]:
-        at = max(i for i, value in enumerate(self.stack) if value is _MARK)
-        values = self.stack[at + 1 :]
-        del self.stack[at:]
-        return values
+    def since_mark(self) -> tuple[list[Any], int]:
+        if not self.marks:
+            raise NotData("it is damaged: it has no mark")
+        count = len(self.stack) - self.marks[-1]
+        found = self.take(count)
+        self.marks.pop()
+        return found
 
-    def take(self, count: int) -> list[Any]:
-        return [self.pop() for _ in range(count)][::-1]
+    def top(self, depth: int = 0) -> Any:
+        """The last value, which is about to hold values nested `depth - 1` deep."""
+        if len(self.stack) <= (self.marks[-1] if self.marks else 0):
+            raise NotData("it is damaged: its stack is empty")
+        self.deep[-1] = max(self.deep[-1], depth)
+        if self.deep[-1] > DEPTH_LIMIT:
+            raise NotData(f"it is nested more than {DEPTH_LIMIT} deep")
+        return self.stack[-1]
 
     def step(self, name: str, argument: Any) -> None:
-        push = self.stack.append
         match name:
             case "PROTO" | "FRAME":
                 pass
             case _ if name in _CONSTANTS:
-                push(_CONSTANTS[name])
+                self.push(_CONSTANTS[name])
             case _ if name in _LITERALS:
-                push(argument)
+                self.push(argument)
             case _ if name in _EMPTY:
-                push(_EMPTY[name]())
+                self.push(_EMPTY[name]())
             case _ if name in _FIXED:
-                push(tuple(self.take(_FIXED[name])))
+                values, depth = self.take(_FIXED[name])
+                self.push(tuple(values), depth)
             case "MARK":
-                push(_MARK)
+                self.marks.append(len(self.stack))
             case "TUPLE":
-                push(tuple(self.since_mark()))
+                values, depth = self.since_mark()
+                self.push(tuple(values), depth)
             case "LIST":
-                push(self.since_mark())
+                values, depth = self.since_mark()
+                self.push(values, depth)
             case "APPEND" | "APPENDS":
-                values = self.since_mark() if name == "APPENDS" else self.take(1)
-                _kind(self.stack[-1], list).extend(values)
+                values, depth = self.since_mark() if name == "APPENDS" else self.take(1)
+                _kind(self.top(depth), list).extend(values)
             case "DICT":
-                push(dict(_pairs(self.since_mark())))
+                values, depth = self.since_mark()
+                self.push(dict(_pairs(values)), depth)
             case "SETITEM" | "SETITEMS":
-                values = self.since_mark() if name == "SETITEMS" else self.take(2)
-                into = self.stack[-1]
+                values, depth = self.since_mark() if name == "SETITEMS" else self.take(2)
+                into = self.top(depth)
                 _kind(into.items if isinstance(into, Record) else into, dict).update(_pairs(values))
             case "PUT" | "BINPUT" | "LONG_BINPUT":
-                self.memo[argument] = self.stack[-1]
+                self.memo[argument] = (self.top(), self.deep[-1])
             case "MEMOIZE":
-                self.memo[len(self.memo)] = self.stack[-1]
+                self.memo[len(self.memo)] = (self.top(), self.deep[-1])
             case "GET" | "BINGET" | "LONG_BINGET":
-                push(self.memo[argument])
+                self.push(*self.memo[argument])
             case "POP":
                 self.pop()
             case _:
@@ -145,18 +182,19 @@ class _Machine:
         match name:
             case "GLOBAL":
                 module, _, member = argument.partition(" ")
-                self.stack.append(Global(module, member))
+                self.push(Global(module, member))
             case "STACK_GLOBAL":
-                module, member = self.take(2)
-                self.stack.append(Global(_kind(module, str), _kind(member, str)))
+                (module, member), _ = self.take(2)
+                self.push(Global(_kind(module, str), _kind(member, str)))
             case "NEWOBJ" | "REDUCE":
-                what, args = self.take(2)
-                self.stack.append(Record(_kind(what, Global), _kind(args, tuple)))
+                (what, args), depth = self.take(2)
+                self.push(Record(_kind(what, Global), _kind(args, tuple)), depth)
             case "BUILD":
-                (state,) = self.take(1)
-                _kind(self.stack[-1], Record).state = state
+                (state,), depth = self.take(1)
+                _kind(self.top(depth), Record).state = state
             case "BINPERSID":
-                self.stack.append(Outside(self.pop()))
+                (key,), depth = self.take(1)
+                self.push(Outside(key), depth)
             case _:
                 raise NotData(f"it uses the operation {name}, which plain data has no need of")
 
@@ -168,6 +206,10 @@ def _kind(value: Any, kind: type) -> Any:
 
 
 def _pairs(values: list[Any]) -> list[tuple[Any, Any]]:
+    """Keys with their values. Keys are names and numbers, which are hashed without recursion."""
     if len(values) % 2:
         raise NotData("it is damaged: a key without a value")
+    for key in values[::2]:
+        if not isinstance(key, _KEYS) or (isinstance(key, str) and len(key) > KEY_LIMIT):
+            raise NotData(f"it has a key of type {type(key).__name__}, or a long one")
     return list(zip(values[::2], values[1::2]))

@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import math
 import re
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +18,10 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.reading.archives import Archive, open_zip
+from scene_experts.core.reading.budget import NETWORK
+from scene_experts.core.reading.numbers import expect_finite_tensors
+from scene_experts.core.reading.source import opening, shorten
 from scene_experts.files.archive.pickle_data import Global, NotData, Outside, Record, decode
 
 _STORAGES = {
@@ -28,8 +30,7 @@ _STORAGES = {
     "ByteStorage": torch.uint8, "BoolStorage": torch.bool,
 }  # fmt: skip
 _RECORD_LIMIT = 1 << 30  # bytes of one record
-_DEPTH_LIMIT = 50
-_VALUE_LIMIT = 1_000_000  # values looked at; a pickle of 100 bytes can name the same list 2^30 times
+_DIMENSIONS = 8  # of a tensor
 _LARGEST = 1 << 62  # of a size, a stride, an offset
 
 
@@ -39,49 +40,46 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
     Raises InputError: absent, not such an archive, damaged, or naming anything that is not tensor data.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"expected a network file at {path}, found none; check the path")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            reader = _Reader(archive)
-            found: dict[str, Tensor] = {}
-            reader.collect(decode(reader.record("data.pkl")), "", found, 0)
-    except NotData as error:
-        raise InputError(f"expected nothing but tensors in {path}, found otherwise: {error}; do not use this file, get it again") from None
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError) as error:
-        raise InputError(
-            f"expected a TorchScript or torch.save archive at {path}, found another or damaged file ({error}); get it again"
-        ) from None
+    with opening(path, NETWORK) as source:
+        try:
+            with open_zip(source) as archive:
+                reader = _Reader(archive)
+                found: dict[str, Tensor] = {}
+                reader.collect(decode(reader.record("data.pkl")), "", found, 0)
+                expect_finite_tensors(found)
+        except NotData as error:
+            raise InputError(
+                f"expected nothing but tensors in {path}, found otherwise: {error}; do not use this file, get it again"
+            ) from None
     return found
 
 
 class _Reader:
     """The records of one archive; `collect` turns the pickle's tree into tensors."""
 
-    def __init__(self, archive: zipfile.ZipFile) -> None:
-        self.archive, self.values = archive, 0
-        pickles = [name for name in archive.namelist() if re.fullmatch(r"[^/]+/data\.pkl", name)]
+    def __init__(self, archive: Archive) -> None:
+        self.archive = archive
+        self.last = ("", b"")  # name and bytes of the record read last: tensors may share one
+        pickles = [name for name in archive.names if re.fullmatch(r"[^/]+/data\.pkl", name)]
         if len(pickles) != 1:
             raise NotData("no data.pkl in it")
         self.root = pickles[0].rpartition("/")[0]
-        if f"{self.root}/byteorder" in archive.namelist() and self.record("byteorder") != b"little":
+        if f"{self.root}/byteorder" in archive.names and self.record("byteorder") != b"little":
             raise NotData("its numbers are big-endian")
 
     def record(self, name: str) -> bytes:
-        try:
-            info = self.archive.getinfo(f"{self.root}/{name}")
-        except KeyError:
-            raise NotData(f"record {name} is missing") from None
-        if info.file_size > _RECORD_LIMIT:
-            raise NotData(f"record {name} claims {info.file_size:,} bytes")
-        return self.archive.read(info)
+        place = f"{self.root}/{name}"
+        if place not in self.archive.names:
+            raise NotData(f"record {shorten(name, 60)} is missing")
+        if self.last[0] != name:
+            self.last = (name, self.archive.read(place, _RECORD_LIMIT))
+        return self.last[1]
 
     def collect(self, value: Any, place: str, found: dict[str, Tensor], depth: int) -> None:
         """Put every tensor below `value` into `found`, named by the path to it."""
-        self.values += 1
-        if depth > _DEPTH_LIMIT or self.values > _VALUE_LIMIT:
-            raise NotData("it is nested too deeply" if depth > _DEPTH_LIMIT else f"it holds more than {_VALUE_LIMIT:,} values")
+        self.archive.source.spend_items(1)  # a pickle of 100 bytes can name the same list 2^30 times
+        if depth > NETWORK.depth:
+            raise NotData("it is nested too deeply")
         if isinstance(value, Record):
             inner = self.content(value)
             if isinstance(inner, Tensor):
@@ -94,7 +92,7 @@ class _Reader:
             for key, item in value.items():
                 self.collect(item, f"{place}.{key}" if place else str(key), found, depth + 1)
         elif not isinstance(value, (int, float, str, bool, type(None))):
-            raise NotData(f"it holds {value}, which is no tensor")
+            raise NotData(f"it holds {shorten(str(value))}, which is no tensor")
 
     def content(self, record: Record) -> Tensor | dict[Any, Any]:
         """What an admitted record stands for: a tensor, or the named values of a module or
@@ -108,7 +106,7 @@ class _Reader:
             return record.items  # its state is torch's note of module versions
         if record.what.module.split(".")[0] == "__torch__" and not record.args:
             return record.state if isinstance(record.state, dict) else {}
-        raise NotData(f"it asks for {name}")
+        raise NotData(f"it asks for {shorten(name)}")
 
     def tensor(self, storage: Any, offset: Any, size: Any, stride: Any) -> Tensor:
         """A tensor from its storage's record, bounds checked."""
@@ -118,14 +116,15 @@ class _Reader:
         known = isinstance(key[1], Global) and key[1].module.split(".")[0] == "torch"
         dtype = _STORAGES.get(key[1].name) if known else None
         if dtype is None:
-            raise NotData(f"a tensor is stored as {key[1]}")
+            raise NotData(f"a tensor is stored as {shorten(str(key[1]))}")
         shape = (offset, *size, *stride) if isinstance(size, tuple) and isinstance(stride, tuple) and len(size) == len(stride) else (None,)
-        if not all(isinstance(n, int) and 0 <= n < _LARGEST for n in shape):
+        if len(shape) > 2 * _DIMENSIONS or not all(isinstance(n, int) and 0 <= n < _LARGEST for n in shape):
             raise NotData("a tensor has no proper size")
         data = self.record(f"data/{key[2]}")
         last = offset + sum((n - 1) * step for n, step in zip(size, stride)) if math.prod(size) else -1
         if (last + 1) * dtype.itemsize > len(data) or math.prod(size) * dtype.itemsize > _RECORD_LIMIT:
             raise NotData(f"a tensor of size {list(size)} does not fit its {len(data):,} bytes")
+        self.archive.source.spend_bytes(math.prod(size) * dtype.itemsize)
         if last < 0:
             return torch.zeros(size, dtype=dtype)
         flat = torch.frombuffer(bytearray(data[: len(data) // dtype.itemsize * dtype.itemsize]), dtype=dtype)

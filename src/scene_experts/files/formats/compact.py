@@ -26,10 +26,16 @@ from torch import Tensor
 
 from scene_experts.core.checkpoint import read_tensors, write_tensors
 from scene_experts.core.errors import InputError
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.numbers import FARTHEST, number, shown, whole_number
+from scene_experts.core.reading.source import Source, opening
 from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.registry import Format
 
 KIND, VERSION = "compact scene", 1
+MOST_ANCHORS, MOST_CHANNELS = 1 << 28, 1 << 12  # of a file; K and F
+FARTHEST_CELL = 1 << 52  # coordinate of a cell
 AXIS_BITS = 21  # bits of a cell coordinate; 63 bits per key
 Code = Literal["float32", "float16", "uint16", "uint8"]
 Keys = NDArray[np.uint64]
@@ -119,30 +125,34 @@ def read(path: Path) -> AnchorData:
     """The scene in a file. Raises InputError for a missing, damaged or other file and for another
     format version."""
     tensors, meta = read_tensors(path, KIND, VERSION)
-    try:
-        n, K, F = int(meta["N"]), int(meta["K"]), int(meta["F"])
-        keys = decode_steps(inflate(tensors["cells"].numpy(), 9 * n, exact=False))
-        place = unmorton(keys) + np.array(meta["low"], np.int64)
-        slots = _decode_slots(tensors["slots"], n, K) if "slots" in tensors else None
-        sizes = {"feature": (n, F), "offsets": (n, 3 * K) if slots is None else (int(slots.sum()), 3), "log_scaling": (n, 6)}
-        columns = {name: _decode(tensors, name, meta["codes"][name], *size) for name, size in sizes.items()}
-        x, y, z = (float(v) for v in meta["origin"])
-        voxel, about = float(meta["voxel"]), dict(meta["scene"])
-        if place.shape != (n, 3) or not voxel > 0:
-            raise ValueError(f"{len(place)} cells of edge {voxel}")
-        step, add_dist = int(about["step"]), tuple(a for a, used in about["add_dist"].items() if used)
-    except (KeyError, ValueError, TypeError, AttributeError, OverflowError, zlib.error) as error:
-        raise InputError(
-            f"expected a whole compact scene at {path}, found parts that do not fit together ({error}); export it again"
-        ) from None
-    networks = {name.removeprefix("network."): value for name, value in tensors.items() if name.startswith("network.")}
-    cells = torch.from_numpy(place)
+    with opening(path, budget.COMPACT) as source:
+        return _unpack(source, tensors, meta)
+
+
+def _unpack(source: Source, tensors: dict[str, Tensor], meta: dict[str, Any]) -> AnchorData:
+    n = whole_number(meta["N"], "the number of anchors", 0, MOST_ANCHORS)
+    K, F = whole_number(meta["K"], "K", 1, MOST_CHANNELS), whole_number(meta["F"], "F", 1, MOST_CHANNELS)
+    source.spend_bytes(n * 8 * (3 * K + F + 6 + 12))
+    low = np.array([whole_number(v, "a corner of the cells", -FARTHEST_CELL, FARTHEST_CELL) for v in meta["low"]], np.int64)
+    origin = tuple(number(v, "the origin of the cells", -FARTHEST, FARTHEST) for v in meta["origin"])
+    voxel = number(meta["voxel"], "the edge of a cell", 1e-30, FARTHEST)
+    about = dict(meta["scene"])
+    keys = decode_steps(inflate(_blob(tensors, "cells"), 9 * n, exact=False))
+    if len(keys) != n or low.shape != (3,) or len(origin) != 3:
+        raise Damaged(f"{len(keys):,} cells of {n:,} anchors")
+    slots = _decode_slots(_blob(tensors, "slots"), n, K) if "slots" in tensors else None
+    sizes = {"feature": (n, F), "offsets": (n, 3 * K) if slots is None else (int(slots.sum()), 3), "log_scaling": (n, 6)}
+    columns = {name: _decode(tensors, name, meta["codes"][name], *size) for name, size in sizes.items()}
+    step = whole_number(about["step"], "the iteration")
+    add_dist = tuple(a for a, used in about["add_dist"].items() if used)
+    cells = torch.from_numpy(unmorton(keys) + low)
     if slots is not None:
         columns["slots"] = slots
         columns["offsets"] = torch.zeros(n, K, 3).index_put_((slots,), columns["offsets"])
     columns["offsets"] = columns["offsets"].reshape(n, K, 3)
-    columns = {"xyz": (cells.double() * voxel + torch.tensor([x, y, z], dtype=torch.float64)).float()} | columns
-    return AnchorData(columns, networks, about, cells, voxel, (x, y, z), add_dist, step)
+    columns = {"xyz": (cells.double() * voxel + torch.tensor(origin, dtype=torch.float64)).float()} | columns
+    networks = {name.removeprefix("network."): value for name, value in tensors.items() if name.startswith("network.")}
+    return AnchorData(columns, networks, about, cells, voxel, origin, add_dist, step).checked()
 
 
 def looks_like(path: Path, head: bytes) -> bool:
@@ -180,20 +190,29 @@ def _encode(array: NDArray[np.float32], code: Code) -> tuple[Code, dict[str, NDA
 def _decode(tensors: dict[str, Tensor], name: str, code: str, n: int, width: int) -> Tensor:
     """The inverse of `_encode`, [N, C] float32."""
     if code not in ("float32", "float16", "uint16", "uint8"):
-        raise ValueError(f"code {code!r}")
+        raise Damaged(f"the code {shown(code)}")
     item = np.dtype(code)
-    planes = inflate(tensors[name].numpy(), n * width * item.itemsize).reshape(width, item.itemsize, n)
+    planes = inflate(_blob(tensors, name), n * width * item.itemsize).reshape(width, item.itemsize, n)
     values = np.ascontiguousarray(planes.transpose(2, 0, 1)).reshape(n, width * item.itemsize).view(item.newbyteorder("<"))
     if item.kind == "u":
-        low, step = tensors[f"{name}.low"].numpy(), tensors[f"{name}.step"].numpy()
+        low, step = (tensors[f"{name}.{part}"].double().numpy() for part in ("low", "step"))
+        if low.shape != (width,) or step.shape != (width,):
+            raise Damaged(f"{len(low)} ranges of the {width} channels of {name}")
         values = values * step + low
     return torch.from_numpy(np.ascontiguousarray(values.astype(np.float32)))
 
 
-def _decode_slots(blob: Tensor, n: int, K: int) -> Tensor:
+def _decode_slots(blob: NDArray[np.uint8], n: int, K: int) -> Tensor:
     """The masks [N, K] bool of slots."""
-    planes = inflate(blob.numpy(), n * -(-K // 8)).reshape(-1, n)
+    planes = inflate(blob, n * -(-K // 8)).reshape(-1, n)
     return torch.from_numpy(np.ascontiguousarray(np.unpackbits(planes.T, axis=1, count=K).astype(bool)))
+
+
+def _blob(tensors: dict[str, Tensor], name: str) -> NDArray[np.uint8]:
+    """The compressed bytes of a column."""
+    if name not in tensors or tensors[name].dtype != torch.uint8 or tensors[name].dim() != 1:
+        raise Damaged(f"no column {name}")
+    return tensors[name].numpy()
 
 
 def deflate(array: NDArray[Any]) -> NDArray[np.uint8]:
@@ -207,7 +226,7 @@ def inflate(blob: NDArray[np.uint8], size: int, exact: bool = True) -> NDArray[n
     """The bytes that `deflate` compressed, in its order: `size` of them, or at most `size` unless
     `exact`. Raises ValueError for others."""
     machine = zlib.decompressobj()
-    data = machine.decompress(blob.tobytes(), size + 1)  # never allocates more than expected, whatever the file declares
+    data = machine.decompress(blob.data, size + 1)  # never allocates more than expected, whatever the file declares
     if len(data) > size or not (machine.eof and (len(data) == size or not exact)):
         raise ValueError(f"{len(data)} bytes where {size} are expected")
     return np.frombuffer(data, np.uint8)

@@ -16,11 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_experts.core.io import write_bytes
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.source import Source, opening
+from scene_experts.core.reading.vertices import HEADER_LIMIT, parse_count
 from scene_experts.files.formats.pack import (
     Floats,
     alphas,
     byte_logits,
-    damaged,
     from_smallest_three,
     morton_order,
     smallest_three,
@@ -28,7 +31,7 @@ from scene_experts.files.formats.pack import (
     to_bytes,
     unit_quats,
 )
-from scene_experts.files.formats.ply import HEADER_LIMIT, header, note_comments
+from scene_experts.files.formats.ply import header, note_comments
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import Format
 from scene_experts.geometry.sh import C0
@@ -38,7 +41,6 @@ _RANGES = [f"{end}_{name}" for part in ("xyz", ("scale_x", "scale_y", "scale_z")
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 _BITS = (11, 10, 11)
 _LIMIT = 20.0  # log scales are clipped to this, as in the format's own writers
-WHAT = "compressed PLY"
 
 
 def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
@@ -73,29 +75,30 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
 
 def read(path: Path) -> Splats:
     """The Gaussians of a file. Raises InputError for other or damaged files."""
-    data = path.read_bytes()
-    end = data[:HEADER_LIMIT].find(b"\nend_header\n")
-    if end < 0:
-        raise damaged(path, WHAT, "no end of the header")
-    elements = _elements(path, data[:end].decode("ascii", "replace"))
-    tables: dict[str, NDArray[Any]] = {}
-    offset = end + len(b"\nend_header\n")
-    for name, (count, row) in elements.items():
-        if offset + count * row.itemsize > len(data):
-            raise damaged(path, WHAT, f"{len(data):,} bytes where the header declares more")
-        tables[name] = np.frombuffer(data, row, count, offset)
-        offset += count * row.itemsize
-    return _decode(path, tables)
+    with opening(path, budget.COMPRESSED_PLY) as source:
+        data = source.read()
+        end = data[:HEADER_LIMIT].find(b"\nend_header\n")
+        if end < 0:
+            raise Damaged("no end of the header")
+        elements = _elements(data[:end].decode("ascii", "replace"), source)
+        tables: dict[str, NDArray[Any]] = {}
+        offset = end + len(b"\nend_header\n")
+        for name, (count, row) in elements.items():
+            if offset + count * row.itemsize > len(data):
+                raise Damaged(f"{len(data):,} bytes where the header declares more")
+            tables[name] = np.frombuffer(data, row, count, offset)
+            offset += count * row.itemsize
+        return _decode(tables).checked(path)
 
 
-def _decode(path: Path, tables: dict[str, NDArray[Any]]) -> Splats:
+def _decode(tables: dict[str, NDArray[Any]]) -> Splats:
     vertex, chunk = tables["vertex"], tables["chunk"]
     n = len(vertex)
     if len(chunk) != -(-n // CHUNK):
-        raise damaged(path, WHAT, f"{len(chunk):,} chunks for {n:,} Gaussians")
+        raise Damaged(f"{len(chunk):,} chunks for {n:,} Gaussians")
     column = np.stack([chunk[name] for name in _RANGES], 1).astype(np.float64) if len(chunk) else np.zeros((0, 18))
     if not np.isfinite(column).all():
-        raise damaged(path, WHAT, "ranges that are not finite")
+        raise Damaged("ranges that are not finite")
     columns = np.repeat(column, CHUNK, 0)[:n]
     steps = (
         _unpack_11_10_11(vertex["packed_position"]),
@@ -115,7 +118,7 @@ def _decode(path: Path, tables: dict[str, NDArray[Any]]) -> Splats:
     return Splats(tensor(values[0]), tensor(values[1]), tensor(_unpack_quats(vertex["packed_rotation"])), tensor(opacity), tensor(sh))
 
 
-def _elements(path: Path, text: str) -> dict[str, tuple[int, np.dtype[Any]]]:
+def _elements(text: str, source: Source) -> dict[str, tuple[int, np.dtype[Any]]]:
     """Number of rows and row type of chunk, vertex and sh, in the order of the header."""
     found: dict[str, tuple[int, list[tuple[str, str]]]] = {}
     types, name = {"float": "<f4", "uint": "<u4", "uchar": "u1"}, ""
@@ -123,8 +126,11 @@ def _elements(path: Path, text: str) -> dict[str, tuple[int, np.dtype[Any]]]:
         for words in (line.split() for line in text.splitlines()):
             if words[:1] == ["element"]:
                 _, name, count = words
-                found[name] = (int(count), [])
+                if name in found:
+                    raise ValueError
+                found[name] = (parse_count(count), [])
             elif words[:1] == ["property"]:
+                source.spend_items(1)
                 found[name][1].append((words[2], types[words[1]]))
         order, widths = list(found), {key: [column for column, _ in columns] for key, (_, columns) in found.items()}
         kinds = {key: {kind for _, kind in columns} for key, (_, columns) in found.items()}
@@ -138,12 +144,11 @@ def _elements(path: Path, text: str) -> dict[str, tuple[int, np.dtype[Any]]]:
             or not kinds.get("sh", set()) <= {"u1"}
             or sorted(widths.get("sh", [])) != sorted(f"f_rest_{i}" for i in range(len(widths.get("sh", []))))
             or len(widths.get("sh", [])) not in (0, 9, 24, 45)
-            or any(count < 0 for count, _ in found.values())
             or ("sh" in found and found["sh"][0] != found["vertex"][0])
         ):
             raise ValueError
     except (ValueError, KeyError, IndexError):
-        raise damaged(path, WHAT, "a header of another layout") from None
+        raise Damaged("a header of another layout") from None
     return {key: (count, np.dtype(columns)) for key, (count, columns) in found.items() if columns}
 
 

@@ -17,14 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_experts.core.io import write_bytes
-from scene_experts.files.formats.pack import Floats, alphas, damaged, logits, tensor, to_bytes, turn, unit_quats
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.numbers import whole_number
+from scene_experts.core.reading.plain import parse_json
+from scene_experts.core.reading.source import Source, opening
+from scene_experts.files.formats.pack import Floats, alphas, logits, tensor, to_bytes, turn, unit_quats
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import Format
 from scene_experts.geometry.sh import C0
 
 NAME = "KHR_gaussian_splatting"
 SETTINGS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective", "sortingMethod": "cameraDistance"}
-WHAT = "glTF"
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -77,20 +81,17 @@ def read(path: Path) -> Splats:
 
     Raises InputError for damaged files and for files without such a primitive.
     """
-    scene, data = _parse(path)
-    try:
+    with opening(path, budget.GLB) as source:
+        scene, data = _parse(source)
         primitives = [p for mesh in scene.get("meshes", []) for p in mesh["primitives"] if NAME in p.get("extensions", {})]
-        found = [_read_primitive(path, scene, data, p["attributes"]) for p in primitives]
-        none_meant = NAME in scene.get("extensionsUsed", [])
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise damaged(path, WHAT, f"Gaussians that do not fit together ({error})") from None
-    if not found:
-        if none_meant:
-            return _splats(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3)))
-        raise damaged(path, WHAT, f"no primitive with {NAME}")
-    coefficients = min(part[4].shape[1] for part in found)
-    means, scales, quats, opacity = (np.concatenate([part[i] for part in found]) for i in range(4))
-    return _splats(means, scales, quats, opacity, np.concatenate([part[4][:, :coefficients] for part in found]))
+        found = [_read_primitive(source, scene, data, p["attributes"]) for p in primitives]
+        if not found:
+            if NAME in scene.get("extensionsUsed", []):
+                return _splats(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3)))
+            raise Damaged(f"no primitive with {NAME}")
+        coefficients = min(part[4].shape[1] for part in found)
+        means, scales, quats, opacity = (np.concatenate([part[i] for part in found]) for i in range(4))
+        return _splats(means, scales, quats, opacity, np.concatenate([part[4][:, :coefficients] for part in found])).checked(path)
 
 
 def _columns(splats: Splats) -> dict[str, NDArray[Any]]:
@@ -120,34 +121,31 @@ def _splats(means: Floats, scales: Floats, quats: Floats, opacity: Floats, sh: F
     return Splats(turned_wrong.means, turned_wrong.log_scales, tensor(wxyz), turned_wrong.opacity_logit, turned_wrong.sh)
 
 
-def _parse(path: Path) -> tuple[dict[str, Any], bytes]:
+def _parse(source: Source) -> tuple[dict[str, Any], memoryview]:
     """The JSON and the binary chunk of a .glb file."""
-    data = path.read_bytes()
+    data = memoryview(source.read())
     if len(data) < 20 or struct.unpack_from("<II", data) != (_MAGIC, 2):
-        raise damaged(path, WHAT, "another header")
+        raise Damaged("another header")
     length = struct.unpack_from("<I", data, 8)[0]
     size, kind = struct.unpack_from("<II", data, 12)
     if length > len(data) or kind != _JSON or 20 + size > len(data):
-        raise damaged(path, WHAT, f"{len(data):,} bytes where the header declares {length:,}")
-    try:
-        scene = json.loads(data[20 : 20 + size])
-    except (ValueError, RecursionError):
-        raise damaged(path, WHAT, "a description that is not JSON") from None
+        raise Damaged(f"{len(data):,} bytes where the header declares {length:,}")
+    scene = parse_json(bytes(data[20 : 20 + size]))
     if not isinstance(scene, dict):
-        raise damaged(path, WHAT, "a description that is not an object")
+        raise Damaged("a description that is not an object")
     start = 20 + size
     if len(data) < start + 8:
-        return scene, b""
+        return scene, memoryview(b"")
     size, kind = struct.unpack_from("<II", data, start)
     body = data[start + 8 : start + 8 + size]
     if kind != _BIN or len(body) != size:
-        raise damaged(path, WHAT, "a binary chunk that was cut short")
+        raise Damaged("a binary chunk that was cut short")
     return scene, body
 
 
-def _read_primitive(path: Path, scene: dict[str, Any], data: bytes, attributes: dict[str, int]) -> tuple[Floats, ...]:
+def _read_primitive(source: Source, scene: dict[str, Any], data: memoryview, attributes: dict[str, int]) -> tuple[Floats, ...]:
     """Means, scales, quaternions (x, y, z, w), opacities and harmonics of one primitive."""
-    get = lambda name: _accessor(path, scene, data, attributes[name])  # noqa: E731
+    get = lambda name: _accessor(source, scene, data, attributes[name])  # noqa: E731
     degree = max(int(m[1]) for name in attributes if (m := re.fullmatch(NAME + r":SH_DEGREE_(\d)_COEF_0", name)))
     names = [f"{NAME}:SH_DEGREE_{d}_COEF_{i}" for d in range(min(degree, 3) + 1) for i in range(2 * d + 1)]
     out = (
@@ -159,20 +157,23 @@ def _read_primitive(path: Path, scene: dict[str, Any], data: bytes, attributes: 
     )
     shapes = (out[0].shape[1:], out[1].shape[1:], out[2].shape[1:], out[4].shape[2:])
     if len({len(part) for part in out}) != 1 or shapes != ((3,), (3,), (4,), (3,)) or not all(np.isfinite(part).all() for part in out):
-        raise ValueError("columns of different lengths or other widths, or values that are not finite")
+        raise Damaged("columns of different lengths or other widths, or values that are not finite")
     return out
 
 
-def _accessor(path: Path, scene: dict[str, Any], data: bytes, index: int) -> Floats:
+def _accessor(source: Source, scene: dict[str, Any], data: memoryview, index: Any) -> Floats:
     """The values [N, C] of an accessor; normalised integers become fractions."""
-    accessor = scene["accessors"][index]
-    view = scene["bufferViews"][accessor["bufferView"]]
-    item, width, count = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]], int(accessor["count"])
-    stride = int(view.get("byteStride", item.itemsize * width))
-    start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
+    accessor = scene["accessors"][whole_number(index, "an accessor")]
+    view = scene["bufferViews"][whole_number(accessor["bufferView"], "a buffer view")]
+    item, width = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
+    count = whole_number(accessor["count"], f"the count of accessor {index}")
+    stride = whole_number(view.get("byteStride", item.itemsize * width), f"a stride of accessor {index}", item.itemsize * width)
+    start = sum(whole_number(part.get("byteOffset", 0), f"an offset of accessor {index}") for part in (view, accessor))
     last = start + stride * (count - 1) + item.itemsize * width if count else start
-    if view.get("buffer", 0) != 0 or count < 0 or start < 0 or stride < item.itemsize * width or last > len(data) or "sparse" in accessor:
-        raise ValueError(f"accessor {index} reaches beyond the file")
+    if view.get("buffer", 0) != 0 or last > len(data) or "sparse" in accessor:
+        raise Damaged(f"accessor {index}, which reaches beyond the file")
+    source.spend_items(1)
+    source.spend_bytes(8 * count * width)  # several accessors may name the same bytes
     rows = np.ndarray((count, width), item, data, start, (stride, item.itemsize))
     if accessor.get("normalized"):
         return np.maximum(rows / float(np.iinfo(item).max), -1.0)

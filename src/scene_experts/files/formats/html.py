@@ -24,9 +24,12 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.source import opening
 from scene_experts.data.views import Capture, World
 from scene_experts.files.cameras import camera_entries
-from scene_experts.files.formats.pack import Floats, damaged
+from scene_experts.files.formats.pack import Floats
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.formats.spz import decode, spz_bytes
 from scene_experts.files.registry import Format
@@ -57,16 +60,17 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
 
 def read(path: Path) -> Splats:
     """The Gaussians in a page that `write` made. Raises InputError for other and damaged pages."""
-    data = path.read_bytes()
-    start = data.find(_SCENE) + len(_SCENE)
-    end = data.find(b"</script>", start)
-    if start < len(_SCENE) or end < 0:
-        raise damaged(path, "html", "no scene")
-    try:
-        scene = base64.b64decode(data[start:end], validate=True)
-    except ValueError:
-        raise damaged(path, "html", "a scene that is not base64") from None
-    return decode(scene, path)
+    with opening(path, budget.HTML) as source:
+        data = source.read()
+        start = data.find(_SCENE) + len(_SCENE)
+        end = data.find(b"</script>", start)
+        if start < len(_SCENE) or end < 0:
+            raise Damaged("no scene")
+        try:
+            scene = base64.b64decode(data[start:end], validate=True)
+        except ValueError:
+            raise Damaged("a scene that is not base64") from None
+        return decode(scene, source).checked(path)
 
 
 def view_note(capture: Capture, world: World) -> dict[str, Any]:

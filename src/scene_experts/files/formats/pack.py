@@ -3,7 +3,6 @@ bytes, turned frames, size limits."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -11,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.source import Source
 from scene_experts.files.formats.compact import AXIS_BITS, morton
 from scene_experts.files.formats.splats import Splats
 
@@ -19,8 +19,6 @@ Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 MAX_GAUSSIANS = 50_000_000  # of a compressed file; readers refuse more before they allocate memory
-MAX_RATIO = 200  # bytes out per byte in, above _SMALL bytes out; real scenes stay far below
-_SMALL = 1 << 26
 _EDGE = 0.25 / 255  # bytes 0 and 255 are read this far inside [0, 1], so that logits are finite
 _SIGNS = {  # of x, y, z after half a turn about an axis
     "x": (1, -1, -1),
@@ -32,18 +30,21 @@ _PARITY = (  # how often x, y, z occur in each harmonic, by coefficient: (odd x,
 )  # fmt: skip
 
 
-def damaged(path: Path, what: str, found: object) -> InputError:
-    """The error for a file of format `what` whose parts do not fit together."""
-    return InputError(f"expected a whole {what} file at {path}, found {found}; copy it again or write it again")
+def check_count(source: Source, count: int, bytes_each: int) -> None:
+    """Raise Damaged where a file declares more Gaussians than are read, or more than its size can honestly unpack to.
 
-
-def check_size(path: Path, what: str, count: int, raw: int, stored: int) -> None:
-    """Raises InputError where a file of `stored` bytes declares implausibly many Gaussians or
-    unpacked bytes (`raw`)."""
+    bytes_each: what a Gaussian takes in memory while it is decoded.
+    """
     if count > MAX_GAUSSIANS:
-        raise damaged(path, what, f"{count:,} Gaussians declared, above the limit of {MAX_GAUSSIANS:,}")
-    if raw > _SMALL and raw > MAX_RATIO * stored:
-        raise damaged(path, what, f"{stored:,} bytes that unpack to {raw:,}")
+        raise Damaged(f"{count:,} Gaussians declared, above the limit of {MAX_GAUSSIANS:,}")
+    if count * bytes_each > source.budget.allowance(source.size):
+        raise Damaged(f"{source.size:,} bytes that unpack to {count:,} Gaussians")
+    source.spend_bytes(count * bytes_each)
+
+
+def decoded_bytes(degree: int) -> int:
+    """Bytes that a Gaussian takes while it is decoded in float64: position, scale, rotation, opacity and harmonics."""
+    return 8 * (11 + 3 * (degree + 1) ** 2)
 
 
 def morton_order(means: Tensor) -> Tensor:

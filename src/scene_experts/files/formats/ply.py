@@ -21,20 +21,18 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_atomic
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.plain import parse_json
+from scene_experts.core.reading.source import guarding, opening
+from scene_experts.core.reading.vertices import HEADER_LIMIT, read_header, read_table
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import Format
 
 Columns = dict[str, NDArray[np.generic]]
 
-HEADER_LIMIT = 1 << 20
 NOTE_MARK = "scene-experts"
 _NOTE_LIMIT = 1 << 16  # other readers hold header lines in small buffers
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
-_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 
 
 # --- vertex tables ------------------------------------------------------------------------------------------------------------------------
@@ -47,64 +45,13 @@ def read_vertices(path: Path) -> Columns:
     Raises InputError for a file that is missing, no PLY, cut short, does not begin with vertices,
     or has list properties or unknown types.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"expected a PLY file at {path}, found none; check the path")
-    with path.open("rb") as stream:
-        head = stream.read(HEADER_LIMIT)
-    match = re.search(rb"\nend_header[ \t]*\r?\n", head)
-    if not head.startswith(b"ply") or match is None:
-        raise InputError(f"expected a PLY file at {path}, found something else; replace it")
-    order, count, fields = _parse_header(head[: match.start()].decode("ascii", "replace"), path)
-    row = np.dtype([(name, order + code) for name, code in fields])
-    if b"\nformat ascii" in head[: match.start()]:
-        table = _read_ascii(path, match.end(), count, row)
-    else:
-        room = (path.stat().st_size - match.end()) // max(row.itemsize, 1)
-        if room < count:
-            raise InputError(f"expected {count:,} vertices in {path}, found {room:,}: the file was cut short; copy it again")
-        table = np.fromfile(path, row, count, offset=match.end())
-    return {name: table[name] for name, _ in fields}
-
-
-def _parse_header(text: str, path: Path) -> tuple[str, int, list[tuple[str, str]]]:
-    """Byte order, number of vertices, and (name, type) of their properties."""
-    order, count, fields, element = "", -1, [], ""
-    try:
-        for words in (line.split() for line in text.splitlines()):
-            match words:
-                case ["format", kind, *_]:
-                    order = _ORDERS[kind]
-                case ["element", name, number]:
-                    if not element and name != "vertex":
-                        raise ValueError("its first element is not 'vertex'")
-                    element = name
-                    count = int(number) if name == "vertex" else count
-                case ["property", "list", *_] if element == "vertex":
-                    raise ValueError("its vertices have lists")
-                case ["property", kind, name] if element == "vertex":
-                    fields.append((name, _TYPES[kind]))
-        if not order or count < 0 or not fields or len({name for name, _ in fields}) != len(fields):
-            raise ValueError("its format, vertices or properties are missing or named twice")
-    except KeyError as error:
-        raise InputError(f"expected known PLY types in {path}, found {error}; write it again in binary_little_endian") from None
-    except ValueError as error:
-        raise InputError(f"expected a PLY file of points at {path}, found another header ({error}); write it again") from None
-    return order, count, fields
-
-
-def _read_ascii(path: Path, start: int, count: int, row: np.dtype[np.void]) -> NDArray[np.void]:
-    lines = path.read_bytes()[start:].split(b"\n")[:count]
-    try:
-        values = np.array([line.split() for line in lines if line.strip()], dtype=np.float64).reshape(-1, len(row.names or ()))
-    except ValueError:
-        raise InputError(f"expected {len(row.names or ())} numbers per line in {path}, found another line; copy it again") from None
-    if len(values) != count:
-        raise InputError(f"expected {count:,} vertices in {path}, found {len(values):,}: the file was cut short; copy it again")
-    table = np.empty(count, row)
-    for i, name in enumerate(row.names or ()):
-        table[name] = values[:, i]
-    return table
+    with opening(path, budget.PLY) as source:
+        header = read_header(source)
+        table = read_table(source, header)
+        if not header.ascii:
+            return {name: table[name] for name, _ in header.fields}
+        with np.errstate(over="ignore", invalid="ignore"):  # callers refuse values that are not finite
+            return {name: table[:, i].astype(code) for i, (name, code) in enumerate(header.fields)}
 
 
 def write_vertices(path: Path, columns: Mapping[str, NDArray[np.generic]], comments: Sequence[str] = ()) -> None:
@@ -140,7 +87,8 @@ def numbered_columns(prefix: str, value: Tensor) -> Columns:
 
 def numbered_names(columns: Columns, prefix: str) -> list[str]:
     """The columns called prefix + number, sorted by number."""
-    return sorted((name for name in columns if re.fullmatch(re.escape(prefix) + r"\d+", name)), key=lambda name: int(name[len(prefix) :]))
+    found = (name for name in columns if re.fullmatch(re.escape(prefix) + r"[0-9]{1,6}", name))
+    return sorted(found, key=lambda name: int(name[len(prefix) :]))
 
 
 def stack(columns: Columns, names: list[str], path: Path) -> Tensor:
@@ -149,8 +97,9 @@ def stack(columns: Columns, names: list[str], path: Path) -> Tensor:
     if absent or not names:
         raise InputError(f"expected the columns {', '.join(absent) or 'of a scene'} in {path}, found none; write the file again")
     out = np.empty((len(columns[names[0]]), len(names)), np.float32)
-    for i, name in enumerate(names):
-        out[:, i] = columns[name]
+    with np.errstate(over="ignore"):  # callers refuse values that are not finite
+        for i, name in enumerate(names):
+            out[:, i] = columns[name]
     return torch.from_numpy(out)
 
 
@@ -177,8 +126,8 @@ def read_note(path: Path) -> dict[str, Any]:
     for line in header(Path(path)).splitlines():
         if line.startswith(start):
             try:
-                found = json.loads(line[len(start) :])
-            except ValueError:
+                found = parse_json(line[len(start) :], budget.NOTE)
+            except (ValueError, RecursionError):
                 return {}
             return found if isinstance(found, dict) else {}
     return {}
@@ -186,8 +135,8 @@ def read_note(path: Path) -> dict[str, Any]:
 
 def header(path: Path) -> bytes:
     """The header of a PLY file, without its end."""
-    with path.open("rb") as stream:
-        return stream.read(HEADER_LIMIT).split(b"\nend_header", 1)[0]
+    with opening(path, budget.PLY) as source:
+        return source.head(HEADER_LIMIT).split(b"\nend_header", 1)[0]
 
 
 def property_names(path: Path) -> set[str]:
@@ -227,6 +176,12 @@ def read(path: Path) -> Splats:
     rest_names = numbered_names(columns, "f_rest_")
     if len(rest_names) not in (0, 9, 24, 45):
         raise InputError(f"expected 0, 9, 24 or 45 f_rest columns in {path}, found {len(rest_names)}; write the file again")
+    with guarding(path, budget.PLY):
+        return splats_in(columns, rest_names, path).checked(path)
+
+
+def splats_in(columns: Columns, rest_names: list[str], path: Path) -> Splats:
+    """The Gaussians in the columns of 3DGS's file."""
     dc = stack(columns, ["f_dc_0", "f_dc_1", "f_dc_2"], path)[:, None]
     rest = stack(columns, rest_names, path) if rest_names else dc.new_zeros(len(dc), 0)
     return Splats(

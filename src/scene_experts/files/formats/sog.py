@@ -12,8 +12,6 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,13 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.archives import Archive, open_zip, zip_names
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.numbers import FARTHEST, expect_range, shown, whole_number
+from scene_experts.core.reading.pictures import decode_picture
+from scene_experts.core.reading.plain import parse_json
+from scene_experts.core.reading.source import Source, opening
 from scene_experts.files.formats.clusters import codebook, nearest_levels, palette
 from scene_experts.files.formats.pack import (
     MAX_GAUSSIANS,
@@ -30,7 +35,8 @@ from scene_experts.files.formats.pack import (
     Floats,
     alphas,
     byte_logits,
-    damaged,
+    check_count,
+    decoded_bytes,
     from_smallest_three,
     morton_order,
     smallest_three,
@@ -41,15 +47,10 @@ from scene_experts.files.formats.pack import (
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import Format
 
-WHAT = "SOG"
 PALETTE = 1 << 16
 _COLUMNS = 64  # palette rows next to each other in a line of the picture
 _COEFFICIENTS = (0, 3, 8, 15)
 _META_LIMIT, _FILE_LIMIT = 1 << 20, 1 << 30
-_BROKEN = (  # raised by zipfile, json, Pillow and numpy for damaged parts
-    zipfile.BadZipFile, zlib.error, KeyError, IndexError, ValueError, TypeError, AttributeError, OSError, EOFError, RuntimeError,
-    Image.DecompressionBombError,
-)  # fmt: skip
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # a fixed date: equal scenes give equal bytes
 
 
@@ -102,39 +103,40 @@ def sog_bytes(splats: Splats, note: dict[str, Any]) -> bytes:
 
 def read(path: Path) -> Splats:
     """The Gaussians of a file of version 2. Raises InputError for other or damaged files."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return _decode(path, lambda name, limit: _member(archive, name, limit))
-    except _BROKEN as error:
-        raise damaged(path, WHAT, f"parts that do not fit together ({error})") from None
+    with opening(path, budget.SOG) as source, open_zip(source) as archive:
+        return _decode(source, archive).checked(path)
 
 
-def _decode(path: Path, member: Callable[[str, int], bytes]) -> Splats:
-    meta = json.loads(member("meta.json", _META_LIMIT))
-    n = meta["count"]
-    if meta["version"] != 2 or not isinstance(n, int) or not 0 < n <= MAX_GAUSSIANS:
-        raise ValueError(f"version {meta['version']} with {n} Gaussians")
+def _decode(source: Source, archive: Archive) -> Splats:
+    meta = parse_json(archive.read("meta.json", _META_LIMIT))
+    n = whole_number(meta["count"], "the number of Gaussians", 1, MAX_GAUSSIANS)
+    if meta["version"] != 2:
+        raise Damaged(f"version {shown(meta['version'])}")
+    bands = whole_number(meta["shN"]["bands"], "the bands of harmonics", 1, 3) if meta.get("shN") else 0
+    check_count(source, n, decoded_bytes(bands))
 
     def pixels(part: str, i: int = 0) -> Bytes:
-        picture = _picture(member(meta[part]["files"][i], _FILE_LIMIT), 4 * n + 65536)
+        picture = _picture(archive.read(meta[part]["files"][i], _FILE_LIMIT), 4 * n + 65536)
+        source.check_time()
         if picture.shape[0] * picture.shape[1] < n:
-            raise ValueError(f"a picture of {part} with too few pixels")
+            raise Damaged(f"a picture of {part} with too few pixels")
         return picture.reshape(-1, 4)[:n]
 
     book = lambda part: np.array(meta[part]["codebook"], np.float64).reshape(-1)  # noqa: E731
     mins, maxs = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
     level = pixels("means", 0)[:, :3].astype(np.int64) + (pixels("means", 1)[:, :3].astype(np.int64) << 8)
+    expect_range(np.stack([mins, maxs]), "ends of the positions", -_squeeze(np.array(FARTHEST)), _squeeze(np.array(FARTHEST)))
     means = _stretch(mins + (maxs - mins) * (level / 65535))
     rest, colors = pixels("quats"), pixels("sh0")
     if (rest[:, 3] < 252).any():
-        raise ValueError("rotations of another kind")
+        raise Damaged("rotations of another kind")
     quats = from_smallest_three(rest[:, 3] - 252, (rest[:, :3] / 255 - 0.5) * np.sqrt(2))
     scales = book("scales")[pixels("scales")[:, :3]]
     sh = book("sh0")[colors[:, :3]][:, None]
     if meta.get("shN"):
-        sh = np.concatenate([sh, _read_harmonics(meta["shN"], pixels("shN", 1), member, book("shN"))], 1)
+        sh = np.concatenate([sh, _read_harmonics(meta["shN"], pixels("shN", 1), archive, book("shN"))], 1)
     if not all(np.isfinite(part).all() for part in (means, scales, sh)):
-        raise ValueError("values that are not finite")
+        raise Damaged("values that are not finite")
     return Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(colors[:, 3])), tensor(sh))
 
 
@@ -157,14 +159,14 @@ def _harmonics(splats: Splats) -> tuple[dict[str, Any], bytes, NDArray[Any]]:
     return meta, _webp(pixels, _COLUMNS * coefficients, lines), np.stack([index & 255, index >> 8, np.zeros_like(index)], 1)
 
 
-def _read_harmonics(meta: dict[str, Any], labels: Bytes, member: Callable[[str, int], bytes], book: Floats) -> Floats:
+def _read_harmonics(meta: dict[str, Any], labels: Bytes, archive: Archive, book: Floats) -> Floats:
     """Harmonics above the constant, [N, C, 3]."""
-    coefficients, count = _COEFFICIENTS[meta["bands"]], int(meta["count"])
-    picture = _picture(member(meta["files"][0], _FILE_LIMIT), PALETTE * coefficients + 65536)
+    coefficients, count = _COEFFICIENTS[meta["bands"]], whole_number(meta["count"], "the rows of the palette", 1, PALETTE)
+    picture = _picture(archive.read(meta["files"][0], _FILE_LIMIT), PALETTE * coefficients + 65536)
     rows = picture.shape[0] * _COLUMNS
     index = labels[:, 0].astype(np.int64) + (labels[:, 1].astype(np.int64) << 8)
-    if coefficients == 0 or picture.shape[1] != _COLUMNS * coefficients or not 0 < count <= min(rows, PALETTE) or index.max() >= count:
-        raise ValueError("a palette of another size")
+    if picture.shape[1] != _COLUMNS * coefficients or count > rows or index.max() >= count:
+        raise Damaged("a palette of another size")
     return book[picture.reshape(rows, coefficients, 4)[:, :, :3][index]]
 
 
@@ -189,19 +191,7 @@ def _webp(values: NDArray[Any], width: int, height: int) -> bytes:
 
 def _picture(data: bytes, limit: int) -> Bytes:
     """Pixels [H, W, 4] of a WebP picture of at most `limit` pixels."""
-    with Image.open(io.BytesIO(data), formats=["WEBP"]) as picture:
-        if picture.width * picture.height > limit:
-            raise ValueError(f"a picture of {picture.width} x {picture.height} pixels")
-        return np.asarray(picture.convert("RGBA"))
-
-
-def _member(archive: zipfile.ZipFile, name: object, limit: int) -> bytes:
-    """One file of the archive. Raises ValueError for more than `limit` bytes."""
-    info = archive.getinfo(str(name))
-    if info.file_size > limit:
-        raise ValueError(f"{name} of {info.file_size:,} bytes")
-    with archive.open(info) as stream:
-        return stream.read(limit)
+    return np.asarray(decode_picture(data, limit, "WEBP").convert("RGBA"))
 
 
 def _zip(files: dict[str, bytes]) -> bytes:
@@ -216,9 +206,9 @@ def looks_like(path: Path, head: bytes) -> bool:
     """Whether a zip has the description of a SOG file. A damaged zip counts as one, so that `read`
     explains the damage."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            return "meta.json" in archive.namelist()
-    except _BROKEN:
+        with opening(path, budget.SOG) as source:
+            return "meta.json" in zip_names(source)
+    except InputError:
         return True
 
 

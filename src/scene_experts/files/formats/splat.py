@@ -13,7 +13,10 @@ from typing import Any
 import numpy as np
 
 from scene_experts.core.io import write_bytes
-from scene_experts.files.formats.pack import alphas, byte_logits, damaged, tensor, to_bytes, unit_quats
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.source import opening
+from scene_experts.files.formats.pack import alphas, byte_logits, tensor, to_bytes, unit_quats
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import Format
 from scene_experts.geometry.sh import C0
@@ -35,23 +38,24 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
 
 def read(path: Path) -> Splats:
     """The Gaussians of a file, of degree 0. Raises InputError for a size or values that no such file has."""
-    data = path.read_bytes()
-    if len(data) % ROW.itemsize:
-        raise damaged(path, ".splat", f"{len(data):,} bytes, which is not a multiple of {ROW.itemsize}")
-    table = np.frombuffer(data, ROW)
-    scales = table["scales"].astype(np.float64)
-    if not (np.isfinite(table["means"]).all() and np.isfinite(scales).all() and (scales >= 0).all()):
-        raise damaged(path, ".splat", "positions or scales that are not finite")
-    quats = (table["quats"].astype(np.float64) - 128) / 128
-    quats[(quats == 0).all(1)] = [1, 0, 0, 0]
-    colors = (table["rgba"][:, :3].astype(np.float64) / 255 - 0.5) / C0
-    return Splats(
-        means=tensor(table["means"]),
-        log_scales=tensor(np.log(np.maximum(scales, 1e-30))),
-        quats=tensor(quats / np.linalg.norm(quats, axis=1, keepdims=True)),
-        opacity_logit=tensor(byte_logits(table["rgba"][:, 3])),
-        sh=tensor(colors[:, None]),
-    )
+    with opening(path, budget.SPLAT) as source:
+        data = source.read()
+        if len(data) % ROW.itemsize:
+            raise Damaged(f"{len(data):,} bytes, which is not a multiple of {ROW.itemsize}")
+        table = np.frombuffer(data, ROW)
+        scales = table["scales"].astype(np.float64)
+        if not (np.isfinite(table["means"]).all() and np.isfinite(scales).all() and (scales >= 0).all()):
+            raise Damaged("positions or scales that are not finite")
+        quats = (table["quats"].astype(np.float64) - 128) / 128
+        quats[(quats == 0).all(1)] = [1, 0, 0, 0]
+        colors = (table["rgba"][:, :3].astype(np.float64) / 255 - 0.5) / C0
+        return Splats(
+            means=tensor(table["means"]),
+            log_scales=tensor(np.log(np.maximum(scales, 1e-30))),
+            quats=tensor(quats / np.linalg.norm(quats, axis=1, keepdims=True)),
+            opacity_logit=tensor(byte_logits(table["rgba"][:, 3])),
+            sh=tensor(colors[:, None]),
+        ).checked(path)
 
 
 def looks_like(path: Path, head: bytes) -> bool:

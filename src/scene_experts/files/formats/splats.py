@@ -10,10 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.reading.numbers import FARTHEST, LARGEST, LARGEST_LOG, all_finite, expect_range
+
+NAMES = ("means", "log_scales", "quats", "opacity_logit", "sh")
 
 
 @dataclass(frozen=True)
@@ -49,8 +53,18 @@ class Splats:
 
     def expect_finite(self, where: str) -> None:
         """Raises InputError, naming `where`, for values that are not finite."""
-        for name in ("means", "log_scales", "quats", "opacity_logit", "sh"):
+        for name in NAMES:
             value = getattr(self, name)
-            bad = int((~value.isfinite()).reshape(len(value), -1).any(1).sum()) if len(value) else 0
-            if bad:
+            if not all_finite(value):
+                bad = int((~value.isfinite()).reshape(len(value), -1).any(1).sum())
                 raise InputError(f"expected finite {name} in {where}, found {bad:,} Gaussians with others; make it again")
+
+    def checked(self, where: Path) -> Splats:
+        """These Gaussians. Raises InputError, naming the file `where`, for values that are not finite, and Damaged for positions
+        and scales that no computation in float32 can bear."""
+        self.expect_finite(str(where))
+        expect_range(self.means, "positions", -FARTHEST, FARTHEST)
+        expect_range(self.log_scales, "logarithms of scales", -LARGEST, LARGEST_LOG)
+        for name in ("quats", "opacity_logit", "sh"):
+            expect_range(getattr(self, name), f"values of {name}")
+        return self

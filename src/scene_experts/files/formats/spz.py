@@ -20,13 +20,16 @@ from numpy.typing import NDArray
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.source import Source, opening
 from scene_experts.files.formats.pack import (
     Bytes,
     Floats,
     alphas,
     byte_logits,
-    check_size,
-    damaged,
+    check_count,
+    decoded_bytes,
     from_smallest_three,
     morton_order,
     smallest_three,
@@ -40,7 +43,7 @@ from scene_experts.files.registry import Format
 
 MAGIC, HEADER = 0x5053474E, struct.Struct("<IIIBBBB")
 V4_HEADER = struct.Struct("<IIIBBBBI12x")
-WHAT = "SPZ"
+_ZSTD_WINDOW = 1 << 27  # bytes that a zstd frame may look back, which the decoder allocates
 ANTIALIASED, _FLAGS = 1, 14  # a bit of the flags, and the offset of the flags in the header of every version
 _STREAMS = ("positions", "alphas", "colors", "scales", "rotations", "sh")
 _COLOR = 0.15  # share of a byte's range per unit of the constant harmonic
@@ -80,31 +83,32 @@ def spz_bytes(splats: Splats, first_step: int = 1, rest_step: int = 1, antialias
 
 def read(path: Path) -> Splats:
     """The Gaussians of a file of version 1 to 4. Raises InputError for other or damaged files."""
-    return decode(path.read_bytes(), path)
+    with opening(path, budget.SPZ) as source:
+        return decode(source.read(), source).checked(path)
 
 
 def is_antialiased(path: Path) -> bool:
     """Whether a file says that it is drawn with antialiasing; False for damaged files."""
-    with path.open("rb") as stream:
-        data = stream.read(4096)
-    try:
-        head = data if data[:4] == b"NGSP" else zlib.decompressobj(31).decompress(data, HEADER.size)
-    except zlib.error:
-        return False
+    with opening(path, budget.SPZ) as source:
+        data = source.head(4096)
+        try:
+            head = data if data[:4] == b"NGSP" else zlib.decompressobj(31).decompress(data, HEADER.size)
+        except zlib.error:
+            return False
     return len(head) > _FLAGS and bool(head[_FLAGS] & ANTIALIASED)
 
 
-def decode(data: bytes, path: Path) -> Splats:
-    """The Gaussians in the bytes of a file; `path` is for messages."""
-    version, n, degree, bits, streams = _streams_v4(data, path) if data[:4] == b"NGSP" else _streams_gzip(data, path)
+def decode(data: bytes, source: Source) -> Splats:
+    """The Gaussians in the bytes of a file. Raises Damaged."""
+    version, n, degree, bits, streams = _streams_v4(data, source) if data[:4] == b"NGSP" else _streams_gzip(data, source)
     means = _positions(streams["positions"], version, n, bits)
     if not np.isfinite(means).all():
-        raise damaged(path, WHAT, "positions that are not finite")
+        raise Damaged("positions that are not finite")
     quats = _unpack_quats(streams["rotations"], n) if version >= 3 else _unpack_xyz(streams["rotations"], n)
     dc = (streams["colors"].reshape(n, 1, 3) / 255.0 - 0.5) / _COLOR
-    rest = (streams["sh"].reshape(n, (degree + 1) ** 2 - 1, 3).astype(np.float64) - 128) / 128
     used = min(degree, 3)
-    sh = np.concatenate([dc, rest[:, : (used + 1) ** 2 - 1]], 1)
+    rest = (streams["sh"].reshape(n, (degree + 1) ** 2 - 1, 3)[:, : (used + 1) ** 2 - 1].astype(np.float64) - 128) / 128
+    sh = np.concatenate([dc, rest], 1)
     scales = streams["scales"].reshape(n, 3) / 16.0 - 10
     return turn(Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(streams["alphas"])), tensor(sh)), "x")
 
@@ -112,11 +116,12 @@ def decode(data: bytes, path: Path) -> Splats:
 # --- containers ---------------------------------------------------------------------------------------------------------------------------
 
 
-def _check_header(path: Path, magic: int, version: int, degree: int, bits: int, versions: range) -> None:
+def _check_header(source: Source, magic: int, version: int, n: int, degree: int, bits: int, versions: range) -> None:
     if magic != MAGIC or version not in versions:
-        raise damaged(path, WHAT, f"a header of version {version}" if magic == MAGIC else "another header")
+        raise Damaged(f"a header of version {version}" if magic == MAGIC else "another header")
     if degree > 4 or bits > 24:
-        raise damaged(path, WHAT, f"harmonics of degree {degree} and {bits} bits of fraction")
+        raise Damaged(f"harmonics of degree {degree} and {bits} bits of fraction")
+    check_count(source, n, decoded_bytes(degree))
 
 
 def _sizes(version: int, n: int, degree: int) -> dict[str, int]:
@@ -125,61 +130,61 @@ def _sizes(version: int, n: int, degree: int) -> dict[str, int]:
     return {name: n * width for name, width in zip(_STREAMS, widths)}
 
 
-def _streams_gzip(data: bytes, path: Path) -> tuple[int, int, int, int, dict[str, Bytes]]:
+def _streams_gzip(data: bytes, source: Source) -> tuple[int, int, int, int, dict[str, Bytes]]:
     """Version, count, degree, bits of fraction and the streams of versions 1 to 3."""
     machine = zlib.decompressobj(31)
-    try:
-        head = machine.decompress(data, HEADER.size)
-        if len(head) < HEADER.size:
-            raise damaged(path, WHAT, "no whole header")
-        magic, version, n, degree, bits, _, _ = HEADER.unpack(head)
-        _check_header(path, magic, version, degree, bits, range(1, 4))
-        sizes = _sizes(version, n, degree)
-        total = sum(sizes.values())
-        check_size(path, WHAT, n, total, len(data))
-        body = machine.decompress(machine.unconsumed_tail, total + 1)
-    except zlib.error as error:
-        raise damaged(path, WHAT, f"a stream that does not unpack ({error})") from None
+    head = machine.decompress(data, HEADER.size)
+    if len(head) < HEADER.size:
+        raise Damaged("no whole header")
+    magic, version, n, degree, bits, _, _ = HEADER.unpack(head)
+    _check_header(source, magic, version, n, degree, bits, range(1, 4))
+    sizes = _sizes(version, n, degree)
+    total = sum(sizes.values())
+    body = machine.decompress(machine.unconsumed_tail, total + 1)
     if len(body) != total:
-        raise damaged(path, WHAT, f"{len(body):,} bytes of attributes where {total:,} are expected")
+        raise Damaged(f"{len(body):,} bytes of attributes where {total:,} are expected")
     ends = np.cumsum([0, *sizes.values()])
     flat = np.frombuffer(body, np.uint8)
     return version, n, degree, bits, {name: flat[ends[i] : ends[i + 1]] for i, name in enumerate(_STREAMS)}
 
 
-def _streams_v4(data: bytes, path: Path) -> tuple[int, int, int, int, dict[str, Bytes]]:
+def _streams_v4(data: bytes, source: Source) -> tuple[int, int, int, int, dict[str, Bytes]]:
     """The same for version 4: a plain header, a table of sizes, and one zstd stream per attribute."""
     try:
         import zstandard
     except ImportError:
-        raise InputError(f"expected the package zstandard to read {path} (SPZ version 4), found none; pip install zstandard") from None
+        raise InputError(
+            f"expected the package zstandard to read {source.path} (SPZ version 4), found none; pip install zstandard"
+        ) from None
     if len(data) < V4_HEADER.size:
-        raise damaged(path, WHAT, "no whole header")
+        raise Damaged("no whole header")
     magic, version, n, degree, bits, _, count, table = V4_HEADER.unpack_from(data)
-    _check_header(path, magic, version, degree, bits, range(4, 5))
+    _check_header(source, magic, version, n, degree, bits, range(4, 5))
     sizes = {name: size for name, size in _sizes(version, n, degree).items() if size or count == len(_STREAMS)}
-    check_size(path, WHAT, n, sum(sizes.values()), len(data))
     if count != len(sizes) or table < V4_HEADER.size or table + 16 * count > len(data):
-        raise damaged(path, WHAT, f"a table of {count} streams where {len(sizes)} are expected")
+        raise Damaged(f"a table of {count} streams where {len(sizes)} are expected")
     out: dict[str, Bytes] = {name: np.zeros(0, np.uint8) for name in _STREAMS}
     offset = table + 16 * count
     for i, (name, size) in enumerate(sizes.items()):
         packed, raw = struct.unpack_from("<QQ", data, table + 16 * i)
         part = data[offset : offset + packed]
         offset += packed
-        try:
-            found = zstandard.ZstdDecompressor().decompressobj().decompress(part) if _honest(zstandard, part, size) else b""
-        except zstandard.ZstdError as error:
-            raise damaged(path, WHAT, f"a stream that does not unpack ({error})") from None
-        if raw != size or len(found) != size or len(part) != packed:
-            raise damaged(path, WHAT, f"a stream of {name} that is not {size:,} bytes long")
-        out[name] = np.frombuffer(found, np.uint8)
+        if raw != size or len(part) != packed:
+            raise Damaged(f"a stream of {name} that is not {size:,} bytes long")
+        out[name] = np.frombuffer(_unpack_zstd(zstandard, part, size), np.uint8)
     return version, n, degree, bits, out
 
 
-def _honest(zstandard: Any, part: bytes, size: int) -> bool:
-    """Whether a zstd frame declares that it unpacks to `size` bytes."""
-    return bool(part) and size > 0 and zstandard.frame_content_size(part) == size
+def _unpack_zstd(zstandard: Any, part: bytes, size: int) -> bytes:
+    """The `size` bytes of a zstd frame. Raises Damaged for a frame that declares or holds another number, and for a huge window."""
+    if not part and not size:
+        return b""
+    if zstandard.frame_content_size(part) != size:
+        raise Damaged(f"a stream that does not unpack to {size:,} bytes")
+    found = zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW).decompress(part, max_output_size=size)
+    if len(found) != size:
+        raise Damaged(f"a stream that does not unpack to {size:,} bytes")
+    return found
 
 
 # --- attributes ---------------------------------------------------------------------------------------------------------------------------

@@ -14,6 +14,8 @@ from torch import Tensor
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json
 from scene_experts.core.plain import from_json
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.source import guarding
 from scene_experts.core.table import Table
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
@@ -22,6 +24,7 @@ from scene_experts.files.formats.ply import property_names
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.gaussians.write import KIND
 from scene_experts.files.registry import Imported, recognise
+from scene_experts.files.registry import read as read_file
 from scene_experts.recipes import gs_3d
 from scene_experts.scene import Scene
 from scene_experts.scene.gaussians import Explicit, GaussianScene
@@ -57,7 +60,7 @@ def read(source: Path, data: Data, iteration: int | None) -> Imported:
             capture.root,
         )
     columns = table_columns(read_splats(source), capture.world)
-    step = int(about.get("step") or iteration or result_folder.iteration_of(source.parent) or 0)
+    step = about.get("step") or iteration or result_folder.iteration_of(source.parent) or 0
     degree = math.isqrt(columns["sh_rest"].shape[1] + 1) - 1
     cfg = replace(gs_3d, scene=Explicit(sh_degree=degree), iterations=step or gs_3d.iterations, antialias=antialias)
     if about.get("kind") == KIND and "train" in about:
@@ -75,13 +78,11 @@ def read(source: Path, data: Data, iteration: int | None) -> Imported:
 def read_splats(path: Path) -> Splats:
     """The Gaussians of a file of any format. Raises InputError for files without Gaussians and for
     values that are not finite."""
-    format = recognise(path)[1]
-    assert format.read is not None
-    found: Splats = format.read(path)
+    found: Splats = read_file(path)
     if not len(found):
         raise InputError(f"expected Gaussians in {path}, found none; export the result again")
-    found.expect_finite(str(path))
-    return found
+    with guarding(path, budget.HEAD):
+        return found.checked(path)
 
 
 def table_columns(splats: Splats, world: World) -> dict[str, Tensor]:

@@ -17,6 +17,9 @@ from torch import Tensor
 from scene_experts.core.checkpoint import read_tensors
 from scene_experts.core.errors import InputError
 from scene_experts.core.plain import from_json
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.numbers import FARTHEST, LARGEST, LARGEST_LOG, expect_finite_tensors, expect_range, number
+from scene_experts.core.reading.source import guarding
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.files import result_folder
@@ -48,6 +51,11 @@ def find(source: Path, iteration: int | None) -> Path | None:
 def read(source: Path, data: Data, iteration: int | None) -> Imported:
     """The run in an iteration's folder. Raises InputError for missing or damaged files and for a
     capture in another world."""
+    with guarding(source, budget.HEAD, "scene of graph points"):
+        return _read(source, data)
+
+
+def _read(source: Path, data: Data) -> Imported:
     about = result_folder.read_description(source) or {}
     if absent := {"grid", "extent", "step", "train"} - about.keys():
         raise InputError(f"expected {', '.join(sorted(absent))} in {source / result_folder.DESCRIPTION}, found none; copy the whole folder")
@@ -62,8 +70,9 @@ def read(source: Path, data: Data, iteration: int | None) -> Imported:
 
 def meta(about: dict[str, Any], world: World, voxel: float) -> dict[str, Any]:
     """The values of `Scene.meta`; the cube of the grid in the trained world."""
-    low = world.from_input(torch.tensor(about["grid"]["low"], dtype=torch.float64)).tolist()
-    grid = {"grid_low": low, "grid_edge": float(about["grid"]["edge"]) * world.scale}
+    corner = [number(v, "a corner of the grid", -FARTHEST, FARTHEST) for v in about["grid"]["low"]]
+    low = world.from_input(torch.tensor(corner, dtype=torch.float64)).tolist()
+    grid = {"grid_low": low, "grid_edge": number(about["grid"]["edge"], "the edge of the grid", 1e-15, FARTHEST) * world.scale}
     return {"voxel": voxel, "extent": float(about["extent"]), **grid}
 
 
@@ -78,6 +87,8 @@ def rows(path: Path, world: World, voxel: float) -> dict[str, Tensor]:
     needed = [*"xyz", *(f"feats_{i}" for i in range(features)), *(f"scale_{i}" for i in range(6))]
     if absent := [name for name in needed if name not in found]:
         raise InputError(f"expected the columns of graph points in {path}, found no {', '.join(absent)}; copy the whole folder")
+    for name in needed:
+        expect_range(found[name], name, -FARTHEST, FARTHEST if name in "xyz" else LARGEST_LOG if name.startswith("scale_") else LARGEST)
     twice = (world.from_input(stack("xyz").double()) * (HALF / voxel)).round().long()
     return {
         "facts.cell": coarsen(twice, HALF),
@@ -92,6 +103,7 @@ def networks(path: Path, scale: float) -> dict[str, Tensor]:
     if not path.is_file():
         raise InputError(f"expected the networks of the scene at {path}, found none; copy the whole folder")
     tensors, _ = read_tensors(path, KIND)
+    expect_finite_tensors(tensors)
     for attribute in CHANNELS:
         tensors[f"{attribute}.0"][:, -1] /= scale
     return {f"network.{name}": value for name, value in tensors.items()}

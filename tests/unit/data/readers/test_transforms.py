@@ -58,7 +58,8 @@ def test_shared_intrinsics_and_an_angle_of_view(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        (lambda m: m["frames"][0].update(transform_matrix=[[float("nan")] * 4] * 4), "transform_matrix"),
+        (lambda m: m["frames"][0].update(transform_matrix=[[float("nan")] * 4] * 4), "finite"),
+        (lambda m: m["frames"][0].update(transform_matrix=[[1e300] * 4] * 4), "transform_matrix"),
         (lambda m: m["frames"][0].update(transform_matrix="no"), "transform_matrix"),
         (lambda m: m["frames"][0].update(transform_matrix=(3 * np.eye(4)).tolist()), "rotation"),
         (lambda m: m["frames"][0].pop("transform_matrix"), "transform_matrix"),

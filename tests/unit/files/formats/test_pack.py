@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.reading.budget import SPZ, Damaged
+from scene_experts.core.reading.source import Source
 from scene_experts.files.formats import pack
 from scene_experts.files.formats.pack import morton_order
 from scene_experts.geometry.rotation import covariance
@@ -49,12 +50,12 @@ def test_bytes_of_opacities_are_finite_logits():
 
 
 def test_sizes_that_cannot_be_honest():
-    pack.check_size(Path("a"), "SPZ", 10, 10_000, 10)
-    pack.check_size(Path("a"), "SPZ", 10, 1 << 30, 1 << 27)
-    with pytest.raises(InputError, match=naming("1,000,000,000")):
-        pack.check_size(Path("a"), "SPZ", 10**9, 1, 1)
-    with pytest.raises(InputError, match=naming(100)):
-        pack.check_size(Path("a"), "SPZ", 10, 1 << 30, 100)
+    pack.check_count(Source(Path("a"), SPZ, 10), 10, 10_000)
+    pack.check_count(Source(Path("a"), SPZ, 1 << 27), 1 << 20, 1 << 10)
+    with pytest.raises(Damaged, match=naming("1,000,000,000")):
+        pack.check_count(Source(Path("a"), SPZ, 1 << 40), 10**9, 1)
+    with pytest.raises(Damaged, match=naming(100, "1,048,576")):
+        pack.check_count(Source(Path("a"), SPZ, 100), 1 << 20, 1 << 10)
 
 
 def test_a_permutation_of_near_neighbours():

@@ -41,11 +41,16 @@ def test_the_layout_byte_by_byte(tmp_path):
     assert [body[20 + 3 * i] for i in range(3)] == [128 - 64, 128 - 32, 128 - 64]  # y, z flip, x does not
 
 
+def read(folder, data):
+    (folder / "a.spz").write_bytes(data)
+    return spz.read(folder / "a.spz")
+
+
 @pytest.mark.parametrize("version", [1, 2])
 def test_old_versions(tmp_path, version):
     s = scene(40, 1)
     raw = gzip.decompress(spz.spz_bytes(s))
-    now = spz.decode(spz.spz_bytes(s), tmp_path)
+    now = read(tmp_path, spz.spz_bytes(s))
     flipped = spz.turn(now, "x")
     places = flipped.means.numpy().astype("<f2").tobytes() if version == 1 else raw[16 : 16 + 9 * 40]
     q = torch.nn.functional.normalize(flipped.quats, dim=1)
@@ -53,7 +58,7 @@ def test_old_versions(tmp_path, version):
     turns = np.clip(np.rint((q[:, 1:].numpy() + 1) * 127.5), 0, 255).astype(np.uint8).tobytes()
     rest = raw[16 + 9 * 40 :]
     data = spz.HEADER.pack(spz.MAGIC, version, 40, 1, raw[13], 0, 0) + places + rest[: 7 * 40] + turns + rest[11 * 40 :]
-    found = spz.decode(gzip.compress(data), tmp_path)
+    found = read(tmp_path, gzip.compress(data))
     torch.testing.assert_close(found.means, now.means, rtol=1e-3, atol=1e-4)
     assert torch.equal(found.sh, now.sh) and torch.equal(found.log_scales, now.log_scales)
     dots = (torch.nn.functional.normalize(found.quats, dim=1) * torch.nn.functional.normalize(now.quats, dim=1)).sum(1).abs()
@@ -77,7 +82,7 @@ def version_4(s, degree=None):
 @pytest.mark.parametrize("degree", [0, 3])
 def test_version_4(tmp_path, degree):
     s = scene(50, degree)
-    found, wanted = spz.decode(version_4(s), tmp_path), spz.decode(spz.spz_bytes(s), tmp_path)
+    found, wanted = read(tmp_path, version_4(s)), read(tmp_path, spz.spz_bytes(s))
     for name in ("means", "log_scales", "quats", "opacity_logit", "sh"):
         assert torch.equal(getattr(found, name), getattr(wanted, name))
 
@@ -110,7 +115,7 @@ def test_damaged_files(tmp_path):
         gzip.compress(raw[:4] + struct.pack("<I", 9) + raw[8:]): "9",
         gzip.compress(raw[:12] + b"\x09" + raw[13:]): "9",
         gzip.compress(raw[:8] + struct.pack("<I", 1 << 31) + raw[12:]): "2,147,483,648",
-        bomb: "2,600,000,000",
+        bomb: "40,000,000",
         version_4(scene(30))[:-9]: "",
         version_4(scene(30))[:40]: "6",
         version_4(scene(30), degree=1): "",

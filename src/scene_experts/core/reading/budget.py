@@ -1,0 +1,85 @@
+"""How much one file of each format may cost: its size, what it unpacks to, its items, its nesting and its time.
+
+A limit is far above what an honest file needs: a PLY file of 10 million Gaussians has 2.5 GB, a compact file of 2 million anchors
+0.3 GB, and a capture of 5,000 views has a transforms.json of 4 MB. What a file unpacks to is limited relative to its size, so a
+small file can never take much memory, and a large honest file is never refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+MIB, GIB = 1 << 20, 1 << 30
+BYTES_PER_SECOND = 2 * MIB
+"""Least speed of a reader. A file may take its budget's seconds and its size divided by this."""
+
+
+class Damaged(ValueError):
+    """The content of a file does not fit its format. The message completes "expected a whole FILE at PATH, found ..."."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Limits of one format.
+
+    Attributes:
+        what: What a file of the format is called in error messages.
+        bytes_in: Largest file in bytes.
+        floor: Bytes in memory that a file of any size may unpack to.
+        ratio: Bytes in memory per byte of the file, above `floor`.
+        items: Largest number of entries: members of an archive, values of a JSON file, operations of a pickle, lines of a header.
+        depth: Largest nesting of lists and objects.
+        seconds: Time that a small file may take; see BYTES_PER_SECOND. Readers check it between their steps.
+        advice: What the user can do about a damaged file.
+    """
+
+    what: str
+    bytes_in: int
+    floor: int = 256 * MIB
+    ratio: int = 64
+    items: int = 4_000_000
+    depth: int = 32
+    seconds: float = 4.0
+    advice: str = "copy it again or write it again"
+
+    def allowance(self, size: int) -> int:
+        """Return how many bytes a file of `size` bytes may take in memory."""
+        return max(self.floor, self.ratio * size)
+
+    def time_limit(self, size: int) -> float:
+        """Return how many seconds a file of `size` bytes may take."""
+        return self.seconds + size / BYTES_PER_SECOND
+
+
+# --- descriptions -------------------------------------------------------------------------------------------------------------------------
+
+JSON = Budget("JSON file", 32 * MIB, advice="restore or remove the file")
+META = Budget("description", 16 * MIB)  # JSON inside another file
+LINES = Budget("file of metrics", 1 * GIB, items=20_000_000)  # one JSON object per line
+LINE = Budget("line of metrics", 1 * MIB, items=100_000)
+SETTINGS = Budget("cfg_args file", 1 * MIB, items=1_000, depth=4, advice="remove the file to go on without it")
+NOTE = Budget("note", 1 * MIB)
+
+# --- captures -----------------------------------------------------------------------------------------------------------------------------
+
+CAPTURE = Budget("capture", 1 << 60, advice="restore its files")
+COLMAP = Budget("COLMAP file", 32 * GIB, advice="copy it again")
+POINTS = Budget("PLY file of points", 16 * GIB, items=4_096, advice="copy it again")
+PHOTOGRAPH = Budget("image", 2 * GIB, floor=160 * MIB, ratio=80, advice="replace it or remove it from the capture")
+MASK = Budget("mask", 1 * GIB, floor=160 * MIB, ratio=80, advice="replace or remove it")
+PICTURE = Budget("picture", 1 * GIB, floor=160 * MIB, ratio=80, advice="evaluate the run again")
+
+# --- scenes -------------------------------------------------------------------------------------------------------------------------------
+
+HEAD = Budget("file", 1 << 50)  # the first bytes, by which formats are recognised
+PLY = Budget("PLY file", 256 * GIB, items=4_096)
+COMPRESSED_PLY = Budget("compressed PLY file", 64 * GIB, items=4_096)
+SPLAT = Budget(".splat file", 64 * GIB)
+SPZ = Budget("SPZ file", 16 * GIB)
+SOG = Budget("SOG file", 16 * GIB, items=256)
+GLB = Budget("glTF file", 64 * GIB, floor=64 * MIB, ratio=32, items=20_000)
+HTML = Budget("html page", 16 * GIB)
+COMPACT = Budget("compact scene", 64 * GIB)
+CHECKPOINT = Budget("checkpoint", 1 << 40, items=100_000, advice="use an older one or copy it again")
+NETWORK = Budget("network file", 16 * GIB, floor=128 * MIB, ratio=4, items=200_000, depth=50, advice="get it again")
+WEIGHTS = Budget("file of LPIPS weights", 4 * GIB, ratio=4, items=1_000, advice="remove the file and get it again")
