@@ -28,7 +28,7 @@ from scene_experts.core.reading.tensors import find_not_finite, read_metadata, r
 FORMAT = 1
 KIND = "checkpoint"
 KEY = "scene_experts"
-FINITE = ("params.", "facts.", "network.", "feature", "offsets", "log_scaling", "cells")
+FINITE = ("params.", "facts.", "network.", "average.", "feature", "offsets", "log_scaling", "cells")
 """Prefixes of the tensors of a scene, whose values must be finite. Statistics and states of an optimiser are not among them."""
 _NAME = re.compile(r"ckpt_(\d{6,})\.safetensors")
 

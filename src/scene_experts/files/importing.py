@@ -6,11 +6,14 @@ from pathlib import Path
 
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.source import guarding
 from scene_experts.data.settings import Data
 from scene_experts.files.export import write_result_folder
 from scene_experts.files.formats.ply import read_vertices
 from scene_experts.files.registry import FAMILIES, Family, family_named, recognise
 from scene_experts.files.result_folder import is_result, iteration_folder
+from scene_experts.scene.fit import restore_foreign
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
 
@@ -31,7 +34,9 @@ def import_files(source: Path, data: Data, out: Path, iteration: int | None = No
     if not source.exists():
         raise InputError(f"expected a result folder or a file of a scene at {source}, found nothing; check the path")
     family, found = owner(source, iteration)
-    read = family.read(found, data, iteration)
+    with guarding(found, budget.HEAD, "scene"):
+        read = family.read(found, data, iteration)
+        restore_foreign(read.cfg.scaled_scene(), read.tensors, {"step": read.step, **read.meta})  # before anything is written
     config = RunConfig(read.cfg, read.data, f"import {found.name if found.is_file() else source.name}", versions=run_folder.versions())
     run_folder.prepare(out, config, resume=False)
     meta = {"recipe": read.cfg.recipe, "step": read.step, "seconds": 0.0, **read.meta, "config": "imported"}

@@ -168,6 +168,10 @@ class SceneConfig(Part, ABC):
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> Scene:
         """Create a scene from a point cloud and the cameras of the training views. Some families ignore the cameras."""
 
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of a row in the columns that a checkpoint must have (`params.NAME`, `facts.NAME`). Empty: not checked."""
+        return {}
+
     @abstractmethod
     def load(self, table: Table, meta: dict[str, Any]) -> Scene:
         """Build a scene from a checkpoint's table and `Scene.meta()`. `restore_scene` loads the tensors of its networks."""

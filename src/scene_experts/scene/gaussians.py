@@ -70,6 +70,11 @@ class Explicit(SceneConfig):
         }
         return GaussianScene(self, Table(params, {}), extent)
 
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        rest = ((self.sh_degree + 1) ** 2 - 1, 3)
+        shapes = {"means": (3,), "log_scales": (3,), "quats": (4,), "raw_opacity": (), "sh_dc": (3,), "sh_rest": rest}
+        return {f"params.{name}": shape for name, shape in shapes.items()}
+
     def load(self, table: Table, meta: dict[str, Any]) -> GaussianScene:
         """Build the scene of a checkpoint. Raises InputError if the table does not have the expected columns."""
         if set(table.params) != set(COLUMNS) or table.params["sh_rest"].shape[1] != (self.sh_degree + 1) ** 2 - 1:

@@ -71,6 +71,8 @@ class Train:
     def _factor(self) -> float:
         if self.iterations < 1:
             raise InputError(f"expected at least 1 iteration, found {self.iterations}; use --iterations 30000")
+        if self.schedule < 1:
+            raise InputError(f"expected a schedule of at least 1 iteration, found {self.schedule}; restore the configuration")
         return self.iterations / self.schedule
 
 

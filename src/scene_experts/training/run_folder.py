@@ -28,12 +28,15 @@ from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import locked, read_json, write_json
 from scene_experts.core.plain import UnknownPart, first_difference, from_json, to_json
+from scene_experts.core.reading.budget import RUN
+from scene_experts.core.reading.source import guarding
 from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
 from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
-from scene_experts.scene import Scene, restore_scene
+from scene_experts.scene import Scene
+from scene_experts.scene.fit import restore_foreign
 from scene_experts.training import capture_place
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig
@@ -166,11 +169,13 @@ def read_config(run: Path) -> RunConfig:
     if not isinstance(value, dict) or value.pop("format", None) != FORMAT:
         raise InputError(f"expected a run configuration of format {FORMAT} in {run}, found another; train it again with this version")
     relative = value.pop(capture_place.KEY, None)
-    try:
-        config = from_json(RunConfig, value)
-    except UnknownPart:  # another package may define the part
-        RECIPES.load()
-        config = from_json(RunConfig, value)
+    with guarding(run / "config.json", RUN, "run configuration"):
+        try:
+            config = from_json(RunConfig, value)
+        except UnknownPart:  # another package may define the part
+            RECIPES.load()
+            config = from_json(RunConfig, value)
+        config.train.scaled_scene()
     path = capture_place.find(run, config.data.path, relative if isinstance(relative, str) else None)
     return replace(config, data=replace(config.data, path=path))
 
@@ -238,8 +243,10 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     folder = run / "checkpoints"
     tensors, meta = newest(folder) if step is None else at_step(folder, step)
     checkpoint.expect(meta, recipe=config.train.recipe)
-    scene = restore_scene(config.train.scaled_scene(), tensors, meta, averaged=True).to(device)
-    return OpenRun(run, config, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""))
+    with guarding(run, RUN):
+        scene = restore_foreign(config.train.scaled_scene(), tensors, meta, averaged=True)
+        opened = OpenRun(run, config, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""))
+    return replace(opened, scene=scene.to(device))
 
 
 def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -13,8 +13,11 @@ from torch import Tensor
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.core.plain import first_difference, from_json, to_json
+from scene_experts.core.reading.budget import RUN
+from scene_experts.core.reading.source import guarding
 from scene_experts.data.capture import Capture
 from scene_experts.scene import Scene, restore_scene
+from scene_experts.scene.fit import restore_foreign
 from scene_experts.training.average import Averages
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import Train
@@ -133,7 +136,7 @@ class Training:
     def restore(cls, cfg: Train, tensors: dict[str, Tensor], meta: dict[str, Any], device: str) -> Training:
         """Restore a training from a checkpoint. Raises InputError if the checkpoint has another configuration."""
         check_same(cfg, meta)
-        scene = restore_scene(cfg.scene, tensors, meta)
+        scene = restore_foreign(cfg.scene, tensors, meta)
         scene.table.stats = {k.removeprefix("stats."): v for k, v in tensors.items() if k.startswith("stats.")}
         training = cls(cfg, scene.to(device))
         table = training.scene.table
@@ -193,4 +196,5 @@ def resume(cfg: Train, folder: Path, device: str) -> Training | None:
         return None
     tensors, meta = found
     checkpoint.expect(meta, recipe=cfg.recipe)
-    return Training.restore(cfg, tensors, meta, device)
+    with guarding(folder, RUN):
+        return Training.restore(cfg, tensors, meta, device)

@@ -13,7 +13,7 @@ from scene_experts.core.reading import budget as budgets
 from scene_experts.core.reading.budget import Budget, Damaged
 from scene_experts.core.reading.source import Source, opening
 
-FORMATS = ("BMP", "GIF", "JPEG", "MPO", "PNG", "PPM", "TIFF", "WEBP")
+FORMATS = ("BMP", "GIF", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
 """The formats that are read, by their content. Pillow's others are not: each decoder is a way in."""
 SIDE_LIMIT = 1 << 17  # px
 _STORED = 4  # bytes per pixel in Pillow's memory, at most

@@ -125,6 +125,8 @@ def _split_arguments(text: str) -> Iterator[str]:
             depth += 1
         elif c in ")]}":
             depth -= 1
+            if depth < 0:
+                raise Damaged("a text of another form")
         elif c == "," and depth == 0:
             yield text[start:at]
             start = at + 1

@@ -99,6 +99,8 @@ def guarding(path: Path | str, budget: Budget, what: str | None = None) -> Itera
             raise damaged_error(path, budget, describe(error), what) from error
         raise InputError(f"cannot read {path}: {error.strerror or error}; check the file and its permissions") from error
     except Exception as error:
+        if type(error).__name__ == "OutOfMemoryError":  # of a GPU: the file is not at fault
+            raise
         if not isinstance(error, Damaged):
             log.debug("could not read %s", path, exc_info=True)
         raise damaged_error(path, budget, describe(error), what) from error

@@ -93,6 +93,11 @@ class Anchors(SceneConfig):
         """Create a scene with one anchor per occupied voxel of the point cloud."""
         return AnchorScene.from_points(self, points, extent, cameras)
 
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        levels: dict[str, tuple[int, ...]] = {"facts.level": (), "facts.extra_level": ()} if self.select.has_levels else {}
+        params = {"params.feature": (self.F,), "params.offsets": (self.K, 3), "params.log_scaling": (6,)}
+        return {**params, "facts.cell": (3,), "facts.xyz": (3,), **levels}
+
     def load(self, table: Table, meta: dict[str, Any]) -> AnchorScene:
         """Create the scene of a checkpoint with newly initialized networks."""
         return AnchorScene(self, table, float(meta["voxel"]), float(meta["extent"]), self.select.restore(meta), meta.get("views", ()))

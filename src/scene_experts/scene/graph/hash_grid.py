@@ -19,6 +19,7 @@ from scene_experts.native import library as native
 
 PRIMES = (1, 2_654_435_761, 805_459_861)  # eq. 4 of the paper
 INITIAL = 1e-4  # features are initialised uniformly in [-INITIAL, INITIAL]
+MOST_LEVELS = 64
 LARGEST = 24  # 2^24 rows per level, the largest size in the paper
 
 
@@ -48,6 +49,8 @@ class HashGrid:
         """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
         names = ("levels", "features", "log2_table", "base", "growth")
         expect_at_least([(f"--scene.grid.{name.replace('_', '-')}", getattr(self, name), 1) for name in names])
+        if self.levels > MOST_LEVELS:
+            raise InputError(f"expected --scene.grid.levels of at most {MOST_LEVELS}, found {self.levels}; give a smaller number")
         if self.log2_table > LARGEST:
             raise InputError(f"expected --scene.grid.log2-table of at most {LARGEST}, found {self.log2_table}; give a smaller number")
 

@@ -88,6 +88,9 @@ class GraphPoints(SceneConfig):
         scene.face(cameras)
         return scene
 
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        return {"params.feature": (self.F,), "params.log_scaling": (6,), "facts.cell": (3,), "facts.xyz": (3,)}
+
     def load(self, table: Table, meta: dict[str, Any]) -> GraphScene:
         """Build the scene of a checkpoint, with newly initialised networks."""
         corner, edge = tuple(float(v) for v in meta["grid_low"]), float(meta["grid_edge"])

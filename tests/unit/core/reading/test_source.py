@@ -1,0 +1,77 @@
+"""Opening files within a budget: absent, special and growing files, and one sentence for every failure."""
+
+import os
+
+import pytest
+
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.reading.budget import Budget, Damaged
+from scene_experts.core.reading.source import describe, guarding, inside, opening, shorten
+from support.messages import naming
+
+SMALL = Budget("test file", bytes_in=100, floor=1000, ratio=10, items=5, seconds=0.0)
+
+
+def test_a_file_within_its_budget(tmp_path):
+    (tmp_path / "a").write_bytes(b"x" * 100)
+    with opening(tmp_path / "a", SMALL) as source:
+        assert source.read() == b"x" * 100 and source.head(3) == b"xxx" and source.size == 100
+        source.spend_bytes(900)
+        source.spend_bytes(100)
+        with pytest.raises(Damaged, match=naming(100, "1,001")):
+            source.spend_bytes(1)
+
+
+def test_what_is_beyond_it(tmp_path):
+    (tmp_path / "a").write_bytes(b"x" * 101)
+    with pytest.raises(InputError, match=naming("a", 101, 100)), opening(tmp_path / "a", SMALL):
+        raise AssertionError
+    (tmp_path / "a").write_bytes(b"x")
+    with pytest.raises(InputError, match=naming("test file", 5)), opening(tmp_path / "a", SMALL) as source:
+        source.spend_items(6)
+    with pytest.raises(InputError, match=naming("test file", "s to read")), opening(tmp_path / "a", SMALL) as source:
+        while True:
+            source.check_time()
+    with pytest.raises(InputError, match="grows"), opening(tmp_path / "a", SMALL) as source:
+        (tmp_path / "a").write_bytes(b"xx")
+        source.read()
+
+
+def test_absent_and_special_files(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for name, fact in (("absent", "no such file"), ("pipe", "no regular file"), (".", "a folder"), ("a\0b", "null")):
+        with pytest.raises(InputError, match=fact), opening(tmp_path / name, SMALL):
+            raise AssertionError
+    with pytest.raises(InputError, match=naming("record of a run")), opening(tmp_path / "absent", SMALL, "record of a run"):
+        raise AssertionError
+
+
+ERRORS = [KeyError("k"), RecursionError(), MemoryError(), OSError("x"), OSError(28, "full"), AssertionError(), Damaged("d")]
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda e: type(e).__name__)
+def test_every_failure_is_one_sentence(error):
+    with pytest.raises(InputError, match="there") as found, guarding("there", SMALL):
+        raise error
+    assert "\n" not in str(found.value) and found.value.__cause__ is error
+
+
+def test_what_passes():
+    for error in (InputError("a"), RunError("b"), KeyboardInterrupt()):
+        with pytest.raises(type(error)) as found, guarding("there", SMALL):
+            raise error
+        assert found.value is error
+
+
+def test_causes_are_short_and_on_one_line():
+    assert shorten("a\n\x1b[31mb\u202e") == "a [31mb"
+    assert len(describe(ValueError("x" * 10_000))) < 250
+
+
+def test_names_stay_inside_their_folder(tmp_path):
+    (tmp_path / "run" / "test").mkdir(parents=True)
+    (tmp_path / "run" / "out").symlink_to(tmp_path)
+    assert inside(tmp_path / "run", "test/../test/a.png").name == "a.png"
+    for name in ("../a", "/etc/passwd", "out/a", "a/../../b", "", None, 3, "a\0"):
+        with pytest.raises(Damaged):
+            inside(tmp_path / "run", name)
