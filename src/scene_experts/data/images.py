@@ -14,10 +14,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.reading.budget import MASK, PHOTOGRAPH
+from scene_experts.core.reading.pictures import opening_picture
 from scene_experts.data.lens import Lens, to_pinhole
 
 Size = tuple[int, int]  # width, height
@@ -43,26 +45,10 @@ class FrameSource:
 
 def probe(path: Path) -> tuple[Size, Size]:
     """Return the stored size of the image at `path`, and its size with the EXIF orientation applied. Reads only the header."""
-    with _open(path) as image:
+    with opening_picture(path, PHOTOGRAPH) as image:
         size = image.size
-        try:
-            turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)
-        except (OSError, ValueError, SyntaxError) as error:  # PNG stores EXIF after the pixels: a truncated file fails here
-            raise _unreadable_error(path, error) from error
+        turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)  # PNG stores EXIF after the pixels: a truncated file fails here
     return size, (size[1], size[0]) if turned else size
-
-
-def _open(path: Path) -> Image.Image:
-    try:
-        return Image.open(path)
-    except FileNotFoundError:
-        raise InputError(f"expected an image at {path}, found no such file; restore it or remove it from the capture") from None
-    except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
-        raise _unreadable_error(path, error) from error
-
-
-def _unreadable_error(path: Path, error: Exception) -> InputError:
-    return InputError(f"cannot read the image {path}: {error}; replace it or remove it from the capture")
 
 
 def target_size(policy: str, size: Size) -> Size:
@@ -132,9 +118,11 @@ def decode(source: FrameSource) -> tuple[Tensor, Tensor | None]:
             weights.append(alpha)
             pixels = pixels[..., :3]
         else:
-            a = alpha[..., None].astype(np.float32) / 255
-            over = pixels[..., :3] * a + np.asarray(source.background, np.float32) * 255 * (1 - a)
-            pixels = np.clip(np.rint(over), 0, 255).astype(np.uint8)
+            over, background = np.empty((*alpha.shape, 3), np.uint8), np.asarray(source.background, np.float32) * 255
+            for top in range(0, len(alpha), 256):  # strips keep the float32 temporaries small
+                a = alpha[top : top + 256, :, None].astype(np.float32) / 255
+                over[top : top + 256] = np.clip(np.rint(pixels[top : top + 256, :, :3] * a + background * (1 - a)), 0, 255)
+            pixels = over
     return torch.from_numpy(np.array(pixels, order="C")), _multiply(weights)
 
 
@@ -155,12 +143,9 @@ def _resize_mask(mask: Image.Image, size: Size) -> Image.Image:
 
 def _load_pixels(source: FrameSource) -> Image.Image:
     """Load the photograph as 8-bit L, RGB or RGBA, rotated if `source.turn`."""
-    with _open(source.path) as image:
-        try:
-            image.load()
-            out = to_8_bit(ImageOps.exif_transpose(image) if source.turn else image)
-        except (OSError, ValueError, SyntaxError) as error:  # Pillow's decoders raise all three for damaged files
-            raise _unreadable_error(source.path, error) from error
+    with opening_picture(source.path, PHOTOGRAPH) as image:
+        image.load()
+        out = to_8_bit(ImageOps.exif_transpose(image) if source.turn else image)
     expected = (source.lens.width, source.lens.height)
     if out.size != expected:
         raise InputError(
@@ -172,8 +157,11 @@ def _load_pixels(source: FrameSource) -> Image.Image:
 def to_8_bit(image: Image.Image) -> Image.Image:
     """Convert a Pillow image of any mode to L, RGB or RGBA."""
     if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey: Pillow's own conversion clips at 255
-        deep = np.asarray(image).astype(np.float64)
-        return Image.fromarray(np.clip(np.rint(deep / 257), 0, 255).astype(np.uint8))
+        deep, out = np.asarray(image), np.empty(image.size[::-1], np.uint8)
+        for top in range(0, len(deep), 256):  # strips keep the float64 temporaries small
+            strip = np.nan_to_num(deep[top : top + 256].astype(np.float64))
+            out[top : top + 256] = np.clip(np.rint(strip / 257), 0, 255)
+        return Image.fromarray(out)
     if image.mode in ("L", "RGB", "RGBA"):
         return image
     return image.convert("RGBA" if "transparency" in image.info or image.mode in ("LA", "PA", "La", "RGBa") else "RGB")
@@ -186,16 +174,13 @@ def _load_mask(source: FrameSource) -> Image.Image | None:
     """
     if source.mask is None:
         return None
-    with _open(source.mask) as image:
-        try:
-            out = to_mask(image)
-        except (OSError, ValueError, SyntaxError) as error:
-            raise _unreadable_error(source.mask, error) from error
+    with opening_picture(source.mask, MASK) as image:
+        out = to_mask(image)
     if not source.turn or (out.width > out.height) == (source.lens.width > source.lens.height):
         return out
     exif = out.getexif()
     if exif.get(_ORIENTATION, 1) == 1:
-        with _open(source.path) as photograph:
+        with opening_picture(source.path, PHOTOGRAPH) as photograph:
             exif[_ORIENTATION] = photograph.getexif().get(_ORIENTATION, 1)
     return ImageOps.exif_transpose(out)
 

@@ -11,8 +11,9 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_atomic
+from scene_experts.core.reading.budget import PICTURE
+from scene_experts.core.reading.pictures import opening_picture
 from scene_experts.training.run_folder import PICTURES
 
 WORST = 0.25  # mean absolute error over RGB at the bright end of the error map, the same for all views
@@ -57,11 +58,8 @@ def write_picture(path: Path, pixels: np.ndarray) -> None:
 
 def read_picture(path: Path, mode: str = "RGB") -> np.ndarray:
     """Return the uint8 pixels of a picture. Raises InputError if it is absent or unreadable."""
-    try:
-        with Image.open(path) as picture:
-            return np.array(picture.convert(mode))
-    except OSError as error:
-        raise InputError(f"cannot read the picture {path}: {error}; evaluate the run again") from error
+    with opening_picture(path, PICTURE) as picture:
+        return np.array(picture.convert(mode))
 
 
 def limit_width(pixels: np.ndarray, widest: int) -> np.ndarray:

@@ -136,6 +136,9 @@ def load_results(run: Path, views: str = "test") -> dict[str, Any]:
     results = read_json(path, "results file")
     if not isinstance(results, dict) or not isinstance(results.get("psnr"), (int, float)):
         raise InputError(f"expected results of `scene-experts eval` in {path}, found something else; evaluate the run again")
+    step = results.get("step")
+    if not isinstance(step, (int, type(None))) or isinstance(results["psnr"], bool):
+        raise InputError(f"expected numbers in {path}, found others; evaluate the run again")
     return results
 
 

@@ -22,9 +22,12 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.errors import InputError, RunError, few
 from scene_experts.core.io import cache_dir, write_atomic
 from scene_experts.core.progress import ByteProgress
+from scene_experts.core.reading.budget import WEIGHTS
+from scene_experts.core.reading.numbers import all_finite
+from scene_experts.core.reading.tensors import read_safetensors
 from scene_experts.data.fetch.download import fetch, sha256
 from scene_experts.evaluate.lpips import BACKBONES, tensor_shapes
 
@@ -44,6 +47,7 @@ LINEAR_FILES = {  # the linear layers of LPIPS v0.1; the same files are in the p
 }
 
 
+_DAMAGE = (LookupError, ValueError, TypeError, AttributeError, pickle.UnpicklingError, safetensors.SafetensorError, RuntimeError)
 TORCHVISION = "https://download.pytorch.org/models"
 LPIPS = "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/082bb24f84c091ea94de2867d34c4544f68e0963/lpips/weights/v0.1"
 
@@ -71,7 +75,17 @@ def load(net: str, explicit: Path | None = None) -> tuple[dict[str, Tensor], str
     for source in find_sources(net, explicit, notes):
         try:
             tensors = source.read()
-        except (InputError, OSError, pickle.UnpicklingError, safetensors.SafetensorError, RuntimeError) as error:
+        except (
+            InputError,
+            OSError,
+            LookupError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            pickle.UnpicklingError,
+            safetensors.SafetensorError,
+            RuntimeError,
+        ) as error:
             notes.append(f"{source.what}: {error}")
             continue
         if not source.cached:
@@ -208,9 +222,9 @@ def _write_cache(net: str, tensors: dict[str, Tensor], what: str) -> None:
 
 def _read_cache(path: Path) -> dict[str, Tensor]:
     """Read cached weights. Raises InputError if their checksum is wrong."""
-    with safetensors.safe_open(path, "pt") as archive:
-        meta = archive.metadata() or {}
-        tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118 - not a dict
+    tensors, meta = read_safetensors(path, WEIGHTS)
+    if bad := [name for name, value in tensors.items() if value.dtype != torch.float32 or not all_finite(value)]:
+        raise InputError(f"expected finite float32 weights in {path}, found others in {few(bad)}; remove the file")
     if _hash_tensors(tensors) != meta.get("sha256"):
         raise InputError(f"expected intact weights in {path}, found a wrong checksum; remove the file")
     return tensors

@@ -18,6 +18,9 @@ from PIL import Image
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json, write_bytes
 from scene_experts.core.plain import to_json
+from scene_experts.core.reading.budget import RUN
+from scene_experts.core.reading.plain import read_json_lines
+from scene_experts.core.reading.source import guarding, inside
 from scene_experts.evaluate.pictures import read_picture
 from scene_experts.evaluate.results import find_difference, find_outdated, load_results
 from scene_experts.evaluate.tables import ResultTable, distinguish_runs, make_table
@@ -53,9 +56,11 @@ def write(runs: Sequence[Path], out: Path | None = None) -> Path:
         raise InputError("expected at least one run folder, found none; name the folders that `scene-experts train --out` wrote")
     if out is None and len(runs) > 1:
         raise InputError("expected --out FILE.html for several runs, found none; give one")
-    sources = tell_apart([read_run(run) for run in runs])
+    with guarding(runs[0] if len(runs) == 1 else "one of the runs", RUN):  # the files of a run may hold anything
+        sources = tell_apart([read_run(run) for run in runs])
+        page = build_page(sources).encode()
     path = out or runs[0] / NAME
-    write_bytes(path, build_page(sources).encode())
+    write_bytes(path, page)
     return path
 
 
@@ -66,6 +71,9 @@ def read_run(run: Path) -> Source:
     per_view = read_json(path, "scores by view") if path.is_file() else {}
     if not isinstance(per_view, dict) or not all(isinstance(v, dict) and isinstance(v.get("file"), str) for v in per_view.values()):
         raise InputError(f"expected scores by view in {path}, found something else; run `scene-experts eval {run}` again")
+    with guarding(path, RUN, "file of scores by view"):
+        for facts in per_view.values():
+            inside(run / "test" / "gt", facts["file"])
     return Source(config.train.recipe, run, config, results, per_view, read_metrics(run / "metrics.jsonl"))
 
 
@@ -77,15 +85,7 @@ def tell_apart(sources: list[Source]) -> list[Source]:
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
     """Read the complete lines of a metrics file."""
-    out = []
-    for line in path.read_text(errors="replace").splitlines() if path.is_file() else []:  # a power cut may leave anything
-        try:
-            found = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(found, dict) and "step" in found:
-            out.append(found)
-    return out
+    return [line for line in read_json_lines(path) if isinstance(line.get("step"), (int, float))] if path.is_file() else []
 
 
 def build_page(sources: Sequence[Source]) -> str:
@@ -259,7 +259,8 @@ def show_experts(sources: Sequence[Source]) -> str:
 
 def show_strips(s: Source) -> str:
     """Show one held-out view by the anchors of each expert: colour open, other attributes folded. Empty without such pictures."""
-    found = {a: s.path / "test" / "experts" / f"{a}.png" for a in s.results.get("experts") or {}}
+    folder = s.path / "test" / "experts"
+    found = {a: inside(folder, f"{a}.png") for a in s.results.get("experts") or {}}
     present = sorted((a for a, path in found.items() if path.is_file()), key=lambda a: a != "color")
     if not present:
         return ""

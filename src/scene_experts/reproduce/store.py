@@ -17,6 +17,9 @@ from typing import Any
 from scene_experts.core.errors import InputError, few
 from scene_experts.core.io import read_json, write_bytes
 from scene_experts.core.plain import from_json, to_json
+from scene_experts.core.reading.budget import JSON, RUN, Damaged
+from scene_experts.core.reading.plain import read_json_lines
+from scene_experts.core.reading.source import guarding
 from scene_experts.evaluate.results import load_results
 from scene_experts.reproduce.columns import columns, length, rows, text
 from scene_experts.reproduce.plan import Spec, identity
@@ -82,6 +85,11 @@ def read_run(run: Path, scene: str) -> Record:
             f"expected scores after all {config.train.iterations:,} iterations in {run}, found scores after {results['step']:,}; "
             f"finish the training with `scene-experts train --resume` and the run's own flags, then run `scene-experts eval {run}`"
         )
+    with guarding(run, RUN):
+        return _make_record(run, scene, config, results)
+
+
+def _make_record(run: Path, scene: str, config: RunConfig, results: dict[str, Any]) -> Record:
     views = read_json(run / "per_view.json", "scores by view")
     return Record(
         scene=scene,
@@ -95,12 +103,9 @@ def read_run(run: Path, scene: str) -> Record:
 def read_curves(path: Path) -> list[dict[str, Any]]:
     """Read up to POINTS lines of a metrics file, evenly spread, with the last line among them."""
     lines = []
-    for line in path.read_text(errors="replace").splitlines() if path.is_file() else []:
-        try:
-            found = json.loads(line)
-        except ValueError:
-            continue  # a crash cut the line
-        if isinstance(found, dict) and math.isfinite(found.get("psnr", math.nan)):
+    for found in read_json_lines(path) if path.is_file() else []:
+        psnr = found.get("psnr")
+        if isinstance(psnr, (int, float)) and math.isfinite(psnr):
             lines.append({k: found[k] for k in CURVES if k in found})
     if len(lines) <= POINTS:
         return lines
@@ -149,6 +154,11 @@ def unpack(value: dict[str, Any]) -> dict[str, Any]:
 
 def read(path: Path) -> Record:
     """Read a record file. Raises InputError where it is something else or was edited by hand."""
+    with guarding(path, JSON, "record of a run"):
+        return _read(path)
+
+
+def _read(path: Path) -> Record:
     value = read_json(path, "record of a run")
     parts = {"scene", "config", "results", "per_view", "curves", "config_sha256", "results_sha256"}
     if not isinstance(value, dict) or value.get("format") not in (1, FORMAT) or not parts <= value.keys():
@@ -160,7 +170,11 @@ def read(path: Path) -> Record:
         value = unpack(value)
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"expected columns of equal length in {path}, found others ({error}); remove it and reproduce again") from error
-    return Record(value["scene"], from_json(RunConfig, value["config"]), value["results"], value["per_view"], value["curves"])
+    scene, results, per_view, curves = (value[name] for name in ("scene", "results", "per_view", "curves"))
+    kinds = (isinstance(scene, str), isinstance(results, dict), isinstance(per_view, dict), isinstance(curves, list))
+    if not all(kinds):
+        raise Damaged("a scene, results, scores or curves of another form")
+    return Record(scene, from_json(RunConfig, value["config"]), results, per_view, curves)
 
 
 def load(store: Path) -> list[Record]:

@@ -12,6 +12,9 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json, write_json
+from scene_experts.core.reading.budget import JSON
+from scene_experts.core.reading.numbers import FARTHEST
+from scene_experts.core.reading.source import guarding
 from scene_experts.core.types import Camera
 from scene_experts.data.views import World
 from scene_experts.geometry.poses import interpolate_poses, make_pose, with_fov
@@ -19,6 +22,7 @@ from scene_experts.view.paths import CameraPath
 
 FORMAT = 1
 LARGEST, FASTEST = 16384, 1000  # px per side; frames per second
+MOST_FRAMES, LONGEST = 36_000, 1e6  # of a path: 20 minutes at 30 frames per second; seconds
 OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # nerfstudio: y up, looking along -z
 
 
@@ -85,13 +89,11 @@ def read_path(path: Path, world: World, model: Camera, size: tuple[int, int] | N
         InputError: if the file is damaged or of another format.
     """
     value = read_json(path, "camera path")
-    try:
+    with guarding(path, JSON, "camera path"):
         if isinstance(value, dict) and "camera_path" in value:
             return parse_nerfstudio(value, world, model, size, fps)
         if isinstance(value, dict) and value.get("format") == FORMAT:
             return parse_keyframes(value, world, model, size, fps)
-    except (KeyError, TypeError, ValueError, RuntimeError, IndexError, OverflowError) as error:
-        raise InputError(f"expected a complete camera path in {path}, found {error}; write the file again") from error
     raise InputError(
         f"expected a camera path of scene-experts or nerfstudio in {path}, found something else; see `scene-experts render --help`"
     )
@@ -102,16 +104,19 @@ def parse_keyframes(value: dict[str, Any], world: World, model: Camera, size: tu
     keys = value["keyframes"]
     if not keys:
         raise ValueError("no keyframes")
+    check_count(len(keys))
     width, height = size or check_size(value["width"], value["height"])
     rate, loop = check_rate(fps or value["fps"]), bool(value.get("loop", False))
     times = torch.tensor([float(k["time"]) for k in keys], dtype=torch.float64)
     if len(keys) > 1 and not bool((times.diff() > 0).all()):
         raise ValueError("a time that does not increase from one keyframe to the next")
     poses = torch.stack([check_pose(torch.tensor(k["camera_to_world"], dtype=torch.float64)) for k in keys])
+    if float(times.abs().max()) > LONGEST:
+        raise ValueError(f"a time that is not within {LONGEST:g} s")
     span = float(times[-1] - times[0])
     if loop and len(keys) > 1:
         span += span / (len(keys) - 1)
-    frames = max(1, round(span * rate) + (0 if loop else 1))
+    frames = check_count(max(1, round(span * rate) + (0 if loop else 1)))
     found = interpolate_poses(world.from_input(poses[:, :3, 3]), poses[:, :3, :3], frames, times, loop)
     degrees = torch.tensor([float(k["fov"]) for k in keys], dtype=torch.float64)
     if loop:  # the way back to the first keyframe
@@ -129,6 +134,7 @@ def parse_nerfstudio(value: dict[str, Any], world: World, model: Camera, size: t
         raise ValueError(f"the camera_type {value['camera_type']}, but only perspective is supported")
     width, height = size or check_size(value["render_width"], value["render_height"])
     out = []
+    check_count(len(value["camera_path"]))
     for entry in value["camera_path"]:
         pose = check_pose(torch.tensor(entry["camera_to_world"], dtype=torch.float64).reshape(4, 4) @ OPENGL)
         to_cam = make_pose(world.from_input(pose[:3, 3]), pose[:3, :3])
@@ -136,6 +142,13 @@ def parse_nerfstudio(value: dict[str, Any], world: World, model: Camera, size: t
     if not out:
         raise ValueError("an empty camera_path")
     return CameraPath(tuple(out), check_rate(fps or value.get("fps", 24)))
+
+
+def check_count(frames: int) -> int:
+    """Return a number of frames. Raises ValueError if it is out of range."""
+    if frames > MOST_FRAMES:
+        raise ValueError(f"{frames:,} frames, more than {MOST_FRAMES:,}")
+    return frames
 
 
 def check_size(width: Any, height: Any) -> tuple[int, int]:
@@ -163,7 +176,7 @@ def make_camera(model: Camera, to_cam: Tensor, fov: float, width: int, height: i
 
 def check_pose(pose: Tensor) -> Tensor:
     """Return `pose`. Raises ValueError unless it is a finite 4x4 matrix with a rotation."""
-    if pose.shape != (4, 4) or not bool(pose.isfinite().all()):
+    if pose.shape != (4, 4) or not bool((pose.abs() <= FARTHEST).all()):  # False for NaN
         raise ValueError("a camera_to_world that is not a 4x4 matrix of finite numbers")
     rotation = pose[:3, :3]
     if not torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=pose.dtype), atol=1e-3) or float(torch.linalg.det(rotation)) < 0:

@@ -74,7 +74,7 @@ def test_a_loop_interpolates_the_field_of_view_back_to_the_first(tmp_path):
         (lambda v: v["keyframes"][0]["camera_to_world"][0].__setitem__(0, 7.0), "camera_to_world"),
         (lambda v: v["keyframes"][0].pop("time"), "time"),
         (lambda v: v.update(fps=0), "fps"),
-        (lambda v: v.update(fps=float("nan")), "fps"),
+        (lambda v: v.update(fps=float("nan")), "finite"),
         (lambda v: v.update(width=0), "0 x 48"),
         (lambda v: v.update(height=10**9), "1000000000"),
         (lambda v: v.pop("format"), ""),

@@ -1,0 +1,73 @@
+"""Fuzz every reader for a time: `make fuzz SECONDS=600`, or `python -m fuzz.run SECONDS [TARGET ...]` from the folder tests.
+
+Workers read batches of mutated inputs. A worker that dies is restarted behind the input that ended it. Findings are printed with
+the name and number from which `python -m fuzz.worker NAME NUMBER 1 FOLDER` makes the same input again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+from fuzz.targets import TARGETS
+
+BATCH = 500
+
+
+def main() -> int:
+    seconds, names = float(sys.argv[1]), sys.argv[2:] or list(TARGETS)
+    begin, end = time.monotonic(), time.monotonic() + seconds
+    first = int(os.environ.get("FUZZ_FIRST", time.time_ns() // 1_000_000))
+    place = dict.fromkeys(names, first)
+    done: Counter[str] = Counter()
+    found: dict[str, list[str]] = {name: [] for name in names}
+    while time.monotonic() < end:
+        for name in names:
+            if time.monotonic() >= end:
+                break
+            with tempfile.TemporaryDirectory() as folder:
+                place[name] += run_batch(name, place[name], Path(folder), done, found[name], end)
+    print(f"{sum(done.values()):,} inputs in {time.monotonic() - begin:.0f} s")
+    for name in names:
+        print(f"{name:26} {done[name]:8,} inputs {len(found[name]):5} findings")
+    return int(any(found.values()))
+
+
+def run_batch(name: str, first: int, folder: Path, done: Counter[str], found: list[str], end: float) -> int:
+    """Run a batch in a worker and return how many inputs it has read."""
+    command = [sys.executable, "-m", "fuzz.worker", name, str(first), str(BATCH), str(folder)]
+    worker = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[1])
+    try:
+        out, err = worker.communicate(timeout=max(20.0, min(600.0, end - time.monotonic() + 20)))
+    except subprocess.TimeoutExpired:
+        worker.kill()
+        out, err = worker.communicate()
+    lines = [json.loads(line) for line in out.splitlines() if line.startswith("{")]
+    for line in lines:
+        if "wrong" in line:
+            report(found, name, line["number"], line["wrong"])
+    if any("done" in line for line in lines):
+        done[name] += BATCH
+        return BATCH
+    current = folder / "current"
+    number = int(current.read_text().split()[1]) if current.is_file() else first
+    done[name] += number - first + 1
+    if time.monotonic() < end:  # it was not stopped: it died
+        report(found, name, number, f"exit code {worker.returncode} {err[-600:]}")
+    return number - first + 1
+
+
+def report(found: list[str], name: str, number: int, wrong: str) -> None:
+    found.append(wrong)
+    if len(found) <= 20:
+        print(f"--- {name} {number}: {wrong}", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,35 @@
+"""Every reader gets 200 mutated inputs: only InputError, within 5 s and 1 GiB, and no number that is not finite.
+
+`make fuzz SECONDS=600` reads many more. Inputs that were found to break a reader are in REGRESSIONS.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fuzz.targets import TARGETS
+
+REGRESSIONS: dict[str, list[int]] = json.loads((Path(__file__).parent / "regressions.json").read_text())
+
+
+def read_inputs(name, first, count, folder):
+    command = [sys.executable, "-m", "fuzz.worker", name, str(first), str(count), str(folder)]
+    ran = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1], timeout=600)
+    assert ran.returncode == 0, f"{(folder / 'current').read_text()}: exit code {ran.returncode} {ran.stderr[-2000:]}"
+    return [line for line in map(json.loads, ran.stdout.splitlines()) if "wrong" in line]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TARGETS)
+def test_mutated_inputs(name, tmp_path):
+    assert not read_inputs(name, 0, 200, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in TARGETS if REGRESSIONS.get(name)])
+def test_inputs_that_broke_a_reader(name, tmp_path):
+    for number in REGRESSIONS[name]:
+        assert not read_inputs(name, number, 1, tmp_path)
