@@ -33,7 +33,7 @@ def make_comparison(options: ReproduceOptions) -> Experiment:
         f"Comparison of {', '.join(recipes)}",
         {recipe: recipe for recipe in recipes},
         tuple(DATASETS),
-        added=("anchors", "active_percent", "cpu_seconds"),
+        added=("anchors", "active_percent", "gaussians_rendered", "cpu_seconds"),
         baselines=tuple(baselines),
     )
 

@@ -30,6 +30,7 @@ COLUMNS = {
     "lpips_3dgs": Column("LPIPS", 3, -1),
     "size_mb": Column("MB", 1, -1),
     "anchors": Column("anchors", 0, 0),
+    "gaussians_rendered": Column("Gaussians drawn a view", 0, 0),
     "active_percent": Column("active %", 1, 0),
     "train_seconds": Column("training, wall s", 0, 0),
     "cpu_seconds": Column("training, CPU s", 0, -1),
