@@ -3,6 +3,8 @@
 # make test       all tests, one process per core
 # make test-fast  the tests that are not marked `slow`: at least one of every test file, within 180 CPU seconds
 # make lint       ruff (rules and format) and pyright
+# make sanitize   the native library with the address and undefined-behaviour sanitisers, and its tests on every instruction set
+# make crash ROUNDS=200   kill trainings of every family at random moments and compare what is resumed with what was left alone
 # make bench      the benchmarks that need no GPU
 # make record-errors, make record-flags   record the command line's error sentences or its flags anew in tests/golden
 # Every target builds a virtual environment in .venv first. An importable torch of PYTHON is used as it is; otherwise the pinned CPU
@@ -16,6 +18,7 @@ SE     := $(BIN)/scene-experts
 # worksteal keeps the tests of one file together, so that they share its fixtures
 WORKERS ?= auto
 PARALLEL := -n $(WORKERS) --dist worksteal
+ROUNDS ?= 200
 DEMO_ITERATIONS ?= 4000
 DEMO_OUT ?= runs/demo
 # Short of iterations, structure pays more than brightness: a larger weight of 1 - SSIM gives a sharper picture at the same PSNR.
@@ -24,7 +27,7 @@ DEMO_FLAGS ?= --iterations $(DEMO_ITERATIONS) --loss.dssim 0.8
 # as the package sets it when it is imported before torch, which the benchmark scripts do not
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo view test test-fast lint record-errors record-flags bench env lpips clean
+.PHONY: demo view test test-fast lint record-errors record-flags bench sanitize crash env lpips clean
 
 env: $(STAMP)
 
@@ -69,6 +72,12 @@ record-errors: $(STAMP)
 record-flags: $(STAMP)
 	rm -f tests/golden/flags.json
 	SCENE_EXPERTS_RECORD=1 $(BIN)/python -m pytest tests/system/test_cli.py -k "flags_of_every or help_is"
+
+sanitize: $(STAMP)
+	$(BIN)/python tools/sanitize.py
+
+crash: $(STAMP)
+	$(BIN)/python tools/crash.py --rounds $(ROUNDS)
 
 bench: $(STAMP)
 	$(BIN)/python benchmarks/raster.py
