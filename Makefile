@@ -2,6 +2,7 @@
 # make view       the demo's MoE-GS scene in a browser
 # make test       all tests, one process per core
 # make test-fast  the tests that are not marked `slow`: at least one of every test file, within 180 CPU seconds
+# make fuzz       mutated files for every reader, for SECONDS seconds (docs/security.md); TARGETS="ply spz" for some readers
 # make lint       ruff (rules and format) and pyright
 # make sanitize   the native library with the address and undefined-behaviour sanitisers, and its tests on every instruction set
 # make crash ROUNDS=200   kill trainings of every family at random moments and compare what is resumed with what was left alone
@@ -17,6 +18,8 @@ STAMP  := $(VENV)/.ready
 SE     := $(BIN)/scene-experts
 # worksteal keeps the tests of one file together, so that they share its fixtures
 WORKERS ?= auto
+SECONDS ?= 600
+TARGETS ?=
 PARALLEL := -n $(WORKERS) --dist worksteal
 ROUNDS ?= 200
 DEMO_ITERATIONS ?= 4000
@@ -27,7 +30,7 @@ DEMO_FLAGS ?= --iterations $(DEMO_ITERATIONS) --loss.dssim 0.8
 # as the package sets it when it is imported before torch, which the benchmark scripts do not
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo view test test-fast lint record-errors record-flags bench sanitize crash env lpips clean
+.PHONY: demo view test test-fast fuzz lint record-errors record-flags bench sanitize crash env lpips clean
 
 env: $(STAMP)
 
@@ -59,6 +62,9 @@ test: $(STAMP)
 
 test-fast: $(STAMP)
 	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
+
+fuzz: $(STAMP)
+	cd tests && OMP_NUM_THREADS=1 $(abspath $(BIN))/python -m fuzz.run $(SECONDS) $(TARGETS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

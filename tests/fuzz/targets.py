@@ -70,7 +70,7 @@ def mutate_files(files: Files, target: Target, rng: random.Random) -> Files:
     pack = target.packs.get(Path(name).suffix)
     try:
         new = pack(files[name], rng) if pack is not None and rng.random() < 0.5 else mutate(files[name], rng, files[other])
-    except (ValueError, KeyError, OverflowError, RuntimeError, UnicodeError, TypeError):  # a mutation of nothing
+    except Exception:  # the first mutation has damaged the container
         new = mutate(files[name], rng, files[other])
     return {**files, name: new}
 
@@ -326,6 +326,7 @@ TARGETS: dict[str, Target] = {
 
 def make_seed(target: Target, folder: Path) -> Files:
     """Return the files of a target's valid input."""
+    folder.mkdir(parents=True, exist_ok=True)
     target.make(folder)
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
