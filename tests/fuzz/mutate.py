@@ -63,9 +63,13 @@ def _mutate_once(data: bytearray, rng: random.Random, other: bytes) -> bytearray
 def mutate_json(data: bytes | str, rng: random.Random) -> bytes:
     """Return JSON text with one to a few values replaced, removed, repeated or nested deeply."""
     value = json.loads(data)
+    text = json.dumps(value)
     for _ in range(rng.choice((1, 1, 2, 5))):
         value = _mutate_value(value, rng)
-    text = json.dumps(value)
+        text = json.dumps(value)
+        if len(text) > 1 << 22:  # a part was repeated: more of it would only be slow to make
+            break
+        value = json.loads(text)  # repeated parts are the same object until here
     if rng.random() < 0.05:
         text = text.replace("0", "9" * 5000, 1)
     if rng.random() < 0.05:
