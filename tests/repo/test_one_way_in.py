@@ -48,7 +48,8 @@ def opened(path: Path) -> list[str]:
         function = node.func
         name = function.attr if isinstance(function, ast.Attribute) else function.id if isinstance(function, ast.Name) else ""
         owner = function.value.id if isinstance(function, ast.Attribute) and isinstance(function.value, ast.Name) else ""
-        modes = [a.value for a in [*node.args, *(k.value for k in node.keywords)] if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+        constants = (a for a in [*node.args, *(k.value for k in node.keywords)] if isinstance(a, ast.Constant))
+        modes = [a.value for a in constants if isinstance(a.value, str)]
         writes = name in ("open", "ZipFile") and any(mode[:1] in "wax" for mode in modes)
         generic = name in ("load", "loads", "decompress") and owner not in OWNERS  # a method of our own
         if name in NAMES and not writes and not generic:
