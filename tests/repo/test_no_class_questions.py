@@ -1,6 +1,7 @@
 """Outside `scene/`, code reads what a scene, a part or a strategy states; it never asks for its class or its kind's name."""
 
 import ast
+import functools
 import re
 from pathlib import Path
 
@@ -13,6 +14,7 @@ OWNERS = ("scene", "strategy")  # the rooms whose classes nobody else asks for
 PART = re.compile(r"\b(scene|growth|strategy|decoder|select|heads?|rates|optimizer)(\]|\b)[^.(]*$")  # what an expression ends with
 
 
+@functools.cache
 def classes() -> set[str]:
     """Names of the classes in the rooms that own them."""
     trees = [ast.parse(path.read_text()) for room in OWNERS for path in (SOURCE / room).rglob("*.py")]

@@ -31,7 +31,11 @@ PARAMETERS = {
     **{f"moe-gs-e{num}-{routing}": num * EXPERT for num in (2, 3, 4, 5) for routing in ("top1", "top2", "dense")},
     **{f"scaffold-gs-depth{depth}": PLAIN + (depth - 2) * LAYER for depth in (2, 3, 4, 5, 6)},
 }
-EXTRA = {"moe-gs-balance": 35_925 + 3 * 5}  # of no paper that is compared
+EXTRA = {  # of no paper that is compared
+    "moe-gs-balance": 35_925 + 3 * 5,
+    "scaffold-gs-wide": 3 * 160 * 36 + 161 * 110,  # 160 hidden units
+    "scaffold-gs-dist": PLAIN + 32 * 3,
+}
 BYTES = {"3dgs": 248, "3dgs-mcmc": 248, "sags": 196}  # of a row; anchors of K = 10 and F = 32 take 316
 
 

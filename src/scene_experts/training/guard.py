@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import RunError
+from scene_experts.training.optim import FusedAdam
 
 EVERY = 100  # iterations between scans where the optimiser does not report
 
@@ -21,9 +22,9 @@ EVERY = 100  # iterations between scans where the optimiser does not report
 def find_broken(optimizer: torch.optim.Optimizer, step: int) -> str:
     """Return the name of a parameter that iteration `step` left with a value or optimiser state that is not finite, else "".
 
-    The groups of `optimizer` have a "name". An optimiser that reports sets `broken` (`training/optim.py: FusedAdam`).
+    The groups of `optimizer` have a "name". `FusedAdam` reports the name after every step.
     """
-    reported = getattr(optimizer, "broken", None)
+    reported = optimizer.broken if isinstance(optimizer, FusedAdam) else None
     if reported is not None or step % EVERY:
         return reported or ""
     return next((str(name) for name, tensors in _states(optimizer) if not are_finite(tensors)), "")

@@ -153,7 +153,7 @@ def write(run: OpenRun, world: World, folder: Path, about: dict[str, Any]) -> di
         stale -= {MOE_FILE}
     for name in stale:  # from an earlier export to this folder
         (folder / name).unlink(missing_ok=True)
-    growth = run.config.train.growth
+    growth = about.get("train", {}).get("growth", {})
     return {
         "sh_degree": 3,
         "feat_dim": about["F"],
@@ -163,9 +163,9 @@ def write(run: OpenRun, world: World, folder: Path, about: dict[str, Any]) -> di
         "appearance_dim": about["appearance_dim"],
         **{f"add_{attribute}_dist": used for attribute, used in about["add_dist"].items()},
         "ratio": 1,  # every point of the capture is used
-        "update_depth": getattr(growth, "levels", 3),
-        "update_init_factor": getattr(growth, "init_factor", 16),
-        "update_hierachy_factor": getattr(growth, "hierarchy_factor", 4),  # spelt as in the published code
+        "update_depth": growth.get("levels", 3),
+        "update_init_factor": growth.get("init_factor", 16),
+        "update_hierachy_factor": growth.get("hierarchy_factor", 4),  # spelt as in the published code
     }
 
 
