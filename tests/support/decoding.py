@@ -183,6 +183,7 @@ CASES = {
     "one shared expert, dense": {"shared": ("cov",), "k": None, "linear": ("cov", "color")},
     "a shared expert, more": {"shared": ("opacity", "color"), "linear": ("opacity",), "E": 6, "k": (4, 2, 6)},
     "margin weights": {"margin": ATTRIBUTES, "E": 5},
+    "margin weights, all chosen": {"margin": ("cov", "opacity"), "k": 3, "distance": ("cov",)},
     "margin weights, others": {"margin": ("cov", "color"), "linear": ("opacity", "color"), "E": 16, "k": (2, 5, 16)},
     "one anchor": {"A": 1, "N": 1, "seed": 1},
 }

@@ -20,11 +20,10 @@ from torch.nn import functional
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.parts import register
 from scene_experts.core.types import Mode, Routing
-from scene_experts.scene.anchors.mlp import ACTIVATIONS, ATTRIBUTES, MLP, Decoder, HeadWeights, linear_init
+from scene_experts.scene.anchors.mlp import ACTIVATIONS, ATTRIBUTES, LEAST_MARGIN, MLP, Decoder, HeadWeights, linear_init
 
 log: logging.Logger = logging.getLogger(__name__)
 MOST_MARGINS = 64  # experts of a head with margin weights in the compiled library
-MARGIN = 1e-4  # keeps the weights finite where all gates are equal
 
 
 @dataclass(frozen=True)
@@ -196,7 +195,7 @@ class MixtureHead(nn.Module):
         shared = logits[:, self.experts :]  # [A, 1], or [A, 0]
         if self.config.router.weights == "margin":
             rest = gates.scatter(1, chosen, 0.0).amax(dim=1, keepdim=True)
-            margin = gates.gather(1, chosen) - rest + MARGIN
+            margin = gates.gather(1, chosen) - rest + LEAST_MARGIN
             weights = margin / margin.sum(dim=1, keepdim=True)
             part = shared.sigmoid()
             return torch.cat([weights * (1.0 - part), part], dim=1) if self.config.shared else weights

@@ -19,6 +19,7 @@ from scene_experts.core.types import Mode, Routing
 ATTRIBUTES = ("opacity", "cov", "color")  # decoded attributes, in the compiled library's order
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid}
 """Activation of the last layer of each attribute."""
+LEAST_MARGIN = 1e-4  # added to margin weights (`Router.weights`), which stay finite where all gates are equal
 CHANNELS = {"opacity": 1, "cov": 7, "color": 3}  # values per Gaussian: opacity; 3 scale + 4 rotation; RGB
 
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.types import Gaussians, Routing
-from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, HeadWeights
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, LEAST_MARGIN, HeadWeights
 
 ACTIVATION = {"opacity": 0, "cov": 1, "color": 2}  # TANH, NONE, SIGMOID of triton_kernels.py
 TENSORS = ("router_w", "router_b", "w1", "b1", "w2", "b2")
@@ -54,7 +54,7 @@ def covers(attribute: str, h: HeadWeights, F: int, K: int) -> bool:
     """Whether the kernels support a network (two layers, held in registers) and its number of experts."""
     E, H = h.w1.shape[:2]
     fits = pad(F + 5) <= 64 and pad(H) <= 64 and pad(K * CHANNELS[attribute]) <= WIDEST
-    return h.middle_w is None and fits and E <= MOST_EXPERTS and not (h.linear or h.shared or h.margin)
+    return h.middle_w is None and fits and E <= MOST_EXPERTS and not (h.linear or h.shared)
 
 
 def pad(n: int, least: int = 16) -> int:
@@ -72,6 +72,7 @@ class _Head:
     routed: bool
     distance: bool
     position: bool  # whether the router receives the position
+    margin: bool  # whether the weights are margins
     sizes: dict[str, Any]  # the compile-time constants of its three kernels
 
 
@@ -150,7 +151,7 @@ def _head(attribute: str, h: HeadWeights, distance: bool, F: int, K: int) -> _He
     sizes: dict[str, Any] = {"E": E, "F": F, "H": H, "K": K, "C": C, "DISTANCE": int(distance), "ROUTED": routed}
     sizes |= {"SPARSE": routed and h.k is not None, "ACT": ACTIVATION[attribute], "COMPACT": attribute != "opacity"}
     sizes |= {"XP": pad(D + 1), "HP": pad(H), "COLS": pad(K * C), "PRECISION": PRECISION}
-    return _Head(attribute, E, (h.k or 0) if routed else 0, routed, distance, h.position, sizes)
+    return _Head(attribute, E, (h.k or 0) if routed else 0, routed, distance, h.position, h.margin, sizes)
 
 
 def _kernels() -> ModuleType:
@@ -224,6 +225,7 @@ def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Ten
     if A:
         bias = weights[1]
         sizes = {"F": feature.shape[1], "E": head.E, "TOP": head.k, "BIAS": bias is not None, "POSITION": head.position}
+        sizes |= {"MARGIN": head.margin, "LEAST": LEAST_MARGIN}
         sizes |= {"FP": pad(feature.shape[1]), "EP": pad(head.E), "B": BLOCK, "PRECISION": PRECISION}
         unused = plan.rows  # placeholder for arrays that the kernel does not access
         arguments = [plan.rows, plan.xyz, feature, weights[0], bias, gates, weight, chosen, keys]
@@ -254,7 +256,14 @@ def _backward(
     arguments = [*shared, gates, plan.xyz, feature, plan.camera, own[0], *own[2:], dst, d_out, d_gates, d_logits, d_feature]
     grid = (-(-A // BLOCK),)
     _kernels().head_backward[grid](
-        *(plan.rows if t is None else t for t in arguments), A, **head.sizes, B=BLOCK, EP=pad(head.E), POSITION=head.position
+        *(plan.rows if t is None else t for t in arguments),
+        A,
+        **head.sizes,
+        B=BLOCK,
+        EP=pad(head.E),
+        POSITION=head.position,
+        MARGIN=head.margin and head.k > 0,
+        LEAST=LEAST_MARGIN,
     )
     blocks = -(-A // BLOCK_WEIGHTS)
     parts = [t.new_empty(_parts(t.device, head.E, blocks), *t.shape) for t in own[2:]]
