@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.checkpoint import write_tensors
+from scene_experts.core.plain import to_json
 from scene_experts.data.views import World
 from scene_experts.files.anchors import torchscript
 from scene_experts.files.anchors.data import FILE_NAMES, AnchorData, by_attribute
@@ -153,7 +154,7 @@ def write(run: OpenRun, world: World, folder: Path, about: dict[str, Any]) -> di
         stale -= {MOE_FILE}
     for name in stale:  # from an earlier export to this folder
         (folder / name).unlink(missing_ok=True)
-    growth = about.get("train", {}).get("growth", {})
+    growth = to_json(run.config.train.growth)
     return {
         "sh_degree": 3,
         "feat_dim": about["F"],
