@@ -37,7 +37,7 @@ def head(a, k, E):
     return triton_decode._head(a, weights, False, F, K).sizes
 
 target = int(sys.argv[1])
-common = {"B": 16, "EP": 16, "FP": 16, "KP": 2, "K": K}
+common = {"B": 16, "EP": 16, "FP": 16, "KP": 2, "K": K, "MARGIN": True, "LEAST": 1e-4}
 check("place", common, target)
 check("place_backward", common, target)
 check("route", {**common, "F": F, "E": E, "TOP": 2, "BIAS": True, "POSITION": True, "PRECISION": "ieee"}, target)
