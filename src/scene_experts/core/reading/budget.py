@@ -29,7 +29,7 @@ class Budget:
         ratio: Bytes in memory per byte of the file, above `floor`.
         items: Largest number of entries: members of an archive, values of a JSON file, operations of a pickle, lines of a header.
         depth: Largest nesting of lists and objects.
-        seconds: Time that a small file may take; see BYTES_PER_SECOND. Readers check it between their steps.
+        seconds: Processor time that a small file may take; see BYTES_PER_SECOND. Readers check it between their steps.
         advice: What the user can do about a damaged file.
     """
 
@@ -65,8 +65,8 @@ NOTE = Budget("note", 1 * MIB)
 CAPTURE = Budget("capture", 1 << 60, advice="restore its files")
 COLMAP = Budget("COLMAP file", 32 * GIB, advice="copy it again")
 POINTS = Budget("PLY file of points", 16 * GIB, items=4_096, advice="copy it again")
-PHOTOGRAPH = Budget("image", 2 * GIB, floor=160 * MIB, ratio=80, advice="replace it or remove it from the capture")
-MASK = Budget("mask", 1 * GIB, floor=160 * MIB, ratio=80, advice="replace or remove it")
+PHOTOGRAPH = Budget("image", 2 * GIB, floor=72 * MIB, ratio=80, advice="replace it or remove it from the capture")
+MASK = Budget("mask", 1 * GIB, floor=128 * MIB, ratio=80, advice="replace or remove it")
 PICTURE = Budget("picture", 1 * GIB, floor=160 * MIB, ratio=80, advice="evaluate the run again")
 
 # --- scenes -------------------------------------------------------------------------------------------------------------------------------

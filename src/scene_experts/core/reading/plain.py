@@ -25,7 +25,7 @@ def read_json(path: Path, what: str) -> Any:
     JSON, and for values beyond the budget: see `parse_json`.
     """
     with opening(path, budgets.JSON, f"{what} in JSON") as source:
-        return parse_json(source.read())
+        return parse_json(source.read(), budgets.JSON)
 
 
 def parse_json(text: bytes | str, budget: Budget = budgets.META, finite: bool = True) -> Any:
