@@ -132,6 +132,9 @@ class Scene(nn.Module):
         """
         return self
 
+    def set_training_cameras(self, cameras: Sequence[Camera]) -> None:
+        """Give the scene the cameras of its training views, before each training or its resumption. The default does nothing."""
+
 
 class LatticeScene(Scene):
     """A scene whose rows lie on a lattice. Densification adds rows at empty cells. The table has a fact `cell` [N, 3] int64."""

@@ -84,6 +84,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
     training = training or Training.start(cfg, capture, run.device, run.dtype)
     training.capture_id = capture.fingerprint()
+    training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
     rasterize = for_growth(rasterize, cfg.growth.absolute)
     total = min(cfg.iterations, run.config.stop_at or cfg.iterations)
     run.begin(training)

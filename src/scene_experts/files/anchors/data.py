@@ -27,7 +27,7 @@ class AnchorData:
     columns: dict[str, Tensor]
     """xyz [N, 3], feature [N, F], offsets [N, K, 3], log_scaling [N, 6] float32; with levels of
     detail also level, extra_level, info [N]. With masked Gaussians also slots [N, K] bool: those
-    that are drawn."""
+    that are drawn. With the smoothing filter also interval [N], in the capture's unit."""
     networks: dict[str, Tensor]
     """By name in files, as `opacity.experts.w1`: opacity, cov and color, which see distances in the
     capture's unit, and where present feature_bank and `appearance.table` [V, dim]."""

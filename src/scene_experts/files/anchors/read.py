@@ -115,6 +115,7 @@ def tensors_of(
     out = {"params.feature": c["feature"], "params.offsets": c["offsets"], "params.log_scaling": scaling}
     out |= {f"facts.{name}": value for name, value in place.items()}
     out |= {"facts.slots": c["slots"]} if "slots" in c else {}
+    out |= {"facts.interval": c["interval"] * world.scale} if "interval" in c else {}
     return out | {f"network.{a}.{name}": value for a, n in trained.items() for name, value in n.items()}
 
 
@@ -213,6 +214,8 @@ def read_anchors(path: Path) -> dict[str, Tensor]:
         if not all(value.isfinite().all() for value in levels.values()) or not ((level >= 0) & (level <= MOST_LEVELS)).all():
             raise InputError(f"expected finite levels between 0 and {MOST_LEVELS} in {path}, found others; export the result again")
         out |= levels | {"level": level.round().long()}
+    if "interval" in columns:
+        out["interval"] = stack(columns, ["interval"], path)[:, 0]
     if masks := numbered_names(columns, SLOTS):
         out["slots"] = unpack_slots(stack(columns, masks, path).nan_to_num(0).clamp(0, (1 << SLOT_BITS) - 1), out["offsets"].shape[1])
     return out

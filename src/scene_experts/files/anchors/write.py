@@ -57,6 +57,8 @@ def contents(run: OpenRun, world: World, about: dict[str, Any]) -> AnchorData:
         }
     if "slots" in facts:
         columns["slots"] = facts["slots"].cpu()
+    if "interval" in facts:
+        columns["interval"] = facts["interval"].cpu() / world.scale
     on_lattice = not run.scene.traits.levels and is_on_lattice(cells, xyz, scene.voxel)
     return AnchorData(
         columns,
@@ -180,8 +182,8 @@ def vertices(data: AnchorData) -> Columns:
 
     Offsets are stored component by component: f_offset_{c * K + k} is component c of offset k.
     Normals are 0, the opacity is inert, the rotation is the identity. With levels of detail, level,
-    extra_level and info replace the normals, as in Octree-GS. Masks of slots are further columns,
-    which other readers ignore.
+    extra_level and info replace the normals, as in Octree-GS. Masks of slots and intervals of
+    the smoothing filter are further columns, which other readers ignore.
     """
     c, n = data.columns, len(data.columns["xyz"])
     zero, one = np.zeros(n, np.float32), np.ones(n, np.float32)
@@ -193,6 +195,7 @@ def vertices(data: AnchorData) -> Columns:
     columns["opacity"] = np.full(n, INERT_OPACITY, np.float32)
     columns |= numbered_columns("scale_", c["log_scaling"])
     columns |= {"rot_0": one, "rot_1": zero, "rot_2": zero, "rot_3": zero}
+    columns |= {"interval": floats(c["interval"][:, None])[0]} if "interval" in c else {}
     return columns | (numbered_columns(SLOTS, pack_slots(c["slots"])) if "slots" in c else {})
 
 
@@ -213,7 +216,9 @@ def warnings(run: OpenRun) -> list[str]:
     of Scaffold-GS cannot express."""
     scene = cast(AnchorScene, run.scene)
     plain = networks(scene, 1.0)
-    masked = ["warning: other readers of the Scaffold-GS layout also draw the masked Gaussians"] if "slots" in scene.table.facts else []
+    facts, readers = scene.table.facts, "warning: other readers of the Scaffold-GS layout"
+    masked = [f"{readers} also draw the masked Gaussians"] if "slots" in facts else []
+    masked += [f"{readers} draw without the smoothing filter"] if "interval" in facts else []
     if not is_plain(plain):
         return masked
     others = []

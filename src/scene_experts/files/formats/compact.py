@@ -95,14 +95,14 @@ def write(path: Path, data: AnchorData, note: dict[str, Any], coding: Coding = C
     drawn = None if slots is None else slots.cpu().numpy()[order]
     if drawn is not None:
         blobs["slots"] = deflate(np.packbits(drawn, axis=1))
-    for name in ("feature", "offsets", "log_scaling"):
+    for name in (name for name in ("feature", "offsets", "log_scaling", "interval") if name in data.columns):
         value = data.columns[name]
         array = value.detach().cpu().float().numpy().reshape(n, int(np.prod(value.shape[1:])))[order]
         if drawn is not None and name == "offsets":  # those of masked slots are left out
             array = array.reshape(n, -1, 3)[drawn]
         if not np.isfinite(array).all():
             raise InputError(f"expected finite {name}, found others in {(~np.isfinite(array)).any(1).sum():,} anchors; train again")
-        codes[name], parts = _encode(array, getattr(coding, name))
+        codes[name], parts = _encode(array, getattr(coding, name, "float32"))
         blobs |= {name if part == "values" else f"{name}.{part}": blob for part, blob in parts.items()}
     meta = {
         "N": n,
@@ -142,10 +142,12 @@ def _unpack(source: Source, tensors: dict[str, Tensor], meta: dict[str, Any]) ->
         raise Damaged(f"{len(keys):,} cells of {n:,} anchors")
     slots = _decode_slots(_blob(tensors, "slots"), n, K) if "slots" in tensors else None
     sizes = {"feature": (n, F), "offsets": (n, 3 * K) if slots is None else (int(slots.sum()), 3), "log_scaling": (n, 6)}
+    sizes |= {"interval": (n, 1)} if "interval" in tensors else {}
     columns = {name: _decode(tensors, name, meta["codes"][name], *size) for name, size in sizes.items()}
     step = whole_number(about["step"], "the iteration")
     add_dist = tuple(a for a, used in about["add_dist"].items() if used)
     cells = torch.from_numpy(unmorton(keys) + low)
+    columns |= {"interval": columns["interval"][:, 0]} if "interval" in columns else {}
     if slots is not None:
         columns["slots"] = slots
         columns["offsets"] = torch.zeros(n, K, 3).index_put_((slots,), columns["offsets"])

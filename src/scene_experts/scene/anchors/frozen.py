@@ -18,6 +18,7 @@ from scene_experts.scene.anchors import native_decode
 from scene_experts.scene.anchors.appearance import fold
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, HeadWeights
 from scene_experts.scene.anchors.select import drop_masked, fade_opacities, visible_rows
+from scene_experts.scene.anchors.smoothing import smooth
 
 if TYPE_CHECKING:
     from scene_experts.scene.anchors.scene import AnchorScene
@@ -73,7 +74,8 @@ class Frozen:
         rows = visible_rows(scene.select(scene.table, camera, step, mode), self.xyz, self.scales, camera, cull)
         decoded = self.decode(rows, camera)
         decoded = fade_opacities(decoded, scene.select.fade(scene.table, rows, camera, step, mode), len(scene.table), scene.K)
-        return drop_masked(decoded, scene.table.facts.get("slots"))
+        decoded = drop_masked(decoded, scene.table.facts.get("slots"))
+        return smooth(decoded, scene.table.facts.get("interval"), scene.config.smoothing, scene.K)
 
     @torch.no_grad()
     def decode(self, rows: Tensor, camera: Camera) -> Decoded:

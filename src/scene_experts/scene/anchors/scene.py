@@ -34,6 +34,7 @@ from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
 from scene_experts.scene.anchors.frozen import Frozen
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, Decoder, HeadWeights, Plain
 from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, drop_masked, fade_opacities, visible_rows
+from scene_experts.scene.anchors.smoothing import find_intervals, smooth
 
 log: logging.Logger = logging.getLogger(__name__)
 NEARLY_ALL = 0.95  # the lattice has almost no effect if this share of the points is alone in its voxel
@@ -77,6 +78,9 @@ class Anchors(SceneConfig):
     photographs (after DropGaussian, Park et al. 2025)."""
     dropout_full: int = 30_000
     """Iteration at which the share of dropped anchors is reached. --iterations rescales it."""
+    smoothing: float = 0.0
+    """Variance of the 3D smoothing filter in squared pixels of the closest training view (0.2 in Mip-Splatting); 0 means no filter. It
+    helps cameras that come closer than the training views."""
     test_appearance: TestRule = "mean"
     """Appearance code of a held-out view. mean: the mean of all codes. index: the code of the training view with the same index, as in
     Scaffold-GS."""
@@ -112,6 +116,7 @@ class Anchors(SceneConfig):
         expect_at_least([(f"--scene.{name}", getattr(self, name), 1) for name in ("K", "F", "hidden")])
         expect_at_least([("--scene.voxel-size", self.voxel_size, 0), ("--scene.appearance", self.appearance, 0)])
         expect_at_least([("--scene.dropout", self.dropout, 0), ("--scene.dropout-full", self.dropout_full, 1)])
+        expect_at_least([("--scene.smoothing", self.smoothing, 0)])
         if self.dropout >= 1:
             raise InputError(f"expected --scene.dropout below 1, found {self.dropout}; it is a share of the anchors")
         self.decoder.check()
@@ -147,6 +152,7 @@ class AnchorScene(LatticeScene):
         self.heads: Mapping[str, MLP | MixtureHead] = nn.ModuleDict(heads)  # type: ignore[assignment]
         self.bank = config.mix.build(config.F)
         self.codes = Codes(config.appearance, views, config.test_appearance) if config.appearance else None
+        self.cameras: tuple[Camera, ...] = ()  # of the training views, for the smoothing filter of new anchors
 
     @property
     def traits(self) -> Traits:
@@ -197,10 +203,20 @@ class AnchorScene(LatticeScene):
         table = Table(params, {**facts, "xyz": facts["xyz"].float()})
         return cls(config, table, voxel, extent, select, [c.id for c in cameras])
 
+    def set_training_cameras(self, cameras: Sequence[Camera]) -> None:
+        """Give the scene the cameras of its training views. The smoothing filter needs them."""
+        if not self.config.smoothing:
+            return
+        self.cameras = tuple(cameras)
+        if "interval" not in self.table.facts:
+            self.table.facts["interval"] = find_intervals(self.table.facts["xyz"], self.cameras)
+
     def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
         """Return rows for new anchors at lattice cells [n, 3] of `level`, with scaling `size`, features [n, F] and zero offsets."""
         n = len(cells)
         facts = self.select.places(cells, self.voxel, level)
+        if "interval" in self.table.facts:
+            facts = {**facts, "interval": find_intervals(facts["xyz"].to(feature.dtype), self.cameras)}
         if "slots" in self.table.facts:
             facts = {**facts, "slots": torch.ones(n, self.K, dtype=torch.bool, device=cells.device)}
         return {
@@ -227,6 +243,7 @@ class AnchorScene(LatticeScene):
         decoded = self.decode(rows, camera, step, mode)
         decoded = fade_opacities(decoded, self.select.fade(table, rows, camera, step, mode), len(table), self.K)
         decoded = drop_masked(decoded, table.facts.get("slots"))
+        decoded = smooth(decoded, table.facts.get("interval"), self.config.smoothing, self.K)
         return self.with_global_routing(decoded, step) if mode is Mode.TRAIN else decoded
 
     def decode(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:

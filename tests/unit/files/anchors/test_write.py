@@ -60,14 +60,17 @@ def test_masks_of_slots_as_numbers_and_back(K):
     assert torch.equal(write.unpack_slots(numbers, K), slots)
 
 
-def test_masked_slots_are_in_the_folder(tmp_path):
+def test_masked_slots_and_the_smoothing_filter_are_in_the_folder(tmp_path):
     run = run_in_memory("moe-gs")
     slots = torch.rand(len(run.scene.positions), run.scene.K, generator=torch.Generator().manual_seed(0)) < 0.5
-    run.scene.table.facts["slots"] = slots
+    intervals = torch.rand(len(slots), generator=torch.Generator().manual_seed(1))
+    run.scene.table.facts |= {"slots": slots, "interval": intervals}
     found = read_folder(folder_of(run, tmp_path))
     assert torch.equal(found.columns["slots"], slots)
+    torch.testing.assert_close(found.columns["interval"], intervals / 2.5)
     tensors = tensors_of(found, by_attribute(found.networks), WORLD, run.scene.voxel)
     assert torch.equal(tensors["facts.slots"], slots)
+    torch.testing.assert_close(tensors["facts.interval"], intervals)
 
 
 def test_positions_move_lengths_scale_and_networks_see_the_files_distances():

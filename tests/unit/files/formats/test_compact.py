@@ -88,6 +88,10 @@ def test_masked_slots_take_no_room(tmp_path):
     data = AnchorData(columns, by_file_name(networks()), ABOUT, s["cells"], 0.0013, ORIGIN)
     whole = compact.write(tmp_path / "a", data, {})
     masked = compact.write(tmp_path / "b", replace(data, columns={**columns, "slots": slots}), {})
+    intervals = torch.rand(2000, generator=torch.Generator().manual_seed(3))
+    compact.write(tmp_path / "c", replace(data, columns={**columns, "interval": intervals}), {})
+    smoothed = read(tmp_path / "c").columns
+    assert torch.equal(smoothed["interval"], intervals[matched(smoothed)])
     found = read(tmp_path / "b").columns
     order = matched(found)
     assert torch.equal(found["slots"], slots[order]) and "slots" not in read(tmp_path / "a").columns
