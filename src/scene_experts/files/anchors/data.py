@@ -53,6 +53,8 @@ class AnchorData:
         bear."""
         expect_range(self.columns["xyz"], "positions", -FARTHEST, FARTHEST)
         expect_range(self.columns["log_scaling"], "logarithms of scales", -LARGEST, LARGEST_LOG)
+        if "interval" in self.columns:
+            expect_range(self.columns["interval"], "sampling intervals", 0, FARTHEST)
         for name in ("feature", "offsets"):
             expect_range(self.columns[name], f"values of {name}")
         for name, value in self.networks.items():
