@@ -217,7 +217,10 @@ def read_anchors(path: Path) -> dict[str, Tensor]:
     if "interval" in columns:
         out["interval"] = stack(columns, ["interval"], path)[:, 0]
     if masks := numbered_names(columns, SLOTS):
-        out["slots"] = unpack_slots(stack(columns, masks, path).nan_to_num(0).clamp(0, (1 << SLOT_BITS) - 1), out["offsets"].shape[1])
+        K = out["offsets"].shape[1]
+        if len(masks) != -(-K // SLOT_BITS):
+            raise InputError(f"expected {-(-K // SLOT_BITS)} columns of masks in {path}, found {len(masks)}; export the result again")
+        out["slots"] = unpack_slots(stack(columns, masks, path).nan_to_num(0).clamp(0, (1 << SLOT_BITS) - 1), K)
     return out
 
 
