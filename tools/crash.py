@@ -23,8 +23,8 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=200, help="number of kills (default: 200)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the moments (default: 0)")
     args = parser.parse_args()
-    from support.crashes import Crashes
-    from support.synthetic import make_capture
+    from support.crashes import Crashes  # pyright: ignore[reportMissingImports]
+    from support.synthetic import make_capture  # pyright: ignore[reportMissingImports]
 
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="crash-") as folder:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import os
 import sys
 import tempfile
@@ -16,6 +17,8 @@ from filelock import FileLock, Timeout
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.reading.plain import read_json as read_json
+
+log: logging.Logger = logging.getLogger(__name__)
 
 
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
@@ -78,7 +81,10 @@ def locked(path: Path, busy: str) -> Iterator[None]:
         lock.acquire(blocking=False)
     except Timeout:
         raise InputError(busy) from None
-    except NotImplementedError:  # some network file systems do not support locks
+    except (NotImplementedError, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP):
+            raise _unwritable(path, error) from error
+        log.warning("%s is on a file system without locks; do not use this folder from two processes at once", path.parent)
         yield
         return
     try:

@@ -23,7 +23,7 @@ from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.guard import explain, find_broken
 from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
-from scene_experts.training.memory import anchor_cap
+from scene_experts.training.memory import anchor_cap, check_start
 from scene_experts.training.state import Training, resume, save
 
 log: logging.Logger = logging.getLogger(__name__)
@@ -83,6 +83,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     if training and training.capture_id not in ("", capture.fingerprint()):
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
     training = training or Training.start(cfg, capture, run.device, run.dtype)
+    check_start(training.scene, training.step > 0, run.max_memory)
     training.capture_id = capture.fingerprint()
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
     rasterize = for_growth(rasterize, cfg.growth.absolute)

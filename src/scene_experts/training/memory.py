@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from scene_experts.core.errors import InputError
 from scene_experts.core.types import Decoded, Render
 from scene_experts.native import library as native
 from scene_experts.scene import Scene
@@ -62,7 +63,9 @@ def row_bytes(scene: Scene) -> int:
 def anchor_cap(scene: Scene, cap: int, max_memory: float, largest: Largest) -> int:
     """Return the current limit on the number of anchors; 0 means no limit.
 
-    The memory of one more frame of the largest size is reserved. Each new row adds its share of Gaussians to that frame.
+    Reserved are one more frame of the largest size, to which each new row adds its share of Gaussians, and a copy of the table, which a
+    save and the export of the run may hold. Each edit may fill half of what is left, because some of this is an estimate; the next edit
+    measures again.
 
     Args:
         scene: The scene.
@@ -74,9 +77,26 @@ def anchor_cap(scene: Scene, cap: int, max_memory: float, largest: Largest) -> i
         return cap
     n = len(scene.table)
     share = largest.gaussians / max(n, 1)
-    left = max_memory * 2**30 - used_bytes(scene.table.device) - frame_bytes(largest.gaussians, largest.pixels)
-    room = max(0, int(left / (2 * row_bytes(scene) + share * gaussian_bytes())))  # 2: an edit holds old and new columns at once
+    row = row_bytes(scene)
+    left = max_memory * 2**30 - used_bytes(scene.table.device) - frame_bytes(largest.gaussians, largest.pixels) - n * row
+    room = max(0, int(left / 2 / (3 * row + share * gaussian_bytes())))  # 3: an edit holds old and new columns at once, and the copy
     return min(n + room, cap) if cap else max(n + room, 1)
+
+
+def check_start(scene: Scene, begun: bool, max_memory: float) -> None:
+    """Raise InputError if a training cannot begin within `max_memory` GiB (0: no limit): its gradients and moments have no room.
+
+    begun: Whether the moments are already there, as in a resumed training.
+    """
+    if max_memory <= 0:
+        return
+    learned = sum(v.element_size() * v.numel() for v in scene.table.params.values())
+    needed = (used_bytes(scene.table.device) + learned * (1 if begun else 3)) / 2**30
+    if needed > max_memory:
+        raise InputError(
+            f"expected a start within --max-memory {max_memory:g} GiB, found {len(scene.table):,} {scene.traits.rows} that need about "
+            f"{needed:.2f} GiB; raise --max-memory or start from fewer points"
+        )
 
 
 def used_bytes(device: torch.device) -> int:

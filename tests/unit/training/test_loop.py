@@ -116,9 +116,16 @@ def test_anchor_cap_holds(folder):
 
 
 @pytest.mark.slow
-def test_memory_cap_stops_growth(folder):
-    capped = [e for e in events(config(), folder, stop_at=100, max_memory=0.001) if isinstance(e, Densified)]
+def test_memory_cap_stops_growth(folder, monkeypatch):
+    monkeypatch.setattr("scene_experts.training.memory.used_bytes", lambda device: 0)
+    capped = [e for e in events(config(), folder, stop_at=100, max_memory=0.002) if isinstance(e, Densified)]
     assert capped and not any(e.edit.grown for e in capped) and any(e.edit.capped for e in capped)
+
+
+def test_a_start_beyond_the_memory_cap_is_refused_before_anything_is_written(folder, tmp_path):
+    with pytest.raises(InputError, match="--max-memory"):
+        list(events(config(), folder, tmp_path / "run", stop_at=100, max_memory=0.001))
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_capture_without_points_or_training_views_is_refused(folder):

@@ -9,10 +9,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 from scene_experts.training import memory
 from scene_experts.training.memory import Largest, anchor_cap, frame_bytes, row_bytes, used_bytes
+from support.messages import naming
 
 
 def scene(n=100) -> AnchorScene:
@@ -29,11 +31,22 @@ def test_the_cap_leaves_room_for_rows_and_their_gaussians(monkeypatch):
     monkeypatch.setattr(memory, "used_bytes", lambda device: 2**30)
     assert anchor_cap(scene(), 7, 0.0, Largest()) == 7 and anchor_cap(scene(), 0, 0.0, Largest()) == 0
     bare = anchor_cap(scene(), 0, 2.0, Largest())
-    assert bare == 100 + 2**30 // (2 * row_bytes(scene()))
+    assert bare == 100 + int((2**30 - 100 * row_bytes(scene())) / 2 / (3 * row_bytes(scene())))
     drawn = anchor_cap(scene(), 0, 2.0, Largest(gaussians=500, pixels=400_000))
     assert 100 < drawn < bare / 1.5
     assert anchor_cap(scene(), 150, 2.0, Largest()) == 150
     assert anchor_cap(scene(), 0, 0.5, Largest()) == 100  # nothing left: no more rows
+
+
+@pytest.mark.parametrize("begun", [True, False])
+def test_a_start_that_cannot_fit_says_so(begun, monkeypatch):
+    monkeypatch.setattr(memory, "used_bytes", lambda device: 2**30)
+    rows, learned = 100_000, 4 * (32 + 30 + 6) * 100_000
+    needed = (2**30 + learned * (1 if begun else 3)) / 2**30
+    memory.check_start(scene(rows), begun, 0.0)
+    memory.check_start(scene(rows), begun, needed * 1.001)
+    with pytest.raises(InputError, match=naming("--max-memory", "100,000")):
+        memory.check_start(scene(rows), begun, needed * 0.999)
 
 
 def test_the_largest_frame_is_remembered():
