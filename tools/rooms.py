@@ -31,6 +31,8 @@ DOORS = {
     ("files.measure", "capture_if_there"): "opening the run and its capture",
     ("files.bake.bake", "bake"): "baking",
     ("files.measure", "cost"): "measuring",
+    ("core.reading.plain", "read_json"): "checking what is read and written",
+    ("core.reading.numbers", "all_finite"): "checking what is read and written",
 }
 ITSELF = "on the way itself"
 

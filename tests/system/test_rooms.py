@@ -1,4 +1,4 @@
-"""An export visits at most 12 of our modules, besides those that open the run, bake and measure (tools/rooms.py)."""
+"""An export visits at most 12 of our modules, besides those that open the run, bake, measure and check files (tools/rooms.py)."""
 
 import re
 import subprocess
