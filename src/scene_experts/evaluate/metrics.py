@@ -46,8 +46,10 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def sharpness(image: Tensor, mask: Tensor | None = None) -> float:
-    """Return the mean norm of the brightness gradient (forward differences per pixel). Blur lowers it."""
+    """Return the mean norm of the brightness gradient (forward differences per pixel). Blur lowers it; 0 for a side of 1 px."""
     gray = image.mean(dim=2)
+    if min(gray.shape) < 2:
+        return 0.0
     dx, dy = gray[:-1, 1:] - gray[:-1, :-1], gray[1:, :-1] - gray[:-1, :-1]
     length = (dx.square() + dy.square()).sqrt()
     if mask is None:

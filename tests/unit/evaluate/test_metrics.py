@@ -120,3 +120,9 @@ def test_scores_on_cuda_are_those_on_the_cpu() -> None:
     there = metrics.score(image.cuda(), target.cuda(), None, Perceptual({net: network.to("cuda") for net, network in networks.items()}))
     assert there == pytest.approx(here, rel=1e-4)
     assert torch.backends.cudnn.allow_tf32  # unchanged
+
+
+def test_pictures_of_one_pixel_have_finite_scores():
+    for shape in ((1, 1, 3), (1, 5, 3), (5, 1, 3)):
+        found = metrics.score(torch.rand(shape), torch.rand(shape), None, metrics.Perceptual.off())
+        assert all(math.isfinite(value) for value in found.values())
