@@ -13,12 +13,12 @@ import scene_experts
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import check_writable, read_json, write_bytes, write_json
 from scene_experts.core.plain import to_json
+from scene_experts.data.settings import Data
 from scene_experts.data.views import Capture, World
 from scene_experts.files.cameras import write_cameras
 from scene_experts.files.measure import Tell, capture_if_there, cost
 from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
 from scene_experts.files.registry import GAUSSIANS, Family, Format, family_named, format_named, format_names, formats_of
-from scene_experts.files.result_folder import capture_settings
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Scene
 from scene_experts.training.progress import format_duration
@@ -246,6 +246,32 @@ def write_scene_folder(run: OpenRun, family: Family, world: World, out: Path) ->
         text = ", ".join(f"{name}={value!r}" for name, value in every.items())
         write_bytes(out / "cfg_args", f"Namespace({text})".encode())
     return folder
+
+
+def capture_settings(data: Data) -> dict[str, Any]:
+    """Return the settings for cfg_args that say where the capture is and how the published tools
+    read it, as closely as their settings can express ours.
+
+    source_path is the path that the run was given. resolution: -1 limits the width to 1600 px, 1, 2,
+    4 and 8 divide the sides, other numbers are the width in px. eval holds out every 8th view; with
+    lod, from 1 to 49, the views 0 to lod instead.
+    """
+    kind, _, number = data.resolution.partition(":")
+    held = data.split.removeprefix("first:")
+    first = int(held) if held != data.split and held.isdecimal() else 0
+    # NeRF-synthetic captures are white by default; the published tools recognise them by this file too.
+    synthetic = (data.path / "transforms_train.json").is_file()
+    white = (data.background is None and synthetic) or data.background == (1.0, 1.0, 1.0)
+    divided = kind == "factor" and float(number) in (1, 2, 4, 8)
+    return {
+        "source_path": str(data.path),
+        "images": data.images or (f"images_{number}" if kind == "inria" else "images"),
+        "resolution": 1 if kind == "as-is" else int(float(number)) if divided or kind == "longest" else -1,
+        "white_background": white,
+        "data_device": "cuda",
+        "eval": data.split != "none",
+        "lod": first - 1 if 2 <= first <= 50 else 0,
+    }
 
 
 # --- standard Gaussians -------------------------------------------------------------------------------------------------------------------

@@ -17,7 +17,6 @@ from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import FARTHEST, number, whole_number
 from scene_experts.core.reading.plain import parse_namespace
 from scene_experts.core.reading.source import guarding, opening
-from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 
 DESCRIPTION, DESCRIPTION_FORMAT = "scene.json", 1
@@ -112,32 +111,6 @@ def expect_world(trained: World, found: World) -> None:
             f"expected the capture in the world of the scene (scale {trained.scale:.6g}, shift {trained.shift}), found scale "
             f"{found.scale:.6g}, shift {found.shift}; use the capture, --split, --normalise and --max-views it was trained with"
         )
-
-
-def capture_settings(data: Data) -> dict[str, Any]:
-    """Return the settings for cfg_args that say where the capture is and how the published tools
-    read it, as closely as their settings can express ours.
-
-    source_path is the path that the run was given. resolution: -1 limits the width to 1600 px, 1, 2,
-    4 and 8 divide the sides, other numbers are the width in px. eval holds out every 8th view; with
-    lod, from 1 to 49, the views 0 to lod instead.
-    """
-    kind, _, number = data.resolution.partition(":")
-    held = data.split.removeprefix("first:")
-    first = int(held) if held != data.split and held.isdecimal() else 0
-    # NeRF-synthetic captures are white by default; the published tools recognise them by this file too.
-    synthetic = (data.path / "transforms_train.json").is_file()
-    white = (data.background is None and synthetic) or data.background == (1.0, 1.0, 1.0)
-    divided = kind == "factor" and float(number) in (1, 2, 4, 8)
-    return {
-        "source_path": str(data.path),
-        "images": data.images or (f"images_{number}" if kind == "inria" else "images"),
-        "resolution": 1 if kind == "as-is" else int(float(number)) if divided or kind == "longest" else -1,
-        "white_background": white,
-        "data_device": "cuda",
-        "eval": data.split != "none",
-        "lod": first - 1 if 2 <= first <= 50 else 0,
-    }
 
 
 def read_settings(folder: Path) -> dict[str, Any]:

@@ -7,8 +7,8 @@ import pytest
 from scene_experts.core.errors import InputError
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
+from scene_experts.files.export import capture_settings
 from scene_experts.files.result_folder import (
-    capture_settings,
     expect_world,
     is_result,
     iteration_folder,
