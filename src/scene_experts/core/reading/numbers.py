@@ -82,7 +82,7 @@ def all_finite(value: Tensor) -> bool:
 
 def usable_rows(xyz: NDArray[Any], path: Path) -> NDArray[np.bool_]:
     """Return which points [P, 3] have a usable position: finite, and not beyond FARTHEST. Logs a warning if some have not."""
-    kept = (np.abs(xyz) <= FARTHEST).all(1)  # False for NaN
+    kept: NDArray[np.bool_] = np.asarray((np.abs(xyz) <= FARTHEST).all(1))  # False for NaN
     if not kept.all():
         log.warning("dropped %s of %s points of %s that have no usable position", f"{(~kept).sum():,}", f"{len(xyz):,}", path)
     return kept

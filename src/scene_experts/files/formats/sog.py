@@ -125,7 +125,8 @@ def _decode(source: Source, archive: Archive) -> Splats:
     book = lambda part: np.array(meta[part]["codebook"], np.float64).reshape(-1)  # noqa: E731
     mins, maxs = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
     level = pixels("means", 0)[:, :3].astype(np.int64) + (pixels("means", 1)[:, :3].astype(np.int64) << 8)
-    expect_range(np.stack([mins, maxs]), "ends of the positions", -_squeeze(np.array(FARTHEST)), _squeeze(np.array(FARTHEST)))
+    farthest = float(_squeeze(np.array(FARTHEST)))
+    expect_range(np.stack([mins, maxs]), "ends of the positions", -farthest, farthest)
     means = _stretch(mins + (maxs - mins) * (level / 65535))
     rest, colors = pixels("quats"), pixels("sh0")
     if (rest[:, 3] < 252).any():

@@ -274,5 +274,11 @@ class MixtureHead(nn.Module):
         if margin and (config.shared or self.experts > MOST_MARGINS):
             return None
         tensors = (self.router_w, self.router_b, self.w1, self.b1, self.w2, self.b2)
-        flags = {"position": router.input_pos, "linear": config.mix == "pre_activation", "shared": config.shared, "margin": margin}
-        return HeadWeights(*tensors, None if k is None else k + config.shared, **flags)
+        return HeadWeights(
+            *tensors,
+            None if k is None else k + config.shared,
+            position=router.input_pos,
+            linear=config.mix == "pre_activation",
+            shared=config.shared,
+            margin=margin,
+        )
