@@ -39,6 +39,7 @@ NEWER = {
     "rates.networks",
     "rates.anneal",
     "rates.anneal_from",
+    "scene.smoothing",
     "scene.dropout",
     "scene.dropout_full",
     "scene.decoder.shared",
