@@ -15,7 +15,7 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.reading.budget import Budget, Damaged
 
 log: logging.Logger = logging.getLogger(__name__)
-_LONGEST = 160  # characters of a cause in an error message
+_LONGEST, _LONGEST_SENTENCE = 160, 2000  # characters of a cause in an error message, and of a message
 
 
 class Source:
@@ -92,7 +92,12 @@ def guarding(path: Path | str, budget: Budget, what: str | None = None) -> Itera
     """Turn every exception of a block that interprets the content of `path` into one InputError; InputError and RunError pass."""
     try:
         yield
-    except (InputError, RunError):
+    except InputError as error:
+        text = str(error)
+        if len(text) > _LONGEST_SENTENCE or not text.isprintable():  # it quotes the file
+            raise InputError(shorten(text, _LONGEST_SENTENCE)) from error
+        raise
+    except RunError:
         raise
     except OSError as error:
         if error.errno is None:  # raised by a decoder for damaged content, not by the system

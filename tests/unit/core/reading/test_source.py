@@ -63,6 +63,12 @@ def test_what_passes():
         assert found.value is error
 
 
+def test_sentences_that_quote_a_file_are_short_and_on_one_line():
+    with pytest.raises(InputError) as found, guarding("there", SMALL):
+        raise InputError("found 'a\n\x1b[31m" + "x" * 100_000)
+    assert len(str(found.value)) <= 2000 and str(found.value).isprintable()
+
+
 def test_causes_are_short_and_on_one_line():
     assert shorten("a\n\x1b[31mb\u202e") == "a [31mb"
     assert len(describe(ValueError("x" * 10_000))) < 250
