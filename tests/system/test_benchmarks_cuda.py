@@ -34,6 +34,7 @@ def test_the_plan_ends_with_the_peer():
     assert train_cuda.list_pending(recipes, {"scaffold-gs": {"done": True}, "moe-gs": {"step": 3}}) == ["moe-gs", train_cuda.PEER]
 
 
+@pytest.mark.slow
 def test_slices_until_the_table(folder, tmp_path, capsys):
     line = ["--data", str(folder), "--out", str(tmp_path), "--device", "cpu", "--iterations", "6", "--recipes", "moe-gs", "--count", "50"]
     train_cuda.main([*line, "--seconds", "0"], draw)

@@ -2,6 +2,8 @@
 
 import sys
 
+import pytest
+
 import compare_checkouts as script
 
 
@@ -33,6 +35,7 @@ def test_the_report_gives_the_ratio_of_each_part_and_returns_the_worst_whole(cap
     assert "work, a" in (out := capsys.readouterr().out) and "1.500" in out
 
 
+@pytest.mark.slow
 def test_a_worker_times_every_part():
     worker = script.Worker(sys.executable, [60, 80, 48, 32])
     for name in worker.names:

@@ -28,6 +28,7 @@ def smaller(code: str) -> str:
     return code
 
 
+@pytest.mark.slow
 def test_every_block_runs(tmp_path, monkeypatch, capsys):
     (tmp_path / "demo").symlink_to(DEMO)
     monkeypatch.chdir(tmp_path)

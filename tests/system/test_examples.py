@@ -76,6 +76,7 @@ def test_orbit_video(run, example):
     assert len(list(Path("frames").glob("*.png"))) == 3
 
 
+@pytest.mark.slow
 def test_new_recipe(tmp_path):
     """The package is installed as pip does it: its module, and a .dist-info folder with its entry points."""
     project = tomllib.loads((EXAMPLES / "new_recipe" / "pyproject.toml").read_text())["project"]

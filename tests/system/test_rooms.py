@@ -22,6 +22,7 @@ def run(tmp_path_factory):
     return root / "run"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["compact"], ["anchors"], ["ply", "--refine", "2"]])
 def test_one_export_visits_at_most_12_modules(run, words, tmp_path):
     command = [sys.executable, str(TOOL), "export", str(run), "--out", str(tmp_path / "out"), "--format", *words]

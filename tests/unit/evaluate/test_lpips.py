@@ -67,6 +67,7 @@ def test_unusable_pictures_and_weights_are_rejected() -> None:
         Lpips("alex", {k: v for k, v in random_tensors("alex").items() if k != "lin4"})
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(weights.explain_missing("vgg") is not None, reason="no VGG weights on this machine")
 def test_documented_values() -> None:
     """torchmetrics 0.x documented two values for VGG: for random pictures, and for the same pictures rescaled to [-1, 1].

@@ -12,6 +12,7 @@ from support.scenes import CAMERA, start_scene
 from support.surveys import make_photo, make_survey
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recipe", ["moe-gs", "sags"])
 def test_sums_are_those_of_pictures_of_one_gaussian_each(recipe):
     scene, survey = start_scene(recipe), make_survey()

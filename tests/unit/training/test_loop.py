@@ -35,7 +35,7 @@ def folder(tmp_path_factory) -> Path:
     return make_capture(tmp_path_factory.mktemp("capture"), views=16).folder
 
 
-@pytest.mark.parametrize("recipe", slow_except(METHODS, "moe-gs", "3dgs"))
+@pytest.mark.parametrize("recipe", slow_except(METHODS, "moe-gs"))
 def test_resumed_equals_uninterrupted_bit_for_bit_while_rows_come_and_go(recipe, folder, tmp_path):
     cfg = config(recipe)
     edits = [e for e in events(cfg, folder, tmp_path / "whole", stop_at=120) if isinstance(e, Densified)]

@@ -111,6 +111,7 @@ print(json.dumps([read_config(Path(sys.argv[1])).train.scene.size, "support.outs
 """
 
 
+@pytest.mark.slow
 def test_a_run_of_another_package_is_opened_by_importing_it(tmp_path):
     """Another process, with a package that is really installed: a .dist-info folder on the path."""
     info = tmp_path / "site" / "dots-1.0.dist-info"

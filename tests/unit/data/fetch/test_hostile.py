@@ -134,6 +134,7 @@ def mutated(rng: random.Random) -> bytes:
     return bytes(data)
 
 
+@pytest.mark.slow
 def test_a_thousand_answers_end_in_the_file_or_in_one_sentence(server: Scripted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(download, "ANSWER", 2.0)
     rng, fine, failed = random.Random(1), 0, 0
