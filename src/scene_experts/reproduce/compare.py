@@ -2,75 +2,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from scene_experts.core.errors import InputError, nearest
+from scene_experts.core.errors import InputError
 from scene_experts.evaluate.tables import ResultTable
-from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import DATASETS, Experiment
 from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.statistics import SEED_SD, Difference, difference
 from scene_experts.reproduce.store import Record
 from scene_experts.reproduce.tables import COLUMNS
+from scene_experts.reproduce.variants import read_line, split_name
 
 COMPARE = "compare"
 DIGITS = {"psnr": 2, "ssim": 4, "lpips_3dgs": 4}
 
 
 def make_comparison(options: ReproduceOptions) -> Experiment:
-    """Return the comparison of --recipes with --baseline, by default the first recipe. Raises InputError for unknown recipes."""
-    recipes, baselines = options.recipes, options.baseline or options.recipes[:1]
-    if len(set(recipes)) < 2:
-        raise InputError(f"expected two or more --recipes with compare, found {len(set(recipes))}; name the recipes to compare")
-    for recipe in recipes:
-        if recipe not in RECIPES:
-            raise InputError(f"expected --recipes among {', '.join(RECIPES)}, found '{recipe}'{nearest(recipe, RECIPES)}; change it")
-    for recipe in baselines:
-        if recipe not in recipes:
-            raise InputError(f"expected --baseline among --recipes ({', '.join(recipes)}), found '{recipe}'; change one of them")
+    """Return the comparison of --recipes with --baseline, by default the first recipe.
+
+    A recipe may have flags, and a name before them (see `variants.split_name`). Raises InputError for unknown recipes and flags.
+    """
+    rows = dict(split_name(text) for text in options.recipes)
+    lines = list(rows.values())
+    if len(set(lines)) < 2 or len(rows) < len(options.recipes):
+        raise InputError(
+            f"expected two or more different --recipes with compare, found {', '.join(options.recipes) or 'none'}; change them"
+        )
+    for line in lines:
+        read_line(line)
+    baselines = options.baseline or tuple(rows)[:1]
+    for name in baselines:
+        if name not in rows:
+            raise InputError(f"expected --baseline among --recipes ({', '.join(rows)}), found '{name}'; change one of them")
     return Experiment(
         COMPARE,
-        f"Comparison of {', '.join(recipes)}",
-        {recipe: recipe for recipe in recipes},
+        f"Comparison of {', '.join(rows)}",
+        rows,
         tuple(DATASETS),
         added=("anchors", "active_percent", "gaussians_rendered", "cpu_seconds"),
-        baselines=tuple(baselines),
+        baselines=tuple(rows[name] for name in baselines),
     )
 
 
 def make_difference_tables(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str]) -> dict[str, ResultTable]:
     """Return, for each baseline of an experiment and each score, the table of the differences from it on `scenes`."""
     here = [r for r in records if r.scene in scenes]
-    made = {}
+    made, names = {}, {recipe: name for name, recipe in experiment.rows.items()}
     for baseline in experiment.baselines:
         for score in SEED_SD:
-            table = make_difference_table(here, list(experiment.rows.values()), baseline, score, scenes)
+            table = make_difference_table(here, experiment.rows, baseline, score, scenes)
             if table.rows:
-                made[f"{COLUMNS[score].title} minus that of {baseline}"] = table
+                made[f"{COLUMNS[score].title} minus that of {names[baseline]}"] = table
     return made
 
 
 def make_difference_table(
-    records: Sequence[Record], recipes: Sequence[str], baseline: str, score: str, scenes: Sequence[str]
+    records: Sequence[Record], recipes: Mapping[str, str], baseline: str, score: str, scenes: Sequence[str]
 ) -> ResultTable:
     """Return the table of the differences of recipes from a baseline in a score: each capture, the mean and both intervals.
 
-    Each difference is paired by view and seed. Recipes that share no run with the baseline have no row.
+    `recipes` maps the title of each row to its recipe. Each difference is paired by view and seed. Recipes that share no run with the
+    baseline have no row.
     """
     base, digits = [r for r in records if r.recipe == baseline], DIGITS[score]
     rows, notes = [], []
     seeds = sorted({r.seed for r in records})
-    for recipe in recipes:
+    for name, recipe in recipes.items():
         found = None if recipe == baseline else difference([r for r in records if r.recipe == recipe], base, score)
         if found is None:
             continue
         cells = [f"{found.by_capture[s]:+.{digits}f}" if s in found.by_capture else "-" for s in scenes]
-        rows.append((recipe, *cells, f"{found.mean:+.{digits}f}", *intervals(found, digits)))
+        rows.append((name, *cells, f"{found.mean:+.{digits}f}", *intervals(found, digits)))
         lacking = [s for s in scenes if s not in found.by_capture]
         if lacking:
-            notes.append(f"{recipe}: no pair of runs on {', '.join(lacking)}.")
+            notes.append(f"{name}: no pair of runs on {', '.join(lacking)}.")
         if found.seeds[0] < len(seeds):
-            notes.append(f"{recipe}: {found.seeds[0]} of the {len(seeds)} seeds on some captures.")
+            notes.append(f"{name}: {found.seeds[0]} of the {len(seeds)} seeds on some captures.")
     about = f"Paired by view and seed (seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))})."
     titles = ("", *scenes, "mean", "95 % interval: other views and seeds", "95 % interval: other captures")
     return ResultTable(titles, tuple(rows), frozenset(), (about, *notes))

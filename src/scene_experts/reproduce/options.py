@@ -45,9 +45,10 @@ class ReproduceOptions:
     devices: Annotated[tuple[str, ...], Option(value="INDEX")] = ()
     """Indices of the CUDA devices that the workers share."""
     recipes: Annotated[tuple[str, ...], Option(value="RECIPE")] = ()
-    """Run only the rows of these recipes. With compare: the recipes to compare, any recipe of `scene-experts train`."""
+    """Run only the rows of these recipes. With compare: the recipes to compare, any recipe of `scene-experts train`, also with flags and a
+    name: "moe-gs" "narrow=moe-gs --scene.hidden 16"."""
     baseline: Annotated[tuple[str, ...], Option(value="RECIPE")] = ()
-    """With compare: show the differences from these recipes; by default from the first of --recipes."""
+    """With compare: show the differences from these recipes (or names of --recipes); by default from the first of --recipes."""
     discard: bool = False
     """Delete each run folder when its record is written."""
     adopt: Annotated[tuple[Path, ...], Option(value="RUN")] = ()

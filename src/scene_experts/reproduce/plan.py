@@ -17,8 +17,8 @@ from scene_experts.data.fetch.obtain import is_present
 from scene_experts.data.images import check_policy
 from scene_experts.data.readers import is_capture, unrecognised_error
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import Experiment
+from scene_experts.reproduce.variants import base, flags, read_line
 from scene_experts.training.config import Train, flags_of, with_numbers
 
 COLLECTIONS = {"mipnerf360": "MipNeRF360", "tandt": "TanksAndTemples", "db": "DeepBlending", "bungeenerf": "BungeeNeRF"}
@@ -97,7 +97,7 @@ def shrink(policy: str, share: float) -> str:
 
 @dataclass(frozen=True)
 class Spec:
-    """One run: a recipe on a scene with a seed."""
+    """One run: a recipe on a scene with a seed. The recipe may have flags: "moe-gs --scene.hidden 8"."""
 
     scene: Scene
     recipe: str
@@ -106,7 +106,7 @@ class Spec:
 
     @property
     def train(self) -> Train:
-        cfg = with_numbers(RECIPES[self.recipe][1], self.scene.numbers)
+        cfg = with_numbers(read_line(self.recipe), self.scene.numbers)
         return replace(cfg, iterations=self.scale.length(cfg), seed=self.seed)
 
     @property
@@ -134,13 +134,13 @@ class Spec:
 
     def folder(self, root: Path) -> Path:
         """Return the path of the run folder. No two configurations share one."""
-        return root / self.scene.name / self.recipe / f"seed{self.seed}-{self.key}"
+        return root / self.scene.name / base(self.recipe) / f"seed{self.seed}-{self.key}"
 
     def arguments(self, out: Path) -> list[str]:
         """Return the arguments of `scene-experts` that train the run."""
-        args = ["train", self.recipe, "--data", str(self.scene.path), "--out", str(out)]
+        args = ["train", base(self.recipe), "--data", str(self.scene.path), "--out", str(out)]
         args += ["--iterations", str(self.train.iterations), "--seed", str(self.seed), "--preview-every", "0"]
-        args += flags_of(self.train, self.scene.numbers)
+        args += flags_of(self.train, self.scene.numbers) + flags(self.recipe)
         for name, value in vars(self.data).items():
             if name != "path" and value != getattr(Data(path=self.scene.path), name):
                 args += [f"--{name.replace('_', '-')}", str(value)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from scene_experts.reproduce.compare import COMPARE, make_comparison
 from scene_experts.reproduce.experiments import EXPERIMENTS, OURS, Experiment
 from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.plan import Scale, Scene, Spec, check_folders, drop_repeated, find_own_scenes, find_paper_scenes, list_runs
+from scene_experts.reproduce.variants import split_name
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ def make_plan(options: ReproduceOptions) -> Plan:
             raise InputError(f"expected a folder at {folder}, found a file; choose another --out, --runs or --records")
     chosen, scenes = choose_experiments(options), choose_scenes(options)
     scale = Scale.of(options.scale, options.iterations, options.resolution)
-    chosen = choose_rows(chosen, options.recipes) if options.recipes else chosen
+    chosen = choose_rows(chosen, tuple(split_name(text)[1] for text in options.recipes)) if options.recipes else chosen
     if not options.tables_only:
         check_folders(scenes)
     shown = list_runs(chosen, scenes, options.seeds or (0,), scale)
@@ -94,5 +96,5 @@ def written_command(options: ReproduceOptions, scenes: list[Scene]) -> str:
     for name in ("scenes", "scale", "iterations", "resolution", "seeds", "recipes", "baseline"):
         value = getattr(options, name)
         if value != getattr(ReproduceOptions(()), name):
-            words += [f"--{name}", *(map(str, value) if isinstance(value, tuple) else [str(value)])]
+            words += [f"--{name}", *(shlex.quote(str(item)) for item in (value if isinstance(value, tuple) else [value]))]
     return " ".join(words)

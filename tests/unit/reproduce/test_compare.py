@@ -24,7 +24,7 @@ def test_one_table_for_each_baseline_and_score_that_the_records_have():
 def test_cells():
     gains = {"x": 0.1, "y": 0.2, "z": 0.3}
     runs = [record("moe-gs", s, psnr=30 + g) for s, g in gains.items()] + [record("scaffold-gs", s, seed=k) for s in gains for k in (0, 1)]
-    table = make_difference_table(runs, ["scaffold-gs", "moe-gs"], "scaffold-gs", "psnr", "xyz")
+    table = make_difference_table(runs, {r: r for r in ("scaffold-gs", "moe-gs")}, "scaffold-gs", "psnr", "xyz")
     ((name, *cells),) = table.rows
     assert name == "moe-gs" and cells[:4] == ["+0.10", "+0.20", "+0.30", "+0.20"] and cells[-1] == "-0.05 to +0.45"
     assert len(table.titles) == len(table.rows[0]) and "1 of the 2 seeds" in " ".join(table.notes)
