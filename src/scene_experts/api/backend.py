@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal
@@ -11,6 +13,7 @@ import torch
 from scene_experts.core.choices import Device, Raster
 from scene_experts.core.errors import InputError
 from scene_experts.render import Rasterizer, choose
+from scene_experts.render.gsplat import explain_missing
 
 
 def backend(device: Device, raster: Raster, antialias: bool, deterministic: bool) -> tuple[str, Rasterizer]:
@@ -18,22 +21,43 @@ def backend(device: Device, raster: Raster, antialias: bool, deterministic: bool
 
     deterministic: also make torch use its deterministic algorithms from now on, in the whole process.
     """
-    device = device_of(device)
+    device = device_of(device, raster)
     if deterministic:
         torch.use_deterministic_algorithms(True, warn_only=True)
     return device, choose(raster, device, antialias=antialias, deterministic=deterministic)
 
 
-def device_of(device: str) -> Literal["cpu", "cuda"]:
-    """Return "cpu" or "cuda". "auto" is CUDA if torch finds it. Raises InputError for another name, and for "cuda" without CUDA."""
+def device_of(device: str, raster: Raster = "auto") -> Literal["cpu", "cuda"]:
+    """Return "cpu" or "cuda".
+
+    "auto" is CUDA if torch finds a device and the rasteriser `raster` draws on it. If only gsplat is missing for the rasteriser "auto",
+    the CPU is used, and one warning says what to install. Raises InputError for another name, and for "cuda" without CUDA.
+    """
     available = torch.cuda.is_available()
     if device == "cuda" and not available:
         raise InputError("expected a CUDA device, found none that torch can use; run `scene-experts doctor`, or use --device cpu")
     if device == "cpu":
         return "cpu"
-    if device in ("auto", "cuda"):
-        return "cuda" if available else "cpu"
+    if device == "cuda":
+        return "cuda"
+    if device == "auto":
+        return "cuda" if available and _draws_on_cuda(raster) else "cpu"
     raise InputError(f"expected a device among auto, cpu and cuda, found {device!r}; use one of those")
+
+
+def _draws_on_cuda(raster: Raster) -> bool:
+    """Whether CUDA is the device for `raster` if the user names none."""
+    if raster in ("cpu", "reference"):
+        return raster == "reference"
+    reason = explain_missing()
+    if reason is not None and raster == "auto":
+        _warn(reason)
+    return reason is None or raster == "gsplat"  # `gsplat` raises its own error when it draws
+
+
+@functools.cache
+def _warn(reason: str) -> None:
+    warnings.warn(f"the GPU is not used, and the CPU is: {reason}", stacklevel=4)
 
 
 @contextmanager

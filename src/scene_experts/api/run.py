@@ -355,7 +355,7 @@ def open_run(
         path: The folder that `train`, `scene-experts train` or an import wrote.
         step: Which checkpoint to open. Default: the newest whole one.
         data: Where the capture is now, if it moved.
-        device: "cpu", "cuda", or "auto" (CUDA if torch finds it).
+        device: "cpu", "cuda", or "auto" (CUDA if torch finds it and gsplat is installed).
         rasterizer: "cpu" (compiled), "gsplat" (CUDA), "reference" (plain torch, slow), or "auto" (the fastest that works on the device).
 
     Raises:

@@ -69,7 +69,7 @@ class Trainer:
             stop_at: Stop at this iteration of the unchanged schedule; `iterations` of the recipe rescales the schedule instead.
             deterministic: Bit-identical results on one machine, resumed or not; a little slower. Until the training ends, torch uses
                 deterministic algorithms in the whole process.
-            device: "cpu", "cuda", or "auto" (CUDA if torch finds it).
+            device: "cpu", "cuda", or "auto" (CUDA if torch finds it and gsplat is installed).
             rasterizer: "cpu" (compiled), "gsplat" (CUDA), "reference" (plain torch, slow), or "auto" (the fastest on the device).
             save_every: Iterations between checkpoints, at least 1.
             preview_every: Iterations between `Previewed` events; 0 for none.
@@ -86,7 +86,7 @@ class Trainer:
             raise InputError("expected a run folder `out` for resume, overwrite or tensorboard, found None; name one")
         if log_every < 1:
             raise InputError(f"expected log_every of at least 1, found {log_every}; give a larger number")
-        where = device_of(device)
+        where = device_of(device, rasterizer)
         rasterize = choose(rasterizer, where, antialias=self.recipe.antialias, deterministic=deterministic)
         loaded = capture if isinstance(capture, Capture) else load_capture(capture, seed=self.recipe.seed)
         self.capture = loaded.with_seed(self.recipe.seed)

@@ -124,9 +124,9 @@ def triton() -> Check:
     version = _version("triton")
     if not torch.cuda.is_available():
         return Check("triton", False, f"{version or 'not installed'} (it only runs on CUDA)")
-    from scene_experts.scene.anchors import triton_decode
+    from scene_experts.native.triton import explain_missing
 
-    reason = triton_decode.available()
+    reason = explain_missing()
     why, _, fix = (reason or "").partition(": ")
     return Check("triton", reason is None, version or "unknown" if reason is None else f"{why}; anchors are decoded in plain PyTorch", fix)
 

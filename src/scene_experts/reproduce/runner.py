@@ -14,6 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import torch
+
 from scene_experts.core.checkpoint import latest
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.signals import PARENT
@@ -60,6 +62,8 @@ class Runner:
         done = store.load(self.records)
         todo = [spec for spec in specs if store.find(done, spec) is None]
         self.say(f"{len(specs)} runs, {len(specs) - len(todo)} of them done")
+        if todo and self.workers > 1:
+            build_kernels()
         free = list(range(self.workers))
         failures: list[Failure] = []
 
@@ -155,6 +159,17 @@ class Runner:
         with self._lock:
             for process in self._running:
                 process.send_signal(signal.SIGTERM)
+
+
+def build_kernels() -> None:
+    """Build the CUDA code of gsplat in a process of its own, if this machine has a CUDA device.
+
+    gsplat compiles itself on its first import, and removes the lock and the build folder of a build that another process runs. Workers
+    that start together would therefore break each other's build.
+    """
+    if torch.cuda.is_available():
+        code = "from scene_experts.render.gsplat import explain_missing; explain_missing()"
+        subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
 
 
 def last_line(log: Path) -> str:

@@ -10,7 +10,7 @@ from scene_experts import render
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Gaussians
 from scene_experts.native import library as native
-from scene_experts.render import NAMES, as_trained, choose, for_growth
+from scene_experts.render import NAMES, as_trained, choose, for_growth, gsplat
 from support.messages import naming
 
 
@@ -31,6 +31,12 @@ def test_auto_on_a_device_without_a_fast_one_takes_the_reference():
     with pytest.warns(UserWarning, match="reference"):
         assert choose("auto", "meta").name == "reference"
     render._warn.cache_clear()
+
+
+def test_auto_on_cuda_without_gsplat_stops_and_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(gsplat, "explain_missing", lambda: "gsplat is missing: run `pip install scene-experts[cuda]`")
+    with pytest.raises(InputError, match=naming("scene-experts[cuda]", "--device cpu")):
+        choose("auto", "cuda")
 
 
 @pytest.mark.parametrize(

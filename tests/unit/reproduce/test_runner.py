@@ -9,6 +9,7 @@ import pytest
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
 from scene_experts.core.plain import to_json
+from scene_experts.reproduce import runner as module
 from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec
 from scene_experts.reproduce.runner import Runner, last_line
@@ -51,6 +52,25 @@ def test_what_is_done_is_not_done_again(runner):
     assert runner.run_all([spec(), spec(seed=1)]) == [] and len(runner.calls) == 4
     assert runner.run_all([spec(), spec(seed=1), spec("scaffold-gs")]) == [] and len(runner.calls) == 6
     assert len(store.load(runner.records)) == 3
+
+
+def test_several_workers_find_the_kernels_built(runner, monkeypatch):
+    built = []
+    monkeypatch.setattr(module, "build_kernels", lambda: built.append(len(runner.calls)))
+    runner.run_all([spec()])
+    assert built == [], "one worker builds them itself"
+    runner.workers = 2
+    runner.run_all([spec("scaffold-gs"), spec(seed=1)])
+    assert built == [2], "once, before the first of the workers' commands"
+
+
+def test_kernels_are_built_only_for_a_gpu(monkeypatch):
+    calls = []
+    monkeypatch.setattr(module.subprocess, "run", lambda command, **options: calls.append(command))
+    for there in (False, True):
+        monkeypatch.setattr(module.torch.cuda, "is_available", lambda there=there: there)
+        module.build_kernels()
+    assert len(calls) == 1 and "explain_missing" in calls[0][-1]
 
 
 def test_one_failure_does_not_lose_the_rest(runner):

@@ -26,6 +26,7 @@ from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points, R
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.voxel import VoxelChoice, choose_voxel_size
 from scene_experts.native import library as native
+from scene_experts.native import triton
 from scene_experts.scene import Cull, Draws, LatticeScene, LearningRates, SceneConfig, Traits
 from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors.appearance import Codes, TestRule, fold
@@ -389,7 +390,7 @@ class AnchorScene(LatticeScene):
 def no_kernels(device: torch.device) -> str | None:
     """Return None if `device` has fused kernels, otherwise the reason why it has none."""
     if device.type == "cuda":
-        return triton_decode.available()
+        return triton.explain_missing()
     return native.explain_missing() if device.type == "cpu" else f"no kernels for {device.type}"
 
 

@@ -8,7 +8,6 @@ inputs give the same bits. Symbols as in `types.py`.
 
 from __future__ import annotations
 
-import functools
 import importlib
 from dataclasses import dataclass
 from types import ModuleType
@@ -18,6 +17,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.types import Gaussians, Routing
+from scene_experts.native.triton import launch
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, LEAST_MARGIN, HeadWeights
 
 ACTIVATION = {"opacity": 0, "cov": 1, "color": 2}  # TANH, NONE, SIGMOID of triton_kernels.py
@@ -27,27 +27,6 @@ BLOCK = 32  # anchors per program; with the paper's sizes, the largest block who
 BLOCK_WEIGHTS = 16  # anchors per step of `weight_backward`, which also keeps the gradient of a network in registers
 MOST_EXPERTS = 30  # a set of experts is stored as the bits of an int32
 WIDEST = 256  # largest padded number of outputs
-
-
-@functools.cache
-def available() -> str | None:
-    """Return None if the kernels can run, otherwise one sentence with the reason and the remedy. Without a CUDA device, only the import is
-    checked."""
-    try:
-        importlib.import_module("triton")
-    except Exception as error:  # a broken installation can raise any exception
-        reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
-        return f"triton cannot be imported ({reason[0]}): install it with `pip install scene-experts[cuda]`, or decode in plain torch"
-    if not torch.cuda.is_available():
-        return None
-    if torch.cuda.get_device_capability()[0] < 8:
-        return "the Triton decode needs a GPU of compute capability 8.0 or newer: decode in plain torch"
-    try:  # Triton builds its launcher with the system's C compiler
-        _kernels().probe[(1,)](torch.zeros(1, device="cuda"))
-    except Exception as error:
-        reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
-        return f"triton cannot compile here ({reason[0]}): install a C compiler, or decode in plain torch"
-    return None
 
 
 def covers(attribute: str, h: HeadWeights, F: int, K: int) -> bool:
@@ -183,7 +162,7 @@ class _Decode(torch.autograd.Function):
         source = torch.empty(M, dtype=torch.int64, device=raw.device)
         if M:
             arguments = (plan.rows, plan.xyz, columns[2], columns[1], raw, cov, dst, means, quats, scales, opacities, source, A)
-            _kernels().place[(-(-A // BLOCK),)](*arguments, K=K, B=BLOCK, KP=pad(K, 1))
+            launch(_kernels().place, (-(-A // BLOCK),), *arguments, K=K, B=BLOCK, KP=pad(K, 1))
         gates, chosen = [r[0] for r in routes], [r[2] for r in routes]
         ctx.plan = plan
         ctx.mark_non_differentiable(source, *(c for c in chosen if c is not None))
@@ -204,7 +183,7 @@ class _Decode(torch.autograd.Function):
         if A:
             given = (plan.rows, columns[2], columns[1], cov, dst, quats, d_means, d_quats, d_scales, d_opacities, d_raw)
             grid = (-(-A // BLOCK),)
-            _kernels().place_backward[grid](*given, d_offsets, d_log_scaling, d_cov, d_all, A, K=K, B=BLOCK, KP=pad(K, 1))
+            launch(_kernels().place_backward, grid, *given, d_offsets, d_log_scaling, d_cov, d_all, A, K=K, B=BLOCK, KP=pad(K, 1))
         d_weights: list[Tensor | None] = []
         for i, d_out in enumerate((d_all, d_cov, d_colors)):
             d_weights += _backward(plan, i, routes[i], columns[0], weights, dst, d_out, d_gates[i], d_feature)
@@ -229,7 +208,7 @@ def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Ten
         sizes |= {"FP": pad(feature.shape[1]), "EP": pad(head.E), "B": BLOCK, "PRECISION": PRECISION}
         unused = plan.rows  # placeholder for arrays that the kernel does not access
         arguments = [plan.rows, plan.xyz, feature, weights[0], bias, gates, weight, chosen, keys]
-        _kernels().route[(-(-A // BLOCK),)](*(unused if t is None else t for t in arguments), A, plan.extent, **sizes)
+        launch(_kernels().route, (-(-A // BLOCK),), *(unused if t is None else t for t in arguments), A, plan.extent, **sizes)
     return gates, weight, chosen, keys, None if keys is None else plan.order(keys)
 
 
@@ -240,7 +219,8 @@ def _forward(plan: _Plan, i: int, routes: Any, feature: Tensor, weights: Any, ds
         return
     _, weight, _, keys, order = routes[i]
     arguments = [plan.rows, order, keys, weight, plan.xyz, feature, plan.camera, *weights[6 * i + 2 : 6 * i + 6], dst, out]
-    _kernels().head_forward[(-(-A // BLOCK),)](*(plan.rows if t is None else t for t in arguments), A, **plan.heads[i].sizes, B=BLOCK)
+    given = (plan.rows if t is None else t for t in arguments)
+    launch(_kernels().head_forward, (-(-A // BLOCK),), *given, A, **plan.heads[i].sizes, B=BLOCK)
 
 
 def _backward(
@@ -255,7 +235,9 @@ def _backward(
     shared = [plan.rows, order, keys, weight]
     arguments = [*shared, gates, plan.xyz, feature, plan.camera, own[0], *own[2:], dst, d_out, d_gates, d_logits, d_feature]
     grid = (-(-A // BLOCK),)
-    _kernels().head_backward[grid](
+    launch(
+        _kernels().head_backward,
+        grid,
         *(plan.rows if t is None else t for t in arguments),
         A,
         **head.sizes,
@@ -268,9 +250,8 @@ def _backward(
     blocks = -(-A // BLOCK_WEIGHTS)
     parts = [t.new_empty(_parts(t.device, head.E, blocks), *t.shape) for t in own[2:]]
     arguments = [*shared, plan.xyz, feature, plan.camera, *own[2:], dst, d_out, *parts]
-    _kernels().weight_backward[(head.E, len(parts[0]))](
-        *(plan.rows if t is None else t for t in arguments), A, blocks, **head.sizes, B=BLOCK_WEIGHTS
-    )
+    given = (plan.rows if t is None else t for t in arguments)
+    launch(_kernels().weight_backward, (head.E, len(parts[0])), *given, A, blocks, **head.sizes, B=BLOCK_WEIGHTS)
     found: list[Tensor | None] = [None, None]
     if d_logits is not None:
         seen = feature.index_select(0, plan.rows)

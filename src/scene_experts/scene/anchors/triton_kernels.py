@@ -8,6 +8,9 @@ Tiles are padded to powers of two: XP inputs, HP hidden units, COLS outputs, EP 
 x = (feature, unit direction, distance if used, 1). The 1 multiplies the bias, so one matrix product computes the first layer and one
 its gradient. Activations: TANH, NONE, SIGMOID. `dst` [A * K] is the index of each slot among the drawn Gaussians, or -1 if the slot is
 not drawn.
+
+Triton compiles a kernel anew for a count that is 1 or divisible by 16, unless `do_not_specialize` names it. The counts change in every
+step.
 """
 
 from __future__ import annotations
@@ -17,12 +20,6 @@ import triton.language as tl
 
 TANH, NONE, SIGMOID = 0, 1, 2
 EPS = tl.constexpr(1e-12)  # keeps directions and quaternions finite if their length is 0; equals EPS of scene.py
-
-
-@triton.jit
-def probe(to):
-    """Write a 1. The call shows whether kernels compile and run on this machine."""
-    tl.store(to, 1.0)
 
 
 @triton.jit
@@ -121,7 +118,7 @@ def outputs(dst, anchor, inside, K: tl.constexpr, C: tl.constexpr, COLS: tl.cons
     return at, there
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["A"])
 def route(
     rows, xyz, feature, router_w, router_b, gates, weight, chosen, keys, A, extent,
     F: tl.constexpr, E: tl.constexpr, TOP: tl.constexpr, BIAS: tl.constexpr, POSITION: tl.constexpr, MARGIN: tl.constexpr,
@@ -167,7 +164,7 @@ def route(
         tl.store(keys + anchor, key, mask=inside)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["A"])
 def head_forward(
     rows, order, keys, weight, xyz, feature, camera, w1, b1, w2, b2, dst, out, A,
     E: tl.constexpr, F: tl.constexpr, H: tl.constexpr, K: tl.constexpr, C: tl.constexpr,
@@ -191,7 +188,7 @@ def head_forward(
     tl.store(out + at, y, mask=there)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["A"])
 def head_backward(
     rows, order, keys, weight, gates, xyz, feature, camera, router_w, w1, b1, w2, b2, dst, d_out, d_gates, d_logits, d_feature, A,
     E: tl.constexpr, F: tl.constexpr, H: tl.constexpr, K: tl.constexpr, C: tl.constexpr,
@@ -245,7 +242,7 @@ def head_backward(
     tl.store(to, tl.load(to, mask=kept, other=0.0) + dx, mask=kept)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["A", "blocks"])
 def weight_backward(
     rows, order, keys, weight, xyz, feature, camera, w1, b1, w2, b2, dst, d_out, d_w1, d_b1, d_w2, d_b2, A, blocks,
     E: tl.constexpr, F: tl.constexpr, H: tl.constexpr, K: tl.constexpr, C: tl.constexpr,
@@ -284,7 +281,7 @@ def weight_backward(
     tl.store(d_b2 + mine_of_all * K * C + out, sum_b, mask=real)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["A"])
 def place(
     rows, xyz, offsets, log_scaling, raw, cov, dst, means, quats, scales, opacities, source, A,
     K: tl.constexpr, B: tl.constexpr, KP: tl.constexpr,
@@ -316,7 +313,7 @@ def place(
         tl.store(quats + d * 4 + c, tl.load(cov + d * 7 + 3 + c, mask=drawn, other=0.0) / length, mask=drawn)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["A"])
 def place_backward(
     rows, offsets, log_scaling, cov, dst, quats, d_means, d_quats, d_scales, d_opacities, d_raw,
     d_offsets, d_log_scaling, d_cov, d_opacity_head, A,
