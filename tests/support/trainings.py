@@ -22,9 +22,12 @@ def config(recipe="moe-gs", **changes):
 
 
 def events(cfg, folder, out=None, rasterizer="auto", world=None, **run):
-    """Train on the capture in `folder` (or on the loaded capture `world`) and yield the events."""
+    """Train on the capture in `folder` (or on the loaded capture `world`) and yield the events.
+
+    ordered: sum in the order of the views, as `--deterministic` does.
+    """
     capture = world or load(folder)
-    made = Run(RunConfig(cfg, Data(folder), stop_at=run.pop("stop_at", None)), out=out, **run)
+    made = Run(RunConfig(cfg, Data(folder), deterministic=run.pop("ordered", False), stop_at=run.pop("stop_at", None)), out=out, **run)
     try:
         yield from train(cfg, made, capture, choose(rasterizer, "cpu", deterministic=True))
     finally:

@@ -30,7 +30,7 @@ def train(run: loop.Run, capture: Capture, rasterize: Rasterizer, *, overwrite: 
     overwrite: start again in a folder that holds an earlier run.  tensorboard: write `run.out`/tensorboard too.
     Raises InputError if the folder cannot hold the run, and RunError if a file cannot be written.
     """
-    if run.out is None:
+    if run.out is None or not run.group.first:  # process 0 writes all files
         yield from loop.train(run.config.train, run, capture, rasterize)
         return
     finished, complete = None, False

@@ -13,7 +13,7 @@ from typing import Annotated
 from rich.console import Console
 
 from scene_experts.api import recording
-from scene_experts.api.backend import backend
+from scene_experts.api.backend import backend, device_of
 from scene_experts.arguments.help import columns
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import HELP, HELP_ALL, Command, HelpAsked, parse
@@ -21,6 +21,7 @@ from scene_experts.arguments.table import rows
 from scene_experts.commands import PROG
 from scene_experts.core.choices import Device, Raster
 from scene_experts.core.errors import InputError, few, nearest
+from scene_experts.core.group import Alone, join
 from scene_experts.core.signals import handled
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.catalog import PREFIX, Numbers, one
@@ -28,6 +29,7 @@ from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer
 from scene_experts.training import run_folder
+from scene_experts.training.batch import check_batch
 from scene_experts.training.config import RunConfig, Train, with_numbers
 from scene_experts.training.events import Exported
 from scene_experts.training.loop import Run
@@ -106,23 +108,42 @@ class TrainCommand:
 
 def train(args: list[str]) -> int:
     command = parse_train(args)
+    group = join(device_of(command.device))
+    command = after_restart(replace(command, viewer=command.viewer and group.first), group)
+    line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # the command of the whole run
+    command, run, capture, rasterize = group.agree(lambda: prepare(command, line, group))
+    console = Console(highlight=False, quiet=not group.first)
+    for warning in capture.warnings if group.first else ():
+        print(f"warning: {warning}", file=sys.stderr)
+    what = f"{command.cfg.recipe} on {capture.name} ({len(capture.train)} views)"
+    together = f", {group.size} processes" if group.size > 1 else ""
+    console.print(f"{what}, {run.device}, rasteriser {rasterize.name}{together}", soft_wrap=True)
+    code = follow(command, run, capture, rasterize, console)
+    group.leave()
+    return code
+
+
+def after_restart(command: TrainCommand, group: Alone) -> TrainCommand:
+    """Let a command that `torchrun` has restarted continue its run, if the run had begun."""
+    begun = group.restarts > 0 and (command.out / "config.json").is_file()
+    return replace(command, resume=True, overwrite=False) if begun else command
+
+
+def prepare(command: TrainCommand, line: str, group: Alone) -> tuple[TrainCommand, Run, Capture, Rasterizer]:
+    """Check the options and load the capture. Nothing is written. Raises InputError for invalid options or an invalid capture."""
     if command.viewer:
         check_port(command.port)
         import_viser()  # reports a missing package before anything is read
     command = replace(command, data=run_folder.named(command.data))
-    line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # the command of the whole run
-    run = run_of(command, line)
+    run = replace(run_of(command, line), group=group)
     recording.check_settings(run)
+    check_batch(command.cfg.batch, group.size)
     reuse_freed()
-    console = Console(highlight=False)
-    device, rasterize = backend(command.device, command.rasterizer, command.cfg.antialias, command.deterministic)
+    device, rasterize = group.in_turn(
+        lambda: backend(command.device, command.rasterizer, command.cfg.antialias, command.deterministic),
+    )
     run_folder.check(command.out, run.config, command.resume, command.overwrite)
-    capture = run_folder.load_capture(command.data, command.cfg.seed)
-    for warning in capture.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
-    what = f"{command.cfg.recipe} on {capture.name} ({len(capture.train)} views)"
-    console.print(f"{what}, {device}, rasteriser {rasterize.name}", soft_wrap=True)
-    return follow(command, replace(run, device=device), capture, rasterize, console)
+    return command, replace(run, device=device), run_folder.load_capture(command.data, command.cfg.seed), rasterize
 
 
 def run_of(command: TrainCommand, line: str) -> Run:

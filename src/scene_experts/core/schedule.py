@@ -29,6 +29,11 @@ class Every:
         return replace(self, start=round(self.start * factor), stop=round(self.stop * factor))
 
 
+def passes(step: int, views: int, interval: int) -> bool:
+    """Return whether one of the `views` iterations up to `step` is a multiple of `interval`."""
+    return step // interval > (step - views) // interval
+
+
 @dataclass(frozen=True)
 class Rate:
     """A learning rate that runs log-linearly from `first` to `last` over the training; 0 stays 0."""

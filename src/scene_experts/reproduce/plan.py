@@ -25,6 +25,7 @@ COLLECTIONS = {"mipnerf360": "MipNeRF360", "tandt": "TanksAndTemples", "db": "De
 NEWER = {
     "optimizer",
     "average",
+    "batch",
     "loss.residual_quantile",
     "loss.residual_weight",
     "loss.residual_from",

@@ -132,6 +132,17 @@ class Scene(nn.Module):
         """
         return self
 
+    def set_batch(self, views: int) -> None:
+        """Tell the scene how many views an optimiser step sees. The default does nothing."""
+
+    def counts(self) -> list[Tensor]:
+        """Return what the scene has counted in the training views of a batch of more than one view, for `settle`. All processes add up
+        these tensors in place. The default counts nothing."""
+        return []
+
+    def settle(self) -> None:
+        """Use the counts of a whole batch of more than one view, and begin to count anew. The default does nothing."""
+
     def set_training_cameras(self, cameras: Sequence[Camera]) -> None:
         """Give the scene the cameras of its training views, before each training or its resumption. The default does nothing."""
 

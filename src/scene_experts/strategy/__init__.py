@@ -31,8 +31,10 @@ class Edit:
 class Strategy(Part, Generic[S], ABC):
     """Hyper-parameters of a densification strategy for scenes of class S. The flags are under --growth.
 
-    The strategy keeps its running statistics in `table.stats`. Each iteration calls `observe`, `survey` and then `update` after the
-    backward pass, and `finish` after the optimiser's step.
+    The strategy keeps its running statistics in `table.stats`. After the backward pass of a view, the training calls `observe`. After
+    the last view of a batch it calls `survey` and `update` for each iteration of the batch, and `finish` after the optimiser's step.
+    A batch has one view by default. Several processes share its views: each observes its own views, the statistics are then added up,
+    and every process makes the same changes.
     """
 
     grows: ClassVar[str]
@@ -53,7 +55,15 @@ class Strategy(Part, Generic[S], ABC):
         return None
 
     def observe(self, scene: S, decoded: Decoded, render: Render, step: int) -> None:
-        """Add one view to the statistics. The default does nothing."""
+        """Add one view to the statistics. The default does nothing. It may only add to sums, and create sums of zeros: other processes
+        add other views."""
+
+    def reads(self, step: int) -> bool:
+        """Whether `survey` or `update` at `step` reads or removes statistics, or removes rows. The default is the safe answer, True.
+
+        Several processes exchange their statistics only then.
+        """
+        return True
 
     def survey(self, scene: S, survey: Survey, step: int, generator: torch.Generator) -> None:
         """Look at further training views before `update`. The default does nothing. generator: the only source of randomness."""

@@ -92,6 +92,10 @@ class SplitClone(Strategy[GaussianScene]):
             stats |= {"grad": torch.zeros_like(like), "count": torch.zeros_like(like)}
         observe.observe_drawn(stats, decoded, render)
 
+    def reads(self, step: int) -> bool:
+        """Whether densification is due at `step`, or the statistics end."""
+        return self.adjust.due(step) or step >= self.adjust.stop
+
     def update(self, scene: GaussianScene, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
         """Clone, split, remove and reset Gaussians if due at `step`. Returns None if densification is not due.
 

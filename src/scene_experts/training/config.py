@@ -43,6 +43,9 @@ class Train:
     """An average of the weights, which is evaluated and exported in place of the last weights."""
     iterations: int = SCHEDULE
     """Number of training iterations. Another number rescales the whole schedule (learning rates, densification, warm-up)."""
+    batch: int = 1
+    """Training views per optimiser step. Iterations count views, so N iterations make N / batch steps. Several processes (torchrun) share
+    the views of a batch."""
     seed: int = 0
     """Seed of all random numbers, at least 0."""
     antialias: bool = False
@@ -91,8 +94,12 @@ class RunConfig:
 def check(cfg: Train) -> None:
     """Check the settings. Raises InputError, which names the flag, if a setting is invalid."""
     expect_at_least([("--iterations", cfg.iterations, 1), ("--seed", cfg.seed, 0), ("--max-anchors", cfg.max_anchors, 0)])
+    expect_at_least([("--batch", cfg.batch, 1)])
     if cfg.seed > LARGEST_SEED:
         raise InputError(f"expected --seed of at most {LARGEST_SEED}, found {cfg.seed}; give a smaller number")
+    if cfg.iterations % cfg.batch:
+        nearest = max(1, round(cfg.iterations / cfg.batch)) * cfg.batch
+        raise InputError(f"expected --iterations that --batch {cfg.batch} divides, found {cfg.iterations}; give for example {nearest}")
     for part in (cfg.scene, cfg.loss, cfg.growth, cfg.rates, cfg.optimizer, cfg.average):
         part.check()
     if unknown := unregistered(cfg):

@@ -14,18 +14,19 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import RunError
+from scene_experts.core.schedule import passes
 from scene_experts.training.optim import FusedAdam
 
 EVERY = 100  # iterations between scans where the optimiser does not report
 
 
-def find_broken(optimizer: torch.optim.Optimizer, step: int) -> str:
-    """Return the name of a parameter that iteration `step` left with a value or optimiser state that is not finite, else "".
+def find_broken(optimizer: torch.optim.Optimizer, step: int, views: int = 1) -> str:
+    """Return the name of a parameter that the last `views` iterations left with a value or state that is not finite, else "".
 
     The groups of `optimizer` have a "name". `FusedAdam` reports the name after every step.
     """
     reported = optimizer.broken if isinstance(optimizer, FusedAdam) else None
-    if reported is not None or step % EVERY:
+    if reported is not None or not passes(step, views, EVERY):
         return reported or ""
     return next((str(name) for name, tensors in _states(optimizer) if not are_finite(tensors)), "")
 

@@ -13,12 +13,15 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.group import Alone
+from scene_experts.core.schedule import passes
 from scene_experts.core.transfer import upload
 from scene_experts.core.types import Decoded, Mode, Render, Routing
 from scene_experts.data.capture import Capture
 from scene_experts.render import Rasterizer, for_growth
 from scene_experts.strategy import Edit
 from scene_experts.strategy.survey import Photo, Survey
+from scene_experts.training.batch import Direct, make_exchange
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.guard import explain, find_broken
@@ -27,6 +30,7 @@ from scene_experts.training.memory import anchor_cap, check_start
 from scene_experts.training.state import Training, resume, save
 
 log: logging.Logger = logging.getLogger(__name__)
+AHEAD = 3  # photographs that are read before they are needed
 ROUTED = 16_384  # anchors sampled for the routing statistics; the shares are within 0.5 % of those of all anchors
 
 
@@ -46,19 +50,20 @@ class Run:
     keep: int = 2  # number of checkpoints to keep
     begin: Callable[[Training], None] = lambda training: None  # called once, before the first event
     watch: Callable[[Training], None] = lambda training: None  # called between iterations and not timed; the viewer renders here
+    group: Alone = field(default_factory=Alone)  # the processes that share the views of each batch; process 0 writes all files
     stop: list[str] = field(default_factory=list)  # append a reason to save and stop, for example from a signal handler
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """Inputs and results of one iteration."""
+    """Inputs and results of the last view of a batch that this process drew, and what densification did after the batch."""
 
     decoded: Decoded
     render: Render
     terms: dict[str, Tensor]
     target: Tensor  # [H, W, 3]
     mask: Tensor | None  # [H, W]
-    edit: Edit | None
+    edits: tuple[tuple[int, Edit], ...] = ()  # iteration and result of each densification step
 
 
 def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iterator[Event]:
@@ -74,11 +79,56 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
         The events of the training. The first is `Started`; the last is `Finished` or `Stopped`.
 
     Raises:
-        InputError: The settings, the capture or the checkpoint cannot be used.
-        RunError: A loss or a parameter is not finite, or a checkpoint cannot be written.
+        InputError: The settings, the capture or the checkpoint cannot be used, or the processes cannot share a batch evenly.
+        RunError: Another process has ended, a loss or a parameter is not finite, or a checkpoint cannot be written.
     """
     cfg = cfg.scaled()
     folder = run.out / "checkpoints" if run.out else None
+    training = run.group.agree(lambda: begin(cfg, run, capture, folder))
+    rasterize = for_growth(rasterize, cfg.growth.absolute)
+    exchange = make_exchange(training, run.group, run.stop, run.config.deterministic)
+    exchange.start()
+    total = min(cfg.iterations, -(-(run.config.stop_at or cfg.iterations) // cfg.batch) * cfg.batch)
+    writes = folder is not None and run.group.first
+    run.begin(training)
+    yield Started(training.step, total, len(training.scene.table), training.scene.traits)
+    saved, parts = training.step, {}
+    while training.step < total and not exchange.stopping:
+        with training.clock.running():
+            done = iterate(training, run, capture, rasterize, exchange)
+        step, parts = training.step, done.terms
+        if broken := find_broken(training.optimizer, step, cfg.batch):
+            check_finite(step, parts)
+            raise RunError(explain(f"the parameter '{broken}' or its gradient", step, folder))
+        for number, edit in done.edits:
+            yield Densified(number, edit)
+        if step == total or passes(step, cfg.batch, run.log_every):
+            check_finite(step, parts)
+            if run.group.first:
+                yield measure_step(training, done)
+        if run.preview_every and run.group.first and (step == total or passes(step, cfg.batch, run.preview_every)):
+            yield preview(training, run, capture, rasterize)
+        if folder and (step == total or passes(step, cfg.batch, run.save_every)):
+            check_finite(step, parts)
+            exchange.complete()
+            if writes:
+                yield Saved(step, save(training, folder, run.keep))
+            saved = step
+        del done  # frees its memory before the next frame
+        run.watch(training)
+    if folder and saved != training.step:
+        check_finite(training.step, parts)
+        exchange.complete()
+        if writes:
+            yield Saved(training.step, save(training, folder, run.keep))
+    if exchange.stopping and training.step < total:
+        yield Stopped(training.step, run.stop[0])
+    else:
+        yield Finished(training.step, training.clock.seconds)
+
+
+def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None) -> Training:
+    """Start a training, or restore it from the newest whole checkpoint in `folder`. `cfg` must be scaled. Raises InputError as `train`."""
     training = resume(cfg, folder, run.device) if run.resume and folder else None
     if training and training.capture_id not in ("", capture.fingerprint()):
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
@@ -86,71 +136,72 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     check_start(training.scene, training.step > 0, run.max_memory)
     training.capture_id = capture.fingerprint()
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
-    rasterize = for_growth(rasterize, cfg.growth.absolute)
-    total = min(cfg.iterations, run.config.stop_at or cfg.iterations)
-    run.begin(training)
-    yield Started(training.step, total, len(training.scene.table), training.scene.traits)
-    saved, parts = training.step, {}
-    while training.step < total and not run.stop:
-        with training.clock.running():
-            done = iterate(training, run, capture, rasterize)
-        step, parts = training.step, done.terms
-        if broken := find_broken(training.optimizer, step):
-            check_finite(step, parts)
-            raise RunError(explain(f"the parameter '{broken}' or its gradient", step, folder))
-        if done.edit is not None:
-            yield Densified(step, done.edit)
-        if step % run.log_every == 0 or step == total:
-            check_finite(step, parts)
-            yield measure_step(training, done)
-        if run.preview_every and (step % run.preview_every == 0 or step == total):
-            yield preview(training, run, capture, rasterize)
-        if folder and (step % run.save_every == 0 or step == total):
-            check_finite(step, parts)
-            yield Saved(step, save(training, folder, run.keep))
-            saved = step
-        del done  # frees its memory before the next frame
-        run.watch(training)
-    if folder and saved != training.step:
-        check_finite(training.step, parts)
-        yield Saved(training.step, save(training, folder, run.keep))
-    if run.stop and training.step < total:
-        yield Stopped(training.step, run.stop[0])
-    else:
-        yield Finished(training.step, training.clock.seconds)
+    return training
 
 
-def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Iteration:
-    """Run one iteration, in the order of the paper: learning rates, view, decoding, rendering, loss, gradients, densification, Adam."""
+def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterizer, exchange: Direct | None = None) -> Iteration:
+    """See the views of one batch and take one optimiser step. Iterations count views, so the step advances by `cfg.batch`.
+
+    The order is that of the paper: learning rates; view, decoding, rendering, loss, gradients; densification; Adam.
+    exchange: How the gradients and statistics of the views come together; None for one process.
+    """
     cfg, scene = training.cfg, training.scene
-    training.step += 1
+    exchange = exchange or Direct(training, run.group, run.stop)
+    training.step += cfg.batch
     training.set_rates()
-    index, following = training.next_view(capture.train)
+    batch, numbers = training.next_batch(capture.train), training.views_of(training.step)
+    mine = range(run.group.rank, cfg.batch, run.group.size)
+    upcoming = [batch[place][0] for place in mine] + training.queue[run.group.rank :: run.group.size]
+    done = None
+    for turn, place in enumerate(mine, 1):
+        capture.images.prefetch(upcoming[turn : turn + AHEAD])
+        done = None  # frees the memory of the previous view
+        done = see_view(training, run, capture, rasterize, numbers[place], *batch[place])
+        exchange.add(done.decoded, done.render)
+    assert done is not None
+    training.seed_view(training.step + 1)
+    exchange.finish()
+    rows = exchange.rows() if cfg.sparse_adam else None
+    cap = exchange.limit(anchor_cap(scene, cfg.growth.max_anchors, run.max_memory, training.largest), run.max_memory > 0)
+    if any(cfg.growth.reads(number) for number in numbers):
+        exchange.complete()
+    edits, survey = [], survey_of(training, run, capture, rasterize)
+    for number in numbers:
+        cfg.growth.survey(scene, survey, number, training.growth_rng)
+        edit = cfg.growth.update(scene, number, training.growth_rng, cap)
+        edits += [] if edit is None else [(number, edit)]
+    exchange.compare(len(scene.table), bool(edits))
+    training.optimizer_step(None if edits else rows)
+    cfg.growth.finish(scene, training.step, training.rates(), training.growth_rng)
+    training.update_averages()
+    return replace(done, edits=tuple(edits))
+
+
+def see_view(
+    training: Training, run: Run, capture: Capture, rasterize: Rasterizer, number: int, index: int, color: Tensor | None
+) -> Iteration:
+    """Draw training view `index` as iteration `number`, and add the gradients of its loss to those of the parameters.
+
+    color: Background [3] of this view; None is the background of the capture.
+    """
+    cfg, scene = training.cfg, training.scene
     camera = capture.views[index].camera.to(run.device, run.dtype)
     frame = capture.frame(index)
-    capture.images.prefetch(following)
     target = upload(frame.rgb, run.device, run.dtype).div_(255.0)
     mask = None if frame.mask is None else upload(frame.mask, run.device, run.dtype)
-    background = torch.rand(3, generator=training.views_rng) if cfg.random_background else torch.tensor(capture.background)
-    decoded = scene(camera, training.step, Mode.TRAIN, rasterize.visible)
-    if cfg.loss.needs_scene_opacity(training.step):
-        decoded = replace(decoded, scene_opacity=scene.scene_opacity(camera, training.step, Mode.TRAIN))
+    background = torch.tensor(capture.background) if color is None else color
+    training.seed_view(number)
+    decoded = scene(camera, number, Mode.TRAIN, rasterize.visible)
+    if cfg.loss.needs_scene_opacity(number):
+        decoded = replace(decoded, scene_opacity=scene.scene_opacity(camera, number, Mode.TRAIN))
     render = rasterize(decoded.gaussians, camera, upload(background, run.device, run.dtype))
-    parts = compute_terms(Sample(decoded, render, target, mask, training.step), cfg.loss)
+    parts = compute_terms(Sample(decoded, render, target, mask, number), cfg.loss)
     loss = torch.stack(list(parts.values())).sum()
     if loss.requires_grad:
         loss.backward()
     decoded, render, parts = without_graph((decoded, render, parts))
-    del loss
     training.largest.see(decoded, render)
-    cap = anchor_cap(scene, cfg.growth.max_anchors, run.max_memory, training.largest)
-    cfg.growth.observe(scene, decoded, render, training.step)
-    cfg.growth.survey(scene, survey_of(training, run, capture, rasterize), training.step, training.growth_rng)
-    edit = cfg.growth.update(scene, training.step, training.growth_rng, cap)
-    step_optimizer(training, decoded, edit)
-    cfg.growth.finish(scene, training.step, training.rates(), training.growth_rng)
-    training.update_averages()
-    return Iteration(decoded, render, parts, target, mask, edit)
+    return Iteration(decoded, render, parts, target, mask)
 
 
 def survey_of(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Survey:
@@ -163,20 +214,6 @@ def survey_of(training: Training, run: Run, capture: Capture, rasterize: Rasteri
         return Photo(capture.views[index].camera.to(run.device, run.dtype), image, mask)
 
     return Survey(capture.train, photo, rasterize, torch.tensor(capture.background))
-
-
-def step_optimizer(training: Training, decoded: Decoded, edit: Edit | None) -> None:
-    """Run one optimiser step.
-
-    With `sparse_adam`, only the decoded rows are updated. All rows are updated if densification added or removed rows, or if the loss
-    has a gradient for rows that were not decoded.
-    """
-    cfg = training.cfg
-    if cfg.sparse_adam and edit is None and not cfg.loss.reaches_every_row(decoded):
-        training.optimizer.step(rows=decoded.rows)  # type: ignore[call-arg]
-    else:
-        training.optimizer.step()
-    training.optimizer.zero_grad(set_to_none=True)
 
 
 def without_graph(value: Any) -> Any:

@@ -5,10 +5,11 @@ The state uses torch's names (`exp_avg`, `exp_avg_sq`, `step`), so checkpoints w
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -27,6 +28,10 @@ class Optimizer(Part, ABC):
     """First word of the names that its state has in checkpoints."""
     by_row: ClassVar[bool] = False
     """Whether `step(rows=...)` of the built optimiser can move some rows of a table only; --sparse-adam needs it."""
+
+    def for_batch(self, views: int) -> Self:
+        """Return the settings for steps that see `views` views each. The training also multiplies the learning rates by sqrt(views)."""
+        return self
 
     @abstractmethod
     def build(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
@@ -52,6 +57,11 @@ class Adam(Optimizer):
     """Decay rates of the first and second moment."""
     eps: float = 1e-15
     """Term added to the denominator."""
+
+    def for_batch(self, views: int) -> Self:
+        """Return the settings with betas^views and eps / sqrt(views) (Zhao et al. 2024, "On scaling up 3D Gaussian splatting training")."""
+        beta1, beta2 = self.betas
+        return replace(self, betas=(beta1**views, beta2**views), eps=self.eps / math.sqrt(views))
 
     def build(self, groups: list[dict[str, Any]]) -> FusedAdam:
         return FusedAdam(groups, betas=self.betas, eps=self.eps)

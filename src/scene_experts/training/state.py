@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
+import math
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -51,7 +53,8 @@ class Training:
         columns = scene.table.params
         named = scene.rate_groups().items()
         groups = [{"params": params, "name": name, "lr": 0.0, "by_row": name in columns} for name, params in named]
-        self.optimizer = cfg.optimizer.build(groups)
+        self.optimizer = cfg.optimizer.for_batch(cfg.batch).build(groups)
+        scene.set_batch(cfg.batch)
         scene.table.attach(self.optimizer)
         self.averages = Averages(scene) if cfg.average.span > 0 else None
 
@@ -82,14 +85,45 @@ class Training:
             self.queue += [train[i] for i in torch.randperm(len(train), generator=self.views_rng).tolist()]
         return self.queue.pop(0), self.queue[:ahead]
 
+    def next_batch(self, train: tuple[int, ...]) -> list[tuple[int, Tensor | None]]:
+        """Return the next `cfg.batch` training views, each with its random background [3], or None without random backgrounds."""
+        batch: list[tuple[int, Tensor | None]] = []
+        for _ in range(self.cfg.batch):
+            index, _ = self.next_view(train)
+            batch.append((index, torch.rand(3, generator=self.views_rng) if self.cfg.random_background else None))
+        return batch
+
+    def views_of(self, step: int) -> range:
+        """Return the numbers, from 1, of the views that the optimiser step at iteration `step` sees."""
+        return range(step - self.cfg.batch + 1, step + 1)
+
+    def seed_view(self, number: int) -> None:
+        """Make the random numbers of a view, such as dropped anchors, depend on its number alone. No effect for a batch of one view."""
+        if self.cfg.batch > 1:
+            digest = hashlib.blake2b(f"{self.cfg.seed} {number}".encode(), digest_size=8).digest()
+            torch.manual_seed(int.from_bytes(digest, "little") >> 1)
+
     def set_rates(self) -> None:
+        """Set the learning rates of the iteration. They grow with the square root of the batch."""
         for group in self.optimizer.param_groups:
-            group["lr"] = self.cfg.rates.at(group["name"], self.step, self.cfg.iterations, self.scene.extent)
+            rate = self.cfg.rates.at(group["name"], self.step, self.cfg.iterations, self.scene.extent)
+            group["lr"] = rate * math.sqrt(self.cfg.batch)
+
+    def optimizer_step(self, rows: Tensor | None = None) -> None:
+        """Run one optimiser step and remove the gradients. rows: [A] int64, the only rows of the table to update; None updates all."""
+        if rows is None:
+            self.optimizer.step()
+        else:
+            self.optimizer.step(rows=rows)  # type: ignore[call-arg]
+        self.optimizer.zero_grad(set_to_none=True)
 
     def update_averages(self) -> None:
-        """Update the averages of the weights after an iteration, if they are due."""
-        if self.averages is not None and self.cfg.average.due(self.step):
-            self.averages.update(self.cfg.average.weight(self.step, self.cfg.iterations))
+        """Update the averages of the weights after an optimiser step, if they are due."""
+        if self.averages is None:
+            return
+        for number in self.views_of(self.step):
+            if self.cfg.average.due(number):
+                self.averages.update(self.cfg.average.weight(number, self.cfg.iterations))
 
     def averaged(self) -> AbstractContextManager[None]:
         """Context manager in which the scene has its averaged weights, as in the saved run. No effect without averages."""

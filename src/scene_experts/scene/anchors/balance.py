@@ -8,6 +8,7 @@ is the loss L_load.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,19 +47,36 @@ class BalancedHead(MixtureHead):
         super().__init__(config, *shape)
         self.router_balance = nn.Parameter(torch.zeros(config.num), requires_grad=False)
         self.moved_at: int | None = None
+        self.counted: Tensor = torch.zeros(config.num)  # how many anchors chose each expert, over the views of a batch
 
     def choose(self, logits: Tensor, k: int) -> Tensor:
         """Return the indices [A, k] of the largest biased gates, largest first."""
         return top_k(logits.softmax(dim=1) + self.router_balance, k)
 
     def route(self, feature: Tensor, step: int, position: Tensor | None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor]:
-        """Route as `MixtureHead` does. In training, also update the biases once per step."""
+        """Route as `MixtureHead` does. In training, also update the biases once per view, or count for `settle`."""
         routing, w = super().route(feature, step, position, mode)
         if mode is Mode.TRAIN and routing.chosen is not None and step != self.moved_at:
             count = torch.bincount(routing.chosen.reshape(-1), minlength=self.config.num).to(w.dtype)
-            self.router_balance += self.config.speed * (count.mean() - count).sign()
             self.moved_at = step  # a loss over the whole scene calls `route` a second time
+            if self.batch == 1:
+                self.move(count, self.config.speed)
+            else:
+                self.counted = self.counted.to(count) + count
         return routing, w
+
+    def move(self, count: Tensor, speed: float) -> None:
+        """Move the biases towards the experts that fewer anchors chose. count: [E]."""
+        self.router_balance += speed * (count.mean() - count).sign()
+
+    def counts(self) -> list[Tensor]:
+        self.counted = self.counted.to(self.router_balance)
+        return [self.counted]
+
+    def settle(self) -> None:
+        """Update the biases once for a batch, by the counts of all its views. Like a learning rate, the speed grows with sqrt(batch)."""
+        self.move(self.counted, self.config.speed * math.sqrt(self.batch))
+        self.counted.zero_()
 
     def weights(self, step: int) -> None:
         """Return None: the kernels choose experts by unbiased gates, so the composed form decodes."""

@@ -133,6 +133,7 @@ class MixtureHead(nn.Module):
     config: Experts
     attribute: str
     experts: int
+    batch: int = 1  # views per optimiser step
     w1: nn.Parameter
     b1: nn.Parameter
     w2: nn.Parameter
@@ -202,6 +203,13 @@ class MixtureHead(nn.Module):
         if self.config.router.renormalise:
             return torch.cat([logits.gather(1, chosen), shared], dim=1).softmax(dim=1)  # eq. 5
         return logits.softmax(dim=1).gather(1, self.with_shared(chosen))
+
+    def counts(self) -> list[Tensor]:
+        """Return what the head has counted in a batch, as `Scene.counts`. A plain mixture counts nothing."""
+        return []
+
+    def settle(self) -> None:
+        """Use the counts of a batch, as `Scene.settle`. A plain mixture has none."""
 
     def with_shared(self, chosen: Tensor) -> Tensor:
         """Append the index of the shared expert, if there is one, to chosen [A, k]."""

@@ -338,6 +338,20 @@ class AnchorScene(LatticeScene):
         found = {a: self.heads[a].routing(feature, step, position, mode) for a in ATTRIBUTES}
         return {a: r for a, r in found.items() if r is not None}
 
+    def set_batch(self, views: int) -> None:
+        for head in self._mixtures():
+            head.batch = views
+
+    def counts(self) -> list[Tensor]:
+        return [count for head in self._mixtures() for count in head.counts()]
+
+    def settle(self) -> None:
+        for head in self._mixtures():
+            head.settle()
+
+    def _mixtures(self) -> list[MixtureHead]:
+        return [head for head in self.heads.values() if isinstance(head, MixtureHead)]
+
     def rows_by_level(self) -> list[int]:
         """Return the number of anchors per level of detail, coarse to fine. Empty without levels."""
         return self.table.facts["level"].bincount().tolist() if self.select.count else []
