@@ -38,13 +38,18 @@ def evaluate(args: list[str]) -> int:
 
     from rich.console import Console
 
-    from scene_experts.api.backend import backend
+    from scene_experts.api.backend import backend, device_of
+    from scene_experts.core.group import join
     from scene_experts.evaluate.command import evaluate_run
     from scene_experts.evaluate.tables import print_results
     from scene_experts.report import page
 
-    device, rasterize = backend(command.device, command.rasterizer, False, False)
-    results = evaluate_run(command.run, device, rasterize, command.options, data=command.data, step=command.step)
+    group = join(device_of(command.device))
+    device, rasterize = group.in_turn(lambda: backend(command.device, command.rasterizer, False, False))
+    results = evaluate_run(command.run, device, rasterize, command.options, data=command.data, step=command.step, group=group)
+    group.leave()
+    if not group.first:
+        return 0
     print_results(results, Console(highlight=False), command.run)
     if not command.options.suffix:  # the page shows the held-out views
         print(f"wrote {page.write([command.run])}")

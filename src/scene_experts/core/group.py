@@ -50,6 +50,10 @@ class Alone:
         """Return the Python values of all processes in the order of their numbers."""
         return [value]
 
+    def wait(self) -> None:
+        """Return when every process has called this."""
+        self.gather_values(None)
+
     def any(self, flag: bool) -> bool:
         """Return whether the flag of any process is true."""
         return any(self.gather_values(flag))
@@ -132,7 +136,7 @@ class Group(Alone):
     def in_turn(self, work: Callable[[], T]) -> T:
         if self.local == 0:
             result = work()
-        self.gather_values(None)
+        self.wait()
         return result if self.local == 0 else work()
 
     def leave(self) -> None:

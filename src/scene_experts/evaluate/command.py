@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
+from scene_experts.core.group import Alone
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.results import About
 from scene_experts.evaluate.score import evaluate
@@ -17,18 +18,29 @@ from scene_experts.training.run_folder import OpenRun
 
 
 def evaluate_run(
-    run: Path, device: str, rasterize: Rasterizer, options: EvalOptions, *, data: Path | None = None, step: int | None = None
+    run: Path,
+    device: str,
+    rasterize: Rasterizer,
+    options: EvalOptions,
+    *,
+    data: Path | None = None,
+    step: int | None = None,
+    group: Alone | None = None,
 ) -> dict[str, Any]:
     """Evaluate the newest checkpoint of a run folder, or the one at `step`. data: the folder of the capture, if it has moved.
 
+    group: The processes that share the views, as in `evaluate`.
+
     The rasteriser antialiases as the run's recipe does, if it can. Raises InputError if run, checkpoint, capture and options do not fit.
     """
-    opened = run_folder.open_run(run, device, step)
+    group = group or Alone()
+    opened = group.agree(lambda: run_folder.open_run(run, device, step))
     rasterize = as_trained(rasterize, opened.config.train.antialias)
-    capture = run_folder.capture_of(opened, data)
+    capture = group.agree(lambda: run_folder.capture_of(opened, data))
+    facts: dict[str, Any] = {"step": opened.step, "about": about(opened), "group": group}
     try:
-        with ProgressBar(Console(stderr=True)) as tell:
-            return evaluate(opened.scene, capture, rasterize, run, options, step=opened.step, about=about(opened), progress=tell)
+        with ProgressBar(Console(stderr=True, quiet=not group.first)) as tell:
+            return evaluate(opened.scene, capture, rasterize, run, options, **facts, progress=tell)
     finally:
         capture.images.close()
 

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.group import Alone
 from scene_experts.core.io import write_json
 from scene_experts.core.progress import Progress
 from scene_experts.core.types import Camera, Decoded, Mode, Render
@@ -52,6 +53,7 @@ def evaluate(
     step: int,
     about: About | None = None,
     progress: Progress | None = None,
+    group: Alone | None = None,
 ) -> dict[str, Any]:
     """Render, score and time the views of a split. The scene is drawn on its own device.
 
@@ -61,37 +63,50 @@ def evaluate(
         step: Iteration whose schedule values (such as Top-k) the scene uses.
         about: Facts about the training for the results file.
         progress: Called with the name of the work, how much is done and how much there is.
+        group: The processes that share the views; None: this process alone. Process 0 measures the speed and writes the results.
 
     Returns:
-        The content of results.json.
+        The content of results.json; empty in other processes than process 0.
 
     Raises:
         InputError: if the split has no views or the options do not fit the scene.
         RunError: if the results cannot be written.
     """
-    options, tell = options or EvalOptions(), progress or (lambda *_: None)
+    options, tell, group = options or EvalOptions(), progress or (lambda *_: None), group or Alone()
     chosen = choose_views(capture, options)
     began = time.perf_counter()
     device = scene.table.device
     background = torch.tensor(capture.background, dtype=torch.float32, device=device)
-    perceptual = load_perceptual(options, device, tell)
+    perceptual = group.in_turn(lambda: load_perceptual(options, device, tell))
     files = pictures.make_file_names(capture.views[i].name for i in chosen)
     cameras = [capture.views[i].camera.to(device) for i in chosen]
+    mine = range(group.rank, len(chosen), group.size)
     if options.appearance == "half":
         fitting: Callable[[int, int], None] = lambda done, total: tell("fitting appearance codes", done, total)  # noqa: E731
-        halves.fit_codes(scene, capture, rasterize, chosen, step, background, fitting)
+        halves.fit_codes(scene, capture, rasterize, [chosen[n] for n in mine], step, background, fitting)
     folder = out / options.folder
-    pictures.remove_pictures(folder)
+    if group.first:
+        pictures.remove_pictures(folder)
+    group.wait()
     drawing = Drawing(scene.frozen(step), rasterize, step, background, folder, options.appearance == "half")
-    per_view: dict[str, dict[str, Any]] = {}
-    for n, (index, camera) in enumerate(zip(chosen, cameras)):
-        capture.images.prefetch(list(chosen[n + 1 : n + 3]))
-        name = capture.views[index].name
-        facts = drawing.draw(capture, index, camera, files[name])
-        scores = score_files(folder, files[name], perceptual, device)
-        write_comparison(folder, files[name], scores)
-        per_view[name] = {"file": files[name], **scores, **facts}
-        tell("rendering and scoring", n + 1, len(chosen))
+
+    def score_mine() -> dict[int, dict[str, Any]]:
+        found = {}
+        for n in mine:
+            index = chosen[n]
+            capture.images.prefetch([chosen[later] for later in mine if later > n][:2])
+            name = capture.views[index].name
+            facts = drawing.draw(capture, index, cameras[n], files[name])
+            scores = score_files(folder, files[name], perceptual, device)
+            write_comparison(folder, files[name], scores)
+            found[n] = {"file": files[name], **scores, **facts}
+            tell("rendering and scoring", n + 1, len(chosen))
+        return found
+
+    by_place = {n: values for part in group.gather_values(group.agree(score_mine)) for n, values in part.items()}
+    if not group.first:
+        return {}
+    per_view = {capture.views[index].name: by_place[n] for n, index in enumerate(chosen)}
     write_expert_strips(folder, scene, cameras[0], step, rasterize, background)
     found = {
         "format": FORMAT,

@@ -7,8 +7,9 @@ import pytest
 from scene_experts.api import recording
 from scene_experts.arguments.parse import HelpAsked
 from scene_experts.arguments.table import rows
-from scene_experts.commands.train import FIRST, TrainCommand, parse_train, run_of, train
+from scene_experts.commands.train import FIRST, TrainCommand, after_restart, parse_train, run_of, train
 from scene_experts.core.errors import InputError
+from scene_experts.core.group import Alone
 from scene_experts.recipes import RECIPES
 from scene_experts.training import run_folder
 from support.messages import naming
@@ -37,6 +38,8 @@ def test_a_recipe_without_flags_is_the_recipe(recipe):
         ("--max-memory", "-1"),
         ("--max-memory", "nan"),
         ("--iterations", "0"),
+        ("--batch", "0"),
+        ("--batch", "7"),
         ("--seed", "-1"),
         ("--max-anchors", "-1"),
         ("--scene.K", "0"),
@@ -47,6 +50,17 @@ def test_a_recipe_without_flags_is_the_recipe(recipe):
 def test_numbers_no_training_can_have_name_their_flag(flag, value):
     with pytest.raises(InputError, match=flag):
         check_settings(parse_train(["moe-gs", *PLACES, flag, value]))
+
+
+def test_a_restarted_process_continues_a_run_that_had_begun(tmp_path):
+    group = Alone()
+    command = parse_train(["moe-gs", "--data", "c", "--out", str(tmp_path), "--overwrite"])
+    assert after_restart(command, group) == command
+    group.restarts = 1
+    assert after_restart(command, group) == command
+    (tmp_path / "config.json").touch()
+    continued = after_restart(command, group)
+    assert continued.resume and not continued.overwrite
 
 
 def test_a_memory_cap_needs_a_system_that_tells(monkeypatch):

@@ -21,6 +21,7 @@ from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.results import About
 from scene_experts.evaluate.score import evaluate
 from scene_experts.scene import Scene, Traits
+from support.groups import run_group
 from support.lpips import random_tensors
 from support.messages import naming
 
@@ -113,7 +114,7 @@ def no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def evaluated(out: Path, capture: Any = None, rasterize: Any = None, scene: Any = None, **options: Any) -> dict[str, Any]:
-    more = {name: options.pop(name) for name in ("about", "progress") if name in options}
+    more = {name: options.pop(name) for name in ("about", "progress", "group") if name in options}
     parts = (scene or FakeScene(), capture or FakeCapture(), rasterize or FakeRasterizer())
     return evaluate(*parts, out, EvalOptions(**options), step=700, **more)
 
@@ -139,6 +140,19 @@ def test_files_and_figures(tmp_path: Path) -> None:
     assert results["rasterizer"] == "fake" and results["fps"]["fps"] > 0 and results["sharpness"]["ratio"] > 0
     assert set(results["variants"]) == {"psnr", "ssim", "lpips", "lpips_3dgs", "lpips_alex"}
     assert seen == [("rendering and scoring", 1, 2), ("rendering and scoring", 2, 2)]
+
+
+def test_two_processes_share_the_views(tmp_path: Path) -> None:
+    def member(group: Any) -> None:
+        results = evaluated(tmp_path / "two", group=group)
+        assert bool(results) == group.first
+
+    one = evaluated(tmp_path / "one")
+    assert run_group(2, member) == [0, 0]
+    assert (tmp_path / "one" / "per_view.json").read_bytes() == (tmp_path / "two" / "per_view.json").read_bytes()
+    two = json.loads((tmp_path / "two" / "results.json").read_text())
+    assert (one["psnr"], one["ssim"], one["view_count"]) == (two["psnr"], two["ssim"], two["view_count"])
+    assert len(list((tmp_path / "two" / "test" / "side_by_side").rglob("*.png"))) == 2
 
 
 def test_scores_are_those_of_the_8_bit_files(tmp_path: Path) -> None:
