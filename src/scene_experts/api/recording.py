@@ -13,6 +13,7 @@ from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.data.capture import Capture
 from scene_experts.files.export import result_warnings, write_result_folder
 from scene_experts.files.registry import exported_files
+from scene_experts.files.result_folder import DESCRIPTION
 from scene_experts.render import Rasterizer
 from scene_experts.training import loop, run_folder
 from scene_experts.training.config import check
@@ -52,8 +53,9 @@ def train(run: loop.Run, capture: Capture, rasterize: Rasterizer, *, overwrite: 
 
 
 def is_exported(out: Path, step: int) -> bool:
-    """Whether the folder holds the layout of the iteration `step`."""
-    return (out / f"point_cloud/iteration_{step}/point_cloud.ply").is_file()
+    """Return whether the folder holds the complete layout of the iteration `step`. Its description and the cameras are written last."""
+    layout = out / "point_cloud" / f"iteration_{step}"
+    return all(path.is_file() for path in (layout / "point_cloud.ply", layout / DESCRIPTION, out / "cameras.json"))
 
 
 def export_layout(out: Path, capture: Capture) -> Exported:

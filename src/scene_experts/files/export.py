@@ -235,16 +235,16 @@ def _export_folder(work: _Work, family: Family, world: World, out: Path) -> Writ
 
 
 def write_scene_folder(run: OpenRun, family: Family, world: World, out: Path) -> Path:
-    """Write point_cloud/iteration_N with the scene and its description, and cfg_args above it; the
-    iteration's folder."""
+    """Write point_cloud/iteration_N with the scene and its description, and cfg_args above it; return
+    the iteration's folder. The description comes last: a folder that has it is complete."""
     folder = out / "point_cloud" / f"iteration_{run.step}"
     about = family.describe(run, world) | _trained(run)
     settings = family.write(run, world, folder, about)
-    write_json(folder / DESCRIPTION, about)
     if settings:
         every = settings | capture_settings(run.config.data)
         text = ", ".join(f"{name}={value!r}" for name, value in every.items())
         write_bytes(out / "cfg_args", f"Namespace({text})".encode())
+    write_json(folder / DESCRIPTION, about)
     return folder
 
 

@@ -127,6 +127,10 @@ def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
         )
 
 
+_UNFINISHED = (".config.json.*.part", ".cfg_args.*.part", "checkpoints/.*.part", "previews/.*.part", "point_cloud/*/.*.part")
+"""Temporary files of `core.io.write_atomic` that a killed training may leave; evaluations and viewers write elsewhere."""
+
+
 @contextmanager
 def held(out: Path) -> Iterator[None]:
     """Lock `out` for one training. The lock ends with the process. Raises InputError if another training holds the lock."""
@@ -137,8 +141,11 @@ def held(out: Path) -> Iterator[None]:
 
 
 def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False, exported: Iterable[Path] = ()) -> None:
-    """Prepare `out` for a run: call `check`, remove the checkpoints and results of an overwritten run, and write config.json."""
+    """Prepare `out` for a run: call `check`, remove unfinished files of a killed training and the checkpoints and results of an
+    overwritten run, and write config.json."""
     check(out, config, resume, overwrite)
+    for unfinished in (path for pattern in _UNFINISHED for path in out.glob(pattern)):
+        unfinished.unlink(missing_ok=True)
     if overwrite:
         results = [out / f"{name}{suffix}.json" for name in ("results", "per_view") for suffix in ("", "_train", "_half")]
         others = [*exported, out / "report.html", out / "config.json"]

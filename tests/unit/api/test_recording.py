@@ -52,8 +52,12 @@ def test_a_complete_run_keeps_its_layout(tmp_path, capture):
     layout.write_bytes(b"mine")
     events = list(recording.train(run_in(tmp_path, capture, resume=True), capture, CPU))
     assert [type(event) for event in events] == [Started, Finished] and layout.read_bytes() == b"mine"
-    layout.unlink()
-    assert Exported in map(type, recording.train(run_in(tmp_path, capture, resume=True), capture, CPU)) and layout.is_file()
+    left = layout.with_name(".color_mlp.pt.abc.part")
+    for lost in (layout, layout.with_name("scene.json"), tmp_path / "cameras.json"):  # as if the process was killed before it was written
+        lost.unlink()
+        left.write_bytes(b"half")
+        assert Exported in map(type, recording.train(run_in(tmp_path, capture, resume=True), capture, CPU)) and lost.is_file()
+        assert not left.exists()
 
 
 def test_a_stopped_run_is_saved_and_has_no_layout_yet(tmp_path, capture):
