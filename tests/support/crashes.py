@@ -43,10 +43,10 @@ class Crashes:
         self.rng = random.Random(self.seed)
 
     def arguments(self, recipe: str, out: Path, end: int = END) -> list[str]:
-        """Return the command line of a training that saves after every iteration, or of its continuation if `out` exists."""
+        """Return the command line of a training that saves after every iteration, or of its continuation if it has begun in `out`."""
         args = ["train", recipe, "--data", str(self.capture), "--out", str(out), "--iterations", "600", "--stop-at", str(end)]
         args += ["--growth.adjust.interval", "20", "--save-every", "1", "--preview-every", "0", "--deterministic", "--device", "cpu"]
-        return [*args, "--resume"] if out.exists() else args
+        return [*args, "--resume"] if (out / "config.json").exists() else args
 
     def warm_up(self, families: tuple[str, ...]) -> None:
         """Train two iterations of each recipe in this process, which loads the code that the forks then need not load."""

@@ -106,7 +106,8 @@ def _foreign(out: Path) -> str:
             return ""
     except (InputError, TypeError):
         pass
-    found = sorted(path.name for path in out.iterdir() if path.name not in (".lock", "paths")) if out.is_dir() else []
+    names = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
+    found = [name for name in names if name not in (".lock", "paths") and not (name.startswith(".config.json.") and name.endswith(".part"))]
     return found[0] if found else ""
 
 

@@ -227,3 +227,10 @@ def test_an_import_over_another_run_is_not_told_to_resume(tmp_path):
     with pytest.raises(InputError, match="--out") as error:
         run_folder.check(tmp_path, replace(CONFIG, command="import scene.ply"), resume=False)
     assert "--resume" not in str(error.value)
+
+
+def test_a_training_killed_before_its_configuration_was_written_can_be_started_again(tmp_path):
+    (tmp_path / ".lock").touch()
+    (tmp_path / ".config.json.abc.part").write_bytes(b"{")
+    run_folder.prepare(tmp_path, CONFIG, resume=False)
+    assert run_folder.read_config(tmp_path) == CONFIG and not list(tmp_path.glob("*.part"))
