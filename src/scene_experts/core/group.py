@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import Any, TypeVar
 
 import torch
@@ -18,6 +19,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError, RunError
 
 T = TypeVar("T")
+TIMEOUT = timedelta(days=1)  # a lost process is noticed at once; a slow one may show a picture, save, or wait for a person
 
 
 class Alone:
@@ -83,7 +85,7 @@ class Alone:
 class Group(Alone):
     """The processes that `torchrun` has started. Create it with `join`."""
 
-    def __init__(self, device: str, timeout: Any = None) -> None:
+    def __init__(self, device: str) -> None:
         """Connect to the other processes. device: "cpu" (gloo) or "cuda" (nccl)."""
         self.rank, self.size = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
         self.local = int(os.environ.get("LOCAL_RANK", self.rank))
@@ -91,7 +93,7 @@ class Group(Alone):
         self.sent = 0
         # Flags and Python values travel over gloo, also beside nccl: they are on the CPU.
         with self._expecting_all():
-            dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo", timeout=timeout)
+            dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo", timeout=TIMEOUT)
 
     def sum(self, tensor: Tensor) -> None:
         self.sent += tensor.numel() * tensor.element_size()
@@ -136,8 +138,10 @@ class Group(Alone):
     def in_turn(self, work: Callable[[], T]) -> T:
         if self.local == 0:
             result = work()
+            self.wait()
+            return result
         self.wait()
-        return result if self.local == 0 else work()
+        return work()
 
     def leave(self) -> None:
         dist.destroy_process_group()
