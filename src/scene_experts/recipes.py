@@ -13,11 +13,13 @@ from dataclasses import replace
 from scene_experts.scene.anchors.balance import BalancedExperts
 from scene_experts.scene.anchors.experts import Experts, Router
 from scene_experts.scene.anchors.features import FeatureBank
-from scene_experts.scene.anchors.mlp import ATTRIBUTES, Plain
-from scene_experts.scene.anchors.scene import Anchors
+from scene_experts.scene.anchors.local import LocalExperts
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, Decoder, Plain
+from scene_experts.scene.anchors.scene import Anchors, Rates
 from scene_experts.scene.anchors.select import Octree
 from scene_experts.scene.gaussians import Explicit, ExplicitRates
 from scene_experts.scene.graph.scene import GraphPoints, GraphRates
+from scene_experts.strategy.grow import GrowAnchors
 from scene_experts.strategy.grow_octree import GrowOctree
 from scene_experts.strategy.grow_points import GrowPoints
 from scene_experts.strategy.mcmc import MCMC
@@ -59,12 +61,35 @@ def _moe(name: str, *, loss: Weights = moe_gs.loss, add_dist: tuple[str, ...] = 
     return replace(moe_gs, recipe=name, scene=replace(moe_gs.scene, decoder=decoder, add_dist=add_dist), loss=loss)
 
 
+def _flagship(name: str, decoder: Decoder, hidden: int) -> Train:
+    return replace(
+        scaffold_gs,
+        recipe=name,
+        scene=Anchors(F=16, hidden=hidden, decoder=decoder),
+        loss=Weights(scale=0.01, opacity=0.01),
+        growth=GrowAnchors(grad_threshold=0.00015),
+        rates=Rates(networks=2.0, anneal=0.1),
+    )
+
+
 def _scaffold(name: str, **scene: object) -> Train:
     return replace(scaffold_gs, recipe=name, scene=replace(scaffold_gs.scene, **scene))  # type: ignore[arg-type]
 
 
 OWN: dict[str, Recipe] = {
     "scaffold-gs": ("Scaffold-GS: one network per attribute (the baseline)", scaffold_gs),
+    "scene-experts": (
+        "Scene Experts: small features, and eight experts per attribute, each for one part of the scene (ours)",
+        _flagship("scene-experts", LocalExperts(), 32),
+    ),
+    "scene-experts-one": (
+        "scene-experts with one network of the same decode cost per attribute (control)",
+        _flagship("scene-experts-one", Plain(), 32),
+    ),
+    "scene-experts-wide": (
+        "scene-experts with one network as wide as all experts together (control)",
+        _flagship("scene-experts-wide", Plain(), 256),
+    ),
     "moe-gs": ("MoE-GS: five experts per attribute, Top-2 after a dense warm-up (the paper's main results)", moe_gs),
     "3dgs": ("3DGS: explicit Gaussians with spherical harmonics, cloned and split", gs_3d),
     "3dgs-mcmc": ("3DGS-MCMC: explicit Gaussians, relocated and perturbed, at most a million", gs_mcmc),

@@ -7,7 +7,18 @@ from scene_experts.recipes import RECIPES
 from scene_experts.scene import Scene
 
 # one recipe of every scene family and of every kind of mixture
-METHODS = ("scaffold-gs", "moe-gs", "3dgs", "3dgs-mcmc", "octree-gs", "octree-moe-gs", "scaffold-gs-bank", "sags", "moe-gs-balance")
+METHODS = (
+    "scene-experts",
+    "scaffold-gs",
+    "moe-gs",
+    "3dgs",
+    "3dgs-mcmc",
+    "octree-gs",
+    "octree-moe-gs",
+    "scaffold-gs-bank",
+    "sags",
+    "moe-gs-balance",
+)
 
 CAMERA = Camera(torch.eye(4), torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), 48, 32, 0.2)
 

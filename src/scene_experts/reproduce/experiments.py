@@ -29,6 +29,9 @@ BEYOND = {
     "Octree-GS": "octree-gs",
     "Octree-GS with experts": "octree-moe-gs",
     "MoE-GS": "moe-gs",
+    "Scene Experts": "scene-experts",
+    "Scene Experts, one network of equal decode cost": "scene-experts-one",
+    "Scene Experts, one network as wide as all experts": "scene-experts-wide",
 }
 ROUTINGS = ("top1", "top2", "dense")
 

@@ -146,6 +146,15 @@ class Scene(nn.Module):
     def set_training_cameras(self, cameras: Sequence[Camera]) -> None:
         """Give the scene the cameras of its training views, before each training or its resumption. The default does nothing."""
 
+    def begin_iteration(self, before: int, step: int, companions: Callable[[Tensor], list[Tensor]]) -> None:
+        """Prepare for training iteration `step`, before its view is drawn. The default does nothing.
+
+        Args:
+            before: Step of the last iteration; 0 before the first.
+            step: Step of this one: `before` and the number of views of a batch.
+            companions: Returns the tensors that follow a network's parameter, of its shape: Adam's moments, its average.
+        """
+
 
 class LatticeScene(Scene):
     """A scene whose rows lie on a lattice. Densification adds rows at empty cells. The table has a fact `cell` [N, 3] int64."""

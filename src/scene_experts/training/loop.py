@@ -149,6 +149,7 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     exchange = exchange or Direct(training, run.group, run.stop)
     training.step += cfg.batch
     training.set_rates()
+    scene.begin_iteration(training.step - cfg.batch, training.step, training.companions)
     batch, numbers = training.next_batch(capture.train), training.views_of(training.step)
     mine = range(run.group.rank, cfg.batch, run.group.size)
     upcoming = [batch[place][0] for place in mine] + training.queue[run.group.rank :: run.group.size]

@@ -117,6 +117,12 @@ class Training:
             self.optimizer.step(rows=rows)  # type: ignore[call-arg]
         self.optimizer.zero_grad(set_to_none=True)
 
+    def companions(self, parameter: Tensor) -> list[Tensor]:
+        """Return the tensors that follow a parameter of a network, each of its shape: the optimiser's moments and the average."""
+        moments = [t for t in self.optimizer.state.get(parameter, {}).values() if t.shape == parameter.shape]
+        averages = self.averages.networks if self.averages is not None else {}
+        return moments + [averages[name] for name, p in self.scene.network_tensors().items() if p is parameter and name in averages]
+
     def update_averages(self) -> None:
         """Update the averages of the weights after an optimiser step, if they are due."""
         if self.averages is None:

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -77,6 +78,9 @@ class Experts(Decoder):
     reference)."""
     router: Router = Router()
 
+    learns_routing: ClassVar[bool] = True
+    """Whether losses train the routers."""
+
     @property
     def with_experts(self) -> tuple[str, ...]:
         return self.attributes
@@ -108,7 +112,7 @@ class Experts(Decoder):
         self.check()
         if self.num == 1 or attribute not in self.attributes:
             return MLP(attribute, inputs, hidden, outputs)
-        if self.top_k == 1 and self.router.renormalise and attribute == self.attributes[0]:
+        if self.learns_routing and self.top_k == 1 and self.router.renormalise and attribute == self.attributes[0]:
             log.warning("with top_k 1 and renormalised weights the picture does not train the routers; only L_load does")
         return self.head()(self, attribute, inputs, hidden, outputs, feature)
 
@@ -163,6 +167,9 @@ class MixtureHead(nn.Module):
             nn.init.zeros_(self.router_w)
             if self.router_b is not None:
                 nn.init.zeros_(self.router_b)
+
+    def begin(self, before: int, step: int, positions: Callable[[], Tensor], companions: Callable[[Tensor], list[Tensor]]) -> None:
+        """Prepare for training iteration `step`. The default does nothing. See `Scene.begin_iteration`."""
 
     def k(self, step: int) -> int | None:
         """Return the number of experts per anchor at `step`, or None if dense. Iterations 1 .. warmup are dense."""

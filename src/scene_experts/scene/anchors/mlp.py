@@ -57,6 +57,10 @@ class Head(Protocol):
         """x [A, inputs], feature [A, F], position [A, 3] over the scene's extent -> activated outputs [A, out], routing."""
         ...
 
+    def begin(self, before: int, step: int, positions: Callable[[], Tensor], companions: Callable[[Tensor], list[Tensor]]) -> None:
+        """Prepare for training iteration `step`, see `Scene.begin_iteration`. positions() are [N, 3], over the scene's extent."""
+        ...
+
     def weights(self, step: int) -> HeadWeights | None:
         """Return the tensors used at `step`, or None if they do not describe the head completely."""
         ...
@@ -141,6 +145,9 @@ class MLP(nn.Module):
         for layer in self.middle:
             h = functional.relu(layer(h))
         return ACTIVATIONS[self.attribute](functional.linear(h, self.w2[0], self.b2[0])), None
+
+    def begin(self, before: int, step: int, positions: Callable[[], Tensor], companions: Callable[[Tensor], list[Tensor]]) -> None:
+        """Do nothing: a plain network is the same at every iteration."""
 
     def weights(self, step: int) -> HeadWeights | None:
         if not self.middle:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
@@ -211,6 +211,10 @@ class AnchorScene(LatticeScene):
         self.cameras = tuple(cameras)
         if "interval" not in self.table.facts:
             self.table.facts["interval"] = find_intervals(self.table.facts["xyz"], self.cameras)
+
+    def begin_iteration(self, before: int, step: int, companions: Callable[[Tensor], list[Tensor]]) -> None:
+        for head in self.heads.values():
+            head.begin(before, step, lambda: self.table.facts["xyz"] / self.extent, companions)
 
     def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
         """Return rows for new anchors at lattice cells [n, 3] of `level`, with scaling `size`, features [n, F] and zero offsets."""
