@@ -103,10 +103,10 @@ def test_moments_and_averages_are_copied_too():
 
 def test_other_iterations_change_nothing():
     made = scene()
-    before = {name: t.clone() for name, t in made.network_tensors().items()}
+    old = {name: t.clone() for name, t in made.network_tensors().items()}
     for before, step in ((0, 1), (WARM - 1, WARM), (WARM + 1, WARM + 2), (WARM - 4, WARM), (29_999, 30_000)):
         made.begin_iteration(before, step, NONE)
-    assert all(torch.equal(t, before[name]) for name, t in made.network_tensors().items())
+    assert all(torch.equal(t, old[name]) for name, t in made.network_tensors().items())
 
 
 def test_a_batch_may_step_over_the_end_of_the_warm_up():
