@@ -23,6 +23,7 @@ import torch
 
 from scene_experts.core import checkpoint
 from scene_experts.core.group import join
+from scene_experts.core.types import Points
 from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
@@ -37,7 +38,7 @@ def settings(recipe: str, args: argparse.Namespace) -> Train:
     """The recipe with a batch, on a schedule as long as the run."""
     cfg = RECIPES[recipe][1]
     growth = replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=args.interval))
-    return replace(cfg, batch=args.batch, iterations=args.steps * args.batch, growth=growth)
+    return replace(cfg, batch=args.batch, iterations=args.steps * args.batch, growth=growth, max_anchors=args.max_anchors)
 
 
 def member(rank: int, size: int, port: int, recipe: str, out: Path, args: argparse.Namespace) -> None:
@@ -48,6 +49,9 @@ def member(rank: int, size: int, port: int, recipe: str, out: Path, args: argpar
     reuse_freed()
     group, cfg = join("cpu"), settings(recipe, args)
     capture = load(args.capture, resolution=args.resolution)
+    if args.points and capture.points is not None:
+        every = -(-len(capture.points.xyz) // args.points)
+        capture = replace(capture, points=Points(capture.points.xyz[::every], capture.points.rgb[::every]))
     for index in capture.train:
         capture.frame(index)  # decoded once and kept: not what is measured
     state = []
@@ -102,6 +106,8 @@ def main() -> int:
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--interval", type=int, default=100, help="views between two densification steps")
+    parser.add_argument("--points", type=int, default=0, help="start from about this many points; 0: all")
+    parser.add_argument("--max-anchors", type=int, default=0)
     parser.add_argument("--capture", type=Path, default=Path("demo/brighton"))
     parser.add_argument("--resolution", default="longest:64")
     parser.add_argument("--deterministic", action="store_true")

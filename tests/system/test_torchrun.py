@@ -1,0 +1,42 @@
+"""One training in several processes that torchrun starts."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from support.synthetic import make_capture
+from support.trainings import assert_same, last_tensors
+
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--max-restarts", "1", "--nproc-per-node"]
+
+
+def command(folder: Path, out: Path) -> list[str]:
+    words = ["-m", "scene_experts", "train", "scaffold-gs", "--data", str(folder), "--out", str(out), "--device", "cpu", "--deterministic"]
+    numbers = {"iterations": 600, "batch": 2, "stop-at": 400, "save-every": 40, "preview-every": 0, "growth.adjust.interval": 20}
+    return words + [word for name, value in numbers.items() for word in (f"--{name}", str(value))]
+
+
+def workers_of(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the workers are found in /proc")
+def test_torchrun_restarts_a_training_that_lost_a_process(tmp_path):
+    folder = make_capture(tmp_path / "capture", views=8, size=(48, 32), points=400).folder
+    subprocess.run([sys.executable, *command(folder, tmp_path / "one")], check=True, capture_output=True)
+    words = [*TORCHRUN, "2", *command(folder, tmp_path / "two")]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as agent:
+        began = time.monotonic()
+        while not list((tmp_path / "two").glob("checkpoints/ckpt_*")) and agent.poll() is None and time.monotonic() - began < 300:
+            time.sleep(0.05)
+        os.kill(workers_of(agent.pid)[-1], signal.SIGKILL)
+        told, _ = agent.communicate(timeout=300)
+    assert agent.returncode == 0, told
+    assert "resumed at iteration" in told and "lost another" in told
+    assert_same(last_tensors(tmp_path / "one"), last_tensors(tmp_path / "two"))
