@@ -7,6 +7,7 @@
 # make sanitize   the native library with the address and undefined-behaviour sanitisers, and its tests on every instruction set
 # make crash ROUNDS=200   kill trainings of every family at random moments and compare what is resumed with what was left alone
 # make bench      the benchmarks that need no GPU
+# make gpu DATA=CAPTURE   everything that a GPU is needed for, in slices below 9 minutes; repeat until it prints "all done"
 # make record-errors, make record-flags   record the command line's error sentences or its flags anew in tests/golden
 # Every target builds a virtual environment in .venv first. An importable torch of PYTHON is used as it is; otherwise the pinned CPU
 # version is installed. WORKERS sets the number of test processes (0: none beside pytest's own).
@@ -30,7 +31,7 @@ DEMO_FLAGS ?= --iterations $(DEMO_ITERATIONS) --loss.dssim 0.8
 # as the package sets it when it is imported before torch, which the benchmark scripts do not
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo view test test-fast fuzz lint record-errors record-flags bench sanitize crash env lpips clean
+.PHONY: demo view test test-fast fuzz lint record-errors record-flags bench gpu sanitize crash env lpips clean
 
 env: $(STAMP)
 
@@ -90,6 +91,9 @@ bench: $(STAMP)
 	$(BIN)/python benchmarks/decode.py
 	$(BIN)/python benchmarks/loss.py
 	$(BIN)/python benchmarks/step.py
+
+gpu: $(STAMP)
+	$(BIN)/python tools/gpu.py --data $(DATA) $(if $(WHEELS),--wheels $(WHEELS))
 
 clean:
 	rm -rf build dist $(VENV)

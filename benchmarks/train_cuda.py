@@ -51,6 +51,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--iterations", type=int, default=30_000)
     parser.add_argument("--resolution", default="auto")
     parser.add_argument("--count", type=int, default=0, help="Gaussians of the peer; 0: as many as the last recipe has")
+    parser.add_argument("--least-anchors", type=int, default=0, help="halve the voxels until a scene starts with so many anchors")
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
     return parser
 
@@ -91,7 +92,10 @@ def main(argv: list[str] | None = None, draw: explicit_gsplat.Draw = explicit_gs
 
 def read_results(args: argparse.Namespace) -> dict[str, Any]:
     """Read the results so far. Exits if they have other settings."""
-    path, settings = args.out / "results.json", {name: str(getattr(args, name)) for name in ("data", "iterations", "resolution", "device")}
+    path, settings = (
+        args.out / "results.json",
+        {name: str(getattr(args, name)) for name in ("data", "iterations", "resolution", "device", "least_anchors")},
+    )
     found = json.loads(path.read_text()) if path.is_file() else {"settings": settings}
     if found["settings"] != settings:
         raise SystemExit(f"expected the settings of {path} ({found['settings']}), found {settings}; give another --out")
@@ -113,6 +117,8 @@ def train_recipe(
 ) -> None:
     """Continue a training, and score the scene when it is finished."""
     cfg: Train = replace(RECIPES[name][1], iterations=args.iterations)
+    if args.least_anchors:
+        cfg = replace(cfg, scene=refine_voxels(cfg.scene, capture, args.least_anchors))
     config = RunConfig(cfg, Data(args.data, resolution=args.resolution))
     if args.device == "cuda":  # compile the kernels of gsplat and Triton before timing: a few steps, dense and sparse
         short = replace(cfg, iterations=20)
@@ -133,6 +139,17 @@ def train_recipe(
         done = resume(cfg.scaled(), args.out / name / "checkpoints", args.device)
         assert done is not None
         result |= score(done, capture, rasterize, args.device) | {"done": True}
+
+
+def refine_voxels(scene: Any, capture: Capture, least: int) -> Any:
+    """Halve the voxels until a scene of anchors starts with `least` anchors, or until smaller voxels give no more."""
+    assert capture.points is not None
+    cameras, before = [capture.views[i].camera for i in capture.train], -1
+    started = scene.start(capture.points, capture.extent, cameras)
+    while before < 0.99 * len(started.table) and len(started.table) < least:
+        before, scene = len(started.table), replace(scene, voxel_size=started.voxel / 2)
+        started = scene.start(capture.points, capture.extent, cameras)
+    return scene
 
 
 @torch.no_grad()

@@ -25,7 +25,9 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Gaussians, Render
-from scene_experts.render.reference import BLUR, MIN_COMPENSATION, TILE, ReferenceRasterizer, project, record_mean2d_grad, visible
+from scene_experts.native import triton
+from scene_experts.render.project_cuda import find_radii
+from scene_experts.render.reference import BLUR, MIN_COMPENSATION, TILE, project, record_mean2d_grad, visible
 
 
 @functools.cache
@@ -59,10 +61,8 @@ class GsplatRasterizer:
         """Draw M Gaussians over `background` [3], see `types.Render`. Raises InputError if gsplat cannot run."""
         library = _import_gsplat()
         if len(g) == 0:
-            return ReferenceRasterizer()(g, camera, background)
+            return _draw_nothing(g, camera, background)
         camera = camera.to(g.means.device, torch.float32)
-        with torch.no_grad():
-            radii = project(g.means, g.quats, g.scales, camera).radii
         extents, means2d, depths, conics, compensations = library.fully_fused_projection(
             g.means,
             None,
@@ -77,7 +77,7 @@ class GsplatRasterizer:
             calc_compensations=self.antialias,
             opacities=g.opacities.detach(),
         )  # [1, M, 2], [1, M, 2], [1, M], [1, M, 3], [1, M] for one view
-        extents = extents * (radii > 0)[None, :, None].to(extents)
+        radii, extents = _find_radii(g, camera, extents)
         opacities = g.opacities[None]
         if self.antialias:
             opacities = opacities * compensations.clamp_min(MIN_COMPENSATION)
@@ -91,7 +91,25 @@ class GsplatRasterizer:
 
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
         """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] are drawn (radius > 0)."""
+        if triton.covers(means, scales):
+            return find_radii(means, None, scales, camera) > 0
         return visible(means, scales, camera)
+
+
+@torch.no_grad()
+def _find_radii(g: Gaussians, camera: Camera, extents: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the radii [M] int32 by the 3 sigma rule, and gsplat's extents [1, M, 2] with 0 for Gaussians without a radius."""
+    if triton.covers(g.means, g.quats, g.scales):
+        return find_radii(g.means, g.quats, g.scales, camera, extents), extents
+    radii = project(g.means, g.quats, g.scales, camera).radii
+    return radii, extents * (radii > 0)[None, :, None].to(extents)
+
+
+def _draw_nothing(g: Gaussians, camera: Camera, background: Tensor) -> Render:
+    """Return the picture of no Gaussians: the background."""
+    blank = g.means.new_zeros(camera.height, camera.width)
+    picture = background.to(blank) + blank[..., None] + g.colors.sum()  # the sum of nothing keeps the picture in the graph
+    return Render(picture, blank, blank, torch.zeros(0, dtype=torch.int32, device=blank.device), g.means.new_zeros(0, 2))
 
 
 def _import_gsplat() -> ModuleType:

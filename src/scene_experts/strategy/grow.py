@@ -13,6 +13,7 @@ from torch import Tensor
 
 from scene_experts.core.errors import expect_at_least
 from scene_experts.core.parts import register
+from scene_experts.core.random import generator_on
 from scene_experts.geometry.voxel import AXIS_LIMIT, coarsen, in_set, pack, scatter_max
 from scene_experts.strategy.control import AnchorControl, L
 from scene_experts.strategy.errors import find_wrong
@@ -81,7 +82,8 @@ class GrowAnchors(AnchorControl[L]):
                 continue
             chosen = g >= self.grad_threshold * (self.hierarchy_factor // 2) ** level
             if self.elimination:
-                draw = torch.rand(stats["grad"].shape, generator=generator).view(-1).to(g.device)
+                own = generator_on(g.device, generator)
+                draw = torch.rand(stats["grad"].shape, generator=own, device=g.device).view(-1)
                 chosen &= draw.index_select(0, slots) > 0.5 ** (level + 1)
             found = empty_cells(features, cells, fine[chosen], parents[chosen], g[chosen], factor)
             if found is None:

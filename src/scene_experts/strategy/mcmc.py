@@ -15,6 +15,7 @@ from torch import Tensor
 
 from scene_experts.core.errors import expect_at_least
 from scene_experts.core.parts import register
+from scene_experts.core.random import generator_on
 from scene_experts.core.schedule import Every
 from scene_experts.geometry.rotation import normalise_quats, quat_to_matrix
 from scene_experts.native import library as native
@@ -129,7 +130,8 @@ class MCMC(Strategy[GaussianScene]):
             return
         p = scene.table.params
         columns = [p[name].detach() for name in ("means", "quats", "log_scales", "raw_opacity")]
-        eta = torch.randn(p["means"].shape, generator=generator).to(p["means"])
+        means = p["means"].detach()
+        eta = torch.randn(means.shape, generator=generator_on(means.device, generator), device=means.device).to(means)
         library = native.load()
         if library is not None and all(c.device.type == "cpu" and c.dtype == torch.float32 and c.is_contiguous() for c in columns):
             where = [native.pointer(t) for t in (*columns, eta)]
@@ -150,7 +152,8 @@ def disturb(means: Tensor, quats: Tensor, log_scales: Tensor, raw_opacity: Tenso
 def draw(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Sample indices [count] with replacement, in proportion to `weight` [N] >= 0. At least one weight must be positive."""
     total = weight.double().cumsum(0)
-    at = torch.rand(count, generator=generator, dtype=torch.float64).to(total.device) * total[-1]
+    own = generator_on(total.device, generator)
+    at = torch.rand(count, generator=own, dtype=torch.float64, device=total.device) * total[-1]
     return torch.searchsorted(total, at, right=True).clamp_max_(int(weight.nonzero()[-1]))
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.parts import register
+from scene_experts.core.random import generator_on
 from scene_experts.core.schedule import Every
 from scene_experts.core.types import Decoded, Render
 from scene_experts.geometry.rotation import normalise_quats, quat_to_matrix
@@ -170,6 +171,6 @@ def split_rows(params: torch.nn.ParameterDict, rows: Tensor, generator: torch.Ge
     """
     halves = {name: torch.cat([column.index_select(0, rows)] * 2) for name, column in params.items()}
     quats, scales = halves["quats"], halves["log_scales"].exp()
-    draw = torch.randn(scales.shape, generator=generator).to(scales)
+    draw = torch.randn(scales.shape, generator=generator_on(scales.device, generator), device=scales.device).to(scales)
     away = (quat_to_matrix(normalise_quats(quats)) @ (draw * scales)[..., None]).squeeze(-1)
     return halves | {"means": halves["means"] + away, "log_scales": halves["log_scales"] - math.log(SHRINK)}

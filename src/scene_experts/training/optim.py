@@ -1,10 +1,12 @@
-"""Optimisers. On the CPU, Adam is one native call for all parameters, with bit-identical results to torch's fused Adam.
+"""Optimisers. On the CPU, Adam is one native call for all parameters, with bit-identical results to torch's fused Adam. On CUDA it is one
+Triton kernel.
 
 The state uses torch's names (`exp_avg`, `exp_avg_sq`, `step`), so checkpoints work with both implementations.
 """
 
 from __future__ import annotations
 
+import importlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
@@ -16,8 +18,12 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.parts import Part, register
+from scene_experts.core.transfer import upload
 from scene_experts.native import library as native
+from scene_experts.native import triton
 from scene_experts.native.api import SeAdamTensor
+
+BLOCK = 1024  # values per program of the Triton kernel
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,7 @@ class FusedAdam(torch.optim.Adam):
         groups = [{"by_row": False, **group} for group in groups]
         every = [p for group in groups for p in group["params"]]
         self._native = all(p.device.type == "cpu" and p.dtype == torch.float32 for p in every) and native.load() is not None
+        self._triton = bool(every) and triton.covers(*every)
         fused = all(p.device.type in ("cpu", "cuda") and p.dtype == torch.float32 for p in every)
         super().__init__(groups, lr=0.0, betas=betas, eps=eps, fused=fused)
 
@@ -109,7 +116,7 @@ class FusedAdam(torch.optim.Adam):
         Returns:
             The loss that `closure` returns, or None.
         """
-        if rows is None and not self._native:
+        if rows is None and not self._native and not self._triton:
             return super().step(closure)
         loss = None
         if closure is not None:
@@ -118,6 +125,8 @@ class FusedAdam(torch.optim.Adam):
         calls = [self._prepared(p, group, rows) for group in self.param_groups for p in group["params"] if p.grad is not None]
         if self._native:
             self._call(calls)
+        elif self._triton:
+            self._launch(calls)
         else:
             for parameter, chosen, step_size, root, group in calls:
                 _by_torch(parameter, self.state[parameter], chosen, step_size, root, group)
@@ -127,9 +136,11 @@ class FusedAdam(torch.optim.Adam):
         """Count the step. Return (parameter, its rows or None for all, step size, root of the second bias correction, group)."""
         state = self.state[parameter]
         if not state:
-            state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
+            state["step"] = torch.zeros((), dtype=torch.float32, device="cpu" if self._triton else parameter.device)
             state["exp_avg"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
             state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+        if self._triton:  # reading a counter on the device would wait for it; a checkpoint may have put it there
+            state["step"] = state["step"].cpu()
         state["step"] += 1
         done, (beta1, beta2) = float(state["step"]), group["betas"]
         chosen = rows if group["by_row"] else None
@@ -150,6 +161,30 @@ class FusedAdam(torch.optim.Adam):
         group = self.param_groups[0]
         bad = native.require().se_adam_step(tensors, len(calls), *group["betas"], group["eps"], native.count_threads())
         self.broken = "" if bad < 0 else str(calls[bad][-1].get("name", bad))
+
+    def _launch(self, calls: list[tuple[Tensor, Tensor | None, float, float, dict]]) -> None:
+        """Run the step of all parameters as one kernel."""
+        if not calls:
+            return
+        places, numbers, alive, programs = [], [], [], 0
+        for parameter, rows, step_size, root, _ in calls:
+            state, gradient = self.state[parameter], parameter.grad
+            assert gradient is not None and parameter.is_contiguous()
+            gradient, rows = gradient.contiguous(), None if rows is None else rows.contiguous()
+            alive += [gradient, rows]  # kept alive until the launch
+            width = max(parameter[:1].numel(), 1) if parameter.dim() else 1
+            count = parameter.numel() if rows is None else len(rows) * width
+            addresses = [t.data_ptr() for t in (parameter.detach(), gradient, state["exp_avg"], state["exp_avg_sq"])]
+            places.append([*addresses, 0 if rows is None else rows.data_ptr(), count, width, programs])
+            numbers.append([step_size, root])
+            programs += -(-count // BLOCK)
+        if not programs:
+            return
+        table = torch.cat([torch.tensor(places), torch.tensor(numbers, dtype=torch.float64).view(torch.int64)], dim=1)
+        kernel = importlib.import_module("scene_experts.training.triton_adam").step
+        group = self.param_groups[0]
+        given = (upload(table, calls[0][0].device), len(calls), *group["betas"], group["eps"])
+        triton.launch(kernel, (programs,), *given, B=BLOCK)
 
 
 def _by_torch(parameter: Tensor, state: dict[str, Tensor], rows: Tensor | None, step_size: float, root: float, group: dict) -> None:

@@ -5,6 +5,8 @@ Images are [H, W, 3] float RGB in [0, 1]. float32 on the CPU uses one call of th
 
 from __future__ import annotations
 
+import importlib
+import math
 from functools import cache
 from typing import Any
 
@@ -13,6 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from scene_experts.native import library as native
+from scene_experts.native import triton
 
 TAPS, SIGMA, C1, C2 = 11, 1.5, 0.01**2, 0.03**2
 
@@ -65,8 +68,8 @@ def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
 def photometric(image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Photometric loss of 3DGS as two terms: (1 - lambda) L1 and lambda (1 - SSIM), both [].
 
-    float32 on the CPU uses one call of the compiled library for values and gradient. Other inputs, and a target that requires a
-    gradient, use plain torch.
+    float32 on the CPU uses one call of the compiled library for values and gradient, and on CUDA one Triton kernel. Other inputs, and a
+    target that requires a gradient, use plain torch.
 
     Args:
         image: [H, W, 3], the rendered image.
@@ -77,14 +80,19 @@ def photometric(image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor
     """
     if mask is not None:
         image = torch.lerp(target, image, mask.to(image.dtype)[..., None])
+    if triton.covers(image, target) and not target.requires_grad and image.numel() > 0:
+        both = _PhotometricCuda.apply(image, target, float(lambda_dssim))
+        return both if mask is None else _divide_by_mean(both, mask)
     fused = image.device.type == "cpu" and image.dtype == target.dtype == torch.float32 and not target.requires_grad and image.numel() > 0
     if fused and native.load() is not None:
         both = _Photometric.apply(image, target, float(lambda_dssim))
     else:
         both = ((1 - lambda_dssim) * l1(image, target), lambda_dssim * dissimilarity(image, target))
-    if mask is None:
-        return both
-    share = mask.to(image.dtype).mean().clamp_min(1e-12)
+    return both if mask is None else _divide_by_mean(both, mask)
+
+
+def _divide_by_mean(both: tuple[Tensor, Tensor], mask: Tensor) -> tuple[Tensor, Tensor]:
+    share = mask.to(both[0].dtype).mean().clamp_min(1e-12)
     return both[0] / share, both[1] / share
 
 
@@ -115,3 +123,41 @@ class _Photometric(torch.autograd.Function):
         if by_l1 != by_dssim:  # the stored gradient weighs both terms equally; the L1 part is cheap to recompute
             out = torch.add(out, (x - y).sign_(), alpha=(by_l1 - by_dssim) * ctx.l1_weight / x.numel())
         return out, None, None
+
+
+TILE, BLOCK = 64, 1024  # pixels along a side of a tile of the first kernel, values per program of the second
+PRECISION = "tf32x3"  # of the windows' products: nearly float32 on tensor cores
+
+
+class _PhotometricCuda(torch.autograd.Function):
+    """Compute both terms and the gradient of 1 - SSIM in one kernel. The backward pass adds the gradient of L1 in another one."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, lambda_dssim: float) -> tuple[Tensor, Tensor]:
+        x, y = image.detach().contiguous(), target.detach().contiguous()
+        H, W, _ = x.shape
+        weights, wanted = ((1 - lambda_dssim) / x.numel(), lambda_dssim / x.numel()), ctx.needs_input_grad[0]
+        gradient = torch.empty_like(x) if wanted else x
+        grid = (-(-W // (TILE - 2 * TAPS + 2)), -(-H // (TILE - 2 * TAPS + 2)), 3)
+        sums = torch.empty(math.prod(grid), 2, dtype=x.dtype, device=x.device)
+        scale, reach = 1 / (2 * SIGMA * SIGMA), TAPS // 2
+        norm = sum(math.exp(-scale * t * t) for t in range(-reach, reach + 1))
+        sizes = {"R": reach, "SCALE": scale, "NORM": norm, "C1": C1, "C2": C2, "T": TILE, "WANTED": wanted, "PRECISION": PRECISION}
+        triton.launch(_kernels().forward, grid, x, y, gradient, sums, H, W, *weights, **sizes, num_warps=8)
+        ctx.l1_weight = weights[0]
+        if wanted:
+            ctx.save_for_backward(x, y, gradient)
+        l1_term, dssim_term = sums.sum(0).unbind(0)
+        return l1_term, dssim_term
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None, None]:
+        x, y, gradient = ctx.saved_tensors
+        out, n = torch.empty_like(x), x.numel()
+        scales = (g.contiguous() for g in upstream)
+        triton.launch(_kernels().backward, (-(-n // BLOCK),), x, y, gradient, *scales, out, n, ctx.l1_weight, B=BLOCK)
+        return out, None, None
+
+
+def _kernels() -> Any:
+    return importlib.import_module("scene_experts.training.triton_loss")

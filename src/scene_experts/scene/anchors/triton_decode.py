@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.types import Gaussians, Routing
-from scene_experts.native.triton import launch
+from scene_experts.native import triton
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, LEAST_MARGIN, HeadWeights
 
 ACTIVATION = {"opacity": 0, "cov": 1, "color": 2}  # TANH, NONE, SIGMOID of triton_kernels.py
@@ -162,7 +162,7 @@ class _Decode(torch.autograd.Function):
         source = torch.empty(M, dtype=torch.int64, device=raw.device)
         if M:
             arguments = (plan.rows, plan.xyz, columns[2], columns[1], raw, cov, dst, means, quats, scales, opacities, source, A)
-            launch(_kernels().place, (-(-A // BLOCK),), *arguments, K=K, B=BLOCK, KP=pad(K, 1))
+            triton.launch(_kernels().place, (-(-A // BLOCK),), *arguments, K=K, B=BLOCK, KP=pad(K, 1))
         gates, chosen = [r[0] for r in routes], [r[2] for r in routes]
         ctx.plan = plan
         ctx.mark_non_differentiable(source, *(c for c in chosen if c is not None))
@@ -183,7 +183,7 @@ class _Decode(torch.autograd.Function):
         if A:
             given = (plan.rows, columns[2], columns[1], cov, dst, quats, d_means, d_quats, d_scales, d_opacities, d_raw)
             grid = (-(-A // BLOCK),)
-            launch(_kernels().place_backward, grid, *given, d_offsets, d_log_scaling, d_cov, d_all, A, K=K, B=BLOCK, KP=pad(K, 1))
+            triton.launch(_kernels().place_backward, grid, *given, d_offsets, d_log_scaling, d_cov, d_all, A, K=K, B=BLOCK, KP=pad(K, 1))
         d_weights: list[Tensor | None] = []
         for i, d_out in enumerate((d_all, d_cov, d_colors)):
             d_weights += _backward(plan, i, routes[i], columns[0], weights, dst, d_out, d_gates[i], d_feature)
@@ -208,7 +208,7 @@ def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Ten
         sizes |= {"FP": pad(feature.shape[1]), "EP": pad(head.E), "B": BLOCK, "PRECISION": PRECISION}
         unused = plan.rows  # placeholder for arrays that the kernel does not access
         arguments = [plan.rows, plan.xyz, feature, weights[0], bias, gates, weight, chosen, keys]
-        launch(_kernels().route, (-(-A // BLOCK),), *(unused if t is None else t for t in arguments), A, plan.extent, **sizes)
+        triton.launch(_kernels().route, (-(-A // BLOCK),), *(unused if t is None else t for t in arguments), A, plan.extent, **sizes)
     return gates, weight, chosen, keys, None if keys is None else plan.order(keys)
 
 
@@ -220,7 +220,7 @@ def _forward(plan: _Plan, i: int, routes: Any, feature: Tensor, weights: Any, ds
     _, weight, _, keys, order = routes[i]
     arguments = [plan.rows, order, keys, weight, plan.xyz, feature, plan.camera, *weights[6 * i + 2 : 6 * i + 6], dst, out]
     given = (plan.rows if t is None else t for t in arguments)
-    launch(_kernels().head_forward, (-(-A // BLOCK),), *given, A, **plan.heads[i].sizes, B=BLOCK)
+    triton.launch(_kernels().head_forward, (-(-A // BLOCK),), *given, A, **plan.heads[i].sizes, B=BLOCK)
 
 
 def _backward(
@@ -235,7 +235,7 @@ def _backward(
     shared = [plan.rows, order, keys, weight]
     arguments = [*shared, gates, plan.xyz, feature, plan.camera, own[0], *own[2:], dst, d_out, d_gates, d_logits, d_feature]
     grid = (-(-A // BLOCK),)
-    launch(
+    triton.launch(
         _kernels().head_backward,
         grid,
         *(plan.rows if t is None else t for t in arguments),
@@ -251,7 +251,7 @@ def _backward(
     parts = [t.new_empty(_parts(t.device, head.E, blocks), *t.shape) for t in own[2:]]
     arguments = [*shared, plan.xyz, feature, plan.camera, *own[2:], dst, d_out, *parts]
     given = (plan.rows if t is None else t for t in arguments)
-    launch(_kernels().weight_backward, (head.E, len(parts[0])), *given, A, blocks, **head.sizes, B=BLOCK_WEIGHTS)
+    triton.launch(_kernels().weight_backward, (head.E, len(parts[0])), *given, A, blocks, **head.sizes, B=BLOCK_WEIGHTS)
     found: list[Tensor | None] = [None, None]
     if d_logits is not None:
         seen = feature.index_select(0, plan.rows)

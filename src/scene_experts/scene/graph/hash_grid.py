@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.transfer import upload
 from scene_experts.native import library as native
 
 PRIMES = (1, 2_654_435_761, 805_459_861)  # eq. 4 of the paper
@@ -83,7 +84,7 @@ class Grid(nn.Module):
         """Convert world positions [A, 3] to grid coordinates, clamped to [0, 1]; unchanged if `coordinates` is "world"."""
         if self.config.coordinates == "world":
             return xyz
-        return ((xyz - xyz.new_tensor(self.low)) / self.edge).clamp(0, 1)
+        return ((xyz - upload(torch.tensor(self.low, dtype=xyz.dtype), xyz.device)) / self.edge).clamp(0, 1)
 
     def forward(self, xyz: Tensor) -> Tensor:
         """Features [A, levels * features], level by level, at world positions [A, 3]. Positions get no gradient."""

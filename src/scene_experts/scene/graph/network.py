@@ -99,10 +99,10 @@ def _forward(feature: Tensor, found: Tensor, weight: Tensor, share: float) -> tu
     Works neighbour by neighbour, to avoid tensors of size A k F.
     """
     least = feature.clone()  # min over u of f_u; a point is a neighbour of itself
-    for me, other, _ in _columns(found, weight):
+    for me, other, _, _ in _columns(found, weight):
         least.scatter_reduce_(0, other[:, None].expand(-1, feature.shape[1]), feature.index_select(0, me), "amin")
     difference, out = feature - least, feature.clone()
-    for me, other, w in _columns(found, weight):
+    for me, other, w, _ in _columns(found, weight):
         out.index_add_(0, me, difference.index_select(0, other).mul_(share * w[:, None]))
     return least, out
 
@@ -110,21 +110,30 @@ def _forward(feature: Tensor, found: Tensor, weight: Tensor, share: float) -> tu
 def _backward(feature: Tensor, found: Tensor, weight: Tensor, least: Tensor, grad: Tensor, share: float) -> Tensor:
     """Gradient of the features [A, F]."""
     to, ties = torch.zeros_like(feature), torch.zeros_like(feature)  # gradients of h; number of points that attain each minimum
-    for me, other, w in _columns(found, weight):
+    for me, other, w, there in _columns(found, weight):
         where = other[:, None].expand(-1, grad.shape[1])
         to.scatter_add_(0, where, grad.index_select(0, me).mul_(share * w[:, None]))
-        ties.scatter_add_(0, where, (feature.index_select(0, me) == least.index_select(0, other)).to(grad.dtype))
+        hit = (feature.index_select(0, me) == least.index_select(0, other)) & there
+        ties.scatter_add_(0, where, hit.to(grad.dtype))
     out, to = grad + to, to / ties.clamp_min(1)
-    for me, other, _ in _columns(found, weight):
-        hit = feature.index_select(0, me) == least.index_select(0, other)
+    for me, other, _, there in _columns(found, weight):
+        hit = (feature.index_select(0, me) == least.index_select(0, other)) & there
         out.index_add_(0, me, to.index_select(0, other).mul_(hit), alpha=-1)
     return out
 
 
-def _columns(found: Tensor, weight: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """For each j: the points that have a j-th neighbour, this neighbour, and its weight."""
-    out = []
+def _columns(found: Tensor, weight: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """For each j: the points that have a j-th neighbour, this neighbour, its weight, and [.., 1] bool: whether it is there.
+
+    Selecting points would synchronise the host with a GPU. There all points are listed, and a missing neighbour is the point itself
+    with the weight 0.
+    """
+    out, everyone, yes = [], torch.arange(len(found), device=found.device), torch.ones((), dtype=torch.bool, device=found.device)
     for j in range(found.shape[1]):
-        me = (found[:, j] >= 0).nonzero().squeeze(1)
-        out.append((me, found[:, j].index_select(0, me), weight[:, j].index_select(0, me)))
+        there = found[:, j] >= 0
+        if found.device.type == "cpu":
+            me = there.nonzero().squeeze(1)
+            out.append((me, found[:, j].index_select(0, me), weight[:, j].index_select(0, me), yes))
+        else:
+            out.append((everyone, torch.where(there, found[:, j], everyone), torch.where(there, weight[:, j], 0.0), there[:, None]))
     return out
