@@ -1,5 +1,6 @@
 """`make gpu`: its plan, its slices and its report, without a GPU."""
 
+import importlib.util
 import sys
 import time
 from pathlib import Path
@@ -7,9 +8,13 @@ from pathlib import Path
 import pytest
 
 from scene_experts.recipes import RECIPES
+from support.places import ROOT
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-import gpu
+SPEC = importlib.util.spec_from_file_location("gpu", ROOT / "tools" / "gpu.py")
+assert SPEC and SPEC.loader
+gpu = importlib.util.module_from_spec(SPEC)
+sys.modules["gpu"] = gpu  # its dataclasses look their module up
+SPEC.loader.exec_module(gpu)
 
 STAGES = [
     gpu.Stage("one", "First", ("a",)),

@@ -194,7 +194,7 @@ def count_copy(name: str, args: Any, kwargs: Any, device: Any, on_cuda: bool) ->
         counts.block("copy")
 
 
-_to, _tensor, _generator = torch.Tensor.to, torch.tensor, torch.Generator
+_to, _tensor = torch.Tensor.to, torch.tensor
 
 
 def _placed(value: Any) -> Any:
@@ -248,7 +248,6 @@ def install() -> None:
         "get_device_properties": lambda device=None: _Properties,
     }.items():
         setattr(torch.cuda, name, value)
-    torch.Generator = lambda device="cpu": _generator()
     torch.Tensor.pin_memory = lambda self, device=None: self
     torch.Tensor.to = to
     torch.Tensor.cuda = lambda self, *args, **kwargs: to(self, CUDA)

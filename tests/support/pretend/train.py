@@ -12,12 +12,14 @@ import traceback
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import torch
 from torch.utils._python_dispatch import _disable_current_modes
 
 import support.pretend.gsplat_stand_in  # noqa: F401  after `tensors`, before gsplat is imported
+from scene_experts.core import random
 from scene_experts.core.types import Points
 from scene_experts.data.capture import Capture, load
 from scene_experts.data.settings import Data
@@ -32,6 +34,7 @@ from scene_experts.render.gsplat import GsplatRasterizer
 from scene_experts.render.reference import ReferenceRasterizer
 from scene_experts.training import loop
 from scene_experts.training.config import RunConfig, Train
+from scene_experts.training.optim import FusedAdam
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.state import Training
 from scene_experts.view.paint import paint
@@ -49,6 +52,13 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **sizes: Any) ->
     counts.kernel(f"triton {kernel.__name__}", sum(t.numel() * t.element_size() for t in tensors))
     with _disable_current_modes():
         kernel[grid](*(a.inner if isinstance(a, Pretender) else a for a in arguments), **sizes)
+
+
+def count_adam(calls: list[tuple]) -> None:
+    """The kernel of Adam reads and writes tensors that it knows by address: value and moments twice, the gradient once."""
+    for parameter, rows, *_ in calls:
+        values = parameter.numel() if rows is None else len(rows) * parameter[:1].numel()
+        counts.bytes += 7 * 4 * values
 
 
 def short(recipe: str, **changes: Any) -> Train:
@@ -114,7 +124,10 @@ def compare(recipe: str, capture: Capture) -> dict[str, Any]:
 
 def main(words: list[str]) -> int:
     gsplat.explain_missing = lambda: None
+    random.torch = SimpleNamespace(randint=torch.randint, Generator=lambda device: torch.Generator())
     triton.launch = launch
+    launch_adam = FusedAdam._launch
+    FusedAdam._launch = lambda self, calls: (count_adam(calls), launch_adam(self, calls))[1]
     triton.explain_missing = lambda: None
     score.measure_speed = partial(score.measure_speed, budget=0.0)  # the fewest frames
     capture = load(DEMO / "buddha", resolution="longest:32", max_views=6)
