@@ -116,7 +116,7 @@ def train(args: list[str]) -> int:
     console = Console(highlight=False, quiet=not group.first)
     for warning in capture.warnings if group.first else ():
         print(f"warning: {warning}", file=sys.stderr)
-    what = f"{command.cfg.recipe} on {capture.name} ({len(capture.train)} views)"
+    what = f"{command.cfg.recipe} on {capture.name} ({len(capture.train)} training views, {len(capture.test)} held out)"
     together = f", {group.size} processes" if group.size > 1 else ""
     console.print(f"{what}, {run.device}, rasteriser {rasterize.name}{together}", soft_wrap=True)
     code = follow(command, run, capture, rasterize, console)

@@ -109,8 +109,11 @@ def _shown(value: Any) -> str:
     return shorten(repr(value))
 
 
-def first_difference(old: Any, new: Any, where: str = "") -> str:
-    """Return the first difference of two nested values, for example "loss.load was 0.01, is now 0.5", or an empty string."""
+MOST_DIFFERENCES = 5  # that an error message lists
+
+
+def differences(old: Any, new: Any, where: str = "") -> list[str]:
+    """Return the differences of two nested values in order, for example ["loss.load was 0.01, is now 0.5"]."""
     if isinstance(old, dict) and isinstance(new, dict) and old.keys() == new.keys():
-        return next((found for key in old if (found := first_difference(old[key], new[key], f"{where}.{key}".lstrip(".")))), "")
-    return "" if old == new else f"{where} was {old}, is now {new}"
+        return [found for key in old for found in differences(old[key], new[key], f"{where}.{key}".lstrip("."))]
+    return [] if old == new else [f"{where} was {old}, is now {new}"]

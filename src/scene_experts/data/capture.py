@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, nearest
 from scene_experts.core.reading.budget import CAPTURE
 from scene_experts.core.reading.numbers import FARTHEST, expect_range, number
 from scene_experts.core.reading.source import guarding
@@ -107,7 +107,9 @@ def _read(
 def _find_image_folder(root: Path, images: str | None, policy: str) -> str | None:
     """Return the folder that was asked for, images_N for "inria:N", or None for the capture's own. Raises InputError if it is absent."""
     if not root.is_dir():
-        raise InputError(f"expected the folder of a capture at {root}, found {'a file' if root.is_file() else 'nothing'}; check the path")
+        beside = [p.name for p in root.absolute().parent.iterdir() if p.is_dir()] if root.absolute().parent.is_dir() else []
+        found = "a file" if root.is_file() else "nothing"
+        raise InputError(f"expected the folder of a capture at {root}, found {found}{nearest(root.name, beside) or '; check the path'}")
     if images is None and policy.startswith("inria:"):
         images = f"images_{policy.partition(':')[2]}"
     if images is not None and not (root / images).is_dir():

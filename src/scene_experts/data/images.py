@@ -86,9 +86,10 @@ def check_policy(policy: str) -> str:
     except ValueError:
         good = False
     if not good:
+        meant = f"for a longest side of {policy} pixels write longest:{policy}" if policy.isdecimal() else "choose one"
         raise InputError(
             f"expected --resolution auto, as-is, cap1600, factor:N, longest:N or inria:N with N >= 1, or share:S with S in (0, 1], "
-            f"found {policy!r}; choose one"
+            f"found {policy!r}; {meant}"
         )
     return policy
 

@@ -75,7 +75,8 @@ class TrainingProgress:
             case Exported():
                 self.print_line(f"wrote {event.path}")
             case Finished():
-                self.print_line(f"finished {event.step:,} iterations in {format_duration(event.seconds)}")
+                if event.step > self.first:  # a run that was already complete has nothing to tell
+                    self.print_line(f"finished {event.step:,} iterations in {format_duration(event.seconds)}")
             case Previewed():
                 pass
 

@@ -25,9 +25,9 @@ from torch import Tensor
 
 import scene_experts
 from scene_experts.core import checkpoint
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, few
 from scene_experts.core.io import locked, read_json, write_json
-from scene_experts.core.plain import UnknownPart, first_difference, from_json, to_json
+from scene_experts.core.plain import MOST_DIFFERENCES, UnknownPart, differences, from_json, to_json
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding
 from scene_experts.data import capture as captures
@@ -93,7 +93,7 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
         _check_same(out, read_config(out), config)
     elif not overwrite and any((out / "checkpoints").glob("ckpt_*.safetensors")):
         imported = config.command.startswith("import ")
-        go_on = "" if imported else "continue it (--resume or resume=True), replace it (--overwrite or overwrite=True), or "
+        go_on = "" if imported else "continue it with --resume, replace it with --overwrite (in Python: resume=True, overwrite=True), or "
         raise InputError(f"expected a new or empty run folder, found checkpoints in {out}; {go_on}choose another folder (--out)")
 
 
@@ -120,10 +120,10 @@ def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
         )
     old = to_json(replace(found.data, path=Path())) | to_json(found.train)
     new = to_json(replace(config.data, path=Path())) | to_json(config.train)
-    other = first_difference(old, new)
+    other = differences(old, new)
     if other:
         raise InputError(
-            f"expected the settings that the run in {out} began with, found other settings: {other}; "
+            f"expected the settings that the run in {out} began with, found other settings: {few(other, MOST_DIFFERENCES)}; "
             f"resume with the run's own flags, or choose another --out"
         )
 

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from scene_experts.core import checkpoint
-from scene_experts.core.errors import InputError
-from scene_experts.core.plain import first_difference, from_json, to_json
+from scene_experts.core.errors import InputError, few
+from scene_experts.core.plain import MOST_DIFFERENCES, differences, from_json, to_json
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding
 from scene_experts.data.capture import Capture
@@ -204,7 +204,7 @@ def check_same(cfg: Train, meta: dict[str, Any]) -> None:
     Settings that are newer than the checkpoint have their defaults.
     """
     if "train" in meta:
-        other = first_difference(to_json(from_json(Train, meta["train"])), to_json(cfg))
+        other = few(differences(to_json(from_json(Train, meta["train"])), to_json(cfg)), MOST_DIFFERENCES)
     else:  # an older checkpoint, which stores only a hash
         other = "" if meta["config"] == old_hash(cfg) else "it does not say which"
     if other:

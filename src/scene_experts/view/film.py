@@ -101,7 +101,7 @@ def make_path(options: FilmOptions, capture: Capture) -> CameraPath:
     if options.path == "test":
         chosen = capture.test or capture.train
         return CameraPath(tuple(resize_camera(capture.views[i].camera, size) for i in chosen), options.fps or 2.0)
-    return paths.make_path(options.path, capture, max(1, round(options.seconds * fps)), size, fps)
+    return paths.make_path(options.path, capture, options.frames or max(1, round(options.seconds * fps)), size, fps)
 
 
 def resize_camera(camera: Camera, size: tuple[int, int] | None) -> Camera:

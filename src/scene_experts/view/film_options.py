@@ -20,6 +20,8 @@ class FilmOptions:
     cameras), or a JSON file of this package or of nerfstudio."""
     seconds: float = 8.0
     """Duration of orbit, spiral and views."""
+    frames: int | None = None
+    """Number of frames of orbit, spiral and views, instead of --seconds."""
     fps: float | None = None
     """Frames per second; by default 24, or what the path's file says."""
     size: Annotated[str | None, Option(value="WIDTHxHEIGHT")] = None
@@ -37,6 +39,7 @@ class FilmOptions:
         """Raises InputError, naming the option, for invalid values."""
         fps = 1.0 if self.fps is None else self.fps
         expect_at_least([("--seconds", self.seconds, 0.01), ("--fps", fps, 0.1), ("--quality", self.quality, 1)])
+        expect_at_least([("--frames", 1 if self.frames is None else self.frames, 1)])
         expect_at_least([("--only", number, 1) for number in self.only])
         if self.quality > 10:
             raise InputError(f"expected --quality of at most 10, found {self.quality}; give a smaller number")

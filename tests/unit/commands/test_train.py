@@ -98,7 +98,8 @@ def test_the_help_without_a_recipe_lists_every_recipe_once():
     with pytest.raises(HelpAsked) as asked:
         parse_train(["--help"])
     lines = str(asked.value).splitlines()
-    named = [line.split()[0] for line in lines if line.startswith("  ") and line.split()[0] in RECIPES]
+    before = lines[: lines.index("Examples:")]  # a line of an example begins with the name of the program
+    named = [line.split()[0] for line in before if line.startswith("  ") and line.split()[0] in RECIPES]
     assert sorted(named) == sorted(RECIPES) and max(map(len, lines)) <= 100
 
 

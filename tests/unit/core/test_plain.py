@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.plain import UnknownPart, first_difference, from_json, to_json
+from scene_experts.core.plain import UnknownPart, differences, from_json, to_json
 from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
 from scene_experts.training.config import RunConfig, Train
@@ -49,6 +49,6 @@ def test_an_unknown_part_is_told_from_a_wrong_value():
         from_json(Train, {"recipe": "x", "scene": {"type": "GrowAnchors"}})
 
 
-def test_the_first_difference_is_named():
+def test_differences_are_named():
     old, new = {"a": 1, "b": {"c": [1, 2], "d": 3}}, {"a": 1, "b": {"c": [1, 2], "d": 4}}
-    assert first_difference(old, new) == "b.d was 3, is now 4" and first_difference(old, old) == ""
+    assert differences(old, new) == ["b.d was 3, is now 4"] and differences(old, old) == []

@@ -15,7 +15,12 @@ def test_sizes():
 
 @pytest.mark.parametrize(
     ("options", "flag"),
-    [(FilmOptions(quality=11), "--quality"), (FilmOptions(seconds=0), "--seconds"), (FilmOptions(only=(0,)), "--only")],
+    [
+        (FilmOptions(quality=11), "--quality"),
+        (FilmOptions(seconds=0), "--seconds"),
+        (FilmOptions(frames=0), "--frames"),
+        (FilmOptions(only=(0,)), "--only"),
+    ],
 )
 def test_invalid_values_name_their_option(options, flag):
     with pytest.raises(InputError, match=flag):
