@@ -8,6 +8,7 @@
 # make crash ROUNDS=200   kill trainings of every family at random moments and compare what is resumed with what was left alone
 # make bench      the benchmarks that need no GPU
 # make gpu DATA=CAPTURE   everything that a GPU is needed for, in slices below 9 minutes; repeat until it prints "all done"
+# make pretend    the CUDA path on tensors that pretend to be on CUDA: mixed devices, and the kernels, waits and bytes of a step
 # make record-errors, make record-flags   record the command line's error sentences or its flags anew in tests/golden
 # Every target builds a virtual environment in .venv first. An importable torch of PYTHON is used as it is; otherwise the pinned CPU
 # version is installed. WORKERS sets the number of test processes (0: none beside pytest's own).
@@ -31,7 +32,7 @@ DEMO_FLAGS ?= --iterations $(DEMO_ITERATIONS) --loss.dssim 0.8
 # as the package sets it when it is imported before torch, which the benchmark scripts do not
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo view test test-fast fuzz lint record-errors record-flags bench gpu sanitize crash env lpips clean
+.PHONY: demo view test test-fast fuzz lint record-errors record-flags bench gpu pretend sanitize crash env lpips clean
 
 env: $(STAMP)
 
@@ -91,6 +92,17 @@ bench: $(STAMP)
 	$(BIN)/python benchmarks/decode.py
 	$(BIN)/python benchmarks/loss.py
 	$(BIN)/python benchmarks/step.py
+
+# Kept out of .venv: Triton's interpreter needs an older numpy, and gsplat without CUDA only warns.
+PRETEND := build/pretend
+WITHOUT_GPU := gsplat==1.5.3 jaxtyping==0.3.11 triton==3.5.1 numpy==2.2.6
+PRETEND_TESTS ?= tests/system/test_pretend_cuda.py -k "not other_recipes"
+
+pretend: $(STAMP)
+	@test -d $(PRETEND)/gsplat || $(BIN)/pip install -q --no-deps --target $(PRETEND) $(WITHOUT_GPU) || echo "gsplat and triton could not be fetched: skipped"
+	PYTHONPATH=$(abspath $(PRETEND)) $(BIN)/python -m pytest -q -W ignore $(PRETEND_TESTS)
+	PYTHONPATH=$(abspath $(PRETEND)) $(BIN)/python -m pytest -q -W ignore tests/unit/native/test_triton_probe.py tests/unit/training/test_triton_*.py \
+	  tests/unit/render/test_*project*.py tests/unit/scene/anchors/test_triton_*.py
 
 gpu: $(STAMP)
 	$(BIN)/python tools/gpu.py --data $(DATA) $(if $(WHEELS),--wheels $(WHEELS))

@@ -23,7 +23,7 @@ def explain_missing() -> str | None:
     if shutil.which("g++") is None or sys.platform != "linux":
         return "g++ on Linux is needed to build the guard"
     missing = [name for name in ("gsplat", "jaxtyping", "triton") if importlib.util.find_spec(name) is None]
-    return f"{', '.join(missing)} not installed: pip install 'scene-experts[cuda]'" if missing else None
+    return f"{', '.join(missing)} not installed: use `make pretend`" if missing else None
 
 
 @cache

@@ -86,7 +86,7 @@ def try_recipe(recipe: str, decode: str, capture: Capture) -> dict[str, Any]:
     for _ in range(STEPS):
         counts.reset()
         done = loop.iterate(training, run, capture, draw)
-        if done.edit is not None:
+        if done.edits:
             found["edits"] += 1
             continue
         found["kernels"], found["waits"], found["blocking"] = sum(counts.kernels.values()), dict(counts.waits), dict(counts.blocking)
