@@ -119,7 +119,7 @@ def draw_expert_strip(
 
 
 def write_expert_strips(folder: Path, scene: Scene, camera: Camera, step: int, rasterize: Rasterizer, background: Tensor) -> None:
-    """Write FOLDER/experts/<attribute>.png, the strip of one view, for each attribute with experts."""
-    for attribute in scene.routing(step, 1):
+    """Write FOLDER/experts/<attribute>.png, the strip of one view, for each attribute whose Gaussians the experts share at `step`."""
+    for attribute in scene(camera, step, Mode.DRAW, rasterize.visible).routing:
         sheet = draw_expert_strip(scene, camera, step, rasterize, background, attribute, WIDEST)
         pictures.write_picture(folder / "experts" / f"{attribute}.png", sheet)

@@ -118,3 +118,7 @@ def test_a_file_for_each_attribute_with_experts(recipe, names, tmp_path):
     for sheet in map(pictures.read_picture, found):
         assert sheet.shape[1] == 6 * (WIDEST + pictures.GAP) - pictures.GAP
         assert sheet[-320:, :WIDEST].max() > 20, "the picture is not black"
+
+
+def test_a_scene_whose_experts_are_not_split_yet(tmp_path):
+    write_expert_strips(tmp_path, start_scene("scene-experts"), CAMERA, 5, choose("auto", "cpu"), torch.zeros(3))

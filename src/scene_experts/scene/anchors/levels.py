@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scene_experts.core.transfer import upload
 from scene_experts.core.types import Camera
 from scene_experts.geometry.voxel import AXIS_LIMIT, find_unique_cells, to_lattice
 
@@ -55,7 +56,7 @@ class Levels:
 
         The value is log_fork(standard / r), where r is the distance to the anchor moved by half a cell (Octree-GS).
         """
-        halves = xyz.new_tensor([0.5 * self.size(i) for i in range(self.count)])
+        halves = upload(torch.tensor([0.5 * self.size(i) for i in range(self.count)], dtype=xyz.dtype), xyz.device)
         v = xyz - camera.to(xyz) + halves.index_select(0, level)[:, None]
         r = v.norm(dim=1).clamp_min(1e-12)
         return torch.log(self.standard / r) / math.log(self.fork)
