@@ -17,7 +17,7 @@ TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--ma
 
 def command(folder: Path, out: Path) -> list[str]:
     words = ["-m", "scene_experts", "train", "scaffold-gs", "--data", str(folder), "--out", str(out), "--device", "cpu", "--deterministic"]
-    numbers = {"iterations": 600, "batch": 2, "stop-at": 400, "save-every": 40, "preview-every": 0, "growth.adjust.interval": 20}
+    numbers = {"iterations": 600, "batch": 2, "stop-at": 200, "save-every": 40, "preview-every": 0, "growth.adjust.interval": 20}
     return words + [word for name, value in numbers.items() for word in (f"--{name}", str(value))]
 
 

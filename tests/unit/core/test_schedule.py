@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from scene_experts.core.schedule import Every, Rate
+from scene_experts.core.schedule import Every, Rate, passes
 
 
 def test_adjustments_of_scaffold_gs_run_from_1600_to_14900():
@@ -30,3 +30,8 @@ def test_ends_zero_and_clipping():
     assert rate.at(1000, 100) == rate.at(100, 100)
     assert Rate(0.0, 0.0).at(5, 10) == 0.0 and Rate(0.004, 0.004).at(7, 10) == 0.004
     assert rate.times(2).at(30, 100) == pytest.approx(2 * math.exp(0.7 * math.log(0.01) + 0.3 * math.log(0.0001)))
+
+
+def test_a_batch_passes_the_multiples_of_its_views():
+    assert [step for step in range(4, 41, 4) if passes(step, 4, 10)] == [12, 20, 32, 40]
+    assert all(passes(step, 1, 7) == (step % 7 == 0) for step in range(1, 50))

@@ -78,6 +78,18 @@ def test_the_biases_follow_the_count_of_a_training_view():
     assert not made.router_balance.requires_grad
 
 
+def test_a_batch_moves_the_biases_once_by_the_counts_of_all_views():
+    made, f = head(BalancedExperts(num=3, top_k=1, speed=0.01)), torch.randn(40, 32)
+    made.batch = 4
+    chosen = [made.route(f[view * 10 : view * 10 + 10], STEP + view, None, Mode.TRAIN)[0].chosen for view in range(4)]
+    assert made.router_balance.tolist() == [0, 0, 0]
+    count = torch.bincount(torch.cat(chosen).reshape(-1), minlength=3).float()
+    assert made.counts()[0].tolist() == count.tolist()
+    made.settle()
+    assert made.router_balance.tolist() == pytest.approx((0.02 * (count.mean() - count).sign()).tolist())  # 0.01 sqrt(4)
+    assert made.counts()[0].tolist() == [0, 0, 0]
+
+
 def test_a_collapsed_router_is_evened_out():
     made, f = head(BalancedExperts(speed=0.002)), torch.randn(500, 32)
     with torch.no_grad():
