@@ -3,6 +3,7 @@
 # make test       all tests, one process per core
 # make test-fast  the tests that are not marked `slow`: at least one of every test file, within 180 CPU seconds
 # make fuzz       mutated files for every reader, for SECONDS seconds (docs/security.md); TARGETS="ply spz" for some readers
+# make docs       the documentation site in build/site; every link within it is checked
 # make lint       ruff (rules and format) and pyright
 # make sanitize   the native library with the address and undefined-behaviour sanitisers, and its tests on every instruction set
 # make crash ROUNDS=200   kill trainings of every family at random moments and compare what is resumed with what was left alone
@@ -32,7 +33,7 @@ DEMO_FLAGS ?= --iterations $(DEMO_ITERATIONS) --loss.dssim 0.8
 # as the package sets it when it is imported before torch, which the benchmark scripts do not
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo view test test-fast fuzz lint record-errors record-flags bench gpu pretend sanitize crash env lpips clean
+.PHONY: demo view test test-fast fuzz lint record-errors record-flags docs bench gpu pretend sanitize crash env lpips clean
 
 env: $(STAMP)
 
@@ -67,6 +68,10 @@ test-fast: $(STAMP)
 
 fuzz: $(STAMP)
 	cd tests && OMP_NUM_THREADS=1 $(abspath $(BIN))/python -m fuzz.run $(SECONDS) $(TARGETS)
+
+docs: $(STAMP)
+	$(BIN)/mkdocs build --strict
+	@echo "open build/site/index.html"
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
