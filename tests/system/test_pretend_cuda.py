@@ -9,6 +9,7 @@ from scene_experts.recipes import RECIPES
 from support.pretend.start import run
 
 MOST = {"scaffold-gs": 150, "moe-gs": 250}  # kernels of a step
+LOSS_ERROR = 1e-3  # of ten steps: Adam's first steps turn tiny gradients of any sign into whole steps
 FAMILIES = ["scaffold-gs-bank", "moe-gs-balance", "octree-gs", "scene-experts", "3dgs", "3dgs-mcmc", "sags"]
 
 
@@ -43,7 +44,7 @@ def test_a_family_trains_is_saved_scored_and_baked(recipe, folder):
 def test_losses_are_those_of_the_cpu(recipe, folder):
     (found,) = passed(run(folder, "train", f"{recipe}:compare")).values()
     assert found["cuda"][0] == pytest.approx(found["cpu"][0], rel=1e-4), "before any step of the optimiser"
-    assert found["cuda"] == pytest.approx(found["cpu"], rel=2e-3)
+    assert found["cuda"] == pytest.approx(found["cpu"], rel=LOSS_ERROR)
 
 
 @pytest.mark.slow

@@ -111,8 +111,12 @@ def try_recipe(recipe: str, decode: str, capture: Capture) -> dict[str, Any]:
 
 
 def compare(recipe: str, capture: Capture) -> dict[str, Any]:
-    """Ten steps on pretended CUDA and with the reference on the CPU: the losses of each step."""
+    """Ten steps on pretended CUDA and with the reference on the CPU: the losses of each step.
+
+    Densification is off: it draws random numbers on the device of the scene.
+    """
     cfg, losses = short(recipe), []
+    cfg = replace(cfg, growth=replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=10**6)))
     for device, draw in (("cuda", GsplatRasterizer(antialias=cfg.antialias)), ("cpu", ReferenceRasterizer(antialias=cfg.antialias))):
         training, run = Training.start(cfg, capture, device), run_of(cfg, device)
         training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
