@@ -34,6 +34,7 @@ def radii(
     tx, ty = tl.minimum(tl.maximum(px / pz, left), right), tl.minimum(tl.maximum(py / pz, top), bottom)
 
     xx, xy, yy = tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32)
+    qw, qx, qy, qz = tl.full((B,), 1.0, tl.float32), xx, xx, xx
     if ROTATED:
         qw, qx = tl.load(quats + at * 4, mask=inside, other=1.0), tl.load(quats + at * 4 + 1, mask=inside, other=0.0)
         qy, qz = tl.load(quats + at * 4 + 2, mask=inside, other=0.0), tl.load(quats + at * 4 + 3, mask=inside, other=0.0)
