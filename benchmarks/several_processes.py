@@ -18,6 +18,7 @@ import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -37,7 +38,8 @@ from scene_experts.training.memory import reuse_freed
 def settings(recipe: str, args: argparse.Namespace) -> Train:
     """The recipe with a batch, on a schedule as long as the run."""
     cfg = RECIPES[recipe][1]
-    growth = replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=args.interval))
+    growth: Any = cfg.growth
+    growth = replace(growth, adjust=replace(growth.adjust, interval=args.interval))
     return replace(cfg, batch=args.batch, iterations=args.steps * args.batch, growth=growth, max_anchors=args.max_anchors)
 
 
