@@ -118,7 +118,7 @@ def find_centres(positions: Tensor, count: int) -> tuple[Tensor, float]:
     low, high = x.quantile(MARGIN, dim=0), x.quantile(1.0 - MARGIN, dim=0)
     inner = x[((x >= low) & (x <= high)).all(dim=1)]
     x = inner if len(inner) >= count else x
-    centres = _spread_out(x, count)
+    centres = _halve(x, count)  # from equal parts, so that no expert gets a few far anchors alone
     nearest = _squares(x, centres).argmin(dim=1)
     for _ in range(ROUNDS):
         members = torch.bincount(nearest, minlength=count)
@@ -130,14 +130,15 @@ def find_centres(positions: Tensor, count: int) -> tuple[Tensor, float]:
     return centres, float(_squares(x, centres).amin(dim=1).mean().clamp_min(1e-12))
 
 
-def _spread_out(x: Tensor, count: int) -> Tensor:
-    """Return the first centres: the row nearest to the mean, then the row farthest from all so far, again and again."""
-    chosen = [int((x - x.mean(dim=0)).square().sum(dim=1).argmin())]
-    least = _squares(x, x[chosen]).amin(dim=1)
-    for _ in range(count - 1):
-        chosen.append(int(least.argmax()))
-        least = torch.minimum(least, _squares(x, x[chosen[-1:]]).squeeze(1))
-    return x[chosen].clone()
+def _halve(x: Tensor, count: int) -> Tensor:
+    """Return the means [count, 3] of `count` equal parts of the rows x [n, 3]: halved across the axis of the largest variance, each half
+    again, and so on."""
+    if count == 1 or len(x) == 1:
+        return x.mean(dim=0).expand(count, 3)
+    first = count // 2
+    order = x[:, int(x.var(dim=0).argmax())].argsort(stable=True)
+    cut = min(max(round(len(x) * first / count), 1), len(x) - 1)
+    return torch.cat([_halve(x[order[:cut]], first), _halve(x[order[cut:]], count - first)])
 
 
 def _squares(x: Tensor, centres: Tensor) -> Tensor:

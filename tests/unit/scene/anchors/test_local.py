@@ -134,6 +134,13 @@ def test_far_points_do_not_take_a_centre():
     assert find_centres(x, 4)[0].abs().max() < 1.5
 
 
+def test_every_centre_has_its_share_beside_a_dense_cluster():
+    torch.manual_seed(3)
+    x = torch.cat([0.1 * torch.randn(900, 3), 3.0 * torch.randn(100, 3)])
+    centres, _ = find_centres(x, 8)
+    assert torch.cdist(x.double(), centres).argmin(1).bincount(minlength=8).min() >= 10
+
+
 @pytest.mark.parametrize("n", [1, 3, 8])
 def test_fewer_positions_than_centres(n):
     centres, spread = find_centres(torch.rand(n, 3), 8)
