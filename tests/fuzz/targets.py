@@ -17,6 +17,7 @@ from PIL import Image
 
 from fuzz import containers
 from fuzz.mutate import mutate
+from fuzz.structure import mutate_structure
 from scene_experts.core import checkpoint
 from scene_experts.core.io import write_json
 from scene_experts.data import capture
@@ -63,13 +64,21 @@ class Target:
     packs: Mapping[str, Pack] = field(default_factory=dict)
 
 
-def mutate_files(files: Files, target: Target, rng: random.Random) -> Files:
+STRUCTURED = 10**12
+"""From this number on, half of the mutations are those of `structure`. Lower numbers keep the inputs that they always had."""
+
+
+def mutate_files(files: Files, target: Target, rng: random.Random, structured: bool = False) -> Files:
     """Return the files of an input with one of them mutated."""
     names = sorted(name for name in files if any(Path(name).match(pattern) for pattern in target.mutated))
     name, other = rng.choice(names), rng.choice(names)
     pack = target.packs.get(Path(name).suffix)
+    if structured and rng.random() < 0.5:
+        pack, certain = mutate_structure, True
+    else:
+        certain = False
     try:
-        new = pack(files[name], rng) if pack is not None and rng.random() < 0.5 else mutate(files[name], rng, files[other])
+        new = pack(files[name], rng) if pack is not None and (certain or rng.random() < 0.5) else mutate(files[name], rng, files[other])
     except Exception:  # the first mutation has damaged the container
         new = mutate(files[name], rng, files[other])
     return {**files, name: new}

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fuzz.targets import TARGETS
+from fuzz.targets import STRUCTURED, TARGETS
 
 REGRESSIONS: dict[str, list[int]] = json.loads((Path(__file__).parent / "regressions.json").read_text())
 
@@ -25,7 +25,7 @@ def read_inputs(name, first, count, folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TARGETS)
 def test_mutated_inputs(name, tmp_path):
-    assert not read_inputs(name, 0, 200, tmp_path)
+    assert not read_inputs(name, STRUCTURED, 200, tmp_path)
 
 
 @pytest.mark.slow

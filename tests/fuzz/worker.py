@@ -70,7 +70,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     import torch
 
-    from fuzz.targets import TARGETS, make_seed, mutate_files
+    from fuzz.targets import STRUCTURED, TARGETS, make_seed, mutate_files
 
     torch.set_num_threads(1)
     target = TARGETS[name]
@@ -83,9 +83,9 @@ def main() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MEMORY, limit))  # a bomb fails here before it takes the machine
         for number in range(seed, seed + count):
             rng = random.Random(f"{name} {number}")
-            changed = mutate_files(files, target, rng)
+            changed = mutate_files(files, target, rng, number >= STRUCTURED)
             if rng.random() < 0.3:
-                changed = mutate_files(changed, target, rng)
+                changed = mutate_files(changed, target, rng, number >= STRUCTURED)
             (out / "current").write_text(f"{name} {number}")
             resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time() + 30), resource.RLIM_INFINITY))
             wrong = try_input(target.read, changed, out / "input", start)
