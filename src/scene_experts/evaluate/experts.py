@@ -118,6 +118,7 @@ def draw_expert_strip(
     return pictures.compose_row(parts if widest is None else [pictures.limit_width(part, widest) for part in parts], captions)
 
 
+@torch.no_grad()
 def write_expert_strips(folder: Path, scene: Scene, camera: Camera, step: int, rasterize: Rasterizer, background: Tensor) -> None:
     """Write FOLDER/experts/<attribute>.png, the strip of one view, for each attribute whose Gaussians the experts share at `step`."""
     for attribute in scene(camera, step, Mode.DRAW, rasterize.visible).routing:

@@ -42,12 +42,14 @@ class BalancedHead(MixtureHead):
 
     config: BalancedExperts  # type: ignore[assignment]
     router_balance: Tensor
+    counted: Tensor
 
     def __init__(self, config: BalancedExperts, *shape: Any) -> None:
         super().__init__(config, *shape)
         self.router_balance = nn.Parameter(torch.zeros(config.num), requires_grad=False)
         self.moved_at: int | None = None
-        self.counted: Tensor = torch.zeros(config.num)  # how many anchors chose each expert, over the views of a batch
+        # how many anchors chose each expert, over the views of a batch
+        self.register_buffer("counted", torch.zeros(config.num), persistent=False)
 
     def choose(self, logits: Tensor, k: int) -> Tensor:
         """Return the indices [A, k] of the largest biased gates, largest first."""
