@@ -19,6 +19,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError, RunError
 
 T = TypeVar("T")
+JOINING = timedelta(minutes=10)
 TIMEOUT = timedelta(days=1)  # a lost process is noticed at once; a slow one may show a picture, save, or wait for a person
 
 
@@ -92,8 +93,23 @@ class Group(Alone):
         self.restarts = restarts()
         self.sent = 0
         # Flags and Python values travel over gloo, also beside nccl: they are on the CPU.
+        backends = "cpu:gloo,cuda:nccl" if device == "cuda" else "gloo"
         with self._expecting_all():
-            dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo", timeout=TIMEOUT)
+            dist.init_process_group(backends, store=self._meet(), rank=self.rank, world_size=self.size, timeout=TIMEOUT)
+
+    def _meet(self) -> Any:
+        """Return the key-value store of this start of the processes, when all of them have reached it.
+
+        After a restart `torchrun` may serve the store of the processes before. Their addresses are still in it, and gloo would wait
+        for them for ever. Each start has keys of its own.
+        """
+        from torch.distributed import PrefixStore, rendezvous  # pyright: ignore[reportPrivateImportUsage]  # documented, but not in __all__
+
+        store, _, _ = next(rendezvous("env://", timeout=JOINING))
+        store = PrefixStore(f"scene-experts/{self.restarts}/{self.size}", store)
+        store.set(f"here/{self.rank}", "")
+        store.wait([f"here/{rank}" for rank in range(self.size)], JOINING)
+        return store
 
     def sum(self, tensor: Tensor) -> None:
         self.sent += tensor.numel() * tensor.element_size()
