@@ -2,6 +2,9 @@
 
 Workers read batches of mutated inputs. A worker that dies is restarted behind the input that ended it. Findings are printed with
 the name and number from which `python -m fuzz.worker NAME NUMBER 1 FOLDER` makes the same input again.
+
+Each batch adds a line to build/fuzz.jsonl: target, first number, number of inputs, findings. The last lines of a run give the totals
+of all runs in this file. The first number of a run is the time in milliseconds, so runs never share inputs.
 """
 
 from __future__ import annotations
@@ -14,10 +17,12 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from fuzz.targets import TARGETS
 
 BATCH = 500
+COUNTS = Path(__file__).parents[2] / "build" / "fuzz.jsonl"
 
 
 def main() -> int:
@@ -31,12 +36,44 @@ def main() -> int:
         for name in names:
             if time.monotonic() >= end:
                 break
+            number, findings = place[name], len(found[name])
             with tempfile.TemporaryDirectory() as folder:
-                place[name] += run_batch(name, place[name], Path(folder), done, found[name], end)
+                place[name] += run_batch(name, number, Path(folder), done, found[name], end)
+            add_count(COUNTS, {"target": name, "first": number, "inputs": place[name] - number, "findings": len(found[name]) - findings})
     print(f"{sum(done.values()):,} inputs in {time.monotonic() - begin:.0f} s")
     for name in names:
         print(f"{name:26} {done[name]:8,} inputs {len(found[name]):5} findings")
+    print(describe_totals(read_counts(COUNTS)))
     return int(any(found.values()))
+
+
+def add_count(path: Path, count: dict[str, Any]) -> None:
+    """Append the count of one batch to the file of all runs."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        file.write(json.dumps(count) + "\n")
+
+
+def read_counts(path: Path) -> list[dict[str, Any]]:
+    """Return the counts of all runs."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+
+
+def describe_totals(counts: list[dict[str, Any]]) -> str:
+    """Return the totals of all runs as text. An input that several runs have read counts once."""
+    spans: dict[str, list[tuple[int, int]]] = {}
+    for count in counts:
+        spans.setdefault(count["target"], []).append((count["first"], count["first"] + count["inputs"]))
+    total = 0
+    for found in spans.values():
+        end = -1
+        for first, last in sorted(found):
+            total += max(0, last - max(first, end))
+            end = max(end, last)
+    findings = sum(count["findings"] for count in counts)
+    firsts = [count["first"] for count in counts]
+    numbers = f", numbers {min(firsts)} to {max(firsts) + BATCH}" if firsts else ""
+    return f"all runs: {total:,} inputs of {len(spans)} targets, {findings} findings{numbers}"
 
 
 def run_batch(name: str, first: int, folder: Path, done: Counter[str], found: list[str], end: float) -> int:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from fuzz.run import add_count, describe_totals, read_counts
 from fuzz.targets import STRUCTURED, TARGETS
 
 REGRESSIONS: dict[str, list[int]] = json.loads((Path(__file__).parent / "regressions.json").read_text())
@@ -33,3 +34,11 @@ def test_mutated_inputs(name, tmp_path):
 def test_inputs_that_broke_a_reader(name, tmp_path):
     for number in REGRESSIONS[name]:
         assert not read_inputs(name, number, 1, tmp_path)
+
+
+def test_totals_of_several_runs(tmp_path):
+    path = tmp_path / "build" / "fuzz.jsonl"
+    for target, first in (("ply", 100), ("ply", 700), ("ply", 400), ("spz", 100), ("spz", 100)):  # 400 overlaps 100 and 700
+        add_count(path, {"target": target, "first": first, "inputs": 500, "findings": int(first == 400)})
+    assert describe_totals(read_counts(path)).startswith("all runs: 1,600 inputs of 2 targets, 1 findings")
+    assert describe_totals([]) == "all runs: 0 inputs of 0 targets, 0 findings"
