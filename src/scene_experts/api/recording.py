@@ -18,7 +18,7 @@ from scene_experts.render import Rasterizer
 from scene_experts.training import loop, run_folder
 from scene_experts.training.config import check
 from scene_experts.training.events import Event, Exported, Finished, Started
-from scene_experts.training.memory import used_bytes
+from scene_experts.training.memory import give_back, used_bytes
 from scene_experts.training.record import Recorder
 
 
@@ -48,6 +48,8 @@ def train(run: loop.Run, capture: Capture, rasterize: Rasterizer, *, overwrite: 
                 yield event
         if finished is not None:
             if not complete:
+                if run.max_memory > 0:
+                    give_back()
                 yield export_layout(run.out, capture)
             yield finished
 

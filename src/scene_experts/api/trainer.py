@@ -23,7 +23,7 @@ from scene_experts.render import choose
 from scene_experts.training import loop, run_folder
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Event
-from scene_experts.training.memory import reuse_freed
+from scene_experts.training.memory import forget_peak, reuse_freed
 from scene_experts.training.progress import TrainingProgress
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.state import Training
@@ -74,12 +74,14 @@ class Trainer:
             save_every: Iterations between checkpoints, at least 1.
             preview_every: Iterations between `Previewed` events; 0 for none.
             log_every: Iterations between `Stepped` events, at least 1.
-            max_memory: GiB of resident memory at which growth stops; 0 for no limit.
+            max_memory: GiB that the process may reach before growth stops, resident or reserved on the GPU; 0 for no limit.
             tensorboard: Write `out`/tensorboard too (needs `pip install 'scene-experts[tensorboard]'`).
 
         Raises:
             InputError: A setting is invalid, the capture cannot be used, or the folder cannot hold the run.
         """
+        if max_memory > 0:
+            forget_peak()
         self.recipe = recipe(method)
         folder = None if out is None else Path(out)
         if folder is None and (resume or overwrite or tensorboard):

@@ -163,6 +163,15 @@ class ImageStore:
         """Size in bytes of the cached frames, never above `cache_bytes`."""
         return self._cache.used
 
+    def count_bytes(self, indices: Iterable[int]) -> int:
+        """Return the size in bytes of these frames, decoded or not."""
+        return sum(self.sources[index].bytes for index in indices)
+
+    def limit(self, cache_bytes: int) -> None:
+        """Lower `cache_bytes`. Frames beyond it are dropped when the next frame is decoded."""
+        with self._cache.changed:
+            self.cache_bytes = self._cache.budget = max(0, min(cache_bytes, self.cache_bytes))
+
     def get(self, index: int) -> Decoded:
         """Return rgb [H, W, 3] uint8 and the mask [H, W] uint8 (255 = counts) or None. The tensors are shared: do not modify them.
 

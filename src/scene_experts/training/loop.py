@@ -26,8 +26,9 @@ from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.guard import explain, find_broken
 from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
-from scene_experts.training.memory import anchor_cap, check_start
+from scene_experts.training.memory import anchor_cap, give_back, peak_bytes
 from scene_experts.training.state import Training, resume, save
+from scene_experts.training.trial import fit_memory
 
 log: logging.Logger = logging.getLogger(__name__)
 AHEAD = 3  # photographs that are read before they are needed
@@ -84,8 +85,8 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     """
     cfg = cfg.scaled()
     folder = run.out / "checkpoints" if run.out else None
-    training = run.group.agree(lambda: begin(cfg, run, capture, folder))
     rasterize = for_growth(rasterize, cfg.growth.absolute)
+    training = run.group.agree(lambda: begin(cfg, run, capture, folder, rasterize))
     exchange = make_exchange(training, run.group, run.stop, run.config.deterministic)
     exchange.start()
     total = min(cfg.iterations, -(-(run.config.stop_at or cfg.iterations) // cfg.batch) * cfg.batch)
@@ -127,15 +128,16 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
         yield Finished(training.step, training.clock.seconds)
 
 
-def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None) -> Training:
+def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize: Rasterizer) -> Training:
     """Start a training, or restore it from the newest whole checkpoint in `folder`. `cfg` must be scaled. Raises InputError as `train`."""
     training = resume(cfg, folder, run.device) if run.resume and folder else None
     if training and training.capture_id not in ("", capture.fingerprint()):
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
     training = training or Training.start(cfg, capture, run.device, run.dtype)
-    check_start(training.scene, training.step > 0, run.max_memory)
     training.capture_id = capture.fingerprint()
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
+    if run.max_memory > 0:
+        fit_memory(training, run.max_memory, capture, lambda *view: see_view(training, run, capture, rasterize, *view))
     return training
 
 
@@ -163,14 +165,20 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     training.seed_view(training.step + 1)
     exchange.finish()
     rows = exchange.rows() if cfg.sparse_adam else None
-    cap = exchange.limit(anchor_cap(scene, cfg.growth.max_anchors, run.max_memory, training.largest), run.max_memory > 0)
-    if any(cfg.growth.reads(number) for number in numbers):
+    if due := any(cfg.growth.reads(number) for number in numbers):
         exchange.complete()
+    limited, before = run.max_memory > 0 and due, len(scene.table)
+    if limited:
+        give_back()
+    cap = exchange.limit(anchor_cap(scene, cfg.growth.max_anchors, run.max_memory, training.largest), run.max_memory > 0)
     edits, survey = [], survey_of(training, run, capture, rasterize)
     for number in numbers:
         cfg.growth.survey(scene, survey, number, training.growth_rng)
         edit = cfg.growth.update(scene, number, training.growth_rng, cap)
         edits += [] if edit is None else [(number, edit)]
+    if limited:
+        training.largest.search(before, peak_bytes(scene.table.device))
+        give_back()
     exchange.compare(len(scene.table), bool(edits))
     training.optimizer_step(None if edits else rows)
     cfg.growth.finish(scene, training.step, training.rates(), training.growth_rng)

@@ -1,10 +1,11 @@
-"""Estimate the memory of a training, limit the number of anchors for `--max-memory`, and reuse freed memory."""
+"""Measure the memory of a training, limit the number of anchors for `--max-memory`, and reuse freed memory."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,19 +20,30 @@ _SPARE = 9 / 8  # the rasteriser allocates one eighth more than requested
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # parameters of mallopt in glibc
 _LARGE, _KEPT = 1 << 30, 256 << 20  # bytes
 _TILES = 8  # assumed number of (Gaussian, tile) pairs per Gaussian
+_SEARCHED = 360  # bytes for each Gaussian of the table while densification searches for new rows
+_FILLED = 0.95  # share of the limit that growth may fill
 
 
 @dataclass
 class Largest:
-    """The largest frame so far: number of rendered Gaussians and number of pixels."""
+    """What a training has needed so far: its largest frame, and what its measured peak of memory includes."""
 
-    gaussians: int = 0
+    gaussians: int = 0  # rendered by one frame
     pixels: int = 0
+    rows: int = 0  # of the table, visible in one frame
+    level: int = 0  # bytes of the process without the table, when the training began
+    searched: int = 0  # rows at the last search for new rows
+    searching: int = 0  # peak of the process after that search, bytes
 
     def see(self, decoded: Decoded, render: Render) -> None:
         """Update the maxima with one frame."""
         self.gaussians = max(self.gaussians, len(decoded.gaussians))
         self.pixels = max(self.pixels, render.alpha.numel())
+        self.rows = max(self.rows, len(decoded.rows))
+
+    def search(self, rows: int, peak: int) -> None:
+        """Record a search for new rows in a table of `rows` rows, and the peak of the process after it, bytes."""
+        self.searched, self.searching = rows, peak
 
 
 def gaussian_bytes(pairs: float = _TILES) -> float:
@@ -63,39 +75,64 @@ def row_bytes(scene: Scene) -> int:
 def anchor_cap(scene: Scene, cap: int, max_memory: float, largest: Largest) -> int:
     """Return the current limit on the number of anchors; 0 means no limit.
 
-    Reserved are one more frame of the largest size, to which each new row adds its share of Gaussians, and a copy of the table, which a
-    save and the export of the run may hold. Each edit may fill half of what is left, because some of this is an estimate; the next edit
-    measures again.
+    The memory of the process above `largest.level` is assumed to grow with the number of rows, which is the worst case: some of it does
+    not grow. Each edit may fill half of what is left below 95 % of the limit, because later frames can be larger and because freed memory
+    is not always used again. The next edit measures again.
 
     Args:
         scene: The scene.
         cap: The limit that the user set; 0 means no limit.
-        max_memory: Limit on the memory that `used_bytes` reports, GiB; 0 means no limit.
-        largest: The largest frame so far.
+        max_memory: Limit on the memory that `peak_bytes` reports, GiB; 0 means no limit.
+        largest: What the training has needed so far.
     """
     if max_memory <= 0:
         return cap
     n = len(scene.table)
+    expected = expected_bytes(scene, largest)
     share = largest.gaussians / max(n, 1)
-    row = row_bytes(scene)
-    left = max_memory * 2**30 - used_bytes(scene.table.device) - frame_bytes(largest.gaussians, largest.pixels) - n * row
-    room = max(0, int(left / 2 / (3 * row + share * gaussian_bytes())))  # 3: an edit holds old and new columns at once, and the copy
+    least = 3 * row_bytes(scene) + share * gaussian_bytes()  # 3: an edit holds old and new columns at once, and a save copies them
+    room = max(0, int((_FILLED * max_memory * 2**30 - expected) / 2 / max(least, (expected - largest.level) / max(n, 1))))
     return min(n + room, cap) if cap else max(n + room, 1)
 
 
-def check_start(scene: Scene, begun: bool, max_memory: float) -> None:
-    """Raise InputError if a training cannot begin within `max_memory` GiB (0: no limit): its gradients and moments have no room.
+def expected_bytes(scene: Scene, largest: Largest) -> int:
+    """Return the peak that a training is expected to reach if its table does not grow.
 
-    begun: Whether the moments are already there, as in a resumed training.
+    To the measured peak are added the Gaussians of visible rows that were transparent in every frame so far, the buffers of a first
+    search for new rows, and the copy of the state that a save or an export holds. Later searches need as much for each row as the last
+    one.
+    """
+    n, measured = len(scene.table), peak_bytes(scene.table.device)
+    if largest.searched:
+        measured = max(measured, largest.level + int((largest.searching - largest.level) * n / largest.searched))
+    else:
+        measured += _SEARCHED * scene.K * n
+    transparent = max(0, largest.rows * scene.K - largest.gaussians)
+    return measured + int(transparent * gaussian_bytes()) + row_bytes(scene) * n * 3 // 4
+
+
+def check_start(scene: Scene, begun: bool, max_memory: float, largest: Largest, images: int = 0) -> None:
+    """Raise InputError if a training cannot begin within `max_memory` GiB (0: no limit).
+
+    Args:
+        scene: The scene at the start.
+        begun: Whether the moments are already there, as in a resumed training.
+        max_memory: Limit on the memory that `peak_bytes` reports, GiB.
+        largest: What trial views have needed; before any of them, the frame counts as one Gaussian for each row.
+        images: Bytes that the cache of the photographs will still take.
     """
     if max_memory <= 0:
         return
     learned = sum(v.element_size() * v.numel() for v in scene.table.params.values())
-    needed = (used_bytes(scene.table.device) + learned * (1 if begun else 3)) / 2**30
-    if needed > max_memory:
+    if largest.gaussians:  # the gradients are part of the peak
+        needed = expected_bytes(scene, largest) + images + (0 if begun else 2 * learned)
+    else:
+        needed = max(peak_bytes(scene.table.device), used_bytes(scene.table.device) + learned * (1 if begun else 3))
+        needed += frame_bytes(len(scene.table), 0)
+    if needed > max_memory * 2**30:
         raise InputError(
             f"expected a start within --max-memory {max_memory:g} GiB, found {len(scene.table):,} {scene.traits.rows} that need about "
-            f"{needed:.2f} GiB; raise --max-memory or start from fewer points"
+            f"{needed / 2**30:.2f} GiB; raise --max-memory, start from fewer points or lower --resolution"
         )
 
 
@@ -107,6 +144,25 @@ def used_bytes(device: torch.device) -> int:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError, AttributeError):
         return _most_used()
+
+
+def peak_bytes(device: torch.device) -> int:
+    """Return the peak of `used_bytes` since `forget_peak`, or since the process began. 0 if the system does not report it."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_reserved(device)
+    with suppress(OSError, ValueError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return 1024 * int(line.split()[1])
+    return max(_most_used(), used_bytes(device))
+
+
+def forget_peak() -> None:
+    """Let `peak_bytes` begin anew in a process that has done other work, where the system allows it."""
+    if torch.cuda.is_initialized():
+        torch.cuda.reset_peak_memory_stats()
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
 
 
 def _most_used() -> int:
@@ -133,3 +189,11 @@ def reuse_freed() -> bool:
     except (OSError, AttributeError):
         return False
     return bool(mallopt(_MMAP_THRESHOLD, _LARGE)) and bool(mallopt(_TRIM_THRESHOLD, _KEPT))
+
+
+def give_back() -> None:
+    """Return freed memory to the system, where the C library can, instead of keeping it for reuse."""
+    if not sys.platform.startswith("linux"):
+        return
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)

@@ -66,6 +66,24 @@ def test_the_most_recently_used_frame_is_dropped_first(tmp_path: Path) -> None:
         store.get(1)
 
 
+def test_a_lower_limit_drops_frames(tmp_path: Path) -> None:
+    store = ImageStore(sources(tmp_path, 3))
+    size = store.count_bytes([0])
+    assert store.count_bytes([0, 1, 2]) == 3 * size > 0
+    for index in range(3):
+        store.get(index)
+    store.limit(2 * size)
+    store.limit(1000 * size)  # a limit is never raised
+    store.get(0)
+    store.close()
+    store = ImageStore(sources(tmp_path, 3))
+    store.limit(2 * size)
+    for index in range(3):
+        store.get(index)
+    assert store.cache_bytes == 2 * size and store.used_bytes <= 2 * size
+    store.close()
+
+
 def test_prefetched_frames_are_not_dropped(tmp_path: Path) -> None:
     store = ImageStore(sources(tmp_path, 9), cache_bytes=6 * FRAME)
     store.get(0)

@@ -4,6 +4,7 @@ import os
 import platform
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -13,7 +14,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 from scene_experts.training import memory
-from scene_experts.training.memory import Largest, anchor_cap, frame_bytes, row_bytes, used_bytes
+from scene_experts.training.memory import Largest, anchor_cap, expected_bytes, frame_bytes, row_bytes, used_bytes
 from support.messages import naming
 
 
@@ -27,34 +28,81 @@ def test_a_row_counts_values_gradients_moments_facts_and_statistics():
     assert row_bytes(scene()) == 4 * 4 * (32 + 30 + 6) + 24 + 12 + 4 * 22
 
 
-def test_the_cap_leaves_room_for_rows_and_their_gaussians(monkeypatch):
-    monkeypatch.setattr(memory, "used_bytes", lambda device: 2**30)
+MIB = 2**20
+
+
+@pytest.fixture
+def peak(monkeypatch):
+    """A process whose peak and resident memory are this number of bytes."""
+    now = [1024 * MIB]
+    monkeypatch.setattr(memory, "used_bytes", lambda device: now[0])
+    monkeypatch.setattr(memory, "peak_bytes", lambda device: now[0])
+    return now
+
+
+def test_without_a_limit_on_memory_the_users_limit_counts():
     assert anchor_cap(scene(), 7, 0.0, Largest()) == 7 and anchor_cap(scene(), 0, 0.0, Largest()) == 0
-    bare = anchor_cap(scene(), 0, 2.0, Largest())
-    assert bare == 100 + int((2**30 - 100 * row_bytes(scene())) / 2 / (3 * row_bytes(scene())))
-    drawn = anchor_cap(scene(), 0, 2.0, Largest(gaussians=500, pixels=400_000))
-    assert 100 < drawn < bare / 1.5
-    assert anchor_cap(scene(), 150, 2.0, Largest()) == 150
-    assert anchor_cap(scene(), 0, 0.5, Largest()) == 100  # nothing left: no more rows
+
+
+def test_growth_fills_half_of_what_is_left(peak):
+    measured = Largest(searched=100, searching=1024 * MIB, level=1024 * MIB)  # the table needs nothing that was measured
+    room = (0.95 * 2048 * MIB - 1024 * MIB - 100 * row_bytes(scene()) * 3 // 4) / 2
+    assert anchor_cap(scene(), 0, 2.0, measured) == 100 + int(room / (3 * row_bytes(scene())))
+    assert anchor_cap(scene(), 150, 2.0, measured) == 150
+    assert anchor_cap(scene(), 0, 1.0, measured) == 100  # nothing left: no more rows
+
+
+def test_growth_assumes_that_the_peak_grows_with_the_rows(peak):
+    """512 MiB above the level belong to 100 rows: 5 MiB each."""
+    measured = Largest(searched=100, searching=1024 * MIB, level=512 * MIB)
+    assert 100 + 80 <= anchor_cap(scene(), 0, 2.0, measured) <= 100 + 0.5 * 100 * (0.95 * 2048 - 1024) / 512
+
+
+def test_a_search_in_a_table_that_has_grown_since_needs_more(peak):
+    peak[0] = 900 * MIB
+    grown = Largest(searched=50, searching=900 * MIB, level=500 * MIB)  # 400 MiB for 50 rows: 800 MiB for the 100 rows now
+    assert expected_bytes(scene(), grown) == 1300 * MIB + 100 * row_bytes(scene()) * 3 // 4
+    assert anchor_cap(scene(), 0, 1.3, grown) == 100 < anchor_cap(scene(), 0, 1.6, grown)
+
+
+def test_what_no_frame_has_shown_yet_is_reserved(peak):
+    seen = Largest(gaussians=1000, rows=100, searched=100, searching=1024 * MIB, level=1024 * MIB)
+    transparent = replace(seen, gaussians=400)  # 100 visible rows of 10 Gaussians
+    assert expected_bytes(scene(), transparent) - expected_bytes(scene(), seen) == int(600 * memory.gaussian_bytes())
+    unsearched = replace(seen, searched=0)
+    assert expected_bytes(scene(), unsearched) - expected_bytes(scene(), seen) == 360 * 1000
 
 
 @pytest.mark.parametrize("begun", [True, False])
-def test_a_start_that_cannot_fit_says_so(begun, monkeypatch):
-    monkeypatch.setattr(memory, "used_bytes", lambda device: 2**30)
+def test_a_start_that_cannot_fit_says_so(begun, peak):
     rows, learned = 100_000, 4 * (32 + 30 + 6) * 100_000
-    needed = (2**30 + learned * (1 if begun else 3)) / 2**30
-    memory.check_start(scene(rows), begun, 0.0)
-    memory.check_start(scene(rows), begun, needed * 1.001)
-    with pytest.raises(InputError, match=naming("--max-memory", "100,000")):
-        memory.check_start(scene(rows), begun, needed * 0.999)
+    for largest, needed in (
+        (Largest(), 2**30 + learned * (1 if begun else 3) + frame_bytes(rows, 0)),
+        (seen := Largest(gaussians=9, rows=9), expected_bytes(scene(rows), seen) + (0 if begun else 2 * learned) + MIB),
+    ):
+        memory.check_start(scene(rows), begun, 0.0, largest)
+        memory.check_start(scene(rows), begun, needed * 1.001 / 2**30, largest, MIB)
+        with pytest.raises(InputError, match=naming("--max-memory", "100,000")):
+            memory.check_start(scene(rows), begun, needed * 0.999 / 2**30, largest, MIB)
+
+
+def test_the_peak_can_begin_anew():
+    cpu = torch.device("cpu")
+    assert memory.peak_bytes(cpu) >= 0.9 * used_bytes(cpu)
+    held = torch.ones(64 * MIB // 4)
+    high = memory.peak_bytes(cpu)
+    del held
+    memory.give_back()
+    memory.forget_peak()
+    assert 0 < memory.peak_bytes(cpu) <= high
 
 
 def test_the_largest_frame_is_remembered():
     largest = Largest()
-    for gaussians, pixels in ((10, 400), (30, 100), (20, 200)):
-        view = SimpleNamespace(gaussians=range(gaussians)), SimpleNamespace(alpha=torch.empty(pixels))
+    for gaussians, rows, pixels in ((10, 8, 400), (30, 3, 100), (20, 5, 200)):
+        view = SimpleNamespace(gaussians=range(gaussians), rows=range(rows)), SimpleNamespace(alpha=torch.empty(pixels))
         largest.see(*view)
-    assert (largest.gaussians, largest.pixels) == (30, 400)
+    assert (largest.gaussians, largest.pixels, largest.rows) == (30, 400, 8)
 
 
 def test_a_frame_grows_with_gaussians_pixels_and_pairs():
