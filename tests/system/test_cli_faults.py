@@ -1,4 +1,4 @@
-"""A run survives a full disk and a killed process."""
+"""Runs and captures survive a full disk and a killed process."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from scene_experts import cli
 from scene_experts.core import checkpoint
@@ -86,3 +88,52 @@ def test_killed_while_it_saves_the_run_goes_on_as_if_nothing_had_happened(captur
     (a, killed), (b, alone) = newest(out), newest(tmp_path / "alone")
     assert a == b == end and killed.keys() == alone.keys()
     assert all(torch.equal(killed[name], alone[name]) for name in alone)
+
+
+def run_with_full_disk(args: list[str], largest: int) -> str:
+    """Run a command whose files may not grow beyond `largest` bytes, and return its one error sentence."""
+
+    def full() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
+
+    done = subprocess.run(command(args), preexec_fn=full, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    (sentence,) = [line for line in done.stderr.splitlines() if line.startswith("error:")]
+    return sentence
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.slow
+def test_a_disk_that_fills_up_while_evaluating_or_reporting(capture, tmp_path):
+    """The scores, pictures and page of the evaluation before are unchanged; without one, nothing is left."""
+    assert cli.main(arguments(capture, tmp_path, "--stop-at", 2)) == 0
+    trained = contents(tmp_path)
+    assert "cannot write" in run_with_full_disk(["eval", str(tmp_path), "--no-lpips"], 2000)
+    assert contents(tmp_path) == trained
+    assert cli.main(["eval", str(tmp_path), "--no-lpips"]) == 0
+    before = contents(tmp_path)
+    assert {"results.json", "per_view.json", "report.html"} <= before.keys()
+    largest = max(len(data) for name, data in before.items() if name.endswith(".png"))
+    for args, limit in ((["eval", str(tmp_path), "--no-lpips"], largest - 1), (["report", str(tmp_path)], largest)):
+        assert "cannot write" in run_with_full_disk(args, limit)
+        assert contents(tmp_path) == before
+
+
+@pytest.mark.slow
+def test_a_disk_that_fills_up_while_making_a_capture(tmp_path):
+    """Photographs that cannot be copied, and a database that COLMAP cannot write: no capture, and the photographs are unchanged."""
+    pytest.importorskip("pycolmap")
+    (tmp_path / "photos").mkdir()
+    noise = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    for name in "abc":
+        Image.fromarray(noise).save(tmp_path / "photos" / f"{name}.png")
+    photos, out = contents(tmp_path / "photos"), tmp_path / "made"
+    size = max(map(len, photos.values()))
+    for limit in (size // 2, size + 1000):
+        sentence = run_with_full_disk(["capture", str(tmp_path / "photos"), "--out", str(out)], limit)
+        assert "cannot write" in sentence and "free some space" in sentence
+        assert contents(tmp_path / "photos") == photos
+        assert [path.name for path in out.iterdir()] == [".capture"] and not list(out.rglob("*.part"))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -49,6 +51,29 @@ def remove_pictures(folder: Path) -> None:
     """Remove the pictures of an earlier evaluation."""
     for name in PICTURES:
         shutil.rmtree(folder / name, ignore_errors=True)
+
+
+@contextmanager
+def replacing(folder: Path, first: bool = True) -> Iterator[Path]:
+    """Context manager that yields an empty folder for new pictures. At its end they replace those in `folder`.
+
+    After an error the pictures in `folder` are unchanged and the new ones are removed.
+    first: Whether this process owns the folder; others only write into it.
+    """
+    new = folder.with_name(f".{folder.name}.part")
+    if first:
+        shutil.rmtree(new, ignore_errors=True)
+    try:
+        yield new
+        if first:
+            remove_pictures(folder)
+            folder.mkdir(parents=True, exist_ok=True)
+            for name in PICTURES:
+                if (new / name).is_dir():
+                    os.replace(new / name, folder / name)
+    finally:
+        if first:
+            shutil.rmtree(new, ignore_errors=True)
 
 
 def write_picture(path: Path, pixels: np.ndarray) -> None:

@@ -84,44 +84,42 @@ def evaluate(
     if options.appearance == "half":
         fitting: Callable[[int, int], None] = lambda done, total: tell("fitting appearance codes", done, total)  # noqa: E731
         halves.fit_codes(scene, capture, rasterize, [chosen[n] for n in mine], step, background, fitting)
-    folder = out / options.folder
-    if group.first:
-        pictures.remove_pictures(folder)
-    group.wait()
-    drawing = Drawing(scene.frozen(step), rasterize, step, background, folder, options.appearance == "half")
+    with pictures.replacing(out / options.folder, group.first) as folder:
+        group.wait()
+        drawing = Drawing(scene.frozen(step), rasterize, step, background, folder, options.appearance == "half")
 
-    def score_mine() -> dict[int, dict[str, Any]]:
-        found = {}
-        for n in mine:
-            index = chosen[n]
-            capture.images.prefetch([chosen[later] for later in mine if later > n][:2])
-            name = capture.views[index].name
-            facts = drawing.draw(capture, index, cameras[n], files[name])
-            scores = score_files(folder, files[name], perceptual, device)
-            write_comparison(folder, files[name], scores)
-            found[n] = {"file": files[name], **scores, **facts}
-            tell("rendering and scoring", n + 1, len(chosen))
+        def score_mine() -> dict[int, dict[str, Any]]:
+            found = {}
+            for n in mine:
+                index = chosen[n]
+                capture.images.prefetch([chosen[later] for later in mine if later > n][:2])
+                name = capture.views[index].name
+                facts = drawing.draw(capture, index, cameras[n], files[name])
+                scores = score_files(folder, files[name], perceptual, device)
+                write_comparison(folder, files[name], scores)
+                found[n] = {"file": files[name], **scores, **facts}
+                tell("rendering and scoring", n + 1, len(chosen))
+            return found
+
+        by_place = {n: values for part in group.gather_values(group.agree(score_mine)) for n, values in part.items()}
+        if not group.first:
+            return {}
+        per_view = {capture.views[index].name: by_place[n] for n, index in enumerate(chosen)}
+        write_expert_strips(folder, scene, cameras[0], step, rasterize, background)
+        found = {
+            "format": FORMAT,
+            **results.describe_scores(per_view, perceptual),
+            **results.describe_scene(scene, step),
+            "gaussians_rendered": results.mean_over_views(per_view, "gaussians_rendered"),
+            "activation_ratio": results.mean_over_views(per_view, "activation_ratio"),
+            "fps": asdict(measure_speed(scene, cameras, step, rasterize, background)),
+            **results.describe_views(capture, cameras, options),
+            **results.describe_run(about or About(), step, rasterize, perceptual),
+            "evaluation_seconds": time.perf_counter() - began,
+        }
+        write_json(out / f"per_view{options.suffix}.json", per_view)
+        write_json(out / f"results{options.suffix}.json", found)
         return found
-
-    by_place = {n: values for part in group.gather_values(group.agree(score_mine)) for n, values in part.items()}
-    if not group.first:
-        return {}
-    per_view = {capture.views[index].name: by_place[n] for n, index in enumerate(chosen)}
-    write_expert_strips(folder, scene, cameras[0], step, rasterize, background)
-    found = {
-        "format": FORMAT,
-        **results.describe_scores(per_view, perceptual),
-        **results.describe_scene(scene, step),
-        "gaussians_rendered": results.mean_over_views(per_view, "gaussians_rendered"),
-        "activation_ratio": results.mean_over_views(per_view, "activation_ratio"),
-        "fps": asdict(measure_speed(scene, cameras, step, rasterize, background)),
-        **results.describe_views(capture, cameras, options),
-        **results.describe_run(about or About(), step, rasterize, perceptual),
-        "evaluation_seconds": time.perf_counter() - began,
-    }
-    write_json(out / f"per_view{options.suffix}.json", per_view)
-    write_json(out / f"results{options.suffix}.json", found)
-    return found
 
 
 def choose_views(capture: Capture, options: EvalOptions) -> tuple[int, ...]:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from scene_experts.core.errors import InputError, RunError
-from scene_experts.core.io import read_json, write_json
+from scene_experts.core.io import read_json, write_bytes, write_json
 from scene_experts.core.progress import Progress
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers import is_capture
@@ -202,8 +202,18 @@ def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress)
     if last.get("step") == "missing":
         raise InputError(f"pycolmap cannot be imported ({last['why']}): {INSTALL}")
     if code != 0 or last.get("step") != "done":
+        check_space(log.parent)
         raise RunError(f"COLMAP failed with exit code {code}: {last_log_line(log)}; its log is {log}")
     return last
+
+
+def check_space(folder: Path) -> None:
+    """Raise RunError if a file of 1 MiB cannot be written to `folder`. COLMAP's own messages do not say that the disk is full."""
+    probe = folder / ".probe"
+    try:
+        write_bytes(probe, bytes(1 << 20))
+    finally:
+        probe.unlink(missing_ok=True)
 
 
 def last_log_line(log: Path) -> str:

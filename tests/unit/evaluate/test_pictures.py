@@ -76,6 +76,18 @@ def test_removing_pictures_leaves_other_files(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
+def test_new_pictures_replace_old_ones_when_all_are_written(tmp_path: Path) -> None:
+    old = tmp_path / "test" / "renders" / "old.png"
+    pictures.write_picture(old, np.zeros((2, 2), np.uint8))
+    with pytest.raises(ZeroDivisionError), pictures.replacing(tmp_path / "test") as new:
+        pictures.write_picture(new / "renders" / "new.png", np.zeros((2, 2), np.uint8))
+        raise ZeroDivisionError
+    assert old.is_file() and [p.name for p in tmp_path.iterdir()] == ["test"]
+    with pictures.replacing(tmp_path / "test") as new:
+        pictures.write_picture(new / "renders" / "new.png", np.zeros((2, 2), np.uint8))
+    assert [p.name for p in (tmp_path / "test" / "renders").iterdir()] == ["new.png"] and [p.name for p in tmp_path.iterdir()] == ["test"]
+
+
 def test_joined_pictures_have_a_white_gap():
     left, right = torch.zeros(5, 7, 3), torch.full((5, 6, 3), 0.5)
     made = pictures.join_pictures([left, right], gap=2)
