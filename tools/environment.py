@@ -8,10 +8,13 @@ from __future__ import annotations
 import subprocess
 import sys
 import sysconfig
+from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 
 ROOT = Path(__file__).resolve().parents[1]
 CONSTRAINTS = ROOT / "constraints.txt"
+STEPS = ("Collecting", "Downloading", "Installing", "Preparing", "Building", "Getting", "Using cached", "Created")  # lines of pip
 FIND_TORCH = """
 import sys, pathlib
 import torch
@@ -21,7 +24,22 @@ print(pathlib.Path(torch.__file__).parents[1])
 
 
 def pip(*args: str) -> None:
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "--disable-pip-version-check", *args], check=True, cwd=ROOT)
+    """Run pip. Every three seconds it prints what pip does, so that nobody waits before a silent screen; an error prints all of it."""
+    command = [sys.executable, "-m", "pip", "install", "--disable-pip-version-check", "--progress-bar", "off", *args]
+    with TemporaryFile("w+", errors="replace") as log:
+        process, shown = subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT), ""
+        while process.poll() is None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(3)
+            log.seek(0)
+            steps = [line.strip() for line in log.readlines() if line.lstrip().startswith(STEPS)]
+            if process.poll() is None:
+                print(f"  {steps[-1][:100]}" if steps and steps[-1] != shown else "  ...", flush=True)
+                shown = steps[-1] if steps else ""
+        if process.returncode:
+            log.seek(0)
+            print(log.read())
+            raise subprocess.CalledProcessError(process.returncode, command)
 
 
 def has_torch() -> bool:

@@ -129,3 +129,11 @@ def test_every_open_question_has_a_decision():
     assert all(len(cells) == 4 and all(cells) for cells in questions)
     departures = [cells for _, cells in rows(read("differences.md")) if len(cells) == 3]
     assert len(departures) > 40 and all(len(cells) == 3 and all(cells) for cells in departures)
+
+
+def test_the_front_page_is_short_and_the_shipped_captures_are_small():
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 90 and max(map(len, lines)) <= 200
+    size = {folder.name: sum(path.stat().st_size for path in folder.rglob("*")) for folder in (ROOT / "demo").iterdir()}
+    assert size["banana"] <= 8_000_000
+    assert all((ROOT / "demo" / name / "ATTRIBUTION.txt").is_file() for name in size)
