@@ -1,16 +1,41 @@
 """The CUDA path without a GPU: tensors that pretend to be on CUDA (support/pretend). `make pretend` installs what it needs and runs it.
 
-The tests show that devices do not mix, and what a step costs in kernels, waits and copies.
+The tests show that devices do not mix, that steps are those of the CPU, and what a step costs in kernels, waits, copies and bytes.
 """
+
+from typing import NamedTuple
 
 import pytest
 
 from scene_experts.recipes import RECIPES
 from support.pretend.start import run
 
-MOST = {"scaffold-gs": 150, "moe-gs": 250}  # kernels of a step
-LOSS_ERROR = 1e-4  # relative, of ten steps
-FAMILIES = ["scaffold-gs-bank", "moe-gs-balance", "octree-gs", "scene-experts", "3dgs", "3dgs-mcmc", "sags"]
+
+class Most(NamedTuple):
+    """Limits of a step without densification, a little above what is counted."""
+
+    kernels: int
+    waits: int
+    bytes: float
+
+
+LEAN = {
+    "scaffold-gs:fused": Most(105, 3, 1.25e6),
+    "scaffold-gs:sparse": Most(105, 3, 1.25e6),
+    "moe-gs:fused": Most(178, 3, 4.0e6),
+}
+FAMILIES = {
+    "scaffold-gs-bank:composed": Most(235, 3, 2.2e6),
+    "scene-experts:composed": Most(210, 3, 3.8e6),
+    "octree-gs:composed": Most(212, 4, 0.92e6),
+    "moe-gs-balance:composed": Most(490, 12, 7.9e6),  # counts its experts on the host
+    "3dgs:composed": Most(278, 2, 0.7e6),
+    "3dgs-mcmc:composed": Most(345, 2, 0.32e6),
+    "sags:composed": Most(1400, 4, 85e6),  # plain torch for its graph and hash grid
+}
+GROUPS = [list(LEAN)[:2], list(LEAN)[2:], *(list(FAMILIES)[i : i + 2] for i in range(0, len(FAMILIES), 2))]  # a process each
+CLOSE = 1e-4  # relative, of losses and gradients
+DRAWN = {"picture": 1e-5, "depth": 1e-5, "gradients": 1e-4}
 
 
 @pytest.fixture(scope="module")
@@ -24,30 +49,44 @@ def passed(found):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("word", ["scaffold-gs:fused", "moe-gs:fused", "moe-gs:sparse"])
-def test_a_step_is_lean(word, folder):
-    (result,) = passed(run(folder, "train", word)).values()
-    assert result["kernels"] <= MOST[word.partition(":")[0]], result["where"]
-    assert sum(result["waits"].values()) <= 3 and not result["blocking"], (result["waits"], result["blocking"])
-    assert result["edits"] > 0 and result["baked"] > 0
+@pytest.mark.parametrize("words", GROUPS, ids="+".join)
+def test_a_recipe_trains_within_its_limits_and_is_saved_drawn_scored_and_baked(words, folder):
+    for word, result in passed(run(folder, "train", *words)).items():
+        most = (LEAN | FAMILIES)[word]
+        assert result["kernels"] <= most.kernels, (word, result["where"])
+        assert sum(result["waits"].values()) <= most.waits, (word, result["waits"])
+        assert result["bytes"] <= most.bytes, (word, result["moved"])
+        assert not result["blocking"], (word, result["blocking"])
+        assert result["edits"] > 0 and result["baked"] > 0, word
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("recipe", FAMILIES)
-def test_a_family_trains_is_saved_scored_and_baked(recipe, folder):
-    (result,) = passed(run(folder, "train", f"{recipe}:composed")).values()
-    assert sum(result["waits"].values()) <= 20 and not result["blocking"], (result["waits"], result["blocking"])
+@pytest.mark.parametrize("recipes", [("scaffold-gs", "octree-gs", "3dgs"), ("moe-gs", "sags")], ids="+".join)
+def test_each_step_is_that_of_the_cpu(recipes, folder):
+    """Or as near to it as float32 on the CPU is to float64: see support/pretend/compare.py."""
+    for recipe, found in passed(run(folder, "compare", *recipes)).items():
+        assert max(found["losses"][0], found["gradients"][0]) < CLOSE, recipe
+        for loss, gradients, rounding in zip(found["losses"], found["gradients"], found["rounding"], strict=True):
+            assert max(loss, gradients) < max(CLOSE, rounding), (recipe, found)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("recipe", ["moe-gs", "3dgs"])
-def test_losses_are_those_of_the_cpu(recipe, folder):
-    (found,) = passed(run(folder, "train", f"{recipe}:compare")).values()
-    assert found["cuda"][0] == pytest.approx(found["cpu"][0], rel=1e-4), "before any step of the optimiser"
-    assert found["cuda"] == pytest.approx(found["cpu"], rel=LOSS_ERROR)
+def test_ten_steps_on_their_own(folder):
+    (found,) = passed(run(folder, "compare", "3dgs:alone")).values()
+    assert len(found["losses"]) == 10 and max(found["losses"]) < CLOSE
+
+
+@pytest.mark.slow
+def test_the_adapter_draws_as_the_reference(folder):
+    cases = run(folder, "adapter")
+    assert len(cases) == 6
+    for name, found in cases.items():
+        assert found["radii"] and found["finite"], name
+        assert found["picture"] < DRAWN["picture"] and found["depth"] < DRAWN["depth"], (name, found)
+        assert max(found["gradients"].values()) < DRAWN["gradients"], (name, found)
 
 
 @pytest.mark.slow
 def test_all_other_recipes(folder):
-    others = [name for name in RECIPES if name not in (*FAMILIES, *MOST)]
-    passed(run(folder, "train", *(f"{name}:composed" for name in others)))
+    tested = {word.partition(":")[0] for word in LEAN | FAMILIES}
+    passed(run(folder, "train", *(f"{name}:composed" for name in RECIPES if name not in tested)))

@@ -21,6 +21,7 @@ from gsplat.cuda import _torch_impl as plain  # noqa: E402
 from support.pretend.tensors import Pretender, counts  # noqa: E402
 
 GARBAGE = float("nan")
+MOST_ALPHA = 0.999  # of a Gaussian at a pixel; 0.99 in the reference, and in gsplat since 1.6
 CHANNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)
 
 
@@ -136,7 +137,7 @@ def _raster(means2d, conics, colors, opac, bg, width, height, ts, offsets, flat)
         m, c, o, col = means2d[0, ids], conics[0, ids], opac[0, ids], colors[0, ids]
         dx, dy = m[:, 0] - px[:, :1], m[:, 1] - px[:, 1:]
         sigma = 0.5 * (c[:, 0] * dx * dx + c[:, 2] * dy * dy) + c[:, 1] * dx * dy
-        alpha = (o * torch.exp(-sigma)).clamp_max(0.999)
+        alpha = (o * torch.exp(-sigma)).clamp_max(MOST_ALPHA)
         alpha = torch.where((sigma < 0) | (alpha < 1 / 255), torch.zeros_like(alpha), alpha)
         after = (1 - alpha.detach()).cumprod(1)
         alpha = torch.where(after <= 1e-4, torch.zeros_like(alpha), alpha)
@@ -167,6 +168,21 @@ def raster_bwd(means2d, conics, colors, opac, bg, masks, w, h, ts, offsets, flat
     return None, *g
 
 
+def harmonics_fwd(degree, dirs, coeffs, masks):
+    with torch.no_grad():
+        colors = plain._spherical_harmonics(degree, torch.nn.functional.normalize(dirs, dim=-1), coeffs)
+        return colors if masks is None else torch.where(masks[..., None], colors, torch.zeros_like(colors))
+
+
+def harmonics_bwd(bases, degree, dirs, coeffs, masks, v_colors, compute_v_dirs):
+    with torch.enable_grad():
+        d, c = (t.detach().requires_grad_() for t in (dirs, coeffs))
+        colors = plain._spherical_harmonics(degree, torch.nn.functional.normalize(d, dim=-1), c)
+        v_colors = v_colors if masks is None else torch.where(masks[..., None], v_colors, torch.zeros_like(v_colors))
+        v_d, v_c = torch.autograd.grad(colors, (d, c), v_colors, allow_unused=True)
+    return v_c, torch.zeros_like(dirs) if v_d is None else v_d
+
+
 def counted(name, function):
     """One kernel with the bytes of its inputs and outputs; sorting waits for the device once, for the number of pairs."""
 
@@ -190,5 +206,7 @@ for _name, _function in {
     "intersect_offset": intersect_offset,
     "rasterize_to_pixels_3dgs_fwd": raster_fwd,
     "rasterize_to_pixels_3dgs_bwd": raster_bwd,
+    "spherical_harmonics_fwd": harmonics_fwd,
+    "spherical_harmonics_bwd": harmonics_bwd,
 }.items():
     setattr(C, _name, counted(_name, _function))

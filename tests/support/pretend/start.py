@@ -14,6 +14,7 @@ import pytest
 import torch
 
 TESTS = Path(__file__).parents[2]
+LONGEST = 300.0  # seconds of a process; the interpreter of Triton takes milliseconds for each operation of a kernel
 
 
 def explain_missing() -> str | None:
@@ -36,14 +37,18 @@ def build_guard(folder: Path) -> Path:
     return library
 
 
+def make_environment(folder: Path) -> dict[str, str]:
+    """Return the environment of a process in which tensors can pretend. The guard is built in `folder`."""
+    path = os.pathsep.join([str(TESTS), *sys.path])
+    return os.environ | {"LD_PRELOAD": str(build_guard(folder)), "PYTHONPATH": path, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"}
+
+
 def run(folder: Path, module: str, *arguments: str) -> Any:
     """Run `python -m support.pretend.MODULE ARGUMENTS` with the guard, and return the JSON that it prints last."""
     reason = explain_missing()
     if reason is not None:
         pytest.skip(reason)
-    path = os.pathsep.join([str(TESTS), *sys.path])
-    environment = os.environ | {"LD_PRELOAD": str(build_guard(folder)), "PYTHONPATH": path, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", f"support.pretend.{module}", *arguments]
-    done = subprocess.run(command, cwd=TESTS, env=environment, capture_output=True, text=True, timeout=1500)
+    done = subprocess.run(command, cwd=TESTS, env=make_environment(folder), capture_output=True, text=True, timeout=LONGEST)
     assert done.returncode == 0, done.stderr[-6000:]
     return json.loads(done.stdout.strip().splitlines()[-1])

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import collections
 import sys
+import time
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch.utils import _pytree as pytree
-from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+from torch.utils._python_dispatch import TorchDispatchMode
 
 CUDA = torch.device("cuda", 0)
 VIEWS = {
@@ -53,13 +54,19 @@ class Counts:
         self.waits: collections.Counter[str] = collections.Counter()
         self.blocking: collections.Counter[str] = collections.Counter()
         self.where: collections.Counter[str] = collections.Counter()
-        self.bytes = 0
+        self.moved: collections.Counter[str] = collections.Counter()
 
     def kernel(self, name: str, moved: int) -> None:
         if not self.quiet:
             self.kernels[name] += 1
-            self.where[find_line()] += 1
-            self.bytes += moved
+            line = find_line()
+            self.where[line] += 1
+            self.moved[f"{name} {line}"] += moved
+
+    @property
+    def bytes(self) -> int:
+        """Bytes that all kernels read and write."""
+        return sum(self.moved.values())
 
     def wait(self, name: str) -> None:
         if not self.quiet:
@@ -132,20 +139,41 @@ class Pretender(torch.Tensor):
 class Pretending(TorchDispatchMode):
     """Context in which tensors made for a CUDA device pretend to be there."""
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # nothing is compiled here, and the wrapper of each call costs as much as the call
+
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         return call(func, args, kwargs or {})
 
 
-def unwrap(value: Any) -> Any:
+def find_tensors(values: Any, into: list[torch.Tensor]) -> list[torch.Tensor]:
+    """Append the tensors in nested sequences to `into`."""
+    for value in values:
+        if isinstance(value, torch.Tensor):
+            into.append(value)
+        elif isinstance(value, (list, tuple)):
+            find_tensors(value, into)
+    return into
+
+
+def replace_tensors(value: Any, change: Callable[[torch.Tensor], torch.Tensor]) -> Any:
+    """Return `value` with the tensors in nested sequences changed."""
+    if isinstance(value, torch.Tensor):
+        return change(value)
+    return type(value)(replace_tensors(v, change) for v in value) if isinstance(value, (list, tuple)) else value
+
+
+def unwrap(value: torch.Tensor) -> torch.Tensor:
     return value.inner if isinstance(value, Pretender) else value
 
 
 def call(func: Any, args: Any, kwargs: Any) -> Any:
-    """Run one operation of torch on the tensors inside, after the checks and counts of a GPU."""
+    """Run one operation of torch on the tensors inside, after the checks and counts of a GPU. No mode is active here."""
     name = func.overloadpacket.__name__
     if name == "is_pinned":
         return False
-    tensors = [t for t in pytree.tree_leaves((args, kwargs)) if isinstance(t, torch.Tensor)]
+    tensors = find_tensors(kwargs.values(), find_tensors(args, []))
     ours, others = [t for t in tensors if isinstance(t, Pretender)], [t for t in tensors if not isinstance(t, Pretender)]
     device = kwargs.get("device")
     on_cuda = bool(ours) if device is None else torch.device(device).type == "cuda"
@@ -156,21 +184,20 @@ def call(func: Any, args: Any, kwargs: Any) -> Any:
         check_devices(name, func, args, tensors, others)
     if copying:
         count_copy(name, args, kwargs, device, on_cuda)
-    plain_args, plain_kwargs = pytree.tree_map_only(Pretender, unwrap, (args, kwargs))
-    if plain_kwargs.get("pin_memory"):
-        plain_kwargs = {**plain_kwargs, "pin_memory": False}
-    with _disable_current_modes():
-        out = func(*plain_args, **plain_kwargs)
+    if ours:
+        args, kwargs = replace_tensors(args, unwrap), {key: replace_tensors(value, unwrap) for key, value in kwargs.items()}
+    if kwargs.get("pin_memory"):
+        kwargs = {**kwargs, "pin_memory": False}
+    out = func(*args, **kwargs)
     if not on_cuda:
         return out
     by_mask = name in INDEXING and any(t.dtype == torch.bool and t.dim() for t in tensors[1:])
     if name in WAITS or by_mask:
         counts.wait("boolean index" if by_mask else name)
     if name not in VIEWS:
-        made = [t for t in pytree.tree_leaves(out) if isinstance(t, torch.Tensor)]
-        counts.kernel(name, sum(t.numel() * t.element_size() for t in (*ours, *made)))
+        counts.kernel(name, sum(t.numel() * t.element_size() for t in (*ours, *find_tensors((out,), []))))
     known = {id(t.inner): t for t in ours}
-    return pytree.tree_map_only(torch.Tensor, lambda t: known[id(t)] if id(t) in known else Pretender(t), out)
+    return replace_tensors(out, lambda t: known[id(t)] if id(t) in known else Pretender(t))
 
 
 def check_devices(name: str, func: Any, args: Any, tensors: list[torch.Tensor], others: list[torch.Tensor]) -> None:
@@ -229,6 +256,22 @@ class _Device:
         pass
 
 
+class _Event:
+    """A moment on the clock of the host."""
+
+    def __init__(self, enable_timing: bool = False) -> None:
+        self.at = 0.0
+
+    def record(self) -> None:
+        self.at = time.perf_counter()
+
+    def synchronize(self) -> None:
+        pass
+
+    def elapsed_time(self, later: _Event) -> float:
+        return 1e3 * (later.at - self.at)
+
+
 def install() -> None:
     """Change torch so that it finds one CUDA device."""
     for name, value in {
@@ -241,6 +284,8 @@ def install() -> None:
         "current_device": lambda: 0,
         "device_count": lambda: 1,
         "device": _Device,
+        "Event": _Event,
+        "get_device_name": lambda device=None: "no GPU: tensors that pretend",
         "synchronize": lambda device=None: None,
         "get_rng_state": lambda device=None: torch.get_rng_state(),
         "set_rng_state": lambda state, device=None: None,
