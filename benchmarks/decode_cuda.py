@@ -103,12 +103,12 @@ def make_scene(config: Anchors, total: int, device: str) -> AnchorScene:
     return made.to(device)
 
 
-def measure_copy_bandwidth(rounds: int) -> float:
-    """Bytes per second that a plain copy of 512 MiB reads and writes."""
-    source = torch.empty(2**27, device="cuda")
+def measure_copy_bandwidth(rounds: int, mebibytes: int = 512) -> float:
+    """Bytes per second that a plain copy of so much memory reads and writes."""
+    source = torch.empty(mebibytes * 2**18, device="cuda")
     to = torch.empty_like(source)
     times = [time_on_device(lambda: to.copy_(source)) for _ in range(rounds + WARM_UP)]
-    return 2 * 4 * 2**27 / (1e-3 * median(times[WARM_UP:]))
+    return 2 * mebibytes * 2**20 / (1e-3 * median(times[WARM_UP:]))
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -116,6 +116,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--anchors", type=int, default=100_000, help="anchors that the camera sees")
     parser.add_argument("--seen", type=float, default=0.7, help="share of the table that it sees")
     parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--copy", type=int, default=512, metavar="MIB", help="size of the copy that measures the bandwidth")
     parser.add_argument("--precision", choices=("ieee", "tf32x3", "tf32"), default="ieee", help="of the kernels' products")
     return parser
 
@@ -136,7 +137,7 @@ def main() -> None:
             cases[kind, form] = Case(make_scene(config, total, "cuda"), rows, camera, form)
     for case in (c for _ in range(args.rounds + WARM_UP) for c in cases.values()):
         case.run()
-    copy = measure_copy_bandwidth(args.rounds)
+    copy = measure_copy_bandwidth(args.rounds, args.copy)
     name = torch.cuda.get_device_name()
     print(f"{name}, {args.anchors} of {total} anchors, K = 10, F = 32, {args.precision}; a copy moves {copy / 1e9:.0f} GB/s")
     print("\n".join(format_report(cases, total, args.anchors, copy)))

@@ -32,6 +32,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--width", type=int, default=800)
     parser.add_argument("--height", type=int, default=544)
     parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--copy", type=int, default=512, metavar="MIB", help="size of the copy that measures the bandwidth")
     return parser
 
 
@@ -108,7 +109,7 @@ def main() -> None:
     names = ("means", "quats", "scales", "opacities", "colors", "source")
     g, camera = Gaussians(*(getattr(g, name).to("cuda") for name in names)), camera.to("cuda")
     cases = raster_cases(g, camera, torch.zeros(3, device="cuda")) | loss_cases(args.height, args.width) | adam_cases(args.count)
-    copy = measure_copy_bandwidth(args.rounds)
+    copy = measure_copy_bandwidth(args.rounds, args.copy)
     print(f"{torch.cuda.get_device_name()}, {args.count} Gaussians, {args.width}x{args.height}; a copy moves {copy / 1e9:.0f} GB/s")
     print(format_table(measure(cases, args.rounds, time_on_device), list_bytes(args.count, args.height, args.width), copy))
 

@@ -121,7 +121,7 @@ def train_recipe(
         cfg = replace(cfg, scene=refine_voxels(cfg.scene, capture, args.least_anchors))
     config = RunConfig(cfg, Data(args.data, resolution=args.resolution))
     if args.device == "cuda":  # compile the kernels of gsplat and Triton before timing: a few steps, dense and sparse
-        short = replace(cfg, iterations=20)
+        short = replace(cfg, iterations=min(20, args.iterations))
         for _ in training.train(short, Run(replace(config, train=short), device=args.device), capture, rasterize):
             pass
         torch.cuda.reset_peak_memory_stats()

@@ -1,0 +1,26 @@
+"""Run a Python script with tensors that pretend to be on CUDA.
+
+python -m support.pretend.script benchmarks/kernels_cuda.py --count 50   # with the guard loaded, see start.make_environment
+"""
+
+import os
+import runpy
+import sys
+from pathlib import Path
+
+from support.pretend.setup import prepare
+from support.pretend.tensors import Pretending
+
+
+def main(words: list[str]) -> None:
+    prepare()
+    sys.argv = words
+    sys.path.insert(0, str(Path(words[0]).resolve().parent))  # as Python does for a script
+    with Pretending():
+        runpy.run_path(words[0], run_name="__main__")
+    sys.stdout.flush()
+    os._exit(0)  # autograd's thread of a device that is not there cannot be joined
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
