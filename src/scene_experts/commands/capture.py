@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -40,6 +39,8 @@ def capture(args: list[str]) -> int:
 
     from rich.console import Console
 
+    from scene_experts.commands.next_step import propose_training
+    from scene_experts.data.readers.colmap_model import read_model
     from scene_experts.sfm.reconstruct import reconstruct
     from scene_experts.training.progress import ProgressBar
 
@@ -49,7 +50,8 @@ def capture(args: list[str]) -> int:
         note = reconstruct(command.photos, command.out, command.options, overwrite=command.overwrite, say=say, progress=bar)
     for line in summarise(note):
         say(line)
-    say(f"next: {PROG} train moe-gs --data {shlex.quote(str(command.out))} --out RUN")
+    lens = next(iter(read_model(command.out / "sparse" / "0").cameras.values()))
+    say(propose_training(command.out, lens.width, lens.height))
     return 0
 
 

@@ -15,10 +15,15 @@ def info(args: list[str]) -> int:
 
     from rich.console import Console
 
+    from scene_experts.commands.next_step import propose_training
     from scene_experts.data.summary import print_summary
     from scene_experts.training import run_folder
 
-    print_summary(run_folder.load_capture(run_folder.named(data), look=True), Console(highlight=False))
+    console = Console(highlight=False)
+    capture = run_folder.load_capture(run_folder.named(data), look=True)
+    print_summary(capture, console)
+    lens = capture.images.sources[0].lens
+    console.print(propose_training(capture.root, lens.width, lens.height), markup=False, soft_wrap=True)
     return 0
 
 

@@ -1,0 +1,71 @@
+"""A training that takes minutes on this machine: its resolution, its iterations, and an estimate of its time."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import torch
+
+from scene_experts.bench import raster, step
+from scene_experts.render import choose
+
+LIMIT = 12.0  # minutes
+SIDES = ((0, 7000), (1200, 7000), (800, 7000), (800, 4000), (600, 4000), (600, 3000), (600, 2000), (400, 2000))
+"""Longest side in pixels (0: as it is) and iterations, the best first."""
+# Iterations of scene-experts on colosseum (0.23 megapixels), banana (0.43) and fox (0.52) take 5.6, 5.7 and 7.6 times the picture below.
+BASE, PER_MEGAPIXEL = 3.5, 7.0
+SERIAL = 0.15  # share of an iteration that one thread does
+
+
+@dataclass(frozen=True)
+class Advice:
+    """A training and its estimated time."""
+
+    side: int
+    """Longest side of the photographs in pixels; 0: as they are."""
+    iterations: int
+    minutes: float | None
+    """Estimated time on this machine as busy as it is now; None on CUDA, which is not measured."""
+
+    @property
+    def flags(self) -> list[str]:
+        """The options of `train`."""
+        side = [] if self.side == 0 else ["--resolution", f"longest:{self.side}"]
+        return [*side, "--iterations", str(self.iterations)]
+
+    def __str__(self) -> str:
+        return "" if self.minutes is None else f"about {max(1, round(self.minutes))} min on this machine"
+
+
+def measure_picture() -> float:
+    """Seconds that one thread takes for a picture of 20,000 Gaussians at 400x272 and its gradients. Takes about a second."""
+    with step.use_threads(1):
+        picture, rasterize = raster.make_picture(20_000, 400, 272), choose("auto", "cpu")
+        return min(sum(raster.time_draw(rasterize, picture, time.perf_counter)) for _ in range(8))
+
+
+def estimate_minutes(width: int, height: int, iterations: int, picture: float, threads: int) -> float:
+    """Minutes of a training. picture: see `measure_picture`."""
+    gain = 1 / (SERIAL + (1 - SERIAL) / threads)
+    return iterations * picture * (BASE + PER_MEGAPIXEL * width * height / 1e6) / gain / 60
+
+
+def suggest(width: int, height: int, picture: float | None = None) -> Advice:
+    """Suggest a training for photographs of this size: the best one of SIDES that takes at most LIMIT minutes, or the shortest.
+
+    picture: seconds from `measure_picture`, which is called by default.
+    """
+    if torch.cuda.is_available() and choose("auto", "cuda").name != "reference":
+        return Advice(0, 30_000, None)
+    picture, threads = picture or measure_picture(), torch.get_num_threads()
+    advice = Advice(0, SIDES[-1][1], 0.0)
+    for side, iterations in SIDES:
+        if side >= max(width, height):
+            side = 0
+        scale = side / max(width, height) if side else min(1.0, 1600 / max(width, height))  # `train` limits photographs to 1,600 px
+        minutes = estimate_minutes(round(width * scale), round(height * scale), iterations, picture, threads)
+        advice = Advice(side, iterations, minutes)
+        if minutes <= LIMIT:
+            break
+    return advice

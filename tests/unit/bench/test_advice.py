@@ -1,0 +1,35 @@
+"""The training that the program proposes: longer and larger where the machine is fast, never longer than the limit if that can be."""
+
+import pytest
+
+from scene_experts.bench import advice
+
+
+def test_the_measured_picture_takes_time():
+    assert 0 < advice.measure_picture() < 60
+
+
+def test_twice_the_iterations_take_twice_the_time_and_threads_save_some():
+    one, two = (advice.estimate_minutes(800, 600, n, 0.015, 1) for n in (1000, 2000))
+    assert two == pytest.approx(2 * one)
+    # 2,000 iterations x 15 ms x (3.5 + 7 x 0.48) = 206 s
+    assert two == pytest.approx(205.8 / 60)
+    assert advice.estimate_minutes(800, 600, 1000, 0.015, 2) == pytest.approx(one * (0.15 + 0.85 / 2))
+
+
+def test_a_fast_machine_gets_the_whole_photographs_and_a_slow_one_the_shortest_training():
+    fast, slow = (advice.suggest(1200, 800, picture) for picture in (1e-4, 10.0))
+    assert fast.flags == ["--iterations", "7000"] and fast.minutes < advice.LIMIT
+    assert slow.flags == ["--resolution", "longest:400", "--iterations", "2000"] and slow.minutes > advice.LIMIT
+
+
+def test_small_photographs_are_never_enlarged():
+    found = advice.suggest(320, 240, 0.5)
+    assert found.side == 0 and "--resolution" not in found.flags
+
+
+@pytest.mark.parametrize("picture", [1e-3, 1e-2, 0.03, 0.1])
+def test_the_time_is_below_the_limit_where_that_can_be(picture):
+    found = advice.suggest(4000, 3000, picture)
+    assert found.minutes <= advice.LIMIT or found.flags == advice.suggest(4000, 3000, 10.0).flags
+    assert "min on this machine" in str(found)
