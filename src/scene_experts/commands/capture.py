@@ -40,7 +40,6 @@ def capture(args: list[str]) -> int:
     from rich.console import Console
 
     from scene_experts.commands.next_step import propose_training
-    from scene_experts.data.readers.colmap_model import read_model
     from scene_experts.sfm.reconstruct import reconstruct
     from scene_experts.training.progress import ProgressBar
 
@@ -50,8 +49,7 @@ def capture(args: list[str]) -> int:
         note = reconstruct(command.photos, command.out, command.options, overwrite=command.overwrite, say=say, progress=bar)
     for line in summarise(note):
         say(line)
-    lens = next(iter(read_model(command.out / "sparse" / "0").cameras.values()))
-    say(propose_training(command.out, lens.width, lens.height))
+    say(propose_training(command.out, *note["size"]))
     return 0
 
 

@@ -236,6 +236,7 @@ def describe_result(
         "format": 1,
         "copied": copied,
         "photographs": len(found),
+        "size": list(found[0].size),
         "with_pose": len(registered),
         "without_pose": [photo.name for photo in found if photo.name not in registered],
         "all_compared": exhaustive,

@@ -32,7 +32,7 @@ def test_a_capture_and_the_next_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("scene_experts.sfm.reconstruct.run_worker", fake_worker(**said))
     assert cli.main(["capture", str(write_black(tmp_path / "photos")), "--out", str(tmp_path / "box")]) == 0
     out = capsys.readouterr().out
-    assert "3 photographs" in out and f"scene-experts train moe-gs --data {tmp_path / 'box'} --out RUN" in out
+    assert "3 photographs" in out and f"scene-experts train scene-experts --data {tmp_path / 'box'} --out RUN" in out
 
 
 def test_unusable_input_is_told(tmp_path, capsys):
