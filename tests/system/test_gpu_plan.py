@@ -1,6 +1,7 @@
 """`make gpu`: its plan, its slices and its report, without a GPU."""
 
 import importlib.util
+import json
 import sys
 import time
 from pathlib import Path
@@ -9,6 +10,8 @@ import pytest
 
 from scene_experts.recipes import RECIPES
 from support.places import ROOT
+from support.pretend.start import explain_missing
+from support.synthetic import make_capture
 
 SPEC = importlib.util.spec_from_file_location("gpu", ROOT / "tools" / "gpu.py")
 assert SPEC and SPEC.loader
@@ -34,7 +37,7 @@ def test_the_plan_names_files_and_recipes_that_exist(capsys):
         for word in stage.command:
             assert not word.endswith(".py") or (gpu.ROOT / word).is_file(), word
     assert set(gpu.RECIPES) <= set(RECIPES) and [s.name for s in stages if s.name.startswith("cpu")] == ["cpu-1", "cpu-2", "cpu-4", "cpu-8"]
-    assert gpu.main(["--data", "capture", "--dry"]) == 0
+    assert gpu.main(["--data", "capture", "--plan"]) == 0
     assert "train_cuda.py" in capsys.readouterr().out
 
 
@@ -75,3 +78,22 @@ def test_a_command_that_takes_too_long_is_ended():
 def test_the_exit_code_and_output_of_a_command(code):
     stage = gpu.Stage("quick", "Quick", (sys.executable, "-c", f"print('out'); raise SystemExit({code})"))
     assert gpu.run_command(stage, 60) == (code, "out\n")
+
+
+@pytest.mark.slow
+def test_a_dry_run_runs_every_command_and_writes_its_tables(tmp_path, capsys):
+    if (reason := explain_missing()) is not None:
+        pytest.skip(reason)
+    capture, page = make_capture(tmp_path / "capture", views=4, size=(24, 16), points=40), gpu.REPORT.read_text()
+    line = ["--data", str(capture.folder), "--out", str(tmp_path / "out"), "--dry"]
+    for _ in range(4):
+        assert gpu.main([*line, "--seconds", "300"]) == 0
+        if "all done" in capsys.readouterr().out:
+            break
+    state = json.loads((tmp_path / "out" / "stages.json").read_text())
+    failed = {name: (tmp_path / "out" / f"{name}.txt").read_text()[-2000:] for name, mine in state.items() if mine["failed"]}
+    assert not failed, failed
+    report = (tmp_path / "out" / "report.md").read_text()
+    for row in ("plain gsplat", "L1 + SSIM, Triton", "Top-2 of 5", "gsplat, explicit", *gpu.RECIPES):
+        assert row in report
+    assert gpu.REPORT.read_text() == page

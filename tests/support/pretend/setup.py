@@ -64,7 +64,7 @@ def prepare() -> None:
     FusedAdam._launch = lambda self, calls: (count_adam(calls), launch_adam(self, calls))[1]
     triton.explain_missing = lambda: None
     timing.WARM_UP = 1
-    score.measure_speed = partial(score.measure_speed, budget=0.0)  # the fewest frames
+    timing.measure_speed = score.measure_speed = partial(timing.measure_speed, budget=0.0)  # the fewest frames
 
 
 def load_small(longest: int = 32, every: int = 1000) -> Capture:
