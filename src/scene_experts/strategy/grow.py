@@ -18,6 +18,8 @@ from scene_experts.geometry.voxel import AXIS_LIMIT, coarsen, in_set, pack, scat
 from scene_experts.strategy.control import AnchorControl, L
 from scene_experts.strategy.errors import find_wrong
 
+_COLUMNS = 8  # columns of the features that are copied at once
+
 
 @register
 @dataclass(frozen=True)
@@ -74,8 +76,7 @@ class GrowAnchors(AnchorControl[L]):
         strong = strong.nonzero().squeeze(1)
         slots, g = eligible.index_select(0, strong), g.index_select(0, strong)
         parents = torch.div(slots, scene.K, rounding_mode="floor")
-        points = scene.slot_points(slots, parents)
-        fine, features = points / scene.voxel, table.params["feature"]
+        fine, features = scene.slot_points(slots, parents) / scene.voxel, table.params["feature"]
         cells, rows, born, capped = table.facts["cell"], [], 0, False
         for level, factor in enumerate(self.cell_factors()):
             if self.parity_level_skip and level > 0 and not born:
@@ -136,7 +137,8 @@ def empty_cells(
     target = slot[group]
     mine = (target >= 0).nonzero().squeeze(1)
     target, parents = target[mine], parents[mine]
-    feature = scatter_max(features.index_select(0, parents), target, len(free))
+    parts = features.split(_COLUMNS, dim=1)  # a copy of all columns for each point would be most of the memory of this function
+    feature = torch.cat([scatter_max(part.index_select(0, parents), target, len(free)) for part in parts], dim=1)
     strength = scatter_max(g[mine, None], target, len(free)).squeeze(1)
     first = torch.full((len(free),), len(cells), device=keys.device).scatter_reduce(0, target, mine, "amin")
     return cells.index_select(0, first), feature, strength

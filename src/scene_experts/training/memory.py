@@ -98,17 +98,15 @@ def anchor_cap(scene: Scene, cap: int, max_memory: float, largest: Largest) -> i
 def expected_bytes(scene: Scene, largest: Largest) -> int:
     """Return the peak that a training is expected to reach if its table does not grow.
 
-    To the measured peak are added the Gaussians of visible rows that were transparent in every frame so far, the buffers of a first
-    search for new rows, and the copy of the state that a save or an export holds. Later searches need as much for each row as the last
-    one.
+    It is the largest of three: the measured peak with the Gaussians of visible rows that were transparent in every frame so far; what
+    the process holds now with the buffers of a search for new rows (later searches need as much for each row as the last one); and what
+    it holds now with the copy of the state that a save or an export makes.
     """
-    n, measured = len(scene.table), peak_bytes(scene.table.device)
-    if largest.searched:
-        measured = max(measured, largest.level + int((largest.searching - largest.level) * n / largest.searched))
-    else:
-        measured += _SEARCHED * scene.K * n
+    n, used, rate = len(scene.table), used_bytes(scene.table.device), _SEARCHED * scene.K
     transparent = max(0, largest.rows * scene.K - largest.gaussians)
-    return measured + int(transparent * gaussian_bytes()) + row_bytes(scene) * n * 3 // 4
+    frame = peak_bytes(scene.table.device) + int(transparent * gaussian_bytes())
+    search = largest.level + (largest.searching - largest.level) * n // largest.searched if largest.searched else used + rate * n
+    return max(frame, search, used + row_bytes(scene) * n * 3 // 4)
 
 
 def check_start(scene: Scene, begun: bool, max_memory: float, largest: Largest, images: int = 0) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from scene_experts.data.capture import Capture
 from scene_experts.scene import Scene
-from scene_experts.training.memory import check_start, used_bytes
+from scene_experts.training.memory import check_start, give_back, used_bytes
 from scene_experts.training.state import Training
 
 VIEWS = 3
@@ -34,6 +34,7 @@ def fit_memory(training: Training, max_memory: float, capture: Capture, see: Cal
     scene, device, largest = training.scene, training.scene.table.device, training.largest
     begun, images = training.step > 0, 0
     table = sum(v.element_size() * v.numel() * (3 if begun and v.requires_grad else 1) for v in scene.table.columns().values())
+    give_back()
     largest.level = max(0, used_bytes(device) - table)
     check_start(scene, begun, max_memory, largest)
     if device.type != "cuda":
@@ -45,6 +46,7 @@ def fit_memory(training: Training, max_memory: float, capture: Capture, see: Cal
             for index in capture.train[:: max(1, len(capture.train) // VIEWS)][:VIEWS]:
                 see(number, index, color)
                 training.optimizer.zero_grad(set_to_none=True)
+    give_back()
     check_start(scene, begun, max_memory, largest, images)
 
 
