@@ -181,7 +181,9 @@ def run_pretending(stage: Stage, seconds: float, folder: Path) -> tuple[int, str
         raise SystemExit(f"a dry run is not possible: {reason}")
     python, *words = stage.command
     pretending = replace(stage, command=(python, "-m", "support.pretend.script", *words))
-    return run_command(pretending, seconds, start.make_environment(folder))
+    environment = start.make_environment(folder)
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "benchmarks"), environment["PYTHONPATH"]])
+    return run_command(pretending, seconds, environment)
 
 
 def format_report(stages: list[Stage], out: Path) -> str:

@@ -1,12 +1,13 @@
 """Run a Python script with tensors that pretend to be on CUDA.
 
-python -m support.pretend.script benchmarks/kernels_cuda.py --count 50   # with the guard loaded, see start.make_environment
+python -m support.pretend.script benchmarks/kernels_cuda.py --count 50   # see start.make_environment
+
+The folder of the script must be on PYTHONPATH.
 """
 
 import os
 import runpy
 import sys
-from pathlib import Path
 
 from support.pretend.setup import prepare
 from support.pretend.tensors import Pretending
@@ -15,7 +16,6 @@ from support.pretend.tensors import Pretending
 def main(words: list[str]) -> None:
     prepare()
     sys.argv = words
-    sys.path.insert(0, str(Path(words[0]).resolve().parent))  # as Python does for a script
     with Pretending():
         runpy.run_path(words[0], run_name="__main__")
     sys.stdout.flush()
