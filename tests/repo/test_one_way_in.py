@@ -26,6 +26,7 @@ ALLOWED = {  # file: why it may open files by itself
     "files/export.py": "the run's own list of cameras, copied",
     "files/formats/html.py": "files of this package",
     "report/page.py": "a file of this package",
+    "reproduce/cluster.py": "a run from the user's own Dask scheduler, which sends pickled code itself: docs/scaling.md",
     "reproduce/figures.py": "pictures of the user's own records",
     "reproduce/runner.py": "logs of its own processes",
     "sfm/frames.py": "the pipe of ffmpeg",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from scene_experts.arguments.option import Option
-from scene_experts.core.errors import expect_at_least
+from scene_experts.core.errors import InputError, expect_at_least
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,12 @@ class ReproduceOptions:
     """Number of runs at a time, each in its own process; by default one, or one for each of --devices."""
     devices: Annotated[tuple[str, ...], Option(value="INDEX")] = ()
     """Indices of the CUDA devices that the workers share."""
+    cluster: Annotated[str | None, Option(value="ADDRESS")] = None
+    """Train the runs on the workers of the Dask scheduler at this address, e.g. tcp://HOST:8786 (needs
+    `pip install 'scene-experts[cluster]'`). All machines must share the folders."""
+    resources: Annotated[tuple[str, ...], Option(value="NAME=AMOUNT")] = ()
+    """With --cluster: what a run takes from its worker, e.g. GPU=1; by default one thread. Start the workers with
+    `dask worker --resources "GPU=1"`."""
     recipes: Annotated[tuple[str, ...], Option(value="RECIPE")] = ()
     """Run only the rows of these recipes. With compare: the recipes to compare, any recipe of `scene-experts train`, also with flags and a
     name: "moe-gs" "narrow=moe-gs --scene.hidden 16"."""
@@ -63,6 +70,25 @@ class ReproduceOptions:
         """Number of runs at a time."""
         return self.workers if self.workers is not None else max(1, len(self.devices))
 
+    def needs(self) -> dict[str, float]:
+        """Return --resources as amounts by name. Raises InputError if one is not NAME=AMOUNT with a positive amount."""
+        found = {}
+        for text in self.resources:
+            name, _, amount = text.partition("=")
+            try:
+                found[name] = float(amount)
+            except ValueError:
+                found[name] = 0.0
+            if not name or not 0 < found[name] < math.inf:
+                raise InputError(f"expected --resources as NAME=AMOUNT with an amount above 0, found '{text}'; give for example GPU=1")
+        return found
+
     def check(self) -> None:
         """Raises InputError, naming the option, for invalid values."""
+        if self.cluster is not None and (self.workers is not None or self.devices):
+            flag = "--devices" if self.devices else "--workers"
+            raise InputError(f"expected either --cluster or {flag}, found both; the cluster's own workers set their number and devices")
+        if self.resources and self.cluster is None:
+            raise InputError("expected --resources together with --cluster, found no --cluster; add it or leave --resources out")
+        self.needs()
         expect_at_least([("--workers", self.worker_count, 1), *(("--seeds", seed, 0) for seed in self.seeds)])

@@ -9,8 +9,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from scene_experts.reproduce.plan import Spec
 from scene_experts.training.run_folder import held
 
 Say = Callable[[str], None]
+VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,16 @@ class Runner:
     workers: int = 1
     """Runs at a time."""
     devices: Sequence[str] = ()
-    """Indices of the CUDA devices to share among the workers. Empty: the CPU, or the first device."""
+    """Indices of the CUDA devices to share among the workers, among those of CUDA_VISIBLE_DEVICES. Empty: the CPU, or the first device."""
     discard: bool = False
     """Remove a run folder once its record is written."""
     say: Say = print
     after: Callable[[Spec, Path], None] = lambda spec, folder: None
     """Called with each finished run folder before it may be removed."""
+    threads: int = 0
+    """Threads of each run. 0: the cores shared among the workers."""
+    patience: float = 0.0
+    """Seconds to wait for a run folder that another training holds."""
     stop: threading.Event = field(default_factory=threading.Event)
     _running: set[subprocess.Popen[str]] = field(default_factory=set)
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -95,7 +101,7 @@ class Runner:
         train = spec.arguments(folder)
         if folder.exists():
             try:
-                with held(folder):
+                with self._held(folder):
                     if latest(folder / "checkpoints") is None:
                         shutil.rmtree(folder)  # it stopped before its first checkpoint
                     else:
@@ -120,6 +126,20 @@ class Runner:
             shutil.rmtree(folder, ignore_errors=True)
         return None
 
+    @contextmanager
+    def _held(self, folder: Path) -> Iterator[None]:
+        """Lock a run folder within `patience` seconds. Raises InputError if another training still holds it."""
+        until = time.monotonic() + self.patience
+        with ExitStack() as stack:
+            while True:
+                try:
+                    stack.enter_context(held(folder))
+                    break
+                except InputError:
+                    if time.monotonic() >= until or self.stop.wait(1.0):
+                        raise
+            yield
+
     def fail(self, spec: Spec, why: str, log: Path, place: str) -> Failure:
         self.say(f"{place} {spec.label}: FAILED: {why}")
         return Failure(spec, why, log)
@@ -127,10 +147,10 @@ class Runner:
     def call(self, args: list[str], slot: int, log: Path) -> int:
         """Run `scene-experts ARGS` with the worker's share of the cores, append its output to the log, return the exit code."""
         environment = {**os.environ, PARENT: str(os.getpid())}
-        if self.workers > 1:
-            environment["OMP_NUM_THREADS"] = str(max(1, native.count_cores() // self.workers))
+        if self.threads or self.workers > 1:
+            environment["OMP_NUM_THREADS"] = str(self.threads or max(1, native.count_cores() // self.workers))
         if self.devices:
-            environment["CUDA_VISIBLE_DEVICES"] = self.devices[slot % len(self.devices)]
+            environment[VISIBLE] = visible_device(self.devices[slot % len(self.devices)], os.environ.get(VISIBLE))
         with log.open("a") as stream:
             stream.write(f"$ scene-experts {' '.join(args)}\n")
             stream.flush()
@@ -159,6 +179,23 @@ class Runner:
         with self._lock:
             for process in self._running:
                 process.send_signal(signal.SIGTERM)
+
+
+def visible_device(index: str, visible: str | None) -> str:
+    """Return CUDA_VISIBLE_DEVICES for a run on device `index` (--devices) of the devices that a scheduler gave to this process.
+
+    visible: CUDA_VISIBLE_DEVICES of this process, or None if it is not set. With "4,5", index 1 is device 5.
+
+    Raises InputError, which names --devices, if `index` is not among the visible devices.
+    """
+    given = [name.strip() for name in visible.split(",")] if visible is not None else None
+    if given is None or not index.isdecimal():
+        return index
+    if int(index) >= len(given) or not given[int(index)]:
+        raise InputError(
+            f"expected --devices within the {len([g for g in given if g])} of {VISIBLE} ({visible!r}), found {index}; change it"
+        )
+    return given[int(index)]
 
 
 def build_kernels() -> None:

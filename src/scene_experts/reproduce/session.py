@@ -8,6 +8,7 @@ from pathlib import Path
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.signals import handled
 from scene_experts.reproduce import report, store
+from scene_experts.reproduce.cluster import ClusterRunner
 from scene_experts.reproduce.experiments import EXPERIMENTS
 from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.plan import Spec
@@ -31,7 +32,7 @@ def reproduce(options: ReproduceOptions, say: Say) -> bool:
         list_plan(plan, say)
         return True
     draw = figure_drawer(options, plan)
-    runner = Runner(plan.runs, plan.records, options.worker_count, options.devices, options.discard, say, draw)
+    runner = make_runner(options, plan, say, draw)
     failures = [] if options.tables_only else run_plan(runner, plan, options.out)
     found = store.find_all(store.load(plan.records), plan.shown)
     for path in report.write(options.out, plan.experiments, plan.scenes, found, written_command(options, plan.scenes)):
@@ -43,6 +44,14 @@ def reproduce(options: ReproduceOptions, say: Say) -> bool:
         lines = "; ".join(f"{f.spec.label}: {f.why} ({f.log})" for f in failures)
         raise RunError(f"expected {len(plan.wanted)} runs to succeed, found {len(failures)} that failed; the others are kept: {lines}")
     return True
+
+
+def make_runner(options: ReproduceOptions, plan: Plan, say: Say, draw: Callable[[Spec, Path], None]) -> Runner:
+    """The runner of the options: the workers of a cluster (--cluster), or processes of this machine."""
+    if options.cluster is not None:
+        cluster = {"address": options.cluster, "resources": options.needs()}
+        return ClusterRunner(plan.runs.absolute(), plan.records.absolute(), discard=options.discard, say=say, after=draw, **cluster)
+    return Runner(plan.runs, plan.records, options.worker_count, options.devices, options.discard, say, draw)
 
 
 def list_plan(plan: Plan, say: Say) -> None:

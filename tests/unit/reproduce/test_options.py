@@ -15,3 +15,15 @@ def test_every_device_has_a_worker_unless_told_otherwise(given, workers):
 def test_invalid_values_name_their_option(given, flag):
     with pytest.raises(InputError, match=flag):
         ReproduceOptions(("table3",), **given).check()
+
+
+def test_options_of_a_cluster():
+    assert ReproduceOptions(("table3",), cluster="tcp://a:1", resources=("GPU=1", "MEMORY=2.5")).needs() == {"GPU": 1, "MEMORY": 2.5}
+    for given, flag in (
+        ({"cluster": "tcp://a:1", "workers": 2}, "--workers"),
+        ({"cluster": "tcp://a:1", "devices": ("0",)}, "--devices"),
+        ({"resources": ("GPU=1",)}, "--cluster"),
+        *(({"cluster": "tcp://a:1", "resources": (text,)}, "--resources") for text in ("GPU", "GPU=0", "=1", "GPU=many", "GPU=nan")),
+    ):
+        with pytest.raises(InputError, match=flag):
+            ReproduceOptions(("table3",), **given).check()

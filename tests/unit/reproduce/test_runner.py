@@ -2,6 +2,8 @@
 
 import signal
 import subprocess
+import threading
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -12,7 +14,7 @@ from scene_experts.core.plain import to_json
 from scene_experts.reproduce import runner as module
 from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec
-from scene_experts.reproduce.runner import Runner, last_line
+from scene_experts.reproduce.runner import Runner, last_line, visible_device
 from scene_experts.training.config import RunConfig
 from scene_experts.training.run_folder import held
 from support.records import record
@@ -154,3 +156,32 @@ def test_a_terminal_s_ctrl_c_reaches_a_run_once(tmp_path, monkeypatch):
 
     monkeypatch.setattr(subprocess, "Popen", Popen)
     assert Runner(tmp_path, tmp_path).call(["train"], 0, tmp_path / "log") == 0 and seen["process_group"] == 0
+
+
+def test_devices_are_among_those_of_a_scheduler(tmp_path, monkeypatch):
+    assert visible_device("1", None) == "1"
+    assert visible_device("1", "4,5") == "5"
+    assert visible_device("GPU-8f", "4,5") == "GPU-8f"
+    for visible in ("4,5", ""):
+        with pytest.raises(InputError, match="--devices"):
+            visible_device("2", visible)
+    seen = {}
+
+    class Popen(subprocess.Popen):
+        def __init__(self, args, env, **options):
+            seen.update(env)
+            super().__init__(["true"], **options)
+
+    monkeypatch.setattr(subprocess, "Popen", Popen)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7")
+    Runner(tmp_path, tmp_path).call(["train"], 0, tmp_path / "log")
+    assert seen["CUDA_VISIBLE_DEVICES"] == "7", "without --devices, that of the scheduler"
+
+
+def test_a_repeated_run_waits_for_the_training_of_a_lost_worker(runner):
+    folder = spec().folder(runner.runs)
+    runner.patience = 20.0
+    with ExitStack() as stack:
+        stack.enter_context(held(folder))
+        threading.Timer(0.3, stack.close).start()
+        assert runner.run_all([spec()]) == [] and len(runner.calls) == 2
