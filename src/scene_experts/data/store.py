@@ -1,6 +1,6 @@
-"""Caches decoded frames within a memory limit, and decodes frames ahead in one thread.
+"""Caches decoded frames within a memory limit, and decodes frames ahead in other threads.
 
-Decoding depends on the files only, so the content of a frame never depends on the cache or on the timing of the thread.
+Decoding depends on the files only, so the content of a frame never depends on the cache or on the timing of the threads.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _read_numbers(path: Path | str) -> dict[str, int]:
 
 
 class _Cache:
-    """The state that the thread shares. It is separate from ImageStore so that the thread does not keep the store alive."""
+    """The state that the threads share. It is separate from ImageStore so that the threads do not keep the store alive."""
 
     def __init__(self, sources: tuple[FrameSource, ...], budget: int) -> None:
         self.sources, self.budget, self.used = sources, budget, 0
@@ -67,7 +67,7 @@ class _Cache:
 
     def get(self, index: int) -> Decoded:
         with self.changed:
-            while index in self.busy:  # the other thread is decoding it
+            while index in self.busy:  # another thread is decoding it
                 self.changed.wait()
             if index in self.frames:
                 self.frames.move_to_end(index)
@@ -106,7 +106,7 @@ class _Cache:
         return next(free, next(iter(self.frames)))
 
     def decode_ahead(self) -> None:
-        """Decode the wanted frames in order until stopped; runs in the thread. `get` reports files that cannot be decoded."""
+        """Decode the wanted frames in order until stopped; runs in each thread. `get` reports files that cannot be decoded."""
         while True:
             with self.changed:
                 while not self.wanted and not self.stopped:
@@ -126,13 +126,14 @@ def _count_bytes(frame: Decoded) -> int:
     return sum(part.numel() for part in frame if part is not None)
 
 
-def _stop(cache: _Cache, thread: threading.Thread | None) -> None:
+def _stop(cache: _Cache, threads: list[threading.Thread]) -> None:
     with cache.changed:
         cache.stopped = True
         cache.wanted.clear()
         cache.changed.notify_all()
-    if thread is not None and thread is not threading.current_thread():
-        thread.join(timeout=30)
+    for thread in threads:
+        if thread is not threading.current_thread():
+            thread.join(timeout=30)
 
 
 class ImageStore:
@@ -153,7 +154,7 @@ class ImageStore:
             cache_bytes = (4 << 30 if free is None else free) // 3
         self.cache_bytes = max(0, int(cache_bytes))
         self._cache = _Cache(self.sources, self.cache_bytes)
-        self._thread: threading.Thread | None = None
+        self._threads: list[threading.Thread] = []
 
     def __len__(self) -> int:
         return len(self.sources)
@@ -179,10 +180,12 @@ class ImageStore:
         """
         return self._cache.get(index)
 
-    def prefetch(self, indices: Iterable[int]) -> None:
+    def prefetch(self, indices: Iterable[int], threads: int = 1) -> None:
         """Decode these frames in the background, in this order. They replace the frames of the previous call.
 
         At most half of the cache is filled; nothing is done if it has room for fewer than two frames.
+
+        threads: Number of threads that decode. The store has at least as many as any call has asked for.
         """
         room, wanted = self.cache_bytes // 2, []
         for index in dict.fromkeys(indices):
@@ -196,12 +199,13 @@ class ImageStore:
             self._cache.wanted = deque(wanted)
             self._cache.ahead = set(wanted)
             self._cache.changed.notify_all()
-        if self._thread is None and not self._cache.stopped:
-            self._thread = threading.Thread(target=self._cache.decode_ahead, name="scene-experts images", daemon=True)
-            self._thread.start()
-            weakref.finalize(self, _stop, self._cache, self._thread)  # also runs at exit
+        if not self._threads and not self._cache.stopped:
+            weakref.finalize(self, _stop, self._cache, self._threads)  # also runs at exit
+        while len(self._threads) < threads and not self._cache.stopped:
+            self._threads.append(threading.Thread(target=self._cache.decode_ahead, name="scene-experts images", daemon=True))
+            self._threads[-1].start()
 
     def close(self) -> None:
-        """Stop the thread. Frames can still be read."""
-        _stop(self._cache, self._thread)
-        self._thread = None
+        """Stop the threads. Frames can still be read."""
+        _stop(self._cache, self._threads)
+        self._threads.clear()

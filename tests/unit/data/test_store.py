@@ -127,11 +127,30 @@ def test_prefetched_frames_equal_decoded_frames(tmp_path: Path, threads: Callabl
     np.testing.assert_array_equal(store.get(0)[0], truth(0))
 
 
-def test_frames_never_depend_on_timing(tmp_path: Path) -> None:
+def test_several_threads_decode_at_once(tmp_path: Path, threads: Callable[[], int], monkeypatch: pytest.MonkeyPatch) -> None:
+    together = threading.Barrier(3)
+
+    def meet(source: FrameSource) -> tuple[torch.Tensor, torch.Tensor | None]:
+        together.wait(timeout=20)
+        return decode(source)
+
+    store = ImageStore(sources(tmp_path, 6), cache_bytes=100 * FRAME)
+    monkeypatch.setattr(module, "decode", meet)
+    store.prefetch([0, 1, 2], threads=3)
+    wait(lambda: store.used_bytes == 3 * FRAME)
+    store.prefetch([3, 4, 5])
+    wait(lambda: store.used_bytes == 6 * FRAME)
+    assert threads() == 3 and all((store.get(i)[0].numpy() == truth(i)).all() for i in range(6))
+    store.close()
+    assert threads() == 0
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_frames_never_depend_on_timing(tmp_path: Path, count: int) -> None:
     store = ImageStore(sources(tmp_path, 12), cache_bytes=5 * FRAME)
     rng = np.random.default_rng(0)
     for _ in range(300):
-        store.prefetch(rng.integers(0, 12, 4).tolist())
+        store.prefetch(rng.integers(0, 12, 4).tolist(), threads=count)
         i = int(rng.integers(0, 12))
         rgb, mask = store.get(i)
         assert mask is None and torch.equal(rgb, torch.from_numpy(truth(i)))
