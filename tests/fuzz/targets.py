@@ -68,6 +68,10 @@ STRUCTURED = 10**12
 """From this number on, half of the mutations are those of `structure`. Lower numbers keep the inputs that they always had."""
 
 
+LARGEST = 64 << 20
+"""Mutated files are cut at this number of bytes: the memory that a larger one honestly takes would count as a finding."""
+
+
 def mutate_files(files: Files, target: Target, rng: random.Random, structured: bool = False) -> Files:
     """Return the files of an input with one of them mutated."""
     names = sorted(name for name in files if any(Path(name).match(pattern) for pattern in target.mutated))
@@ -81,7 +85,7 @@ def mutate_files(files: Files, target: Target, rng: random.Random, structured: b
         new = pack(files[name], rng) if pack is not None and (certain or rng.random() < 0.5) else mutate(files[name], rng, files[other])
     except Exception:  # the first mutation has damaged the container
         new = mutate(files[name], rng, files[other])
-    return {**files, name: new}
+    return {**files, name: new[:LARGEST]}
 
 
 # --- the values that readers return -------------------------------------------------------------------------------------------------------

@@ -76,7 +76,7 @@ def check_writable(path: Path) -> None:
 @contextmanager
 def locked(path: Path, busy: str) -> Iterator[None]:
     """Hold the lock file `path`. The lock ends with the process. Raises InputError(busy) if another process holds it."""
-    lock = FileLock(path)
+    lock = _make_lock(path)
     try:
         lock.acquire(blocking=False)
     except Timeout:
@@ -91,6 +91,14 @@ def locked(path: Path, busy: str) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def _make_lock(path: Path) -> FileLock:
+    """Return a lock of the system. Newer versions of filelock would replace a missing one by a file, which outlives a killed process."""
+    try:
+        return FileLock(path, fallback_to_soft=False)
+    except TypeError:
+        return FileLock(path)
 
 
 def new_file_mode(most: int) -> int:

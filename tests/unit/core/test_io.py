@@ -1,5 +1,6 @@
 """Files appear whole or not at all, and every failure is one sentence."""
 
+import errno
 import os
 import resource
 import stat
@@ -11,6 +12,8 @@ from scene_experts.core import io
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.io import locked, read_json, write_atomic, write_bytes, write_json
 from support.messages import naming
+
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 
 
 def names(folder):
@@ -125,10 +128,35 @@ def test_a_lock_is_held_once_and_let_go(tmp_path):
         pass
 
 
-def test_a_file_system_without_locks_holds_nothing_up(tmp_path, monkeypatch):
+@pytest.mark.parametrize("error", [NotImplementedError(), *(OSError(number, "") for number in NO_LOCKS)])
+def test_a_file_system_without_locks_is_told_of_and_holds_nothing_up(error, tmp_path, monkeypatch, caplog):
     def refuse(self, blocking):
-        raise NotImplementedError
+        raise error
 
     monkeypatch.setattr(io.FileLock, "acquire", refuse)
     with locked(tmp_path / ".lock", "busy"), locked(tmp_path / ".lock", "busy"):
+        pass
+    assert str(tmp_path) in caplog.text and "without locks" in caplog.text
+
+
+@pytest.mark.parametrize("number", NO_LOCKS)
+def test_the_system_call_refuses_locks(number, tmp_path, monkeypatch, caplog):
+    """The library of the locks is between: some of its versions use a lock of another kind instead."""
+    fcntl = pytest.importorskip("fcntl")
+
+    def refuse(*_):
+        raise OSError(number, "no locks here")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with locked(tmp_path / ".lock", "busy"):
+        pass
+    assert "without locks" in caplog.text
+
+
+def test_another_error_of_a_lock_is_told(tmp_path, monkeypatch):
+    def refuse(self, blocking):
+        raise OSError(errno.ENOSPC, "no space")
+
+    monkeypatch.setattr(io.FileLock, "acquire", refuse)
+    with pytest.raises(RunError, match=naming(tmp_path / ".lock")), locked(tmp_path / ".lock", "busy"):
         pass
