@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,7 @@ from scene_experts.view.film_options import FilmOptions
 
 FIRST = ("--out", "--path", "--seconds", "--size", "--show", "--only", "--beside", "--step", "--data", "--device")
 """The options that people use first, for --help."""
+UNSEEN = 0.1  # a larger share of frames that nobody photographed gets a warning
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,7 @@ def render(args: list[str]) -> int:
     from scene_experts.training import run_folder
     from scene_experts.training.progress import ProgressBar
     from scene_experts.view.film import check_out, make_film
+    from scene_experts.view.paths import SEEN, count_unseen
 
     check_out(command.out)
     device, rasterize = backend(command.device, command.rasterizer, False, False)
@@ -56,6 +59,10 @@ def render(args: list[str]) -> int:
     capture = run_folder.capture_of(runs[0], command.data)
     try:
         film = make_film(command.options, runs, capture)
+        unseen = count_unseen(film.path, capture)
+        if unseen > UNSEEN * len(film.path):
+            text = f"{unseen} of {len(film.path)} frames look in a direction that no photograph has (within {SEEN:.0f} degrees)"
+            print(f"warning: {text} and may show fog; --path spiral or views stays near the photographs", file=sys.stderr)
         if command.save_path:
             film.write_path(command.save_path)
         out = command.out or command.run / "renders" / f"{Path(command.options.path).stem}.mp4"

@@ -18,6 +18,7 @@ from scene_experts.geometry.rotation import estimate_up
 NAMES = ("auto", "orbit", "spiral", "views")
 FACING = 0.7  # if the mean of the unit viewing directions is longer, the capture faces one way and an orbit would go behind the scene
 MOST_POSES = 40  # captured poses that a path goes through
+SEEN = 45.0  # degrees from the nearest captured viewing direction, beyond which a picture shows what no photograph does
 LEVEL = math.cos(math.radians(15))  # least cosine of the roll of an upright picture
 
 
@@ -159,6 +160,16 @@ def follow_views(rig: CameraRig, frames: int) -> list[Tensor]:
     count = min(len(rig.cameras), MOST_POSES)
     chosen = torch.linspace(0, len(rig.cameras) - 1, count).round().long()
     return interpolate_poses(rig.positions[chosen], rig.rotations[chosen], frames)
+
+
+def count_unseen(path: CameraPath, capture: Capture) -> int:
+    """Return the number of cameras that look in a direction which no training camera has within SEEN degrees.
+
+    They show backs of things that nobody photographed. Position is not considered.
+    """
+    captured = analyse_cameras(capture).forward
+    along = torch.stack([camera.world_to_cam[2, :3].double() for camera in path.cameras])
+    return int(((along @ captured.T).amax(1) < math.cos(math.radians(SEEN))).sum())
 
 
 def median_camera(cameras: Sequence[Camera], size: tuple[int, int] | None = None) -> Camera:

@@ -112,3 +112,13 @@ def test_the_shipped_captures_open_upright_with_the_whole_scene_in_view():
         found[name] = made.views[choose_best_view(made)].name
         made.images.close()
     assert found == {"buddha": "017.jpg", "brighton": "DJI_0034.jpg"}
+
+
+def test_frames_that_nobody_photographed_are_counted(capture):
+    """All cameras but those that look within 60 degrees of the first are left out: an orbit shows the back, a spiral does not."""
+    ahead = {i: capture.views[i].camera.world_to_cam[2, :3] for i in capture.train}
+    near = tuple(i for i in ahead if ahead[i] @ ahead[capture.train[0]] > 0.5)
+    around = paths.CameraPath(tuple(capture.views[i].camera for i in capture.train))
+    assert paths.count_unseen(around, capture) == 0
+    far = [i for i in ahead if max(float(ahead[i] @ ahead[j]) for j in near) < math.cos(math.pi / 4)]
+    assert far and paths.count_unseen(around, replace(capture, train=near)) == len(far)
