@@ -58,6 +58,8 @@ def test_a_recipe_trains_within_its_limits_and_is_saved_drawn_scored_and_baked(w
         assert result["bytes"] <= most.bytes, (word, result["moved"])
         assert not result["blocking"], (word, result["blocking"])
         assert result["edits"] > 0 and result["baked"] > 0, word
+        assert result["frozen"] is None or result["frozen"]["equal"], word
+        assert result["frozen"] or word not in LEAN
 
 
 @pytest.mark.slow

@@ -15,12 +15,15 @@ from typing import Any
 import torch
 from torch.utils._python_dispatch import _disable_current_modes
 
+from scene_experts.core.types import Camera, Mode
 from scene_experts.data.capture import Capture
 from scene_experts.evaluate import score
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.files.bake.bake import Bake, bake
 from scene_experts.files.bake.refine import Refine
+from scene_experts.render import Rasterizer
 from scene_experts.render.gsplat import GsplatRasterizer
+from scene_experts.scene import Scene
 from scene_experts.training import loop
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.state import Training
@@ -29,6 +32,21 @@ from support.pretend.setup import answer, load_small, run_of, short
 from support.pretend.tensors import CUDA, counts
 
 STEPS = 10
+
+
+def draw_frozen(scene: Scene, camera: Camera, step: int, draw: Rasterizer) -> dict[str, Any] | None:
+    """Whether a frozen scene decodes the same bits, and the kernels of both decodes. None if the scene cannot be frozen."""
+    frozen = scene.frozen(step)
+    if frozen is scene:
+        return None
+    results, kernels = [], []
+    with torch.no_grad():
+        for decode in (scene, frozen):
+            counts.reset()
+            results.append(vars(decode(camera, step, Mode.DRAW, draw.visible).gaussians))
+            kernels.append(sum(counts.kernels.values()))
+    equal = all(torch.equal(t.cpu(), results[1][name].cpu()) for name, t in results[0].items())
+    return {"equal": equal, "kernels": kernels}
 
 
 def try_recipe(capture: Capture, word: str) -> dict[str, Any]:
@@ -64,6 +82,7 @@ def try_recipe(capture: Capture, word: str) -> dict[str, Any]:
     again.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
     loop.iterate(again, run, capture, draw)
     scene, camera = again.scene, capture.views[capture.test[0]].camera.to("cuda")
+    found["frozen"] = draw_frozen(scene, camera, again.step, draw)
     paint(scene, camera, again.step, draw, torch.zeros(3, device=CUDA))
     with tempfile.TemporaryDirectory() as folder:
         score.evaluate(scene, capture, draw, Path(folder), EvalOptions(lpips=False), step=again.step)

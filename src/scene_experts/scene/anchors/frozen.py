@@ -1,7 +1,7 @@
 """A trained anchor scene prepared for drawing: values that do not depend on the camera are computed once.
 
 Routing depends only on the anchor, so the chosen experts of each anchor and their weights are stored. The Gaussians are the same bits as
-those of the native decode. Symbols as in `types.py`.
+those of the native decode, on the CPU and on CUDA. Symbols as in `types.py`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode
 from scene_experts.scene import Cull
-from scene_experts.scene.anchors import native_decode
+from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors.appearance import fold
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, HeadWeights
 from scene_experts.scene.anchors.select import drop_masked, fade_opacities, visible_rows
@@ -117,3 +117,21 @@ class Frozen:
 def _detach(w: HeadWeights) -> HeadWeights:
     values: dict[str, Any] = {name: value.detach().contiguous() for name, value in vars(w).items() if isinstance(value, Tensor)}
     return replace(w, **values)
+
+
+class FrozenCuda(Frozen):
+    """The same on CUDA, with the Triton kernels."""
+
+    kept: triton_decode.Routes  # type: ignore[assignment]
+
+    @property
+    def bytes(self) -> int:
+        return self.kept.bytes + self.scales.numel() * 4
+
+    @torch.no_grad()
+    def decode(self, rows: Tensor, camera: Camera) -> Decoded:
+        gaussians, raw = self.kept.decode(rows, camera.position, self._at(camera))
+        return Decoded(gaussians, rows, raw, {})
+
+    def _keep(self) -> triton_decode.Routes:  # type: ignore[override]
+        return triton_decode.Routes(self.xyz, self.columns, self.weights, self.with_dist, self.scene.extent)

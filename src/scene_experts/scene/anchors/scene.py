@@ -32,7 +32,7 @@ from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors.appearance import Codes, TestRule, fold
 from scene_experts.scene.anchors.experts import MixtureHead
 from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
-from scene_experts.scene.anchors.frozen import Frozen
+from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, Decoder, HeadWeights, Plain
 from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, drop_masked, fade_opacities, visible_rows
 from scene_experts.scene.anchors.smoothing import find_intervals, smooth
@@ -372,10 +372,10 @@ class AnchorScene(LatticeScene):
 
     def frozen(self, step: int) -> Draws:
         """Return the scene with precomputed routing if the native decode supports it, otherwise the scene itself."""
-        if not len(self.table) or self.table.device.type != "cpu":
+        weights = self.native_weights(step) if len(self.table) else None
+        if weights is None:
             return self
-        weights = self.native_weights(step)
-        return self if weights is None else Frozen(self, weights, step)
+        return (Frozen if self.table.device.type == "cpu" else FrozenCuda)(self, weights, step)
 
     def with_global_routing(self, decoded: Decoded, step: int) -> Decoded:
         """With `load_scope = all`, replace the routing by that of all anchors, so that L_load balances the whole scene."""

@@ -9,7 +9,7 @@ inputs give the same bits. Symbols as in `types.py`.
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -148,21 +148,8 @@ class _Decode(torch.autograd.Function):
     def forward(ctx: Any, plan: _Plan, feature: Tensor, log_scaling: Tensor, offsets: Tensor, *weights: Tensor | None) -> tuple:
         columns = [t.detach().contiguous() for t in (feature, log_scaling, offsets)]
         weights = tuple(None if t is None else t.detach().contiguous() for t in weights)
-        A, K = len(plan.rows), offsets.shape[1]
         routes = [_route(plan, head, columns[0], weights[6 * i : 6 * i + 6]) for i, head in enumerate(plan.heads)]
-        raw = feature.new_empty(A, K)
-        _forward(plan, 0, routes, columns[0], weights, raw, raw)
-        counted = (raw > 0).view(-1).cumsum(0, dtype=torch.int32)
-        M = int(counted[-1]) if A else 0  # the host waits for the device only here
-        dst = torch.where(raw.view(-1) > 0, counted - 1, -1)
-        cov, colors = feature.new_empty(M, 7), feature.new_empty(M, 3)
-        _forward(plan, 1, routes, columns[0], weights, dst, cov)
-        _forward(plan, 2, routes, columns[0], weights, dst, colors)
-        means, quats, scales, opacities = (feature.new_empty(M, *shape) for shape in ((3,), (4,), (3,), ()))
-        source = torch.empty(M, dtype=torch.int64, device=raw.device)
-        if M:
-            arguments = (plan.rows, plan.xyz, columns[2], columns[1], raw, cov, dst, means, quats, scales, opacities, source, A)
-            triton.launch(_kernels().place, (-(-A // BLOCK),), *arguments, K=K, B=BLOCK, KP=pad(K, 1))
+        (means, quats, scales, opacities, colors, source, raw), dst, cov = _draw(plan, columns, weights, routes)
         gates, chosen = [r[0] for r in routes], [r[2] for r in routes]
         ctx.plan = plan
         ctx.mark_non_differentiable(source, *(c for c in chosen if c is not None))
@@ -189,6 +176,69 @@ class _Decode(torch.autograd.Function):
             d_weights += _backward(plan, i, routes[i], columns[0], weights, dst, d_out, d_gates[i], d_feature)
         wanted = ctx.needs_input_grad[1:]
         return None, *(g if want else None for g, want in zip([d_feature, d_log_scaling, d_offsets, *d_weights], wanted))
+
+
+def _draw(plan: _Plan, columns: list[Tensor], weights: Any, routes: Any) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
+    """Return the Gaussians and raw opacities [A, K] of routed anchors; the place [A K] of each Gaussian, -1: not drawn; shapes [M, 7]."""
+    (feature, log_scaling, offsets), A, K = columns, len(plan.rows), columns[2].shape[1]
+    raw = feature.new_empty(A, K)
+    _forward(plan, 0, routes, feature, weights, raw, raw)
+    counted = (raw > 0).view(-1).cumsum(0, dtype=torch.int32)
+    M = int(counted[-1]) if A else 0  # the host waits for the device only here
+    dst = torch.where(raw.view(-1) > 0, counted - 1, -1)
+    cov, colors = feature.new_empty(M, 7), feature.new_empty(M, 3)
+    _forward(plan, 1, routes, feature, weights, dst, cov)
+    _forward(plan, 2, routes, feature, weights, dst, colors)
+    means, quats, scales, opacities = (feature.new_empty(M, *shape) for shape in ((3,), (4,), (3,), ()))
+    source = torch.empty(M, dtype=torch.int64, device=raw.device)
+    if M:
+        arguments = (plan.rows, plan.xyz, offsets, log_scaling, raw, cov, dst, means, quats, scales, opacities, source, A)
+        triton.launch(_kernels().place, (-(-A // BLOCK),), *arguments, K=K, B=BLOCK, KP=pad(K, 1))
+    return (means, quats, scales, opacities, colors, source, raw), dst, cov
+
+
+class Routes:
+    """The routing of all anchors, which does not depend on the camera, and the decode with it. Without gradients."""
+
+    @torch.no_grad()
+    def __init__(
+        self, xyz: Tensor, columns: list[Tensor], heads: dict[str, HeadWeights], with_dist: dict[str, bool], extent: float
+    ) -> None:
+        """xyz [N, 3]; columns: feature [N, F], log_scaling [N, 6], offsets [N, K, 3], all contiguous. Other arguments: see `decode`."""
+        F, K = columns[0].shape[1], columns[2].shape[1]
+        self.columns, self.heads = columns, tuple(_head(a, heads[a], with_dist[a], F, K) for a in ATTRIBUTES)
+        everyone = torch.arange(len(xyz), device=xyz.device)
+        self.plan = _Plan(everyone, xyz, xyz.new_zeros(3), self.heads, extent)  # type: ignore[arg-type]
+        routes = [_route(self.plan, h, columns[0], [heads[a].router_w, heads[a].router_b]) for a, h in zip(ATTRIBUTES, self.heads)]
+        self.weights, self.keys = _stack([r[1] for r in routes]), _stack([r[3] for r in routes])
+
+    @property
+    def bytes(self) -> int:
+        return sum(t.numel() * t.element_size() for t in (*self.weights, *self.keys) if t is not None)
+
+    @torch.no_grad()
+    def decode(self, rows: Tensor, camera_position: Tensor, heads: dict[str, HeadWeights]) -> tuple[Gaussians, Tensor]:
+        """Decode anchors into the Gaussians and raw opacities [A, K] of `decode`, the same bits. heads: contiguous tensors."""
+        plan = replace(self.plan, rows=rows.contiguous(), camera=camera_position.to(self.plan.xyz).contiguous())
+        weights, keys = _gather(self.weights, plan.rows), _gather(self.keys, plan.rows)
+        routes = [(None, w, None, k, None if k is None else plan.order(k)) for w, k in zip(weights, keys)]
+        made, _, _ = _draw(plan, self.columns, tuple(getattr(heads[a], name) for a in ATTRIBUTES for name in TENSORS), routes)
+        return Gaussians(*made[:6]), made[6]
+
+
+Columns = Tensor | list[Tensor | None]
+"""A tensor of N rows for each attribute; those of one shape are one tensor [3, N, ..]."""
+
+
+def _stack(columns: list[Tensor | None]) -> Columns:
+    found = [t for t in columns if t is not None]
+    return torch.stack(found) if len(found) == len(columns) and len({t.shape for t in found}) == 1 else columns
+
+
+def _gather(columns: Columns, rows: Tensor) -> list[Tensor | None]:
+    if isinstance(columns, Tensor):
+        return list(columns.index_select(1, rows))
+    return [None if t is None else t.index_select(0, rows) for t in columns]
 
 
 def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Tensor | None, ...]:
