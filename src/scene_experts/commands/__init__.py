@@ -19,6 +19,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "report": ("report:report", "Write one web page about one or more runs"),
     "export": ("files:export", "Write a trained scene to a file that other tools can open"),
     "import": ("files:import_", "Make a run folder from a published result or an exported file"),
+    "blocks": ("blocks:blocks", "Plan blocks of a large capture, and merge their runs"),
     "reproduce": ("reproduce:reproduce", "Reproduce the paper's tables and figures"),
     "bench": ("bench:bench", "Measure how fast this machine is"),
     "catalog": ("catalog:catalog", "List the paper's 17 scenes, their licences and where they are"),

@@ -81,6 +81,8 @@ class TrainCommand:
     out: Annotated[Path, Option(short="-m", value="RUN")]
     """Run folder to write."""
     cfg: Annotated[Train, Option(name="")]
+    init_from: Annotated[Path | None, Option(value="RUN")] = None
+    """Start from the scene of this run, at its iteration; --iterations counts its iterations too. The optimiser starts anew."""
     overwrite: bool = False
     """Replace the run in the folder: its checkpoints and results are deleted."""
     resume: bool = False
@@ -153,6 +155,7 @@ def run_of(command: TrainCommand, line: str) -> Run:
         config=RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, run_folder.versions()),
         out=command.out,
         resume=command.resume,
+        initial=command.init_from,
         save_every=command.save_every,
         preview_every=command.preview_every,
         max_memory=command.max_memory,

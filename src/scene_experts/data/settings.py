@@ -38,10 +38,15 @@ class Data:
     unit."""
     ignore_principal_point: bool = False
     """Assume that the principal point is the centre of the picture, as the reference implementations do."""
+    views: Annotated[Path | None, Option(value="FILE")] = None
+    """Train only on the training views that this JSON list names. The world and the held-out views stay those of the whole capture."""
     background: tuple[float, float, float] | None = None
     """Background colour, RGB in [0, 1]; by default that of the kind of capture (white for NeRF-synthetic, else black)."""
 
     def settings(self) -> dict[str, Any]:
         """How the capture is read, as plain JSON, without its path."""
         values = {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items() if name != "path"}
+        views = values.pop("views")  # newer than the first records, so left out unless it is given
+        if views is not None:
+            values["views"] = str(views)
         return {"type": "Data", **values}

@@ -105,6 +105,8 @@ class Capture:
     states_split: bool = False  # the files divide the views into training and test views, even if no test view is left
     bounds: tuple[Vector, Vector] | None = None  # lower and upper corner of the scene in the capture's own frame; None: unknown
 
+    left_out: tuple[int, ...] = ()  # indices of training views that --views leaves out; they still identify the capture
+
     def frame(self, index: int) -> Frame:
         """Return the pixels of view `index`. Raises InputError if its file cannot be read."""
         rgb, mask = self.images.get(index)
@@ -115,5 +117,5 @@ class Capture:
 
         A run compares it to recognise its capture, wherever the capture's folder is.
         """
-        content = [[(v.name, v.camera.width, v.camera.height) for v in self.views], self.train, self.test]
+        content = [[(v.name, v.camera.width, v.camera.height) for v in self.views], sorted(self.train + self.left_out), self.test]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]

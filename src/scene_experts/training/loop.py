@@ -49,6 +49,7 @@ class Run:
     log_every: int = 10  # iterations between Stepped events
     max_memory: float = 0.0  # GiB of memory (resident, or reserved on the GPU) at which densification stops; 0: no limit
     keep: int = 2  # number of checkpoints to keep
+    initial: Path | None = None  # run folder whose scene the training starts from; None: the points of the capture
     begin: Callable[[Training], None] = lambda training: None  # called once, before the first event
     watch: Callable[[Training], None] = lambda training: None  # called between iterations and not timed; the viewer renders here
     group: Alone = field(default_factory=Alone)  # the processes that share the views of each batch; process 0 writes all files
@@ -133,6 +134,8 @@ def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize
     training = resume(cfg, folder, run.device) if run.resume and folder else None
     if training and training.capture_id not in ("", capture.fingerprint()):
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
+    if training is None and run.initial is not None:
+        training = Training.start_from(cfg, run.initial, capture, run.device)
     training = training or Training.start(cfg, capture, run.device, run.dtype)
     training.capture_id = capture.fingerprint()
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])

@@ -31,6 +31,7 @@ from scene_experts.core.plain import MOST_DIFFERENCES, UnknownPart, differences,
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding
 from scene_experts.data import capture as captures
+from scene_experts.data.blocks import read_view_names
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
 from scene_experts.data.settings import Data
@@ -191,7 +192,8 @@ def read_config(run: Path) -> RunConfig:
 def named(data: Data) -> Data:
     """Replace `catalog:SCENE` with the folder of the scene. A resolution or split of "auto" is replaced with that of the paper."""
     path, resolution, split = resolve(data.path, data.resolution, data.split)
-    return replace(data, path=path, resolution=resolution, split=split)
+    views = None if data.views is None else data.views.absolute()
+    return replace(data, path=path, resolution=resolution, split=split, views=views)
 
 
 def load_capture(data: Data, seed: int = 0, look: bool = False) -> Capture:
@@ -217,9 +219,22 @@ def load_capture(data: Data, seed: int = 0, look: bool = False) -> Capture:
         seed=seed,
         allow_no_points=look,
     )
+    if data.views is not None:
+        capture = choose_views(capture, data.views)
     if data.near is None:
         return capture
     return replace(capture, views=tuple(replace(v, camera=replace(v.camera, near=data.near)) for v in capture.views))
+
+
+def choose_views(capture: Capture, path: Path) -> Capture:
+    """Return the capture with only those training views that the JSON list at `path` names. Raises InputError for unknown names."""
+    names = set(read_view_names(path))
+    chosen = tuple(index for index in capture.train if capture.views[index].name in names)
+    if len(chosen) < len(names):
+        unknown = sorted(names - {capture.views[index].name for index in chosen})
+        capture.images.close()
+        raise InputError(f"expected training views of {capture.root} in {path}, found {few(unknown)}; correct --views")
+    return replace(capture, train=chosen, left_out=tuple(index for index in capture.train if index not in chosen))
 
 
 def capture_of(run: OpenRun, data: Path | None = None) -> Capture:

@@ -79,6 +79,30 @@ class Training:
             log.warning("starts with %s rows, more than the recipe's %s: none will be added", f"{n:,}", f"{cfg.growth.max_anchors:,}")
         return cls(cfg, scene.to(device, dtype))
 
+    @classmethod
+    def start_from(cls, cfg: Train, run: Path, capture: Capture, device: str) -> Training:
+        """Create a training of `cfg`, which must be scaled, that starts from the scene of a run folder, at its iteration.
+
+        The scene has its averaged weights, if there are any. The optimiser, the statistics and the order of the views start anew.
+
+        Raises InputError if the run has no checkpoint, another recipe, capture or scene, or as many iterations as `cfg` already.
+        """
+        found = checkpoint.newest(run / "checkpoints")
+        if found is None:
+            raise InputError(f"expected a trained run for --init-from at {run}, found none; give the folder that `train --out` wrote")
+        tensors, meta = found
+        checkpoint.expect(meta, recipe=cfg.recipe)
+        if meta.get("capture", "") not in ("", capture.fingerprint()):
+            raise InputError(f"expected a run on the capture {capture.root} for --init-from, found one on another; use the same --data")
+        if not int(meta["step"]) < cfg.iterations or int(meta["step"]) % cfg.batch:
+            more = f"above {meta['step']}" if int(meta["step"]) >= cfg.iterations else f"and a --batch that divides {meta['step']}"
+            raise InputError(f"expected --iterations {more}, where the run of --init-from ended, found {cfg.iterations}; change it")
+        torch.manual_seed(cfg.seed)
+        with guarding(run, RUN):
+            training = cls(cfg, restore_foreign(cfg.scene, tensors, meta, averaged=True).to(device))
+        training.step = int(meta["step"])
+        return training
+
     def next_view(self, train: tuple[int, ...], ahead: int = 3) -> tuple[int, list[int]]:
         """Return the next training view and the `ahead` views after it. Each epoch uses every view once, in random order."""
         while len(self.queue) < ahead + 1:

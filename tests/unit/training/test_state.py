@@ -5,11 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from scene_experts import cli
 from scene_experts.core.errors import InputError
 from scene_experts.data.capture import load
 from scene_experts.recipes import RECIPES
 from scene_experts.scene import restore_scene
 from scene_experts.training.old_hash import old_hash
+from scene_experts.training.run_folder import open_run
 from scene_experts.training.state import Training, resume, save
 from support.messages import naming
 from support.synthetic import make_capture
@@ -106,3 +108,24 @@ def test_a_checkpoint_without_a_cpu_time_opens_and_it_stays_unknown(capture):
         pass
     found = after.meta()
     assert found["cpu_seconds"] is None and found["seconds"] > meta["seconds"] and "start" not in found["load"]
+
+
+def test_a_training_starts_from_exactly_the_scene_of_another(tmp_path):
+    folder = make_capture(tmp_path / "box", views=9, size=(48, 32), points=300).folder
+    cfg = replace(RECIPES["moe-gs"][1], iterations=40, average=replace(RECIPES["moe-gs"][1].average, span=0.5))
+    words = ["--iterations", "40", "--average.span", "0.5", "--preview-every", "0", "--device", "cpu"]
+    assert cli.main(["train", "moe-gs", "--data", str(folder), "--out", str(tmp_path / "run"), "--stop-at", "20", *words]) == 0
+    capture = load(folder)
+    training = Training.start_from(cfg.scaled(), tmp_path / "run", capture, "cpu")
+    capture.images.close()
+    scene = open_run(tmp_path / "run").scene
+    assert training.step == 20 and not training.optimizer.state
+    for name, value in scene.table.columns().items():
+        assert torch.equal(training.scene.table.columns()[name].detach(), value.detach()), name
+    for name, value in scene.network_tensors().items():
+        assert torch.equal(training.scene.network_tensors()[name], value), name
+    for iterations, batch in ((20, 1), (60, 6)):
+        with pytest.raises(InputError, match="--iterations"):
+            Training.start_from(replace(cfg, iterations=iterations, batch=batch).scaled(), tmp_path / "run", capture, "cpu")
+    with pytest.raises(InputError, match="--init-from"):
+        Training.start_from(cfg.scaled(), tmp_path, capture, "cpu")

@@ -1,0 +1,48 @@
+"""`scene-experts blocks`: its commands can be pasted, and its errors name what is wrong."""
+
+import shlex
+
+import pytest
+
+from scene_experts import cli
+from scene_experts.commands.train import parse_train
+from support.synthetic import make_capture
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return make_capture(tmp_path_factory.mktemp("plan") / "box", views=9, size=(48, 32), points=300).folder
+
+
+def test_the_commands_of_a_plan_are_commands_of_train(capture, tmp_path, capsys):
+    out = tmp_path / "my plan"
+    given = ["--blocks", "3", "--recipe", "scaffold-gs", "--iterations", "900", "--background", "1", "1", "0.5"]
+    assert cli.main(["blocks", "plan", str(capture), "--out", str(out), *given, "--ignore-principal-point"]) == 0
+    lines = (out / "commands.sh").read_text().splitlines()[2:]
+    assert "\n".join(lines) in capsys.readouterr().out and len(lines) == 1 + 3 + 1 + 1
+    words = [shlex.split(line) for line in lines]
+    trains = [parse_train(line[2:]) for line in words if line[1] == "train"]
+    assert [train.init_from for train in trains] == [None, *[out / "coarse"] * 3, out / "merged"]
+    assert [train.cfg.iterations for train in trains] == [900, 900, 900, 900, 990] and trains[0].stop_at == 300
+    assert all(train.data.background == (1, 1, 0.5) and train.data.ignore_principal_point for train in trains)
+    assert [train.data.views for train in trains[1:4]] == [out / f"block{number}.json" for number in range(3)]
+    assert words[4][1:3] == ["blocks", "merge"]
+
+
+def test_words_that_do_not_fit(capture, tmp_path, capsys):
+    out = ["--out", str(tmp_path / "plan")]
+    for words, found in (
+        (["blocks"], "plan or merge"),
+        (["blocks", "plans"], "'plan'"),
+        (["blocks", "plan", str(capture), *out, "--recipe", "moegs"], "--recipe"),
+        (["blocks", "plan", str(capture), *out, "--blocks", "0"], "--blocks"),
+        (["blocks", "merge", str(tmp_path), *out, "--runs", str(tmp_path)], "plan.json"),
+    ):
+        assert cli.main(words) == 2 and found in capsys.readouterr().err
+    assert not (tmp_path / "plan").exists()
+
+
+def test_views_of_another_capture(capture, tmp_path, capsys):
+    (tmp_path / "views.json").write_text('["elsewhere.png"]')
+    assert cli.main(["info", str(capture), "--views", str(tmp_path / "views.json")]) == 2
+    assert "elsewhere.png" in capsys.readouterr().err

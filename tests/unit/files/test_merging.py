@@ -1,0 +1,81 @@
+"""Blocks that are trained alone and merged: no anchor twice, and nothing but anchors of their own block."""
+
+import json
+
+import pytest
+import torch
+
+from scene_experts import cli
+from scene_experts.core.errors import InputError
+from scene_experts.data.blocks import read_plan
+from scene_experts.files.merging import merge_blocks
+from scene_experts.training.run_folder import open_run
+from support.synthetic import make_capture
+
+
+def call(*words) -> None:
+    assert cli.main([str(word) for word in words]) == 0
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A plan of two blocks with their runs."""
+    place = tmp_path_factory.mktemp("merging")
+    capture = make_capture(place / "box", views=9, size=(48, 32), points=400).folder
+    plan = place / "plan"
+    call("blocks", "plan", capture, "--out", plan, "--blocks", 2, "--share", 0.5)
+    grow = ["--growth.adjust.interval", 20, "--growth.success-threshold", 0.05, "--preview-every", 0, "--device", "cpu"]
+    train = ["train", "moe-gs", "--data", capture, "--iterations", 120, *grow]
+    call(*train, "--out", plan / "coarse", "--stop-at", 40)
+    for number in range(2):
+        views = ["--views", plan / f"block{number}.json", "--init-from", plan / "coarse"]
+        call(*train, "--out", plan / f"run{number}", *views, "--rates.networks", 0)
+    return capture, plan
+
+
+@pytest.mark.slow
+def test_merged_blocks_have_no_anchor_twice(trained, tmp_path):
+    capture, plan = trained
+    runs = [plan / "run0", plan / "run1"]
+    merge_blocks(plan, runs, tmp_path / "merged")
+    merged, parts = open_run(tmp_path / "merged"), [open_run(run) for run in runs]
+    cells = merged.scene.table.facts["cell"]
+    assert len(cells.unique(dim=0)) == len(cells)
+    _, blocks = read_plan(plan)
+    inside = [block.holds(part.scene.positions.detach()) for block, part in zip(blocks, parts)]
+    assert len(cells) == sum(int(rows.sum()) for rows in inside) and all(rows.any() and not rows.all() for rows in inside)
+    feature = torch.cat([part.scene.table.params["feature"].detach()[rows] for part, rows in zip(parts, inside)])
+    assert torch.equal(merged.scene.table.params["feature"].detach(), feature)
+    call(
+        "train",
+        "moe-gs",
+        "--data",
+        capture,
+        "--iterations",
+        132,
+        "--init-from",
+        merged.path,
+        "--out",
+        tmp_path / "joint",
+        "--device",
+        "cpu",
+    )
+    call("eval", tmp_path / "joint")
+    assert json.loads((tmp_path / "joint" / "results.json").read_text())["psnr"] > 10
+    with pytest.raises(InputError, match="2 runs"):
+        merge_blocks(plan, runs[:1], tmp_path / "other")
+
+
+@pytest.mark.slow
+def test_runs_that_do_not_fit_are_named(trained, tmp_path):
+    capture, plan = trained
+    train = ["train", "moe-gs", "--data", capture, "--iterations", 50, "--preview-every", 0, "--device", "cpu"]
+    call(*train, "--init-from", plan / "coarse", "--out", tmp_path / "moved")
+    with pytest.raises(InputError, match=r"moved.*--rates\.networks 0"):
+        merge_blocks(plan, [plan / "run0", tmp_path / "moved"], tmp_path / "out")
+    call(*train, "--out", tmp_path / "fresh", "--split", "mod:3")
+    with pytest.raises(InputError, match="fresh"):
+        merge_blocks(plan, [plan / "run0", tmp_path / "fresh"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    assert cli.main([str(word) for word in (*train, "--init-from", tmp_path / "fresh", "--out", tmp_path / "x")]) == 2
+    assert cli.main([str(word) for word in (*train, "--init-from", tmp_path, "--out", tmp_path / "x")]) == 2
