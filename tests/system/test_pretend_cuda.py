@@ -26,8 +26,8 @@ LEAN = {
 }
 FAMILIES = {
     "scaffold-gs-bank:composed": Most(235, 3, 2.2e6),
-    "scene-experts:composed": Most(210, 3, 3.8e6),
-    "octree-gs:composed": Most(212, 4, 0.92e6),
+    "scene-experts:fused": Most(126, 3, 2.9e6),
+    "octree-gs:fused": Most(126, 4, 0.75e6),
     "moe-gs-balance:composed": Most(490, 12, 7.9e6),  # counts its experts on the host
     "3dgs:composed": Most(278, 2, 0.7e6),
     "3dgs-mcmc:composed": Most(345, 2, 0.32e6),
