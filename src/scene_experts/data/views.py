@@ -117,5 +117,6 @@ class Capture:
 
         A run compares it to recognise its capture, wherever the capture's folder is.
         """
-        content = [[(v.name, v.camera.width, v.camera.height) for v in self.views], sorted(self.train + self.left_out), self.test]
+        train = sorted(self.train + self.left_out) if self.left_out else self.train
+        content = [[(v.name, v.camera.width, v.camera.height) for v in self.views], train, self.test]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
