@@ -44,7 +44,12 @@ def test_help_is_what_was_reviewed(capsys):
 
 
 RECIPES_SHOWN = ("moe-gs", "scaffold-gs", "3dgs", "3dgs-mcmc", "octree-gs", "sags", "moe-gs-balance")
-HELP = [*(name for name in COMMANDS if name != "train"), *(f"train {name}" for name in RECIPES_SHOWN)]
+HELP = [
+    *(name for name in COMMANDS if name not in ("train", "blocks")),
+    "blocks plan",
+    "blocks merge",
+    *(f"train {name}" for name in RECIPES_SHOWN),
+]
 
 
 @pytest.mark.parametrize("command", HELP)

@@ -21,7 +21,8 @@ Train a scene that is too large for one run in blocks.
 plan: divide a capture into blocks and write the commands that train them.
 merge: merge the runs of the blocks into one run.
 
-`{PROG} blocks plan --help` and `{PROG} blocks merge --help` show the options."""
+`{PROG} blocks plan --help` and
+`{PROG} blocks merge --help` show the options."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,8 @@ def plan(args: list[str]) -> int:
     from scene_experts.recipes import RECIPES
     from scene_experts.training import run_folder
 
+    if command.data.views is not None:
+        raise InputError(f"expected a plan of all training views, found --views {command.data.views}; leave it out")
     if command.recipe not in RECIPES:
         raise InputError(f"expected a recipe as --recipe, found '{command.recipe}'{nearest(command.recipe, RECIPES)}; change it")
     capture = run_folder.load_capture(run_folder.named(command.data))

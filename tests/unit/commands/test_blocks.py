@@ -36,6 +36,7 @@ def test_words_that_do_not_fit(capture, tmp_path, capsys):
         (["blocks", "plans"], "'plan'"),
         (["blocks", "plan", str(capture), *out, "--recipe", "moegs"], "--recipe"),
         (["blocks", "plan", str(capture), *out, "--blocks", "0"], "--blocks"),
+        (["blocks", "plan", str(capture), *out, "--views", "x.json"], "--views"),
         (["blocks", "merge", str(tmp_path), *out, "--runs", str(tmp_path)], "plan.json"),
     ):
         assert cli.main(words) == 2 and found in capsys.readouterr().err
