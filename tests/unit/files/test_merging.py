@@ -79,3 +79,12 @@ def test_runs_that_do_not_fit_are_named(trained, tmp_path):
     assert not (tmp_path / "out").exists()
     assert cli.main([str(word) for word in (*train, "--init-from", tmp_path / "fresh", "--out", tmp_path / "x")]) == 2
     assert cli.main([str(word) for word in (*train, "--init-from", tmp_path, "--out", tmp_path / "x")]) == 2
+
+
+def test_each_block_needs_its_run(tmp_path):
+    box = {"low": [None] * 3, "high": [None] * 3, "views": ["a.png"]}
+    (tmp_path / "plan.json").write_text(json.dumps({"format": 1, "capture": "", "blocks": [box, box]}))
+    with pytest.raises(InputError, match="2 runs"):
+        merge_blocks(tmp_path, [tmp_path], tmp_path / "out")
+    with pytest.raises(InputError, match=r"config\.json"):
+        merge_blocks(tmp_path, [tmp_path, tmp_path], tmp_path / "out")
