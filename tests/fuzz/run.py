@@ -93,7 +93,8 @@ def run_batch(name: str, first: int, folder: Path, done: Counter[str], found: li
         done[name] += BATCH
         return BATCH
     current = folder / "current"
-    number = int(current.read_text().split()[1]) if current.is_file() else first
+    words = current.read_text().split() if current.is_file() else []
+    number = int(words[1]) if len(words) == 2 else first  # it may have been stopped while it wrote the file
     done[name] += number - first + 1
     if time.monotonic() < end:  # it was not stopped: it died
         report(found, name, number, f"exit code {worker.returncode} {err[-600:]}")

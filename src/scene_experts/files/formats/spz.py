@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from scene_experts.core.errors import InputError
@@ -105,12 +106,14 @@ def decode(data: bytes, source: Source) -> Splats:
     if not np.isfinite(means).all():
         raise Damaged("positions that are not finite")
     quats = _unpack_quats(streams["rotations"], n) if version >= 3 else _unpack_xyz(streams["rotations"], n)
-    dc = (streams["colors"].reshape(n, 1, 3) / 255.0 - 0.5) / _COLOR
-    used = min(degree, 3)
-    rest = (streams["sh"].reshape(n, (degree + 1) ** 2 - 1, 3)[:, : (used + 1) ** 2 - 1].astype(np.float64) - 128) / 128
-    sh = np.concatenate([dc, rest], 1)
+    count = (min(degree, 3) + 1) ** 2
+    sh = np.empty((n, count, 3), np.float32)  # in place: most of the memory of a file is here
+    sh[:, 0] = (streams["colors"].reshape(n, 3) / 255.0 - 0.5) / _COLOR
+    sh[:, 1:] = streams["sh"].reshape(n, (degree + 1) ** 2 - 1, 3)[:, : count - 1]
+    sh[:, 1:] -= 128
+    sh[:, 1:] /= 128
     scales = streams["scales"].reshape(n, 3) / 16.0 - 10
-    return turn(Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(streams["alphas"])), tensor(sh)), "x")
+    return turn(Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(streams["alphas"])), torch.from_numpy(sh)), "x")
 
 
 # --- containers ---------------------------------------------------------------------------------------------------------------------------
