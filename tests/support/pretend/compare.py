@@ -3,8 +3,7 @@
     python -m support.pretend.compare octree-gs moe-gs:alone                 # in tests/, with the guard loaded
 
 RECIPE: each step starts on both from the same checkpoint, that of the CPU. `losses` and `gradients` are the differences.
-RECIPE:alone: both train on their own. Then `gradients` is empty. Trainings in float32 leave each other: Adam divides a gradient by its own
-size, so a gradient that is a rounding error moves a parameter as far as any other one does.
+RECIPE:alone: both train on their own. Then `gradients` is empty.
 
 A training starts with the Gaussians of an anchor at one place, and its first steps move them by equal lengths. Depths are then equal up to
 rounding, rounding decides which Gaussian is drawn first, and the pictures differ, on one CPU between float32 and float64 as well. So the
