@@ -225,7 +225,9 @@ def load_capture(
         InputError: The folder holds no usable capture, or an argument is invalid.
     """
     chosen = normalise or ("none" if str(path).startswith("catalog:") else "extent")
-    data = Data(Path(path), images, resolution, split, missing, chosen, init, max_views, near, ignore_principal_point, background)
+    data = Data(
+        Path(path), images, resolution, split, missing, chosen, init, max_views, near, ignore_principal_point, background=background
+    )
     for name, value in (("resolution", resolution), ("split", split)):
         if not isinstance(value, str):
             raise InputError(f"expected {name} as text such as 'longest:800' or 'mod8', found {value!r}; write it in quotes")
