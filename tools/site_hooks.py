@@ -21,8 +21,16 @@ RECIPE = "scene-experts"  # whose options stand for those of every recipe
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add pages for results/ and examples/."""
-    for path in sorted([*ROOT.glob("results/**/*.md"), *ROOT.glob("results/**/*.png"), *ROOT.glob("examples/**/*.md")]):
+    """Add pages for results/, examples/ and the documents in the repository's root."""
+    for path in sorted(
+        [
+            ROOT / "CHANGELOG.md",
+            ROOT / "CONTRIBUTING.md",
+            *ROOT.glob("results/**/*.md"),
+            *ROOT.glob("results/**/*.png"),
+            *ROOT.glob("examples/**/*.md"),
+        ]
+    ):
         files.append(File.generated(config, f"{OUTSIDE}/{path.relative_to(ROOT).as_posix()}", abs_src_path=str(path)))
     for path in sorted(ROOT.glob("examples/**/*.py")):
         name = path.relative_to(ROOT).as_posix()
