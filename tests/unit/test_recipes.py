@@ -28,7 +28,14 @@ def test_every_ablation_of_the_paper_has_a_recipe():
     assert RECIPES["scaffold-gs-opacity"][1].loss.opacity == 0.01
 
 
-NAMED = {"reproduce/experiments.py", "reproduce/claims.py", "reproduce/figures.py", "bench/step.py", "commands/train.py"}
+NAMED = {
+    "reproduce/experiments.py",
+    "reproduce/claims.py",
+    "reproduce/figures.py",
+    "bench/step.py",
+    "commands/train.py",
+    "commands/blocks.py",
+}
 
 
 @pytest.mark.parametrize("path", [p for p in SOURCE.rglob("*.py") if p.name != "recipes.py"], ids=lambda p: str(p.relative_to(SOURCE)))
