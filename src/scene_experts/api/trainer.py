@@ -195,7 +195,7 @@ def train(
         method: A recipe, or the name of one.
         capture: A capture, or its folder.
         out: Run folder to write, as `scene-experts train --out` does. Default: the scene stays in memory.
-        progress: Print iterations, losses and PSNR.
+        progress: Print iterations, losses and the PSNR of training views.
         settings: `resume`, `overwrite`, `stop_at`, `deterministic`, `device` and the other settings of `Trainer`.
 
     Returns:

@@ -13,6 +13,7 @@ from scene_experts.core.errors import few
 from scene_experts.core.signals import handled
 from scene_experts.sfm.options import Options
 
+MOST_REASONS = 8  # lines about photographs without a pose
 FEW = 0.9  # a smaller share of photographs with a pose gets a warning
 
 
@@ -67,8 +68,16 @@ def summarise(note: dict[str, Any]) -> list[str]:
         f"{have} of {all_} photographs have a pose: {note['points']:,} points, {note['observations']:.0f} points per photograph, "
         f"mean error {note['error']:.2f} px, {note['mapper']} mapper, {format_duration(note['seconds'])} min"
     ]
+    tried = note.get("mappers", {})
+    if len(tried) > 1:
+        posed = " and ".join(f"{count} from the {name} mapper" for name, count in tried.items())
+        lines.append(f"both mappers ran because the first gave too few poses: {posed}; the result is the {note['mapper']} mapper's")
     if without:
         lines.append(f"photographs without a pose: {few(without, 8)}")
+    reasons: dict[str, list[str]] = {}
+    for name, why in note.get("why", {}).items():
+        reasons.setdefault(why, []).append(name)
+    lines += [f"  {few(names, 4)}: {why}" for why, names in sorted(reasons.items(), key=lambda item: -len(item[1]))[:MOST_REASONS]]
     if note["apart"]:
         parts = ", ".join(map(str, note["apart"]))
         lines.append(f"warning: {parts} of these fit together, but not with the others; add photographs that connect them")

@@ -9,6 +9,7 @@ import platform
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from rich.console import Console
@@ -17,6 +18,19 @@ from scene_experts.data.store import available_bytes
 from scene_experts.native import library as native
 
 PIN = "keep torch as it is with `pip install -c constraints.txt ...`, run in the project's folder"
+EXTRAS = {
+    "sfm": ("pycolmap", "camera poses of photographs and videos (capture)"),
+    "heic": ("pillow_heif", "HEIC photographs of phones (capture)"),
+    "viewer": ("viser", "the viewer (view, train --viewer)"),
+    "video": ("imageio_ffmpeg", "videos (render --out FILE.mp4, capture VIDEO)"),
+    "spz4": ("zstandard", "SPZ files of version 4 (import)"),
+    "plots": ("matplotlib", "figures (reproduce)"),
+    "tensorboard": ("tensorboard", "TensorBoard (train --tensorboard)"),
+    "cluster": ("distributed", "runs on several machines (reproduce --cluster)"),
+    "docs": ("mkdocs", "this project's documentation (make docs)"),
+    "test": ("pytest", "this project's tests (make test)"),
+}
+"""Optional packages of pyproject.toml by the name of their extra: the module, and what it is for. `cuda` has checks of its own."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +46,8 @@ class Check:
 
 def diagnose() -> list[Check]:
     """Run all checks. They install, download and change nothing, and raise no exception."""
-    checks = (python, pytorch, cuda, native_library, gsplat, triton, machine, memory, lpips, viewer, sfm, tensorboard)
-    return [_guarded(check) for check in checks]
+    checks = (python, pytorch, cuda, native_library, gsplat, triton, machine, memory, lpips)
+    return [*map(_guarded, checks), *(_guarded(partial(extra, name)) for name in EXTRAS)]
 
 
 def run(console: Console) -> int:
@@ -156,24 +170,13 @@ def lpips() -> Check:
     return Check("LPIPS weights", False, f"{why}; scores are written without them", weights.HOW)
 
 
-def viewer() -> Check:
-    return _package("viser", "viewer", "view and train --viewer")
-
-
-def sfm() -> Check:
-    return _package("pycolmap", "sfm", "capture")
-
-
-def tensorboard() -> Check:
-    return _package("tensorboard", "tensorboard", "train --tensorboard")
-
-
-def _package(name: str, extra: str, purpose: str) -> Check:
+def extra(name: str) -> Check:
     """Check an optional package without importing it: pycolmap corrupts the heap of a process that also uses Pillow."""
-    version = _version(name)
+    module, purpose = EXTRAS[name]
+    version = _version(module)
     if version is not None:
-        return Check(name, True, version)
-    return Check(name, False, f"not installed (needed for {purpose})", f"pip install 'scene-experts[{extra}]'; {PIN}")
+        return Check(name, True, f"{module} {version}: {purpose}")
+    return Check(name, False, f"{module} is not installed: {purpose}", f"pip install 'scene-experts[{name}]'")
 
 
 def _version(name: str) -> str | None:
@@ -189,4 +192,5 @@ def _guarded(check: Callable[[], Check]) -> Check:
     try:
         return check()
     except Exception as error:  # the report must appear whatever is broken
-        return Check(check.__name__.replace("_", " "), False, f"the check itself failed: {type(error).__name__}: {error}", "report this")
+        name = check.args[0] if isinstance(check, partial) else check.__name__.replace("_", " ")
+        return Check(name, False, f"the check itself failed: {type(error).__name__}: {error}", "report this")

@@ -18,7 +18,8 @@ from scene_experts.data.images import to_8_bit
 from scene_experts.data.match import EXTENSIONS
 
 FEWEST = 3  # photographs needed for a reconstruction
-UNSUPPORTED = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw")  # photographs that Pillow does not read
+UNSUPPORTED = (".dng", ".cr2", ".cr3", ".nef", ".arw")  # photographs that Pillow does not read
+HEIC = (".heic", ".heif")  # read with pillow-heif, if it is installed
 COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "BMP", "TIFF")  # what COLMAP reads
 MASK_ENDINGS = (".mask.png", "_mask.png")  # after the stem of a photograph in the same folder
 COPIED = "copied.json"
@@ -54,11 +55,13 @@ class Photo:
 def find_photos(folder: Path, exclude: Path | None = None) -> list[Photo]:
     """Return the photographs in `folder` and its subfolders except `exclude`, sorted so that "2.jpg" precedes "10.jpg".
 
-    Every photograph is decoded at an eighth of its size to verify it.
-    Raises InputError if there are too few, or if one is damaged or its name cannot be used.
+    Every photograph is decoded at an eighth of its size to verify it. A HEIC file beside a photograph of the same name is left out.
+    Raises InputError if there are too few, if one is damaged or its name cannot be used, or if HEIC files cannot be read.
     """
     files = list_files(folder, exclude)
-    names = sorted((path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in EXTENSIONS), key=natural_key)
+    paths = [path for path in files if path.suffix.lower() in EXTENSIONS]
+    paths += find_heic(files, {path.with_suffix("") for path in paths}, folder)
+    names = sorted((path.relative_to(folder).as_posix() for path in paths), key=natural_key)
     masks = find_masks_beside(names)
     names = [name for name in names if name not in masks.values()]
     if len(names) < FEWEST:
@@ -71,6 +74,24 @@ def find_photos(folder: Path, exclude: Path | None = None) -> list[Photo]:
             raise InputError(
                 f"expected names in {folder} that differ not only in blanks or extension, found '{one.name}' and '{other.name}'; rename one"
             )
+    return found
+
+
+def find_heic(files: Sequence[Path], others: set[Path], folder: Path) -> list[Path]:
+    """Return the HEIC photographs among `files`, without those that `others` (paths without extension) has in another format.
+
+    Raises InputError if there are any and pillow-heif is missing.
+    """
+    found = [path for path in files if path.suffix.lower() in HEIC and path.with_suffix("") not in others]
+    if found:
+        try:
+            from pillow_heif import register_heif_opener
+        except ImportError:
+            raise InputError(
+                f"expected the package pillow-heif to read the {len(found)} HEIC photographs in {folder}, found none; "
+                "pip install 'scene-experts[heic]', or save them as JPEG"
+            ) from None
+        register_heif_opener()
     return found
 
 
@@ -115,7 +136,7 @@ def inspect_photo(folder: Path, name: str, mask: str) -> Photo:
             inner = exif.get_ifd(_EXIF)
             image.draft(None, (max(1, size[0] // 8), max(1, size[1] // 8)))
             image.load()
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except (OSError, ValueError, SyntaxError, RuntimeError, Image.DecompressionBombError) as error:
         raise InputError(f"cannot read the photograph {path}: {error}; replace or remove it") from error
     camera = (exif.get(_MAKE), exif.get(_MODEL), inner.get(_LENS), inner.get(_FOCAL))
     orientation = exif.get(_ORIENTATION, 1)

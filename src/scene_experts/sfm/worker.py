@@ -18,6 +18,7 @@ from typing import Any
 CHUNK = 8  # photographs per progress message during feature extraction
 PAIRS = 200  # pairs per progress message during matching
 ENOUGH = 0.9  # fraction of photographs with a pose at which the second mapper is not tried
+FEW_FEATURES = 200  # a sharp photograph has thousands
 
 
 def report(**what: Any) -> None:
@@ -83,6 +84,7 @@ def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
     """Reconstruct the scene, write the best model and return a description of it."""
     total = sum(map(len, ask["groups"]))
     found: list[tuple[str, Any]] = []
+    tried: dict[str, int] = {}
     for mapper in ("incremental", "global") if ask["mapper"] == "auto" else (ask["mapper"],):
         out = Path(ask["maps"]) / mapper
         out.mkdir(parents=True)
@@ -91,10 +93,14 @@ def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
             models = MAPPERS[mapper](colmap, ask, str(out), total)
         except Exception as error:  # report it; the other mapper may succeed
             report(step="failed", mapper=mapper, why=str(error))
+            tried[mapper] = 0
             continue
         found += [(mapper, model) for model in models.values()]
-        if found and max(model.num_reg_images() for _, model in found) >= ENOUGH * total:
+        tried[mapper] = max((model.num_reg_images() for model in models.values()), default=0)
+        if tried[mapper] >= ENOUGH * total:
             break
+        if mapper != ask["mapper"] and len(tried) == 1:
+            report(step="next mapper", mapper=mapper, posed=tried[mapper], total=total)
     if not found:
         return {"registered": []}
     mapper, best = max(found, key=lambda one: (one[1].num_reg_images(), one[1].num_points3D()))
@@ -104,7 +110,9 @@ def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
     others = [registered_names(model) - have for one, model in found if one == mapper]
     return {
         "mapper": mapper,
+        "mappers": tried,
         "registered": sorted(have),
+        "why": explain_missing(colmap, ask, have, set().union(*others)),
         "apart": sorted(map(len, filter(None, others)), reverse=True),
         "points": best.num_points3D(),
         "error": best.compute_mean_reprojection_error(),
@@ -119,6 +127,40 @@ def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
 def registered_names(model: Any) -> set[str]:
     """Return the names of the photographs that have a pose in a model."""
     return {model.images[i].name for i in model.reg_image_ids()}
+
+
+def explain_missing(colmap: Any, ask: dict[str, Any], have: set[str], apart: set[str]) -> dict[str, str]:
+    """Return why each photograph that is not in `have` has no pose, by name. apart: photographs with poses in a model of their own."""
+    names = [name for group in ask["groups"] for name in group if name not in have]
+    if not names:
+        return {}
+    with colmap.Database.open(ask["database"]) as there:
+        by_name = {image.name: image.image_id for image in there.read_all_images()}
+        features = {name: there.num_keypoints_for_image(by_name[name]) if name in by_name else 0 for name in names}
+        pairs, inliers = there.read_two_view_geometry_num_inliers()
+    shared: dict[int, dict[int, int]] = {}
+    for pair, count in zip(pairs, inliers):
+        one, other = colmap.pair_id_to_image_pair(pair)
+        shared.setdefault(one, {})[other] = shared.setdefault(other, {})[one] = count
+    posed = {by_name[name] for name in have if name in by_name}
+    return {name: explain(features[name], shared.get(by_name.get(name, -1), {}), posed, name in apart) for name in names}
+
+
+def explain(features: int, shared: dict[int, int], posed: set[int], apart: bool) -> str:
+    """Return why a photograph has no pose.
+
+    shared: The number of points that it shares with other photographs, by their id. posed: Ids of the photographs that have a pose.
+    """
+    with_posed = [count for other, count in shared.items() if other in posed and count]
+    if features < FEW_FEATURES:
+        return f"only {features} features: it is blurred, dark or plain"
+    if apart:
+        return "fits only together with others that are apart from the rest"
+    if not any(shared.values()):
+        return "no other photograph shows the same points"
+    if not with_posed:
+        return "shares points only with photographs that have no pose either"
+    return f"shares points with {len(with_posed)} photographs that have a pose, at most {max(with_posed)}, which did not fit a pose"
 
 
 def map_incrementally(colmap: Any, ask: dict[str, Any], out: str, total: int) -> dict[int, Any]:

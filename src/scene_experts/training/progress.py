@@ -81,7 +81,7 @@ class TrainingProgress:
                 pass
 
     def show_step(self, event: Stepped) -> None:
-        """Show an iteration: running means of the losses and PSNR, the number of rows, speed and remaining time."""
+        """Show an iteration: running means of the losses and of the PSNR of training views, the number of rows, speed and remaining time."""
         for name, value in event.terms.items():
             self.loss[name] = SMOOTHING * self.loss.get(name, value) + (1 - SMOOTHING) * value
         self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr
@@ -90,7 +90,7 @@ class TrainingProgress:
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
         active = f"active {100 * event.active:.0f} %  " if self.traits.activation else ""
         line = (
-            f"{event.step:>6,}/{self.total:,}  {terms}  PSNR {self.psnr:.2f}  {self.traits.rows} {event.anchors:,}  {active}"
+            f"{event.step:>6,}/{self.total:,}  {terms}  training PSNR {self.psnr:.2f}  {self.traits.rows} {event.anchors:,}  {active}"
             f"{speed:.1f} it/s  {format_duration(left)} left"
         )
         if self.live:

@@ -26,6 +26,12 @@ def test_what_was_found_and_what_to_do():
     assert "2" in few[2] and "--matching exhaustive --overwrite" in few[3]
 
 
+def test_why_a_second_mapper_ran_and_why_photographs_have_no_pose():
+    tried = {"mappers": {"incremental": 2, "global": 3}, "without_pose": ["a.jpg"], "why": {"a.jpg": "it is blurred"}}
+    lines = summarise({**NOTE, **tried, "photographs": 4})
+    assert "2 from the incremental mapper and 3 from the global mapper" in lines[1] and lines[3].strip() == "a.jpg: it is blurred"
+
+
 def test_a_capture_and_the_next_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("scene_experts.sfm.reconstruct.importlib.util.find_spec", lambda name: name)
     said = {**NOTE, "registered": ["0.jpg", "1.jpg", "2.jpg"], "cameras": []}

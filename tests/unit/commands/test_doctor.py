@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import subprocess
 import sys
+import tomllib
 
 import pytest
 from rich.console import Console
@@ -12,6 +13,7 @@ from rich.console import Console
 from scene_experts.commands import doctor
 from scene_experts.commands.doctor import Check
 from scene_experts.native import library as native
+from support.places import ROOT
 
 NAMES = [
     "Python",
@@ -23,9 +25,7 @@ NAMES = [
     "cores",
     "memory",
     "LPIPS weights",
-    "viser",
-    "pycolmap",
-    "tensorboard",
+    *doctor.EXTRAS,
 ]
 
 
@@ -62,8 +62,14 @@ def test_old_torch(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_absent_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
-    check = doctor.sfm()
-    assert not check.ok and "scene-experts[sfm]" in check.fix and "constraints.txt" in check.fix
+    for name, (_, purpose) in doctor.EXTRAS.items():
+        check = doctor.extra(name)
+        assert not check.ok and f"scene-experts[{name}]" in check.fix and purpose in check.found
+
+
+def test_every_extra_of_the_project_is_listed() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(doctor.EXTRAS) == set(extras) - {"all", "cuda"}  # gsplat and triton have checks of their own
 
 
 def test_a_check_that_breaks_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:

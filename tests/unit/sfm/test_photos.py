@@ -1,6 +1,7 @@
 """Photographs: finding, grouping by camera, copying."""
 
 import os
+import sys
 
 import numpy as np
 import pytest
@@ -22,8 +23,8 @@ def test_names_are_sorted_by_their_numbers_and_hidden_files_are_ignored(tmp_path
 def test_too_few_or_unreadable_photographs_are_reported(tmp_path):
     write_photo(tmp_path / "1.jpg")
     for i in range(4):
-        (tmp_path / f"{i}.HEIC").write_bytes(b"")
-    with pytest.raises(InputError, match=naming(1, ".heic")):
+        (tmp_path / f"{i}.NEF").write_bytes(b"")
+    with pytest.raises(InputError, match=naming(1, ".nef")):
         find_photos(tmp_path)
     for i in range(3):
         write_photo(tmp_path / f"{i}.jpg")
@@ -31,6 +32,25 @@ def test_too_few_or_unreadable_photographs_are_reported(tmp_path):
     (tmp_path / "2.jpg").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"2\.jpg"):
         find_photos(tmp_path)
+
+
+def test_heic_photographs_are_read_where_pillow_heif_is_installed(tmp_path, monkeypatch):
+    heif = pytest.importorskip("pillow_heif")
+    heif.register_heif_opener()
+    source = tmp_path / "phone"
+    source.mkdir()
+    for i in range(3):
+        Image.new("RGB", (64, 48), (40 * i, 90, 10)).save(source / f"IMG_{i}.HEIC", format="HEIF", quality=90)
+    write_photo(source / "IMG_2.jpg")  # the same photograph twice
+    found = find_photos(source)
+    assert [photo.name for photo in found] == ["IMG_0.HEIC", "IMG_1.HEIC", "IMG_2.jpg"]
+    there = copy_photos(found, source, tmp_path / "work" / "images")
+    assert [photo.name for photo in there] == ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg"]
+    with Image.open(tmp_path / "work" / "images" / "IMG_1.jpg") as picture:
+        assert picture.format == "JPEG" and picture.size == (64, 48)
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(InputError, match=naming(2, "scene-experts[heic]")):
+        find_photos(source)
 
 
 def test_a_camera_is_one_size_maker_and_focal_length(tmp_path):

@@ -79,6 +79,7 @@ def reconstruct(tmp_path, monkeypatch):
 
         calls.append(None)
         monkeypatch.setattr(worker, "MAPPERS", {"incremental": mapping("incremental", incremental), "global": mapping("global", at_once)})
+        monkeypatch.setattr(worker, "explain_missing", lambda *_: {})
         folder = tmp_path / str(len(calls))
         ask = {"maps": str(folder / "maps"), "model": str(folder / "model"), "groups": [list("abcdefghij")], "mapper": mapper}
         return ran, written, worker.estimate_poses(None, ask)
@@ -92,10 +93,24 @@ def test_the_second_mapper_is_tried_if_the_first_leaves_many_out(reconstruct, ca
     assert found["apart"] == [1]  # only j of the second model is in no other model
     ran, written, found = reconstruct(["abcd"], ["abcdefg"])
     assert ran == ["incremental", "global"] and written == ["abcdefg"] and found["mapper"] == "global" and found["apart"] == []
+    assert found["mappers"] == {"incremental": 4, "global": 7}
+    assert json.loads(capsys.readouterr().out.splitlines()[-2])["posed"] == 4  # said before the second mapper starts
     ran, written, found = reconstruct(["abcd"], None)
     assert written == ["abcd"] and found["mapper"] == "incremental"
     ran, written, found = reconstruct([], [], mapper="global")
     assert ran == ["global"] and not written and found == {"registered": []}
+
+
+def test_why_a_photograph_has_no_pose():
+    posed = {1, 2}
+    words = [
+        worker.explain(30, {1: 90}, posed, False),
+        worker.explain(3000, {1: 90}, posed, True),
+        worker.explain(3000, {1: 0}, posed, False),
+        worker.explain(3000, {3: 40}, posed, False),
+        worker.explain(3000, {1: 40, 2: 20, 3: 99}, posed, False),
+    ]
+    assert len(set(words)) == 5 and "30 features" in words[0] and "2 photographs" in words[4] and "at most 40" in words[4]
 
 
 def test_the_worker_ends_when_its_parent_ends(tmp_path):

@@ -23,7 +23,7 @@ def test_a_log_file_gets_plain_lines():
         "1,234 anchors on a lattice of 0.02",
         "10/200",
         "l1 0.0500",
-        "PSNR 21.50",
+        "training PSNR 21.50",
         "anchors 1,300",
         "active 61 %",
         "it/s",
