@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from statistics import fmean, median_high
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, few
 from scene_experts.core.io import read_json
 from scene_experts.core.types import Camera
 from scene_experts.evaluate.experts import measure_scene_shares
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from scene_experts.render import Rasterizer
     from scene_experts.scene import Scene
 
+FAILED = 6.0  # dB below the median of the views: such a view fails
 PROTOCOL = {  # what must agree before scores may be compared: key in results.json, name, option that sets it
     "capture": ("capture", "--data"),
     "resolution": ("resolution", "--resolution"),
@@ -124,6 +126,30 @@ def describe_run(about: About, step: int, rasterize: Rasterizer, perceptual: Per
         "lpips_weights": perceptual.sources,
         "versions": {"training": about.versions, "evaluation": run_folder.versions()},
     }
+
+
+def find_failed(per_view: dict[str, dict[str, Any]]) -> list[str]:
+    """Return the names of the views whose PSNR is more than FAILED below the (upper) median of all, the worst first."""
+    scored = {name: facts["psnr"] for name, facts in per_view.items() if isinstance(facts.get("psnr"), (int, float))}
+    if not scored:
+        return []
+    least = median_high(scored.values()) - FAILED
+    return sorted((name for name, psnr in scored.items() if psnr < least), key=lambda name: scored[name])
+
+
+def describe_failed(per_view: dict[str, dict[str, Any]]) -> str:
+    """Return a sentence about the views that fail, or "" if there are none."""
+    failed = find_failed(per_view)
+    if not failed:
+        return ""
+    scored = {name: facts["psnr"] for name, facts in per_view.items() if "psnr" in facts}
+    kept = [psnr for name, psnr in scored.items() if name not in failed]
+    named = few([f"{name} ({scored[name]:.1f} dB)" for name in failed])
+    verb = "fails" if len(failed) == 1 else "fail"
+    return (
+        f"{len(failed)} of {len(scored)} views {verb}: {named}; the others have {fmean(kept):.1f} dB on average. Look at their pictures: "
+        "a failing view often has a wrong pose, is blurred, has other light, or shows what no training photograph shows"
+    )
 
 
 def load_results(run: Path, views: str = "test") -> dict[str, Any]:

@@ -17,7 +17,8 @@ from rich.console import Console
 from rich.text import Text
 
 from scene_experts.core.errors import InputError
-from scene_experts.evaluate.results import check_protocol, find_outdated, load_results
+from scene_experts.core.io import read_json
+from scene_experts.evaluate.results import check_protocol, describe_failed, find_outdated, load_results
 
 Format = Literal["table", "markdown", "csv"]
 
@@ -84,7 +85,10 @@ def make_table(names: Sequence[str], results: Sequence[dict[str, Any]], columns:
             winner = max(texts, key=lambda i: columns[j].best * (values[i][j] or 0.0))
             best |= {(i, place + 1) for i, text in texts.items() if text == texts[winner]}
     rows = tuple((name, *(columns[j].text(row[j]) for j in used)) for name, row in zip(names, values))
-    titles = tuple(columns[j].title if columns[j].path != ("anchors",) else _name_scene_rows(results) for j in used)
+    names_of = {("anchors",): _name_scene_rows(results)}
+    if results and all(result.get("views") == "train" for result in results):
+        names_of[("psnr",)] = "training PSNR"
+    titles = tuple(names_of.get(columns[j].path, columns[j].title) for j in used)
     return ResultTable(("run", *titles), rows, frozenset(best), _explain_absent(names, results))
 
 
@@ -204,6 +208,9 @@ def print_results(results: dict[str, Any], console: Console, run: Path) -> None:
     console.print(to_rich(made, console.width), crop=False)
     for note in made.notes:
         say(note)
+    path = run / f"per_view{suffix}.json"
+    if failed := describe_failed(read_json(path, "scores by view")) if path.is_file() else "":
+        say(f"warning: {failed}")
     for attribute, shares in results["experts"].items():
         named, values = ("share", shares["share"]) if shares["share"] else ("mean gate", shares["mean_gate"])
         say(f"experts, {attribute}: {named} {' '.join(f'{v:.0%}' for v in values)}, gate entropy {shares['entropy']:.2f}")

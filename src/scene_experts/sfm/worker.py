@@ -100,7 +100,7 @@ def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
         if tried[mapper] >= ENOUGH * total:
             break
         if mapper != ask["mapper"] and len(tried) == 1:
-            report(step="next mapper", mapper=mapper, posed=tried[mapper], total=total)
+            report(step="next mapper", mapper=mapper, posed=tried[mapper], photographs=total)
     if not found:
         return {"registered": []}
     mapper, best = max(found, key=lambda one: (one[1].num_reg_images(), one[1].num_points3D()))

@@ -6,7 +6,15 @@ import pytest
 
 from scene_experts.core.errors import InputError
 from scene_experts.evaluate.metrics import Perceptual
-from scene_experts.evaluate.results import check_protocol, describe_scores, describe_size, find_difference, find_outdated
+from scene_experts.evaluate.results import (
+    check_protocol,
+    describe_failed,
+    describe_scores,
+    describe_size,
+    find_difference,
+    find_failed,
+    find_outdated,
+)
 from support.messages import naming
 from support.scenes import start_scene
 
@@ -44,3 +52,13 @@ def test_the_first_difference_in_the_protocol_is_named():
     assert find_difference(["a", "b"], [one, two]) == ("the same split, found mod8 in a and mod4 in b", "--split")
     with pytest.raises(InputError, match=naming("--split", "--mixed")):
         check_protocol(["a", "b"], [one, two])
+
+
+def test_views_that_fail_are_named():
+    scores = {"a": 20.0, "b": 8.0, "c": 21.0, "d": 19.0}
+    views = {name: {"file": f"{name}.png", "psnr": psnr} for name, psnr in scores.items()}
+    assert find_failed(views) == ["b"] and find_failed({"a": {"file": "a.png"}}) == []
+    text = describe_failed(views)
+    assert "1 of 4" in text and "b (8.0 dB)" in text and "20.0 dB" in text
+    assert describe_failed({name: views[name] for name in "acd"}) == ""
+    assert find_failed({name: views[name] for name in "ab"}) == ["b"]  # also of two views

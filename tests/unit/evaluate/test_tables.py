@@ -184,3 +184,8 @@ def test_rows_are_called_anchors_or_gaussians() -> None:
     anchors, explicit = results("moe-gs", 27.0), results("3dgs", 26.0, activation_ratio=None)
     assert "anchors" in tables.make_table(["a"], [anchors]).titles and "Gaussians" in tables.make_table(["b"], [explicit]).titles
     assert "anchors or Gaussians" in tables.make_table(["a", "b"], [anchors, explicit]).titles
+
+
+def test_scores_of_training_views_are_named_as_such() -> None:
+    assert tables.make_table(["a"], [results("moe-gs", 30.0, views="train")]).titles[1] == "training PSNR"
+    assert tables.make_table(["a"], [results("moe-gs", 30.0)]).titles[1] == "PSNR"
