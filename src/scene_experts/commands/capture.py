@@ -71,7 +71,7 @@ def summarise(note: dict[str, Any]) -> list[str]:
     tried = note.get("mappers", {})
     if len(tried) > 1:
         posed = " and ".join(f"{count} from the {name} mapper" for name, count in tried.items())
-        lines.append(f"both mappers ran because the first gave too few poses: {posed}; the result is the {note['mapper']} mapper's")
+        lines.append(f"poses: {posed}; the result of the {note['mapper']} mapper is kept")
     if without:
         lines.append(f"photographs without a pose: {few(without, 8)}")
     reasons: dict[str, list[str]] = {}

@@ -33,6 +33,7 @@ class ResultColumn:
     factor: float = 1.0
     best: int = 0  # 1: larger is better; -1: smaller is better; 0: neither
     counted: bool = False  # 0 means unknown, e.g. for a file of another program
+    about: str = ""  # what it is, in a sentence for people who do not know it
 
     def value(self, results: dict[str, Any]) -> float | None:
         """Return the value in `results`, or None if it is absent."""
@@ -47,21 +48,30 @@ class ResultColumn:
 
 
 COLUMNS = (
-    ResultColumn("PSNR", ("psnr",), 2, best=1),
-    ResultColumn("SSIM", ("ssim",), 3, best=1),
-    ResultColumn("LPIPS", ("lpips",), 3, best=-1),
-    ResultColumn("LPIPS (3DGS)", ("lpips_3dgs",), 3, best=-1),
-    ResultColumn("LPIPS (Alex)", ("lpips_alex",), 3, best=-1),
-    ResultColumn("MB", ("size", "MB"), 1, best=-1),
-    ResultColumn("anchors", ("anchors",)),
-    ResultColumn("active %", ("activation_ratio",), 1, 100.0),
-    ResultColumn("sharpness", ("sharpness", "ratio"), 2),
-    ResultColumn("FPS", ("fps", "fps"), 1, best=1),
-    ResultColumn("iterations", ("step",), counted=True),
-    ResultColumn("of schedule", ("iterations",), counted=True),  # length of the schedule; fewer iterations mean an interrupted training
-    ResultColumn("train s", ("train_seconds",), counted=True),
-    ResultColumn("CPU s", ("cpu_seconds",), counted=True),
-)
+    ResultColumn(
+        "PSNR", ("psnr",), 2, best=1,
+        about="likeness of pixels in decibels. Higher is better: 20 is rough, 25 good, over 30 hard to tell apart.",
+    ),
+    ResultColumn("SSIM", ("ssim",), 3, best=1, about="likeness of local structure, at most 1. Higher is better."),
+    ResultColumn(
+        "LPIPS", ("lpips",), 3, best=-1,
+        about="difference as a network (VGG) perceives it; 0 is equal. Lower is better. It punishes blur more than PSNR does.",
+    ),
+    ResultColumn("LPIPS (3DGS)", ("lpips_3dgs",), 3, best=-1, about="LPIPS as the code of 3DGS computes it, for comparison with papers."),
+    ResultColumn("LPIPS (Alex)", ("lpips_alex",), 3, best=-1, about="LPIPS with another network (AlexNet)."),
+    ResultColumn("MB", ("size", "MB"), 1, best=-1, about="size of the scene with its networks, in millions of bytes."),
+    ResultColumn("anchors", ("anchors",), about="elements that the scene stores. A network turns each anchor into several Gaussians."),
+    ResultColumn("active %", ("activation_ratio",), 1, 100.0, about="share of the decoded Gaussians whose opacity is positive."),
+    ResultColumn("sharpness", ("sharpness", "ratio"), 2, about="fine detail of the renders relative to the photographs; 1 is as sharp."),
+    ResultColumn("FPS", ("fps", "fps"), 1, best=1, about="pictures drawn per second on the machine that scored the run."),
+    ResultColumn("iterations", ("step",), counted=True, about="training steps until the scored checkpoint."),
+    ResultColumn(
+        "of schedule", ("iterations",), counted=True,  # fewer iterations mean an interrupted training
+        about="training steps that were planned.",
+    ),
+    ResultColumn("train s", ("train_seconds",), counted=True, about="wall time of the training in seconds."),
+    ResultColumn("CPU s", ("cpu_seconds",), counted=True, about="processor time of the training in seconds, over all threads."),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -85,11 +95,19 @@ def make_table(names: Sequence[str], results: Sequence[dict[str, Any]], columns:
             winner = max(texts, key=lambda i: columns[j].best * (values[i][j] or 0.0))
             best |= {(i, place + 1) for i, text in texts.items() if text == texts[winner]}
     rows = tuple((name, *(columns[j].text(row[j]) for j in used)) for name, row in zip(names, values))
-    names_of = {("anchors",): _name_scene_rows(results)}
+    names_of: dict[tuple[str, ...], str] = {("anchors",): _name_scene_rows(results)}
     if results and all(result.get("views") == "train" for result in results):
         names_of[("psnr",)] = "training PSNR"
     titles = tuple(names_of.get(columns[j].path, columns[j].title) for j in used)
     return ResultTable(("run", *titles), rows, frozenset(best), _explain_absent(names, results))
+
+
+def explain(titles: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the titles that have an explanation, each with it."""
+    known = {column.title: column.about for column in COLUMNS}
+    known |= {"Gaussians": "elements that the scene stores and draws.", "training PSNR": "PSNR of photographs that were trained on."}
+    known["anchors or Gaussians"] = known["anchors"]
+    return [(title, known[title]) for title in titles if known.get(title)]
 
 
 def _name_scene_rows(results: Sequence[dict[str, Any]]) -> str:

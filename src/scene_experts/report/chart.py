@@ -65,9 +65,17 @@ def bars(title: str, shares: Sequence[float]) -> str:
     """Draw one bar, divided into shares that sum to 1, each with its percentage."""
     cells = []
     for i, share in enumerate(shares):
-        style = f"width:{100 * share:.2f}%;background:{COLOURS[i % len(COLOURS)]}"
+        colour = COLOURS[i % len(COLOURS)]
+        style = f"width:{100 * share:.2f}%;background:{colour};color:{text_on(colour)}"
         cells.append(f'<span style="{style}" title="expert {i + 1}: {share:.1%}">{share:.0%}</span>')
     return f'<div class="bar"><b>{escape(title)}</b><div>{"".join(cells)}</div></div>'
+
+
+def text_on(colour: str) -> str:
+    """Return the colour of text on a background "#rrggbb": black or white, whichever has more contrast (WCAG 2)."""
+    parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    r, g, b = (p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts)
+    return "#000" if 0.2126 * r + 0.7152 * g + 0.0722 * b > 0.179 else "#fff"
 
 
 def thin_out(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

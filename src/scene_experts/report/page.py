@@ -2,49 +2,38 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import Any
 
-from PIL import Image
-
 from scene_experts.core.errors import InputError
-from scene_experts.core.io import read_json, write_bytes
+from scene_experts.core.io import write_bytes
 from scene_experts.core.plain import to_json
 from scene_experts.core.reading.budget import RUN
-from scene_experts.core.reading.plain import read_json_lines
 from scene_experts.core.reading.source import guarding, inside
-from scene_experts.evaluate.pictures import read_picture
-from scene_experts.evaluate.results import find_difference, find_outdated, load_results
-from scene_experts.evaluate.tables import ResultTable, distinguish_runs, make_table
+from scene_experts.evaluate.results import describe_failed, find_difference, find_failed, find_outdated
+from scene_experts.evaluate.tables import ResultTable, explain, make_table
 from scene_experts.report import chart
 from scene_experts.report.chart import Line
-from scene_experts.training import run_folder
-from scene_experts.training.config import RunConfig
+from scene_experts.report.source import Source, group_by_capture, read_run, tell_apart
+from scene_experts.report.views import encode_picture, show_captures
 
 NAME = "report.html"
-MOST_VIEWS = 8  # of a capture; pictures are most of a page's bytes
-LONGEST, LONGEST_STRIP = 960, 1600  # px; larger pictures and strips are scaled down
-QUALITY = 88  # of the JPEGs
-
-
-@dataclass(frozen=True)
-class Source:
-    """What the page shows of one run. `metrics`: lines of metrics.jsonl; `per_view`: scores by the name of a view."""
-
-    name: str
-    path: Path
-    config: RunConfig
-    results: dict[str, Any]
-    per_view: dict[str, dict[str, Any]]
-    metrics: list[dict[str, Any]]
+LONGEST_STRIP = 1600  # px; larger strips are scaled down
+MOST_TURNED = 3  # runs in a table whose rows are the scores
+LOSSES = {
+    "l1": "l1: mean absolute difference of pixels",
+    "dssim": "dssim: 1 - SSIM",
+    "volume": "volume: size of the Gaussians, kept small",
+    "opacity": "opacity: opacities, kept near 0 or 1",
+    "load": "load: unequal use of the experts",
+}
+"""What the terms of the loss are, for the page."""
 
 
 def write(runs: Sequence[Path], out: Path | None = None) -> Path:
@@ -64,30 +53,6 @@ def write(runs: Sequence[Path], out: Path | None = None) -> Path:
     return path
 
 
-def read_run(run: Path) -> Source:
-    """Read a run folder. Raises InputError if it is not evaluated or its scores by view are invalid."""
-    config, results = run_folder.read_config(run), load_results(run)
-    path = run / "per_view.json"
-    per_view = read_json(path, "scores by view") if path.is_file() else {}
-    if not isinstance(per_view, dict) or not all(isinstance(v, dict) and isinstance(v.get("file"), str) for v in per_view.values()):
-        raise InputError(f"expected scores by view in {path}, found something else; run `scene-experts eval {run}` again")
-    with guarding(path, RUN, "file of scores by view"):
-        for facts in per_view.values():
-            inside(run / "test" / "gt", facts["file"])
-    return Source(config.train.recipe, run, config, results, per_view, read_metrics(run / "metrics.jsonl"))
-
-
-def tell_apart(sources: list[Source]) -> list[Source]:
-    """Give runs of the same recipe different names."""
-    names = distinguish_runs([s.path for s in sources], [s.name for s in sources])
-    return [replace(s, name=name) for s, name in zip(sources, names)]
-
-
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Read the complete lines of a metrics file."""
-    return [line for line in read_json_lines(path) if isinstance(line.get("step"), (int, float))] if path.is_file() else []
-
-
 def build_page(sources: Sequence[Source]) -> str:
     """Return the page as HTML."""
     names, results = [s.name for s in sources], [s.results for s in sources]
@@ -101,10 +66,15 @@ def build_page(sources: Sequence[Source]) -> str:
         f"<h1>{escape(title)}</h1><p class='soft'>{'<br>'.join(map(escape, subtitle))}</p>",
         *(f"<p><b>{escape(line)}.</b></p>" for line in find_outdated(names, [s.path for s in sources], results)),
         f"<p><b>Do not compare these scores:</b> expected {escape(other[0])}.</p>" if other else "",
-        format_table(replace(scores, best=frozenset()) if other else scores),
-        "<h2>Held-out views</h2><p class='soft'>Move the pointer over a picture, or drag the slider.</p>",
+        *(f"<p class='warn'>{escape(line)}.</p>" for line in find_failures(sources)),
+        "<h2>Held-out views</h2>",
+        "<p class='soft'>Photographs that the training did not use, the best view and the worst view first. "
+        "Move the pointer over a picture, or drag the slider.</p>",
         views,
+        "<h2>Scores</h2>",
+        format_table(replace(scores, best=frozenset()) if other else scores),
         "<h2>Training</h2>",
+        explain_curves(sources),
         f"<div class='charts'>{draw_curves(sources)}</div>",
         show_experts(sources),
         "<h2>Scores by view</h2>",
@@ -121,86 +91,48 @@ def describe_scores(r: dict[str, Any]) -> str:
     """Name the scored views, the resolution and the iterations of the training."""
     whole = f" of {r['iterations']:,}" if r.get("step") and (r.get("iterations") or 0) > r["step"] else ""
     steps = f", {r['step']:,}{whole} iterations" if r.get("step") else ""
-    return f"{r.get('view_count')} {r.get('views')} views ({r.get('split')}), {r.get('resolution')}{steps}"
+    views = {"test": "held-out", "train": "training"}.get(str(r.get("views")), r.get("views"))
+    return f"{r.get('view_count')} {views} views ({r.get('split')}), {r.get('resolution')}{steps}"
+
+
+def find_failures(sources: Sequence[Source]) -> list[str]:
+    """Return a sentence for each run about the views that fail."""
+    found = [(s.name, describe_failed(s.per_view)) for s in sources]
+    return [text if len(sources) == 1 else f"{name}: {text}" for name, text in found if text]
 
 
 def format_table(found: ResultTable) -> str:
-    """Return a table as HTML, with its best cells marked and its notes below."""
-    head = "".join(f"<th>{escape(t)}</th>" for t in found.titles)
-    rows = []
-    for i, row in enumerate(found.rows):
-        cells = [f"<td{' class=best' if (i, j) in found.best else ''}>{escape(cell)}</td>" for j, cell in enumerate(row)]
-        rows.append(f"<tr>{''.join(cells)}</tr>")
+    """Return a table as HTML with its best cells marked, its notes below, and what its columns are.
+
+    The scores of a few runs are rows, which fit on a phone, each beside its explanation. Those of many runs are columns.
+    """
     notes = "".join(f"<p class='soft'>{escape(note)}</p>" for note in found.notes)
-    return f"<div class='wide'><table><tr>{head}</tr>{''.join(rows)}</table></div>{notes}"
-
-
-def group_by_capture(sources: Sequence[Source]) -> dict[str, list[Source]]:
-    """Group runs by the name of their capture: only these can have views in common."""
-    groups: dict[str, list[Source]] = {}
-    for s in sources:
-        groups.setdefault(str(s.results.get("capture", "?")), []).append(s)
-    return groups
-
-
-def find_common_views(sources: Sequence[Source]) -> list[str]:
-    """Return the names of the views that every run was scored on."""
-    return [name for name in sources[0].per_view if all(name in s.per_view for s in sources)]
-
-
-def show_captures(groups: dict[str, list[Source]]) -> tuple[str, dict[str, str]]:
-    """Return the held-out views of each capture as HTML, and their pictures as data URLs by key."""
-    pictures: dict[str, str] = {}
-    parts = []
-    for i, (capture, group) in enumerate(groups.items()):
-        views, shown = show_views(group, f"{i}.")
-        pictures |= shown
-        if len(groups) > 1:
-            parts.append(f"<h3>{escape(capture)}</h3>")
-        why = "no pictures in the run folder" if find_common_views(group) else "no view that all of these runs held out"
-        parts.append(f"<div class='views'>{views}</div>" if views else f"<p>{why}</p>")
-    return "\n".join(parts), pictures
-
-
-def show_views(sources: Sequence[Source], prefix: str) -> tuple[str, dict[str, str]]:
-    """Return up to MOST_VIEWS views with their sliders as HTML, and their pictures as data URLs by key. Keys start with `prefix`."""
-    pictures: dict[str, str] = {}
-    blocks = []
-    names = find_common_views(sources)
-    step = max(1, -(-len(names) // MOST_VIEWS))
-    for n, name in enumerate(names[::step]):
-        options = [("photograph", sources[0].path / "test" / "gt" / sources[0].per_view[name]["file"])]
-        options += [(s.name, s.path / "test" / "renders" / s.per_view[name]["file"]) for s in sources]
-        options += [(f"{s.name}, error", s.path / "test" / "errors" / s.per_view[name]["file"]) for s in sources]
-        present = [(label, path) for label, path in options if path.is_file()]
-        if len(present) < 2:
-            continue
-        for i, (_, path) in enumerate(present):
-            pictures[f"{prefix}{n}.{i}"] = encode_picture(path)
-        scores = ", ".join(f"{s.name} {s.per_view[name]['psnr']:.2f} dB" for s in sources if "psnr" in s.per_view[name])
-        pick = [
-            "".join(
-                f"<option value='{prefix}{n}.{i}'{' selected' if i == wanted else ''}>{escape(label)}</option>"
-                for i, (label, _) in enumerate(present)
-            )
-            for wanted in (0, 1)
-        ]
-        blocks.append(
-            f"<div class='view'><div class='pick'><b>{escape(name)}</b><span class='soft'>{escape(scores)}</span>"
-            f"<label>left <select>{pick[0]}</select></label><label>right <select>{pick[1]}</select></label></div>"
-            f"<div class='stage'><img alt='left'><img class='over' alt='right'><span class='edge'></span></div>"
-            f"<input type='range' min='0' max='100' value='50' aria-label='boundary between the two pictures'></div>"
+    terms = dict(explain(found.titles))
+    mark = lambda i, j: " class=best" if (i, j) in found.best else ""  # noqa: E731
+    if len(found.rows) <= MOST_TURNED:
+        head = "".join(f"<th scope=col>{escape(row[0])}</th>" for row in found.rows)
+        rows = "".join(
+            f"<tr><th scope=row>{escape(title)}</th>"
+            + "".join(f"<td{mark(i, j)}>{escape(row[j])}</td>" for i, row in enumerate(found.rows))
+            + f"<td class=about>{escape(terms.get(title, ''))}</td></tr>"
+            for j, title in enumerate(found.titles[1:], 1)
         )
-    return "\n".join(blocks), pictures
+        head = f"<tr><th scope=col>score</th>{head}<th scope=col class=about>what it is</th></tr>"
+        return f"<table class=scores style='--runs:{len(found.rows)}'>{head}{rows}</table>{notes}"
+    head = "".join(f"<th scope=col>{escape(t)}</th>" for t in found.titles)
+    rows = "".join(
+        f"<tr>{''.join(f'<td{mark(i, j)}>{escape(cell)}</td>' for j, cell in enumerate(row))}</tr>" for i, row in enumerate(found.rows)
+    )
+    items = "".join(f"<dt>{escape(title)}</dt><dd>{escape(text)}</dd>" for title, text in terms.items())
+    return f"<div class='wide' tabindex=0><table><tr>{head}</tr>{rows}</table></div>{notes}<dl class=terms>{items}</dl>"
 
 
-def encode_picture(path: Path, longest: int = LONGEST) -> str:
-    """Return a picture as the data URL of a JPEG of at most `longest` px a side. Raises InputError if it is unreadable."""
-    picture = Image.fromarray(read_picture(path))
-    picture.thumbnail((longest, longest), Image.Resampling.LANCZOS)
-    stream = io.BytesIO()
-    picture.save(stream, format="JPEG", quality=QUALITY)
-    return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
+def explain_curves(sources: Sequence[Source]) -> str:
+    """Return what the curves of the training show, as HTML."""
+    terms = sorted({t for s in sources for m in s.metrics for t in m.get("terms", {})})
+    named = "; ".join(LOSSES[term] for term in terms if term in LOSSES)
+    text = "Training PSNR is measured on the photographs that are trained on, so it is higher than that of the held-out views."
+    return f"<p class='soft'>{text}{f' Losses: {escape(named)}.' if named else ''}</p>"
 
 
 def draw_curves(sources: Sequence[Source]) -> str:
@@ -215,7 +147,7 @@ def draw_curves(sources: Sequence[Source]) -> str:
             out.append(Line(s.name, chart.smooth(points) if smooth else points))
         return out
 
-    parts = [chart.lines("PSNR of training views", series("psnr"), "dB")]
+    parts = [chart.lines("training PSNR", series("psnr"), "dB")]
     terms = sorted({t for s in sources for m in s.metrics for t in m.get("terms", {})})
     for term in terms:
         lines = [
@@ -264,7 +196,10 @@ def show_strips(s: Source) -> str:
     present = sorted((a for a, path in found.items() if path.is_file()), key=lambda a: a != "color")
     if not present:
         return ""
-    images = [f"<img class='strip' alt='{escape(a)} experts' src='{encode_picture(found[a], LONGEST_STRIP)}'>" for a in present]
+    images = [
+        f"<div class='wide' tabindex=0><img class='strip' alt='{escape(a)} experts' src='{encode_picture(found[a], LONGEST_STRIP)}'></div>"
+        for a in present
+    ]
     folded = "".join(f"<details><summary>{escape(a)}</summary>{image}</details>" for a, image in zip(present[1:], images[1:]))
     k = s.results["experts"][present[0]].get("k")
     how = f"the anchors routed to each expert, rendered alone; Top-{k} puts every anchor in {k} picture{'' if k == 1 else 's'}"
@@ -277,6 +212,7 @@ def show_strips(s: Source) -> str:
 def format_scores(sources: Sequence[Source]) -> str:
     """Return the table of scores by view as HTML."""
     rows = []
+    failed = {name for s in sources for name in find_failed(s.per_view)}
     for name in sources[0].per_view:
         cells = []
         for s in sources:
@@ -285,9 +221,9 @@ def format_scores(sources: Sequence[Source]) -> str:
                 f"<td>{facts[k]:.{d}f}</td>" if facts.get(k) is not None else "<td>-</td>"
                 for k, d in (("psnr", 2), ("ssim", 3), ("lpips", 3))
             ]
-        rows.append(f"<tr><td>{escape(name)}</td>{''.join(cells)}</tr>")
+        rows.append(f"<tr{' class=fails' if name in failed else ''}><td>{escape(name)}</td>{''.join(cells)}</tr>")
     head = "".join(f"<th>PSNR {escape(s.name)}</th><th>SSIM</th><th>LPIPS</th>" for s in sources)
-    return f"<div class='wide'><table><tr><th>view</th>{head}</tr>{''.join(rows)}</table></div>"
+    return f"<div class='wide' tabindex=0><table><tr><th>view</th>{head}</tr>{''.join(rows)}</table></div>"
 
 
 def show_command(s: Source) -> str:
@@ -295,6 +231,6 @@ def show_command(s: Source) -> str:
     line = s.config.command or "This run was trained by another program."
     config = json.dumps(to_json(s.config), indent=1)
     return (
-        f"<p><b>{escape(s.name)}</b></p><pre>{escape(line)}</pre>"
+        f"<p><b>{escape(s.name)}</b></p><pre tabindex=0>{escape(line)}</pre>"
         f"<details><summary>configuration and versions</summary><pre>{escape(config)}</pre></details>"
     )

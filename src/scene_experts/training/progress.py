@@ -81,7 +81,7 @@ class TrainingProgress:
                 pass
 
     def show_step(self, event: Stepped) -> None:
-        """Show an iteration: running means of the losses and of the PSNR of training views, the number of rows, speed and remaining time."""
+        """Show an iteration: running means of losses and training PSNR, the number of rows, speed and remaining time."""
         for name, value in event.terms.items():
             self.loss[name] = SMOOTHING * self.loss.get(name, value) + (1 - SMOOTHING) * value
         self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr

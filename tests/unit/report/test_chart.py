@@ -19,6 +19,7 @@ from scene_experts.report.chart import (
     lines,
     log_ticks,
     smooth,
+    text_on,
     thin_out,
     ticks,
 )
@@ -75,3 +76,7 @@ def test_bars_are_as_wide_as_the_shares():
 def test_no_label_is_cut_at_the_edge(last):
     drawn = re.findall(r'<text x="([\d.]+)" y="\d+" text-anchor="middle">([^<]+)</text>', lines("a", [Line("a", [(0, 1.0), (last, 2.0)])]))
     assert len(drawn) > 2 and all(float(x) + 3.6 * len(text) <= WIDTH for x, text in drawn)  # 11 px letters are at most 7 px wide
+
+
+def test_text_has_contrast_on_every_colour():
+    assert text_on("#0072b2") == "#fff" and text_on("#e69f00") == "#000"

@@ -118,3 +118,16 @@ def test_an_imported_run_claims_no_training(tmp_path):
     write_json(folder / "results.json", {**results, "step": 0, "iterations": 0, "train_seconds": 0.0})
     text = write([folder]).read_text()
     assert "0 iterations" not in text and "train s" not in text and "steps" not in text
+
+
+def test_scores_are_explained_and_views_that_fail_are_named(tmp_path):
+    folder = make_run(tmp_path)
+    text = write([folder]).read_text()
+    assert "what it is" in text and "likeness of pixels" in text and "class='warn'" not in text
+    per_view = json.loads((folder / "per_view.json").read_text())
+    name = list(per_view)[1]
+    write_json(folder / "per_view.json", {**per_view, name: {**per_view[name], "psnr": 8.0}})
+    text = write([folder]).read_text()
+    assert "class='warn'" in text and f"{name} (8.0 dB)" in text and "<tr class=fails>" in text
+    many = write([make_run(tmp_path / str(i)) for i in range(4)], tmp_path / "many.html").read_text()
+    assert "<dl class=terms>" in many and "<main>" in many
