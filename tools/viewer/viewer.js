@@ -7,6 +7,7 @@ import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 
 const FLIP = [1, -1, -1];
 const settings = JSON.parse(document.getElementById("settings").textContent);
+const WIDTH = 0.62; // share of a photograph that a narrow screen shows at least
 const QUIET = 400; // milliseconds of drawing after the last news
 const UNIT = 10 / settings.distance; // the renderer sorts anew when the camera moves by 0.001: scenes are drawn in lengths that suit it
 const note = document.getElementById("note");
@@ -23,7 +24,10 @@ const rotationMatrix = (r) => new Matrix4().set(
 class Page {
   constructor() {
     this.renderer = new WebGLRenderer({ antialias: false, powerPreference: "high-performance" });
-    document.body.prepend(this.renderer.domElement);
+    const canvas = this.renderer.domElement;
+    canvas.setAttribute("role", "img");
+    canvas.setAttribute("aria-label", `the scene, ${settings.count.toLocaleString("en")} Gaussians`);
+    document.querySelector("main").prepend(canvas);
     this.scene = new Scene();
     this.scene.background = new Color().setRGB(...settings.background, SRGBColorSpace);
     this.camera = new PerspectiveCamera(settings.fov, 1, settings.near * UNIT, settings.far * UNIT);
@@ -34,11 +38,13 @@ class Page {
       preBlurAmount: settings.antialias ? 0 : 0.3, blurAmount: settings.antialias ? 0.3 : 0, onDirty: () => this.wake(),
     });
     this.scene.add(this.spark);
+    this.places = settings.poses.map((pose) => new Vector3(...pose.position.map((v, i) => v * FLIP[i] * UNIT)));
     this.keys = new Set();
     this.news = this.last = performance.now();
     this.held = true; // an exact pose, until somebody takes the camera
     this.frames = 0;
     this.listen();
+    this.fov = settings.fov;
     this.resize();
     this.setPose(settings.pose);
     this.readHash();
@@ -57,7 +63,11 @@ class Page {
     addEventListener("keydown", (event) => this.press(event));
     addEventListener("keyup", (event) => this.keys.delete(event.code));
     addEventListener("blur", () => this.keys.clear());
-    const buttons = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: () => this.whole() };
+    const buttons = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: () => this.whole(),
+      ask: () => this.help(), close: () => this.help() };
+    this.near = document.getElementById("near"); // whether the camera stays where photographs were taken
+    this.near.addEventListener("change", () => { this.held = false; this.wake(); });
+    if (!settings.reach) this.near.parentElement.hidden = !(this.near.checked = false);
     for (const [name, act] of Object.entries(buttons)) document.getElementById(name).addEventListener("click", act);
     if (settings.poses.length < 2) document.getElementById("previous").hidden = document.getElementById("next").hidden = true;
   }
@@ -65,7 +75,7 @@ class Page {
   press(event) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const act = { KeyR: () => this.home(), KeyF: () => this.whole(), BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
-      KeyL: () => this.writeHash() }[event.code];
+      KeyL: () => this.writeHash(), KeyH: () => this.help(), Escape: () => this.help(false) }[event.code];
     if (act) act();
     else if (/^(Key[WASDQE]|Arrow)/.test(event.code)) this.keys.add(event.code);
     this.wake();
@@ -79,24 +89,57 @@ class Page {
     this.setPose(settings.poses[this.index]);
   }
 
+  // Shows or hides the help; without an argument, the other one of the two.
+  help(open) {
+    const panel = document.getElementById("help");
+    panel.hidden = !(open ?? panel.hidden);
+    document.getElementById("ask").setAttribute("aria-expanded", String(!panel.hidden));
+  }
+
+  // Moves a camera that left the photographs to the nearest point within reach of one. A target that moved with it moves back too.
+  stay(target) {
+    if (!this.near.checked) return;
+    const place = this.camera.position, reach = settings.reach * UNIT;
+    let nearest = null, least = Infinity;
+    for (const pose of this.places) {
+      const distance = pose.distanceTo(place);
+      if (distance < least) [nearest, least] = [pose, distance];
+    }
+    if (least <= reach) return;
+    const back = nearest.clone().sub(place).multiplyScalar(1 - reach / least);
+    place.add(back);
+    if (target.distanceTo(this.controls.target) > 1e-6 * UNIT) this.controls.target.add(back);
+    this.camera.lookAt(this.controls.target);
+  }
+
   whole() { document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.(); }
 
   // A pose of the capture: {position, rotation, fov}; fov is the vertical field of view in degrees and may be left out.
   setPose(pose) {
     this.camera.position.set(...pose.position.map((v, i) => v * FLIP[i] * UNIT));
     this.camera.quaternion.setFromRotationMatrix(rotationMatrix(pose.rotation));
-    this.camera.fov = pose.fov ?? settings.fov;
-    this.camera.updateProjectionMatrix();
+    this.fov = pose.fov ?? settings.fov;
+    this.aspect = pose.aspect ?? this.aspect ?? settings.pose.aspect;
+    this.fit();
     const ahead = new Vector3(0, 0, -1).applyQuaternion(this.camera.quaternion);
     this.controls.target.copy(this.camera.position).addScaledVector(ahead, settings.distance * UNIT);
     this.held = true;
     this.wake();
   }
 
+  // Widens the field of view on a narrow screen (a phone), so that it shows at least WIDTH of the photograph's width.
+  fit() {
+    this.camera.aspect = innerWidth / innerHeight;
+    const wider = this.aspect ? Math.max(1, (WIDTH * this.aspect) / this.camera.aspect) : 1;
+    this.camera.fov = (360 / Math.PI) * Math.atan(wider * Math.tan((this.fov * Math.PI) / 360));
+    this.camera.updateProjectionMatrix();
+    this.wake();
+  }
+
   pose() {
     const e = new Matrix4().makeRotationFromQuaternion(this.camera.quaternion).elements;
     const rotation = [0, 1, 2].map((i) => [0, 1, 2].map((j) => e[4 * j + i] * FLIP[i] * FLIP[j]));
-    return { position: this.camera.position.toArray().map((v, i) => (v * FLIP[i]) / UNIT), rotation, fov: this.camera.fov };
+    return { position: this.camera.position.toArray().map((v, i) => (v * FLIP[i]) / UNIT), rotation, fov: this.fov };
   }
 
   readHash() {
@@ -118,9 +161,7 @@ class Page {
   resize() {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.renderer.setSize(innerWidth, innerHeight);
-    this.camera.aspect = innerWidth / innerHeight;
-    this.camera.updateProjectionMatrix();
-    this.wake();
+    this.fit();
   }
 
   fly(seconds) {
@@ -146,10 +187,11 @@ class Page {
   frame() {
     const now = performance.now();
     const seconds = (now - this.last) / 1000;
+    const target = this.controls.target.clone();
     const flying = this.fly(Math.min(seconds, 0.1));
     this.controls.dampingFactor = 1 - Math.exp(-8 * seconds); // by time, so that slow machines come to rest as soon
     this.last = now;
-    if (!this.held) this.controls.update();
+    if (!this.held) { this.controls.update(); this.stay(target); }
     this.renderer.render(this.scene, this.camera);
     this.frames += 1;
     this.running = flying || now - this.news < QUIET || this.spark.sorting || this.spark.sortDirty;

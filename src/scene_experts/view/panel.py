@@ -23,6 +23,17 @@ MOST_FRUSTA = 300
 MOST_POINTS = 200_000
 STATUS_INTERVAL = 0.5  # seconds between updates of the status line
 CURVE_INTERVAL = 1.0  # seconds between updates of the curves
+HELP = """**Mouse**: drag to turn, right drag to move, wheel to go nearer.
+
+**Keys**: W A S D move, Q and E go down and up, arrows turn.
+
+**Show** chooses colours, depth, opacity or experts. **Views** goes to a photograph's place; its slider *photograph* draws the
+photograph over the scene. *cameras* shows all places; click one to go there. **Crop** hides what is outside a box.
+**Camera path** records places and saves them for `scene-experts render --path FILE`."""
+EXPERTS = (
+    "{} expert networks share the {}: a router chooses which of them decode each one. "
+    "Switch experts off to see what each draws; *Show: experts* colours the scene by expert."
+)
 
 
 class Panel:
@@ -59,6 +70,7 @@ class Panel:
     attribute: Any
     wipe: Any
     chosen: Any
+    near: Any
     crop: Any
 
     def __init__(
@@ -75,6 +87,8 @@ class Panel:
         self.status_time, self.curve_time, self.charts, self.pause = 0.0, 0.0, [], None
         self.jobs: dict[str, Callable[[], None]] = {}
         self.status = server.gui.add_markdown("")
+        with server.gui.add_folder("Help", expand_by_default=False):
+            server.gui.add_markdown(HELP)
         scene, step = current()
         self.traits = scene.traits
         with server.gui.add_folder("Show"):
@@ -114,6 +128,7 @@ class Panel:
             attributes = tuple(scene.routing(step, 1))
         gui, numbers = self.server.gui, range(1, self.traits.experts + 1)
         with gui.add_folder("Experts"):
+            gui.add_markdown(EXPERTS.format(self.traits.experts, self.traits.rows))
             self.attribute = self.redraw_on_change(gui.add_dropdown("of", options=attributes, initial_value=attributes[-1]))
             self.switches = [self.redraw_on_change(gui.add_checkbox(f"expert {number}", initial_value=True)) for number in numbers]
             alone = gui.add_dropdown("only", options=("all", *map(str, numbers)), initial_value="all")
@@ -133,6 +148,7 @@ class Panel:
             chosen = gui.add_dropdown("view", options=names, initial_value=names[choose_best_view(self.capture)])
             chosen.on_update(lambda _: self.go_to_view(names.index(chosen.value)))
             self.wipe = self.redraw_on_change(gui.add_slider("photograph", min=0.0, max=1.0, step=0.01, initial_value=0.0))
+            self.near = self.redraw_on_change(gui.add_checkbox("stay near the photographs", initial_value=True))
             frusta = gui.add_checkbox("cameras", initial_value=False)
             rows = gui.add_checkbox(self.traits.rows, initial_value=False)
         frusta.on_update(lambda _: self.queue("frusta", lambda: self.show_frusta(frusta.value)))
@@ -181,6 +197,10 @@ class Panel:
     def read_wipe(self) -> float:
         """Return the fraction of the picture that the photograph covers, in [0, 1]."""
         return float(self.wipe.value)
+
+    def stays_near(self) -> bool:
+        """Return whether pictures are drawn only from where photographs were taken."""
+        return bool(self.near.value)
 
     def read_finest(self) -> int | None:
         """Return the finest level to draw, or None for all levels."""

@@ -69,14 +69,14 @@ def analyse_cameras(capture: Capture) -> CameraRig:
 
 
 def choose_best_view(capture: Capture) -> int:
-    """Return the index of the view that shows a capture best at first sight, among the held-out views if there are any.
+    """Return the index of the view that shows a capture best at first sight, among the training views: those are drawn best.
 
     The view is upright (or the one nearest to upright) and not nearer to the centre than half of the training cameras (or the
     farthest). Among those, the view is chosen that looks most level and most directly at the centre.
     """
     rig = analyse_cameras(capture)
     middle = float((rig.positions - rig.centre).norm(dim=1).median())
-    chosen = capture.test or capture.train
+    chosen = capture.train or capture.test
     rotations = torch.stack([capture.views[i].camera.world_to_cam[:3, :3].double().T for i in chosen])
     to_centre = rig.centre - torch.stack([capture.views[i].camera.position.double() for i in chosen])
     distance = to_centre.norm(dim=1)

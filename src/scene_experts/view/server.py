@@ -32,6 +32,7 @@ from scene_experts.view.gate import Gate, guarding, is_local
 from scene_experts.view.paint import paint
 from scene_experts.view.panel import Panel
 from scene_experts.view.paths import analyse_cameras, choose_best_view
+from scene_experts.view.region import Region, find_region
 
 log: logging.Logger = logging.getLogger(__name__)
 
@@ -122,6 +123,7 @@ class Viewer:
         rig = analyse_cameras(self.capture)
         self.server.scene.set_up_direction(tuple(rig.up.tolist()))
         self.centre: Tensor = rig.centre
+        self.region: Region = find_region(rig.positions, float((rig.positions - rig.centre).norm(dim=1).median()))
         self.reach: float = float((rig.positions - rig.centre).norm(dim=1).median())
         self.first: int = choose_best_view(self.capture)  # where clients start
         self.panel: Panel = Panel(self.server, self.capture, self.current, self.request_redraw, self.go_to_view, self.paths)
@@ -234,9 +236,21 @@ class Viewer:
             return
         client.handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=75 if moving else 95)
         client.full = not moving
+        if client.full:
+            self.bring_back(client, camera)
         taken = (time.monotonic() - began) / (camera.width * camera.height)
         client.seconds_a_pixel += 0.5 * (taken - client.seconds_a_pixel)
         self.panel.report_picture(time.monotonic() - began, camera)
+
+    def bring_back(self, client: Client, camera: Camera) -> None:
+        """Move a resting client to where its picture was drawn, if it left the region of the photographs."""
+        place, seen = camera.position.double(), client.handle.camera
+        moved = place - torch.tensor(np.asarray(seen.position), dtype=torch.float64)
+        if float(moved.norm()) > 1e-4 * self.region.radius:
+            client.arriving = time.monotonic() + 1.0
+            with client.handle.atomic():
+                seen.position = tuple(place.tolist())
+                seen.look_at = tuple((place + self.reach * camera.world_to_cam[2, :3].double()).tolist())
 
     @torch.no_grad()
     def render_picture(self, client: Client, scene: Scene, step: int, camera: Camera) -> torch.Tensor:
@@ -271,6 +285,8 @@ class Viewer:
         fine = quat.shape == (4,) and place.shape == (3,) and bool(quat.isfinite().all()) and bool(place.isfinite().all())
         if not fine or float(quat.norm()) < 1e-6 or not 0.01 < fov < 3.1 or not 0.1 < aspect < 10:
             raise ValueError("invalid camera")
+        if self.panel.stays_near():
+            place = self.region.nearest(place)
         height = max(16, min(self.height, int(getattr(seen, "image_height", 0) or self.height), self.panel.read_height()))
         height = min(height, int((MOST_PIXELS / aspect) ** 0.5))
         width = max(16, round(height * aspect))

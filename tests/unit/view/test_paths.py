@@ -86,22 +86,21 @@ def standing(capture, places, rolls):
         c, s = math.cos(roll), math.sin(roll)
         made[:3] = torch.tensor([[c, s, 0], [-s, c, 0], [0, 0, 1]], dtype=torch.float64) @ made[:3]
         views.append(replace(capture.views[0], name=f"{i}", camera=replace(CAMERA, world_to_cam=made.float(), id=i)))
-    return replace(capture, views=tuple(views), train=tuple(range(3, len(views))), test=(0, 1, 2))
+    return replace(capture, views=tuple(views), train=tuple(range(len(views))), test=())
 
 
 def test_the_best_view_is_upright_not_near_and_level(capture):
-    around = [(4 * math.cos(a), 4 * math.sin(a), 1.0) for a in (0.1, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)]
+    around = [(3 * math.cos(a), 3 * math.sin(a), 3.0) for a in (0.1, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)]  # from above
     rolls = [0.0] * 4 + [math.pi / 2] * 3  # with portraits
     scene = lambda places, turned: standing(capture, [*places, *around], [*turned, *rolls])  # noqa: E731
     far, near, above, level = (5.0, 0, 1.0), (0.0, 1.5, 0.3), (0.5, 0, 6.0), (0, 6.0, 1.0)
     assert choose_best_view(scene((far, near, level), (math.pi / 2, 0.0, 0.0))) == 2  # on its side; a close-up
     assert choose_best_view(scene((above, level, near), (0.0, 0.0, 0.0))) == 1  # from straight above
-    assert choose_best_view(scene((far, near, near), (math.pi / 2, math.pi, 0.1))) == 2  # upright takes precedence over far
-    assert choose_best_view(scene((near, (0, 2.0, 0.3), near), (0.0, 0.0, 0.0))) == 1  # all are near: the farthest
-    none_held_out = replace(scene((far, level, near), (1.0, 0.0, 0.0)), test=(), train=tuple(range(10)))
-    assert choose_best_view(none_held_out) == 1
-    assert choose_best_view(replace(none_held_out, views=none_held_out.views[:1], train=(0,))) == 0
-    assert choose_best_view(capture) in capture.test
+    assert choose_best_view(scene((near, (0, 2.0, 0.3), near), (0.0, 0.0, 0.0))) in (3, 4, 5, 6)  # these are near
+    some = scene((far, level, near), (1.0, 0.0, 0.0))
+    assert choose_best_view(replace(some, test=(1,), train=(0, *range(2, 10)))) in (3, 4, 5, 6)  # training views are drawn best
+    assert choose_best_view(replace(some, views=some.views[:1], train=(), test=(0,))) == 0
+    assert choose_best_view(capture) in capture.train
 
 
 @pytest.mark.skipif(not DEMO.is_dir(), reason="the demo captures are not shipped with the package")
@@ -111,7 +110,7 @@ def test_the_shipped_captures_open_upright_with_the_whole_scene_in_view():
         made = load(DEMO / name)
         found[name] = made.views[choose_best_view(made)].name
         made.images.close()
-    assert found == {"buddha": "017.jpg", "brighton": "DJI_0034.jpg"}
+    assert found == {"buddha": "040.jpg", "brighton": "DJI_0031.jpg"}
 
 
 def test_frames_that_nobody_photographed_are_counted(capture):

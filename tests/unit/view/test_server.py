@@ -15,7 +15,7 @@ from scene_experts.view.server import Client, Viewer
 from support.viewers import DRAW, Handle, joined
 
 
-def test_a_client_starts_at_the_best_held_out_view_and_gets_the_render(viewer, capture):
+def test_a_client_starts_at_the_best_view_and_gets_the_render(viewer, capture):
     handle = joined(viewer)
     viewer.draw()
     (picture, how), camera = handle.pictures[-1], viewer.read_camera(viewer.clients[0])
@@ -39,6 +39,21 @@ def test_a_moving_client_gets_small_pictures_and_a_resting_one_the_full_picture(
     viewer.clients[0].moved = time.monotonic() - 1
     viewer.draw()
     assert handle.pictures[-1][0].shape[0] == 60 and len(handle.pictures) == 3
+
+
+def test_a_client_stays_near_the_photographs_until_it_may_leave(viewer, capture):
+    handle = joined(viewer)
+    viewer.draw()
+    handle.camera.position = np.array([1e3, 0.0, 0.0])
+    inside = viewer.read_camera(viewer.clients[0]).position.double()
+    assert torch.allclose(viewer.region.nearest(inside), inside, rtol=1e-4)
+    handle.move()
+    viewer.clients[0].moved = 0.0
+    viewer.draw()  # it rests: the browser is moved to where the picture was drawn
+    assert np.allclose(handle.camera.position, inside.numpy(), atol=1e-4)
+    viewer.panel.near.value = False
+    handle.camera.position = np.array([1e3, 0.0, 0.0])
+    assert float(viewer.read_camera(viewer.clients[0]).position[0]) == pytest.approx(1e3, rel=1e-4)
 
 
 def test_controls_change_the_picture(viewer):

@@ -3,7 +3,7 @@
 Renderer, scene and start pose are in one file. The renderer is Spark on three.js (MIT), bundled by
 tools/viewer; the scene is an SPZ file in base64. The note may set the start: `camera`, an entry as
 in cameras.json (position, rotation as rows of the 3x3 camera-to-world matrix, and fov in degrees or
-fy and height), `cameras`, a list of such entries to step through, `background` (RGB in [0, 1]),
+fy and height; width is optional), `cameras`, a list of such entries to step through, `background` (RGB in [0, 1]),
 `antialias` and `title`.
 """
 
@@ -35,6 +35,7 @@ from scene_experts.files.formats.spz import decode, spz_bytes
 from scene_experts.files.registry import Format
 from scene_experts.geometry.rotation import estimate_up
 from scene_experts.view.paths import choose_best_view
+from scene_experts.view.region import find_region
 
 ASSETS = files("scene_experts.files.formats") / "assets"
 MARK = b'<meta name="generator" content="scene-experts">'
@@ -88,13 +89,16 @@ def view_note(capture: Capture, world: World) -> dict[str, Any]:
 
 
 def page_settings(splats: Splats, note: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of the page's script: poses, up direction, distances, background."""
+    """The settings of the page's script: poses, up direction, distances, background.
+
+    The camera stays within `reach` of the poses; None does not limit it."""
     means = splats.means.double().numpy()
     poses = [_pose(entry) for entry in note.get("cameras") or []]
     first = _pose(note["camera"]) if note.get("camera") else poses[0] if poses else _from_outside(means)
     poses = poses or [first]
     up = estimate_up(torch.tensor([pose["rotation"] for pose in poses], dtype=torch.float64))
     distance = _distance(means, first)
+    places = torch.tensor([pose["position"] for pose in poses], dtype=torch.float64)
     return {
         "count": len(splats),
         "pose": first,
@@ -103,6 +107,7 @@ def page_settings(splats: Splats, note: Mapping[str, Any]) -> dict[str, Any]:
         "fov": first["fov"],
         "up": up.tolist(),
         "distance": distance,
+        "reach": find_region(places, distance).radius if note.get("cameras") else None,
         "near": distance / 500,
         "far": max(distance * 1000, 4 * _radius(means)),
         "speed": distance / 2,
@@ -122,7 +127,8 @@ def _pose(entry: Mapping[str, Any]) -> Pose:
         raise InputError(
             f"expected cameras with position, rotation and fov (or fy and height) for the page, found one without ({error}); correct it"
         ) from None
-    return {"position": position.tolist(), "rotation": rotation.tolist(), "fov": fov}
+    aspect = {"aspect": entry["width"] / entry["height"]} if entry.get("width") and entry.get("height") else {}
+    return {"position": position.tolist(), "rotation": rotation.tolist(), "fov": fov, **aspect}
 
 
 def _from_outside(means: Floats) -> Pose:

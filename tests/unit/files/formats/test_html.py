@@ -150,11 +150,12 @@ def test_a_capture_s_views_in_the_frame_of_the_file():
     poses = [torch.eye(4), torch.eye(4)]
     poses[1][:3, 3] = torch.tensor([0.0, 0.0, 7.0])  # the camera's centre at z = -7 of the trained world
     views = tuple(View(f"{i}.jpg", Camera(pose, K, 120, 80, id=i), Path("x")) for i, pose in enumerate(poses))
-    capture = SimpleNamespace(views=views, test=(1,), train=(0,), points=None, extent=1.0, background=(1.0, 1.0, 1.0))
+    capture = SimpleNamespace(views=views, test=(0,), train=(1,), points=None, extent=1.0, background=(1.0, 1.0, 1.0))
     note = view_note(capture, world) | {"antialias": True}  # type: ignore[arg-type]
     assert note["camera"] == note["cameras"][1] and len(note["cameras"]) == 2 and note["background"] == [1.0, 1.0, 1.0]
     np.testing.assert_allclose(note["camera"]["position"], [-1.0, 0.0, -3.5 + 3.0], atol=1e-6)
     found = page_settings(blobs(), note)
+    assert found["reach"] > 0 and page_settings(blobs(), {})["reach"] is None
     assert found["antialias"] and found["fov"] == pytest.approx(math.degrees(2 * math.atan(0.4)))
 
 
@@ -181,10 +182,10 @@ def test_what_is_vendored_has_its_licences():
 
 def test_the_hint_is_in_the_words_of_the_pointer():
     text = (html.ASSETS / "page.html").read_text()
-    touch, mouse = (re.search(rf'<span class="{kind}">([^<]+)</span>', text) for kind in ("touch", "mouse"))
+    touch, mouse = (re.search(rf'<dl class="{kind}">(.+?)</dl>', text, re.DOTALL) for kind in ("touch", "mouse"))
     assert touch and mouse and "finger" in touch[1] and "wheel" not in touch[1] and "right drag" in mouse[1]
-    coarse = text.partition("(pointer: coarse)")[2].partition("</style>")[0]
-    assert "#bar .mouse { display: none; }" in coarse and "#bar .touch { display: inline-block; }" in coarse
+    coarse, _, fine = text.partition("(pointer: coarse)")[2].partition("(pointer: fine)")
+    assert ".mouse { display: none" in coarse and ".touch { display: none" in fine.partition("</style>")[0]
 
 
 @pytest.mark.slow
@@ -203,6 +204,8 @@ def test_hints_on_touch_screens_and_none_without_webgl(tmp_path):
             page = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT}, has_touch=touch, is_mobile=touch).new_page()
             page.goto((tmp_path / "a.html").as_uri())
             page.wait_for_function("window.sceneExperts || /WebGL/.test(document.getElementById('note').textContent)", timeout=60_000)
-            assert [kind for kind in (".mouse", ".touch") if page.locator(f"#bar {kind}").is_visible()] == ([shown] if shown else [])
+            if shown:
+                page.click("#ask")
+            assert [kind for kind in (".mouse", ".touch") if page.locator(f"#help {kind}").is_visible()] == ([shown] if shown else [])
             assert page.locator("#home").is_visible() == bool(shown)
             browser.close()
