@@ -1,8 +1,8 @@
 """Makes large honest files, opens them, and prints the time and the memory of each (docs/security.md).
 
-python benchmarks/large_files.py [--share 1.0] [--only ply,compact,capture,hostile]: a PLY file of 10 million Gaussians (2.5 GB; its reader
-takes three times that in memory), a compact file of 2 million anchors and a capture of 5,000 views, or a share of these numbers; and
-hostile files of 12 and 24 MB that would unpack to 1.25 GiB.
+python benchmarks/large_files.py [--share 1.0] [--only ply,compact,capture]: a PLY file of 10 million Gaussians (2.5 GB; its reader
+takes three times that in memory), a compact file of 2 million anchors and a capture of 5,000 views, or a share of these numbers.
+Hostile files are in `bombs.py`.
 """
 
 from __future__ import annotations
@@ -69,64 +69,7 @@ def make_capture(folder: Path, share: float) -> Callable[[], Any]:
     return lambda: capture.load(folder)
 
 
-def make_hostile(folder: Path, share: float) -> Callable[[], Any]:
-    """Files of 12 and 24 MB (more with a share above 1) that unpack to 1.25 GiB or declare as much: SPZ, SOG, compact, networks, glTF."""
-    import gzip
-    import io
-    import json
-    import struct
-    import zipfile
-
-    from scene_experts.core.errors import InputError
-    from scene_experts.files.archive.torch_archive import read_tensors
-    from scene_experts.files.formats import compact, glb, sog, spz
-
-    zeros, most = bytes(64 << 20), 5 << 28
-    packed = gzip.compress(zeros, 6)
-    head = spz.HEADER.pack(spz.MAGIC, 3, most // 64, 3, 12, 0, 0)
-    cases: list[tuple[str, Callable[[Path], Any]]] = []
-
-    def make_zip(path: Path, names: list[str], padding: int) -> None:
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
-            for name in names:
-                with archive.open(name, "w", force_zip64=True) as member:
-                    for _ in range(most // len(zeros)):
-                        member.write(zeros)
-            archive.writestr(zipfile.ZipInfo("padding"), np.random.default_rng(0).bytes(padding))
-
-    for size in (int(12e6 * max(1, share)), int(24e6 * max(1, share))):
-        path = folder / f"{size}.spz"
-        body = gzip.compress(head) + packed * (most // len(zeros))
-        path.write_bytes(body + gzip.compress(np.random.default_rng(0).bytes(max(0, size - len(body))), 0))
-        cases.append((path.name, spz.read))
-        make_zip(folder / f"{size}.sog", ["meta.json"], size)
-        cases.append((f"{size}.sog", sog.read))
-        make_zip(folder / f"{size}.pt", ["x/data.pkl"], size)
-        cases.append((f"{size}.pt", read_tensors))
-        for name, form, read in (("compact", "<Q", compact.read), ("glb", "<III", glb.read)):
-            text = json.dumps({"asset": {"version": "2.0"}, "accessors": [{"count": most, "type": "VEC3", "componentType": 5126}] * 1000})
-            data = struct.pack(form, *((len(text),) if form == "<Q" else (0x46546C67, 2, size))) + text.encode()
-            (folder / f"{size}.{name}").write_bytes(data + bytes(max(0, size - len(data))))
-            cases.append((f"{size}.{name}", read))
-    buffer = io.StringIO()
-
-    def read_all() -> None:
-        for name, read in cases:
-            began = time.process_time()
-            Path("/proc/self/clear_refs").write_text("5")
-            try:
-                read(folder / name)
-                said = "accepted"
-            except InputError:
-                said = "refused"
-            peak = next(int(line.split()[1]) for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
-            print(f"  {name}: {said}, {time.process_time() - began:.2f} s CPU, peak of the process {peak / 2**20:.2f} GiB", file=buffer)
-        print(buffer.getvalue(), end="")
-
-    return read_all
-
-
-MAKE = {"ply": make_ply, "compact": make_compact, "capture": make_capture, "hostile": make_hostile}
+MAKE = {"ply": make_ply, "compact": make_compact, "capture": make_capture}
 
 
 def main() -> None:

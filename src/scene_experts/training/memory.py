@@ -21,7 +21,7 @@ _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # parameters of mallopt in glibc
 _LARGE, _KEPT = 1 << 30, 256 << 20  # bytes
 _TILES = 8  # assumed number of (Gaussian, tile) pairs per Gaussian
 _SEARCHED = 360  # bytes for each Gaussian of the table while densification searches for new rows
-_FILLED = 0.95  # share of the limit that growth may fill
+_FILLED = 0.92  # share of the limit that growth may fill
 
 
 @dataclass
@@ -76,7 +76,7 @@ def anchor_cap(scene: Scene, cap: int, max_memory: float, largest: Largest) -> i
     """Return the current limit on the number of anchors; 0 means no limit.
 
     The memory of the process above `largest.level` is assumed to grow with the number of rows, which is the worst case: some of it does
-    not grow. Each edit may fill half of what is left below 95 % of the limit, because later frames can be larger and because freed memory
+    not grow. Each edit may fill half of what is left below 92 % of the limit, because later frames can be larger and because freed memory
     is not always used again. The next edit measures again.
 
     Args:

@@ -90,8 +90,11 @@ def read(path: Path) -> Splats:
                 return _splats(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3)))
             raise Damaged(f"no primitive with {NAME}")
         coefficients = min(part[4].shape[1] for part in found)
-        means, scales, quats, opacity = (np.concatenate([part[i] for part in found]) for i in range(4))
-        return _splats(means, scales, quats, opacity, np.concatenate([part[4][:, :coefficients] for part in found])).checked(path)
+        join = lambda parts: parts[0] if len(parts) == 1 else np.concatenate(parts)  # noqa: E731
+        means, scales, quats, opacity = (join([part[i] for part in found]) for i in range(4))
+        sh = join([part[4][:, :coefficients] for part in found])
+        found.clear()  # the copies below are as large
+        return _splats(means, scales, quats, opacity, sh).checked(path)
 
 
 def _columns(splats: Splats) -> dict[str, NDArray[Any]]:
@@ -143,18 +146,19 @@ def _parse(source: Source) -> tuple[dict[str, Any], memoryview]:
     return scene, body
 
 
-def _read_primitive(source: Source, scene: dict[str, Any], data: memoryview, attributes: dict[str, int]) -> tuple[Floats, ...]:
+def _read_primitive(source: Source, scene: dict[str, Any], data: memoryview, attributes: dict[str, int]) -> tuple[NDArray[Any], ...]:
     """Means, scales, quaternions (x, y, z, w), opacities and harmonics of one primitive."""
     get = lambda name: _accessor(source, scene, data, attributes[name])  # noqa: E731
     degree = max(int(m[1]) for name in attributes if (m := re.fullmatch(NAME + r":SH_DEGREE_(\d)_COEF_0", name)))
     names = [f"{NAME}:SH_DEGREE_{d}_COEF_{i}" for d in range(min(degree, 3) + 1) for i in range(2 * d + 1)]
-    out = (
-        get("POSITION"),
-        get(f"{NAME}:SCALE"),
-        get(f"{NAME}:ROTATION"),
-        get(f"{NAME}:OPACITY")[:, 0],
-        np.stack([get(n) for n in names], 1),
-    )
+    small = (get("POSITION"), get(f"{NAME}:SCALE"), get(f"{NAME}:ROTATION"), get(f"{NAME}:OPACITY")[:, 0])
+    sh = np.empty((len(small[0]), len(names), 3), np.float32)  # one after the other: most of the memory of a file is here
+    for i, name in enumerate(names):
+        value = get(name)
+        if value.shape != (len(sh), 3):
+            raise Damaged(f"{name} of another length or width")
+        sh[:, i] = value
+    out = (*small, sh)
     shapes = (out[0].shape[1:], out[1].shape[1:], out[2].shape[1:], out[4].shape[2:])
     if len({len(part) for part in out}) != 1 or shapes != ((3,), (3,), (4,), (3,)) or not all(np.isfinite(part).all() for part in out):
         raise Damaged("columns of different lengths or other widths, or values that are not finite")

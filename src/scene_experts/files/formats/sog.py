@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -133,12 +134,14 @@ def _decode(source: Source, archive: Archive) -> Splats:
         raise Damaged("rotations of another kind")
     quats = from_smallest_three(rest[:, 3] - 252, (rest[:, :3] / 255 - 0.5) * np.sqrt(2))
     scales = book("scales")[pixels("scales")[:, :3]]
-    sh = book("sh0")[colors[:, :3]][:, None]
-    if meta.get("shN"):
-        sh = np.concatenate([sh, _read_harmonics(meta["shN"], pixels("shN", 1), archive, book("shN"))], 1)
+    sh = np.empty((n, (bands + 1) ** 2, 3), np.float32)  # in place: most of the memory of a file is here
+    with np.errstate(over="ignore"):  # refused below
+        sh[:, 0] = book("sh0")[colors[:, :3]]
+        if bands:
+            _read_harmonics(meta["shN"], pixels("shN", 1), archive, book("shN").astype(np.float32), sh[:, 1:])
     if not all(np.isfinite(part).all() for part in (means, scales, sh)):
         raise Damaged("values that are not finite")
-    return Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(colors[:, 3])), tensor(sh))
+    return Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(colors[:, 3])), torch.from_numpy(sh))
 
 
 def _harmonics(splats: Splats) -> tuple[dict[str, Any], bytes, NDArray[Any]]:
@@ -160,15 +163,17 @@ def _harmonics(splats: Splats) -> tuple[dict[str, Any], bytes, NDArray[Any]]:
     return meta, _webp(pixels, _COLUMNS * coefficients, lines), np.stack([index & 255, index >> 8, np.zeros_like(index)], 1)
 
 
-def _read_harmonics(meta: dict[str, Any], labels: Bytes, archive: Archive, book: Floats) -> Floats:
-    """Harmonics above the constant, [N, C, 3]."""
+def _read_harmonics(meta: dict[str, Any], labels: Bytes, archive: Archive, book: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+    """Write the harmonics above the constant into `out` [N, C, 3]."""
     coefficients, count = _COEFFICIENTS[meta["bands"]], whole_number(meta["count"], "the rows of the palette", 1, PALETTE)
     picture = _picture(archive.read(meta["files"][0], _FILE_LIMIT), PALETTE * coefficients + 65536)
     rows = picture.shape[0] * _COLUMNS
     index = labels[:, 0].astype(np.int64) + (labels[:, 1].astype(np.int64) << 8)
     if picture.shape[1] != _COLUMNS * coefficients or count > rows or index.max() >= count:
         raise Damaged("a palette of another size")
-    return book[picture.reshape(rows, coefficients, 4)[:, :, :3][index]]
+    levels = picture.reshape(rows, coefficients, 4)
+    for i in range(coefficients):
+        out[:, i] = book[levels[:, i, :3][index]]
 
 
 def _squeeze(x: Floats) -> Floats:

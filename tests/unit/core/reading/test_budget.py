@@ -13,5 +13,5 @@ def test_every_budget_names_its_files_and_allows_honest_ones():
 
 def test_allowances_grow_with_the_file():
     b = budget.Budget("x", 100, floor=10, ratio=3, seconds=1.0)
-    assert b.allowance(1) == 10 and b.allowance(100) == 300
+    assert b.allowance(0) == 10 and b.allowance(100) == 310
     assert b.time_limit(0) == 1.0 < b.time_limit(1 << 30)
