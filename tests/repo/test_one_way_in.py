@@ -25,6 +25,8 @@ ALLOWED = {  # file: why it may open files by itself
     "evaluate/weights.py": "files with a published SHA-256, which is verified first",
     "files/export.py": "the run's own list of cameras, copied",
     "files/formats/html.py": "files of this package",
+    "files/formats/usd.py": "arrays of its own worker",
+    "files/formats/usd_worker.py": "arrays of the process that started it; usd-core reads the file: docs/formats.md",
     "report/page.py": "a file of this package",
     "reproduce/cluster.py": "a run from the user's own Dask scheduler, which sends pickled code itself: docs/scaling.md",
     "reproduce/figures.py": "pictures of the user's own records",

@@ -46,7 +46,7 @@ def differences(found: Splats, wanted: Splats) -> dict[str, Tensor]:
 def quanta(format: str, s: Splats) -> dict[str, Tensor | float]:
     """Return the largest rounding error of the format, for rows in the order of the file. `sh` covers the harmonics in the file."""
     float32 = {"means": 0.0, "log_scales": 2e-5, "opacity": 1e-6, "quats": 1e-6, "sh": 0.0}
-    if format in ("ply", "glb"):
+    if format in ("ply", "glb", "usd"):
         return float32
     return {"splat": _splat, "compressed-ply": _compressed, "spz": _spz, "html": _spz, "sog": _sog}[format](s)
 

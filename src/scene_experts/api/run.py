@@ -244,8 +244,8 @@ class Run:
 
         Args:
             format: "compact" is one small file of this package. "anchors" is the Scaffold-GS folder layout. "ply", "compressed-ply",
-                "splat", "spz", "sog", "glb" and "html" (a page with a viewer) are standard files of Gaussians; scenes of anchors are baked
-                for them, which takes minutes.
+                "splat", "spz", "sog", "glb", "usd" and "html" (a page with a viewer) are standard files of Gaussians; scenes of anchors
+                are baked for them, which takes minutes.
             out: File or folder. Default: inside the run folder.
             sh_degree: Standard files: degree of the spherical harmonics, 0 to 3.
             max_gaussians: Standard files: keep this many Gaussians, those that contribute most; 0 keeps all.
@@ -372,7 +372,7 @@ def import_run(
 
     Args:
         source: Result folder (with point_cloud/iteration_N) of Scaffold-GS, Octree-GS, SAGS or 3DGS, a compact file, or Gaussians as ply,
-            compressed-ply, splat, spz, sog, glb or html.
+            compressed-ply, splat, spz, sog, glb, usd or html.
         capture: The capture that it was trained on, or its folder.
         out: Run folder to write.
         iteration: Which iteration of a result folder. Default: the newest.

@@ -109,6 +109,8 @@ def export(
         work = replace(work, options=replace(options, sh_degree=min(options.sh_degree, work.format.sh_degree)))
     path = file_path(run.path, format, work.format, out)
     check_writable(path)
+    if work.format.needs is not None:
+        work.format.needs()
     with capture_if_there(run, needed=not work.is_direct) as capture:
         return [_export_gaussians(work, file, level, capture) for level, file in _files(run, path, options.levels)]
 

@@ -42,6 +42,7 @@ FORMATS = {
     "spz": "scene_experts.files.formats.spz",
     "sog": "scene_experts.files.formats.sog",
     "glb": "scene_experts.files.formats.glb",
+    "usd": "scene_experts.files.formats.usd",
     "html": "scene_experts.files.formats.html",
 }
 """Name on the command line -> module that states the format as `FORMAT`."""
@@ -91,6 +92,8 @@ class Format:
     """The writer uses the entry `antialias` of the note: whether to draw the Gaussians with antialiasing."""
     is_antialiased: Callable[[Path], bool] | None = None
     """is_antialiased(path): whether a file says that it is drawn with antialiasing. None: files do not say."""
+    needs: Callable[[], None] | None = None
+    """needs(): raises InputError where a library that the writer needs is missing. It is called before a scene is baked."""
     view_note: Callable[[Capture, World], Note] | None = None
     """view_note(capture, world): entries about the capture's cameras that the writer adds to the note."""
 
