@@ -24,6 +24,7 @@ EXTRAS = {
     "viewer": ("viser", "the viewer (view, train --viewer)"),
     "video": ("imageio_ffmpeg", "videos (render --out FILE.mp4, capture VIDEO)"),
     "spz4": ("zstandard", "SPZ files of version 4 (import)"),
+    "usd": ("pxr", "OpenUSD files (export --format usd, import)"),
     "plots": ("matplotlib", "figures (reproduce)"),
     "tensorboard": ("tensorboard", "TensorBoard (train --tensorboard)"),
     "cluster": ("distributed", "runs on several machines (reproduce --cluster)"),
