@@ -239,6 +239,8 @@ class Run:
         prune: float = 0.0,
         refine: int = 1000,
         frame: Literal["capture", "trained"] = "capture",
+        crop: str | None = None,
+        floaters: Literal["keep", "remove"] = "keep",
     ) -> Path:
         """Write the scene to a file that other tools or later runs read.
 
@@ -252,6 +254,9 @@ class Run:
             prune: Standard files: leave out the Gaussians that contribute least, up to this share (0 to 1) of all contributions.
             refine: Standard files: iterations that fit the baked Gaussians to pictures of the run; 0 for none.
             frame: Standard files: the frame of the capture, or the trained world.
+            crop: Standard files: keep what is inside "sphere:RADIUS" (around the point that the cameras look at; "1.2x" counts in their
+                distance from it), "sphere:X,Y,Z,RADIUS" or "box:X0,Y0,Z0,X1,Y1,Z1", in the units of the capture's poses.
+            floaters: Standard files: "remove" leaves out Gaussians that no training photograph supports.
 
         Returns:
             The path of the file or folder.
@@ -263,7 +268,7 @@ class Run:
         folder, opened = self._in_folder("export"), self._opened
         if self._device != "cpu":
             opened = run_folder.open_run(folder, "cpu", self.step)
-        options = Options(False, sh_degree, max_gaussians, prune, refine, frame)
+        options = Options(False, sh_degree, max_gaussians, prune, refine, frame, crop, floaters)
         opened = run_folder.with_capture(opened, self._data)
         return exporting.export(opened, format, None if out is None else Path(out), options)[0].path
 

@@ -26,10 +26,10 @@ class ExportCommand:
 
     run: Annotated[Path, Option(value="RUN")]
     """Run folder."""
-    format: Annotated[str, Option(value="FORMAT")] = "compact"
-    """File format, from the list above."""
+    format: Annotated[tuple[str, ...], Option(value="FORMAT")] = ("compact",)
+    """File formats, from the list above. Several standard files share one bake."""
     out: Path | None = None
-    """File or folder to write; by default in the run folder."""
+    """File or folder to write; by default in the run folder. A folder for several formats."""
     step: int | None = None
     """Iteration of the checkpoint to export; by default the newest."""
     data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
@@ -58,19 +58,19 @@ def export(args: list[str]) -> int:
 
     from rich.console import Console
 
-    from scene_experts.files.export import export as write
+    from scene_experts.files.export import export_several
     from scene_experts.training.memory import reuse_freed
     from scene_experts.training.progress import ProgressBar
     from scene_experts.training.run_folder import open_run, with_capture
 
     run = with_capture(open_run(command.run, "cpu", command.step), command.data)
-    bakes = format_named(command.format).family == GAUSSIANS
+    bakes = any(format_named(name).family == GAUSSIANS for name in command.format)
     if bakes:
         reuse_freed()
     line = shlex.join([PROG, "export", *args])
     with ProgressBar(Console(stderr=True)) if bakes else nullcontext() as bar:
         tell = bar or (lambda *_: None)
-        written = write(run, command.format, command.out, command.options, tell=tell, command=line)
+        written = export_several(run, command.format, command.out, command.options, tell=tell, command=line)
     for file in written:
         print("\n".join(file.lines))
     return 0

@@ -4,6 +4,7 @@ for other tools."""
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -16,7 +17,8 @@ from scene_experts.core.plain import to_json
 from scene_experts.data.settings import Data
 from scene_experts.data.views import Capture, World
 from scene_experts.files.cameras import write_cameras
-from scene_experts.files.measure import Tell, capture_if_there, cost
+from scene_experts.files.formats.splats import Splats
+from scene_experts.files.measure import Painter, Tell, capture_if_there, cost
 from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
 from scene_experts.files.registry import GAUSSIANS, Family, Format, family_named, format_named, format_names, formats_of
 from scene_experts.render import Rasterizer
@@ -101,18 +103,49 @@ def export(
             the capture is missing.
         RunError: The disk is full.
     """
+    return export_several(run, (format,), out, options, rasterize=rasterize, tell=tell, command=command)
+
+
+def export_several(
+    run: OpenRun,
+    formats: Sequence[str],
+    out: Path | None = None,
+    options: Options = DEFAULT,
+    *,
+    rasterize: Rasterizer | None = None,
+    tell: Tell = lambda what, done, total: None,
+    command: str = "",
+) -> list[Written]:
+    """Write a trained scene in several formats. Standard files with harmonics of the same degree share one bake.
+
+    out: with several formats, a folder. The other arguments, the result and the errors are those of `export`.
+    """
     _check(options)
-    work = _Work(run, format, format_named(format), options, rasterize, tell, command)
-    if work.format.family != GAUSSIANS:
-        return [_export_scene(work, out)]
-    if run.scene.traits.sh_degree is None:  # it will be baked
-        work = replace(work, options=replace(options, sh_degree=min(options.sh_degree, work.format.sh_degree)))
-    path = file_path(run.path, format, work.format, out)
-    check_writable(path)
-    if work.format.needs is not None:
-        work.format.needs()
-    with capture_if_there(run, needed=not work.is_direct) as capture:
-        return [_export_gaussians(work, file, level, capture) for level, file in _files(run, path, options.levels)]
+    if len(formats) > 1 and out is not None:
+        if out.is_file() or out.suffix:
+            raise InputError(f"expected a folder as --out for several formats, found {out}; name a folder")
+        out.mkdir(parents=True, exist_ok=True)
+    works = [_Work(run, name, format_named(name), options, rasterize, tell, command) for name in dict.fromkeys(formats)]
+    standard, places = [], []
+    for work in works:
+        if work.format.family == GAUSSIANS:
+            if run.scene.traits.sh_degree is None:  # it will be baked
+                work = replace(work, options=replace(options, sh_degree=min(options.sh_degree, work.format.sh_degree)))
+            standard.append(work)
+            places.append(file_path(run.path, work.name, work.format, out))
+            check_writable(places[-1])
+            if work.format.needs is not None:
+                work.format.needs()
+    own = Options(measure=options.measure) if standard else options  # the other options are those of the standard files then
+    written = [_export_scene(replace(work, options=own), out) for work in works if work.format.family != GAUSSIANS]
+    if standard:
+        made: dict[tuple[int | None, int], _Made] = {}
+        selects = bool(options.crop) or options.floaters == "remove"
+        with capture_if_there(run, needed=selects or not all(work.is_direct for work in standard)) as capture:
+            for work, path in zip(standard, places):
+                for level, file in _files(run, path, options.levels):
+                    written.append(_export_gaussians(work, file, level, capture, made))
+    return written
 
 
 def write_result_folder(run: OpenRun, capture: Capture, out: Path | None = None) -> Path:
@@ -181,6 +214,10 @@ def _check(options: Options) -> None:
             raise InputError(f"expected {_flag(name)} of at least 0, found {getattr(options, name)}; give a larger number")
     if options.sh_degree > MAX_DEGREE:
         raise InputError(f"expected --sh-degree of at most {MAX_DEGREE}, found {options.sh_degree}; give a lower degree")
+    if options.crop:
+        from scene_experts.files.select import parse_crop
+
+        parse_crop(options.crop)
     if not 0 <= options.prune < 1:
         raise InputError(f"expected --prune as a share from 0 to below 1, found {options.prune}; correct it")
 
@@ -291,31 +328,74 @@ def _files(run: OpenRun, path: Path, levels: bool) -> list[tuple[int | None, Pat
     return [(level, path.with_name(f"{stem}_level{level}{dot}{suffixes}")) for level, count in enumerate(held) if count]
 
 
-def _export_gaussians(work: _Work, path: Path, level: int | None, capture: Capture | None) -> Written:
-    """Make, write, read again and measure one file."""
+@dataclass(frozen=True)
+class _Made:
+    """Standard Gaussians of a run, which several formats may share."""
+
+    contents: Splats  # of the file
+    whole: Splats  # before Gaussians were left out
+    about: dict[str, Any]  # how they were baked and selected
+    before: dict[str, tuple[Scene, int]]  # scenes to measure too
+    seconds: float  # of the bake
+    lines: tuple[str, ...]  # what was left out
+
+
+def _make_gaussians(work: _Work, world: World, capture: Capture | None) -> _Made:
+    """Bake the run's scene where that is needed, and leave out what the options say."""
+    options, gaussians = work.options, family_named(GAUSSIANS)
+    assert gaussians is not None
+    began = time.perf_counter()
+    made, about, before = (work.run, {}, {}) if work.is_direct else _bake(work, capture)
+    whole = contents = gaussians.contents(made, world, {})
+    seconds, lines = time.perf_counter() - began, []
+    whole.expect_finite("the scene")
+    if options.floaters == "remove":
+        from scene_experts.files.select import find_floaters
+
+        assert capture is not None
+        painter = Painter.of(*gaussians.scene(work.run, whole, world), work.rasterize, work.run.config.train.antialias)
+        out = find_floaters(whole, painter, [capture.views[i].camera for i in capture.train], work.tell)
+        contents, about = whole.rows(~out), about | {"floaters": int(out.sum())}
+        lines.append(f"removed {int(out.sum()):,} floaters ({float(out.float().mean()):.1%})")
+    if options.crop:
+        from scene_experts.files.select import crop, parse_crop
+
+        assert capture is not None
+        count = len(contents)
+        contents, about = crop(contents, parse_crop(options.crop), capture, world), about | {"crop": options.crop}
+        lines.append(f"cropped to {options.crop}: {len(contents):,} of {count:,} Gaussians; PSNR is not measured without the rest")
+    return _Made(contents, whole, about, before, seconds, tuple(lines))
+
+
+def _export_gaussians(
+    work: _Work, path: Path, level: int | None, capture: Capture | None, made: dict[tuple[int | None, int], _Made]
+) -> Written:
+    """Make, write, read again and measure one file. made: what earlier files made, by level and degree of the harmonics."""
     run, options, format, gaussians = work.run, work.options, work.format, family_named(GAUSSIANS)
     assert gaussians is not None and format.write is not None
     world = World() if options.frame == "trained" else world_of(run) if capture is None else capture.world
-    began = time.perf_counter()
+    key = (level, options.sh_degree)
     with nullcontext() if level is None else run.scene.at_level(level):
-        made, bake, before = (run, {}, {}) if work.is_direct else _bake(work, capture)
-        contents = gaussians.contents(made, world, {})
-        seconds = time.perf_counter() - began
-        contents.expect_finite("the scene")
-        about = _describe(work, contents, level) | bake
+        fresh = key not in made
+        if fresh:
+            made[key] = _make_gaussians(work, world, capture)
+        one = made[key]
+        contents, bake = one.contents, not work.is_direct
+        about = _describe(work, contents, level) | one.about
         note = {name: value for name, value in about.items() if name != "antialias" or format.antialias}
         views = {} if format.view_note is None or capture is None else format.view_note(capture, world)
         format.write(path, contents, note | views)
-        facts: dict[str, Any] = {"file": path.name, "bytes": path.stat().st_size, "seconds": round(seconds, 1), "psnr": {}}
+        facts: dict[str, Any] = {"file": path.name, "bytes": path.stat().st_size, "seconds": round(one.seconds, 1), "psnr": {}}
         frame = "the capture's own frame" if options.frame == "capture" else "the trained world"
         said = f"{len(contents):,} Gaussians, {facts['bytes'] / 1e6:.2f} MB, harmonics of degree {contents.degree}, in {frame}"
-        lines = (f"wrote {path}", said + (f"; baked in {format_duration(seconds)}" if bake else ""))
+        how = f"; baked in {format_duration(one.seconds)}" if fresh else "; of the same bake"
+        lines = (f"wrote {path}", said + (how if bake else ""), *one.lines)
         written = Written(path, facts["bytes"], len(contents), lines)
-        if options.measure and format.read is not None:
+        if options.measure and format.read is not None and not options.crop:
 
             def scenes() -> dict[str, tuple[Scene, int]]:
-                baked = {"bake": gaussians.scene(run, contents, world)} if bake else {}
-                return {**before, **baked, "file": gaussians.scene(run, format.read(path), world)}  # type: ignore[misc]
+                baked = {"bake": gaussians.scene(run, one.whole, world)} if bake else {}
+                return {**one.before, **baked, "file": gaussians.scene(run, format.read(path), world)}  # type: ignore[misc]
 
             found = cost(run, scenes, capture, work.rasterize, work.tell)
             facts["psnr"], written = found.plain, replace(written, lines=(*lines, *found.lines), psnr=found.psnr)

@@ -4,7 +4,9 @@ reads it."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from scene_experts.arguments.option import Option
 
 MAX_DEGREE = 3  # of spherical harmonics in any format
 
@@ -25,9 +27,16 @@ class Options:
     below 1 (0.02 costs little)."""
     refine: int = 1000
     """Standard files: iterations that fit all parameters to the run's pictures; 0 keeps the means
-    over the views."""
+    over the views, which takes seconds."""
     frame: Literal["capture", "trained"] = "capture"
     """Standard files: the capture's own frame, or the frame that the scene was trained in."""
+    crop: Annotated[str | None, Option(value="SHAPE")] = None
+    """Standard files: keep what is inside sphere:RADIUS (around the point that the cameras look at; 1.2x
+    counts in their distance from it), sphere:X,Y,Z,RADIUS or box:X0,Y0,Z0,X1,Y1,Z1, in the units of
+    the capture's poses."""
+    floaters: Literal["keep", "remove"] = "keep"
+    """Standard files: remove Gaussians that no training photograph supports: those that cover less than
+    0.3 pixels of each, and large, faint ones that fewer than 4 show."""
     levels: bool = False
     """Standard files: one file per level of detail, each without the finer levels."""
 

@@ -15,7 +15,7 @@ from scene_experts.data.views import World
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.files import registry
 from scene_experts.files.anchors.read import read_anchors, read_folder
-from scene_experts.files.export import Options, export, file_path, result_warnings, world_of, write_result_folder
+from scene_experts.files.export import Options, export, export_several, file_path, result_warnings, world_of, write_result_folder
 from scene_experts.files.formats import compact
 from scene_experts.files.gaussians.read import DRAWN_AT, scene_of, table_columns
 from scene_experts.files.gaussians.write import splats_of
@@ -269,6 +269,24 @@ def test_what_is_printed_is_what_the_file_gives(short, tmp_path):
     assert about["bytes"] == (tmp_path / "a.ply").stat().st_size and about["frame"] == "capture"
     assert about["sh_degree"] == 1 and about["bake"]["refine"]["iterations"] == 5
     assert {"run", "closed_form", "bake", "file", "views"} == set(about["psnr"]) and "refining" in said
+
+
+@pytest.mark.parametrize("short", ["moe-gs"], indirect=True)
+def test_several_formats_share_one_bake(short, tmp_path):
+    said = []
+    opened, options = run_folder.open_run(short), Options(measure=False, sh_degree=1, refine=0, floaters="remove", crop="sphere:3x")
+    tell = lambda what, done, total: said.append(what) if done == total else None  # noqa: E731
+    written = export_several(opened, ("ply", "spz", "compact"), tmp_path / "all", replace(options, floaters="keep", crop=None), tell=tell)
+    assert len(written) == 3
+    assert said.count("summing contributions") == 1 and "same bake" in " ".join(line for w in written for line in w.lines)
+    (one,) = export(opened, "ply", tmp_path / "one.ply", replace(options, floaters="keep", crop=None))
+    assert one.path.read_bytes() == (tmp_path / "all" / "scene.ply").read_bytes()
+    chosen = export_several(opened, ("ply", "spz"), tmp_path / "some", options, tell=tell)
+    assert said.count("finding floaters") == 1 and "sphere:3x" in " ".join(chosen[1].lines) and chosen[0].rows <= one.rows
+    about = json.loads((tmp_path / "some" / "scene.spz.json").read_text())
+    assert about["crop"] == "sphere:3x" and about["floaters"] >= 0
+    with pytest.raises(InputError, match="--out"):
+        export_several(opened, ("ply", "spz"), tmp_path / "a.ply", options)
 
 
 @pytest.mark.parametrize("short", ["moe-gs", "3dgs"], indirect=True)
