@@ -53,7 +53,7 @@ demo: $(STAMP) lpips
 	$(SE) eval $(DEMO_OUT)/scaffold-gs
 	$(SE) compare $(DEMO_OUT)/scaffold-gs $(DEMO_OUT)/scene-experts
 	$(SE) report $(DEMO_OUT)/scaffold-gs $(DEMO_OUT)/scene-experts --out $(DEMO_OUT)/report.html
-	$(SE) render $(DEMO_OUT)/scene-experts --path orbit --out $(DEMO_OUT)/orbit.mp4
+	$(SE) render $(DEMO_OUT)/scene-experts --out $(DEMO_OUT)/orbit.mp4
 	$(SE) export $(DEMO_OUT)/scene-experts --format html --refine 200 --out $(DEMO_OUT)/scene.html
 	@echo
 	@echo "a flight around the scene      $(DEMO_OUT)/orbit.mp4"

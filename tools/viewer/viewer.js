@@ -2,12 +2,13 @@
 // Poses are those of the capture: position and camera-to-world rotation (rows of 3x3; x right, y down, z forward).
 // The scene is drawn in SPZ's frame (x right, y up, z back), half a turn about x from the capture's.
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
-import { Color, Matrix4, PerspectiveCamera, Scene, SRGBColorSpace, Vector3, WebGLRenderer } from "three";
+import { Color, Matrix4, PerspectiveCamera, Quaternion, Scene, SRGBColorSpace, Vector3, WebGLRenderer } from "three";
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 
 const FLIP = [1, -1, -1];
 const settings = JSON.parse(document.getElementById("settings").textContent);
 const WIDTH = 0.62; // share of a photograph that a narrow screen shows at least
+const FLIGHT = 16; // seconds of a round
 const QUIET = 400; // milliseconds of drawing after the last news
 const UNIT = 10 / settings.distance; // the renderer sorts anew when the camera moves by 0.001: scenes are drawn in lengths that suit it
 const note = document.getElementById("note");
@@ -43,6 +44,7 @@ class Page {
     this.news = this.last = performance.now();
     this.held = true; // an exact pose, until somebody takes the camera
     this.frames = 0;
+    this.flight = null; // place on the flight, or null while nobody flies
     this.listen();
     this.fov = settings.fov;
     this.resize();
@@ -55,7 +57,7 @@ class Page {
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enableDamping = true;
     this.controls.zoomToCursor = true;
-    this.controls.addEventListener("start", () => { this.held = false; this.wake(); });
+    this.controls.addEventListener("start", () => { this.held = false; this.flight = null; this.wake(); });
     this.controls.addEventListener("change", () => this.wake());
     canvas.addEventListener("wheel", () => { this.held = false; this.wake(); }, { passive: true });
     addEventListener("resize", () => this.resize());
@@ -64,20 +66,21 @@ class Page {
     addEventListener("keyup", (event) => this.keys.delete(event.code));
     addEventListener("blur", () => this.keys.clear());
     const buttons = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: () => this.whole(),
-      ask: () => this.help(), close: () => this.help() };
+      ask: () => this.help(), close: () => this.help(), flight: () => this.fly_around() };
     this.near = document.getElementById("near"); // whether the camera stays where photographs were taken
     this.near.addEventListener("change", () => { this.held = false; this.wake(); });
     if (!settings.reach) this.near.parentElement.hidden = !(this.near.checked = false);
     for (const [name, act] of Object.entries(buttons)) document.getElementById(name).addEventListener("click", act);
+    document.getElementById("flight").hidden = settings.flight.length < 2;
     if (settings.poses.length < 2) document.getElementById("previous").hidden = document.getElementById("next").hidden = true;
   }
 
   press(event) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const act = { KeyR: () => this.home(), KeyF: () => this.whole(), BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
-      KeyL: () => this.writeHash(), KeyH: () => this.help(), Escape: () => this.help(false) }[event.code];
+      KeyL: () => this.writeHash(), KeyH: () => this.help(), Escape: () => this.help(false), KeyP: () => this.fly_around() }[event.code];
     if (act) act();
-    else if (/^(Key[WASDQE]|Arrow)/.test(event.code)) this.keys.add(event.code);
+    else if (/^(Key[WASDQE]|Arrow)/.test(event.code)) { this.keys.add(event.code); this.flight = null; }
     this.wake();
   }
 
@@ -87,6 +90,30 @@ class Page {
     const n = settings.poses.length;
     this.index = ((this.index ?? settings.index ?? 0) + by + n) % n;
     this.setPose(settings.poses[this.index]);
+  }
+
+  // Starts or stops the flight: a closed path that fits the capture, FLIGHT seconds a round.
+  fly_around() {
+    this.flight = this.flight === null && settings.flight.length > 1 ? 0 : null;
+    this.wake();
+  }
+
+  // Moves the camera along the flight by some seconds.
+  follow(seconds) {
+    if (this.flight === null) return false;
+    const n = settings.flight.length;
+    this.flight = (this.flight + (seconds * n) / FLIGHT) % n;
+    const i = Math.floor(this.flight), part = this.flight - i;
+    const [one, two] = [settings.flight[i], settings.flight[(i + 1) % n]];
+    const turn = (pose) => new Quaternion().setFromRotationMatrix(rotationMatrix(pose.rotation));
+    const round = this.flight;
+    this.setPose(one);
+    this.flight = round;
+    this.camera.position.lerp(new Vector3(...two.position.map((v, k) => v * FLIP[k] * UNIT)), part);
+    this.camera.quaternion.copy(turn(one).slerp(turn(two), part));
+    const ahead = new Vector3(0, 0, -1).applyQuaternion(this.camera.quaternion);
+    this.controls.target.copy(this.camera.position).addScaledVector(ahead, settings.distance * UNIT);
+    return true;
   }
 
   // Shows or hides the help; without an argument, the other one of the two.
@@ -124,6 +151,7 @@ class Page {
     const ahead = new Vector3(0, 0, -1).applyQuaternion(this.camera.quaternion);
     this.controls.target.copy(this.camera.position).addScaledVector(ahead, settings.distance * UNIT);
     this.held = true;
+    this.flight = null;
     this.wake();
   }
 
@@ -188,7 +216,7 @@ class Page {
     const now = performance.now();
     const seconds = (now - this.last) / 1000;
     const target = this.controls.target.clone();
-    const flying = this.fly(Math.min(seconds, 0.1));
+    const flying = this.follow(Math.min(seconds, 0.1)) || this.fly(Math.min(seconds, 0.1));
     this.controls.dampingFactor = 1 - Math.exp(-8 * seconds); // by time, so that slow machines come to rest as soon
     this.last = now;
     if (!this.held) { this.controls.update(); this.stay(target); }

@@ -15,7 +15,6 @@ from scene_experts.view.film_options import FilmOptions
 
 FIRST = ("--out", "--path", "--seconds", "--size", "--show", "--only", "--beside", "--step", "--data", "--device")
 """The options that people use first, for --help."""
-UNSEEN = 0.1  # a larger share of frames that nobody photographed gets a warning
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ def render(args: list[str]) -> int:
     from scene_experts.training import run_folder
     from scene_experts.training.progress import ProgressBar
     from scene_experts.view.film import check_out, make_film
-    from scene_experts.view.paths import SEEN, count_unseen
+    from scene_experts.view.paths import SEEN, UNSEEN, count_unseen
 
     check_out(command.out)
     device, rasterize = backend(command.device, command.rasterizer, False, False)

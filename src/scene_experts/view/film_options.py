@@ -16,8 +16,8 @@ class FilmOptions:
     """Camera path and picture."""
 
     path: str = "auto"
-    """Camera path: orbit, spiral, views (through the captured poses), test (each held-out view), auto (orbit or spiral, whichever fits the
-    cameras), or a JSON file of this package or of nerfstudio."""
+    """Camera path: orbit, spiral, views (through the captured poses), test (each held-out view), auto (the one of these that fits
+    the cameras), or a JSON file of this package or of nerfstudio."""
     seconds: float = 8.0
     """Duration of orbit, spiral and views."""
     frames: int | None = None

@@ -16,10 +16,11 @@ from scene_experts.data.capture import Capture
 from scene_experts.geometry.poses import interpolate_poses, make_pose, with_fov
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 from scene_experts.view import path_files
-from scene_experts.view.paths import CameraPath
+from scene_experts.view.paths import CameraPath, make_path
 
 SIZE = (1280, 720)  # width and height of the saved path, px
 MOST_KEYS = 200
+AROUND, ROUND = 24, 16.0  # keyframes and seconds of the path around the scene
 
 
 @dataclass
@@ -40,9 +41,11 @@ class Keyframes:
             self.seconds: Any = gui.add_number("seconds between keyframes", initial_value=2.0, min=0.1, max=60.0, step=0.1)
             self.loop: Any = gui.add_checkbox("loop", initial_value=False)
             play, save = gui.add_button("play"), gui.add_button("save")
+            around = gui.add_button("fly around the scene")
         add.on_click(lambda event: self.add(event.client))
         clear.on_click(lambda _: self.clear())
         play.on_click(lambda event: self.play(event.client))
+        around.on_click(lambda event: self.fly_around(event.client))
         save.on_click(lambda event: self.save(event.client))
 
     def add(self, client: Any) -> None:
@@ -87,6 +90,13 @@ class Keyframes:
             return
         if client.client_id not in self.playing:
             threading.Thread(target=self.move_client, args=(client,), daemon=True).start()
+
+    def fly_around(self, client: Any) -> None:
+        """Replace the keyframes by a closed path that fits the capture, and move a client along it."""
+        self.keys = [with_fov(camera, camera.fov, *SIZE) for camera in make_path("auto", self.capture, AROUND).cameras]
+        self.loop.value, self.seconds.value = True, ROUND / AROUND
+        self.words.content = f"{len(self.keys)} keyframes around the scene"
+        self.play(client)
 
     def move_client(self, client: Any, fps: float = 15.0) -> None:
         """Move a client along the path; returns at its end or when the client leaves."""

@@ -19,6 +19,8 @@ NAMES = ("auto", "orbit", "spiral", "views")
 FACING = 0.7  # if the mean of the unit viewing directions is longer, the capture faces one way and an orbit would go behind the scene
 MOST_POSES = 40  # captured poses that a path goes through
 SEEN = 45.0  # degrees from the nearest captured viewing direction, beyond which a picture shows what no photograph does
+UNSEEN = 0.1  # a larger share of frames that nobody photographed is too much
+TRIED = 36  # frames by which a path is chosen
 LEVEL = math.cos(math.radians(15))  # least cosine of the roll of an upright picture
 
 
@@ -101,8 +103,7 @@ def make_path(name: str, capture: Capture, frames: int, size: tuple[int, int] | 
     """Make a camera path by name.
 
     Args:
-        name: "orbit", "spiral", "views" (along the captured poses), or "auto" (orbit if the cameras surround the scene,
-            otherwise spiral).
+        name: "orbit", "spiral", "views" (along the captured poses), or "auto" (see `choose_path`).
         frames: Number of cameras, at least 1.
         size: Width and height in px. None takes those of the camera with the median field of view.
         fps: Frames per second.
@@ -114,10 +115,10 @@ def make_path(name: str, capture: Capture, frames: int, size: tuple[int, int] | 
         raise InputError(f"expected at least 1 frame, found {frames}; increase --seconds")
     rig = analyse_cameras(capture)
     if name == "auto":
-        name = "spiral" if float(rig.forward.mean(0).norm()) > FACING else "orbit"
+        name = choose_path(rig)
     if name not in NAMES:
         raise InputError(f"expected a path among {', '.join(NAMES)}, test or a file, found '{name}'; correct --path")
-    poses = {"orbit": orbit, "spiral": spiral, "views": follow_views}[name](rig, frames)
+    poses = PATHS[name](rig, frames)
     model = median_camera(rig.cameras, size)
     return CameraPath(tuple(replace(model, world_to_cam=pose.float()) for pose in poses), fps)
 
@@ -162,14 +163,34 @@ def follow_views(rig: CameraRig, frames: int) -> list[Tensor]:
     return interpolate_poses(rig.positions[chosen], rig.rotations[chosen], frames)
 
 
+PATHS = {"orbit": orbit, "spiral": spiral, "views": follow_views}
+
+
+def choose_path(rig: CameraRig) -> str:
+    """Return the name of the path that fits the shape of a capture.
+
+    Orbit if the cameras surround the scene, otherwise spiral, or views where a spiral looks where no photograph does.
+    """
+    names = ["spiral", "views"] if float(rig.forward.mean(0).norm()) > FACING else ["orbit", "spiral", "views"]
+    for name in names[:-1]:
+        along = torch.stack([pose[2, :3] for pose in PATHS[name](rig, TRIED)])
+        if count_unseen_directions(along, rig) <= UNSEEN * TRIED:
+            return name
+    return names[-1]
+
+
 def count_unseen(path: CameraPath, capture: Capture) -> int:
     """Return the number of cameras that look in a direction which no training camera has within SEEN degrees.
 
     They show backs of things that nobody photographed. Position is not considered.
     """
-    captured = analyse_cameras(capture).forward
     along = torch.stack([camera.world_to_cam[2, :3].double() for camera in path.cameras])
-    return int(((along @ captured.T).amax(1) < math.cos(math.radians(SEEN))).sum())
+    return count_unseen_directions(along, analyse_cameras(capture))
+
+
+def count_unseen_directions(along: Tensor, rig: CameraRig) -> int:
+    """Return how many of the unit directions [n, 3] no training camera has within SEEN degrees."""
+    return int(((along @ rig.forward.T).amax(1) < math.cos(math.radians(SEEN))).sum())
 
 
 def median_camera(cameras: Sequence[Camera], size: tuple[int, int] | None = None) -> Camera:

@@ -44,3 +44,11 @@ def test_playing_moves_the_client(viewer):
     handle.camera.position = np.array([9.0, 9.0, 9.0])
     keys.move_client(handle, fps=50.0)
     assert np.allclose(handle.camera.position, [1.0, 0, 0], atol=1e-5)
+
+
+def test_a_flight_around_the_scene_is_made_of_keyframes(viewer, monkeypatch):
+    handle, keys = joined(viewer), viewer.panel.keyframes
+    played = []
+    monkeypatch.setattr(keys, "play", played.append)
+    keys.fly_around(handle)
+    assert len(keys.keys) == 24 and keys.loop.value and played == [handle]

@@ -121,3 +121,13 @@ def test_frames_that_nobody_photographed_are_counted(capture):
     assert paths.count_unseen(around, capture) == 0
     far = [i for i in ahead if max(float(ahead[i] @ ahead[j]) for j in near) < math.cos(math.pi / 4)]
     assert far and paths.count_unseen(around, replace(capture, train=near)) == len(far)
+
+
+def test_a_path_is_chosen_by_the_shape_of_the_capture():
+    around = ring(12)
+    assert paths.choose_path(around) == "orbit"
+    chosen = [0, 1, 2, 3, 4, 5, 6]  # half of the circle: an orbit would show the backs that nobody photographed
+    half = replace(around, positions=around.positions[chosen], rotations=around.rotations[chosen], cameras=around.cameras[:7])
+    assert float(half.forward.mean(0).norm()) < paths.FACING and paths.choose_path(half) in ("spiral", "views")
+    front = replace(around, positions=around.positions[:3], rotations=around.rotations[:3], cameras=around.cameras[:3])
+    assert paths.choose_path(front) == "spiral"

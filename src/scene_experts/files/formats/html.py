@@ -3,7 +3,8 @@
 Renderer, scene and start pose are in one file. The renderer is Spark on three.js (MIT), bundled by
 tools/viewer; the scene is an SPZ file in base64. The note may set the start: `camera`, an entry as
 in cameras.json (position, rotation as rows of the 3x3 camera-to-world matrix, and fov in degrees or
-fy and height; width is optional), `cameras`, a list of such entries to step through, `background` (RGB in [0, 1]),
+fy and height; width is optional), `cameras`, a list of such entries to step through, `flight`,
+a closed path of such entries, `background` (RGB in [0, 1]),
 `antialias` and `title`.
 """
 
@@ -27,19 +28,20 @@ from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.source import opening
-from scene_experts.data.views import Capture, World
+from scene_experts.data.views import Capture, View, World
 from scene_experts.files.cameras import camera_entries
 from scene_experts.files.formats.pack import Floats
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.formats.spz import decode, spz_bytes
 from scene_experts.files.registry import Format
 from scene_experts.geometry.rotation import estimate_up
-from scene_experts.view.paths import choose_best_view
+from scene_experts.view.paths import choose_best_view, make_path
 from scene_experts.view.region import find_region
 
 ASSETS = files("scene_experts.files.formats") / "assets"
 MARK = b'<meta name="generator" content="scene-experts">'
 _SCENE = b'<script type="text/plain" id="scene">'
+FLIGHT = 48  # poses of the flight, between which the page interpolates
 _FOV = 50.0  # degrees, without a camera
 Pose = dict[str, Any]
 
@@ -85,6 +87,8 @@ def view_note(capture: Capture, world: World) -> dict[str, Any]:
         "camera": entries[choose_best_view(capture)] if entries else None,
         "cameras": entries,
         "background": list(capture.background),
+        "title": f"{capture.name}, a scene by scene-experts",
+        "flight": camera_entries([View("flight", camera, Path()) for camera in make_path("auto", capture, FLIGHT).cameras], world),
     }
 
 
@@ -103,6 +107,7 @@ def page_settings(splats: Splats, note: Mapping[str, Any]) -> dict[str, Any]:
         "count": len(splats),
         "pose": first,
         "poses": poses,
+        "flight": [_pose(entry) for entry in note.get("flight") or []],
         "index": poses.index(first) if first in poses else 0,
         "fov": first["fov"],
         "up": up.tolist(),

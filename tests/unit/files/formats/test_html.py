@@ -150,11 +150,12 @@ def test_a_capture_s_views_in_the_frame_of_the_file():
     poses = [torch.eye(4), torch.eye(4)]
     poses[1][:3, 3] = torch.tensor([0.0, 0.0, 7.0])  # the camera's centre at z = -7 of the trained world
     views = tuple(View(f"{i}.jpg", Camera(pose, K, 120, 80, id=i), Path("x")) for i, pose in enumerate(poses))
-    capture = SimpleNamespace(views=views, test=(0,), train=(1,), points=None, extent=1.0, background=(1.0, 1.0, 1.0))
+    capture = SimpleNamespace(name="yard", views=views, test=(0,), train=(1,), points=None, extent=1.0, background=(1.0, 1.0, 1.0))
     note = view_note(capture, world) | {"antialias": True}  # type: ignore[arg-type]
     assert note["camera"] == note["cameras"][1] and len(note["cameras"]) == 2 and note["background"] == [1.0, 1.0, 1.0]
     np.testing.assert_allclose(note["camera"]["position"], [-1.0, 0.0, -3.5 + 3.0], atol=1e-6)
     found = page_settings(blobs(), note)
+    assert len(found["flight"]) == 48 and page_settings(blobs(), {})["flight"] == []
     assert found["reach"] > 0 and page_settings(blobs(), {})["reach"] is None
     assert found["antialias"] and found["fov"] == pytest.approx(math.degrees(2 * math.atan(0.4)))
 
