@@ -30,6 +30,10 @@ class ExportCommand:
     """File formats, from the list above. Several standard files share one bake."""
     out: Path | None = None
     """File or folder to write; by default in the run folder. A folder for several formats."""
+    hub: Annotated[Path | None, Option(value="FOLDER")] = None
+    """Write a folder for a model hub: compact and spz (or --format), a picture and a card (README.md)."""
+    licence: str | None = None
+    """With --hub: licence of the photographs, for the card, such as mit or cc-by-4.0."""
     step: int | None = None
     """Iteration of the checkpoint to export; by default the newest."""
     data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
@@ -58,21 +62,36 @@ def export(args: list[str]) -> int:
 
     from rich.console import Console
 
+    from scene_experts.core.errors import InputError
+    from scene_experts.files import hub
     from scene_experts.files.export import export_several
     from scene_experts.training.memory import reuse_freed
     from scene_experts.training.progress import ProgressBar
     from scene_experts.training.run_folder import open_run, with_capture
 
+    if command.hub is not None and command.out is not None:
+        raise InputError(f"expected --hub or --out, found both; leave --out {command.out} out")
+    if command.licence is not None and command.hub is None:
+        raise InputError(f"expected --licence with --hub, found it alone; leave --licence {command.licence} out or name a folder by --hub")
     run = with_capture(open_run(command.run, "cpu", command.step), command.data)
-    bakes = any(format_named(name).family == GAUSSIANS for name in command.format)
+    bakes = command.hub is not None or any(format_named(name).family == GAUSSIANS for name in command.format)
     if bakes:
         reuse_freed()
     line = shlex.join([PROG, "export", *args])
     with ProgressBar(Console(stderr=True)) if bakes else nullcontext() as bar:
         tell = bar or (lambda *_: None)
-        written = export_several(run, command.format, command.out, command.options, tell=tell, command=line)
+        if command.hub is not None:
+            chosen = () if command.format == ExportCommand.format else command.format
+            licence = command.licence or hub.UNKNOWN
+            written = hub.write_hub(run, command.hub, chosen, command.options, licence=licence, tell=tell, command=line)
+        else:
+            written = export_several(run, command.format, command.out, command.options, tell=tell, command=line)
     for file in written:
         print("\n".join(file.lines))
+    if command.hub is not None:
+        print(f"wrote {command.hub / hub.CARD}")
+        if command.licence is None:
+            print("the card says that the licence of the photographs is unknown: --licence mit states it")
     return 0
 
 

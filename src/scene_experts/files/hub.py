@@ -1,0 +1,145 @@
+"""A folder for a model hub: a trained scene in several formats, a picture, and a card (README.md) that hubs read.
+
+The card begins with YAML: licence, tags, and the scores of `scene-experts eval` where the run was evaluated. Whoever publishes a scene
+must know the licence of its photographs: licence texts beside them are copied, and the card says where none was stated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+import scene_experts
+from scene_experts.core.errors import InputError
+from scene_experts.core.io import check_writable, write_bytes
+from scene_experts.core.reading import budget
+from scene_experts.core.reading.source import opening
+from scene_experts.data.capture import Capture
+from scene_experts.evaluate.pictures import to_8bit, write_picture
+from scene_experts.evaluate.results import load_results
+from scene_experts.files.export import Written, export_several
+from scene_experts.files.measure import Painter, Tell, capture_if_there
+from scene_experts.files.options import DEFAULT, Options
+from scene_experts.files.registry import formats_of
+from scene_experts.training.run_folder import OpenRun
+from scene_experts.view.paths import choose_best_view
+
+CARD, PREVIEW = "README.md", "preview.png"
+UNKNOWN = "unknown"
+METRICS = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS"}
+_NOTICES = ("LICENSE*", "LICENCE*", "ATTRIBUTION*", "NOTICE*")  # in a capture's folder
+_LONGEST = 1 << 20  # bytes of such a text
+
+
+def default_formats(run: OpenRun) -> tuple[str, ...]:
+    """The formats of a folder for which none was chosen: the small one that keeps the networks, where the family has one, and SPZ."""
+    return ("compact", "spz") if "compact" in formats_of(run.scene.traits.family, ("compact",)) else ("spz",)
+
+
+def write_hub(
+    run: OpenRun,
+    folder: Path,
+    formats: Sequence[str] = (),
+    options: Options = DEFAULT,
+    *,
+    licence: str = UNKNOWN,
+    tell: Tell = lambda what, done, total: None,
+    command: str = "",
+) -> list[Written]:
+    """Write a folder for a model hub.
+
+    Args:
+        run: The run, on the CPU. The picture needs its capture.
+        folder: Folder to write; files of the same names are replaced.
+        formats: Names of formats; none for `default_formats`.
+        options: What the files hold, as for `export`.
+        licence: Licence of the photographs and so of the scene, as hubs name it: "mit", "cc-by-4.0".
+        tell: Called with the progress: what, done, total.
+        command: The command line, kept in the files' notes.
+
+    Returns:
+        One `Written` per scene file.
+
+    Raises:
+        InputError: `folder` is a file, the capture is missing, or a format cannot hold the scene.
+        RunError: The disk is full.
+    """
+    if folder.is_file():
+        raise InputError(f"expected a folder for --hub, found the file {folder}; name a folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    check_writable(folder / CARD)
+    with capture_if_there(run, needed=True) as capture:
+        assert capture is not None
+        notices = copy_notices(capture.root, folder)
+        write_picture(folder / PREVIEW, draw_preview(run, capture))
+    names = tuple(formats) or default_formats(run)
+    written = export_several(run, names, folder, options, tell=tell, command=command)
+    try:
+        scores = load_results(run.path)
+    except InputError:  # the run was not evaluated
+        scores = {}
+    write_bytes(folder / CARD, make_card(run, written, scores, licence, notices).encode())
+    return written
+
+
+@torch.no_grad()
+def draw_preview(run: OpenRun, capture: Capture) -> Any:
+    """The picture of the view that shows the capture best, uint8 [H, W, 3]."""
+    camera = capture.views[choose_best_view(capture)].camera
+    painter = Painter.of(run.scene, run.step, antialias=run.config.train.antialias)
+    return to_8bit(painter.picture(camera, torch.tensor(capture.background)))
+
+
+def copy_notices(capture: Path, folder: Path) -> list[str]:
+    """Copy the licence texts of a capture's folder as CAPTURE_NAME; return their new names."""
+    found = sorted({path for pattern in _NOTICES for path in capture.glob(pattern) if path.is_file() and path.stat().st_size <= _LONGEST})
+    names = []
+    for path in found:
+        with opening(path, budget.NOTE) as source:
+            write_bytes(folder / f"CAPTURE_{path.name}", source.read())
+        names.append(f"CAPTURE_{path.name}")
+    return names
+
+
+def make_card(run: OpenRun, files: Sequence[Written], scores: dict[str, Any], licence: str, notices: Sequence[str]) -> str:
+    """The text of the card. scores: the content of results.json, or empty."""
+    recipe, scene = run.config.train.recipe, run.config.data.path.name or "scene"
+    metrics = [{"type": name, "name": title, "value": round(float(scores[name]), 4)} for name, title in METRICS.items() if scores.get(name)]
+    head: dict[str, Any] = {
+        "license": licence,
+        "library_name": "scene-experts",
+        "pipeline_tag": "image-to-3d",
+        "tags": ["3d", "gaussian-splatting", "novel-view-synthesis", "scene-experts", recipe],
+    }
+    if metrics:
+        task = {"type": "image-to-3d", "name": "novel view synthesis"}
+        result = {"task": task, "dataset": {"type": scene, "name": f"held-out views of {scene}"}, "metrics": metrics}
+        head["model-index"] = [{"name": f"{scene}, {recipe}", "results": [result]}]
+    lines = ["---", yaml.safe_dump(head, sort_keys=False, allow_unicode=True).strip(), "---", "", f"# {scene}", ""]
+    maker = f"scene-experts {scene_experts.__version__}"
+    lines += [f"![{scene}]({PREVIEW})", "", f"A 3D scene of Gaussians, trained from photographs by {maker} with"]
+    lines += [f"the recipe `{recipe}` for {run.step:,} iterations.", "", "| file | content |", "|---|---|"]
+    lines += [f"| `{file.path.name}` | {file.rows:,} rows, {file.bytes / 1e6:.1f} MB |" for file in files]
+    lines += ["", "## Open it", "", "```sh", "pip install scene-experts"]
+    lines += ["# CAPTURE: folder of its photographs with poses; the run can be drawn, scored and converted"]
+    lines += [f"scene-experts import {files[0].path.name} --data CAPTURE --out RUN"]
+    lines += ["```", ""]
+    if any(file.path.suffix == ".spz" for file in files):
+        lines += ["Viewers of Gaussian splats open the `.spz` file directly.", ""]
+    if metrics:
+        views = f"{scores.get('view_count', 'the')} held-out views"
+        resolution, split = scores.get("resolution", "unknown"), scores.get("split", "unknown")
+        lines += ["## Scores", "", f"Means over {views} (split `{split}`, resolution `{resolution}`), of the scene with its networks:", ""]
+        lines += ["| metric | value |", "|---|---|", *(f"| {metric['name']} | {metric['value']} |" for metric in metrics), ""]
+    lines += ["## Licence", ""]
+    if licence == UNKNOWN:
+        lines += ["The licence of the photographs was not stated. Ask their owner before you use this scene.", ""]
+    else:
+        lines += [f"The scene has the licence of its photographs: {licence}.", ""]
+    if notices:
+        lines += [f"Texts that came with the photographs: {', '.join(f'[{name}]({name})' for name in notices)}.", ""]
+    return "\n".join(lines)

@@ -1,0 +1,79 @@
+"""The folder for a model hub: what hubs read in its card, and its files."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from scene_experts.commands.files import export
+from scene_experts.core.errors import InputError
+from scene_experts.data.settings import Data
+from scene_experts.files import hub
+from scene_experts.files.export import Written
+from scene_experts.recipes import RECIPES
+from scene_experts.render import choose
+from scene_experts.training import loop, run_folder
+from scene_experts.training.config import RunConfig
+from support.synthetic import make_capture
+
+
+def front_matter(card):
+    _, head, body = card.split("---\n", 2)
+    return yaml.safe_load(head), body
+
+
+def test_the_card_states_licence_tags_scores_and_files(tmp_path):
+    train = SimpleNamespace(recipe="moe-gs")
+    run = SimpleNamespace(config=SimpleNamespace(train=train, data=SimpleNamespace(path=tmp_path / "banana")), step=2000)
+    files = [Written(tmp_path / "scene.compact", 3_000_000, 400, ()), Written(tmp_path / "scene.spz", 900_000, 4000, ())]
+    scores = {"psnr": 27.25, "ssim": 0.9, "lpips": None, "view_count": 2, "split": "mod8", "resolution": "longest:800"}
+    head, body = front_matter(hub.make_card(run, files, scores, "mit", ["CAPTURE_LICENSE"]))  # type: ignore[arg-type]
+    assert head["license"] == "mit" and {"gaussian-splatting", "moe-gs"} <= set(head["tags"])
+    metrics = head["model-index"][0]["results"][0]["metrics"]
+    assert {m["type"]: m["value"] for m in metrics} == {"psnr": 27.25, "ssim": 0.9}
+    for fact in ("scene.compact", "scene.spz", hub.PREVIEW, "scene-experts import", "2 held-out views", "CAPTURE_LICENSE", "2,000"):
+        assert fact in body
+    head, body = front_matter(hub.make_card(run, files, {}, hub.UNKNOWN, []))  # type: ignore[arg-type]
+    assert "model-index" not in head and head["license"] == "unknown" and "not stated" in body
+
+
+def test_licence_texts_are_copied(tmp_path):
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "capture" / "LICENSE").write_text("MIT")
+    (tmp_path / "capture" / "ATTRIBUTION.txt").write_text("by A")
+    (tmp_path / "capture" / "photo.txt").write_text("no")
+    assert hub.copy_notices(tmp_path / "capture", tmp_path) == ["CAPTURE_ATTRIBUTION.txt", "CAPTURE_LICENSE"]
+    assert (tmp_path / "CAPTURE_LICENSE").read_text() == "MIT"
+
+
+def test_flags_that_do_not_fit_are_refused(tmp_path):
+    with pytest.raises(InputError, match="--hub"):
+        export([str(tmp_path), "--hub", str(tmp_path / "hub"), "--out", str(tmp_path / "a.spz")])
+    with pytest.raises(InputError, match="--licence"):
+        export([str(tmp_path), "--licence", "mit"])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="--hub"):
+        hub.write_hub(None, tmp_path / "file")  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_folder(tmp_path, capsys):
+    folder = make_capture(tmp_path / "capture", views=9, size=(48, 32), points=250).folder
+    (folder / "LICENSE").write_text("MIT")
+    config = RunConfig(replace(RECIPES["moe-gs"][1], iterations=300), Data(folder), stop_at=10)
+    run_folder.prepare(tmp_path / "run", config, resume=False)
+    capture = run_folder.load_capture(config.data)
+    list(loop.train(config.train, loop.Run(config, tmp_path / "run"), capture, choose("auto", "cpu")))
+    capture.images.close()
+    out = tmp_path / "hub"
+    assert export([str(tmp_path / "run"), "--hub", str(out), "--refine", "2", "--no-measure", "--licence", "mit"]) == 0
+    assert "README.md" in capsys.readouterr().out
+    assert {"README.md", "preview.png", "scene.compact", "scene.spz", "CAPTURE_LICENSE"} <= {p.name for p in out.iterdir()}
+    head, body = front_matter((out / "README.md").read_text())
+    assert head["license"] == "mit" and "CAPTURE_LICENSE" in body
+    picture = np.asarray(Image.open(out / "preview.png"))
+    assert picture.shape == (32, 48, 3) or picture.ndim == 3
+    assert picture.std() > 1
