@@ -85,7 +85,7 @@ def plan(args: list[str]) -> int:
     capture.images.close()
     found = make_blocks(capture, command.blocks, command.margin, command.share)
     write_plan(command.out, capture, found)
-    lines = commands(command)
+    lines = commands(command, [block.bounds for block in found])
     write_bytes(command.out / "commands.sh", ("#!/bin/sh\nset -e\n" + "\n".join(lines) + "\n").encode())
     for number, block in enumerate(found):
         print(f"block {number}: {len(block.views)} of {len(capture.train)} training views")
@@ -93,8 +93,11 @@ def plan(args: list[str]) -> int:
     return 0
 
 
-def commands(command: PlanCommand) -> list[str]:
-    """The commands that train a coarse scene, the blocks, and the merged scene."""
+def commands(command: PlanCommand, bounds: list[tuple[float, ...]]) -> list[str]:
+    """The commands that train a coarse scene, the blocks, and the merged scene.
+
+    bounds: corners of the box of each block with its margin, in trained world units.
+    """
     out, total = command.out, command.iterations
     data = [word for name, value in vars(command.data).items() if value != getattr(Data(Path()), name) for word in _flag(name, value)]
     train = [PROG, "train", command.recipe, *data]
@@ -103,7 +106,8 @@ def commands(command: PlanCommand) -> list[str]:
     lines = [[*train, "--out", coarse, "--iterations", str(total), "--stop-at", str(max(1, total // 3))]]
     for number, run in enumerate(runs):
         views = ["--views", str(out / f"block{number}.json"), "--init-from", coarse, "--rates.networks", "0"]
-        lines.append([*train, "--out", run, "--iterations", str(total), *views])
+        inside = ["--growth.bounds", *(f"{side:.6g}" for side in bounds[number])]
+        lines.append([*train, "--out", run, "--iterations", str(total), *views, *inside])
     lines.append([PROG, "blocks", "merge", str(out), "--runs", *runs, "--out", merged])
     lines.append([*train, "--out", str(out / "joint"), "--iterations", str(total + max(1, total // 10)), "--init-from", merged])
     return [shlex.join(line) for line in lines]

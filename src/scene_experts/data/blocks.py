@@ -17,11 +17,13 @@ from torch import Tensor
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.io import write_json
 from scene_experts.core.reading.budget import CAPTURE
+from scene_experts.core.reading.numbers import number
 from scene_experts.core.reading.plain import read_json
 from scene_experts.core.reading.source import guarding
 from scene_experts.data.views import Capture, View
 
 FORMAT = 1
+FAR = 1e30  # stands for an infinite side where only finite numbers are written
 MOST_POINTS = 200_000  # of a capture that decide about its blocks; evenly chosen
 
 
@@ -32,6 +34,14 @@ class Block:
     low: tuple[float, ...]
     high: tuple[float, ...]
     views: tuple[str, ...] = ()
+    margin: float = 0.0
+    """How far beyond its box a block is trained, in trained world units."""
+
+    @property
+    def bounds(self) -> tuple[float, ...]:
+        """The low and the high corner (x, y, z, x, y, z) of the box with its margin. Infinite sides are at +-1e30."""
+        sides = [side - self.margin for side in self.low] + [side + self.margin for side in self.high]
+        return tuple(min(max(side, -FAR), FAR) for side in sides)
 
     def holds(self, xyz: Tensor, margin: float = 0.0) -> Tensor:
         """Return which positions [N, 3] lie in the box, [N] bool. Its low sides belong to it, its high sides do not.
@@ -59,18 +69,19 @@ def make_blocks(capture: Capture, count: int, margin: float = 0.1, share: float 
     xyz = capture.points.xyz.double()
     xyz = xyz[:: -(-len(xyz) // MOST_POINTS)]
     boxes = split_box(xyz, Block((-math.inf,) * 3, (math.inf,) * 3), count)
-    reach = [box.holds(xyz, margin * float(_size(xyz[box.holds(xyz)]).max())) for box in boxes]
+    margins = [margin * float(_size(xyz[box.holds(xyz)]).max()) for box in boxes]
+    reach = [box.holds(xyz, distance) for box, distance in zip(boxes, margins)]
     views: list[list[str]] = [[] for _ in boxes]
     for index in capture.train:
         view = capture.views[index]
         seen = visible(view, xyz)
         shares = torch.stack([(seen & inside).sum() for inside in reach]) / seen.sum().clamp_min(1)
-        for number in range(len(boxes)):
-            if shares[number] >= max(share, 1e-9) or number == int(shares.argmax()):
-                views[number].append(view.name)
+        for i in range(len(boxes)):
+            if shares[i] >= max(share, 1e-9) or i == int(shares.argmax()):
+                views[i].append(view.name)
     if empty := [number for number, names in enumerate(views) if not names]:
         raise InputError(f"expected views that see each block, found none for block {empty[0]}; give smaller --blocks or --share")
-    return [Block(box.low, box.high, tuple(names)) for box, names in zip(boxes, views)]
+    return [Block(box.low, box.high, tuple(names), distance) for box, names, distance in zip(boxes, views, margins)]
 
 
 def split_box(xyz: Tensor, box: Block, count: int) -> list[Block]:
@@ -105,9 +116,9 @@ def _size(xyz: Tensor) -> Tensor:
 
 def write_plan(folder: Path, capture: Capture, blocks: list[Block]) -> None:
     """Write `folder`/plan.json, and `folder`/blockN.json with the names of the views of block N."""
-    for number, block in enumerate(blocks):
-        write_json(folder / f"block{number}.json", list(block.views))
-    boxes = [{"low": _plain(block.low), "high": _plain(block.high), "views": list(block.views)} for block in blocks]
+    for i, block in enumerate(blocks):
+        write_json(folder / f"block{i}.json", list(block.views))
+    boxes = [{"low": _plain(b.low), "high": _plain(b.high), "margin": b.margin, "views": list(b.views)} for b in blocks]
     write_json(folder / "plan.json", {"format": FORMAT, "capture": capture.fingerprint(), "blocks": boxes})
 
 
@@ -121,7 +132,13 @@ def read_plan(folder: Path) -> tuple[str, list[Block]]:
         if value["format"] != FORMAT:
             raise InputError(f"expected a plan of format {FORMAT} in {path}, found another; make it again")
         return str(value["capture"]), [
-            Block(_side(box["low"], -math.inf), _side(box["high"], math.inf), tuple(map(str, box["views"]))) for box in value["blocks"]
+            Block(
+                _side(box["low"], -math.inf),
+                _side(box["high"], math.inf),
+                tuple(map(str, box["views"])),
+                number(box.get("margin", 0.0), "the margin of a block", 0.0),
+            )
+            for box in value["blocks"]
         ]
 
 

@@ -37,6 +37,7 @@ NEWER = {
     "growth.mask_contribution",
     "growth.mask_at",
     "growth.mask_views",
+    "growth.bounds",
     "rates.networks",
     "rates.anneal",
     "rates.anneal_from",

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import torch
+from torch import Tensor
 from typing_extensions import TypeVar
 
 from scene_experts.core.errors import InputError, expect_at_least
@@ -57,6 +58,9 @@ class AnchorControl(Strategy[L]):
     """Number of random training views that a mask looks at; 0 means all."""
     max_anchors: int = 0
     """Maximum number of anchors; 0 means no limit. Anchors with the largest gradients are created first."""
+    bounds: tuple[float, ...] = ()
+    """Corners (low x, y, z, high x, y, z) of the box in which anchors are created, in trained world units; empty means everywhere. Blocks
+    of a large capture use it."""
 
     @property
     def absolute(self) -> bool:
@@ -78,6 +82,10 @@ class AnchorControl(Strategy[L]):
         names = ("max_anchors", "error_views", "error_share", "least_contribution", "mask_contribution", "mask_views")
         least = [(f"--growth.{name.replace('_', '-')}", getattr(self, name), 0) for name in names]
         expect_at_least([("--growth.adjust.interval", self.adjust.interval, 1), *least])
+        low, high = self.bounds[:3], self.bounds[3:]
+        if self.bounds and not (len(high) == 3 and all(a < b for a, b in zip(low, high))):
+            found = " ".join(f"{side:g}" for side in self.bounds)
+            raise InputError(f"expected --growth.bounds as a low and a high corner, x y z x y z, found {found}; correct the numbers")
         if not 0 <= self.error_quantile < 1:
             raise InputError(f"expected --growth.error-quantile from 0 to below 1, found {self.error_quantile}; correct it")
         if self.least_contribution > 0 and not self.error_views:
@@ -131,6 +139,11 @@ class AnchorControl(Strategy[L]):
         Returns the number of new anchors and whether the limit rejected candidates.
         """
         raise NotImplementedError
+
+    def inside(self, points: Tensor) -> Tensor:
+        """Return which points [P, 3] lie in the box in which anchors are created, [P] bool. Its low sides belong to it."""
+        low, high = (torch.tensor(side, dtype=points.dtype, device=points.device) for side in (self.bounds[:3], self.bounds[3:]))
+        return ((points >= low) & (points < high)).all(1)
 
     def gate(self) -> float:
         """Number of views that must draw a slot before the slot can create an anchor: more than 40 of 100 by default."""

@@ -76,7 +76,11 @@ class GrowAnchors(AnchorControl[L]):
         strong = strong.nonzero().squeeze(1)
         slots, g = eligible.index_select(0, strong), g.index_select(0, strong)
         parents = torch.div(slots, scene.K, rounding_mode="floor")
-        fine, features = scene.slot_points(slots, parents) / scene.voxel, table.params["feature"]
+        points = scene.slot_points(slots, parents)
+        if self.bounds:
+            here = self.inside(points).nonzero().squeeze(1)
+            slots, g, parents, points = (part.index_select(0, here) for part in (slots, g, parents, points))
+        fine, features = points / scene.voxel, table.params["feature"]
         cells, rows, born, capped = table.facts["cell"], [], 0, False
         for level, factor in enumerate(self.cell_factors()):
             if self.parity_level_skip and level > 0 and not born:

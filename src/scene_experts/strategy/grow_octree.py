@@ -63,7 +63,11 @@ class GrowOctree(AnchorControl[AnchorScene]):
             strong &= find_wrong(table.stats, self.error_share)
         slots = strong.view(-1).nonzero().squeeze(1)
         strength, parents = g.view(-1).index_select(0, slots), torch.div(slots, scene.K, rounding_mode="floor")
-        points, own = scene.slot_points(slots, parents), table.facts["level"].index_select(0, parents)
+        points = scene.slot_points(slots, parents)
+        if self.bounds:
+            here = self.inside(points).nonzero().squeeze(1)
+            slots, strength, parents, points = (part.index_select(0, here) for part in (slots, strength, parents, points))
+        own = table.facts["level"].index_select(0, parents)
         cells = [table.facts["cell"][table.facts["level"] == level] for level in range(levels.count)]
         rows: list[dict[str, Tensor]] = []
         born, capped = 0, False

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.blocks import Block, make_blocks, read_plan, read_view_names, split_box, visible, write_plan
+from scene_experts.data.blocks import FAR, Block, make_blocks, read_plan, read_view_names, split_box, visible, write_plan
 from scene_experts.data.capture import load
 from support.synthetic import make_capture
 
@@ -52,6 +52,11 @@ def test_a_plan_is_written_and_read(capture, tmp_path):
     write_plan(tmp_path, capture, blocks)
     assert read_plan(tmp_path) == (capture.fingerprint(), blocks)
     assert read_view_names(tmp_path / "block1.json") == list(blocks[1].views)
+    assert blocks[0].margin > 0 and FAR in blocks[0].bounds and -FAR in blocks[1].bounds
+
+
+def test_the_bounds_of_a_block_are_its_box_and_its_margin():
+    assert Block((0.0, 1.0, -math.inf), (2.0, math.inf, 3.0), margin=0.5).bounds == (-0.5, 0.5, -FAR, 2.5, FAR, 3.5)
 
 
 def test_invalid_plans_and_numbers(capture, tmp_path):

@@ -86,7 +86,7 @@ def specs_of(capture: Path) -> list[Spec]:
 
 def kill_a_worker_half_way(specs: list[Spec], runs: Path, killed: list[int]) -> None:
     """Kill the worker process whose training is the first to have begun."""
-    until = time.monotonic() + 60
+    until = time.monotonic() + 200
     while time.monotonic() < until and not killed:
         for spec in specs:
             metrics = spec.folder(runs) / "metrics.jsonl"

@@ -1,6 +1,7 @@
 """Growing and pruning against a slow implementation of Scaffold-GS's rule."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -51,6 +52,23 @@ def slow_growth(scene: AnchorScene, rule: GrowAnchors):
             taken.append(fine)
             born.setdefault(fine, []).append((factor, torch.stack(features).amax(0)))
     return born
+
+
+def test_growth_within_bounds_keeps_the_candidates_inside():
+    """With one level of single voxels, a cell is created inside exactly if it is created without bounds."""
+    cells = lambda scene: {tuple(cell) for cell in scene.table.facts["cell"].tolist()}  # noqa: E731
+    free, bound, start = make(), make(), cells(make())
+    rule = GrowAnchors(elimination=False, levels=1, init_factor=1)
+    rule.grow(free, torch.Generator())
+    replace(rule, bounds=(-9.0, -9.0, -9.0, 0.0, 9.0, 9.0)).grow(bound, torch.Generator())
+    assert cells(bound) - start == {cell for cell in cells(free) - start if cell[0] * VOXEL < -0.5 * VOXEL} | {
+        cell
+        for cell in cells(bound) - start
+        if cell[0] == 0  # a cell that the side cuts
+    }
+    assert 5 < len(cells(bound) - start) < len(cells(free) - start)
+    with pytest.raises(InputError, match=r"--growth\.bounds"):
+        GrowAnchors(bounds=(0.0, 0.0, 0.0, 1.0, 1.0, -1.0)).check()
 
 
 def test_growth_founds_the_cells_of_the_slow_rule():

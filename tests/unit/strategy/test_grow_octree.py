@@ -88,6 +88,15 @@ def test_growth_founds_the_cells_of_the_slow_rule(step, empty):
     assert (2 in found.facts["level"]) == (empty != 2)  # nothing is founded on an empty level
 
 
+def test_growth_within_bounds_creates_anchors_near_the_box_alone():
+    free, bound = make(), make()
+    n = len(free.table)
+    GrowOctree().grow(free, torch.Generator(), LATE)
+    GrowOctree(bounds=(-9.0, -9.0, -9.0, 0.0, 9.0, 9.0)).grow(bound, torch.Generator(), LATE)
+    new = lambda scene: scene.table.facts["xyz"][n:, 0]  # noqa: E731
+    assert new(bound).max() <= EDGE < new(free).max() and 5 < len(new(bound)) < len(new(free))
+
+
 def test_statistics_of_eligible_slots_begin_anew():
     scene = make()
     before = {k: v.clone() for k, v in scene.table.stats.items()}
