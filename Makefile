@@ -8,6 +8,7 @@
 # make sanitize   the native library with the address and undefined-behaviour sanitisers, and its tests on every instruction set
 # make crash ROUNDS=200   kill trainings of every family at random moments and compare what is resumed with what was left alone
 # make bench      the benchmarks that need no GPU
+# make wheels     the sdist and wheels for Linux, macOS and Windows in dist, compiled by zig and checked (docs/releasing.md); TARGETS="linux-x86_64"
 # make gpu DATA=CAPTURE   everything that a GPU is needed for, in slices below 9 minutes; repeat until it prints "all done"
 # make pretend    the CUDA path on tensors that pretend to be on CUDA: mixed devices, and the kernels, waits and bytes of a step
 # make record-errors, make record-flags   record the command line's error sentences or its flags anew in tests/golden
@@ -32,7 +33,7 @@ DEMO_FLAGS ?= --iterations $(DEMO_ITERATIONS) --resolution longest:800
 # as the package sets it when it is imported before torch, which the benchmark scripts do not
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo view test test-fast fuzz lint record-errors record-flags docs bench gpu pretend sanitize crash env lpips clean
+.PHONY: wheels demo view test test-fast fuzz lint record-errors record-flags docs bench gpu pretend sanitize crash env lpips clean
 
 env: $(STAMP)
 
@@ -111,6 +112,14 @@ PRETEND_TESTS ?= tests/system/test_pretend_cuda.py tests/system/test_gpu_plan.py
 pretend: $(STAMP)
 	@test -d $(PRETEND)/gsplat || $(BIN)/pip install -q --no-deps --target $(PRETEND) $(WITHOUT_GPU) || echo "gsplat and triton could not be fetched: skipped"
 	PYTHONPATH=$(abspath $(PRETEND)) $(BIN)/python -m pytest -q -W ignore $(PARALLEL) $(PRETEND_TESTS)
+
+# An environment of their own: neither torch nor this project is needed to build wheels.
+WHEELS_ENV := build/wheels-env
+
+wheels:
+	@test -x $(WHEELS_ENV)/bin/python || $(PYTHON) -m venv $(WHEELS_ENV)
+	@$(WHEELS_ENV)/bin/pip install -q $$($(WHEELS_ENV)/bin/python tools/wheels.py --requirements)
+	$(WHEELS_ENV)/bin/python tools/wheels.py $(TARGETS)
 
 gpu: $(STAMP)
 	$(BIN)/python tools/gpu.py --data $(DATA) $(if $(WHEELS),--wheels $(WHEELS))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import posixpath
 import re
@@ -35,7 +36,16 @@ def on_files(files: Files, config: Any) -> Files:
     for path in sorted(ROOT.glob("examples/**/*.py")):
         name = path.relative_to(ROOT).as_posix()
         files.append(File.generated(config, f"{OUTSIDE}/{name}.md", content=f"# {name}\n\n```python\n{path.read_text()}```\n"))
+    for path in sorted(ROOT.glob("examples/*.ipynb")):
+        name = path.relative_to(ROOT).as_posix()
+        files.append(File.generated(config, f"{OUTSIDE}/{name}.md", content=notebook(path)))
     return files
+
+
+def notebook(path: Path) -> str:
+    """Return the cells of a notebook in Markdown."""
+    cells = [(cell["cell_type"], "".join(cell["source"])) for cell in json.loads(path.read_text())["cells"]]
+    return "\n\n".join(text if kind == "markdown" else f"```python\n{text}\n```" for kind, text in cells) + "\n"
 
 
 def on_page_markdown(markdown: str, page: Any, files: Files, **_: Any) -> str:

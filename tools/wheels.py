@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import stat
 import subprocess
 import sys
 import tarfile
@@ -72,15 +71,18 @@ def write_toolchain(target: Target, folder: Path) -> Path:
     for name, words in tools.items():
         path = folder / name
         path.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang {words} "$@"\n')
-        path.chmod(path.stat().st_mode | stat.S_IXUSR)
+        path.chmod(0o755)
     lines = [
         f"set(CMAKE_SYSTEM_NAME {target.system})",
         f"set(CMAKE_SYSTEM_PROCESSOR {target.processor})",
         f"set(CMAKE_CXX_COMPILER {folder / 'c++'})",
         f"set(CMAKE_RC_COMPILER {folder / 'rc'})",  # CMake looks for one on Windows; no file needs it
+        f"set(CMAKE_INSTALL_NAME_TOOL {folder / 'nothing'})",  # and for this on macOS; names need no change
         'set(CMAKE_OSX_SYSROOT "")',
         "set(CMAKE_SHARED_LINKER_FLAGS_INIT -s)" if target.system != "Darwin" else "",
     ]
+    (folder / "nothing").write_text("#!/bin/sh\n")
+    (folder / "nothing").chmod(0o755)
     path = folder / "toolchain.cmake"
     path.write_text("\n".join(lines) + "\n")
     return path
@@ -140,7 +142,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"among {', '.join(TARGETS)}; all of them by default")
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder for the sdist and the wheels")
+    parser.add_argument("--requirements", action="store_true", help="print the packages that this script needs")
     args = parser.parse_args()
+    if args.requirements:
+        print(" ".join(REQUIREMENTS))
+        return
     unknown = set(args.targets) - set(TARGETS)
     if unknown:
         parser.error(f"expected targets among {', '.join(TARGETS)}, found {', '.join(sorted(unknown))}")
