@@ -76,6 +76,7 @@ fuzz: $(STAMP)
 
 docs: $(STAMP)
 	$(BIN)/mkdocs build --strict
+	$(BIN)/python tools/check_site.py build/site
 	@echo "open build/site/index.html"
 
 lint: $(STAMP)

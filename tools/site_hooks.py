@@ -18,6 +18,7 @@ OUTSIDE = "repository"  # folder of the site for pages of files outside docs/
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
 FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 COMMANDS = "reference/commands.md"  # the page that `commands` fills
+RECIPES = "reference/recipes.md"  # the page that `recipes` fills
 RECIPE = "scene-experts"  # whose options stand for those of every recipe
 
 
@@ -65,6 +66,8 @@ def on_page_markdown(markdown: str, page: Any, files: Files, **_: Any) -> str:
 
     if here == COMMANDS:
         return f"{markdown}\n\n{commands()}"
+    if here == RECIPES:
+        return f"{markdown}\n\n{recipes()}"
     parts, last = [], 0
     for fence in FENCE.finditer(markdown):
         parts += [LINK.sub(follow, markdown[last : fence.start()]), fence[0]]
@@ -90,11 +93,28 @@ def commands() -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def recipes() -> str:
+    """Return all recipes in Markdown, in the groups of `train --help`, each with its description."""
+    code = (
+        "import json, re; from scene_experts.commands.train import GROUPS; from scene_experts.recipes import RECIPES; left = dict(RECIPES);"
+        "print(json.dumps({t: [(n, left.pop(n)[0]) for n in list(left) if re.fullmatch(p, n)] for t, p in GROUPS.items()}))"
+    )
+    done = run([sys.executable, "-c", code])
+    parts = []
+    for title, rows in json.loads(done).items():
+        if rows:
+            lines = [f'| <span id="{name}"></span>`{name}` | {text.replace("|", "&#124;")} |' for name, text in rows]
+            parts.append("\n".join([f"## {title}", "", "| recipe | what it is |", "|---|---|", *lines]))
+    return "\n\n".join(parts) + "\n"
+
+
 def help_of(*words: str) -> str:
     """Return what `scene-experts WORDS --help` prints, 100 columns wide."""
     args = [*words] if "--help-all" in words else [*words, "--help"]
+    return run([sys.executable, "-m", "scene_experts", *args])
+
+
+def run(command: list[str]) -> str:
+    """Return what a command prints, 100 columns wide."""
     environment = {**os.environ, "COLUMNS": "100", "PYTHONPATH": str(ROOT / "src")}
-    done = subprocess.run(
-        [sys.executable, "-m", "scene_experts", *args], capture_output=True, text=True, env=environment, cwd=ROOT, check=True
-    )
-    return done.stdout
+    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT, check=True).stdout

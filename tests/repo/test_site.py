@@ -9,6 +9,7 @@ import pytest
 
 import scene_experts
 from scene_experts.commands import COMMANDS
+from scene_experts.recipes import RECIPES
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -25,6 +26,14 @@ def test_every_page_is_in_the_navigation():
     assert not [page for page in pages if f" {page}\n" not in listed]
 
 
+def load_checker():
+    """The module tools/check_site.py."""
+    spec = importlib.util.spec_from_file_location("check_site", ROOT / "tools" / "check_site.py")
+    module = importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
+    spec.loader.exec_module(module)  # type: ignore[union-attr]
+    return module
+
+
 @pytest.mark.slow
 def test_it_builds_without_a_warning(tmp_path):
     if importlib.util.find_spec("mkdocs") is None or importlib.util.find_spec("mkdocstrings") is None:
@@ -32,6 +41,32 @@ def test_it_builds_without_a_warning(tmp_path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    page = (tmp_path / "site" / "reference" / "commands.html").read_text()
-    assert all(f'id="{name}"' in page for name in COMMANDS)
-    assert "https://fonts" not in page
+    site = load_checker()
+    pages = site.read_site(tmp_path / "site")
+    reached = {path for path, _ in site.count_clicks(pages)}
+    for page, names in {
+        "reference/commands.html": COMMANDS,
+        "reference/recipes.html": RECIPES,
+        "reference/api.html": [f"scene_experts.{name}" for name in scene_experts.__all__ if name != "__version__"],
+    }.items():
+        assert page in reached and set(names) <= pages[page].ids, set(names) - pages[page].ids
+    assert not list(site.find_dead(tmp_path / "site", pages))
+    assert (tmp_path / "site" / "search" / "search_index.js").is_file()  # search works from disk
+
+
+def test_dead_links_and_distant_pages_are_found(tmp_path):
+    site = load_checker()
+    text = {
+        "index.html": '<a href="a/b.html#x">b</a> <a href="gone.html">gone</a> <a href="https://x.org">far</a>',
+        "a/b.html": '<h2 id="x"></h2> <a href="../c.html">c</a> <a href="#y">y</a> <img src="https://x.org/i.png">',
+        "c.html": '<a href="d.html">d</a>',
+        "d.html": "",
+    }
+    for name, body in text.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(body)
+    pages = site.read_site(tmp_path)
+    assert sorted(site.find_dead(tmp_path, pages)) == [
+        "a/b.html loads https://x.org/i.png", "a/b.html: #y has no such anchor", "index.html: gone.html leads nowhere",
+    ]  # fmt: skip
+    assert {path for path, _ in site.count_clicks(pages)} >= {"c.html"} and "d.html" not in {path for path, _ in site.count_clicks(pages)}
