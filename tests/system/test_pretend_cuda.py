@@ -35,6 +35,7 @@ FAMILIES = {
 }
 GROUPS = [list(LEAN)[:2], list(LEAN)[2:], *(list(FAMILIES)[i : i + 2] for i in range(0, len(FAMILIES), 2))]  # a process each
 CLOSE = 1e-4  # relative, of losses and gradients
+ROUNDING = 6e-7  # relative, of an alpha in float32: ten times that of one number
 DRAWN = {"picture": 1e-5, "depth": 1e-5, "gradients": 1e-4}
 
 
@@ -67,6 +68,15 @@ def test_a_recipe_trains_within_its_limits_and_is_saved_drawn_scored_and_baked(w
 def test_each_step_is_that_of_the_cpu(recipes, folder):
     for recipe, found in passed(run(folder, "compare", *recipes)).items():
         assert len(found["losses"]) == 10 and max(*found["losses"], *found["gradients"]) < CLOSE, (recipe, found)
+
+
+@pytest.mark.slow
+def test_a_step_differs_only_where_an_alpha_lies_on_its_threshold(folder):
+    found = passed(run(folder, "compare", "moe-gs-e2-dense"))["moe-gs-e2-dense"]
+    steps = list(zip(found["losses"], found["gradients"], found["close"]))
+    clear = [max(loss, gradient) for loss, gradient, close in steps if close > ROUNDING]
+    assert len(clear) >= 8 and max(clear) < CLOSE, found
+    assert all(loss < CLOSE and gradient < 1e-2 for loss, gradient, _ in steps), found
 
 
 @pytest.mark.slow

@@ -2,7 +2,9 @@
 
     python -m support.pretend.compare octree-gs moe-gs:alone                 # in tests/, with the guard loaded
 
-RECIPE: each step starts on both from the same checkpoint, that of the CPU. `losses` and `gradients` are the differences.
+RECIPE: each step starts on both from the same checkpoint, that of the CPU. `losses` and `gradients` are the differences. `close` is how
+near the nearest alpha of the picture lies to 1/255, relative, in float64. Below that threshold a Gaussian is skipped: where an alpha lies
+nearer to it than float32 can tell, rounding decides whether a pixel has a Gaussian, and one gradient differs.
 RECIPE:alone: both train on their own. Then `gradients` is empty.
 
 A training starts with the Gaussians of an anchor at one place, and its first steps move them by equal lengths. Depths are then equal up to
@@ -17,8 +19,9 @@ from functools import partial
 
 import torch
 
+from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.data.capture import Capture
-from scene_experts.render import Rasterizer
+from scene_experts.render import Rasterizer, reference
 from scene_experts.render.cpu import CpuRasterizer
 from scene_experts.render.gsplat import GsplatRasterizer
 from scene_experts.training import loop
@@ -75,6 +78,27 @@ def measure(one: list[torch.Tensor], other: list[torch.Tensor]) -> float:
     return max(float((a - b).norm()) / max(float(b.norm()), least) for a, b in zip(one, other))
 
 
+class Watched(CpuRasterizer):
+    """The rasteriser of the CPU, which keeps how near the alphas of its last picture lie to the threshold."""
+
+    close = 1.0
+
+    def __call__(self, g: Gaussians, camera: Camera, background: torch.Tensor) -> Render:
+        type(self).close = measure_nearest(g, camera)
+        return super().__call__(g, camera, background)
+
+
+@torch.no_grad()
+def measure_nearest(g: Gaussians, camera: Camera) -> float:
+    """The smallest relative distance of an alpha of the picture to 1/255, in float64."""
+    p = reference.project(g.means.double(), g.quats.double(), g.scales.double(), camera)
+    row, column = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    dx, dy = column.double() - p.mean2d[:, 0, None, None], row.double() - p.mean2d[:, 1, None, None]
+    a, b, c = (side[:, None, None] for side in p.conic.unbind(1))
+    alpha = g.opacities.double()[:, None, None] * (-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).exp()
+    return float((alpha[p.radii > 0] / reference.MIN_ALPHA - 1).abs().min())
+
+
 @torch.no_grad()
 def begin(cfg: Train, capture: Capture, device: str) -> Training:
     """Start a training and change its parameters a little."""
@@ -89,9 +113,9 @@ def compare(capture: Capture, word: str) -> dict[str, list[float]]:
     recipe, _, how = word.partition(":")
     cfg = short(recipe)
     cfg: Train = replace(cfg, growth=replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=10**6)))
-    on_cuda, on_cpu = GsplatRasterizer(antialias=cfg.antialias), CpuRasterizer(antialias=cfg.antialias)
+    on_cuda, on_cpu = GsplatRasterizer(antialias=cfg.antialias), Watched(antialias=cfg.antialias)
     plain = Steps(begin(cfg, capture, "cpu"), capture, "cpu", on_cpu)
-    found: dict[str, list[float]] = {"losses": [], "gradients": []}
+    found: dict[str, list[float]] = {"losses": [], "gradients": [], "close": []}
     if how == "alone":
         alone = Steps(begin(cfg, capture, "cuda"), capture, "cuda", on_cuda)
         found["losses"] = [abs(alone.take() / plain.take() - 1) for _ in range(TEN)]
@@ -102,6 +126,7 @@ def compare(capture: Capture, word: str) -> dict[str, list[float]]:
         state = torch.get_rng_state()
         found["losses"].append(abs(same.take() / loss - 1))
         found["gradients"].append(measure(same.gradients, plain.gradients))
+        found["close"].append(Watched.close)
         torch.set_rng_state(state)
     return found
 
