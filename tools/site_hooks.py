@@ -70,9 +70,21 @@ def on_page_markdown(markdown: str, page: Any, files: Files, **_: Any) -> str:
         return f"{markdown}\n\n{recipes()}"
     parts, last = [], 0
     for fence in FENCE.finditer(markdown):
-        parts += [LINK.sub(follow, markdown[last : fence.start()]), fence[0]]
+        text = list_arrows(fence[0]) if fence[0].startswith("```mermaid") else fence[0]
+        parts += [LINK.sub(follow, markdown[last : fence.start()]), text]
         last = fence.end()
     return "".join([*parts, LINK.sub(follow, markdown[last:])])
+
+
+def list_arrows(diagram: str) -> str:
+    """Return a Mermaid flowchart as a table: drawing it would need a script from elsewhere."""
+    rows = []
+    for line in diagram.splitlines():
+        left, arrow, right = line.partition("-->")
+        if arrow:
+            names = [re.sub(r'^\w+\["(.*)"\]$', r"\1", name.strip()) for name in (left, *right.split("&"))]
+            rows.append(f"| {names[0]} | {', '.join(names[1:])} |")
+    return "\n".join(["| room | imports |", "|---|---|", *rows])
 
 
 def find(path: str, files: Files) -> str | None:
