@@ -70,7 +70,7 @@ def read(path: Path) -> Splats:
         if done.returncode == DAMAGED:
             raise Damaged(shorten(done.stdout))
         if done.returncode or not archive.is_file():
-            raise Damaged("content that OpenUSD cannot read within its limits")
+            raise Damaged("content that OpenUSD cannot read")
         with np.load(archive) as data:
             found = [_prim(source, data, i) for i in range(int(data["count"]))]
         coefficients = min(part[4].shape[1] for part in found)
