@@ -23,6 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 REQUIREMENTS = ("build", "ziglang", "auditwheel", "wheel", "scikit-build-core", "cmake", "ninja")
+EXPORTED = b"se_abi_version"  # a name that every library exports
 GLIBC = 28  # oldest C library of Linux, 2.28: RHEL 8, Debian 10, Ubuntu 20.04
 X86, ARM = ("avx512", "avx2", "portable"), ("portable",)  # instruction sets, as native/library.py names them
 
@@ -126,7 +127,7 @@ def check(wheel: Path, target: Target) -> str:
             place, code = target.machine
             if target.magic == DOS:
                 place += int.from_bytes(data[60:64], "little")
-            if not data.startswith(target.magic) or data[place : place + len(code)] != code:
+            if not data.startswith(target.magic) or data[place : place + len(code)] != code or EXPORTED not in data:
                 sys.exit(f"expected a library for {target.tag} in {name} of {wheel.name}, found another")
     said = f"{wheel.name}: {wheel.stat().st_size / 1e6:.2f} MB, {len(found)} libraries"
     if target.system == "Linux":
