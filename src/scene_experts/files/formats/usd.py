@@ -30,7 +30,7 @@ from scene_experts.files.formats.usd_worker import COEFFICIENTS, DAMAGED, MISSIN
 from scene_experts.files.registry import Format
 
 LONGEST = 3600  # seconds that a file may take to be written
-_LOADED = 4 << 30  # bytes of addresses that usd-core and its threads reserve
+_LOADED = 1 << 30  # bytes of addresses that Python, NumPy and usd-core reserve with one thread
 _STARTING = 60  # seconds that usd-core may take to start on a busy machine, beside the time limit of a file
 
 
@@ -71,6 +71,7 @@ def read(path: Path) -> Splats:
             raise Damaged(shorten(done.stdout))
         if done.returncode or not archive.is_file():
             raise Damaged("content that OpenUSD cannot read")
+        source.spend_bytes(3 * archive.stat().st_size)  # float32, and float64 beside it
         with np.load(archive) as data:
             found = [_prim(source, data, i) for i in range(int(data["count"]))]
         coefficients = min(part[4].shape[1] for part in found)
@@ -108,7 +109,7 @@ def _work(task: str, source: Path, target: Path, seconds: int, *limits: str) -> 
     roots = [str(Path(root).parent) for root in scene_experts.__path__]
     paths = os.pathsep.join([*roots, *filter(None, [os.environ.get("PYTHONPATH")])])
     command = [sys.executable, "-m", "scene_experts.files.formats.usd_worker", task, str(source), str(target), *limits]
-    environment = os.environ | {"PYTHONPATH": paths, "PXR_WORK_THREAD_LIMIT": "1"}
+    environment = os.environ | {"PYTHONPATH": paths, "PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     try:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", timeout=seconds, check=False)
     except subprocess.TimeoutExpired:
