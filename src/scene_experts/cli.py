@@ -11,6 +11,7 @@ from scene_experts import commands
 from scene_experts.arguments.parse import HelpAsked
 from scene_experts.commands import COMMANDS, PROG
 from scene_experts.core.errors import InputError, RunError, nearest
+from scene_experts.core.reading.source import sentence
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,10 +48,10 @@ def dispatch(args: list[str]) -> int:
         print(help_)
         return 0
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {sentence(error)}", file=sys.stderr)
         return 2
     except RunError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {sentence(error)}", file=sys.stderr)
         return 1
     except BrokenPipeError:
         raise

@@ -206,7 +206,7 @@ def train(
         RunError: A loss is not finite, or a file cannot be written.
     """
     trainer = Trainer(method, capture, out, **settings)
-    console = Console(highlight=False, quiet=not progress)
+    console = Console(markup=False, highlight=False, quiet=not progress)
     with saved_on_interrupt(trainer, out is not None), TrainingProgress(console) as show:
         for event in trainer:
             show(event)

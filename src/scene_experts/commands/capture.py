@@ -44,7 +44,7 @@ def capture(args: list[str]) -> int:
     from scene_experts.sfm.reconstruct import reconstruct
     from scene_experts.training.progress import ProgressBar
 
-    console = Console(highlight=False)
+    console = Console(markup=False, highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
     with handled(interrupt), ProgressBar(console) as bar:
         note = reconstruct(command.photos, command.out, command.options, overwrite=command.overwrite, say=say, progress=bar)

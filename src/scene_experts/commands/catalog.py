@@ -42,7 +42,7 @@ class DownloadCommand:
 def download(args: list[str]) -> int:
     command = parse(DownloadCommand, Command(f"{PROG} download", ("--scenes",)), args)
     root = command.to or captures_dir()
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(markup=False, highlight=False, soft_wrap=True)
     scenes = select(command.scenes)
     if command.list:
         console.print(table(scenes or SCENES, root))
@@ -78,7 +78,7 @@ class CatalogCommand:
 
 def catalog(args: list[str]) -> int:
     command = parse(CatalogCommand, Command(f"{PROG} catalog", ("--scenes",)), args)
-    root, console = command.to or captures_dir(), Console(highlight=False, soft_wrap=True)
+    root, console = command.to or captures_dir(), Console(markup=False, highlight=False, soft_wrap=True)
     scenes = select(command.scenes)
     if not scenes:
         console.print(table(SCENES, root))

@@ -50,7 +50,7 @@ def evaluate(args: list[str]) -> int:
     group.leave()
     if not group.first:
         return 0
-    print_results(results, Console(highlight=False), command.run)
+    print_results(results, Console(markup=False, highlight=False), command.run)
     if not command.options.suffix:  # the page shows the held-out views
         print(f"wrote {page.write([command.run])}")
     return 0
@@ -75,5 +75,5 @@ def compare(args: list[str]) -> int:
 
     from scene_experts.evaluate.tables import compare_runs
 
-    compare_runs(command.runs, command.format, command.mixed, Console(highlight=False))
+    compare_runs(command.runs, command.format, command.mixed, Console(markup=False, highlight=False))
     return 0

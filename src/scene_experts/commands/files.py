@@ -78,7 +78,7 @@ def export(args: list[str]) -> int:
     if bakes:
         reuse_freed()
     line = shlex.join([PROG, "export", *args])
-    with ProgressBar(Console(stderr=True)) if bakes else nullcontext() as bar:
+    with ProgressBar(Console(stderr=True, markup=False)) if bakes else nullcontext() as bar:
         tell = bar or (lambda *_: None)
         if command.hub is not None:
             chosen = () if command.format == ExportCommand.format else command.format

@@ -19,7 +19,7 @@ def info(args: list[str]) -> int:
     from scene_experts.data.summary import print_summary
     from scene_experts.training import run_folder
 
-    console = Console(highlight=False)
+    console = Console(markup=False, highlight=False)
     capture = run_folder.load_capture(run_folder.named(data), look=True)
     print_summary(capture, console)
     lens = capture.images.sources[0].lens
@@ -39,4 +39,4 @@ def doctor(args: list[str]) -> int:
 
     from scene_experts.commands import doctor as checks
 
-    return checks.run(Console(highlight=False))
+    return checks.run(Console(markup=False, highlight=False))

@@ -65,7 +65,7 @@ def render(args: list[str]) -> int:
         if command.save_path:
             film.write_path(command.save_path)
         out = command.out or command.run / "renders" / f"{Path(command.options.path).stem}.mp4"
-        with ProgressBar(Console(stderr=True)) as tell:
+        with ProgressBar(Console(stderr=True, markup=False)) as tell:
             count = film.write(out, rasterize, device, tell)
     finally:
         capture.images.close()

@@ -29,6 +29,6 @@ def reproduce(args: list[str]) -> int:
 
     from scene_experts.reproduce.session import reproduce as run
 
-    console = Console(highlight=False)
+    console = Console(markup=False, highlight=False)
     complete = run(options, lambda text: console.print(text, soft_wrap=True, markup=False))
     return 0 if complete else 130

@@ -115,7 +115,7 @@ def train(args: list[str]) -> int:
     command = after_restart(replace(command, viewer=command.viewer and group.first), group)
     line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # the command of the whole run
     command, run, capture, rasterize = group.agree(lambda: prepare(command, line, group))
-    console = Console(highlight=False, quiet=not group.first)
+    console = Console(markup=False, highlight=False, quiet=not group.first)
     for warning in capture.warnings if group.first else ():
         print(f"warning: {warning}", file=sys.stderr)
     what = f"{command.cfg.recipe} on {capture.name} ({len(capture.train)} training views, {len(capture.test)} held out)"

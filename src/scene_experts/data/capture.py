@@ -13,7 +13,7 @@ import torch
 from scene_experts.core.errors import InputError, nearest
 from scene_experts.core.reading.budget import CAPTURE
 from scene_experts.core.reading.numbers import FARTHEST, expect_range, number
-from scene_experts.core.reading.source import guarding
+from scene_experts.core.reading.source import guarding, sentence
 from scene_experts.core.types import Camera
 from scene_experts.data import prepare
 from scene_experts.data.images import FrameSource, check_policy, probe
@@ -207,4 +207,4 @@ def _finish(capture: Capture) -> Capture:
         notes.append(f"views of {len(sizes)} sizes")
     if capture.points is not None and len(capture.points.xyz) < 500:
         notes.append(f"only {len(capture.points.xyz)} points to start from")
-    return replace(capture, views=views, warnings=tuple(notes))
+    return replace(capture, views=views, warnings=tuple(map(sentence, notes)))  # they quote names of files

@@ -8,8 +8,10 @@ from typing import Any
 import torch
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 from torch import Tensor
 
+from scene_experts.core.reading.source import sentence
 from scene_experts.data.views import Capture
 from scene_experts.geometry.neighbours import median_neighbour_distance
 
@@ -72,10 +74,10 @@ def print_summary(capture: Capture, console: Console) -> None:
     table.add_column(overflow="fold")
     for key, value in summarise(capture).items():
         if key != "warnings":
-            table.add_row(key.replace("_", " "), format_value(value))
+            table.add_row(key.replace("_", " "), Text(sentence(format_value(value))))
     console.print(table)
     for warning in capture.warnings:
-        console.print(f"warning: {warning}", style="yellow", soft_wrap=True)
+        console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
 
 
 def format_value(value: object) -> str:

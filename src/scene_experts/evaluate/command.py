@@ -39,7 +39,7 @@ def evaluate_run(
     capture = group.agree(lambda: run_folder.capture_of(opened, data))
     facts: dict[str, Any] = {"step": opened.step, "about": about(opened), "group": group}
     try:
-        with ProgressBar(Console(stderr=True, quiet=not group.first)) as tell:
+        with ProgressBar(Console(stderr=True, markup=False, quiet=not group.first)) as tell:
             return evaluate(opened.scene, capture, rasterize, run, options, **facts, progress=tell)
     finally:
         capture.images.close()

@@ -172,7 +172,7 @@ def find_outdated(names: Sequence[str], runs: Sequence[Path], results: Sequence[
     """Return a sentence for each run that was trained further after it was scored."""
     out = []
     for name, run, found in zip(names, runs, results):
-        newest = max((int(p.stem[5:]) for p in (run / "checkpoints").glob("ckpt_*.safetensors") if p.stem[5:].isdigit()), default=0)
+        newest = max((int(p.stem[5:]) for p in (run / "checkpoints").glob("ckpt_*.safetensors") if p.stem[5:].isdecimal()), default=0)
         if newest > (found.get("step") or newest):
             out.append(f"{name} was scored at iteration {found['step']:,} and is at {newest:,} now: run `scene-experts eval {run}` again")
     return out

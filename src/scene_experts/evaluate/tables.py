@@ -18,6 +18,8 @@ from rich.text import Text
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json
+from scene_experts.core.reading.budget import RUN
+from scene_experts.core.reading.source import guarding, sentence
 from scene_experts.evaluate.results import check_protocol, describe_failed, find_outdated, load_results
 
 Format = Literal["table", "markdown", "csv"]
@@ -125,7 +127,7 @@ def _explain_absent(names: Sequence[str], results: Sequence[dict[str, Any]]) -> 
                 known.append(metric)
     lacking = {reason: [n for n, r in zip(names, results) if reason in (r.get("absent") or {}).values()] for reason in reasons}
     where = {reason: "" if len(of) == len(results) else f" of {', '.join(of)}" for reason, of in lacking.items()}
-    return tuple(f"{', '.join(metrics)}{where[reason]} absent: {reason}" for reason, metrics in reasons.items())
+    return tuple(sentence(f"{', '.join(metrics)}{where[reason]} absent: {reason}") for reason, metrics in reasons.items())
 
 
 def to_markdown(table: ResultTable) -> str:
@@ -175,7 +177,7 @@ def _measure_width(table: ResultTable) -> int:
 
 def name_runs(runs: Sequence[Path], results: Sequence[dict[str, Any]]) -> list[str]:
     """Return a distinct name for each run from the recipe in its results, see `distinguish_runs`."""
-    return distinguish_runs(runs, [str(result.get("recipe") or run.name) for run, result in zip(runs, results)])
+    return distinguish_runs(runs, [sentence(result.get("recipe") or run.name) for run, result in zip(runs, results)])
 
 
 def distinguish_runs(runs: Sequence[Path], recipes: Sequence[str]) -> list[str]:
@@ -193,18 +195,20 @@ def compare_runs(runs: Sequence[Path], format: Format, mixed: bool, console: Con
     """
     if not runs:
         raise InputError("expected at least one run folder, found none; give the folders that `scene-experts train --out` wrote")
-    results = [load_results(Path(run)) for run in runs]
-    names = name_runs([Path(run) for run in runs], results)
-    if not mixed:
-        check_protocol(names, results)
-    else:
-        names = [f"{name} on {result.get('capture')}, {result.get('resolution')}" for name, result in zip(names, results)]
-    published = paper_results(paper) if paper else {}
-    made = make_table([*names, *published], [*results, *published.values()])
-    made = replace(made, notes=(*made.notes, *find_outdated(names, [Path(run) for run in runs], results)))
-    if format == "table":
+    with guarding(runs[0] if len(runs) == 1 else "one of the runs", RUN):  # the files of a run may hold anything
+        results = [load_results(Path(run)) for run in runs]
+        names = name_runs([Path(run) for run in runs], results)
         if not mixed:
-            console.print(_describe_protocol(results[0]), markup=False, soft_wrap=True)
+            check_protocol(names, results)
+        else:
+            names = [sentence(f"{name} on {result.get('capture')}, {result.get('resolution')}") for name, result in zip(names, results)]
+        published = paper_results(paper) if paper else {}
+        made = make_table([*names, *published], [*results, *published.values()])
+        made = replace(made, notes=(*made.notes, *find_outdated(names, [Path(run) for run in runs], results)))
+        protocol = "" if mixed else _describe_protocol(results[0])
+    if format == "table":
+        if protocol:
+            console.print(protocol, markup=False, soft_wrap=True)
         console.print(to_rich(made, console.width), crop=False)
         for note in made.notes:
             console.print(note, markup=False, soft_wrap=True)
@@ -240,7 +244,8 @@ def print_results(results: dict[str, Any], console: Console, run: Path) -> None:
 def _describe_protocol(results: dict[str, Any]) -> str:
     """Return what was scored, in words."""
     part = "right halves of " if results.get("appearance") == "half" else ""
-    return f"{results['capture']}: {part}{results['view_count']} {results['views']} views ({results['split']}), {results['resolution']}"
+    views = f"{part}{results['view_count']} {results['views']} views"
+    return sentence(f"{results['capture']}: {views} ({results['split']}), {results['resolution']}")
 
 
 @cache

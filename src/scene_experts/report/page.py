@@ -206,7 +206,7 @@ def show_strips(s: Source) -> str:
     if k is None:
         how = "the anchors where each expert's gate is the largest, rendered alone; the mixture is dense"
     view = escape(next(iter(s.per_view), "a held-out view"))
-    return f"<p><b>{escape(s.name)}</b>, {view}: <span class='soft'>{how}.</span></p>{images[0]}{folded}"
+    return f"<p><b>{escape(s.name)}</b>, {view}: <span class='soft'>{escape(how)}.</span></p>{images[0]}{folded}"
 
 
 def format_scores(sources: Sequence[Source]) -> str:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from PIL import Image, ImageOps
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.reading.budget import CAPTURED
+from scene_experts.core.reading.pictures import opening_picture
 from scene_experts.data.images import to_mask
 from scene_experts.data.match import find_mask
 from scene_experts.sfm.photos import Photo
@@ -46,7 +47,7 @@ def find_photo_mask(photo: Photo, images: Path) -> Path | None:
 
 def has_alpha(path: Path) -> bool:
     """Return whether an image has an alpha channel or a transparent colour."""
-    with Image.open(path) as image:
+    with opening_picture(path, CAPTURED, heic=True) as image:
         return "A" in image.getbands() or "transparency" in image.info
 
 
@@ -55,11 +56,8 @@ def read_mask(path: Path, photo: Photo) -> Image.Image:
 
     A mask that is upright although EXIF rotates its photograph is rotated back. Raises InputError if the file is unreadable.
     """
-    try:
-        with Image.open(path) as image:
-            mask = to_mask(image)
-    except (OSError, ValueError, SyntaxError) as error:
-        raise InputError(f"cannot read the mask {path}: {error}; replace or remove it") from error
+    with opening_picture(path, CAPTURED) as image:
+        mask = to_mask(image)
     width, height = photo.size
     if photo.orientation in (5, 6, 7, 8) and (mask.width > mask.height) != (width > height):
         mask.getexif()[0x0112] = {6: 8, 8: 6}.get(photo.orientation, photo.orientation)
@@ -69,7 +67,7 @@ def read_mask(path: Path, photo: Photo) -> Image.Image:
 
 def read_alpha(path: Path) -> Image.Image:
     """Return the alpha channel of a photograph as a mask. It is white if there is no alpha channel."""
-    with Image.open(path) as image:
+    with opening_picture(path, CAPTURED, heic=True) as image:
         return image.convert("RGBA").getchannel("A").point(binarise) if has_alpha(path) else Image.new("L", image.size, 255)
 
 

@@ -14,6 +14,8 @@ from PIL import Image, ImageOps
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json, write_atomic, write_json
+from scene_experts.core.reading.budget import CAPTURED
+from scene_experts.core.reading.pictures import opening_picture
 from scene_experts.data.images import to_8_bit
 from scene_experts.data.match import EXTENSIONS
 
@@ -22,6 +24,7 @@ UNSUPPORTED = (".dng", ".cr2", ".cr3", ".nef", ".arw")  # photographs that Pillo
 HEIC = (".heic", ".heif")  # read with pillow-heif, if it is installed
 COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "BMP", "TIFF")  # what COLMAP reads
 MASK_ENDINGS = (".mask.png", "_mask.png")  # after the stem of a photograph in the same folder
+_LONGEST_FACT = 256  # characters of what EXIF says about a camera
 COPIED = "copied.json"
 _MAKE, _MODEL, _ORIENTATION, _EXIF, _FOCAL, _LENS = 0x010F, 0x0110, 0x0112, 0x8769, 0x920A, 0xA434
 
@@ -128,22 +131,20 @@ def inspect_photo(folder: Path, name: str, mask: str) -> Photo:
         name.encode()
     except UnicodeEncodeError:
         raise InputError(f"expected names in UTF-8 in {folder}, found {name!r}; rename the file") from None
-    try:
-        with Image.open(path) as image:
-            size, deep = image.size, is_deep(image)
-            readable, lossless = image.format in COLMAP_FORMATS and not deep, "A" in image.getbands() or deep
-            exif = image.getexif()
-            inner = exif.get_ifd(_EXIF)
-            image.draft(None, (max(1, size[0] // 8), max(1, size[1] // 8)))
-            image.load()
-    except (OSError, ValueError, SyntaxError, RuntimeError, Image.DecompressionBombError) as error:
-        raise InputError(f"cannot read the photograph {path}: {error}; replace or remove it") from error
-    camera = (exif.get(_MAKE), exif.get(_MODEL), inner.get(_LENS), inner.get(_FOCAL))
-    orientation = exif.get(_ORIENTATION, 1)
+    with opening_picture(path, CAPTURED, heic=True) as image:
+        size, deep = image.size, is_deep(image)
+        readable, lossless = image.format in COLMAP_FORMATS and not deep, "A" in image.getbands() or deep
+        exif = image.getexif()
+        inner = exif.get_ifd(_EXIF)
+        image.draft(None, (max(1, size[0] // 8), max(1, size[1] // 8)))
+        image.load()
+        facts = (exif.get(_MAKE), exif.get(_MODEL), inner.get(_LENS), inner.get(_FOCAL))
+        camera = tuple(str(value).strip()[:_LONGEST_FACT] for value in facts) if any(facts) else ()
+        orientation = exif.get(_ORIENTATION, 1)
     return Photo(
         name,
         size,
-        tuple(str(value).strip() for value in camera) if any(camera) else (),
+        camera,
         orientation if orientation in range(1, 9) else 1,
         "" if readable else ".png" if lossless else ".jpg",
         file_stamp(path) + (file_stamp(folder / mask) if mask else ()),
@@ -211,7 +212,7 @@ def transfer(old: Path, new: Path, orientation: int, suffix: str = "") -> None:
     if orientation == 1 and not suffix:
         write_atomic(new, lambda temporary: shutil.copyfile(old, temporary))
         return
-    with Image.open(old) as image:
+    with opening_picture(old, CAPTURED, heic=True) as image:
         form = {".jpg": "JPEG", ".png": "PNG"}.get(suffix) or ("JPEG" if image.format == "MPO" else image.format)
         image.getexif()[_ORIENTATION] = orientation  # that of the photograph, for its mask too
         upright = ImageOps.exif_transpose(image)

@@ -43,7 +43,7 @@ def explain(what: str, step: int, folder: Path | None) -> str:
 
     folder: Folder of the checkpoints; None if nothing is saved.
     """
-    saved = [int(digits) for path in (folder or Path()).glob("ckpt_*.safetensors") if folder and (digits := path.stem[5:]).isdigit()]
+    saved = [int(digits) for path in (folder or Path()).glob("ckpt_*.safetensors") if folder and (digits := path.stem[5:]).isdecimal()]
     kept = f"the checkpoint of iteration {max(saved)} is intact" if saved else "nothing was saved yet"
     return (
         f"expected finite numbers, found NaN or infinity in {what} at iteration {step}; {kept}: "

@@ -288,6 +288,6 @@ def at_step(folder: Path, step: int) -> tuple[dict[str, Tensor], dict[str, Any]]
     """Load the tensors and metadata of the checkpoint at a step. Raises InputError if there is none."""
     path = folder / f"ckpt_{step:06d}.safetensors"
     if not path.is_file():
-        kept = ", ".join(str(int(p.stem[5:])) for p in sorted(folder.glob("ckpt_*.safetensors")) if p.stem[5:].isdigit()) or "none"
+        kept = ", ".join(str(int(p.stem[5:])) for p in sorted(folder.glob("ckpt_*.safetensors")) if p.stem[5:].isdecimal()) or "none"
         raise InputError(f"expected a checkpoint at step {step} in {folder}, found {kept}; give one of those, or leave --step out")
     return checkpoint.load(path)

@@ -7,6 +7,7 @@ import pytest
 
 from scene_experts import cli, commands
 from scene_experts.core.errors import InputError, RunError, few, nearest
+from scene_experts.core.reading.source import sentence
 
 
 @pytest.mark.parametrize(
@@ -48,3 +49,9 @@ def test_a_word_like_a_known_one_is_hinted_at():
 
 def test_of_many_names_the_first_are_told():
     assert few(["a", "b", "c"]) == "a, b, c" and few(["a", "b", "c", "d"]) == "a, b, c and 1 more" and few([], 8) == ""
+
+
+def test_a_sentence_shows_on_every_terminal():
+    assert sentence("expected a  file") == "expected a  file"
+    hostile = sentence("a\nb\x1b]0;title\x07\ud800\u202e" + "x" * 9000)
+    assert hostile.isprintable() and len(hostile) <= 2000

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from scene_experts.data.capture import load
 from scene_experts.data.summary import format_value, neighbour_distance, print_summary, summarise
-from support.synthetic import make_capture
+from support.synthetic import make_capture, make_nerfstudio
 
 
 def test_counts_sizes_and_a_capture_without_points(tmp_path):
@@ -56,4 +56,16 @@ def test_one_fact_a_row_then_the_warnings_on_one_line_each(tmp_path):
     rows = out.getvalue().splitlines()
     assert ["views", "6"] in [row.split() for row in rows] and rows[-1] == f"warning: {long}"
     assert not any(row.startswith("warnings") for row in rows)
+    capture.images.close()
+
+
+def test_names_in_a_capture_neither_steer_the_terminal_nor_fail_as_markup(tmp_path):
+    folder = make_nerfstudio(tmp_path, views=4, size=(48, 32), points=40).folder
+    meta = json.loads((folder / "transforms.json").read_text())
+    meta["frames"][0]["file_path"] = "images/[/red]\x1b]0;title\x07\ud800.png"
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    out = io.StringIO()
+    capture = load(folder)
+    print_summary(replace(capture, name="[/red]\x1b[2J"), Console(file=out, width=200))
+    assert "\x1b" not in out.getvalue() and "\ud800" not in out.getvalue() and out.getvalue().count("[/red]") == 2
     capture.images.close()

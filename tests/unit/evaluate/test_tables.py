@@ -189,3 +189,34 @@ def test_rows_are_called_anchors_or_gaussians() -> None:
 def test_scores_of_training_views_are_named_as_such() -> None:
     assert tables.make_table(["a"], [results("moe-gs", 30.0, views="train")]).titles[1] == "training PSNR"
     assert tables.make_table(["a"], [results("moe-gs", 30.0)]).titles[1] == "PSNR"
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"ssim": "x"},
+        {"size": {"MB": {}}},
+        {"views": None, "view_count": []},
+        {"absent": 3},
+        {"absent": {"lpips": []}},
+        {"step": True},
+        {"fps": {"fps": [1]}},
+    ],
+)
+def test_results_of_other_types_end_in_a_table_or_one_sentence(runs: list[Path], other: dict[str, Any]) -> None:
+    value = results("moe-gs", 20.0, **other)
+    (runs[0] / "results.json").write_text(json.dumps({k: v for k, v in value.items() if v is not None}))
+    try:
+        printed(runs[:1])
+    except InputError as error:
+        assert str(runs[0]) in str(error) and "\n" not in str(error)
+
+
+def test_texts_of_results_cannot_steer_a_terminal(runs: list[Path]) -> None:
+    hostile = "\x1b]0;title\x07[/red]\ud800"
+    value = results(hostile, 20.0, capture=hostile, resolution=hostile, absent={hostile: hostile})
+    (runs[0] / "results.json").write_text(json.dumps(value))
+    for format in ("table", "markdown", "csv"):
+        for mixed in (False, True):
+            text = printed(runs[:1], format, mixed)
+            assert "\x1b" not in text and "\ud800" not in text and "[/red]" in text

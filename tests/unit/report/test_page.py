@@ -131,3 +131,16 @@ def test_scores_are_explained_and_views_that_fail_are_named(tmp_path):
     assert "class='warn'" in text and f"{name} (8.0 dB)" in text and "<tr class=fails>" in text
     many = write([make_run(tmp_path / str(i)) for i in range(4)], tmp_path / "many.html").read_text()
     assert "<dl class=terms>" in many and "<main>" in many
+
+
+def test_no_text_of_a_run_becomes_code_of_the_page(tmp_path):
+    folder, code = make_run(tmp_path), "<script>alert(1)</script>"
+    results = json.loads((folder / "results.json").read_text())
+    shares = {"share": [0.5, 0.5], "k": code}
+    said = dict.fromkeys(("capture", "views", "view_count", "split", "resolution", "recipe"), code)
+    write_json(folder / "results.json", {**results, **said, "absent": {code: code}, "experts": {"color": shares}})
+    views = json.loads((folder / "per_view.json").read_text())
+    write_json(folder / "per_view.json", {f"{name}{code}": facts for name, facts in views.items()})
+    (folder / "test" / "experts").mkdir()
+    Image.new("RGB", (64, 16)).save(folder / "test" / "experts" / "color.png")
+    assert code not in write([folder]).read_text()

@@ -150,3 +150,14 @@ def test_a_changed_mask_is_copied_again(tmp_path):
         copy_photos(find_photos(source), source, target)
         with Image.open(target / "0_mask.png") as mask:
             assert mask.getextrema() == (value, value)
+
+
+@pytest.mark.parametrize("form", ["EPS", "PCX", "TGA"])
+def test_only_known_decoders_see_photographs(tmp_path, form, monkeypatch):
+    """Pillow would run Ghostscript for an EPS file that is called a.png."""
+    monkeypatch.setattr("subprocess.check_call", lambda *a, **k: pytest.fail("a program was started"))
+    for name in "bc":
+        write_photo(tmp_path / f"{name}.png")
+    Image.new("RGB", (64, 48)).save(tmp_path / "a.png", form)
+    with pytest.raises(InputError, match=r"a\.png"):
+        find_photos(tmp_path)

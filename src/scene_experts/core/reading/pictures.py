@@ -15,17 +15,20 @@ from scene_experts.core.reading.source import Source, opening
 
 FORMATS = ("BMP", "GIF", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
 """The formats that are read, by their content. Pillow's others are not: each decoder is a way in."""
+HEIC = "HEIF"  # read too where pillow-heif has registered it, by those who pass `heic`
 SIDE_LIMIT = 1 << 17  # px
 _STORED = 4  # bytes per pixel in Pillow's memory, at most
 
 
 @contextmanager
-def opening_picture(path: Path, budget: Budget = budgets.PICTURE) -> Iterator[Image.Image]:
+def opening_picture(path: Path, budget: Budget = budgets.PICTURE, heic: bool = False) -> Iterator[Image.Image]:
     """Open the picture at `path` without decoding it. The block decodes it.
 
+    `heic` admits HEIC photographs where pillow-heif reads them.
     Raises InputError if it is absent, damaged, of another format or beyond the budget, or if the block fails.
     """
-    with opening(path, budget) as source, source.stream() as stream, Image.open(stream, formats=FORMATS) as image:
+    formats = (*FORMATS, HEIC) if heic and HEIC in Image.OPEN else FORMATS
+    with opening(path, budget) as source, source.stream() as stream, Image.open(stream, formats=formats) as image:
         check_size(source, image)
         yield image
 

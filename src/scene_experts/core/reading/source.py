@@ -93,9 +93,8 @@ def guarding(path: Path | str, budget: Budget, what: str | None = None) -> Itera
     try:
         yield
     except InputError as error:
-        text = str(error)
-        if len(text) > _LONGEST_SENTENCE or not text.isprintable():  # it quotes the file
-            raise InputError(shorten(text, _LONGEST_SENTENCE)) from error
+        if (text := sentence(error)) != str(error):  # it quotes the file
+            raise InputError(text) from error
         raise
     except RunError:
         raise
@@ -130,6 +129,12 @@ def describe(error: BaseException) -> str:
     if isinstance(error, Damaged):
         return text
     return f"content that does not fit together ({text or type(error).__name__})"
+
+
+def sentence(text: object) -> str:
+    """Return a message in a form that a terminal can show: as it is, or `shorten`ed if it is very long or quotes unprintable characters."""
+    line = str(text)
+    return line if line.isprintable() and len(line) <= _LONGEST_SENTENCE else shorten(line, _LONGEST_SENTENCE)
 
 
 def shorten(text: str, most: int = _LONGEST) -> str:

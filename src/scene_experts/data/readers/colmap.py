@@ -74,7 +74,7 @@ def _other_reconstructions(place: Path) -> list[str]:
     """Return a warning if COLMAP split the photographs into several reconstructions."""
     if place.name != "0":
         return []
-    others = [p for p in place.parent.iterdir() if p.is_dir() and p.name.isdigit() and p.name != "0"]
+    others = [p for p in place.parent.iterdir() if p.is_dir() and p.name.isdecimal() and p.name != "0"]
     note = f"{place.parent.name}/ holds {len(others) + 1} reconstructions that COLMAP could not join; only 0 is used"
     return [note] if others else []
 
