@@ -113,7 +113,7 @@ def make_card(run: OpenRun, files: Sequence[Written], scores: dict[str, Any], li
         "license": licence,
         "library_name": "scene-experts",
         "pipeline_tag": "image-to-3d",
-        "tags": ["3d", "gaussian-splatting", "novel-view-synthesis", "scene-experts", recipe],
+        "tags": list(dict.fromkeys(["3d", "gaussian-splatting", "novel-view-synthesis", "scene-experts", recipe])),
     }
     if metrics:
         task = {"type": "image-to-3d", "name": "novel view synthesis"}
@@ -123,7 +123,9 @@ def make_card(run: OpenRun, files: Sequence[Written], scores: dict[str, Any], li
     maker = f"scene-experts {scene_experts.__version__}"
     lines += [f"![{scene}]({PREVIEW})", "", f"A 3D scene of Gaussians, trained from photographs by {maker} with"]
     lines += [f"the recipe `{recipe}` for {run.step:,} iterations.", "", "| file | content |", "|---|---|"]
-    lines += [f"| `{file.path.name}` | {file.rows:,} rows, {file.bytes / 1e6:.1f} MB |" for file in files]
+    kinds = {".compact": f"{run.scene.traits.rows} with their networks"}
+    named = [(file, kinds.get(file.path.suffix, "Gaussians")) for file in files]
+    lines += [f"| `{file.path.name}` | {file.rows:,} {kind}, {file.bytes / 1e6:.1f} MB |" for file, kind in named]
     lines += ["", "## Open it", "", "```sh", "pip install scene-experts"]
     lines += ["# CAPTURE: folder of its photographs with poses; the run can be drawn, scored and converted"]
     lines += [f"scene-experts import {files[0].path.name} --data CAPTURE --out RUN"]

@@ -28,13 +28,24 @@ def front_matter(card):
 def test_the_card_states_licence_tags_scores_and_files(tmp_path):
     train = SimpleNamespace(recipe="moe-gs")
     run = SimpleNamespace(config=SimpleNamespace(train=train, data=SimpleNamespace(path=tmp_path / "banana")), step=2000)
+    run.scene = SimpleNamespace(traits=SimpleNamespace(rows="anchors"))
     files = [Written(tmp_path / "scene.compact", 3_000_000, 400, ()), Written(tmp_path / "scene.spz", 900_000, 4000, ())]
     scores = {"psnr": 27.25, "ssim": 0.9, "lpips": None, "view_count": 2, "split": "mod8", "resolution": "longest:800"}
     head, body = front_matter(hub.make_card(run, files, scores, "mit", ["CAPTURE_LICENSE"]))  # type: ignore[arg-type]
     assert head["license"] == "mit" and {"gaussian-splatting", "moe-gs"} <= set(head["tags"])
     metrics = head["model-index"][0]["results"][0]["metrics"]
     assert {m["type"]: m["value"] for m in metrics} == {"psnr": 27.25, "ssim": 0.9}
-    for fact in ("scene.compact", "scene.spz", hub.PREVIEW, "scene-experts import", "2 held-out views", "CAPTURE_LICENSE", "2,000"):
+    for fact in (
+        "scene.compact",
+        "scene.spz",
+        hub.PREVIEW,
+        "scene-experts import",
+        "2 held-out views",
+        "400 anchors",
+        "4,000 Gaussians",
+        "CAPTURE_LICENSE",
+        "2,000",
+    ):
         assert fact in body
     head, body = front_matter(hub.make_card(run, files, {}, hub.UNKNOWN, []))  # type: ignore[arg-type]
     assert "model-index" not in head and head["license"] == "unknown" and "not stated" in body
