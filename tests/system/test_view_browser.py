@@ -35,8 +35,13 @@ def settled(page, viewer, seconds=30.0) -> np.ndarray:
     end = time.monotonic() + seconds
     while time.monotonic() < end and not (viewer.clients and all(c.full for c in viewer.clients.values())):
         page.wait_for_timeout(200)
+    take = lambda: np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))  # noqa: E731
     page.wait_for_timeout(2500)
-    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
+    before, shot = None, take()
+    while time.monotonic() < end and (before is None or not np.array_equal(before, shot)):  # the page fades pictures in
+        page.wait_for_timeout(1500)
+        before, shot = shot, take()
+    return shot
 
 
 def test_the_page_shows_our_own_render_and_follows_the_controls(serving, browser, capture):
@@ -45,7 +50,7 @@ def test_the_page_shows_our_own_render_and_follows_the_controls(serving, browser
     shot = settled(page, serving)
     (client,) = serving.clients.values()
     scene, step = serving.current()
-    camera = serving.camera(client)
+    camera = serving.read_camera(client)
     picture = to_8bit(paint(scene, camera, step, DRAW, torch.tensor(serving.panel.read_background())))
     picture = np.asarray(Image.fromarray(picture).resize((960, 540), Image.Resampling.BILINEAR))
     error = ((shot[PART].astype(float) - picture[PART]) ** 2).mean()
