@@ -121,5 +121,6 @@ def turn(splats: Splats, axis: Literal["x", "z"]) -> Splats:
 
 
 def tensor(values: NDArray[Any]) -> torch.Tensor:
-    """A float32 tensor with memory of its own."""
-    return torch.from_numpy(np.array(values, dtype=np.float32, order="C"))
+    """A float32 tensor with memory of its own. Numbers beyond float32 become infinite, which readers refuse."""
+    with np.errstate(over="ignore"):
+        return torch.from_numpy(np.array(values, dtype=np.float32, order="C"))
