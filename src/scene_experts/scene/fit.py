@@ -13,11 +13,12 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from scene_experts.core.reading.budget import Damaged
-from scene_experts.core.reading.numbers import FARTHEST, all_finite, number, whole_number
+from scene_experts.core.reading.numbers import FARTHEST, all_finite, expect_range, number, whole_number
 from scene_experts.scene import Scene, SceneConfig, restore_scene
 
 _CREATE = (torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn)
 
+_MOST_FLOAT32 = torch.finfo(torch.float32).max
 MOST_LEVELS, MOST_FORK = 64, 1024  # of levels of detail
 MOST_STEPS = 1 << 40  # iterations of a training
 
@@ -37,6 +38,10 @@ def check_fit(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[str, A
     for name, value in tensors.items():
         if name.startswith(("params.", "facts.", "network.", "average.")) and not all_finite(value):
             raise Damaged(f"values that are not finite in {name}")
+        if value.is_complex():
+            raise Damaged(f"complex numbers in {name}")
+        if value.dtype == torch.float64:  # it becomes float32
+            expect_range(value, name, -_MOST_FLOAT32, _MOST_FLOAT32)
     if "levels" in meta:
         check_levels(meta["levels"], columns.get("facts.level"))
 

@@ -265,8 +265,8 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     config = read_config(run)
     folder = run / "checkpoints"
     tensors, meta = newest(folder) if step is None else at_step(folder, step)
-    checkpoint.expect(meta, recipe=config.train.recipe)
     with guarding(run, RUN):
+        checkpoint.expect(meta, recipe=config.train.recipe)
         scene = restore_foreign(config.train.scaled_scene(), tensors, meta, averaged=True)
         opened = OpenRun(run, config, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""))
     return replace(opened, scene=scene.to(device))

@@ -46,6 +46,9 @@ def test_columns_that_do_not_fit():
         {"facts.level": level + 99},
         {"facts.level": level - 1 - int(level.min())},
         {"network.heads.opacity.w1": torch.tensor([float("inf")])},
+        {"network.heads.opacity.w1": torch.tensor([1 + 1j])},
+        {"network.heads.opacity.w1": torch.tensor([1e300], dtype=torch.float64)},
+        {"params.feature": tensors["params.feature"].double() + 1e300},
     ):
         with pytest.raises(Damaged):
             check_fit(config, tensors | change, meta)

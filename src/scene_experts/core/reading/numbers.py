@@ -65,12 +65,14 @@ def expect_range(values: NDArray[Any] | Tensor, what: str, low: float = -LARGEST
 def expect_finite_tensors(tensors: Mapping[str, Tensor]) -> None:
     """Raise Damaged, with the name of the tensor, for floating-point values that are not finite."""
     for name, value in tensors.items():
-        if value.is_floating_point() and not all_finite(value):
+        if not all_finite(value):
             raise Damaged(f"values that are not finite in {name}")
 
 
 def all_finite(value: Tensor) -> bool:
     """Return whether all values are finite. It needs no memory of its own for large float32 and float64 tensors."""
+    if value.is_complex():
+        value = torch.view_as_real(value.detach().resolve_conj())
     if not value.numel() or not value.is_floating_point():
         return True
     if value.dtype in (torch.float32, torch.float64):

@@ -29,13 +29,13 @@ def test_single_numbers():
         numbers.whole_number(2.0, "x")
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.float8_e5m2, torch.complex64])
 def test_finite_tensors(dtype):
     good = {"a": torch.ones(3, dtype=dtype), "b": torch.tensor([2**40]), "c": torch.zeros(0)}
     numbers.expect_finite_tensors(good)
     for bad in (float("nan"), float("inf")):
         with pytest.raises(Damaged, match="a"):
-            numbers.expect_finite_tensors(good | {"a": torch.tensor([1, bad], dtype=dtype)})
+            numbers.expect_finite_tensors(good | {"a": torch.tensor([1, bad]).to(dtype)})
 
 
 def test_points_without_a_position_are_dropped(tmp_path, caplog):

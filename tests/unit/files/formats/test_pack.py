@@ -9,7 +9,7 @@ import torch
 from scene_experts.core.reading.budget import SPZ, Damaged
 from scene_experts.core.reading.source import Source
 from scene_experts.files.formats import pack
-from scene_experts.files.formats.pack import morton_order
+from scene_experts.files.formats.pack import morton_order, tensor
 from scene_experts.geometry.rotation import covariance
 from scene_experts.geometry.sh import sh_to_rgb
 from support.messages import naming
@@ -69,3 +69,8 @@ def test_a_permutation_of_near_neighbours():
 def test_none_one_and_equal_places():
     assert morton_order(torch.zeros(0, 3)).tolist() == [] and morton_order(torch.ones(1, 3)).tolist() == [0]
     assert morton_order(torch.ones(5, 3)).tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.filterwarnings("error")
+def test_values_beyond_float32_become_infinite_without_a_warning():
+    assert tensor(np.array([1e300, -1e300, 1.0])).tolist() == [np.inf, -np.inf, 1.0]
