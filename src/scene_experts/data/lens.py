@@ -31,6 +31,7 @@ MODELS: dict[str, tuple[str, ...]] = {
 }
 FISHEYE = frozenset(name for name in MODELS if name.endswith("FISHEYE"))
 _LARGEST, _LONGEST = 1e9, 1 << 20  # of a parameter, and of a side in pixels
+_SHORTEST = 1e-6  # px, of a focal length: powers of shorter ones overflow
 _LARGEST_ANGLE = math.radians(88.0)  # rays further from the axis are not usable on a flat image
 
 
@@ -55,7 +56,7 @@ class Lens:
                 f"expected {len(MODELS[self.model])} parameters for camera model {self.model}, found {len(self.params)}; restore the file"
             )
         fits = all(abs(p) <= _LARGEST for p in self.params) and max(self.width, self.height) <= _LONGEST  # False for NaN
-        if not fits or self.fx <= 0 or self.fy <= 0 or self.width < 1 or self.height < 1:
+        if not fits or self.fx < _SHORTEST or self.fy < _SHORTEST or self.width < 1 or self.height < 1:
             raise InputError(
                 f"expected a camera with a positive size and focal length and finite parameters in range, found {self.model} "
                 f"{self.width:.9g}x{self.height:.9g} {self.params}; remove it or reconstruct the capture again"

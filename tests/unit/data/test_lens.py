@@ -134,3 +134,12 @@ def test_centred_principal_point() -> None:
 def test_bad_lenses(model: str, params: tuple[float, ...], word: str) -> None:
     with pytest.raises(InputError, match=word):
         Lens(model, 8, 8, params)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("model", list(MODELS))
+def test_the_shortest_focal_length_overflows_nothing(model):
+    params = [1e-6 if name in ("f", "fx", "fy") else 8.0 if name in ("cx", "cy") else 0.01 for name in MODELS[model]]
+    to_pinhole(Lens(model, 16, 16, tuple(params)))
+    with pytest.raises(InputError):
+        Lens(model, 16, 16, (1e-15, *params[1:]))
