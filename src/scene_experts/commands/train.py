@@ -35,6 +35,7 @@ from scene_experts.training.events import Exported
 from scene_experts.training.loop import Run
 from scene_experts.training.memory import reuse_freed
 from scene_experts.training.progress import TrainingProgress
+from scene_experts.training.shards import check_shard
 from scene_experts.view.live import Live
 from scene_experts.view.server import check_port, import_viser
 
@@ -91,6 +92,8 @@ class TrainCommand:
     """Stop at this iteration and leave the schedule as it is; --iterations rescales the schedule."""
     deterministic: bool = False
     """Give bit-identical results on the same machine, also after --resume. Slightly slower."""
+    shard: bool = False
+    """Divide the anchors among the processes of torchrun, so that each needs less memory. The results are those without it."""
     device: Device = "auto"
     """Device to train on. auto: CUDA if available."""
     rasterizer: Raster = "auto"
@@ -141,6 +144,8 @@ def prepare(command: TrainCommand, line: str, group: Alone) -> tuple[TrainComman
     run = replace(run_of(command, line), group=group)
     recording.check_settings(run)
     check_batch(command.cfg.batch, group.size)
+    if command.shard:
+        check_shard(command.cfg, command.max_memory, command.viewer)
     reuse_freed()
     device, rasterize = group.in_turn(
         lambda: backend(command.device, command.rasterizer, command.cfg.antialias, command.deterministic),
@@ -156,6 +161,7 @@ def run_of(command: TrainCommand, line: str) -> Run:
         out=command.out,
         resume=command.resume,
         initial=command.init_from,
+        shard=command.shard,
         save_every=command.save_every,
         preview_every=command.preview_every,
         max_memory=command.max_memory,

@@ -35,7 +35,7 @@ class Alone:
     restarts: int = 0
     """How often `torchrun` has restarted the processes."""
     sent: int = 0
-    """Bytes of the tensors that this process has handed to `sum` and `gather`."""
+    """Bytes of the tensors that this process has handed to `sum`, `gather` and `exchange`."""
 
     @property
     def first(self) -> bool:
@@ -48,6 +48,10 @@ class Alone:
     def gather(self, tensor: Tensor) -> list[Tensor]:
         """Return the tensors of all processes in the order of their numbers. They have one shape."""
         return [tensor]
+
+    def exchange(self, parts: list[Tensor]) -> list[Tensor]:
+        """Send `parts[r]` [n, ...] to process r, and return what each process has sent to this one. Only n may differ."""
+        return parts
 
     def gather_values(self, value: T) -> list[T]:
         """Return the Python values of all processes in the order of their numbers."""
@@ -122,6 +126,15 @@ class Group(Alone):
         with self._expecting_all():
             dist.all_gather(out, tensor.contiguous())
         return out
+
+    def exchange(self, parts: list[Tensor]) -> list[Tensor]:
+        counts = [len(part) for part in parts]
+        incoming = [int(count[self.rank]) for count in self.gather(torch.tensor(counts, device=parts[0].device))]
+        out = parts[0].new_empty(sum(incoming), *parts[0].shape[1:])
+        self.sent += sum(p.numel() * p.element_size() for r, p in enumerate(parts) if r != self.rank)
+        with self._expecting_all():
+            dist.all_to_all_single(out, torch.cat(parts), incoming, counts)
+        return list(out.split(incoming))
 
     def gather_values(self, value: T) -> list[T]:
         out: list[Any] = [None] * self.size

@@ -182,6 +182,10 @@ class SceneConfig(Part, ABC):
     def grown_as(self) -> str:
         """Value of `Strategy.grows` that strategies for this scene must have, for example "anchors on levels"."""
 
+    def needs_whole_table(self) -> str:
+        """Return the setting that needs all rows in every process, for the message of --shard; "" if none does. The default refuses."""
+        return f"a scene of {self.grown_as}"
+
     @property
     def dense_until(self) -> int:
         """Last iteration of the experts' dense warm-up. 0 if there is none."""

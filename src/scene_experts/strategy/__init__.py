@@ -50,6 +50,10 @@ class Strategy(Part, Generic[S], ABC):
         """Whether the statistics use absolute pixel gradients (`types.Render.mean2d_grad`)."""
         return False
 
+    def needs_whole_table(self) -> str:
+        """Return the setting that needs all rows in every process, for the message of --shard; "" if none does. The default refuses."""
+        return "this growth rule"
+
     def count_steps(self, iterations: int) -> int | None:
         """Number of densification steps in a training of `iterations` iterations; None if unknown."""
         return None

@@ -126,12 +126,12 @@ class AnchorControl(Strategy[L]):
         contribution = scene.table.stats.pop("contribution", None)
         masked = None if contribution is None else errors.mask_slots(scene.table, contribution, self.mask_contribution)
         if not self.grows_at(scene, step):
-            return None if masked is None else Edit(0, masked, len(scene.table))
+            return None if masked is None else Edit(0, masked, scene.table.total)
         for column in scene.table.params.values():
             column.grad = None  # in Scaffold-GS, the optimiser skips all anchors in a densification step
         grown, capped = self.grow(scene, generator, step, cap)
         pruned = self.prune(scene)
-        return Edit(grown, pruned + (masked or 0), len(scene.table), capped)
+        return Edit(grown, pruned + (masked or 0), scene.table.total, capped)
 
     def grow(self, scene: L, generator: torch.Generator, step: int = 0, cap: int = 0) -> tuple[int, bool]:
         """Create anchors, up to `cap` anchors in total (0: no limit).
@@ -162,9 +162,7 @@ class AnchorControl(Strategy[L]):
             faint |= errors.find_unneeded(table.stats, self.least_contribution)
         for name in ("visits", "opacity"):
             table.stats[name][seen] = 0.0
-        pruned = int(faint.sum())
-        if pruned:
-            table.keep(~faint)
+        pruned = table.drop(faint)
         if self.scale_clamp != "off":
             table.params["log_scaling"][:, 3:].clamp_(max=0.05 if self.scale_clamp == "log0.05" else math.log(0.05))
         return pruned

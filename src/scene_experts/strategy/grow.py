@@ -14,9 +14,11 @@ from torch import Tensor
 from scene_experts.core.errors import expect_at_least
 from scene_experts.core.parts import register
 from scene_experts.core.random import generator_on
+from scene_experts.core.shard import NUMBER
 from scene_experts.geometry.voxel import AXIS_LIMIT, coarsen, in_set, pack, scatter_max
 from scene_experts.strategy.control import AnchorControl, L
 from scene_experts.strategy.errors import find_wrong
+from scene_experts.strategy.grow_shards import Candidates
 
 _COLUMNS = 8  # columns of the features that are copied at once
 
@@ -57,10 +59,17 @@ class GrowAnchors(AnchorControl[L]):
 
         Returns the number of new anchors and whether the limit rejected candidates.
         """
-        rows, born, capped = self.search(scene, generator, cap)  # `search` frees its buffers before the columns are copied
+        search = self.search if scene.table.shard is None else self.search_shards
+        rows, born, capped = search(scene, generator, cap)  # `search` frees its buffers before the columns are copied
         if rows:
             scene.table.append({name: torch.cat([row[name] for row in rows]) for name in rows[0]})
+        if scene.table.shard is not None:
+            scene.table.shard.total += born
         return born, capped
+
+    def needs_whole_table(self) -> str:
+        surveys = ("error_views", "least_contribution", "mask_contribution")
+        return next((f"--growth.{name.replace('_', '-')}" for name in surveys if getattr(self, name)), "")
 
     def search(self, scene: L, generator: torch.Generator, cap: int = 0) -> tuple[list[dict[str, Tensor]], int, bool]:
         """Find the anchors to create and reset the statistics of the slots that were seen often enough.
@@ -68,19 +77,8 @@ class GrowAnchors(AnchorControl[L]):
         Returns the new rows by level, their number, and whether the limit rejected candidates.
         """
         table, stats = scene.table, scene.table.stats
-        eligible = (stats["count"].view(-1) > self.gate()).nonzero().squeeze(1)  # flat slot index: row * K + k
-        g = stats["grad"].view(-1).index_select(0, eligible) / stats["count"].view(-1).index_select(0, eligible).clamp_min(1)
-        strong = g >= self.grad_threshold  # the first level has the lowest threshold
-        if self.error_views and "wrong" in stats:
-            strong &= find_wrong(stats, self.error_share).view(-1).index_select(0, eligible)
-        strong = strong.nonzero().squeeze(1)
-        slots, g = eligible.index_select(0, strong), g.index_select(0, strong)
-        parents = torch.div(slots, scene.K, rounding_mode="floor")
-        points = scene.slot_points(slots, parents)
-        if self.bounds:
-            here = self.inside(points).nonzero().squeeze(1)
-            slots, g, parents, points = (part.index_select(0, here) for part in (slots, g, parents, points))
-        fine, features = points / scene.voxel, table.params["feature"]
+        eligible, slots, g, parents, fine = self.candidates(scene)
+        features = table.params["feature"]
         cells, rows, born, capped = table.facts["cell"], [], 0, False
         for level, factor in enumerate(self.cell_factors()):
             if self.parity_level_skip and level > 0 and not born:
@@ -100,6 +98,50 @@ class GrowAnchors(AnchorControl[L]):
             if len(new):
                 rows.append(scene.new_rows(new * factor, scene.voxel * factor, feature))
                 cells, born = torch.cat([cells, rows[-1]["cell"]]), born + len(new)
+        for name in ("grad", "count"):
+            stats[name].view(-1).index_fill_(0, eligible, 0.0)
+        return rows, born, capped
+
+    def candidates(self, scene: L) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Return the slots that were seen often enough, [e], and those whose gradients are large enough for a level.
+
+        The latter have their flat indices [s], mean gradients [s], rows [s] and positions [s, 3] in units of fine voxels.
+        """
+        stats = scene.table.stats
+        eligible = (stats["count"].view(-1) > self.gate()).nonzero().squeeze(1)  # flat slot index: row * K + k
+        g = stats["grad"].view(-1).index_select(0, eligible) / stats["count"].view(-1).index_select(0, eligible).clamp_min(1)
+        strong = g >= self.grad_threshold  # the first level has the lowest threshold
+        if self.error_views and "wrong" in stats:
+            strong &= find_wrong(stats, self.error_share).view(-1).index_select(0, eligible)
+        strong = strong.nonzero().squeeze(1)
+        slots, g = eligible.index_select(0, strong), g.index_select(0, strong)
+        parents = torch.div(slots, scene.K, rounding_mode="floor")
+        points = scene.slot_points(slots, parents)
+        if self.bounds:
+            here = self.inside(points).nonzero().squeeze(1)
+            slots, g, parents, points = (part.index_select(0, here) for part in (slots, g, parents, points))
+        return eligible, slots, g, parents, points / scene.voxel
+
+    def search_shards(self, scene: L, generator: torch.Generator, cap: int = 0) -> tuple[list[dict[str, Tensor]], int, bool]:
+        """Do the same as `search` for a table that is divided among several processes. Returns the new rows of this process."""
+        table, stats, shard = scene.table, scene.table.stats, scene.table.shard
+        assert shard is not None
+        eligible, slots, g, parents, fine = self.candidates(scene)
+        cells, rows, born, capped = table.facts["cell"], [], 0, False
+        for level, factor in enumerate(self.cell_factors()):
+            if self.parity_level_skip and level > 0 and not born:
+                continue
+            chosen = g >= self.grad_threshold * (self.hierarchy_factor // 2) ** level
+            if self.elimination:
+                chosen &= shard.draw(generator, table.facts[NUMBER], slots, scene.K) > 0.5 ** (level + 1)
+            found = Candidates(shard, table.params["feature"], cells, fine[chosen], parents[chosen], g[chosen], factor)
+            best = strongest(found.strength, cap, shard.total + born)
+            capped |= len(best) < len(found.cells)
+            numbers = shard.total + born + torch.arange(len(best), device=best.device)
+            own, feature = shard.owned(numbers), found.features_of(best, numbers % shard.group.size)
+            new = found.cells[best[own]]
+            rows.append({**scene.new_rows(new * factor, scene.voxel * factor, feature), NUMBER: numbers[own]})
+            cells, born = torch.cat([cells, rows[-1]["cell"]]), born + len(best)
         for name in ("grad", "count"):
             stats[name].view(-1).index_fill_(0, eligible, 0.0)
         return rows, born, capped

@@ -9,12 +9,15 @@ and make the same decisions. They exchange gradients after each batch, and the s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.group import Alone
-from scene_experts.core.types import Decoded, Render
+from scene_experts.core.types import Camera, Decoded, Mode, Render
+from scene_experts.scene import Cull, Scene
 from scene_experts.training.state import Training
 
 
@@ -33,6 +36,17 @@ class Direct:
 
     def start(self) -> None:
         """Make the state of all processes equal, before the first iteration."""
+
+    def scene_of(self, cameras: Sequence[Camera | None], step: int, mode: Mode, cull: Cull) -> Scene:
+        """Return the scene from which this process draws its view. Every process must call this.
+
+        cameras: One for each process; None for a process that draws nothing. With TRAIN, process r draws as iteration step + r.
+        """
+        return self.training.scene
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors of a checkpoint, in process 0. Every process must call this, after `complete`."""
+        return self.training.tensors()
 
     def add(self, decoded: Decoded, render: Render) -> None:
         """Add a view of this process, after its backward pass."""

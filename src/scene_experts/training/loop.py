@@ -19,14 +19,16 @@ from scene_experts.core.transfer import upload
 from scene_experts.core.types import Decoded, Mode, Render, Routing
 from scene_experts.data.capture import Capture
 from scene_experts.render import Rasterizer, for_growth
+from scene_experts.scene import Scene
 from scene_experts.strategy import Edit
 from scene_experts.strategy.survey import Photo, Survey
-from scene_experts.training.batch import Direct, make_exchange
+from scene_experts.training.batch import Direct, check_batch, make_exchange
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.guard import explain, find_broken
 from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
 from scene_experts.training.memory import anchor_cap, give_back, peak_bytes
+from scene_experts.training.shards import Sharded, check_shard
 from scene_experts.training.state import Training, resume, save
 from scene_experts.training.trial import fit_memory
 
@@ -52,6 +54,7 @@ class Run:
     initial: Path | None = None  # run folder whose scene the training starts from; None: the points of the capture
     begin: Callable[[Training], None] = lambda training: None  # called once, before the first event
     watch: Callable[[Training], None] = lambda training: None  # called between iterations and not timed; the viewer renders here
+    shard: bool = False  # divide the rows of the table among the processes
     group: Alone = field(default_factory=Alone)  # the processes that share the views of each batch; process 0 writes all files
     stop: list[str] = field(default_factory=list)  # append a reason to save and stop, for example from a signal handler
 
@@ -88,12 +91,11 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     folder = run.out / "checkpoints" if run.out else None
     rasterize = for_growth(rasterize, cfg.growth.absolute)
     training = run.group.agree(lambda: begin(cfg, run, capture, folder, rasterize))
-    exchange = make_exchange(training, run.group, run.stop, run.config.deterministic)
-    exchange.start()
+    exchange = start_exchange(training, run)
     total = min(cfg.iterations, -(-(run.config.stop_at or cfg.iterations) // cfg.batch) * cfg.batch)
     writes = folder is not None and run.group.first
     run.begin(training)
-    yield Started(training.step, total, len(training.scene.table), training.scene.traits)
+    yield Started(training.step, total, training.scene.table.total, training.scene.traits)
     saved, parts = training.step, {}
     while training.step < total and not exchange.stopping:
         with training.clock.running():
@@ -108,21 +110,27 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
             check_finite(step, parts)
             if run.group.first:
                 yield measure_step(training, done)
-        if run.preview_every and run.group.first and (step == total or passes(step, cfg.batch, run.preview_every)):
-            yield preview(training, run, capture, rasterize)
+        if run.preview_every and (step == total or passes(step, cfg.batch, run.preview_every)):
+            shown = preview(training, run, capture, rasterize, exchange)
+            if shown is not None:
+                yield shown
         if folder and (step == total or passes(step, cfg.batch, run.save_every)):
             check_finite(step, parts)
             exchange.complete()
+            tensors = exchange.tensors()
             if writes:
-                yield Saved(step, save(training, folder, run.keep))
+                yield Saved(step, save(training, folder, run.keep, tensors))
+            del tensors
             saved = step
         del done  # frees its memory before the next frame
         run.watch(training)
     if folder and saved != training.step:
         check_finite(training.step, parts)
         exchange.complete()
+        tensors = exchange.tensors()
         if writes:
-            yield Saved(training.step, save(training, folder, run.keep))
+            yield Saved(training.step, save(training, folder, run.keep, tensors))
+        del tensors
     if exchange.stopping and training.step < total:
         yield Stopped(training.step, run.stop[0])
     else:
@@ -144,6 +152,18 @@ def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize
     return training
 
 
+def start_exchange(training: Training, run: Run) -> Direct:
+    """Return the exchange of a training, and divide or compare the scenes of the processes. Raises InputError as `train`."""
+    if run.shard:
+        check_batch(training.cfg.batch, run.group.size)
+        check_shard(training.cfg, run.max_memory, viewer=False)
+        exchange: Direct = Sharded(training, run.group, run.stop, run.config.deterministic)
+    else:
+        exchange = make_exchange(training, run.group, run.stop, run.config.deterministic)
+    exchange.start()
+    return exchange
+
+
 def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterizer, exchange: Direct | None = None) -> Iteration:
     """See the views of one batch and take one optimiser step. Iterations count views, so the step advances by `cfg.batch`.
 
@@ -162,12 +182,16 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     for turn, place in enumerate(mine, 1):
         capture.images.prefetch(upcoming[turn : turn + AHEAD], threads=1 if run.device == "cpu" else AHEAD)
         done = None  # frees the memory of the previous view
-        done = see_view(training, run, capture, rasterize, numbers[place], *batch[place])
+        turn_views = range(place - run.group.rank, place - run.group.rank + run.group.size)
+        cameras = [capture.views[batch[other][0]].camera.to(run.device, run.dtype) for other in turn_views]
+        shown = exchange.scene_of(cameras, numbers[turn_views[0]], Mode.TRAIN, rasterize.visible)
+        done = see_view(training, run, capture, rasterize, numbers[place], *batch[place], scene=shown)
+        del shown
         exchange.add(done.decoded, done.render)
     assert done is not None
     training.seed_view(training.step + 1)
     exchange.finish()
-    rows = exchange.rows() if cfg.sparse_adam else None
+    rows = exchange.rows() if cfg.sparse_adam or run.shard else None
     if due := any(cfg.growth.reads(number) for number in numbers):
         exchange.complete()
     limited, before = run.max_memory > 0 and due, len(scene.table)
@@ -182,7 +206,7 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     if limited:
         training.largest.search(before, peak_bytes(scene.table.device))
         give_back()
-    exchange.compare(len(scene.table), bool(edits))
+    exchange.compare(scene.table.total, bool(edits))
     training.optimizer_step(None if edits else rows)
     cfg.growth.finish(scene, training.step, training.rates(), training.growth_rng)
     training.update_averages()
@@ -190,13 +214,20 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
 
 
 def see_view(
-    training: Training, run: Run, capture: Capture, rasterize: Rasterizer, number: int, index: int, color: Tensor | None
+    training: Training,
+    run: Run,
+    capture: Capture,
+    rasterize: Rasterizer,
+    number: int,
+    index: int,
+    color: Tensor | None,
+    scene: Scene | None = None,
 ) -> Iteration:
     """Draw training view `index` as iteration `number`, and add the gradients of its loss to those of the parameters.
 
-    color: Background [3] of this view; None is the background of the capture.
+    color: Background [3] of this view; None is the background of the capture.  scene: What to draw; None is the scene of the training.
     """
-    cfg, scene = training.cfg, training.scene
+    cfg, scene = training.cfg, scene or training.scene
     camera = capture.views[index].camera.to(run.device, run.dtype)
     frame = capture.frame(index)
     target = upload(frame.rgb, run.device, run.dtype).div_(255.0)
@@ -268,7 +299,7 @@ def measure_step(training: Training, done: Iteration) -> Stepped:
         step=training.step,
         terms={k: float(v) for k, v in done.terms.items()},
         psnr=-10.0 * math.log10(max(mse, 1e-10)),
-        anchors=len(training.scene.table),
+        anchors=training.scene.table.total,
         visible=len(decoded.rows),
         gaussians=len(decoded.gaussians),
         active=float((raw > 0).float().mean()) if raw is not None and raw.numel() else 0.0,
@@ -289,11 +320,16 @@ def use(r: Routing) -> list[float]:
 
 
 @torch.no_grad()
-def preview(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Previewed:
-    """Render one held-out view, or a training view if none is held out."""
+def preview(training: Training, run: Run, capture: Capture, rasterize: Rasterizer, exchange: Direct | None = None) -> Previewed | None:
+    """Render one held-out view, or a training view if none is held out, in process 0. Every process must call this."""
+    exchange = exchange or Direct(training, run.group, run.stop)
     index = (capture.test or capture.train)[0]
     camera = capture.views[index].camera.to(run.device, run.dtype)
     with training.averaged():
-        decoded = training.scene(camera, training.step, Mode.DRAW, rasterize.visible)
+        cameras = [camera, *([None] * (run.group.size - 1))]
+        scene = exchange.scene_of(cameras, training.step, Mode.DRAW, rasterize.visible)
+        if not run.group.first:
+            return None
+        decoded = scene(camera, training.step, Mode.DRAW, rasterize.visible)
     picture = rasterize(decoded.gaussians, camera, torch.tensor(capture.background, device=run.device, dtype=run.dtype)).image
     return Previewed(training.step, index, picture.clamp(0, 1).cpu())

@@ -238,12 +238,15 @@ def check_same(cfg: Train, meta: dict[str, Any]) -> None:
         )
 
 
-def save(training: Training, folder: Path, keep: int) -> Path:
+def save(training: Training, folder: Path, keep: int, tensors: dict[str, Tensor] | None = None) -> Path:
     """Write a checkpoint atomically and return its path. The newest `keep` checkpoints are kept.
+
+    tensors: The state as named tensors, if it is divided among several processes; None means `training.tensors()`.
 
     Raises RunError if a number of the state is not finite. Earlier checkpoints are then unchanged.
     """
-    tensors = {k: v.detach().cpu().contiguous() for k, v in training.tensors().items()}
+    tensors = training.tensors() if tensors is None else tensors
+    tensors = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
     check_state(tensors, training.step, folder)
     return checkpoint.save(folder, training.step, tensors, training.meta(), keep=keep)
 

@@ -7,6 +7,7 @@ mu = x_v + O_v * exp(l_v)[0:3] (paper eq. 2). Anchors do not move; `strategy.gro
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -93,6 +94,11 @@ class Anchors(SceneConfig):
     @property
     def dense_until(self) -> int:
         return self.decoder.dense_until
+
+    def needs_whole_table(self) -> str:
+        if self.select.has_levels:
+            return "anchors on levels"
+        return "--scene.decoder.load-scope all" if self.decoder.balances_all else ""
 
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
         """Create a scene with one anchor per occupied voxel of the point cloud."""
@@ -214,7 +220,7 @@ class AnchorScene(LatticeScene):
 
     def begin_iteration(self, before: int, step: int, companions: Callable[[Tensor], list[Tensor]]) -> None:
         for head in self.heads.values():
-            head.begin(before, step, lambda: self.table.facts["xyz"] / self.extent, companions)
+            head.begin(before, step, lambda: self.table.whole_fact("xyz") / self.extent, companions)
 
     def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
         """Return rows for new anchors at lattice cells [n, 3] of `level`, with scaling `size`, features [n, F] and zero offsets."""
@@ -240,8 +246,7 @@ class AnchorScene(LatticeScene):
     def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
         """Return the Gaussians visible from `camera` at `step`. `cull(means, scales, camera)` is the rasteriser's visibility test."""
         table = self.table
-        scales = table.params["log_scaling"].detach()[:, :3].contiguous().exp()  # exp takes 7 times as long on a non-contiguous tensor
-        rows = visible_rows(self.select(table, camera, step, mode), table.facts["xyz"], scales, camera, cull)
+        rows = self.visible(camera, step, mode, cull)
         if self.config.dropout and mode is Mode.TRAIN:
             share = self.config.dropout * min(1.0, step / self.config.dropout_full)
             rows = rows[torch.rand(len(rows), device=rows.device) >= share]
@@ -250,6 +255,18 @@ class AnchorScene(LatticeScene):
         decoded = drop_masked(decoded, table.facts.get("slots"))
         decoded = smooth(decoded, table.facts.get("interval"), self.config.smoothing, self.K)
         return self.with_global_routing(decoded, step) if mode is Mode.TRAIN else decoded
+
+    def visible(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Tensor:
+        """Return the rows [A] that `camera` sees at `step`."""
+        table = self.table
+        scales = table.params["log_scaling"].detach()[:, :3].contiguous().exp()  # exp takes 7 times as long on a non-contiguous tensor
+        return visible_rows(self.select(table, camera, step, mode), table.facts["xyz"], scales, camera, cull)
+
+    def with_table(self, table: Table) -> AnchorScene:
+        """Return a scene with the same networks and the anchors of `table`."""
+        scene = copy.copy(self)
+        scene._modules = {**self._modules, "table": table}
+        return scene
 
     def decode(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:
         """Decode the given anchors [A]. Uses the device's fused kernels if they support the scene, otherwise PyTorch."""
