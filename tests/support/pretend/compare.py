@@ -1,11 +1,12 @@
 """Compare training on pretended CUDA with training on the CPU, and print the relative differences of ten steps as JSON.
 
-    python -m support.pretend.compare octree-gs moe-gs:alone                 # in tests/, with the guard loaded
+    python -m support.pretend.compare octree-gs moe-gs:alone sags:unchanged  # in tests/, with the guard loaded
 
 RECIPE: each step starts on both from the same checkpoint, that of the CPU. `losses` and `gradients` are the differences. `close` is how
 near the nearest alpha of the picture lies to 1/255, relative, in float64. Below that threshold a Gaussian is skipped: where an alpha lies
 nearer to it than float32 can tell, rounding decides whether a pixel has a Gaussian, and one gradient differs.
 RECIPE:alone: both train on their own. Then `gradients` is empty.
+RECIPE:unchanged: as RECIPE, and the training starts as it is, without the change that follows.
 
 A training starts with the Gaussians of an anchor at one place, and its first steps move them by equal lengths. Depths are then equal up to
 rounding, rounding decides which Gaussian is drawn first, and the pictures differ, on one CPU between float32 and float64 as well. So the
@@ -100,12 +101,12 @@ def measure_nearest(g: Gaussians, camera: Camera) -> float:
 
 
 @torch.no_grad()
-def begin(cfg: Train, capture: Capture, device: str) -> Training:
-    """Start a training and change its parameters a little."""
+def begin(cfg: Train, capture: Capture, device: str, change: float = CHANGE) -> Training:
+    """Start a training and change its parameters a little. change: standard deviation."""
     training, generator = Training.start(cfg, capture, device), torch.Generator().manual_seed(0)
     for group in training.scene.rate_groups().values():
         for p in group:
-            p.add_((CHANGE * torch.randn(p.shape, generator=generator)).to(device))
+            p.add_((change * torch.randn(p.shape, generator=generator)).to(device))
     return training
 
 
@@ -114,7 +115,7 @@ def compare(capture: Capture, word: str) -> dict[str, list[float]]:
     cfg = short(recipe)
     cfg: Train = replace(cfg, growth=replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=10**6)))
     on_cuda, on_cpu = GsplatRasterizer(antialias=cfg.antialias), Watched(antialias=cfg.antialias)
-    plain = Steps(begin(cfg, capture, "cpu"), capture, "cpu", on_cpu)
+    plain = Steps(begin(cfg, capture, "cpu", 0.0 if how == "unchanged" else CHANGE), capture, "cpu", on_cpu)
     found: dict[str, list[float]] = {"losses": [], "gradients": [], "close": []}
     if how == "alone":
         alone = Steps(begin(cfg, capture, "cuda"), capture, "cuda", on_cuda)
