@@ -49,8 +49,8 @@ lpips: $(STAMP)
 
 demo: $(STAMP) lpips
 	$(SE) train scene-experts --data demo/banana --out $(DEMO_OUT)/scene-experts $(DEMO_FLAGS) --overwrite
-	$(SE) train scaffold-gs --data demo/banana --out $(DEMO_OUT)/scaffold-gs $(DEMO_FLAGS) --overwrite
 	$(SE) eval $(DEMO_OUT)/scene-experts
+	$(SE) train scaffold-gs --data demo/banana --out $(DEMO_OUT)/scaffold-gs $(DEMO_FLAGS) --overwrite
 	$(SE) eval $(DEMO_OUT)/scaffold-gs
 	$(SE) compare $(DEMO_OUT)/scaffold-gs $(DEMO_OUT)/scene-experts
 	$(SE) report $(DEMO_OUT)/scaffold-gs $(DEMO_OUT)/scene-experts --out $(DEMO_OUT)/report.html

@@ -8,6 +8,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import sysconfig
+import time
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -23,19 +24,27 @@ print(pathlib.Path(torch.__file__).parents[1])
 """
 
 
+def shorten(step: str) -> str:
+    """A line of pip as one short line: without versions, sizes and the long list of packages."""
+    if step.startswith("Installing"):
+        return f"Installing {step.count(',') + 1} packages"
+    if step.startswith("Building editable"):
+        return "Compiling scene-experts"
+    return step.split(" (")[0][:80]
+
+
 def pip(*args: str) -> None:
     """Run pip. Every three seconds it prints what pip does, so that nobody waits before a silent screen; an error prints all of it."""
     command = [sys.executable, "-m", "pip", "install", "--disable-pip-version-check", "--progress-bar", "off", *args]
     with TemporaryFile("w+", errors="replace") as log:
-        process, shown = subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT), ""
+        process, started = subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT), time.monotonic()
         while process.poll() is None:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(3)
             log.seek(0)
             steps = [line.strip() for line in log.readlines() if line.lstrip().startswith(STEPS)]
             if process.poll() is None:
-                print(f"  {steps[-1][:100]}" if steps and steps[-1] != shown else "  ...", flush=True)
-                shown = steps[-1] if steps else ""
+                print(f"  {time.monotonic() - started:3.0f} s  {shorten(steps[-1]) if steps else 'Looking for packages'}", flush=True)
         if process.returncode:
             log.seek(0)
             print(log.read())
@@ -61,13 +70,13 @@ def main() -> None:
             print(f"using the torch installed in {folder}")
             borrowed.write_text(f"{folder}\n")
         else:
-            print(f"installing torch (for another build of it, a CPU one say, install that for {sys.argv[1]} first: it is then used)")
+            print(f"installing torch (to use another build of it, for example one for the CPU, install that build for {sys.argv[1]} first)")
             pip("torch", *constraints)
     if borrowed.exists():  # a later run too must not fetch the pinned one beside it
         rest = [line for line in CONSTRAINTS.read_text().splitlines() if not line.startswith("torch==")]
         relaxed.write_text("\n".join(rest) + "\n")
         constraints = ["-c", str(relaxed)]
-    print("building scene-experts")
+    print("installing scene-experts and the packages that it needs")
     pip("-e", ".[test]", *constraints)
 
 

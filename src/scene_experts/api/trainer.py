@@ -207,7 +207,7 @@ def train(
     """
     trainer = Trainer(method, capture, out, **settings)
     console = Console(markup=False, highlight=False, quiet=not progress)
-    with saved_on_interrupt(trainer, out is not None), TrainingProgress(console) as show:
+    with saved_on_interrupt(trainer, out is not None), TrainingProgress(console, out=Path(out) if out is not None else None) as show:
         for event in trainer:
             show(event)
     return trainer.run

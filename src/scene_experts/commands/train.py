@@ -238,7 +238,7 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
         label = f"{command.cfg.recipe} on {capture.name}"
         live = Live(capture, rasterize, lambda: bool(run.stop), command.port, label, command.out / "paths", say)
         run = replace(run, watch=live)
-    with handled(stop), TrainingProgress(console) as progress:
+    with handled(stop), TrainingProgress(console, out=command.out) as progress:
         try:
             for event in recording.train(run, capture, rasterize, overwrite=command.overwrite, tensorboard=command.tensorboard):
                 progress(event)

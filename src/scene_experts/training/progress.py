@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 from rich.console import Console
 from rich.live import Live
@@ -22,10 +23,12 @@ class TrainingProgress:
     Args:
         console: Where the events are shown. A terminal has one line that is updated in place.
         every: Seconds between lines if the console is not a terminal.
+        out: The folder of the run, for the place of the first picture; without it no place is shown.
     """
 
     console: Console
     every: float
+    out: Path | None
     live: Live | None
     total: int
     first: int
@@ -34,9 +37,10 @@ class TrainingProgress:
     loss: dict[str, float]
     psnr: float | None
     traits: Traits
+    pictured: bool
 
-    def __init__(self, console: Console, every: float = 15.0) -> None:
-        self.console, self.every = console, every
+    def __init__(self, console: Console, every: float = 15.0, out: Path | None = None) -> None:
+        self.console, self.every, self.out, self.pictured = console, every, out, False
         self.live = Live(console=console, refresh_per_second=4, transient=True) if console.is_terminal else None
         self.total, self.first, self.began, self.printed = 0, 0, time.perf_counter(), 0.0
         self.loss, self.psnr = {}, None
@@ -78,7 +82,9 @@ class TrainingProgress:
                 if event.step > self.first:  # a run that was already complete has nothing to tell
                     self.print_line(f"finished {event.step:,} iterations in {format_duration(event.seconds)}")
             case Previewed():
-                pass
+                if self.out and not self.pictured:
+                    self.pictured = True
+                    self.print_line(f"first picture: {self.out / 'previews' / f'{event.step:06d}.png'}")
 
     def show_step(self, event: Stepped) -> None:
         """Show an iteration: running means of losses and training PSNR, the number of rows, speed and remaining time."""

@@ -1,11 +1,12 @@
 import io
 from pathlib import Path
 
+import torch
 from rich.console import Console
 
 from scene_experts.scene import Traits
 from scene_experts.strategy import Edit
-from scene_experts.training.events import Densified, Finished, Saved, Started, Stepped, Stopped
+from scene_experts.training.events import Densified, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.progress import ProgressBar, TrainingProgress, format_duration
 
 
@@ -45,6 +46,14 @@ def test_rows_have_the_name_that_the_traits_state():
     text = out.getvalue()
     assert all(fact in text for fact in ("1,234", "200", "1,300"))
     assert "anchors" not in text and "active" not in text and "lattice" not in text
+
+
+def test_the_first_picture_has_its_place():
+    out = io.StringIO()
+    with TrainingProgress(Console(file=out, width=200), out=Path("runs/a")) as show:
+        show(Previewed(500, 0, torch.zeros(2, 2, 3)))
+        show(Previewed(1000, 0, torch.zeros(2, 2, 3)))
+    assert str(Path("runs/a/previews/000500.png")) in out.getvalue() and "001000" not in out.getvalue()
 
 
 def test_durations_are_formatted():
