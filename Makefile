@@ -4,6 +4,7 @@
 # make test-fast  the tests that are not marked `slow`: at least one of every test file, within 180 CPU seconds
 # make fuzz       mutated files for every reader, for SECONDS seconds (docs/security.md); TARGETS="ply spz" for some readers
 # make docs       the documentation site in build/site; every link within it is checked
+# make pages      axe-core and the browser's console on every page of the documentation and of the demo, in headless Chromium
 # make lint       ruff (rules and format) and pyright
 # make sanitize   the native library with the address and undefined-behaviour sanitisers, and its tests on every instruction set
 # make crash ROUNDS=200   kill trainings of every family at random moments and compare what is resumed with what was left alone
@@ -33,7 +34,7 @@ DEMO_FLAGS ?= --iterations $(DEMO_ITERATIONS) --resolution longest:800
 # as the package sets it when it is imported before torch, which the benchmark scripts do not
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: wheels demo view test test-fast fuzz lint record-errors record-flags docs bench gpu pretend sanitize crash env lpips clean
+.PHONY: wheels demo view test test-fast fuzz lint record-errors record-flags docs pages bench gpu pretend sanitize crash env lpips clean
 
 env: $(STAMP)
 
@@ -78,6 +79,10 @@ docs: $(STAMP)
 	$(BIN)/mkdocs build --strict
 	$(BIN)/python tools/check_site.py build/site
 	@echo "open build/site/index.html"
+
+pages: docs
+	@$(BIN)/pip install -q playwright axe-playwright-python
+	$(BIN)/python tools/check_pages.py build/site $(wildcard $(DEMO_OUT)/*.html $(DEMO_OUT)/*/report.html)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 
@@ -42,6 +43,7 @@ def dispatch(args: list[str]) -> int:
         print(f"error: expected one of {', '.join(COMMANDS)}, found '{command}'{hint}", file=sys.stderr)
         return 2
     logging.basicConfig(level=logging.WARNING, format="warning: %(message)s")
+    warnings.filterwarnings("ignore", module=r"PIL\.")  # about damaged metadata; damaged pixels raise an error
     try:
         return commands.run(command, rest)
     except HelpAsked as help_:

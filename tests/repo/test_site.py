@@ -1,9 +1,12 @@
 """The documentation site builds: every link within it leads to a page, and every command, recipe page and public name is there."""
 
 import importlib.util
+import shutil
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
+from urllib.request import urlopen
 
 import pytest
 
@@ -26,9 +29,9 @@ def test_every_page_is_in_the_navigation():
     assert not [page for page in pages if f" {page}\n" not in listed]
 
 
-def load_checker():
-    """The module tools/check_site.py."""
-    spec = importlib.util.spec_from_file_location("check_site", ROOT / "tools" / "check_site.py")
+def load_checker(name="check_site"):
+    """A module of tools/."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
     spec.loader.exec_module(module)  # type: ignore[union-attr]
     return module
@@ -70,3 +73,34 @@ def test_dead_links_and_distant_pages_are_found(tmp_path):
         "a/b.html loads https://x.org/i.png", "a/b.html: #y has no such anchor", "index.html: gone.html leads nowhere",
     ]  # fmt: skip
     assert {path for path, _ in site.count_clicks(pages)} >= {"c.html"} and "d.html" not in {path for path, _ in site.count_clicks(pages)}
+
+
+def test_a_folder_is_served_and_stands_for_its_pages(tmp_path):
+    (tmp_path / "a").mkdir()
+    for name in ("b.html", "a/c d.html", "a/d.txt"):
+        (tmp_path / name).write_text(name)
+    pages = load_checker("check_pages")
+    with ExitStack() as stack:
+        first, second = pages.find_addresses(tmp_path, stack)
+        assert urlopen(first, timeout=10).read() == b"a/c d.html" and second.endswith("/b.html")
+        assert pages.find_addresses(tmp_path / "b.html", stack) == [(tmp_path / "b.html").as_uri()]
+
+
+@pytest.mark.slow
+@pytest.mark.foreign
+def test_pages_that_people_cannot_read_are_found(tmp_path):
+    pytest.importorskip("playwright")
+    pytest.importorskip("axe_playwright_python")
+    pages = load_checker("check_pages")
+    if not any(shutil.which(name) for name in pages.BROWSERS):
+        pytest.skip("no Chromium on this machine")
+    bad = tmp_path / "bad.html"
+    bad.write_text(
+        '<!doctype html><html lang="en"><title>a</title><main><h1>a</h1><img src="data:,"></main><script>undefined_name()</script></html>'
+    )
+    command = [sys.executable, str(ROOT / "tools" / "check_pages.py")]
+    done = subprocess.run([*command, str(bad)], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and "image-alt" in done.stdout and "undefined_name" in done.stdout, done.stdout + done.stderr
+    bad.write_text('<!doctype html><html lang="en"><title>a</title><main><h1>a</h1></main></html>')
+    done = subprocess.run([*command, str(bad)], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr

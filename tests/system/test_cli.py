@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import pytest
@@ -123,6 +124,14 @@ def test_unknown_command_recipe_and_flag(capsys):
     assert "--scene.decoder.top-k" in sentence and "moe-gs" in sentence
     assert "'--iterations'" in fails(capsys, "train", "moe-gs", "--data", "x", "--out", "y", "--iteration", "5")
     assert run(capsys)[0] == 2
+
+
+def test_warnings_about_the_metadata_of_photographs_are_not_shown(capsys):
+    with warnings.catch_warnings(record=True) as seen:
+        fails(capsys, "info", "nothing_here")
+        warnings.warn_explicit("Corrupt EXIF data", UserWarning, "TiffImagePlugin.py", 1, module="PIL.TiffImagePlugin")
+        warnings.warn_explicit("another", UserWarning, "a.py", 1, module="a")
+    assert [str(warning.message) for warning in seen] == ["another"]
 
 
 def test_flags_reach_the_configuration():
