@@ -1,10 +1,12 @@
 """The figures of README.md, docs/results.md and the pages of results/ are those of the records."""
 
 import functools
+import importlib.util
 import json
 import re
 import shlex
 import statistics
+import sys
 from pathlib import Path
 
 import pytest
@@ -137,3 +139,11 @@ def test_a_record_keeps_the_name_of_its_run():
 
 
 records = functools.cache(store.load)
+
+
+def test_when_experts_pay():
+    spec = importlib.util.spec_from_file_location("experts_pay", ROOT / "benchmarks" / "experts_pay.py")
+    script = importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
+    sys.modules["experts_pay"] = script  # dataclasses look their module up
+    spec.loader.exec_module(script)  # type: ignore[union-attr]
+    assert "\n".join(script.table(script.read_scores(RECORDS))) in (ROOT / "docs" / "results.md").read_text()
