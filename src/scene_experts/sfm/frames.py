@@ -33,13 +33,20 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
     if not chosen:
         raise InputError(f"expected a video with frames at {video}, found none; convert it to mp4 or extract its frames with another tool")
     names = [f"frame_{i + 1:05d}.jpg" for i in range(len(chosen))]
-    wanted = "+".join(rf"eq(n\,{index})" for index in chosen)
     folder.mkdir(parents=True, exist_ok=True)
-    for i, (name, frame) in enumerate(zip(names, read_frames(video, f"select={wanted}", "rgb24", 3)[1])):
+    for i, (name, frame) in enumerate(zip(names, read_frames(video, f"select={select_frames(chosen)}", "rgb24", 3)[1])):
         image = Image.fromarray(frame)
         write_atomic(folder / name, lambda temporary, image=image: image.save(temporary, "JPEG", quality=JPEG_QUALITY, subsampling=0))
         progress("frames", i + 1, len(names))
     return names
+
+
+def select_frames(numbers: Sequence[int]) -> str:
+    """Return ffmpeg's expression that is true for these frames: a balanced tree, because ffmpeg limits the depth of expressions to 100."""
+    if len(numbers) == 1:
+        return rf"eq(n\,{numbers[0]})"
+    middle = len(numbers) // 2
+    return f"({select_frames(numbers[:middle])}+{select_frames(numbers[middle:])})"
 
 
 def choose_sharpest(grades: Sequence[float], count: int) -> list[int]:

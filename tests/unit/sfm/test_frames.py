@@ -38,6 +38,17 @@ def test_the_sharp_frames_of_a_video_are_extracted_in_order(tmp_path):
     assert (9, 9) in [step[1:] for step in said]
 
 
+def test_more_frames_than_an_expression_of_ffmpeg_may_be_deep(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    stream = ffmpeg.write_frames(str(tmp_path / "long.mp4"), (16, 16), fps=10, macro_block_size=2)
+    stream.send(None)
+    for shade in range(130):
+        stream.send(np.full((16, 16, 3), shade, np.uint8))
+    stream.close()
+    names = frames.extract_frames(tmp_path / "long.mp4", tmp_path / "out", 120, lambda *_: None)
+    assert len(names) == len(list((tmp_path / "out").glob("*.jpg"))) == 120
+
+
 def test_a_file_that_is_not_a_video_is_reported(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     (tmp_path / "broken.mp4").write_bytes(b"nothing of the kind")
