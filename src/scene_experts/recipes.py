@@ -15,7 +15,8 @@ from scene_experts.scene.anchors.experts import Experts, Router
 from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.scene.anchors.local import LocalExperts
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, Decoder, Plain
-from scene_experts.scene.anchors.scene import Anchors, Rates
+from scene_experts.scene.anchors.rates import Rates
+from scene_experts.scene.anchors.scene import Anchors
 from scene_experts.scene.anchors.select import Octree
 from scene_experts.scene.gaussians import Explicit, ExplicitRates
 from scene_experts.scene.graph.scene import GraphPoints, GraphRates

@@ -12,7 +12,8 @@ from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.parts import Part, find
 from scene_experts.data.settings import Data
 from scene_experts.scene import LearningRates, SceneConfig
-from scene_experts.scene.anchors.scene import Anchors, Rates
+from scene_experts.scene.anchors.rates import Rates
+from scene_experts.scene.anchors.scene import Anchors
 from scene_experts.strategy import Strategy
 from scene_experts.strategy.grow import GrowAnchors
 from scene_experts.training.average import Average
