@@ -13,9 +13,9 @@ from scene_experts.render import choose
 LIMIT = 8.0  # minutes, so that a capture of few photographs, its training, scores and page take a quarter of an hour together
 SIDES = ((0, 7000), (1200, 7000), (800, 7000), (800, 4000), (600, 4000), (600, 3000), (600, 2000), (400, 2000))
 """Longest side in pixels (0: as it is) and iterations, the best first."""
-# Iterations of scene-experts on colosseum (0.23 megapixels), banana (0.43), fox (0.52) and sceaux (1.08) take 5.6, 5.7, 7.6 and 15.1 times
-# the picture below: more pixels and, with them, more anchors. The line goes through the first and the last.
-BASE, PER_MEGAPIXEL = 3.0, 11.2
+# Iterations of scene-experts on pyramid (0.10 megapixels), colosseum (0.23), banana (0.43), fox (0.52) and sceaux (1.08) take 6.4, 5.6,
+# 5.7, 7.6 and 15.1 times the picture below. The line is near the first and the last, and above the others.
+BASE, PER_MEGAPIXEL = 4.5, 9.8
 SERIAL = 0.15  # share of an iteration that one thread does
 
 
