@@ -191,7 +191,8 @@ def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress)
                 elif last["step"] == "failed":
                     say(f"the {last['mapper']} mapper failed: {last['why']}")
                 elif last["step"] == "next mapper":
-                    posed = f"gave {last['posed']} of {last['photographs']} photographs a pose"
+                    apart = f" in the largest of {last['parts']} parts, which do not fit together" if last["parts"] > 1 else ""
+                    posed = f"gave {last['posed']} of {last['photographs']} photographs a pose{apart}"
                     say(f"the {last['mapper']} mapper {posed}; the global mapper runs too, and the better result is kept")
                 elif last["step"] == "unread":
                     say(f"warning: COLMAP cannot read {', '.join(last['names'])}")

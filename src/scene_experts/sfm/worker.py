@@ -100,7 +100,7 @@ def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
         if tried[mapper] >= ENOUGH * total:
             break
         if mapper != ask["mapper"] and len(tried) == 1:
-            report(step="next mapper", mapper=mapper, posed=tried[mapper], photographs=total)
+            report(step="next mapper", mapper=mapper, posed=tried[mapper], photographs=total, parts=len(models))
     if not found:
         return {"registered": []}
     mapper, best = max(found, key=lambda one: (one[1].num_reg_images(), one[1].num_points3D()))
@@ -165,16 +165,22 @@ def explain(features: int, shared: dict[int, int], posed: set[int], apart: bool)
 
 def map_incrementally(colmap: Any, ask: dict[str, Any], out: str, total: int) -> dict[int, Any]:
     """Run COLMAP's mapper, which adds one photograph at a time."""
-    options, count = colmap.IncrementalPipelineOptions(), 2
+    options, count, part = colmap.IncrementalPipelineOptions(), 2, 0
     options.num_threads, options.random_seed, options.ba_use_gpu = ask["threads"], ask["seed"], False
     options.min_model_size = 3
+
+    def start_part() -> None:  # photographs that do not fit the parts before form another one
+        nonlocal count, part
+        count, part = 2, part + 1
 
     def count_image() -> None:
         nonlocal count
         count += 1
-        report(step="poses (incremental)", done=min(count, total), total=total)
+        name = "poses (incremental)" if part < 2 else f"poses (incremental, part {part})"
+        report(step=name, done=min(count, total), total=total)
 
-    return colmap.incremental_mapping(ask["database"], ask["images"], out, options=options, next_image_callback=count_image)
+    calls = {"initial_image_pair_callback": start_part, "next_image_callback": count_image}
+    return colmap.incremental_mapping(ask["database"], ask["images"], out, options=options, **calls)
 
 
 def map_globally(colmap: Any, ask: dict[str, Any], out: str, total: int) -> dict[int, Any]:
