@@ -23,7 +23,7 @@ ALLOWED = {  # file: why it may open files by itself
     "data/store.py": "/proc and /sys",
     "evaluate/tables.py": "a file of this package",
     "evaluate/weights.py": "files with a published SHA-256, which is verified first",
-    "files/own.py": "the run's own list of cameras, copied",
+    "files/export.py": "the run's own list of cameras, copied",
     "files/formats/html.py": "files of this package",
     "files/formats/usd.py": "arrays of its own worker",
     "files/formats/usd_worker.py": "arrays of the process that started it; usd-core reads the file: docs/formats.md",

@@ -11,7 +11,7 @@ import torch
 
 from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.data.capture import Capture
-from scene_experts.files.own import result_warnings, write_result_folder
+from scene_experts.files.export import result_warnings, write_result_folder
 from scene_experts.files.registry import exported_files
 from scene_experts.files.result_folder import DESCRIPTION
 from scene_experts.render import Rasterizer

@@ -26,8 +26,8 @@ from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.pictures import to_8bit
 from scene_experts.evaluate.score import evaluate
 from scene_experts.files import export as exporting
+from scene_experts.files.export import Options
 from scene_experts.files.importing import import_files
-from scene_experts.files.options import Options
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.report import page
 from scene_experts.scene import Draws, Scene

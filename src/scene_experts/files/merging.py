@@ -12,7 +12,7 @@ from torch import Tensor
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.data.blocks import read_plan
-from scene_experts.files.own import write_result_folder
+from scene_experts.files.export import write_result_folder
 from scene_experts.scene import Scene
 from scene_experts.training import run_folder
 

@@ -12,7 +12,7 @@ from scene_experts.commands.files import export
 from scene_experts.core.errors import InputError
 from scene_experts.data.settings import Data
 from scene_experts.files import hub
-from scene_experts.files.work import Written
+from scene_experts.files.export import Written
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training import loop, run_folder

@@ -3,6 +3,33 @@
 import subprocess
 import sys
 
+import pytest
+
+from scene_experts.core.errors import InputError
+from scene_experts.files.export import _check, _expect_unused
+from scene_experts.files.options import DEFAULT, Options
+from support.messages import naming
+
+
+@pytest.mark.parametrize("name", ["sh_degree", "max_gaussians", "refine"])
+def test_numbers_out_of_range_are_named_by_their_flag(name):
+    with pytest.raises(InputError, match=naming("--" + name.replace("_", "-"), -1)):
+        _check(Options(**{name: -1}))
+    _check(DEFAULT)
+    with pytest.raises(InputError, match=naming("--sh-degree", 4)):
+        _check(Options(sh_degree=4))
+    for prune in (1.0, -0.1, float("nan")):
+        with pytest.raises(InputError, match="--prune"):
+            _check(Options(prune=prune))
+
+
+def test_options_of_standard_files_are_not_ignored_elsewhere():
+    for options in (DEFAULT, Options(measure=False)):
+        _expect_unused(options, "compact")
+    for name, value in {"levels": True, "frame": "trained", "prune": 0.1}.items():
+        with pytest.raises(InputError, match=naming(f"--{name}", "compact")):
+            _expect_unused(Options(**{name: value}), "compact")
+
 
 def test_the_help_needs_no_torch():
     code = "import sys, scene_experts.files.options, scene_experts.files.registry; print('torch' in sys.modules, 'numpy' in sys.modules)"

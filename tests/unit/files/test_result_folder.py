@@ -5,7 +5,9 @@ import json
 import pytest
 
 from scene_experts.core.errors import InputError
+from scene_experts.data.settings import Data
 from scene_experts.data.views import World
+from scene_experts.files.export import capture_settings
 from scene_experts.files.result_folder import (
     expect_world,
     is_result,
@@ -68,6 +70,27 @@ def test_other_bytes(tmp_path):
     (tmp_path / "cfg_args").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match="cfg_args"):
         read_settings(iteration(tmp_path))
+
+
+def test_the_reading_of_a_capture_in_the_published_settings(tmp_path):
+    plain = {"images": "images", "resolution": -1, "white_background": False, "data_device": "cuda", "eval": True, "lod": 0}
+    assert capture_settings(Data(tmp_path)) == {"source_path": str(tmp_path), **plain}
+    for change, expected in (
+        ({"resolution": "as-is"}, {"resolution": 1}),
+        ({"resolution": "factor:4"}, {"resolution": 4}),
+        ({"resolution": "factor:2.5"}, {}),  # no setting can say it
+        ({"resolution": "longest:400"}, {"resolution": 400}),
+        ({"resolution": "inria:4"}, {"images": "images_4"}),
+        ({"images": "images_2"}, {"images": "images_2"}),
+        ({"split": "none"}, {"eval": False}),
+        ({"split": "first:31"}, {"lod": 30}),
+        ({"split": "first:1"}, {}),
+        ({"background": (1.0, 1.0, 1.0)}, {"white_background": True}),
+    ):
+        assert capture_settings(Data(tmp_path, **change)) == {"source_path": str(tmp_path), **plain, **expected}, change
+    (tmp_path / "transforms_train.json").touch()
+    assert capture_settings(Data(tmp_path))["white_background"]
+    assert not capture_settings(Data(tmp_path, background=(0.0, 0.0, 0.0)))["white_background"]
 
 
 def test_no_settings(tmp_path):
