@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -53,6 +54,7 @@ def evaluate(args: list[str]) -> int:
     print_results(results, Console(markup=False, highlight=False), command.run)
     if not command.options.suffix:  # the page shows the held-out views
         print(f"wrote {page.write([command.run])}")
+        print(f"next: {shlex.join([PROG, 'export', str(command.run), '--format', 'html', '--out', str(command.run / 'scene.html')])}")
     return 0
 
 
