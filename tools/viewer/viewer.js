@@ -7,7 +7,7 @@ import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 
 const FLIP = [1, -1, -1];
 const settings = JSON.parse(document.getElementById("settings").textContent);
-const WIDTH = 0.62; // share of a photograph that a narrow screen shows at least
+const WIDEST = 100; // degrees, vertical field of view that a narrow screen (a phone) may have to show a whole photograph
 const FLIGHT = 16; // seconds of a round
 const QUIET = 400; // milliseconds of drawing after the last news
 const UNIT = 10 / settings.distance; // the renderer sorts anew when the camera moves by 0.001: scenes are drawn in lengths that suit it
@@ -155,11 +155,12 @@ class Page {
     this.wake();
   }
 
-  // Widens the field of view on a narrow screen (a phone), so that it shows at least WIDTH of the photograph's width.
+  // Widens the field of view on a screen that is narrower than the photograph, so that it shows the photograph's whole width.
   fit() {
     this.camera.aspect = innerWidth / innerHeight;
-    const wider = this.aspect ? Math.max(1, (WIDTH * this.aspect) / this.camera.aspect) : 1;
-    this.camera.fov = (360 / Math.PI) * Math.atan(wider * Math.tan((this.fov * Math.PI) / 360));
+    const wider = this.aspect ? Math.max(1, this.aspect / this.camera.aspect) : 1;
+    const fov = (360 / Math.PI) * Math.atan(wider * Math.tan((this.fov * Math.PI) / 360));
+    this.camera.fov = Math.max(this.fov, Math.min(fov, WIDEST));
     this.camera.updateProjectionMatrix();
     this.wake();
   }

@@ -241,6 +241,7 @@ class Run:
         frame: Literal["capture", "trained"] = "capture",
         crop: str | None = None,
         floaters: Literal["keep", "remove"] = "keep",
+        title: str | None = None,
     ) -> Path:
         """Write the scene to a file that other tools or later runs read.
 
@@ -257,6 +258,7 @@ class Run:
             crop: Standard files: keep what is inside "sphere:RADIUS" (around the point that the cameras look at; "1.2x" counts in their
                 distance from it), "sphere:X,Y,Z,RADIUS" or "box:X0,Y0,Z0,X1,Y1,Z1", in the units of the capture's poses.
             floaters: Standard files: "remove" leaves out Gaussians that no training photograph supports.
+            title: html: title of the page. Default: the name of the capture.
 
         Returns:
             The path of the file or folder.
@@ -268,7 +270,7 @@ class Run:
         folder, opened = self._in_folder("export"), self._opened
         if self._device != "cpu":
             opened = run_folder.open_run(folder, "cpu", self.step)
-        options = Options(False, sh_degree, max_gaussians, prune, refine, frame, crop, floaters)
+        options = Options(False, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title)
         opened = run_folder.with_capture(opened, self._data)
         return exporting.export(opened, format, None if out is None else Path(out), options)[0].path
 

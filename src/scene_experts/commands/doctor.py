@@ -68,10 +68,10 @@ def render(checks: list[Check]) -> str:
     width = max(len(check.name) for check in checks)
     lines = []
     for check in checks:
-        mark = "ok    " if check.ok else "MISSING" if check.needed else "absent"
-        lines.append(f"{mark:<8}{check.name:<{width}}  {check.found}")
+        mark = "ok" if check.ok else "MISSING" if check.needed else "optional"
+        lines.append(f"{mark:<10}{check.name:<{width}}  {check.found}")
         if check.fix and not check.ok:
-            lines.append(f"{'':<8}{'':<{width}}  -> {check.fix}")
+            lines.append(f"{'':<10}{'':<{width}}  -> {check.fix}")
     return "\n".join([*lines, "", verdict(checks)])
 
 

@@ -53,7 +53,7 @@ def evaluate(args: list[str]) -> int:
         return 0
     print_results(results, Console(markup=False, highlight=False), command.run)
     if not command.options.suffix:  # the page shows the held-out views
-        print(f"wrote {page.write([command.run])}")
+        print(f"wrote {page.write([command.run])}, with the pictures and what each score means")
         print(f"next: {shlex.join([PROG, 'export', str(command.run), '--format', 'html', '--out', str(command.run / 'scene.html')])}")
     return 0
 

@@ -387,7 +387,8 @@ def _export_gaussians(
         about = _describe(work, contents, level) | one.about
         note = {name: value for name, value in about.items() if name != "antialias" or format.antialias}
         views = {} if format.view_note is None or capture is None else format.view_note(capture, world)
-        format.write(path, contents, note | views)
+        titled = {} if options.title is None else {"title": options.title}
+        format.write(path, contents, note | views | titled)
         facts: dict[str, Any] = {"file": path.name, "bytes": path.stat().st_size, "seconds": round(one.seconds, 1), "psnr": {}}
         frame = "the capture's own frame" if options.frame == "capture" else "the trained world"
         said = f"{len(contents):,} Gaussians, {facts['bytes'] / 1e6:.2f} MB, harmonics of degree {contents.degree}, in {frame}"

@@ -37,6 +37,8 @@ class Options:
     floaters: Literal["keep", "remove"] = "keep"
     """Standard files: remove Gaussians that no training photograph supports: those that cover less than
     0.3 pixels of each, and large, faint ones that fewer than 4 show."""
+    title: str | None = None
+    """html: title of the page; by default it names the capture."""
     levels: bool = False
     """Standard files: one file per level of detail, each without the finer levels."""
 

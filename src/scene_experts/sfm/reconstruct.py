@@ -62,13 +62,15 @@ def reconstruct(
         own = source.resolve() == (out / "images").resolve()
         images = out / "images" if own else folder / work.DONE / "images"
         if source.is_file():
+            say(f"reading {source.name}: the sharpest of its frames are used")
             found = extract_photos(source, images, options, progress)
         else:
             found = photos.check_in_place(found, source) if own else photos.copy_photos(found, source, images)
         groups = photos.group_by_camera(found)
-        say(f"{len(found)} photographs, {len(groups)} camera{'s' if len(groups) > 1 else ''}")
         names = [photo.name for photo in found]
         pairs = choose_pairs(len(names), options.matching)
+        kind = "frames" if source.is_file() else "photographs"
+        say(f"{len(found)} {kind}, {len(groups)} camera{'s' if len(groups) > 1 else ''}, {len(pairs):,} pairs to match")
         masks = write_masks(found, images, folder / "masks")
         prepare_folder(folder, found, options, masks)
         request = {

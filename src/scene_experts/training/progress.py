@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from pathlib import Path
 
 from rich.console import Console
@@ -15,6 +16,8 @@ from scene_experts.scene import Traits
 from scene_experts.training.events import Densified, Event, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
 
 SMOOTHING = 0.9  # weight of the previous value in the running means of loss and PSNR
+RECENT = 30.0  # seconds whose speed is shown and extrapolated: a scene that grows slows down
+TICK = 0.5  # seconds between the times that are kept for it
 
 
 class TrainingProgress:
@@ -38,6 +41,7 @@ class TrainingProgress:
     psnr: float | None
     traits: Traits
     pictured: bool
+    times: deque[tuple[float, int]]
 
     def __init__(self, console: Console, every: float = 15.0, out: Path | None = None) -> None:
         self.console, self.every, self.out, self.pictured = console, every, out, False
@@ -45,6 +49,7 @@ class TrainingProgress:
         self.total, self.first, self.began, self.printed = 0, 0, time.perf_counter(), 0.0
         self.loss, self.psnr = {}, None
         self.traits = Traits("", "rows")
+        self.times = deque()
 
     def __enter__(self) -> TrainingProgress:
         if self.live:
@@ -60,6 +65,7 @@ class TrainingProgress:
         match event:
             case Started():
                 self.total, self.first, self.began = event.total, event.step, time.perf_counter()
+                self.times = deque([(self.began, event.step)])
                 verb = f"resumed at iteration {event.step:,}" if event.step else "started"
                 self.traits, rows = event.traits, event.traits.rows
                 lattice = f" on a lattice of {event.traits.voxel:.3g}" if event.traits.voxel else ""
@@ -91,7 +97,7 @@ class TrainingProgress:
         for name, value in event.terms.items():
             self.loss[name] = SMOOTHING * self.loss.get(name, value) + (1 - SMOOTHING) * value
         self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr
-        speed = (event.step - self.first) / max(time.perf_counter() - self.began, 1e-9)
+        speed = self.find_speed(event.step)
         left = (self.total - event.step) / max(speed, 1e-9)
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
         active = f"active {100 * event.active:.0f} %  " if self.traits.activation else ""
@@ -104,6 +110,16 @@ class TrainingProgress:
         elif time.perf_counter() - self.printed > self.every or event.step == self.total:
             self.printed = time.perf_counter()
             self.print_line(line)
+
+    def find_speed(self, step: int) -> float:
+        """Return the iterations per second of the last RECENT seconds, until iteration `step` now."""
+        now, times = time.perf_counter(), self.times
+        while len(times) > 1 and now - times[1][0] >= RECENT:
+            times.popleft()
+        began, first = times[0]
+        if now - times[-1][0] >= TICK:
+            times.append((now, step))
+        return (step - first) / max(now - began, 1e-9)
 
     def print_line(self, text: str) -> None:
         """Print a line above the line that is updated in place."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-NEAR = 0.35  # radius around each photograph's place, as a share of the distance to the scene
+NEAR = 0.2  # radius around each photograph's place, as a share of the distance to the scene: 11 degrees beside a photograph
 SPACING = 0.9  # quantile of the distances between neighbouring places that the radius covers at least
 
 

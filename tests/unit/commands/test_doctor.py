@@ -88,7 +88,7 @@ def test_verdicts() -> None:
     assert len(verdicts) == 3
     assert doctor.exit_code(without("CUDA", "CPU library")) == 0
     report = doctor.render(without("torch"))
-    assert "MISSING torch" in report and "do this" in report
+    assert "MISSING   torch" in report and "do this" in report
     assert doctor.exit_code(without("torch")) == 1
 
 
