@@ -32,6 +32,9 @@ def make_boxes(side: int, rng: np.random.Generator) -> Array:
     return np.stack((np.hstack((centre - half, 0 * height)), np.hstack((centre + half, height))), 1)
 
 
+EDGES = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]  # of a box: pairs of corners that differ in one coordinate
+
+
 def paint(xyz: Array, box: NDArray[np.int64]) -> Array:
     """Return the colour [..., 3] of surface points. box: number of the building, -1 for the ground."""
     x, y, z = xyz[..., 0], xyz[..., 1], xyz[..., 2]
@@ -44,6 +47,16 @@ def paint(xyz: Array, box: NDArray[np.int64]) -> Array:
     return np.clip(np.where((box < 0)[..., None], ground, wall), 0, 1)
 
 
+def before(corners: Array, near: float) -> Array:
+    """Return the corners [8, 3] of a box in the camera's frame that lie beyond the plane z = near, and where its edges meet the plane."""
+    seen = [corners[corners[:, 2] >= near]]
+    for i, j in EDGES:
+        a, b = corners[i], corners[j]
+        if (a[2] < near) != (b[2] < near):
+            seen.append((a + (near - a[2]) / (b[2] - a[2]) * (b - a))[None])
+    return np.concatenate(seen)
+
+
 def trace(origin: Array, rays: Array, pose: Array, lens: Lens, boxes: Array, half: float, samples: int) -> tuple[Array, NDArray[np.int64]]:
     """Return the distance along each ray [H, W, 3] (inf for the sky) and the number of the building it meets (-1: the ground)."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -53,12 +66,13 @@ def trace(origin: Array, rays: Array, pose: Array, lens: Lens, boxes: Array, hal
         number = np.full(best.shape, -1)
         for i, (low, high) in enumerate(boxes):
             corners = np.stack(np.meshgrid(*zip(low, high), indexing="ij"), -1).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
-            if (corners[:, 2] < 0.05).all():
+            seen = before(corners, 0.05)
+            if not len(seen):
                 continue
-            rows = columns = slice(None)
-            if (corners[:, 2] > 0.05).all():  # only the rays through the picture of the box
-                u, v = (corners[:, :2] / corners[:, 2:] * lens.fx + (lens.cx, lens.cy)).T * samples
-                columns, rows = (slice(max(0, int(a.min()) - 1), max(0, int(a.max()) + 2)) for a in (u, v))
+            u, v = (seen[:, :2] / seen[:, 2:] * lens.fx + (lens.cx, lens.cy)).T * samples  # only the rays through the picture of the box
+            columns, rows = (slice(max(0, int(a.min()) - 1), max(0, int(a.max()) + 2)) for a in (u, v))
+            if rows.start >= rays.shape[0] or columns.start >= rays.shape[1] or rows.stop < 2 or columns.stop < 2:
+                continue
             part = rays[rows, columns]
             ends = np.stack(((low - origin) / part, (high - origin) / part))
             enter, leave = ends.min(0).max(-1), ends.max(0).min(-1)
