@@ -98,7 +98,9 @@ def draw(scores: dict[Key, Score], path: Path) -> None:
         panel.set_xticks([], minor=True)
         panel.grid(alpha=0.3)
     for first, second in ((0, 1), (2, 3)):  # both panels of a capture
-        axes[second].sharey(axes[first])
+        ends = [end for index in (first, second) for end in axes[index].get_ylim()]
+        for index in (first, second):
+            axes[index].set_ylim(min(ends), max(ends))
     axes[0].set_ylabel("PSNR, dB")
     axes[0].legend()
     figure.savefig(path, dpi=110)

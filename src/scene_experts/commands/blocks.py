@@ -10,9 +10,10 @@ from typing import Annotated
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import HELP, HELP_ALL, Command, HelpAsked, parse
 from scene_experts.commands import PROG
-from scene_experts.core.errors import InputError, nearest
+from scene_experts.core.errors import InputError, expect_at_least, nearest
 from scene_experts.data.settings import Data
 
+SETTLE = 0.05  # share of the constant rates at the end of the joint training
 ABOUT = f"""usage: {PROG} blocks plan CAPTURE --out PLAN [options]
        {PROG} blocks merge PLAN --runs RUN... --out RUN [options]
 
@@ -43,6 +44,12 @@ class PlanCommand:
     """Recipe of the commands; a recipe with anchors."""
     iterations: int = 30_000
     """Iterations of the commands: a third for the coarse scene, the others for each block, and a tenth more for the merged scene."""
+    train: Annotated[str, Option(value="OPTIONS")] = ""
+    """More options for all trainings, in quotes after =: --train="--scene.voxel-size 0.01 --seed 1"."""
+    coarse_anchors: int = 0
+    """Maximum number of anchors of the coarse scene; 0 means no limit. Each block holds the coarse scene beside its own anchors."""
+    max_memory: float = 0.0
+    """Stop densification in the coarse scene and in each block at this resident memory in GiB; 0 means no limit."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +78,7 @@ def blocks(args: list[str]) -> int:
 def plan(args: list[str]) -> int:
     """Write a plan and print its commands."""
     command = parse(PlanCommand, Command(f"{PROG} blocks plan", ("--data",)), args)
+    expect_at_least([("--coarse-anchors", command.coarse_anchors, 0), ("--max-memory", command.max_memory, 0)])
 
     from scene_experts.core.io import write_bytes
     from scene_experts.data.blocks import make_blocks, write_plan
@@ -81,6 +89,8 @@ def plan(args: list[str]) -> int:
         raise InputError(f"expected a plan of all training views, found --views {command.data.views}; leave it out")
     if command.recipe not in RECIPES:
         raise InputError(f"expected a recipe as --recipe, found '{command.recipe}'{nearest(command.recipe, RECIPES)}; change it")
+    lines = commands(command, [(0.0, 0.0, 0.0, 1.0, 1.0, 1.0)] * command.blocks)  # a wrong option is found before the capture is read
+    check_trainings(lines)
     capture = run_folder.load_capture(run_folder.named(command.data))
     capture.images.close()
     found = make_blocks(capture, command.blocks, command.margin, command.share)
@@ -98,19 +108,41 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]]) -> list[str]
 
     bounds: corners of the box of each block with its margin, in trained world units.
     """
-    out, total = command.out, command.iterations
+    out, total, more = command.out, command.iterations, split_words(command.train)
     data = [word for name, value in vars(command.data).items() if value != getattr(Data(Path()), name) for word in _flag(name, value)]
-    train = [PROG, "train", command.recipe, *data]
+    train = [PROG, "train", command.recipe, *data, *more]
     coarse, merged = str(out / "coarse"), str(out / "merged")
     runs = [str(out / f"run{number}") for number in range(command.blocks)]
-    lines = [[*train, "--out", coarse, "--iterations", str(total), "--stop-at", str(max(1, total // 3))]]
+    memory = ["--max-memory", f"{command.max_memory:g}"] if command.max_memory else []
+    few = ["--max-anchors", str(command.coarse_anchors)] if command.coarse_anchors else []
+    lines = [[*train, "--out", coarse, "--iterations", str(total), "--stop-at", str(max(1, total // 3)), *few, *memory]]
     for number, run in enumerate(runs):
         views = ["--views", str(out / f"block{number}.json"), "--init-from", coarse, "--rates.networks", "0"]
         inside = ["--growth.bounds", *(f"{side:.6g}" for side in bounds[number])]
-        lines.append([*train, "--out", run, "--iterations", str(total), *views, *inside])
+        lines.append([*train, "--out", run, "--iterations", str(total), *views, *inside, *memory])
     lines.append([PROG, "blocks", "merge", str(out), "--runs", *runs, "--out", merged])
-    lines.append([*train, "--out", str(out / "joint"), "--iterations", str(total + max(1, total // 10)), "--init-from", merged])
+    both = total + max(1, total // 10)
+    # the rates that a schedule leaves constant fall during the joint training: without it, the blocks' fit is shaken and not restored
+    settle = ["--rates.anneal", str(SETTLE), "--rates.anneal-from", f"{total / both:.4f}"]
+    lines.append([*train, "--out", str(out / "joint"), "--iterations", str(both), "--init-from", merged, *settle])
     return [shlex.join(line) for line in lines]
+
+
+def check_trainings(lines: list[str]) -> None:
+    """Raise InputError if the options of a training in `lines` are wrong."""
+    from scene_experts.commands.train import parse_train
+
+    for words in map(shlex.split, lines):
+        if words[1] == "train":
+            parse_train(words[2:])
+
+
+def split_words(text: str) -> list[str]:
+    """Split the options of --train as a shell does. Raises InputError for an open quote."""
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise InputError(f"expected options for --train, found '{text}' ({error}); correct the quotes") from None
 
 
 def _flag(name: str, value: object) -> list[str]:

@@ -16,7 +16,7 @@ def capture(tmp_path_factory):
 
 def test_the_commands_of_a_plan_are_commands_of_train(capture, tmp_path, capsys):
     out = tmp_path / "my plan"
-    given = ["--blocks", "3", "--recipe", "scaffold-gs", "--iterations", "900", "--background", "1", "1", "0.5"]
+    given = ["--blocks", "3", "--recipe", "scaffold-gs", "--iterations", "900", "--train=--seed 3", "--coarse-anchors", "500", "--max-memory", "4", "--background", "1", "1", "0.5"]
     assert cli.main(["blocks", "plan", str(capture), "--out", str(out), *given, "--ignore-principal-point"]) == 0
     lines = (out / "commands.sh").read_text().splitlines()[2:]
     assert "\n".join(lines) in capsys.readouterr().out and len(lines) == 1 + 3 + 1 + 1
@@ -24,9 +24,14 @@ def test_the_commands_of_a_plan_are_commands_of_train(capture, tmp_path, capsys)
     trains = [parse_train(line[2:]) for line in words if line[1] == "train"]
     assert [train.init_from for train in trains] == [None, *[out / "coarse"] * 3, out / "merged"]
     assert [train.cfg.iterations for train in trains] == [900, 900, 900, 900, 990] and trains[0].stop_at == 300
+    assert all(train.cfg.seed == 3 for train in trains)
+    assert [train.cfg.max_anchors for train in trains[:2]] == [500, 0] and [t.max_memory for t in trains] == [4, 4, 4, 4, 0]
     assert all(train.data.background == (1, 1, 0.5) and train.data.ignore_principal_point for train in trains)
     assert [train.data.views for train in trains[1:4]] == [out / f"block{number}.json" for number in range(3)]
     assert words[4][1:3] == ["blocks", "merge"]
+    joint = trains[-1].cfg.rates  # the constant rates fall while the blocks are trained together
+    assert joint.at("feature", 900, 990, 1.0) == pytest.approx(0.0075, rel=1e-3)
+    assert joint.at("feature", 990, 990, 1.0) == pytest.approx(0.05 * 0.0075)
 
 
 def test_words_that_do_not_fit(capture, tmp_path, capsys):
@@ -37,6 +42,8 @@ def test_words_that_do_not_fit(capture, tmp_path, capsys):
         (["blocks", "plan", str(capture), *out, "--recipe", "moegs"], "--recipe"),
         (["blocks", "plan", str(capture), *out, "--blocks", "0"], "--blocks"),
         (["blocks", "plan", str(capture), *out, "--views", "x.json"], "--views"),
+        (["blocks", "plan", str(capture), *out, "--train=--seeed 3"], "seeed"),
+        (["blocks", "plan", str(capture), *out, "--train=--seed '3"], "--train"),
         (["blocks", "merge", str(tmp_path), *out, "--runs", str(tmp_path)], "plan.json"),
     ):
         assert cli.main(words) == 2 and found in capsys.readouterr().err
