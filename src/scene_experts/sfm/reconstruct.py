@@ -110,6 +110,8 @@ def check_request(source: Path, out: Path, overwrite: bool) -> None:
         raise InputError(f"expected a folder of photographs or a video, found the single photograph {source}; give its folder")
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(f"finding camera poses requires pycolmap: {INSTALL}")
+    if source.is_file():
+        frames.import_ffmpeg()
     here, images = source.resolve(), (out / "images").resolve()
     if here == out.resolve():
         raise InputError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from scene_experts.core.io import check_writable, locked
@@ -18,14 +18,25 @@ PLACES = {"images": "images", "model": "sparse/0", "capture.json": "capture.json
 def open_work_folder(out: Path) -> Iterator[Path]:
     """Lock the work folder of the capture `out` for this process and yield it. Complete results of a killed process are published first.
 
+    After an error, folders that were made here are removed if nothing was written to them.
+
     Raises InputError if another process holds the lock, RunError if `out` is not writable.
     """
     folder = out / NAME
+    made = [path for path in (folder, out) if not path.exists()]
     check_writable(folder / ".lock")
     with locked(folder / ".lock", f"another process is making a capture in {out}; wait until it ends"):
         if (folder / WHOLE).exists():
             publish(out)
-        yield folder
+        try:
+            yield folder
+        except BaseException:
+            if folder in made and [path.name for path in folder.iterdir()] == [".lock"]:
+                (folder / ".lock").unlink()
+                with suppress(OSError):  # not empty
+                    for path in made:
+                        path.rmdir()
+            raise
 
 
 def publish(out: Path) -> None:

@@ -66,3 +66,14 @@ def test_incomplete_results_are_not_published(tmp_path):
 def test_one_process_at_a_time(tmp_path):
     with work.open_work_folder(tmp_path), pytest.raises(InputError, match=naming(tmp_path)), work.open_work_folder(tmp_path):
         pass
+
+
+def test_a_call_that_wrote_nothing_leaves_no_folder(tmp_path):
+    out = tmp_path / "new"
+    with pytest.raises(ValueError), work.open_work_folder(out):
+        raise ValueError
+    assert not out.exists()
+    with pytest.raises(ValueError), work.open_work_folder(out) as folder:
+        (folder / "database").mkdir()
+        raise ValueError
+    assert (folder / "database").is_dir()  # to continue from
