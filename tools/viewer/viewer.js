@@ -12,6 +12,8 @@ const FLIGHT = 16; // seconds of a round
 const QUIET = 400; // milliseconds of drawing after the last news
 const UNIT = 10 / settings.distance; // the renderer sorts anew when the camera moves by 0.001: scenes are drawn in lengths that suit it
 const note = document.getElementById("note");
+const veil = document.getElementById("veil"); // hides what lies above and below a photograph, until somebody takes the camera
+veil.style.setProperty("--back", `rgb(${settings.background.map((v) => Math.round(255 * v))})`);
 const say = (text) => { note.textContent = text; note.hidden = !text; };
 
 function bytesOf(id) {
@@ -161,6 +163,8 @@ class Page {
     const wider = this.aspect ? Math.max(1, this.aspect / this.camera.aspect) : 1;
     const fov = (360 / Math.PI) * Math.atan(wider * Math.tan((this.fov * Math.PI) / 360));
     this.camera.fov = Math.max(this.fov, Math.min(fov, WIDEST));
+    const shown = Math.tan((this.fov * Math.PI) / 360) / Math.tan((this.camera.fov * Math.PI) / 360); // share of the screen's height
+    veil.style.setProperty("--edge", `${(50 * (1 - shown)).toFixed(2)}%`);
     this.camera.updateProjectionMatrix();
     this.wake();
   }
@@ -220,6 +224,7 @@ class Page {
     const flying = this.follow(Math.min(seconds, 0.1)) || this.fly(Math.min(seconds, 0.1));
     this.controls.dampingFactor = 1 - Math.exp(-8 * seconds); // by time, so that slow machines come to rest as soon
     this.last = now;
+    veil.classList.toggle("on", this.held);
     if (!this.held) { this.controls.update(); this.stay(target); }
     this.renderer.render(this.scene, this.camera);
     this.frames += 1;
