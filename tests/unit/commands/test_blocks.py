@@ -16,7 +16,8 @@ def capture(tmp_path_factory):
 
 def test_the_commands_of_a_plan_are_commands_of_train(capture, tmp_path, capsys):
     out = tmp_path / "my plan"
-    given = ["--blocks", "3", "--recipe", "scaffold-gs", "--iterations", "900", "--train=--seed 3", "--coarse-anchors", "500", "--max-memory", "4", "--background", "1", "1", "0.5"]
+    given = ["--blocks", "3", "--recipe", "scaffold-gs", "--iterations", "900", "--background", "1", "1", "0.5"]
+    given += ["--train=--seed 3", "--coarse-anchors", "500", "--max-memory", "4"]
     assert cli.main(["blocks", "plan", str(capture), "--out", str(out), *given, "--ignore-principal-point"]) == 0
     lines = (out / "commands.sh").read_text().splitlines()[2:]
     assert "\n".join(lines) in capsys.readouterr().out and len(lines) == 1 + 3 + 1 + 1
