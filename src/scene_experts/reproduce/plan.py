@@ -26,6 +26,7 @@ NEWER = {
     "optimizer",
     "average",
     "batch",
+    "batch_rates",
     "loss.residual_quantile",
     "loss.residual_weight",
     "loss.residual_from",

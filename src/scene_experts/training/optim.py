@@ -36,7 +36,7 @@ class Optimizer(Part, ABC):
     """Whether `step(rows=...)` of the built optimiser can move some rows of a table only; --sparse-adam needs it."""
 
     def for_batch(self, views: int) -> Self:
-        """Return the settings for steps that see `views` views each. The training also multiplies the learning rates by sqrt(views)."""
+        """Return the settings for steps that see `views` views each. The learning rates are multiplied by views**batch_rates elsewhere."""
         return self
 
     @abstractmethod

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -128,10 +127,10 @@ class Training:
             torch.manual_seed(int.from_bytes(digest, "little") >> 1)
 
     def set_rates(self) -> None:
-        """Set the learning rates of the iteration. They grow with the square root of the batch."""
+        """Set the learning rates of the iteration. They grow with the batch to the power `batch_rates`."""
         for group in self.optimizer.param_groups:
             rate = self.cfg.rates.at(group["name"], self.step, self.cfg.iterations, self.scene.extent)
-            group["lr"] = rate * math.sqrt(self.cfg.batch)
+            group["lr"] = rate * self.cfg.batch**self.cfg.batch_rates
 
     def optimizer_step(self, rows: Tensor | None = None) -> None:
         """Run one optimiser step and remove the gradients. rows: [A] int64, the only rows of the table to update; None updates all."""

@@ -16,6 +16,7 @@ from scene_experts.render import choose
 from scene_experts.training.average import Average
 from scene_experts.training.batch import check_batch
 from scene_experts.training.config import RunConfig
+from scene_experts.training.config import check as check_train
 from scene_experts.training.events import Densified, Previewed, Started, Stepped, Stopped
 from scene_experts.training.loop import Run, iterate
 from scene_experts.training.state import Training
@@ -131,8 +132,9 @@ def test_iterations_count_views(folder, tmp_path):
     assert float(last_tensors(tmp_path)["adam.feature.0.step"]) == 6 - 1  # anchors miss the step of a densification
 
 
-def test_a_batch_has_the_mean_gradient_and_the_rates_of_its_size(folder):
-    cfg = replace(of_family("scaffold-gs"), random_background=False)
+@pytest.mark.parametrize(("power", "factor"), [(0.5, 2), (1.0, 4), (0.0, 1)])
+def test_a_batch_has_the_mean_gradient_and_the_rates_of_its_size(folder, power, factor):
+    cfg = replace(of_family("scaffold-gs"), random_background=False, batch_rates=power)
     capture = load(folder)
     rasterize = choose("auto", "cpu", deterministic=True)
     training = Training.start(cfg.scaled(), capture, "cpu")
@@ -145,10 +147,15 @@ def test_a_batch_has_the_mean_gradient_and_the_rates_of_its_size(folder):
         iterate(single, run, capture, rasterize)
     mean, total = (t.scene.table.params["offsets"].grad for t in (training, single))
     assert mean is not None and total is not None and torch.allclose(mean, total / 4, rtol=1e-4, atol=1e-9)
-    assert training.rates()["feature"] == pytest.approx(2 * single.rates()["feature"])
+    assert training.rates()["feature"] == pytest.approx(factor * single.rates()["feature"])
     group = training.optimizer.param_groups[0]
     assert group["betas"] == pytest.approx((0.9**4, 0.999**4)) and group["eps"] == pytest.approx(0.5e-15)
     capture.images.close()
+
+
+def test_a_power_outside_0_to_1_is_refused():
+    with pytest.raises(InputError, match="--batch-rates from 0 to 1"):
+        check_train(replace(of_family("scaffold-gs"), batch_rates=1.5))
 
 
 def test_processes_that_do_not_divide_the_batch_are_refused():
