@@ -1,6 +1,6 @@
 """A scene in blocks against the same training in one piece: plan, trainings, merge, joint training and scores.
 
-    python benchmarks/blocks.py CAPTURE --out OUT --seed 0 --blocks 4 --iterations 3000 --train="--resolution longest:400"
+    python benchmarks/blocks.py CAPTURE --out OUT --seed 0 --blocks 4 --iterations 3000 --plan="--resolution longest:400"
 
 Rows of the table: the run in one piece; the merged scene; the merged scene after the joint training; and the control, the run in one
 piece after the same further training. The commands of the blocks are those of `scene-experts blocks plan`. The coarse scene is the

@@ -90,7 +90,7 @@ def plan(args: list[str]) -> int:
     if command.recipe not in RECIPES:
         raise InputError(f"expected a recipe as --recipe, found '{command.recipe}'{nearest(command.recipe, RECIPES)}; change it")
     lines = commands(command, [(0.0, 0.0, 0.0, 1.0, 1.0, 1.0)] * command.blocks)  # a wrong option is found before the capture is read
-    check_trainings(lines)
+    check_trainings(lines, command.data)
     capture = run_folder.load_capture(run_folder.named(command.data))
     capture.images.close()
     found = make_blocks(capture, command.blocks, command.margin, command.share)
@@ -128,13 +128,16 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]]) -> list[str]
     return [shlex.join(line) for line in lines]
 
 
-def check_trainings(lines: list[str]) -> None:
-    """Raise InputError if the options of a training in `lines` are wrong."""
+def check_trainings(lines: list[str], data: Data) -> None:
+    """Raise InputError if the options of a training in `lines` are wrong, or change how the capture `data` of the plan is read."""
     from scene_experts.commands.train import parse_train
 
     for words in map(shlex.split, lines):
         if words[1] == "train":
-            parse_train(words[2:])
+            found = vars(parse_train(words[2:]).data)
+            for name in (name for name, value in vars(data).items() if name != "views" and value != found[name]):
+                option = f"--{name.replace('_', '-')}"
+                raise InputError(f"expected options of the training in --train, found {option}; give it to `{PROG} blocks plan` itself")
 
 
 def split_words(text: str) -> list[str]:

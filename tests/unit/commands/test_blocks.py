@@ -45,6 +45,7 @@ def test_words_that_do_not_fit(capture, tmp_path, capsys):
         (["blocks", "plan", str(capture), *out, "--views", "x.json"], "--views"),
         (["blocks", "plan", str(capture), *out, "--train=--seeed 3"], "seeed"),
         (["blocks", "plan", str(capture), *out, "--train=--seed '3"], "--train"),
+        (["blocks", "plan", str(capture), *out, "--train=--resolution longest:40"], "--resolution"),
         (["blocks", "merge", str(tmp_path), *out, "--runs", str(tmp_path)], "plan.json"),
     ):
         assert cli.main(words) == 2 and found in capsys.readouterr().err
