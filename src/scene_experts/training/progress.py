@@ -101,9 +101,9 @@ class TrainingProgress:
         left = (self.total - event.step) / max(speed, 1e-9)
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
         active = f"active {100 * event.active:.0f} %  " if self.traits.activation else ""
-        line = (
-            f"{event.step:>6,}/{self.total:,}  {terms}  training PSNR {self.psnr:.2f}  {self.traits.rows} {event.anchors:,}  {active}"
-            f"{speed:.1f} it/s  {format_duration(left)} left"
+        line = (  # a narrow terminal cuts the end off
+            f"{event.step:>6,}/{self.total:,}  {format_duration(left)} left  {speed:.1f} it/s  training PSNR {self.psnr:.2f}  "
+            f"{self.traits.rows} {event.anchors:,}  {active}{terms}"
         )
         if self.live:
             self.live.update(Text(line, no_wrap=True, overflow="ellipsis"))

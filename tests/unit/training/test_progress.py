@@ -37,6 +37,15 @@ def test_a_log_file_gets_plain_lines():
     assert "--resume" in text and "\x1b" not in text
 
 
+def test_a_narrow_terminal_shows_the_time_that_is_left():
+    console = Console(file=io.StringIO(), force_terminal=True, width=60)
+    with TrainingProgress(console, every=0.0) as show:
+        show(Started(0, 200, 1234, Traits("anchors", "anchors", 0.02, activation=True)))
+        show(Stepped(10, dict.fromkeys(("l1", "dssim", "volume", "opacity", "load"), 0.05), 21.5, 1300, 800, 4000, 0.61, 1.0, {}))
+    shown = next(line for line in console.file.getvalue().split("\r") if "10/200" in line)  # type: ignore[attr-defined]
+    assert " left " in shown and "load" not in shown
+
+
 def test_rows_have_the_name_that_the_traits_state():
     out = io.StringIO()
     with TrainingProgress(Console(file=out, width=200), every=0.0) as show:
