@@ -77,14 +77,18 @@ def test_orbit_video(run, example):
 
 
 @pytest.mark.slow
-def test_new_recipe(tmp_path):
+@pytest.mark.parametrize(
+    ("folder", "recipe", "option"),
+    [("new_recipe", "wide-decoders", ("--scene.decoder.width", 3)), ("new_loss", "binary-opacity", ("--loss.binary", 0.5))],
+)
+def test_new_recipe(tmp_path, folder, recipe, option):
     """The package is installed as pip does it: its module, and a .dist-info folder with its entry points."""
-    project = tomllib.loads((EXAMPLES / "new_recipe" / "pyproject.toml").read_text())["project"]
-    (group, entries), info = next(iter(project["entry-points"].items())), tmp_path / "wide_decoders-0.1.0.dist-info"
+    project = tomllib.loads((EXAMPLES / folder / "pyproject.toml").read_text())["project"]
+    (group, entries), info = next(iter(project["entry-points"].items())), tmp_path / f"{recipe.replace('-', '_')}-0.1.0.dist-info"
     info.mkdir()
     info.joinpath("METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
     info.joinpath("entry_points.txt").write_text(f"[{group}]\n" + "".join(f"{name} = {place}\n" for name, place in entries.items()))
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(EXAMPLES / "new_recipe"), str(tmp_path), *filter(None, sys.path)])}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(EXAMPLES / folder), str(tmp_path), *filter(None, sys.path)])}
 
     def call(*words: object) -> str:
         command = [sys.executable, "-m", "scene_experts", *map(str, words)]
@@ -93,6 +97,6 @@ def test_new_recipe(tmp_path):
         return done.stdout
 
     size = ("--resolution", "longest:48", "--max-views", 16, "--iterations", 3, "--scene.voxel-size", 0.2)
-    call("train", "wide-decoders", "--data", DEMO / "buddha", "--out", "run", *size, "--scene.decoder.width", 3)
+    call("train", recipe, "--data", DEMO / "buddha", "--out", "run", *size, *option)
     call("eval", "run", "--no-lpips")
-    assert "wide-decoders" in (tmp_path / "run" / "config.json").read_text()
+    assert recipe in (tmp_path / "run" / "config.json").read_text()

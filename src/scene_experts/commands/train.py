@@ -172,6 +172,8 @@ def parse_train(args: list[str]) -> TrainCommand:
     """The recipe and its options. The numbers of the recipe are the defaults. Raises InputError, or HelpAsked for --help."""
     name = args[0] if args else ""
     if name not in RECIPES:
+        if name in RECIPES.broken:
+            raise InputError(f"expected a recipe '{name}' that loads, found an error in it: {RECIPES.broken[name]}; correct the package")
         if any(arg in (*HELP, HELP_ALL) for arg in args):
             raise HelpAsked(help_of_recipes())
         raise InputError(no_recipe(args))

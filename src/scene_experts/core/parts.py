@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +42,20 @@ def register(part: type[P]) -> type[P]:
         raise ValueError(f"expected a part of a new name, found {part.__name__!r} of both {known.__module__} and {part.__module__}")
     _REGISTERED[part.__name__] = part
     return part
+
+
+def extend(part: Part, kind: type[P], **numbers: Any) -> P:
+    """Return a part of the class `kind`, a subclass of the class of `part`, with the numbers of `part` and `numbers`:
+
+        loss = extend(recipe.loss, MyWeights, mine=0.01)
+
+    `MyWeights(mine=0.01)` would have the defaults of the class instead of the numbers of the recipe.
+
+    Raises TypeError if `kind` is no subclass, or has no field of a name.
+    """
+    if not issubclass(kind, type(part)):
+        raise TypeError(f"expected a subclass of {type(part).__name__}, found {kind.__name__}")
+    return kind(**{field.name: getattr(part, field.name) for field in dataclasses.fields(part) if field.init} | numbers)
 
 
 def find(name: str, kind: type[P]) -> type[P] | None:

@@ -49,6 +49,8 @@ class ResultColumn:
         return "-" if value is None else f"{value:,.{self.digits}f}"
 
 
+FEW_VIEWS = 5  # with fewer held-out views, means are unreliable
+NOISE = 0.7  # dB; how far seeds and the order of the views move the PSNR of one run (3,000 iterations)
 COLUMNS = (
     ResultColumn(
         "PSNR", ("psnr",), 2, best=1,
@@ -101,7 +103,7 @@ def make_table(names: Sequence[str], results: Sequence[dict[str, Any]], columns:
     if results and all(result.get("views") == "train" for result in results):
         names_of[("psnr",)] = "training PSNR"
     titles = tuple(names_of.get(columns[j].path, columns[j].title) for j in used)
-    return ResultTable(("run", *titles), rows, frozenset(best), _explain_absent(names, results))
+    return ResultTable(("run", *titles), rows, frozenset(best), (*_explain_absent(names, results), *_warn_of_few_views(results)))
 
 
 def explain(titles: Sequence[str]) -> list[tuple[str, str]]:
@@ -128,6 +130,14 @@ def _explain_absent(names: Sequence[str], results: Sequence[dict[str, Any]]) -> 
     lacking = {reason: [n for n, r in zip(names, results) if reason in (r.get("absent") or {}).values()] for reason in reasons}
     where = {reason: "" if len(of) == len(results) else f" of {', '.join(of)}" for reason, of in lacking.items()}
     return tuple(sentence(f"{', '.join(metrics)}{where[reason]} absent: {reason}") for reason, metrics in reasons.items())
+
+
+def _warn_of_few_views(results: Sequence[dict[str, Any]]) -> tuple[str, ...]:
+    """Return a note where so few held-out views were scored that differences between runs are chance."""
+    counts = [count for result in results if (count := result.get("view_count")) and result.get("views") != "train"]
+    if len(counts) < 2 or min(counts) >= FEW_VIEWS:
+        return ()
+    return (f"Only {min(counts)} held-out views, one run in each row: differences below {NOISE} dB show nothing.",)
 
 
 def to_markdown(table: ResultTable) -> str:

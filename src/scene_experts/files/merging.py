@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -32,27 +33,36 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     fingerprint, blocks = read_plan(plan)
     if len(runs) != len(blocks):
         raise InputError(f"expected {len(blocks)} runs, one for each block of {plan}, found {len(runs)}; name them in the plan's order")
-    opened = [run_folder.open_run(run) for run in runs]
-    first = opened[0]
-    for run in opened:
-        if not run.scene.traits.voxel:
-            raise InputError(f"expected a scene of anchors in {run.path}, found one of {run.scene.traits.rows}; train an anchor recipe")
+    columns: dict[str, list[Tensor]] = {}
+    networks: dict[str, Tensor] = {}
+    lattice: dict[str, Any] = {}
+    configs, step, seconds = [], 0, 0.0
+    for block, path in zip(blocks, runs):  # one run in memory at a time
+        run = run_folder.open_run(path)
+        scene = run.scene
+        if not scene.traits.voxel:
+            raise InputError(f"expected a scene of anchors in {path}, found one of {scene.traits.rows}; train an anchor recipe")
         if run.capture != fingerprint:
-            raise InputError(f"expected a run on the capture of the plan, found one on another in {run.path}; use the plan's command")
-        _check_same(first.scene, run.scene, run.path)
-    tensors: dict[str, Tensor] = {f"network.{name}": value.detach() for name, value in first.scene.network_tensors().items()}
-    kept = [block.holds(run.scene.positions.detach()) for block, run in zip(blocks, opened)]
-    for name in first.scene.table.columns():
-        kind = "params" if name in first.scene.table.params else "facts"
-        columns = [run.scene.table.columns()[name].detach()[rows] for run, rows in zip(opened, kept)]
-        tensors[f"{kind}.{name}"] = torch.cat(columns)
-    data = replace(first.config.data, views=None)
-    config = replace(first.config, data=data, command=f"merged from {len(runs)} blocks", versions=run_folder.versions(), stop_at=None)
-    step = max(run.step for run in opened)
+            raise InputError(f"expected a run on the capture of the plan, found one on another in {path}; use the plan's command")
+        if not configs:
+            networks, lattice = {name: value.detach().clone() for name, value in scene.network_tensors().items()}, scene.meta()
+        _check_same(lattice, networks, scene, path)
+        rows = block.holds(scene.positions.detach())
+        for name, column in scene.table.columns().items():
+            kind = "params" if name in scene.table.params else "facts"
+            columns.setdefault(f"{kind}.{name}", []).append(column.detach()[rows])
+        configs.append(run.config)
+        step, seconds = max(step, run.step), seconds + run.clock.seconds
+        del run, scene
+    tensors = {f"network.{name}": value for name, value in networks.items()}
+    for name in list(columns):
+        tensors[name] = torch.cat(columns.pop(name))
+    data = replace(configs[0].data, views=None)
+    config = replace(configs[0], data=data, command=f"merged from {len(runs)} blocks", versions=run_folder.versions(), stop_at=None)
     run_folder.prepare(out, config, resume=False)
-    seconds = sum(run.clock.seconds for run in opened)
     meta = {"recipe": config.train.recipe, "step": step, "seconds": seconds, "capture": fingerprint}
-    checkpoint.save(out / "checkpoints", step, tensors, {**first.scene.meta(), **meta, "config": "imported"})
+    checkpoint.save(out / "checkpoints", step, tensors, {**lattice, **meta, "config": "imported"})
+    del tensors
     merged = run_folder.open_run(out)
     capture = run_folder.capture_of(merged)
     try:
@@ -62,13 +72,12 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     return len(merged.scene.table)
 
 
-def _check_same(first: Scene, other: Scene, path: Path) -> None:
-    """Raise InputError unless two scenes have the same lattice and networks."""
-    lattice, found = first.meta(), other.meta()
-    if lattice != found:
+def _check_same(lattice: dict[str, Any], networks: dict[str, Tensor], scene: Scene, path: Path) -> None:
+    """Raise InputError unless a scene has this lattice and these networks."""
+    if lattice != scene.meta():
         raise InputError(f"expected the lattice of the first block in {path}, found another; begin all blocks with the same --init-from")
-    mine, its = first.network_tensors(), other.network_tensors()
-    if mine.keys() != its.keys() or not all(torch.equal(mine[name], its[name]) for name in mine):
+    its = scene.network_tensors()
+    if networks.keys() != its.keys() or not all(torch.equal(value, its[name]) for name, value in networks.items()):
         raise InputError(
             f"expected the networks of the first block in {path}, found others; "
             "begin all blocks with the same --init-from and train them with --rates.networks 0"

@@ -30,7 +30,7 @@ LOSSES = {
     "l1": "l1: mean absolute difference of pixels",
     "dssim": "dssim: 1 - SSIM",
     "volume": "volume: size of the Gaussians, kept small",
-    "opacity": "opacity: opacities, kept near 0 or 1",
+    "opacity": "opacity: mean negative opacity, which the hinge pushes towards 0 so that more Gaussians are drawn",
     "load": "load: unequal use of the experts",
 }
 """What the terms of the loss are, for the page."""
@@ -130,7 +130,7 @@ def format_table(found: ResultTable) -> str:
 def explain_curves(sources: Sequence[Source]) -> str:
     """Return what the curves of the training show, as HTML."""
     terms = sorted({t for s in sources for m in s.metrics for t in m.get("terms", {})})
-    named = "; ".join(LOSSES[term] for term in terms if term in LOSSES)
+    named = "; ".join(LOSSES.get(term, f"{term}: a term of the recipe") for term in terms)
     text = "Training PSNR is measured on the photographs that are trained on, so it is higher than that of the held-out views."
     return f"<p class='soft'>{text}{f' Losses: {escape(named)}.' if named else ''}</p>"
 

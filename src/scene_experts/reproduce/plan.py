@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+import sys
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -124,12 +126,17 @@ class Spec:
     @property
     def key(self) -> str:
         """A short hash of every setting that changes the run's numbers. The path of the capture is left out."""
-        return identity(self.scene.name, self.train, self.data)
+        return identity(self.scene.name, self.train, self.data, self.code)
 
     @property
     def numbers(self) -> str:
         """The same hash without the recipe's name. Rows of different experiments with the same hash are the same training."""
-        return identity(self.scene.name, replace(self.train, recipe=""), self.data)
+        return identity(self.scene.name, replace(self.train, recipe=""), self.data, self.code)
+
+    @cached_property
+    def code(self) -> str:
+        """As `code_of` its recipe."""
+        return code_of(self.train)
 
     @property
     def label(self) -> str:
@@ -150,10 +157,41 @@ class Spec:
         return args
 
 
-def identity(scene: str, train: Train, data: Data) -> str:
-    """Return the hash that names a run: of the scene's name, the recipe with all numbers and how the capture is read, not of its path."""
-    text = json.dumps([scene, without_newer(to_json(train), train), data.settings()], sort_keys=True)
+def identity(scene: str, train: Train, data: Data, code: str = "") -> str:
+    """Return the hash that names a run: of the scene's name, the recipe with all numbers, how the capture is read (not of its path), and
+    the code of other packages (`code_of`)."""
+    text = json.dumps([scene, without_newer(to_json(train), train), data.settings(), *filter(None, [code])], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def code_of(train: Train) -> str:
+    """Return a hash of the source files of the packages, other than this one, that a recipe has parts of; "" without such parts.
+
+    A run is therefore trained again after a change of the code that it was trained with.
+    """
+    ours = __name__.partition(".")[0]
+    names = {type(part).__module__.partition(".")[0] for part in parts_of(train)} - {ours}
+    found = hashlib.sha256()
+    for name in sorted(names):
+        module = sys.modules[name]
+        roots = [Path(place) for place in getattr(module, "__path__", ())]
+        files = [(path.relative_to(root), path) for root in roots for path in root.rglob("*.py")]
+        if not files and getattr(module, "__file__", None):
+            files = [(Path(name), Path(str(module.__file__)))]
+        for place, path in sorted(files):
+            found.update(f"{name} {place.as_posix()} ".encode() + hashlib.sha256(path.read_bytes()).digest())
+    return found.hexdigest()[:12] if names else ""
+
+
+def parts_of(value: Any) -> Iterator[Any]:
+    """Yield a recipe and all its parts: the dataclasses that it is made of."""
+    if dataclasses.is_dataclass(value):
+        yield value
+        for f in dataclasses.fields(value):
+            yield from parts_of(getattr(value, f.name))
+    elif isinstance(value, (tuple, list)):
+        for entry in value:
+            yield from parts_of(entry)
 
 
 def without_newer(plain: dict[str, Any], part: Any, place: str = "") -> dict[str, Any]:

@@ -16,7 +16,7 @@ from scene_experts.render import choose
 from scene_experts.reproduce import claims, figures, store, tables
 from scene_experts.reproduce.compare import COMPARE, make_difference_tables
 from scene_experts.reproduce.experiments import Experiment
-from scene_experts.reproduce.plan import OWN, Scene, Spec
+from scene_experts.reproduce.plan import OWN, Scene, Spec, code_of
 from scene_experts.reproduce.statistics import SEED_SD, SEED_WEIGHT, on_common_scenes
 from scene_experts.reproduce.store import Record
 from scene_experts.training import run_folder
@@ -33,6 +33,8 @@ def write(
     records = [r for r in records if r.scene in wanted]
     written: list[Path] = []
     page = ["# Reproduced tables and figures", "", *(["```sh", command, "```", ""] if command else [])]
+    if "CAPTURES/" in command:
+        page += ["`CAPTURES` is the folder of the captures. `--out` and other folders are left out.", ""]
     for experiment in experiments:
         made = [*write_tables(out, experiment, scenes, records), *write_figures(out, experiment, scenes, records)]
         if experiment.name == "fig5":
@@ -40,20 +42,31 @@ def write(
         written += made
         page += [f"## {experiment.title}", "", ", ".join(f"[{p.name}]({p.name})" for p in made) or "No run is finished yet.", ""]
         page += [f"![{p.stem}]({p.name})\n" for p in made if p.suffix == ".png"]
-    if any(experiment.name != COMPARE for experiment in experiments):
+        if experiment.name == COMPARE:
+            page += [line for p in made if p.suffix == ".md" for line in below_title(p.read_text())]
+    claimed = any(experiment.name != COMPARE for experiment in experiments)
+    if claimed:
         page += ["## The paper's claims", "", *caveat(records), claims.to_markdown(claims.check(records))]
     noise = f"{SEED_SD['psnr']} dB with {SEED_WEIGHT} degrees of freedom"
     page += [
         "Differences are paired by view and seed. The interval covers other views and other seeds of these captures (Student's t).",
-        "The interval over capture means covers other captures: Student's t with the captures as the sample, from three captures on. "
-        "Verdicts use the first interval, so they are about these captures.",
+        "The interval over capture means covers other captures: Student's t with the captures as the sample, from three captures on."
+        + (" Verdicts use the first interval, so they are about these captures." if claimed else ""),
         f"The standard deviation over seeds is the same for all captures. It is pooled from the measured seeds and from {noise}.",
-        '"On training views" is the difference in PSNR on training views over the second half of the trainings, paired by iteration.',
-        "",
     ]
+    if claimed:
+        page.append(
+            '"On training views" is the difference in PSNR on training views over the second half of the trainings, paired by iteration.'
+        )
+    page.append("")
     path = out / "README.md"
     write_bytes(path, "\n".join(page).encode())
     return [*written, path]
+
+
+def below_title(text: str) -> list[str]:
+    """Return the lines of a Markdown page without its title, with headings one level lower."""
+    return [f"#{line}" if line.startswith("#") else line for line in text.splitlines() if not line.startswith("# ")]
 
 
 def caveat(records: Sequence[Record]) -> list[str]:
@@ -141,5 +154,5 @@ def draw_experts(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
 
 def adopt(run: Path, folder: Path) -> Path:
     """Write the record of a run folder that another command trained. Its scene is the name of its capture."""
-    scene = Path(run_folder.read_config(run).data.path).resolve().name
-    return store.write(folder, store.read_run(run, scene))
+    config = run_folder.read_config(run)
+    return store.write(folder, store.read_run(run, Path(config.data.path).resolve().name, code_of(config.train)))

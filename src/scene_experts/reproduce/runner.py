@@ -97,7 +97,7 @@ class Runner:
         log = folder.parent / f"{folder.name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
         began = time.monotonic()
-        self.say(f"{place} {spec.label}")
+        self.say(f"{place} {spec.label} (log: {log})")
         train = spec.arguments(folder)
         if folder.exists():
             try:
@@ -116,7 +116,7 @@ class Runner:
             if code != 0:
                 return self.fail(spec, last_line(log) or f"exit code {code}", log, place)
         try:
-            record = store.read_run(folder, spec.scene.name)
+            record = store.read_run(folder, spec.scene.name, spec.code)
             store.write(self.records, record)
             self.say(f"{place} {spec.label}: {record.results['psnr']:.2f} dB, {(time.monotonic() - began) / 60:.1f} min")
             self.after(spec, folder)

@@ -37,7 +37,7 @@ class Record:
     """One finished run.
 
     `results` is its results.json. `per_view` maps the name of a held-out view to its scores (PER_VIEW). `curves` holds the values of
-    CURVES at up to POINTS iterations.
+    CURVES at up to POINTS iterations. `code` is a hash of the code of other packages that it was trained with (`plan.code_of`).
     """
 
     scene: str
@@ -45,16 +45,17 @@ class Record:
     results: dict[str, Any]
     per_view: dict[str, dict[str, Any]]
     curves: list[dict[str, Any]]
+    code: str = ""
 
     @cached_property
     def key(self) -> str:
         """As `Spec.key`."""
-        return identity(self.scene, self.config.train, self.config.data)
+        return identity(self.scene, self.config.train, self.config.data, self.code)
 
     @cached_property
     def numbers(self) -> str:
         """As `Spec.numbers`."""
-        return identity(self.scene, replace(self.config.train, recipe=""), self.config.data)
+        return identity(self.scene, replace(self.config.train, recipe=""), self.config.data, self.code)
 
     @property
     def recipe(self) -> str:
@@ -74,7 +75,7 @@ class Record:
         return self.results.get(column)
 
 
-def read_run(run: Path, scene: str) -> Record:
+def read_run(run: Path, scene: str, code: str = "") -> Record:
     """Make the record of an evaluated run folder. Raises InputError where files are missing or the training was scored before its end."""
     for name in ("config.json", "results.json", "per_view.json"):
         if not (run / name).is_file():
@@ -86,10 +87,10 @@ def read_run(run: Path, scene: str) -> Record:
             f"finish the training with `scene-experts train --resume` and the run's own flags, then run `scene-experts eval {run}`"
         )
     with guarding(run, RUN):
-        return _make_record(run, scene, config, results)
+        return _make_record(run, scene, config, results, code)
 
 
-def _make_record(run: Path, scene: str, config: RunConfig, results: dict[str, Any]) -> Record:
+def _make_record(run: Path, scene: str, config: RunConfig, results: dict[str, Any], code: str) -> Record:
     views = read_json(run / "per_view.json", "scores by view")
     return Record(
         scene=scene,
@@ -97,6 +98,7 @@ def _make_record(run: Path, scene: str, config: RunConfig, results: dict[str, An
         results=results,
         per_view={name: {k: facts[k] for k in PER_VIEW if facts.get(k) is not None} for name, facts in views.items()},
         curves=read_curves(run / "metrics.jsonl"),
+        code=code,
     )
 
 
@@ -131,6 +133,8 @@ def write(store: Path, record: Record) -> Path:
         "per_view": record.per_view,
         "curves": record.curves,
     }
+    if record.code:
+        value["code"] = record.code
     path = record_path(store, record)
     write_bytes(path, pack(value).encode())
     return path
@@ -171,10 +175,11 @@ def _read(path: Path) -> Record:
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"expected columns of equal length in {path}, found others ({error}); remove it and reproduce again") from error
     scene, results, per_view, curves = (value[name] for name in ("scene", "results", "per_view", "curves"))
-    kinds = (isinstance(scene, str), isinstance(results, dict), isinstance(per_view, dict), isinstance(curves, list))
+    code = value.get("code", "")
+    kinds = (isinstance(scene, str), isinstance(code, str), isinstance(results, dict), isinstance(per_view, dict), isinstance(curves, list))
     if not all(kinds):
         raise Damaged("a scene, results, scores or curves of another form")
-    return Record(scene, from_json(RunConfig, value["config"]), results, per_view, curves)
+    return Record(scene, from_json(RunConfig, value["config"]), results, per_view, curves, code)
 
 
 def load(store: Path) -> list[Record]:

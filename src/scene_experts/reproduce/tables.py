@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from scene_experts.evaluate.tables import ResultTable, load_paper, to_markdown
+from scene_experts.evaluate.tables import FEW_VIEWS, NOISE, ResultTable, load_paper, to_markdown
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.plan import OWN
 from scene_experts.reproduce.statistics import Mean, clock_of, complete_seeds, mean
@@ -27,7 +27,7 @@ class Column:
 COLUMNS = {
     "psnr": Column("PSNR", 2, 1),
     "ssim": Column("SSIM", 3, 1),
-    "lpips_3dgs": Column("LPIPS", 3, -1),
+    "lpips_3dgs": Column("LPIPS (3DGS)", 3, -1),
     "size_mb": Column("MB", 1, -1),
     "anchors": Column("anchors", 0, 0),
     "gaussians_rendered": Column("Gaussians drawn a view", 0, 0),
@@ -151,6 +151,11 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
     seeds = sorted({r.seed for r in records})
     made = ", ".join(f"{n:,} iterations{bracket(counts)}" for n, counts in sorted(lengths.items()))
     out = [f"{made}; resolution {', '.join(sizes)}; seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}."]
+    views = {r.scene: r.results["view_count"] for r in records if r.results.get("view_count")}
+    if views:
+        out.append(f"Held-out views: {', '.join(f'{scene} {count}' for scene, count in views.items())}.")
+    if few := [scene for scene, count in views.items() if count < FEW_VIEWS]:
+        out.append(f"So few views ({', '.join(few)}) make means and intervals unreliable: differences below {NOISE} dB show nothing there.")
     for name, rows in found.items():
         whole = sorted(complete_seeds(rows))
         if rows and whole != seeds:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
+import sysconfig
+import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 
 from scene_experts.training.config import Train
 
@@ -26,6 +29,9 @@ class RecipeBook(Mapping[str, Recipe]):
     cannot be loaded are skipped with one warning.
     """
 
+    broken: dict[str, str]
+    """What is wrong with the recipes that could not be loaded, by name."""
+
     def __init__(self, own: Mapping[str, Recipe]) -> None:
         """Create the book.
 
@@ -33,6 +39,7 @@ class RecipeBook(Mapping[str, Recipe]):
             own: Recipes that are available without imports.
         """
         self._own = own
+        self.broken = {}
         self._others: dict[str, Recipe] | None = None
 
     def load(self) -> dict[str, Recipe]:
@@ -46,8 +53,10 @@ class RecipeBook(Mapping[str, Recipe]):
                         raise ValueError(f"there already is a recipe {taken[0]!r}")
                     self._others |= found
                 except Exception as error:  # an error in another package must not affect our own recipes
+                    self.broken[entry.name] = f"{error} ({locate(error)})"
                     where = f"{entry.name!r} ({entry.value})"
-                    log.warning("cannot use the recipe %s of another package: %s; update or uninstall that package", where, error)
+                    why = self.broken[entry.name]
+                    log.warning("cannot use the recipe %s of another package: %s; correct, update or uninstall that package", where, why)
         return self._others
 
     def __getitem__(self, name: str) -> Recipe:
@@ -59,6 +68,14 @@ class RecipeBook(Mapping[str, Recipe]):
 
     def __len__(self) -> int:
         return len(self._own) + len(self.load())
+
+
+def locate(error: BaseException) -> str:
+    """Return the file and line where an error was raised, "my_package.py:12"; of several, the innermost outside this package and Python."""
+    places = traceback.extract_tb(error.__traceback__)
+    skip = (str(Path(__file__).parents[1]), sysconfig.get_paths()["stdlib"], "<")
+    theirs = [place for place in places if not place.filename.startswith(skip)] or list(places)
+    return f"{Path(theirs[-1].filename).name}:{theirs[-1].lineno}" if theirs else type(error).__name__
 
 
 def read_entry(entry: EntryPoint) -> dict[str, Recipe]:
