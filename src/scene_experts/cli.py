@@ -14,6 +14,9 @@ from scene_experts.commands import COMMANDS, PROG
 from scene_experts.core.errors import InputError, RunError, nearest
 from scene_experts.core.reading.source import sentence
 
+SLOW = ("capture", "train", "eval", "render", "view", "export", "import")
+"""Commands that load torch before their first line."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command. Returns the exit code: 0 for success, 1 for a failure, 2 for invalid input."""
@@ -44,6 +47,8 @@ def dispatch(args: list[str]) -> int:
         return 2
     logging.basicConfig(level=logging.WARNING, format="warning: %(message)s")
     warnings.filterwarnings("ignore", module=r"PIL\.")  # about damaged metadata; damaged pixels raise an error
+    if command in SLOW and sys.stderr.isatty() and not {"-h", "--help", "--help-all"} & set(rest):
+        print("starting ...", end="\r", file=sys.stderr, flush=True)  # torch takes seconds to load; the first line covers this one
     try:
         return commands.run(command, rest)
     except HelpAsked as help_:

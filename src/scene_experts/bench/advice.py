@@ -15,6 +15,7 @@ SIDES = ((0, 7000), (1200, 7000), (800, 7000), (800, 4000), (600, 4000), (600, 3
 """Longest side in pixels (0: as it is) and iterations, the best first."""
 # Iterations of scene-experts on pyramid (0.10 megapixels), colosseum (0.23), banana (0.43), fox (0.52) and sceaux (1.08) take 6.4, 5.6,
 # 5.7, 7.6 and 15.1 times the picture below. The line is near the first and the last, and above the others.
+FEW, FEW_ITERATIONS = 30, 4000
 BASE, PER_MEGAPIXEL = 4.5, 9.8
 SERIAL = 0.15  # share of an iteration that one thread does
 
@@ -27,7 +28,7 @@ class Advice:
     """Longest side of the photographs in pixels; 0: as they are."""
     iterations: int
     minutes: float | None
-    """Estimated time on this machine as busy as it is now; None on CUDA, which is not measured."""
+    """Estimated time on this machine while nothing else runs; None on CUDA, which is not measured."""
 
     @property
     def flags(self) -> list[str]:
@@ -36,14 +37,14 @@ class Advice:
         return [*side, "--iterations", str(self.iterations)]
 
     def __str__(self) -> str:
-        return "" if self.minutes is None else f"about {max(1, round(self.minutes))} min on this machine"
+        return "" if self.minutes is None else f"about {max(1, round(self.minutes))} min on this machine if it is not busy"
 
 
 def measure_picture() -> float:
-    """Seconds that one thread takes for a picture of 20,000 Gaussians at 400x272 and its gradients. Takes about a second."""
+    """CPU seconds that one thread takes for a picture of 20,000 Gaussians at 400x272 and its gradients. Takes about a second."""
     with step.use_threads(1):
         picture, rasterize = raster.make_picture(20_000, 400, 272), choose("auto", "cpu")
-        return min(sum(raster.time_draw(rasterize, picture, time.perf_counter)) for _ in range(8))
+        return min(sum(raster.time_draw(rasterize, picture, time.process_time)) for _ in range(8))
 
 
 def estimate_minutes(width: int, height: int, iterations: int, picture: float, threads: int) -> float:
@@ -52,16 +53,19 @@ def estimate_minutes(width: int, height: int, iterations: int, picture: float, t
     return iterations * picture * (BASE + PER_MEGAPIXEL * width * height / 1e6) / gain / 60
 
 
-def suggest(width: int, height: int, picture: float | None = None) -> Advice:
+def suggest(width: int, height: int, views: int, picture: float | None = None) -> Advice:
     """Suggest a training for photographs of this size: the best one of SIDES that takes at most LIMIT minutes, or the shortest.
 
-    picture: seconds from `measure_picture`, which is called by default.
+    With FEW photographs or less, at most FEW_ITERATIONS: a longer training fits them better and what lies between them worse.
+
+    views: number of photographs. picture: seconds from `measure_picture`, which is called by default.
     """
     if torch.cuda.is_available() and choose("auto", "cuda").name != "reference":
         return Advice(0, 30_000, None)
     picture, threads = picture or measure_picture(), torch.get_num_threads()
     advice = Advice(0, SIDES[-1][1], 0.0)
     for side, iterations in SIDES:
+        iterations = min(iterations, FEW_ITERATIONS) if views <= FEW else iterations
         if side >= max(width, height):
             side = 0
         scale = side / max(width, height) if side else min(1.0, 1600 / max(width, height))  # `train` limits photographs to 1,600 px

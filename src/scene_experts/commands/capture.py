@@ -50,7 +50,8 @@ def capture(args: list[str]) -> int:
         note = reconstruct(command.photos, command.out, command.options, overwrite=command.overwrite, say=say, progress=bar)
     for line in summarise(note):
         say(line)
-    say(propose_training(command.out, *note["size"]))
+    width, height = note["size"]
+    say(propose_training(command.out, width, height, note["with_pose"]))
     return 0
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from scene_experts.commands import PROG
 
 
-def propose_training(capture: Path, width: int, height: int) -> str:
-    """Return a command that trains on photographs of this size, with its estimated time here."""
+def propose_training(capture: Path, width: int, height: int, views: int) -> str:
+    """Return a command that trains on `views` photographs of this size, with its estimated time here."""
     from scene_experts.bench.advice import suggest
 
-    advice = suggest(width, height)
+    advice = suggest(width, height, views)
     time = f"  # {advice}" if str(advice) else ""
     return f"next: {shlex.join([PROG, 'train', 'scene-experts', '--data', str(capture), '--out', 'RUN', *advice.flags])}{time}"

@@ -19,6 +19,8 @@ from scene_experts.render import Rasterizer, as_trained, choose
 from scene_experts.scene import Draws, Scene
 from scene_experts.training.run_folder import OpenRun, capture_of
 
+LOSS = 1.0  # dB; a file that loses more gets a warning
+MENDS = "refine it (without --refine 0), or let it have more Gaussians (--max-gaussians, --prune) or a higher --sh-degree"
 Tell = Callable[[str, int, int], None]
 """Reports the progress of long work: (what, done, total)."""
 
@@ -101,7 +103,10 @@ def cost(
     line += f"; its pictures against the run's {found['file'].first:.2f} dB" if "bake" in found else ""
     plain: dict[str, Any] = {name: {"photographs": round(s.photographs, 6), "run": round(s.first, 6)} for name, s in found.items()}
     psnr = {name: score.photographs for name, score in found.items()}
-    return Cost((line,), psnr, plain | {"views": len(views)})
+    lines = [line]
+    if "bake" in found and before - after > LOSS:
+        lines.append(f"warning: the file loses {before - after:.1f} dB against the run; {MENDS}")
+    return Cost(tuple(lines), psnr, plain | {"views": len(views)})
 
 
 @contextmanager

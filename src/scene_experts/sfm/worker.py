@@ -31,6 +31,7 @@ def extract_features(colmap: Any, ask: dict[str, Any]) -> None:
     options = colmap.FeatureExtractionOptions()
     options.num_threads, options.max_image_size, options.use_gpu = ask["threads"], ask["max_side"], False
     total, done = sum(map(len, ask["groups"])), 0
+    report(step="features", done=0, total=total)
     for names in ask["groups"]:
         camera, missing = read_done(colmap, ask["database"], names)
         done += len(names) - len(missing)
@@ -69,6 +70,7 @@ def match_pairs(colmap: Any, ask: dict[str, Any]) -> None:
     options = colmap.FeatureMatchingOptions()
     options.num_threads, options.use_gpu = ask["threads"], False
     pairs = ask["pairs"]
+    report(step="matches", done=0, total=len(pairs))
     for first in range(0, len(pairs), PAIRS):
         some = pairs[first : first + PAIRS]
         with tempfile.TemporaryDirectory() as folder:
@@ -157,7 +159,7 @@ def explain(features: int, shared: dict[int, int], posed: set[int], apart: bool)
     if apart:
         return "fits only together with others that are apart from the rest"
     if not any(shared.values()):
-        return "no other photograph shows the same points"
+        return "no other photograph shows the same points; take one or two between it and its neighbours"
     if not with_posed:
         return "shares points only with photographs that have no pose either"
     return f"shares points with {len(with_posed)} photographs that have a pose, at most {max(with_posed)}, which did not fit a pose"
@@ -165,21 +167,21 @@ def explain(features: int, shared: dict[int, int], posed: set[int], apart: bool)
 
 def map_incrementally(colmap: Any, ask: dict[str, Any], out: str, total: int) -> dict[int, Any]:
     """Run COLMAP's mapper, which adds one photograph at a time."""
-    options, count, part = colmap.IncrementalPipelineOptions(), 2, 0
+    options, count, attempt = colmap.IncrementalPipelineOptions(), 2, 0
     options.num_threads, options.random_seed, options.ba_use_gpu = ask["threads"], ask["seed"], False
     options.min_model_size = 3
 
-    def start_part() -> None:  # photographs that do not fit the parts before form another one
-        nonlocal count, part
-        count, part = 2, part + 1
+    def start() -> None:  # from two photographs; again where they lead nowhere, and for photographs that do not fit the others
+        nonlocal count, attempt
+        count, attempt = 2, attempt + 1
 
     def count_image() -> None:
         nonlocal count
         count += 1
-        name = "poses (incremental)" if part < 2 else f"poses (incremental, part {part})"
+        name = "poses (incremental)" if attempt < 2 else f"poses (incremental, start {attempt})"
         report(step=name, done=min(count, total), total=total)
 
-    calls = {"initial_image_pair_callback": start_part, "next_image_callback": count_image}
+    calls = {"initial_image_pair_callback": start, "next_image_callback": count_image}
     return colmap.incremental_mapping(ask["database"], ask["images"], out, options=options, **calls)
 
 

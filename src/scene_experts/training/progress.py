@@ -81,7 +81,9 @@ class TrainingProgress:
             case Saved():
                 self.print_line(f"saved {event.path}")
             case Stopped():
-                self.print_line(f"stopped at iteration {event.step:,} ({event.reason}); the run is saved, continue with --resume")
+                self.print_line(
+                    f"stopped at iteration {event.step:,} ({event.reason}); the run is saved: continue with --resume, or use it as it is"
+                )
             case Exported():
                 self.print_line(f"wrote {event.path}")
             case Finished():

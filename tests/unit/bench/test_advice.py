@@ -18,18 +18,22 @@ def test_twice_the_iterations_take_twice_the_time_and_threads_save_some():
 
 
 def test_a_fast_machine_gets_the_whole_photographs_and_a_slow_one_the_shortest_training():
-    fast, slow = (advice.suggest(1200, 800, picture) for picture in (1e-4, 10.0))
+    fast, slow = (advice.suggest(1200, 800, 100, picture) for picture in (1e-4, 10.0))
     assert fast.flags == ["--iterations", "7000"] and fast.minutes < advice.LIMIT
     assert slow.flags == ["--resolution", "longest:400", "--iterations", "2000"] and slow.minutes > advice.LIMIT
 
 
 def test_small_photographs_are_never_enlarged():
-    found = advice.suggest(320, 240, 0.5)
+    found = advice.suggest(320, 240, 100, 0.5)
     assert found.side == 0 and "--resolution" not in found.flags
+
+
+def test_few_photographs_get_a_shorter_training():
+    assert advice.suggest(1200, 800, 30, 1e-4).iterations == 4000 and advice.suggest(1200, 800, 31, 1e-4).iterations == 7000
 
 
 @pytest.mark.parametrize("picture", [1e-3, 1e-2, 0.03, 0.1])
 def test_the_time_is_below_the_limit_where_that_can_be(picture):
-    found = advice.suggest(4000, 3000, picture)
-    assert found.minutes <= advice.LIMIT or found.flags == advice.suggest(4000, 3000, 10.0).flags
+    found = advice.suggest(4000, 3000, 100, picture)
+    assert found.minutes <= advice.LIMIT or found.flags == advice.suggest(4000, 3000, 100, 10.0).flags
     assert "min on this machine" in str(found)

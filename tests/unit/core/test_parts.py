@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import pytest
 
 from scene_experts.core import parts
-from scene_experts.core.parts import Part, find, names_of, register
+from scene_experts.core.parts import Part, extend, find, names_of, register
+from scene_experts.training.losses import Weights
 from support.messages import naming
 
 
@@ -51,3 +52,17 @@ def test_a_name_belongs_to_one_class_which_may_be_defined_again():
 def test_only_frozen_dataclasses_are_parts():
     with pytest.raises(TypeError):
         register(int)  # type: ignore[type-var]
+
+
+def test_a_part_of_a_subclass_keeps_the_numbers():
+    @dataclass(frozen=True)
+    class More(Weights):
+        mine: float = 0.0
+
+    base = Weights(load=0.5, tau=0.25)
+    made = extend(base, More, mine=2.0)
+    assert type(made) is More and (made.load, made.tau, made.mine) == (0.5, 0.25, 2.0)
+    with pytest.raises(TypeError, match="subclass of More"):
+        extend(made, Weights)
+    with pytest.raises(TypeError, match="yours"):
+        extend(base, More, yours=1.0)

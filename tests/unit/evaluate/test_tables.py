@@ -220,3 +220,10 @@ def test_texts_of_results_cannot_steer_a_terminal(runs: list[Path]) -> None:
         for mixed in (False, True):
             text = printed(runs[:1], format, mixed)
             assert "\x1b" not in text and "\ud800" not in text and "[/red]" in text
+
+
+def test_a_few_held_out_views_are_said_to_show_little():
+    few, many = ([{**results("moe-gs", 30.0), "view_count": count}] * 2 for count in (2, 9))
+    assert any("2 held-out views" in note for note in tables.make_table(["a", "b"], few).notes)
+    for made in (tables.make_table(["a", "b"], many), tables.make_table(["a"], few[:1])):
+        assert not any("held-out views" in note for note in made.notes)

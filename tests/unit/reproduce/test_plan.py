@@ -1,5 +1,6 @@
 """Plans: each run once, named by everything that changes its numbers."""
 
+import importlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from scene_experts.reproduce.plan import (
     Scale,
     Scene,
     Spec,
+    code_of,
     find_own_scenes,
     find_paper_scenes,
     identity,
@@ -141,3 +143,21 @@ def test_the_papers_scenes_bring_the_numbers_of_their_scripts():
 
 def test_the_catalog_and_the_experiments_know_the_same_scenes():
     assert {s.name: COLLECTIONS[s.collection.key] for s in catalog.SCENES} == {s: d for d, scenes in DATASETS.items() for s in scenes}
+
+
+def test_code_of_another_package_counts(tmp_path, monkeypatch):
+    module = tmp_path / "foreign_package.py"
+    text = (
+        "from dataclasses import dataclass\nfrom scene_experts.training.losses import Weights\n"
+        "@dataclass(frozen=True)\nclass Foreign(Weights):\n    pass\n"
+    )
+    module.write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    foreign = importlib.import_module("foreign_package")
+    ours = Spec(FOX, "moe-gs", 0, Scale()).train
+    cfg = replace(ours, loss=foreign.Foreign())
+    first = code_of(cfg)
+    assert code_of(ours) == "" and len(first) == 12
+    module.write_text(text + "# changed\n")
+    assert code_of(cfg) != first
+    assert identity("fox", ours, Data(FOX.path), first) != identity("fox", ours, Data(FOX.path))

@@ -27,6 +27,13 @@ def test_a_record_comes_back_as_it_was_without_the_place_of_the_capture(tmp_path
     assert [r.key for r in load(tmp_path)] == [made.key]
 
 
+def test_a_record_keeps_the_code_that_it_was_trained_with(tmp_path):
+    made = replace(record(), code="0123456789ab")
+    back = read(write(tmp_path, made))
+    assert (back.code, back.key) == (made.code, made.key) and made.key != record().key
+    assert "code" not in json.loads(write(tmp_path, record()).read_text())
+
+
 def test_a_record_of_the_first_format_opens(tmp_path):
     made = record()
     path = write(tmp_path, made)

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from scene_experts.commands.train import parse_train
+from scene_experts.core.errors import InputError
 from scene_experts.core.schedule import Every
 from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
@@ -67,6 +68,14 @@ def test_a_package_that_cannot_be_used_gives_one_warning(monkeypatch, caplog, ba
     assert "dots" in RECIPES and len(RECIPES) == len(set(RECIPES)) and RECIPES["moe-gs"][1] is moe_gs
     (record,) = caplog.records
     assert said in record.getMessage() and "\n" not in record.getMessage()
+
+
+def test_an_error_of_another_package_has_its_place_and_meets_who_asks_for_the_recipe(monkeypatch, tmp_path):
+    (tmp_path / "broken_package.py").write_text("x = 1\nraise KeyError('nothing')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    use(monkeypatch, entry("bad", "broken_package:recipe"))
+    with pytest.raises(InputError, match=r"broken_package\.py:2"):
+        parse_train(["bad", "--help"])
 
 
 def test_it_has_flags_on_the_command_line(monkeypatch):
