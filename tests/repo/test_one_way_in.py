@@ -30,6 +30,8 @@ ALLOWED = {  # file: why it may open files by itself
     "report/page.py": "a file of this package",
     "reproduce/cluster.py": "a run from the user's own Dask scheduler, which sends pickled code itself: docs/scaling.md",
     "reproduce/figures.py": "pictures of the user's own records",
+    "reproduce/plan.py": "source files of installed packages, whose hash is part of a run's name",
+    "reproduce/report.py": "a table that it has just written",
     "reproduce/runner.py": "logs of its own processes",
     "sfm/frames.py": "the pipe of ffmpeg",
     "sfm/masks.py": "the masks that it has just written",

@@ -74,7 +74,8 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
 
 def _check_same(lattice: dict[str, Any], networks: dict[str, Tensor], scene: Scene, path: Path) -> None:
     """Raise InputError unless a scene has this lattice and these networks."""
-    if lattice != scene.meta():
+    found = scene.meta()
+    if lattice != found:
         raise InputError(f"expected the lattice of the first block in {path}, found another; begin all blocks with the same --init-from")
     its = scene.network_tensors()
     if networks.keys() != its.keys() or not all(torch.equal(value, its[name]) for name, value in networks.items()):
