@@ -88,6 +88,8 @@ def export(args: list[str]) -> int:
             written = export_several(run, command.format, command.out, command.options, tell=tell, command=line)
     for file in written:
         print("\n".join(file.lines))
+    if command.hub is None and "html" in command.format:
+        print("next: open the page in a browser; smaller pages, pages of your own, other viewers: docs/how-to.md")
     if command.hub is not None:
         print(f"wrote {command.hub / hub.CARD}")
         if command.licence is None:

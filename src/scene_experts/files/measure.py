@@ -97,13 +97,13 @@ def cost(
     painters = {name: Painter.of(scene, step, rasterize, run.config.train.antialias) for name, (scene, step) in drawn.items()}
     found = scores(painters, capture, views, tell)
     before, after = found["run"].photographs, found["file"].photographs
-    words = {"closed_form": "means over the views", "bake": "refined" if "closed_form" in found else "means over the views"}
-    between = "".join(f"{words[name]} {found[name].photographs:.3f}, " for name in words if name in found)
-    line = f"PSNR of {len(views)} held-out views: run {before:.3f} dB, {between}this file {after:.3f} dB ({after - before:+.3f})"
-    line += f"; its pictures against the run's {found['file'].first:.2f} dB" if "bake" in found else ""
+    lines = [f"PSNR of {len(views)} held-out views: run {before:.3f} dB, this file {after:.3f} dB ({after - before:+.3f})"]
+    if "bake" in found:
+        baked = found.get("closed_form", found["bake"]).photographs
+        refined = f", refined {found['bake'].photographs:.3f} dB" if "closed_form" in found else ""
+        lines.append(f"on the way: baked {baked:.3f} dB{refined}; PSNR against the run's pictures {found['file'].first:.2f} dB")
     plain: dict[str, Any] = {name: {"photographs": round(s.photographs, 6), "run": round(s.first, 6)} for name, s in found.items()}
     psnr = {name: score.photographs for name, score in found.items()}
-    lines = [line]
     if "bake" in found and before - after > LOSS:
         lines.append(f"warning: the file loses {before - after:.1f} dB against the run; {MENDS}")
     return Cost(tuple(lines), psnr, plain | {"views": len(views)})

@@ -127,7 +127,7 @@ class Panel:
         with torch.no_grad():
             attributes = tuple(scene.routing(step, 1))
         gui, numbers = self.server.gui, range(1, self.traits.experts + 1)
-        with gui.add_folder("Experts"):
+        with gui.add_folder("Experts", expand_by_default=False):
             gui.add_markdown(EXPERTS.format(self.traits.experts, self.traits.rows))
             self.attribute = self.redraw_on_change(gui.add_dropdown("of", options=attributes, initial_value=attributes[-1]))
             self.switches = [self.redraw_on_change(gui.add_checkbox(f"expert {number}", initial_value=True)) for number in numbers]

@@ -126,6 +126,7 @@ class Viewer:
         self.region: Region = find_region(rig.positions, float((rig.positions - rig.centre).norm(dim=1).median()))
         self.reach: float = float((rig.positions - rig.centre).norm(dim=1).median())
         self.first: int = choose_best_view(self.capture)  # where clients start
+        self.set_start()
         self.panel: Panel = Panel(self.server, self.capture, self.current, self.request_redraw, self.go_to_view, self.paths)
         self.gate.gui = self.server.gui
         self.server.on_client_connect(self.connect)
@@ -173,12 +174,30 @@ class Viewer:
                 client.wanted, client.full = True, False
         self.changed.set()
 
+    def set_start(self) -> None:
+        """Let pages open at the first view. A page that still loads when `connect` moves it may lose that message."""
+        start = getattr(self.server, "initial_camera", None)  # viser 1.0.0 has none
+        if start is not None:
+            camera = self.capture.views[self.first].camera
+            forward = camera.world_to_cam[2, :3].double()
+            place = camera.position.double()
+            start.position = tuple(place.tolist())
+            start.look_at = tuple((place + self.find_distance(self.first) * forward).tolist())
+            start.up = tuple((-camera.world_to_cam[1, :3].double()).tolist())
+            start.fov = camera.fov
+
+    def find_distance(self, view: int) -> float:
+        """Return how far ahead of the camera of a view the point lies that the mouse turns around."""
+        camera = self.capture.views[view].camera
+        forward = camera.world_to_cam[2, :3].double()
+        return max(float((self.centre - camera.position.double()) @ forward), 0.1 * self.reach)
+
     def go_to_view(self, view: int, clients: list[Client] | None = None) -> None:
         """Move clients (None: all) to the camera of a view."""
         camera = self.capture.views[view].camera
         rotation = camera.world_to_cam[:3, :3].T.double()
         place = camera.position.double()
-        distance = max(float((self.centre - place) @ rotation[:, 2]), 0.1 * self.reach)
+        distance = self.find_distance(view)
         with self.lock:
             chosen = list(self.clients.values()) if clients is None else clients
         for client in chosen:

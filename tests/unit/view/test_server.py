@@ -29,6 +29,14 @@ def test_a_client_starts_at_the_best_view_and_gets_the_render(viewer, capture):
     assert len(handle.pictures) == 1  # nothing changed
 
 
+def test_a_page_that_loads_opens_at_the_best_view(viewer, capture):
+    start, first = viewer.server.initial_camera, capture.views[choose_best_view(capture)].camera
+    ahead = torch.tensor(start.look_at - start.position).float()
+    assert np.allclose(start.position, first.position.numpy(), atol=1e-5) and start.fov == pytest.approx(first.fov)
+    assert torch.allclose(ahead / ahead.norm(), first.world_to_cam[2, :3], atol=1e-4)
+    assert np.allclose(start.up, -first.world_to_cam[1, :3].numpy(), atol=1e-5)
+
+
 def test_a_moving_client_gets_small_pictures_and_a_resting_one_the_full_picture(viewer):
     handle = joined(viewer)
     viewer.draw()
