@@ -14,6 +14,7 @@ parameters are changed a little before the first step.
 Densification is off: it draws random numbers on the device of the scene.
 """
 
+import os
 import sys
 from dataclasses import replace
 from functools import partial
@@ -133,4 +134,6 @@ def compare(capture: Capture, word: str) -> dict[str, list[float]]:
 
 
 if __name__ == "__main__":
-    raise SystemExit(answer(sys.argv[1:], partial(compare, load_small())))
+    code = answer(sys.argv[1:], partial(compare, load_small()))
+    sys.stdout.flush()
+    os._exit(code)  # torch's threads sometimes abort the end of the interpreter ("terminate called without an active exception")
