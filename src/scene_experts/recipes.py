@@ -66,7 +66,7 @@ def _flagship(name: str, decoder: Decoder, hidden: int) -> Train:
     return replace(
         scaffold_gs,
         recipe=name,
-        scene=Anchors(F=16, hidden=hidden, decoder=decoder),
+        scene=Anchors(F=16, hidden=hidden, decoder=decoder, dropout=0.2, view_jitter=0.5, few_views=20),
         loss=Weights(scale=0.01, opacity=0.01),
         growth=GrowAnchors(grad_threshold=0.00015),
         rates=Rates(networks=2.0, anneal=0.1),

@@ -47,6 +47,8 @@ NEWER = {
     "scene.smoothing",
     "scene.dropout",
     "scene.dropout_full",
+    "scene.few_views",
+    "scene.view_jitter",
     "scene.decoder.shared",
     "scene.decoder.router.weights",
 }

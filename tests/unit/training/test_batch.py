@@ -59,7 +59,9 @@ def test_bits_do_not_depend_on_the_number_of_processes(recipe, folder, tmp_path)
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "changes", [{"sparse_adam": True}, {"average": Average(span=0.2)}, {"appearance": 4, "dropout": 0.3}, {"error_views": 3}], ids=str
+    "changes",
+    [{"sparse_adam": True}, {"average": Average(span=0.2)}, {"appearance": 4, "dropout": 0.3, "view_jitter": 0.4}, {"error_views": 3}],
+    ids=str,
 )
 def test_bits_do_not_depend_on_the_number_of_processes_with_options(changes, folder, tmp_path):
     cfg = of_family("moe-gs", **{name: value for name, value in changes.items() if hasattr(config(), name)})

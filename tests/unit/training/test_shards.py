@@ -27,7 +27,7 @@ def of_recipe(recipe: str, **changes) -> Any:
     """A recipe with a batch of 4 that creates and removes anchors from iteration 20 on."""
     cfg: Any = config(recipe, batch=4, iterations=240, schedule=240, random_background=True, **changes)
     growth = replace(cfg.growth, adjust=replace(cfg.growth.adjust, start=9, stop=200, interval=20), start_stat=5, grad_threshold=1e-4)
-    cfg = replace(cfg, growth=replace(growth, min_opacity=0.5), scene=replace(cfg.scene, dropout=0.3))
+    cfg = replace(cfg, growth=replace(growth, min_opacity=0.5), scene=replace(cfg.scene, dropout=0.3, view_jitter=0.4))
     decoder = cfg.scene.decoder
     return replace(cfg, scene=replace(cfg.scene, decoder=replace(decoder, warmup=30))) if hasattr(decoder, "warmup") else cfg
 

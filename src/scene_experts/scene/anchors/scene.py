@@ -32,6 +32,7 @@ from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors.appearance import Codes, TestRule, fold
 from scene_experts.scene.anchors.experts import MixtureHead
 from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
+from scene_experts.scene.anchors.few_views import displace, drop_anchors, find_spacings, find_weight
 from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, Decoder, HeadWeights, Plain
 from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, drop_masked, fade_opacities, visible_rows
@@ -79,6 +80,12 @@ class Anchors(SceneConfig):
     photographs (after DropGaussian, Park et al. 2025)."""
     dropout_full: int = 30_000
     """Iteration at which the share of dropped anchors is reached. --iterations rescales it."""
+    view_jitter: float = 0.0
+    """Training views are decoded as seen from a random position around their camera. Its root mean square distance from the camera, as a
+    share of the distance to the nearest other training cameras; 0 means no displacement."""
+    few_views: int = 0
+    """Number of training views up to which dropout and view_jitter have their whole value. Both fall linearly to 0 at twice as many
+    views; 0: the same values for any number of views."""
     smoothing: float = 0.0
     """Variance of the 3D smoothing filter in squared pixels of the closest training view (0.2 in Mip-Splatting); 0 means no filter. It
     helps cameras that come closer than the training views."""
@@ -122,6 +129,7 @@ class Anchors(SceneConfig):
         expect_at_least([(f"--scene.{name}", getattr(self, name), 1) for name in ("K", "F", "hidden")])
         expect_at_least([("--scene.voxel-size", self.voxel_size, 0), ("--scene.appearance", self.appearance, 0)])
         expect_at_least([("--scene.dropout", self.dropout, 0), ("--scene.dropout-full", self.dropout_full, 1)])
+        expect_at_least([("--scene.few-views", self.few_views, 0), ("--scene.view-jitter", self.view_jitter, 0)])
         expect_at_least([("--scene.smoothing", self.smoothing, 0)])
         if self.dropout >= 1:
             raise InputError(f"expected --scene.dropout below 1, found {self.dropout}; it is a share of the anchors")
@@ -159,6 +167,8 @@ class AnchorScene(LatticeScene):
         self.bank = config.mix.build(config.F)
         self.codes = Codes(config.appearance, views, config.test_appearance) if config.appearance else None
         self.cameras: tuple[Camera, ...] = ()  # of the training views, for the smoothing filter of new anchors
+        self.few_weight = 1.0  # factor of dropout and jitter, see `find_weight`
+        self.spacings: dict[int, float] = {}  # by camera id, see `find_spacings`; empty without view_jitter
 
     @property
     def traits(self) -> Traits:
@@ -210,7 +220,9 @@ class AnchorScene(LatticeScene):
         return cls(config, table, voxel, extent, select, [c.id for c in cameras])
 
     def set_training_cameras(self, cameras: Sequence[Camera]) -> None:
-        """Give the scene the cameras of its training views. The smoothing filter needs them."""
+        """Give the scene the cameras of its training views. The smoothing filter, the dropout and the jitter need them."""
+        self.few_weight = find_weight(self.config.few_views, len(cameras))
+        self.spacings = find_spacings(cameras) if self.config.view_jitter else {}
         if not self.config.smoothing:
             return
         self.cameras = tuple(cameras)
@@ -245,11 +257,12 @@ class AnchorScene(LatticeScene):
     def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
         """Return the Gaussians visible from `camera` at `step`. `cull(means, scales, camera)` is the rasteriser's visibility test."""
         table = self.table
-        rows = self.visible(camera, step, mode, cull)
-        if self.config.dropout and mode is Mode.TRAIN:
-            share = self.config.dropout * min(1.0, step / self.config.dropout_full)
-            rows = rows[torch.rand(len(rows), device=rows.device) >= share]
-        decoded = self.decode(rows, camera, step, mode)
+        rows, seen_from, config = self.visible(camera, step, mode, cull), camera, self.config
+        if config.dropout and self.few_weight and mode is Mode.TRAIN:
+            rows = drop_anchors(rows, config.dropout * self.few_weight * min(1.0, step / config.dropout_full))
+        if config.view_jitter and self.few_weight and mode is Mode.TRAIN:
+            seen_from = displace(camera, config.view_jitter * self.few_weight * self.spacings.get(camera.id, 0.0))
+        decoded = self.decode(rows, seen_from, step, mode)
         decoded = fade_opacities(decoded, self.select.fade(table, rows, camera, step, mode), len(table), self.K)
         decoded = drop_masked(decoded, table.facts.get("slots"))
         decoded = smooth(decoded, table.facts.get("interval"), self.config.smoothing, self.K)
