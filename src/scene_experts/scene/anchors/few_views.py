@@ -8,8 +8,8 @@ around it, and neighbouring photographs have to agree on the positions between t
 
 With `dropout` p, each anchor is left out of a training view with probability p (after DropGaussian, Park et al., CVPR 2025).
 
-With `few_views` m, both fall linearly to nothing
-from m to 2 m training views: with more photographs, little is left to guess, and both cost sharpness.
+With `few_views` m, both fall linearly to nothing from m to 2 m training views: with more photographs, little
+is left to guess, and both cost sharpness.
 """
 
 from __future__ import annotations
