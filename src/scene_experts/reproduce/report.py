@@ -23,6 +23,7 @@ from scene_experts.training import run_folder
 from scene_experts.training.config import SCHEDULE
 
 SHORT = 2000  # iterations; shorter trainings hardly pass the dense warm-up
+DISJOINT = "No scene has runs of every row: each mean is over the scenes of its own row, so do not compare these rows."
 
 
 def write(
@@ -100,6 +101,8 @@ def write_tables(out: Path, experiment: Experiment, scenes: Sequence[Scene], rec
             if even != done:
                 missed = ", ".join(name for name in done if name not in even)
                 table = replace(table, notes=(*table.notes, f"Not in the means, as not every row has a run there: {missed}."))
+            elif len(done) > 1 and not every:
+                table = replace(table, notes=(*table.notes, DISJOINT))
             made[f"{dataset}: means over {', '.join(even)}"] = table
             made[f"{dataset}: scene by scene"] = tables.by_scene(experiment, records, done)
             made |= {f"{dataset}: {name}": table for name, table in make_difference_tables(experiment, records, done).items()}

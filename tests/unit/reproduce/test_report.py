@@ -35,6 +35,15 @@ def test_means_are_over_the_captures_that_every_row_has(tmp_path):
     assert "10.00" in by_scene
 
 
+def test_rows_without_a_common_capture_are_said_not_to_compare(tmp_path):
+    scenes = [Scene(name, OWN, tmp_path / name) for name in ("fox", "fern")]
+    runs = [record("moe-gs", "fox", psnr=30.0), record("scaffold-gs-opacity", "fern", psnr=20.0)]
+    report.write(tmp_path, [EXPERIMENTS["table4"]], scenes, runs)
+    assert report.DISJOINT in (tmp_path / "table4.md").read_text()
+    report.write(tmp_path, [EXPERIMENTS["table4"]], scenes, [*runs, record("moe-gs", "fern", psnr=10.0)])
+    assert report.DISJOINT not in (tmp_path / "table4.md").read_text()
+
+
 def test_a_comparison_has_no_claims_and_the_differences_from_its_baseline(tmp_path):
     scenes = [Scene(name, OWN, tmp_path / name) for name in ("fox", "fern", "box")]
     experiment = make_comparison(ReproduceOptions(("compare",), recipes=("moe-gs-balance", "3dgs", "scaffold-gs"), baseline=("3dgs",)))
