@@ -108,7 +108,7 @@ def commands() -> dict[str, list[str]]:
     return {words[words.index("--out") + 1]: words[1:] for words in found}
 
 
-@pytest.mark.parametrize("folder", ["confirmation", "seeds", "parts", "parts/fox", "suite", "long", "long/fox", "extras"])
+@pytest.mark.parametrize("folder", ["confirmation", "short", "seeds", "parts", "parts/fox", "suite", "long", "long/fox", "extras"])
 def test_pages_are_what_their_commands_write(folder, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
 
