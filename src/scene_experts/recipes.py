@@ -20,7 +20,6 @@ from scene_experts.scene.anchors.scene import Anchors
 from scene_experts.scene.anchors.select import Octree
 from scene_experts.scene.gaussians import Explicit, ExplicitRates
 from scene_experts.scene.graph.scene import GraphPoints, GraphRates
-from scene_experts.strategy.grow import GrowAnchors
 from scene_experts.strategy.grow_octree import GrowOctree
 from scene_experts.strategy.grow_points import GrowPoints
 from scene_experts.strategy.mcmc import MCMC
@@ -66,9 +65,8 @@ def _flagship(name: str, decoder: Decoder, hidden: int) -> Train:
     return replace(
         scaffold_gs,
         recipe=name,
-        scene=Anchors(F=16, hidden=hidden, decoder=decoder, dropout=0.2, view_jitter=0.5, few_views=20),
+        scene=Anchors(hidden=hidden, decoder=decoder, dropout=0.2, view_jitter=0.5, few_views=20),
         loss=Weights(scale=0.01, opacity=0.01),
-        growth=GrowAnchors(grad_threshold=0.00015),
         rates=Rates(networks=2.0, anneal=0.1),
     )
 
@@ -80,16 +78,16 @@ def _scaffold(name: str, **scene: object) -> Train:
 OWN: dict[str, Recipe] = {
     "scaffold-gs": ("Scaffold-GS: one network per attribute (the baseline)", scaffold_gs),
     "scene-experts": (
-        "Scene Experts: small features, and eight experts per attribute, each for one part of the scene (ours)",
-        _flagship("scene-experts", LocalExperts(), 32),
+        "Scene Experts: five experts per attribute, each for one part of the scene (ours)",
+        _flagship("scene-experts", LocalExperts(), 64),
     ),
     "scene-experts-one": (
         "scene-experts with one network of the same decode cost per attribute (control)",
-        _flagship("scene-experts-one", Plain(), 32),
+        _flagship("scene-experts-one", Plain(), 64),
     ),
     "scene-experts-wide": (
         "scene-experts with one network as wide as all experts together (control)",
-        _flagship("scene-experts-wide", Plain(), 256),
+        _flagship("scene-experts-wide", Plain(), 320),
     ),
     "moe-gs": ("MoE-GS: five experts per attribute, Top-2 after a dense warm-up (the paper's main results)", moe_gs),
     "3dgs": ("3DGS: explicit Gaussians with spherical harmonics, cloned and split", gs_3d),

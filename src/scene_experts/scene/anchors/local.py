@@ -33,7 +33,7 @@ MARGIN = 0.02  # share of the positions that k-means ignores at either end of ea
 class LocalExperts(Experts):
     """A mixture of experts in which each part of the scene has its own expert."""
 
-    num: int = 8
+    num: int = 5
     """Number of experts per attribute."""
     top_k: int | None = 1
     """Number of experts per anchor after the warm-up: those of the nearest places."""

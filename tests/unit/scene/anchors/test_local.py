@@ -15,6 +15,7 @@ from scene_experts.training.config import check
 from support.scenes import CAMERA, start_scene
 
 WARM = 10_000  # the last iteration of one network
+EXPERTS = 5
 NONE = lambda p: []  # noqa: E731
 
 
@@ -78,16 +79,16 @@ def test_each_expert_learns_from_its_own_anchors_after_the_split():
     assert len(rows)
     made.decode(rows, CAMERA, WARM + 1, Mode.TRAIN).gaussians.colors.sum().backward()
     grad = made.heads["color"].w1.grad
-    assert grad[3].any() and not grad[[i for i in range(8) if i != 3]].any()
+    assert grad[3].any() and not grad[[i for i in range(EXPERTS) if i != 3]].any()
 
 
 def test_an_anchor_has_the_expert_of_the_nearest_centre():
     made = split(scene())
     x = made.table.facts["xyz"] / made.extent
-    centres, _ = find_centres(x, 8)
+    centres, _ = find_centres(x, EXPERTS)
     nearest = torch.cdist(x.double(), centres).argmin(1)
     assert all(torch.equal(r.chosen[:, 0], nearest) for r in made.routing(WARM + 1).values())
-    assert nearest.bincount(minlength=8).min() > 0
+    assert nearest.bincount(minlength=EXPERTS).min() > 0
 
 
 def test_moments_and_averages_are_copied_too():
