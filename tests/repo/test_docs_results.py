@@ -108,7 +108,10 @@ def commands() -> dict[str, list[str]]:
     return {words[words.index("--out") + 1]: words[1:] for words in found}
 
 
-@pytest.mark.parametrize("folder", ["confirmation", "short", "seeds", "parts", "parts/fox", "suite", "long", "long/fox", "extras"])
+PAGES = ("confirmation", "earlier", "short", "seeds", "parts", "parts/fox", "suite", "long", "long/fox", "long/bonsai", "extras")
+
+
+@pytest.mark.parametrize("folder", PAGES)
 def test_pages_are_what_their_commands_write(folder, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
 
