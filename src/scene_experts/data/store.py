@@ -91,18 +91,18 @@ class _Cache:
         size = _count_bytes(frame)
         if size > self.budget:
             return
+        while self.used + size > self.budget:  # before it is added: `used` is read without the lock and must never exceed the budget
+            self.used -= _count_bytes(self.frames.pop(self._choose_victim()))
         self.frames[index] = frame
         self.used += size
-        while self.used > self.budget:
-            self.used -= _count_bytes(self.frames.pop(self._choose_victim(index)))
 
-    def _choose_victim(self, new: int) -> int:
+    def _choose_victim(self) -> int:
         """Choose the frame to drop: the most recently used one that is not prefetched.
 
         Training sees every view once per epoch, so this frame is needed last. With a cache for half of the frames, the hit rate is
         50 %; dropping the least recently used frame gives 12 %.
         """
-        free = (index for index in reversed(self.frames) if index != new and index not in self.ahead)
+        free = (index for index in reversed(self.frames) if index not in self.ahead)
         return next(free, next(iter(self.frames)))
 
     def decode_ahead(self) -> None:

@@ -158,6 +158,22 @@ def test_frames_never_depend_on_timing(tmp_path: Path, count: int) -> None:
     store.close()
 
 
+def test_the_bytes_in_use_never_exceed_the_budget_not_even_within_a_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    class Watched(module._Cache):
+        def __setattr__(self, name: str, value: object) -> None:
+            super().__setattr__(name, value)
+            if name == "used":
+                seen.append(value)
+
+    monkeypatch.setattr(module, "_Cache", Watched)
+    store = ImageStore(sources(tmp_path, 6), cache_bytes=2 * FRAME)
+    for i in [0, 1, 2, 3, 4, 5, 0, 5]:
+        store.get(i)
+    assert max(seen) == 2 * FRAME and min(seen) == 0
+
+
 def test_a_bad_file_is_reported_by_get_not_by_the_thread(tmp_path: Path) -> None:
     store = ImageStore(sources(tmp_path, 3), cache_bytes=100 * FRAME)
     (tmp_path / "1.png").write_bytes(b"broken")
