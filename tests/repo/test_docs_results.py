@@ -98,9 +98,15 @@ def test_scene_experts_beside_its_controls(recipe):
         assert expected in plain
 
 
+def fullest(capture: str) -> list[dict]:
+    """The run of 3DGS-MCMC with the most Gaussians: some captures have two, with growth of 5 % and of 6 % a step."""
+    runs = recorded(capture, "3dgs-mcmc", 7000)
+    return [max(runs, key=lambda run: run["anchors"])]
+
+
 @pytest.mark.parametrize("recipe", ["3dgs-mcmc", "scene-experts"])
 def test_3dgs_mcmc_at_the_same_bytes(recipe):
-    runs = {capture: [as_it_is(capture, recipe)[0]] for capture in ORDER}
+    runs = {capture: fullest(capture) if recipe == "3dgs-mcmc" else as_it_is(capture, recipe)[:1] for capture in ORDER}
     plain = [line.replace("**", "") for line in lines("docs/results.md")]
     for name, expected in zip(("PSNR", "LPIPS", "MB"), beside(recipe, runs), strict=True):
         assert expected.replace(f"| {recipe} |", f"| {name}, {recipe} |", 1) in plain
