@@ -242,4 +242,4 @@ def test_the_page_of_a_training_needs_the_token_also_on_this_machine(viewer, cap
         made.viewer.panel.pause.value = True
         began = time.monotonic()
         made(training)  # nobody is connected: the pause ends
-        assert time.monotonic() - began < 5 and not made.viewer.panel.is_paused()
+        assert time.monotonic() - began < 30 and not made.viewer.panel.is_paused()

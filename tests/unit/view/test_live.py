@@ -31,7 +31,7 @@ def test_drawing_keeps_to_its_share_and_a_paused_training_waits(viewer, capture)
         stop.append("enough")
         began = time.monotonic()
         live(training)
-        assert time.monotonic() - began < 2
+        assert time.monotonic() - began < 30  # it does not wait for ever
     finally:
         live.close()
 
