@@ -77,7 +77,8 @@ def make_difference_table(
         if lacking:
             notes.append(f"{name}: no pair of runs on {', '.join(lacking)}.")
         if found.seeds[0] < len(seeds):
-            notes.append(f"{name}: {found.seeds[0]} of the {len(seeds)} seeds on some captures.")
+            where = "each capture" if found.seeds[0] == found.seeds[1] else "some captures"
+            notes.append(f"{name}: {found.seeds[0]} of the {len(seeds)} seeds on {where}.")
     about = f"Paired by view and seed (seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))})."
     titles = ("", *scenes, "mean", "95 % interval: other views and seeds", "95 % interval: other captures")
     return ResultTable(titles, tuple(rows), frozenset(), (about, *notes))

@@ -167,9 +167,10 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
         lacking = sorted({scene for scene, _ in every} - scenes)
         if rows and lacking:
             out.append(f"{name}: no run on {', '.join(lacking)}.")
-        fewer = sorted((scene, seed) for scene, seed in every - cases(rows) if scene in scenes)
-        if fewer:
-            out.append(f"{name}: no run on {', '.join(f'{scene} with seed {seed}' for scene, seed in fewer)}.")
+        for seed in seeds:
+            fewer = sorted(scene for scene, s in every - cases(rows) if s == seed and scene in scenes)
+            if fewer:
+                out.append(f"{name}: no run with seed {seed}{'' if set(fewer) == scenes else ' on ' + ', '.join(fewer)}.")
     if none:
         out.append(f"No run: {'; '.join(none)}.")
     return tuple(out)
