@@ -123,6 +123,14 @@ def test_the_gains_of_scene_experts_are_those_of_its_page(recipe):
         assert f"{gain} dB PSNR over Scaffold-GS (95 % interval over seven captures {across}" in (ROOT / "README.md").read_text()
 
 
+def test_ssim_and_lpips_over_scaffold_gs_are_those_of_the_page():
+    page, doc = ((ROOT / name).read_text() for name in ("results/confirmation/README.md", "docs/results.md"))
+    for score, start in (("SSIM", "SSIM gains "), ("LPIPS (3DGS)", "LPIPS (3DGS) ")):
+        section = page[page.index(f"### captures: {score} minus that of scaffold-gs\n") :]
+        cells = next(line for line in section.splitlines() if line.startswith("| scene-experts |")).split("|")
+        assert re.search(rf"{re.escape(start + cells[-4].strip())} \((over captures )?{re.escape(cells[-2].strip())}\)", doc), score
+
+
 @pytest.mark.parametrize("capture", CAPTURES)
 def test_differences_seed_by_seed(capture):
     scaffold, moe = (recorded(capture, recipe, 7000) for recipe in SEEDED[:2])
