@@ -89,12 +89,13 @@ class _Cache:
 
     def _insert(self, index: int, frame: Decoded) -> None:
         size = _count_bytes(frame)
-        if size > self.budget:
-            return
-        while self.used + size > self.budget:  # before it is added: `used` is read without the lock and must never exceed the budget
+        fits = size <= self.budget
+        room = self.budget - size if fits else self.budget
+        while self.used > room:  # before it is added: `used` is read without the lock and must not exceed the budget
             self.used -= _count_bytes(self.frames.pop(self._choose_victim()))
-        self.frames[index] = frame
-        self.used += size
+        if fits:
+            self.frames[index] = frame
+            self.used += size
 
     def _choose_victim(self) -> int:
         """Choose the frame to drop: the most recently used one that is not prefetched.

@@ -174,6 +174,15 @@ def test_the_bytes_in_use_never_exceed_the_budget_not_even_within_a_step(tmp_pat
     assert max(seen) == 2 * FRAME and min(seen) == 0
 
 
+def test_a_lower_limit_holds_from_the_next_frame_on_even_one_that_does_not_fit(tmp_path: Path) -> None:
+    store = ImageStore(sources(tmp_path, 4), cache_bytes=3 * FRAME)
+    for i in range(3):
+        store.get(i)
+    store.limit(FRAME // 2)
+    np.testing.assert_array_equal(store.get(3)[0], truth(3))
+    assert store.used_bytes == 0
+
+
 def test_a_bad_file_is_reported_by_get_not_by_the_thread(tmp_path: Path) -> None:
     store = ImageStore(sources(tmp_path, 3), cache_bytes=100 * FRAME)
     (tmp_path / "1.png").write_bytes(b"broken")
