@@ -9,14 +9,18 @@ from typing import Any
 from scene_experts.core.group import Alone, join
 
 
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
 def run_group(size: int, work: Callable[..., Any], *args: Any, timeout: float = 300.0) -> list[int | None]:
     """Call `work(group, *args)` in `size` forked processes. Returns their exit codes; 0 is success.
 
     The processes are forked, so that they need not import torch again.
     """
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     context = multiprocessing.get_context("fork")
     members = [context.Process(target=_member, args=(rank, size, port, work, args)) for rank in range(size)]
     for member in members:

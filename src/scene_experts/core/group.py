@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
+from importlib import import_module
 from typing import Any, TypeVar
 
 import torch
@@ -109,6 +110,9 @@ class Group(Alone):
         """
         from torch.distributed import PrefixStore, rendezvous  # pyright: ignore[reportPrivateImportUsage]  # documented, but not in __all__
 
+        # Its functions keep the group as a default argument if they are imported after the group exists, as torch.compile does. Then
+        # gloo's threads would go on after `leave`, and can abort the process at its end.
+        import_module("torch.distributed.nn.functional")
         store, _, _ = next(rendezvous("env://", timeout=JOINING))
         store = PrefixStore(f"scene-experts/{self.restarts}/{self.size}", store)
         store.set(f"here/{self.rank}", "")

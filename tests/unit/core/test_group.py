@@ -1,13 +1,15 @@
 """One process and several forked ones have the same methods."""
 
 import os
+import subprocess
+import sys
 
 import pytest
 import torch
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.group import Alone, join, world_size
-from support.groups import run_group
+from support.groups import free_port, run_group
 
 
 def test_one_process_exchanges_nothing():
@@ -34,6 +36,27 @@ def exchange(group, folder):
 def test_two_processes_exchange(tmp_path):
     assert run_group(2, exchange, tmp_path) == [0, 0]
     assert (tmp_path / "1").read_text().startswith("0")  # the second process worked after the first
+
+
+LEFT = """
+import os
+from importlib import import_module
+from pathlib import Path
+from scene_experts.core.group import Group
+group = Group("cpu")
+import_module("torch.distributed.nn.functional")  # as torch.compile does
+group.wait()
+group.leave()
+print([name for path in Path("/proc/self/task").glob("*/comm") if "gloo" in (name := path.read_text())])
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the threads are found in /proc")
+def test_no_thread_of_the_exchange_is_left():
+    """A thread of gloo that is left can abort the process when the interpreter ends."""
+    one = {"RANK": "0", "WORLD_SIZE": "1", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
+    done = subprocess.run([sys.executable, "-c", LEFT], env=os.environ | one, check=True, capture_output=True, text=True, timeout=120)
+    assert done.stdout == "[]\n"
 
 
 def fail(group):
