@@ -64,6 +64,7 @@ def test_means_over_seeds(capture, recipe):
 
 
 ORDER = ("fox", "colosseum", "bonsai", "buddha", "brighton", "fern", "kitchen")
+SCORES = ((("psnr",), 2), (("lpips",), 3), (("size", "MB"), 1))
 BESIDE = {"scaffold-gs": 3, "scaffold-gs-opacity": 1, "moe-gs": 3, "scene-experts-one": 3, "scene-experts-wide": 1, "scene-experts": 3}
 """The number of seeds of each recipe beside scene-experts."""
 
@@ -83,7 +84,7 @@ def as_it_is(capture: str, recipe: str) -> list[dict]:
 def beside(recipe: str, runs: dict[str, list[dict]]) -> list[str]:
     """The rows of a recipe in the tables of PSNR, LPIPS and MB: means over seeds, and their mean over captures."""
     found = []
-    for path, digits in ((("psnr",), 2), (("lpips",), 3), (("size", "MB"), 1)):
+    for path, digits in SCORES:
         whole = [run for capture in ORDER for run in runs[capture]]
         found.append(row(recipe, *(mean(runs[c], *path, digits=digits) for c in ORDER), mean(whole, *path, digits=digits)))
     return found
@@ -110,6 +111,15 @@ def test_3dgs_mcmc_at_the_same_bytes(recipe):
     plain = [line.replace("**", "") for line in lines("docs/results.md")]
     for name, expected in zip(("PSNR", "LPIPS", "MB"), beside(recipe, runs), strict=True):
         assert expected.replace(f"| {recipe} |", f"| {name}, {recipe} |", 1) in plain
+
+
+@pytest.mark.parametrize("capture", ORDER)
+def test_sags_beside_scene_experts(capture):
+    sags, ours = (as_it_is(capture, recipe)[:1] for recipe in ("sags", "scene-experts"))
+    if sags:
+        pairs = [mean(runs, *path, digits=n) for path, n in SCORES for runs in (sags, ours)]
+        ratio = f"{sags[0]['cpu_seconds'] / ours[0]['cpu_seconds']:.1f}"
+        assert row(capture, *pairs, ratio) in [line.replace("**", "") for line in lines("docs/results.md")]
 
 
 @pytest.mark.parametrize("recipe", [recipe for recipe in BESIDE if recipe != "scene-experts"])
