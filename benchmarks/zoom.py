@@ -1,6 +1,7 @@
 """PSNR of held-out views at other resolutions than that of the training: what the 3D smoothing filter does when a camera comes closer.
 
-Usage: python benchmarks/zoom.py CAPTURE [--recipe scene-experts] [--smoothing 0 0.2] [--train 400] [--score 200 400 800] [--iterations 3000]
+Usage: python benchmarks/zoom.py CAPTURE [--recipe scene-experts] [--smoothing 0 0.2] [--train 400] [--score 200 400 800]
+    [--iterations 3000]
 Resolutions are those of the longest side, pixels. One training for each value of --smoothing; nothing is kept.
 """
 
