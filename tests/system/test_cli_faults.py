@@ -69,8 +69,7 @@ def test_killed_while_it_saves_the_run_goes_on_as_if_nothing_had_happened(captur
     for kill in range(2):
         args = arguments(capture, out, "--save-every", 1, *(["--resume"] if kill else []))
         process = subprocess.Popen(command(args), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline and process.poll() is None:
+        while process.poll() is None:
             steps = [int(p.stem[5:]) for p in (out / "checkpoints").glob("ckpt_*.safetensors")]
             if steps and max(steps) >= reached + 12:
                 break
@@ -96,7 +95,7 @@ def run_with_full_disk(args: list[str], largest: int) -> str:
     def full() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
 
-    done = subprocess.run(command(args), preexec_fn=full, capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(command(args), preexec_fn=full, capture_output=True, text=True, check=False, timeout=400)
     assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
     (sentence,) = [line for line in done.stderr.splitlines() if line.startswith("error:")]
     return sentence

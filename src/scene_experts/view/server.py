@@ -222,11 +222,14 @@ class Viewer:
         return bool(self.panel.jobs or self.find_due(now))
 
     def draw(self, budget: float = float("inf")) -> float:
-        """Draw for every client that is due and return the seconds taken. The last picture may exceed `budget` seconds."""
+        """Draw for every client that is due and return the seconds taken.
+
+        The first picture is always drawn, and the last one may exceed `budget` seconds.
+        """
         began = time.monotonic()
         self.panel.run_jobs()
-        for client in self.find_due(began):
-            if time.monotonic() - began >= budget:
+        for turn, client in enumerate(self.find_due(began)):
+            if turn and time.monotonic() - began >= budget:
                 self.changed.set()
                 break
             try:

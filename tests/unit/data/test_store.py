@@ -216,7 +216,7 @@ lens = Lens("PINHOLE", 300, 300, (200.0, 200.0, 150.0, 150.0))
 store = ImageStore([FrameSource(Path({str(tmp_path)!r}) / f"{{i}}.png", lens, (300, 300)) for i in range(40)], 1 << 30)
 store.prefetch(range(40))
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=400)
     assert done.returncode == 0 and done.stderr == ""
 
 

@@ -86,7 +86,7 @@ def specs_of(capture: Path) -> list[Spec]:
 
 def kill_a_worker_half_way(specs: list[Spec], runs: Path, killed: list[int]) -> None:
     """Kill the worker process whose training is the first to have begun."""
-    until = time.monotonic() + 200
+    until = time.monotonic() + 500
     while time.monotonic() < until and not killed:
         for spec in specs:
             metrics = spec.folder(runs) / "metrics.jsonl"
@@ -119,7 +119,7 @@ def test_three_runs_with_a_worker_killed_half_way_equal_local_ones(tmp_path):
     with distributed.LocalCluster(**options, local_directory=str(tmp_path / "dask")) as workers:
         runner = ClusterRunner(tmp_path / "runs", tmp_path / "records", say=said.append, address=workers.scheduler_address)
         killer = threading.Thread(target=kill_a_worker_half_way, args=(specs, runner.runs, killed), daemon=True)
-        limit = threading.Timer(240, runner.end)
+        limit = threading.Timer(500, runner.end)
         for thread in (killer, limit):
             thread.start()
         try:

@@ -244,12 +244,17 @@ class _WebRedirects(urllib.request.HTTPRedirectHandler):
 def _ask(url: str, headers: dict[str, str]) -> http.client.HTTPResponse:
     """Send a request and return the answer when its head has arrived. Raises TimeoutError if that takes longer than ANSWER seconds."""
     sockets: list[socket.socket] = []
+    over = threading.Event()
 
     def connect(address: tuple[str, int], timeout: float | None = None, source: tuple[str, int] | None = None) -> socket.socket:
         sockets.append(socket.create_connection(address, timeout, source))
+        if over.is_set():  # `end` may have come before this socket
+            sockets[-1].close()
+            raise TimeoutError(f"no answer within {ANSWER:g} seconds")
         return sockets[-1]
 
     def end() -> None:
+        over.set()
         for opened in sockets:
             with suppress(OSError):
                 opened.shutdown(socket.SHUT_RDWR)
