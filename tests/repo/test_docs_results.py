@@ -69,12 +69,16 @@ BESIDE = {"scaffold-gs": 3, "scaffold-gs-opacity": 1, "moe-gs": 3, "scene-expert
 """The number of seeds of each recipe beside scene-experts."""
 
 
-def as_it_is(capture: str, recipe: str) -> list[dict]:
-    """The results of the recipe as it is now, one a seed: of 7,000 iterations at the shipped resolution."""
+def as_it_is(capture: str, recipe: str, distance: bool = False) -> list[dict]:
+    """The results of the recipe as it is now, one a seed: of 7,000 iterations at the shipped resolution.
+
+    distance: whether the decoders see the distance.
+    """
     found = {}
     for path in (RECORDS / capture / recipe).glob("seed*.json"):
         config, results = (json.loads(path.read_text())[part] for part in ("config", "results"))
         train, now = config["train"], config["data"]["resolution"] == "auto" and results["iterations"] == 7000
+        now = now and distance == bool(train["scene"].get("add_dist"))
         if now and train.get("batch", 1) == 1 and train["scene"].get("F", 32) == 32:
             assert train["seed"] not in found, path
             found[train["seed"]] = results
@@ -111,6 +115,23 @@ def test_3dgs_mcmc_at_the_same_bytes(recipe):
     plain = [line.replace("**", "") for line in lines("docs/results.md")]
     for name, expected in zip(("PSNR", "LPIPS", "MB"), beside(recipe, runs), strict=True):
         assert expected.replace(f"| {recipe} |", f"| {name}, {recipe} |", 1) in plain
+
+
+@pytest.mark.parametrize(
+    ("name", "recipe", "distance"),
+    [
+        ("scaffold-gs", "scaffold-gs", False),
+        ("scaffold-gs-dist", "scaffold-gs-dist", True),
+        ("scaffold-gs-opacity", "scaffold-gs-opacity", False),
+        ("scaffold-gs-opacity with the distance", "scaffold-gs-opacity", True),
+        ("moe-gs", "moe-gs", False),
+        ("moe-gs-dist", "moe-gs-dist", True),
+    ],
+)
+def test_the_distance_as_an_input(name, recipe, distance):
+    runs = [as_it_is(capture, recipe, distance)[:1] for capture in ("fox", "colosseum", "bonsai")]
+    cells = [mean(found, *path, digits=n) if found else "-" for path, n in SCORES for found in runs]
+    assert row(name, *cells) in lines("docs/results.md")
 
 
 @pytest.mark.parametrize("capture", ORDER)
