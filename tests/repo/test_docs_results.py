@@ -143,6 +143,21 @@ def test_sags_beside_scene_experts(capture):
         assert row(capture, *pairs, ratio) in [line.replace("**", "") for line in lines("docs/results.md")]
 
 
+def cells_of(section: str, page: str) -> dict[str, list[str]]:
+    """The rows of the first table of a section, by their first cell."""
+    part = page[page.index(f"### captures: {section}\n") :].split("\n###")[0]
+    rows = [[cell.strip().strip("*") for cell in line.split("|")[1:-1]] for line in part.splitlines() if line.startswith("| ")]
+    return {name: cells for name, *cells in rows}
+
+
+def test_the_parts_of_scene_experts():
+    page = (ROOT / "results/ablation/README.md").read_text()
+    psnr, lpips = (cells_of(f"{score} minus that of scene-experts", page) for score in ("PSNR", "LPIPS (3DGS)"))
+    sizes = cells_of("means over fox, bonsai, colosseum", page)
+    for name in ("one network", "no hinge", "width 32", "networks x 1", "constant rates", "scaffold-gs"):
+        assert row(name, *psnr[name][:4], lpips[name][3], sizes[name][3]) in lines("docs/results.md")
+
+
 @pytest.mark.parametrize("recipe", [recipe for recipe in BESIDE if recipe != "scene-experts"])
 def test_the_gains_of_scene_experts_are_those_of_its_page(recipe):
     page = (ROOT / "results/confirmation/README.md").read_text()
@@ -207,7 +222,20 @@ def commands() -> dict[str, list[str]]:
     return {words[words.index("--out") + 1]: words[1:] for words in found}
 
 
-PAGES = ("confirmation", "earlier", "short", "seeds", "parts", "parts/fox", "suite", "long", "long/fox", "long/bonsai", "extras")
+PAGES = (
+    "confirmation",
+    "ablation",
+    "earlier",
+    "short",
+    "seeds",
+    "parts",
+    "parts/fox",
+    "suite",
+    "long",
+    "long/fox",
+    "long/bonsai",
+    "extras",
+)
 
 
 @pytest.mark.parametrize("folder", PAGES)
