@@ -97,6 +97,9 @@ class Group(Alone):
         self.local = int(os.environ.get("LOCAL_RANK", self.rank))
         self.restarts = restarts()
         self.sent = 0
+        # Parts of torch import this module later. Its functions would then keep the group as a default argument, and gloo's threads
+        # would go on after `leave`: they can abort the process at its end.
+        import_module("torch.distributed.nn.functional")
         # Flags and Python values travel over gloo, also beside nccl: they are on the CPU.
         backends = "cpu:gloo,cuda:nccl" if device == "cuda" else "gloo"
         with self._expecting_all():
@@ -110,9 +113,6 @@ class Group(Alone):
         """
         from torch.distributed import PrefixStore, rendezvous  # pyright: ignore[reportPrivateImportUsage]  # documented, but not in __all__
 
-        # Its functions keep the group as a default argument if they are imported after the group exists, as torch.compile does. Then
-        # gloo's threads would go on after `leave`, and can abort the process at its end.
-        import_module("torch.distributed.nn.functional")
         store, _, _ = next(rendezvous("env://", timeout=JOINING))
         store = PrefixStore(f"scene-experts/{self.restarts}/{self.size}", store)
         store.set(f"here/{self.rank}", "")

@@ -44,7 +44,7 @@ from importlib import import_module
 from pathlib import Path
 from scene_experts.core.group import Group
 group = Group("cpu")
-import_module("torch.distributed.nn.functional")  # as torch.compile does
+import_module("torch.distributed.nn.functional")  # as parts of torch do
 group.wait()
 group.leave()
 

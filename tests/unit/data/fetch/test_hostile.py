@@ -182,7 +182,7 @@ def test_a_server_that_drips_is_left(where: str, server: Scripted, tmp_path: Pat
     monkeypatch.setattr(download, "WINDOW", 0.5)
     real = socket.create_connection
     if "over" in where:
-        monkeypatch.setattr(socket, "create_connection", lambda *where: time.sleep(1) or real(*where))
+        monkeypatch.setattr(socket, "create_connection", lambda *options: time.sleep(1) or real(*options))
 
     def drip(connection: socket.socket) -> None:
         connection.sendall(b"HTTP/1.1 200 OK\r\n" + (b"\r\n" if where == "body" else b""))
