@@ -158,6 +158,16 @@ def test_the_parts_of_scene_experts():
         assert row(name, *psnr[name][:4], lpips[name][3], sizes[name][3]) in lines("docs/results.md")
 
 
+def test_the_switches_that_scene_experts_does_not_use():
+    page = (ROOT / "results/switches/README.md").read_text()
+    psnr, lpips = (cells_of(f"{score} minus that of scene-experts", page) for score in ("PSNR", "LPIPS (3DGS)"))
+    sizes = cells_of("means over fox, colosseum", page)
+    for name in ("average", "absolute gradients", "error views", "masks", "residuals", "later growth", "smoothing"):
+        written = next(line for line in lines("docs/results.md") if line.startswith(f"| {name} (`--"))
+        size, drawn = (sizes[name][i].strip("*") for i in (3, 6))
+        assert written.endswith(row(*psnr[name][:3], lpips[name][2], size, drawn)[1:]), name
+
+
 @pytest.mark.parametrize("recipe", [recipe for recipe in BESIDE if recipe != "scene-experts"])
 def test_the_gains_of_scene_experts_are_those_of_its_page(recipe):
     page = (ROOT / "results/confirmation/README.md").read_text()
@@ -225,6 +235,7 @@ def commands() -> dict[str, list[str]]:
 PAGES = (
     "confirmation",
     "ablation",
+    "switches",
     "earlier",
     "short",
     "seeds",
