@@ -20,7 +20,7 @@ from scene_experts.api.camera import Camera, to_trained
 from scene_experts.api.capture import Capture, load_capture
 from scene_experts.api.recipe import Recipe
 from scene_experts.core import types
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, expect_among, expect_words
 from scene_experts.evaluate.command import about
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.pictures import to_8bit
@@ -149,8 +149,7 @@ class Run:
         Raises:
             InputError: `show` is unknown, or needs experts that the scene does not have.
         """
-        if show not in SHOWS:
-            raise InputError(f"expected show among {', '.join(SHOWS)}, found {show!r}; choose one of those")
+        expect_among("show", show, SHOWS)
         view, background = self._view(camera)
         return numpy(paint(self.scene, view, self.step, self._rasterize, background, Look(show, attribute), self._frozen()))
 
@@ -220,7 +219,7 @@ class Run:
             download_lpips: Download the weights if they are not on this machine.
 
         Raises:
-            InputError: The split has no views.
+            InputError: The split has no views, or `views` or `appearance` is unknown.
             RunError: The disk is full.
         """
         options = EvalOptions(views, appearance, lpips, None if lpips_weights is None else Path(lpips_weights), download_lpips)
@@ -264,13 +263,14 @@ class Run:
             The path of the file or folder.
 
         Raises:
-            InputError: The format cannot hold the scene, the run is only in memory, or a value is out of range.
+            InputError: The format cannot hold the scene, the run is only in memory, or a value is unknown or out of range.
             RunError: The disk is full.
         """
+        options = Options(False, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title)
+        expect_words(options)
         folder, opened = self._in_folder("export"), self._opened
         if self._device != "cpu":
             opened = run_folder.open_run(folder, "cpu", self.step)
-        options = Options(False, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title)
         opened = run_folder.with_capture(opened, self._data)
         return exporting.export(opened, format, None if out is None else Path(out), options)[0].path
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, expect_words
 from scene_experts.core.group import Alone
 from scene_experts.core.io import write_json
 from scene_experts.core.progress import Progress
@@ -123,7 +123,11 @@ def evaluate(
 
 
 def choose_views(capture: Capture, options: EvalOptions) -> tuple[int, ...]:
-    """Return the views to score. Raises InputError if there are none, or if codes would be fitted to training views."""
+    """Return the views to score.
+
+    Raises InputError for an unknown word in the options, if there are no views, or if codes would be fitted to training views.
+    """
+    expect_words(options)
     views = options.views
     chosen = capture.test if views == "test" else capture.train
     if not chosen:
