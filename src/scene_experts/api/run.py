@@ -84,6 +84,7 @@ class Run:
         self._opened, self._device, self._capture, self._data, self._training = opened, device, capture, data, training
         self._rasterize = as_trained(rasterize, opened.config.train.antialias)
         self._draws: Draws | None = None
+        self._averaged: tuple[int, Scene] | None = None  # of a training with averages: the iteration, and the scene at it
 
     @property
     def path(self) -> Path | None:
@@ -107,8 +108,18 @@ class Run:
 
     @property
     def scene(self) -> Scene:
-        """The scene in the trained world, as the package's own modules use it: a torch module with a table of rows."""
-        return self._training.scene if self._training else self._opened.scene
+        """The scene in the trained world, as the package's own modules use it: a torch module with a table of rows.
+
+        A recipe with `average.span` gives it the averaged weights, in memory as in a folder.
+        """
+        training = self._training
+        if training is None:
+            return self._opened.scene
+        if training.averages is None:
+            return training.scene
+        if self._averaged is None or self._averaged[0] != training.step:
+            self._averaged = training.step, training.averaged_scene()
+        return self._averaged[1]
 
     @property
     def capture(self) -> Capture:
@@ -308,7 +319,7 @@ class Run:
     def _now(self) -> OpenRun:
         """The run as the package's own modules know it."""
         live = self._training
-        return self._opened if live is None else replace(self._opened, scene=live.scene, step=live.step, clock=live.clock)
+        return self._opened if live is None else replace(self._opened, scene=self.scene, step=live.step, clock=live.clock)
 
     def _view(self, camera: Camera) -> tuple[types.Camera, Tensor]:
         """The camera in the trained world and the background, on the run's device."""
@@ -321,7 +332,7 @@ class Run:
     def _frozen(self) -> Draws:
         """The scene prepared for drawing. Unless it is being trained, values that do not depend on the camera are computed once."""
         if self._training:
-            return self._training.scene
+            return self.scene
         if self._draws is None:
             self._draws = self._opened.scene.frozen(self._opened.step)
         return self._draws
