@@ -60,7 +60,8 @@ class Scores:
     ssim: float
     """Structural similarity, at most 1; higher is better."""
     lpips: float | None
-    """Learned perceptual distance as 3DGS computes it, at least 0; lower is better. None where its weights are not on this machine."""
+    """Learned perceptual distance (VGG16, pictures in [-1, 1]), at least 0; lower is better. None where its weights are not on this
+    machine. `details["lpips_3dgs"]` has it for pictures in [0, 1], as 3DGS and papers after it compute it."""
     per_view: dict[str, dict[str, Any]]
     """The scores and counts of each view, by the name of its photograph."""
     details: dict[str, Any]
