@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 from pathlib import Path
 from typing import Literal
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scene_experts.api.camera import Camera, from_trained, vector
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, expect_words
 from scene_experts.data import views
 from scene_experts.data.settings import Data
 from scene_experts.training import run_folder
@@ -231,12 +232,9 @@ def load_capture(
     for name, value in (("resolution", resolution), ("split", split)):
         if not isinstance(value, str):
             raise InputError(f"expected {name} as text such as 'longest:800' or 'mod8', found {value!r}; write it in quotes")
-    for name, value, known in (
-        ("missing", missing, ("error", "drop")),
-        ("normalise", chosen, ("extent", "none")),
-        ("init", init, ("points", "random")),
-    ):
-        if value not in known:
-            raise InputError(f"expected {name} as {' or '.join(map(repr, known))}, found {value!r}; use one of those")
+    for name, value, least in (("seed", seed, 0), ("max_views", 1 if max_views is None else max_views, 1)):
+        if not isinstance(value, Integral) or value < least:
+            raise InputError(f"expected {name} as an integer of at least {least}, found {value!r}; correct it")
+    expect_words(data)
     data = run_folder.named(data)
     return Capture(data, run_folder.load_capture(data, seed), seed)

@@ -20,7 +20,7 @@ from scene_experts.api.camera import Camera, to_trained
 from scene_experts.api.capture import Capture, load_capture
 from scene_experts.api.recipe import Recipe
 from scene_experts.core import types
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, expect_among, expect_words
 from scene_experts.evaluate.command import about
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.pictures import to_8bit
@@ -60,7 +60,8 @@ class Scores:
     ssim: float
     """Structural similarity, at most 1; higher is better."""
     lpips: float | None
-    """Learned perceptual distance as 3DGS computes it, at least 0; lower is better. None where its weights are not on this machine."""
+    """Learned perceptual distance (VGG16, pictures in [-1, 1]), at least 0; lower is better. None where its weights are not on this
+    machine. `details["lpips_3dgs"]` has it for pictures in [0, 1], as 3DGS and papers after it compute it."""
     per_view: dict[str, dict[str, Any]]
     """The scores and counts of each view, by the name of its photograph."""
     details: dict[str, Any]
@@ -84,6 +85,7 @@ class Run:
         self._opened, self._device, self._capture, self._data, self._training = opened, device, capture, data, training
         self._rasterize = as_trained(rasterize, opened.config.train.antialias)
         self._draws: Draws | None = None
+        self._averaged: tuple[int, Scene] | None = None  # of a training with averages: the iteration, and the scene at it
 
     @property
     def path(self) -> Path | None:
@@ -107,8 +109,18 @@ class Run:
 
     @property
     def scene(self) -> Scene:
-        """The scene in the trained world, as the package's own modules use it: a torch module with a table of rows."""
-        return self._training.scene if self._training else self._opened.scene
+        """The scene in the trained world, as the package's own modules use it: a torch module with a table of rows.
+
+        A recipe with `average.span` gives it the averaged weights, in memory as in a folder.
+        """
+        training = self._training
+        if training is None:
+            return self._opened.scene
+        if training.averages is None:
+            return training.scene
+        if self._averaged is None or self._averaged[0] != training.step:
+            self._averaged = training.step, training.averaged_scene()
+        return self._averaged[1]
 
     @property
     def capture(self) -> Capture:
@@ -149,8 +161,7 @@ class Run:
         Raises:
             InputError: `show` is unknown, or needs experts that the scene does not have.
         """
-        if show not in SHOWS:
-            raise InputError(f"expected show among {', '.join(SHOWS)}, found {show!r}; choose one of those")
+        expect_among("show", show, SHOWS)
         view, background = self._view(camera)
         return numpy(paint(self.scene, view, self.step, self._rasterize, background, Look(show, attribute), self._frozen()))
 
@@ -220,7 +231,7 @@ class Run:
             download_lpips: Download the weights if they are not on this machine.
 
         Raises:
-            InputError: The split has no views.
+            InputError: The split has no views, or `views` or `appearance` is unknown.
             RunError: The disk is full.
         """
         options = EvalOptions(views, appearance, lpips, None if lpips_weights is None else Path(lpips_weights), download_lpips)
@@ -264,13 +275,14 @@ class Run:
             The path of the file or folder.
 
         Raises:
-            InputError: The format cannot hold the scene, the run is only in memory, or a value is out of range.
+            InputError: The format cannot hold the scene, the run is only in memory, or a value is unknown or out of range.
             RunError: The disk is full.
         """
+        options = Options(False, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title)
+        expect_words(options)
         folder, opened = self._in_folder("export"), self._opened
         if self._device != "cpu":
             opened = run_folder.open_run(folder, "cpu", self.step)
-        options = Options(False, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title)
         opened = run_folder.with_capture(opened, self._data)
         return exporting.export(opened, format, None if out is None else Path(out), options)[0].path
 
@@ -308,7 +320,7 @@ class Run:
     def _now(self) -> OpenRun:
         """The run as the package's own modules know it."""
         live = self._training
-        return self._opened if live is None else replace(self._opened, scene=live.scene, step=live.step, clock=live.clock)
+        return self._opened if live is None else replace(self._opened, scene=self.scene, step=live.step, clock=live.clock)
 
     def _view(self, camera: Camera) -> tuple[types.Camera, Tensor]:
         """The camera in the trained world and the background, on the run's device."""
@@ -321,7 +333,7 @@ class Run:
     def _frozen(self) -> Draws:
         """The scene prepared for drawing. Unless it is being trained, values that do not depend on the camera are computed once."""
         if self._training:
-            return self._training.scene
+            return self.scene
         if self._draws is None:
             self._draws = self._opened.scene.frozen(self._opened.step)
         return self._draws

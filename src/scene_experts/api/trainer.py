@@ -133,8 +133,7 @@ class Trainer:
             return Run(run_folder.open_run(out, self._run.device), self._run.device, self._rasterize, capture=self.capture)
         if training is None:
             raise InputError("expected a training that has begun, found one without an event; iterate over it first")
-        scene = training.scene if training.averages is None else training.averaged_scene()
-        opened = OpenRun(out or Path(), self._run.config, scene, training.step, training.clock, training.capture_id)
+        opened = OpenRun(out or Path(), self._run.config, training.scene, training.step, training.clock, training.capture_id)
         return Run(opened, self._run.device, self._rasterize, capture=self.capture, training=training)
 
     def stop(self, reason: str = "stop") -> None:

@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable, Sequence
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 
 class InputError(Exception):
@@ -17,6 +18,20 @@ def expect_at_least(numbers: list[tuple[str, float, float]]) -> None:
     for flag, value, least in numbers:
         if not value >= least:
             raise InputError(f"expected {flag} of at least {least}, found {value}; give a larger number or leave it out")
+
+
+def expect_among(name: str, value: object, words: Iterable[str]) -> None:
+    """Raise InputError unless the value of the argument `name` is one of `words`."""
+    known = tuple(words)
+    if not isinstance(value, str) or value not in known:
+        raise InputError(f"expected {name} among {', '.join(known)}, found {value!r}; choose one of those")
+
+
+def expect_words(options: Any) -> None:
+    """Raise InputError for the first Literal field of a dataclass whose value is not one of its words."""
+    for name, kind in get_type_hints(type(options)).items():
+        if get_origin(kind) is Literal:
+            expect_among(name, getattr(options, name), get_args(kind))
 
 
 def nearest(word: str, words: Iterable[str]) -> str:

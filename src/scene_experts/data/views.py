@@ -107,6 +107,11 @@ class Capture:
 
     left_out: tuple[int, ...] = ()  # indices of training views that --views leaves out; they still identify the capture
 
+    @property
+    def alpha_over(self) -> Vector | None:
+        """RGB in [0, 1] that transparent pixels of the photographs are composited over; None: alpha is a mask."""
+        return next((source.background for source in self.images.sources), None)
+
     def frame(self, index: int) -> Frame:
         """Return the pixels of view `index`. Raises InputError if its file cannot be read."""
         rgb, mask = self.images.get(index)

@@ -6,7 +6,8 @@ the exposure of a photograph is known only from the photograph, and no pixel is 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import torch
@@ -43,7 +44,8 @@ def right_half(mask: Tensor | None, height: int, width: int) -> Tensor:
     return half if mask is None else half * mask
 
 
-def fit_codes(
+@contextmanager
+def fitted_codes(
     scene: Scene,
     capture: Capture,
     rasterize: Rasterizer,
@@ -51,18 +53,23 @@ def fit_codes(
     step: int,
     background: Tensor,
     tell: Callable[[int, int], None] = lambda done, total: None,
-) -> None:
-    """Fit the code of each of the views `chosen` and store it in the scene's codes. Nothing else in the scene changes.
+) -> Iterator[None]:
+    """Fit the code of each of the views `chosen`; context manager in which the scene draws them with it. Nothing of it stays in the scene.
 
     tell: Called with the number of views that are done and the number of views.
     """
     codes = require_codes(scene)
-    for n, index in enumerate(chosen):
-        camera, frame = capture.views[index].camera.to(background.device), capture.frame(index)
-        counts = left_half(camera.height, camera.width) * (1.0 if frame.mask is None else frame.mask)
-        photo = (frame.rgb.float() / 255).to(background.device)
-        codes.fitted[camera.id] = fit_code(scene, codes, rasterize, camera, photo, counts.to(background.device), step, background)
-        tell(n + 1, len(chosen))
+    before = dict(codes.fitted)
+    try:
+        for n, index in enumerate(chosen):
+            camera, frame = capture.views[index].camera.to(background.device), capture.frame(index)
+            counts = left_half(camera.height, camera.width) * (1.0 if frame.mask is None else frame.mask)
+            photo = (frame.rgb.float() / 255).to(background.device)
+            codes.fitted[camera.id] = fit_code(scene, codes, rasterize, camera, photo, counts.to(background.device), step, background)
+            tell(n + 1, len(chosen))
+        yield
+    finally:
+        codes.fitted = before
 
 
 def fit_code(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import combinations
 from pathlib import Path
 from statistics import fmean, median_high
 from typing import TYPE_CHECKING, Any
@@ -33,8 +34,10 @@ PROTOCOL = {  # what must agree before scores may be compared: key in results.js
     "view_count": ("number of views", "--max-views"),
     "appearance": ("appearance codes", "--appearance"),
     "masked": ("use of masks", "--data"),
+    "background": ("background of transparent photographs", "--background"),
 }
 DEFAULTS = {"appearance": "rule"}  # the meaning of a results file without the key
+MAY_LACK = ("background",)  # a results file without one of these agrees with every other
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,7 @@ def describe_views(capture: Capture, cameras: Sequence[Camera], options: EvalOpt
         "split": capture.split,
         "resolution": capture.resolution,
         "mean_pixels": round(sum(c.width * c.height for c in cameras) / len(cameras)),
+        **({} if capture.alpha_over is None else {"background": list(capture.alpha_over)}),
     }
 
 
@@ -180,11 +184,13 @@ def find_outdated(names: Sequence[str], runs: Sequence[Path], results: Sequence[
 
 def find_difference(names: Sequence[str], results: Sequence[dict[str, Any]]) -> tuple[str, str] | None:
     """Return the first difference in what was scored, in words, and the option that sets it; None if scores may be compared."""
-    for name, other in zip(names[1:], results[1:]):
+    for (first, one), (second, other) in combinations(zip(names, results), 2):
         for key, (what, option) in PROTOCOL.items():
-            ours, theirs = (r.get(key, DEFAULTS.get(key)) for r in (results[0], other))
+            if key in MAY_LACK and not (key in one and key in other):
+                continue
+            ours, theirs = (r.get(key, DEFAULTS.get(key)) for r in (one, other))
             if ours != theirs:
-                return f"the same {what}, found {ours} in {names[0]} and {theirs} in {name}", option
+                return f"the same {what}, found {ours} in {first} and {theirs} in {second}", option
     return None
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, expect_words
 from scene_experts.core.group import Alone
 from scene_experts.core.io import write_json
 from scene_experts.core.progress import Progress
@@ -81,10 +82,11 @@ def evaluate(
     files = pictures.make_file_names(capture.views[i].name for i in chosen)
     cameras = [capture.views[i].camera.to(device) for i in chosen]
     mine = range(group.rank, len(chosen), group.size)
+    fitted: AbstractContextManager[None] = nullcontext()
     if options.appearance == "half":
         fitting: Callable[[int, int], None] = lambda done, total: tell("fitting appearance codes", done, total)  # noqa: E731
-        halves.fit_codes(scene, capture, rasterize, [chosen[n] for n in mine], step, background, fitting)
-    with pictures.replacing(out / options.folder, group.first) as folder:
+        fitted = halves.fitted_codes(scene, capture, rasterize, [chosen[n] for n in mine], step, background, fitting)
+    with fitted, pictures.replacing(out / options.folder, group.first) as folder:
         group.wait()
         drawing = Drawing(scene.frozen(step), rasterize, step, background, folder, options.appearance == "half")
 
@@ -123,7 +125,11 @@ def evaluate(
 
 
 def choose_views(capture: Capture, options: EvalOptions) -> tuple[int, ...]:
-    """Return the views to score. Raises InputError if there are none, or if codes would be fitted to training views."""
+    """Return the views to score.
+
+    Raises InputError for an unknown word in the options, if there are no views, or if codes would be fitted to training views.
+    """
+    expect_words(options)
     views = options.views
     chosen = capture.test if views == "test" else capture.train
     if not chosen:

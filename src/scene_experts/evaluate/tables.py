@@ -201,7 +201,7 @@ def distinguish_runs(runs: Sequence[Path], recipes: Sequence[str]) -> list[str]:
 def compare_runs(runs: Sequence[Path], format: Format, mixed: bool, console: Console, paper: str | None = None) -> ResultTable:
     """Print a table of evaluated runs, followed by the paper's numbers for the data set `paper`, and return it.
 
-    Raises InputError if the runs were scored on different captures, resolutions or splits, unless `mixed` is set.
+    Raises InputError if the runs were scored on different photographs (see `check_protocol`), unless `mixed` is set.
     """
     if not runs:
         raise InputError("expected at least one run folder, found none; give the folders that `scene-experts train --out` wrote")

@@ -1,11 +1,14 @@
 """A folder for a model hub: a trained scene in several formats, a picture, and a card (README.md) that hubs read.
 
-The card begins with YAML: licence, tags, and the scores of `scene-experts eval` where the run was evaluated. Whoever publishes a scene
-must know the licence of its photographs: licence texts beside them are copied, and the card says where none was stated.
+The card begins with YAML: licence, tags, and the scores of `scene-experts eval` where the run was evaluated at this iteration.
+Whoever publishes a scene must know the licence of its photographs: licence texts beside them are copied, and the card says where none
+was stated.
 """
 
 from __future__ import annotations
 
+import logging
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +31,7 @@ from scene_experts.files.registry import formats_of
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.view.paths import choose_best_view
 
+log: logging.Logger = logging.getLogger(__name__)
 CARD, PREVIEW = "README.md", "preview.png"
 UNKNOWN = "unknown"
 METRICS = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS"}
@@ -78,12 +82,22 @@ def write_hub(
         write_picture(folder / PREVIEW, draw_preview(run, capture))
     names = tuple(formats) or default_formats(run)
     written = export_several(run, names, folder, options, tell=tell, command=command)
+    write_bytes(folder / CARD, make_card(run, written, find_scores(run), licence, notices).encode())
+    return written
+
+
+def find_scores(run: OpenRun) -> dict[str, Any]:
+    """The content of results.json; empty where the run was not evaluated. Scores of another iteration are left out, with a warning."""
     try:
         scores = load_results(run.path)
-    except InputError:  # the run was not evaluated
-        scores = {}
-    write_bytes(folder / CARD, make_card(run, written, scores, licence, notices).encode())
-    return written
+    except InputError:
+        return {}
+    step = scores.get("step")
+    if step in (None, run.step):
+        return scores
+    again = shlex.join(["scene-experts", "eval", str(run.path), "--step", str(run.step)])
+    log.warning("the card has no scores: the run was scored at iteration %s, its files are of %s; run `%s` first", step, run.step, again)
+    return {}
 
 
 @torch.no_grad()

@@ -17,6 +17,7 @@ import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -199,10 +200,11 @@ def named(data: Data) -> Data:
 def load_capture(data: Data, seed: int = 0, look: bool = False) -> Capture:
     """Load the capture that `data` describes. `look` accepts a capture without points, which cannot be trained on.
 
-    Raises InputError if `background` is not in [0, 1], if `near` is not positive, or if the capture cannot be read.
+    Raises InputError if `background` is not three numbers in [0, 1], if `near` is not positive, or if the capture cannot be read.
     """
-    if data.background and not all(math.isfinite(v) and 0 <= v <= 1 for v in data.background):
-        raise InputError(f"expected --background as three numbers between 0 and 1, found {list(data.background)}; correct them")
+    if data.background is not None and not _is_colour(data.background):
+        found = list(data.background) if isinstance(data.background, tuple) else repr(data.background)
+        raise InputError(f"expected --background as three numbers between 0 and 1, found {found}; correct them")
     if data.near is not None and not 0 < data.near < math.inf:
         raise InputError(f"expected --near as a positive length, found {data.near}; leave it out for min(0.2, 0.02 R)")
     capture = captures.load(
@@ -224,6 +226,10 @@ def load_capture(data: Data, seed: int = 0, look: bool = False) -> Capture:
     if data.near is None:
         return capture
     return replace(capture, views=tuple(replace(v, camera=replace(v.camera, near=data.near)) for v in capture.views))
+
+
+def _is_colour(value: object) -> bool:
+    return isinstance(value, (tuple, list)) and len(value) == 3 and all(isinstance(v, Real) and 0 <= float(v) <= 1 for v in value)
 
 
 def choose_views(capture: Capture, path: Path) -> Capture:

@@ -159,8 +159,12 @@ class Training:
         return nullcontext() if self.averages is None else self.averages.swapped()
 
     def averaged_scene(self) -> Scene:
-        """Return a copy of the scene with its averaged weights."""
-        return restore_scene(self.cfg.scene, self.tensors(), self.meta(), averaged=True).to(self.scene.table.device)
+        """Return a copy of the scene with its averaged weights, as in the saved run; without averages the scene itself."""
+        if self.averages is None:
+            return self.scene
+        own = {name: value.clone() for name, value in self.tensors().items() if name.startswith(("average.", "facts."))}
+        with torch.random.fork_rng(devices=()):  # new networks draw their first weights
+            return restore_scene(self.cfg.scene, own, self.meta(), averaged=True).to(self.scene.table.device)
 
     def rates(self) -> dict[str, float]:
         """Return the current learning rates by group."""

@@ -75,7 +75,11 @@ def test_an_orbit_goes_around_the_centre(capture):
         ({"resolution": "huge"}, "resolution"),
         ({"background": (0.0, 0.0, 2.0)}, "background"),
         ({"near": -1.0}, "near"),
-        ({"max_views": 0}, "max-views"),
+        ({"background": (0, 0)}, "background"),
+        ({"background": "white"}, "background"),
+        ({"max_views": 0}, "max_views"),
+        ({"max_views": "5"}, "max_views.*'5'"),
+        ({"seed": -1, "init": "random"}, "seed.*-1"),
         ({"images": "images_8"}, "images_8"),
     ],
 )

@@ -79,6 +79,17 @@ def test_a_checkpoint_may_be_chosen(capture, small, tmp_path):
         se.open_run(tmp_path / "absent")
 
 
+def test_words_that_mean_nothing_are_named(run, tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in run.path.rglob("*")}
+    for words in ({"views": "val"}, {"appearance": "fit"}):
+        with pytest.raises(se.InputError, match=naming(*words, *words.values())):
+            run.evaluate(**words, lpips=False)
+    for words in ({"frame": "world"}, {"floaters": "drop"}):
+        with pytest.raises(se.InputError, match=naming(*words, *words.values())):
+            run.export("ply", tmp_path / "scene.ply", **words)
+    assert before == {path: path.stat().st_mtime_ns for path in run.path.rglob("*")} and not list(tmp_path.iterdir())
+
+
 def test_files_come_back(run, capture, tmp_path):
     compact = run.export("compact", tmp_path / "scene.compact")
     anchors = run.export("anchors", tmp_path / "anchors")

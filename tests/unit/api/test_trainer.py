@@ -83,6 +83,23 @@ def test_a_training_in_memory_is_the_same_scene(capture, small, run, tmp_path, m
         saved.save(tmp_path / "other")
 
 
+def test_a_training_in_memory_shows_its_averaged_weights(capture, small, tmp_path):
+    averaged = se.recipe(small, **{"average.span": 0.5, "average.interval": 1})
+    looked = se.Trainer(averaged, capture, preview_every=3, deterministic=True, device="cpu")
+    camera = capture.test_cameras[0]
+    for event in looked:
+        if isinstance(event, se.Previewed):
+            assert np.allclose(looked.run.render(camera), event.picture.numpy(), atol=1e-6)
+    scene = looked.run
+    saved = scene.save(tmp_path / "saved")
+    assert np.allclose(scene.render(camera), saved.render(camera), atol=1e-6) and len(scene.scene.table) == len(saved.scene.table)
+    assert scene.evaluate(lpips=False).psnr == pytest.approx(saved.evaluate(lpips=False).psnr, abs=1e-4)
+    unseen = se.train(averaged, capture, tmp_path / "unseen", deterministic=True, device="cpu", progress=False)
+    ours, theirs = tensors(tmp_path / "saved"), tensors(unseen.path or Path())
+    assert [n for n in ours if not torch.equal(ours[n], theirs[n])] == [], "looking changes nothing, and the raw weights are saved"
+    assert any(not torch.equal(ours[name], ours[f"average.{name}"]) for name in ours if name.startswith("params."))
+
+
 def test_a_loop_may_pause_go_on_and_stop(capture, small, tmp_path):
     trainer = se.Trainer(small, capture, tmp_path / "run", log_every=1)
     with pytest.raises(se.InputError, match="iterate"):

@@ -2,11 +2,13 @@
 
 import errno
 import os
+from dataclasses import dataclass
+from typing import Literal
 
 import pytest
 
 from scene_experts import cli, commands
-from scene_experts.core.errors import InputError, RunError, few, nearest
+from scene_experts.core.errors import InputError, RunError, expect_words, few, nearest
 from scene_experts.core.reading.source import sentence
 
 
@@ -45,6 +47,19 @@ def test_a_word_like_a_known_one_is_hinted_at():
     assert nearest("zzz", ["export", "eval"]) == ""
     assert nearest("--iteration", ["--resolution", "--iterations"]) == "; did you mean '--iterations'?"  # the other is much less alike
     assert nearest("roma", ["rome", "room", "truck"]) == "; did you mean 'room' or 'rome'?"
+
+
+@dataclass
+class Words:
+    text: str = "any"
+    order: Literal["up", "down"] = "up"
+
+
+def test_fields_have_one_of_their_words():
+    expect_words(Words())
+    for wrong in ("left", ["up"], None):
+        with pytest.raises(InputError, match="expected order among up, down, found "):
+            expect_words(Words(order=wrong))  # type: ignore[arg-type]
 
 
 def test_of_many_names_the_first_are_told():

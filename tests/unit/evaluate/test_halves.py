@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
 from scene_experts.evaluate import halves
@@ -69,11 +69,19 @@ def test_right_halves_are_scored_beside_the_usual_results(capture, tmp_path):
     scene, draw = started(capture), choose("auto", "cpu")
     usual = evaluate(scene, capture, draw, tmp_path, EvalOptions(lpips=False), step=STEP)
     half = evaluate(scene, capture, draw, tmp_path, EvalOptions(appearance="half", lpips=False), step=STEP)
+    assert not scene.codes.fitted, "later pictures of the scene know nothing of the held-out photographs"
     assert "appearance" not in usual and half["appearance"] == "half" and half["masked"]
     assert half["psnr"] > usual["psnr"]  # these codes fit the photographs
     assert json.loads((tmp_path / "results.json").read_text())["psnr"] == usual["psnr"]
     assert json.loads((tmp_path / "results_half.json").read_text())["psnr"] == half["psnr"]
     assert any((tmp_path / "test_half" / "masks").iterdir()) and (tmp_path / "per_view_half.json").is_file()
+
+    def stop(what: str, done: int, total: int) -> None:
+        raise RunError(what)
+
+    with pytest.raises(RunError, match="fitting"):
+        evaluate(scene, capture, draw, tmp_path, EvalOptions(appearance="half", lpips=False), step=STEP, progress=stop)
+    assert not scene.codes.fitted
     for wrong, options in ((started(capture, 0), {}), (scene, {"views": "train"})):
         with pytest.raises(InputError, match="--appearance half"):
             evaluate(wrong, capture, draw, tmp_path, EvalOptions(appearance="half", lpips=False, **options), step=STEP)

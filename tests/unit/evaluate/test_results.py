@@ -5,18 +5,22 @@ from __future__ import annotations
 import pytest
 
 from scene_experts.core.errors import InputError
+from scene_experts.data.capture import load
 from scene_experts.evaluate.metrics import Perceptual
+from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.results import (
     check_protocol,
     describe_failed,
     describe_scores,
     describe_size,
+    describe_views,
     find_difference,
     find_failed,
     find_outdated,
 )
 from support.messages import naming
 from support.scenes import start_scene
+from support.synthetic import make_blender, make_capture
 
 
 @pytest.mark.parametrize(("recipe", "row"), [("scaffold-gs", 316), ("3dgs", 248)])
@@ -52,6 +56,25 @@ def test_the_first_difference_in_the_protocol_is_named():
     assert find_difference(["a", "b"], [one, two]) == ("the same split, found mod8 in a and mod4 in b", "--split")
     with pytest.raises(InputError, match=naming("--split", "--mixed")):
         check_protocol(["a", "b"], [one, two])
+
+
+def test_photographs_over_other_backgrounds_are_not_compared():
+    old = {"split": "mod8"}
+    white, black = ({**old, "background": [value] * 3} for value in (1.0, 0.0))
+    assert find_difference(["a", "b", "c"], [old, white, white]) is None
+    for runs in ([white, black], [old, white, black]):
+        with pytest.raises(InputError, match=naming("--background", [1.0] * 3, [0.0] * 3)):
+            check_protocol("abc", runs)
+
+
+def test_the_background_is_stated_where_photographs_are_transparent(tmp_path):
+    opaque = make_capture(tmp_path / "colmap", views=3, size=(16, 12), points=20).folder
+    make_blender(tmp_path / "blender", views=3, size=16)
+    blue = (0.0, 0.0, 1.0)
+    for folder, colour, stated in ((tmp_path / "blender", None, [1.0] * 3), (tmp_path / "blender", blue, [*blue]), (opaque, blue, None)):
+        capture = load(folder, background=colour)
+        assert describe_views(capture, [view.camera for view in capture.views], EvalOptions()).get("background") == stated
+        capture.images.close()
 
 
 def test_views_that_fail_are_named():

@@ -45,6 +45,7 @@ class FakeCapture:
     resolution: str = "as-is"
     split: str = "mod2"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    alpha_over: tuple[float, float, float] | None = None
 
     @property
     def images(self) -> Any:

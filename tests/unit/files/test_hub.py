@@ -1,5 +1,6 @@
 """The folder for a model hub: what hubs read in its card, and its files."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -49,6 +50,17 @@ def test_the_card_states_licence_tags_scores_and_files(tmp_path):
         assert fact in body
     head, body = front_matter(hub.make_card(run, files, {}, hub.UNKNOWN, []))  # type: ignore[arg-type]
     assert "model-index" not in head and head["license"] == "unknown" and "not stated" in body
+
+
+def test_scores_are_those_of_the_iteration_that_is_written(tmp_path, caplog):
+    run = SimpleNamespace(path=tmp_path, step=2000)
+    assert hub.find_scores(run) == {}  # type: ignore[arg-type]
+    for scores in ({"psnr": 27.0, "step": 2000}, {"psnr": 27.0}):
+        (tmp_path / "results.json").write_text(json.dumps(scores))
+        assert hub.find_scores(run) == scores and not caplog.records  # type: ignore[arg-type]
+    (tmp_path / "results.json").write_text(json.dumps({"psnr": 27.0, "step": 1500}))
+    assert hub.find_scores(run) == {}  # type: ignore[arg-type]
+    assert all(fact in caplog.text for fact in ("1500", "2000", f"eval {tmp_path} --step 2000"))
 
 
 def test_licence_texts_are_copied(tmp_path):

@@ -95,8 +95,22 @@ def test_drawing_with_the_average_leaves_the_weights(capture):
             assert not torch.equal(p, weights[name])
     assert all(torch.equal(training.scene.table.params[name], value) for name, value in weights.items())
     assert all(torch.equal(training.scene.network_tensors()[name], value) for name, value in networks.items())
+
+
+@pytest.mark.parametrize("recipe", ["moe-gs", "3dgs", "sags"])
+def test_a_copy_with_the_average_leaves_the_training_alone(recipe, capture):
+    training = started(capture, recipe)
+    move(training, 30)
+    name = next(iter(training.scene.table.params))
+    average, random = training.scene.table.averages[name].clone(), torch.get_rng_state()
     copy = training.averaged_scene()
-    torch.testing.assert_close(copy.table.params["feature"].detach(), training.scene.table.averages["feature"])
+    assert torch.equal(torch.get_rng_state(), random)
+    move(training, 10)
+    assert torch.equal(copy.table.params[name], average), "the copy stays as it was"
+    assert not torch.equal(training.scene.table.averages[name], average)
+    with torch.no_grad():
+        copy.table.params[name].zero_()
+    assert training.scene.table.averages[name].any()
 
 
 def test_off_by_default(capture):

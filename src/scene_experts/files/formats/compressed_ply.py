@@ -31,7 +31,7 @@ from scene_experts.files.formats.pack import (
     to_bytes,
     unit_quats,
 )
-from scene_experts.files.formats.ply import header, note_comments
+from scene_experts.files.formats.ply import header, is_antialiased, note_comments
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import Format
 from scene_experts.geometry.sh import C0
@@ -187,4 +187,6 @@ FORMAT = Format(
     marks=(b"ply",),
     looks_like=lambda path, head: b"\nelement chunk " in header(path),
     other_suffixes=(".ply",),
+    antialias=True,
+    is_antialiased=is_antialiased,
 )

@@ -27,6 +27,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.plain import parse_json
 from scene_experts.core.reading.source import opening
 from scene_experts.data.views import Capture, View, World
 from scene_experts.files.cameras import camera_entries
@@ -41,6 +42,7 @@ from scene_experts.view.region import find_region
 ASSETS = files("scene_experts.files.formats") / "assets"
 MARK = b'<meta name="generator" content="scene-experts">'
 _SCENE = b'<script type="text/plain" id="scene">'
+_SETTINGS = b'<script type="application/json" id="settings">'
 FLIGHT = 48  # poses of the flight, between which the page interpolates
 _FOV = 50.0  # degrees, without a camera
 Pose = dict[str, Any]
@@ -64,16 +66,31 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
 def read(path: Path) -> Splats:
     """The Gaussians in a page that `write` made. Raises InputError for other and damaged pages."""
     with opening(path, budget.HTML) as source:
-        data = source.read()
-        start = data.find(_SCENE) + len(_SCENE)
-        end = data.find(b"</script>", start)
-        if start < len(_SCENE) or end < 0:
-            raise Damaged("no scene")
+        content = _content(source.read(), _SCENE)
         try:
-            scene = base64.b64decode(data[start:end], validate=True)
+            scene = base64.b64decode(content, validate=True)
         except ValueError:
             raise Damaged("a scene that is not base64") from None
         return decode(scene, source).checked(path)
+
+
+def is_antialiased(path: Path) -> bool:
+    """Whether the settings of a page say that it is drawn with antialiasing; False for damaged pages."""
+    with opening(path, budget.HTML) as source:
+        try:
+            settings = parse_json(_content(source.read(), _SETTINGS))
+        except (ValueError, RecursionError):
+            return False
+    return isinstance(settings, dict) and settings.get("antialias") is True
+
+
+def _content(page: bytes, tag: bytes) -> bytes:
+    """The content of the script that begins with `tag`. Raises Damaged if the page has none or ends in it."""
+    start = page.find(tag) + len(tag)
+    end = page.find(b"</script>", start)
+    if start < len(tag) or end < 0:
+        raise Damaged("no scene")
+    return page[start:end]
 
 
 def view_note(capture: Capture, world: World) -> dict[str, Any]:
@@ -164,5 +181,6 @@ FORMAT = Format(
     marks=(b"<!doctype html>",),
     looks_like=lambda path, head: MARK in head,
     antialias=True,
+    is_antialiased=is_antialiased,
     view_note=view_note,
 )

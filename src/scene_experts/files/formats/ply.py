@@ -110,9 +110,9 @@ def note_comments(note: Mapping[str, Any]) -> list[str]:
     """The comment lines of a note on how a file was made: "scene-experts {...}" in JSON and ASCII,
     or none for an empty note.
 
-    The longest entries are left out until the line has at most 64 KiB.
+    The longest entries are left out until the line has at most 64 KiB, and `antialias` where it is false.
     """
-    kept = dict(note)
+    kept = {name: value for name, value in note.items() if name != "antialias" or value}
     text = json.dumps(kept, allow_nan=False, default=str)
     while len(text) > _NOTE_LIMIT:
         del kept[max(kept, key=lambda name: len(json.dumps(kept[name], default=str)))]
@@ -131,6 +131,11 @@ def read_note(path: Path) -> dict[str, Any]:
                 return {}
             return found if isinstance(found, dict) else {}
     return {}
+
+
+def is_antialiased(path: Path) -> bool:
+    """Whether the note in the header of a PLY file says that it is drawn with antialiasing."""
+    return read_note(path).get("antialias") is True
 
 
 def header(path: Path) -> bytes:
@@ -199,4 +204,6 @@ FORMAT = Format(
     read=read,
     marks=(b"ply",),
     looks_like=lambda path, head: b"\nelement chunk " not in header(path),
+    antialias=True,
+    is_antialiased=is_antialiased,
 )

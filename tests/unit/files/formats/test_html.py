@@ -58,6 +58,13 @@ def ours(s, entry):
     return (image.clamp(0, 1) * 255).round().byte().numpy()
 
 
+@pytest.mark.parametrize("page", [b"", b'id="settings">{}', b"{broken", b"[true]", b'{"antialias": 1}', b"[" * 10_000])
+def test_settings_that_say_nothing_of_antialiasing(tmp_path, page):
+    tag = b'<script type="application/json" id="settings">'
+    (tmp_path / "a.html").write_bytes(tag + page + (b"</script>" if page else b""))
+    assert html.is_antialiased(tmp_path / "a.html") is False
+
+
 def psnr(a, b):
     return 10 * math.log10(255**2 / max(((a.astype(float) - b.astype(float)) ** 2).mean(), 1e-9))
 

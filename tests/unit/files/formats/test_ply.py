@@ -194,6 +194,9 @@ def test_no_note_a_foreign_one_and_a_long_one(tmp_path):
     assert ply.read_note(path) == {}
     ply.write_vertices(path, {"x": np.zeros(1, np.float32)}, ["scene-experts [1]"])
     assert ply.read_note(path) == {}
+    for value in (1, "true", False):
+        ply.write_vertices(path, {"x": np.zeros(1, np.float32)}, ply.note_comments({"antialias": value}))
+        assert not ply.is_antialiased(path)
     (line,) = ply.note_comments({"psnr": 1.0, "figures": list(range(100_000))})
     assert line == 'scene-experts {"psnr": 1.0}'
 

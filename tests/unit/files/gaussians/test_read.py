@@ -12,10 +12,11 @@ from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
 from scene_experts.files import registry
-from scene_experts.files.export import write_result_folder
-from scene_experts.files.formats import ply, splat, spz
+from scene_experts.files.export import export, write_result_folder
+from scene_experts.files.formats import ply, splat
 from scene_experts.files.formats.ply import read_vertices, write_vertices
 from scene_experts.files.importing import import_files
+from scene_experts.files.options import Options
 from scene_experts.files.result_folder import read_settings
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
@@ -136,13 +137,15 @@ def test_beside_a_description_of_more_harmonics_the_file_says_the_degree(made, t
     assert opened.step == 90 and opened.scene.config.sh_degree == 0
 
 
-def test_spz_says_by_itself_whether_it_is_antialiased(made, tmp_path):
+@pytest.mark.parametrize("format", ["spz", "html", "ply", "compressed-ply"])
+def test_a_file_says_by_itself_whether_it_is_antialiased(made, tmp_path, format):
     run, folder = made
-    layout = write_result_folder(run_folder.open_run(run), run_folder.load_capture(Data(folder)), tmp_path / "result")
+    opened, name = run_folder.open_run(run), f"scene{registry.format_named(format).suffix}"
     for asked in (False, True):
-        file = tmp_path / f"{asked}.spz"
-        spz.write(file, ply.read(layout / "point_cloud.ply"), {"antialias": asked})
-        out = import_files(file, Data(folder), tmp_path / f"{asked}")
+        one = replace(opened, config=replace(opened.config, train=replace(opened.config.train, antialias=asked)))
+        export(one, format, tmp_path / name, Options(measure=False))
+        (tmp_path / f"{name}.json").unlink()
+        out = import_files(tmp_path / name, Data(folder), tmp_path / f"{asked}")
         assert run_folder.read_config(out).train.antialias is asked
 
 
