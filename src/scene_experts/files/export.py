@@ -388,12 +388,12 @@ def _export_gaussians(
         note = {name: value for name, value in about.items() if name != "antialias" or format.antialias}
         views = {} if format.view_note is None or capture is None else format.view_note(capture, world)
         titled = {} if options.title is None else {"title": options.title}
-        format.write(path, contents, note | views | titled)
+        told = format.write(path, contents, note | views | titled)
         facts: dict[str, Any] = {"file": path.name, "bytes": path.stat().st_size, "seconds": round(one.seconds, 1), "psnr": {}}
         frame = "the capture's own frame" if options.frame == "capture" else "the trained world"
         said = f"{len(contents):,} Gaussians, {facts['bytes'] / 1e6:.2f} MB, harmonics of degree {contents.degree}, in {frame}"
         how = f"; baked in {format_duration(one.seconds)}" if fresh else "; of the same bake"
-        lines = (f"wrote {path}", said + (how if bake else ""), *one.lines)
+        lines = (f"wrote {path}", said + (how if bake else ""), *one.lines, *([str(told)] if told is not None else []))
         written = Written(path, facts["bytes"], len(contents), lines)
         if options.measure and format.read is not None and not options.crop:
 

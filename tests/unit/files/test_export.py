@@ -304,6 +304,15 @@ def test_frames_and_folders(short, tmp_path):
     assert measured(short, tmp_path / "world.ply", World()) == pytest.approx(measured(short, tmp_path / "scene.ply"), abs=0.01)
 
 
+@pytest.mark.parametrize("short", ["3dgs"], indirect=True)
+def test_what_a_format_cannot_hold_is_told(short, tmp_path):
+    opened = run_folder.open_run(short)
+    with torch.no_grad():
+        opened.scene.table.params["log_scales"] += 20
+    (spz,), (sog,) = (export(opened, name, tmp_path, Options(measure=False)) for name in ("spz", "sog"))
+    assert spz.lines[-1].startswith("warning: ") and "SPZ" in spz.lines[-1] and not any("warning" in line for line in sog.lines)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("short", ["moe-gs"], indirect=True)
 def test_each_format_is_measured_from_its_own_file(short, tmp_path):

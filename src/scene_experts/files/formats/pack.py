@@ -3,6 +3,7 @@ bytes, turned frames, size limits."""
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 import numpy as np
@@ -118,6 +119,14 @@ def turn(splats: Splats, axis: Literal["x", "z"]) -> Splats:
         splats.opacity_logit,
         splats.sh * torch.from_numpy(harmonics).float()[:, None],
     )
+
+
+def scaled(splats: Splats, factor: float) -> Splats:
+    """The Gaussians with all lengths times `factor`, above 0."""
+    if factor == 1:
+        return splats
+    means, log_scales = splats.means.double() * factor, splats.log_scales.double() + math.log(factor)
+    return Splats(means.float(), log_scales.float(), splats.quats, splats.opacity_logit, splats.sh)
 
 
 def tensor(values: NDArray[Any]) -> torch.Tensor:
