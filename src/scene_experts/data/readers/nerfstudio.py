@@ -43,7 +43,7 @@ class NerfstudioReader:
         warnings: list[str] = []
         for index, frame in enumerate(meta["frames"]):
             name, image = transforms.find_image(folder, transforms.read_file_path(frame, index, path), options.images)
-            lens = transforms.read_lens(meta, frame, path)
+            lens = transforms.read_lens(meta, frame, path, image)
             given = folder / str(frame["mask_path"]) if frame.get("mask_path") else None
             mask = given if given and given.is_file() else image and find_mask(folder, name.partition("/")[2] or name, image)
             angle = transforms.read_angle(meta, frame, path) if lens is None else 0.0
