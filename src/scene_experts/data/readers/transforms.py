@@ -59,13 +59,17 @@ def read_angle(meta: dict[str, Any], frame: dict[str, Any], path: Path) -> float
     return float(angle)
 
 
+def to_pure(name: str) -> PurePosixPath:
+    """Return the path that a name in the file stands for: "./a/b" and "a\\b" are the same as "a/b"."""
+    return PurePosixPath(name.replace("\\", "/"))
+
+
 def find_image(root: Path, file_path: str, images: str | None) -> tuple[str, Path | None]:
     """Return the name of a view and its file, or None instead of the file if it is absent.
 
     A path without an extension matches an image with any known extension. `images` replaces the first folder of the path.
     """
-    pure = PurePosixPath(file_path.replace("\\", "/"))
-    parts = [p for p in pure.parts if p != "."]
+    parts = list(to_pure(file_path).parts)
     if images is not None:
         parts = [images, *parts[1:]] if len(parts) > 1 else [images, *parts]
     name = "/".join(parts)
