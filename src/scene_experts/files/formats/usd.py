@@ -47,7 +47,7 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
         "note": np.array(json.dumps(note, default=str) if note else ""),
     }
     with tempfile.TemporaryDirectory(prefix="scene-experts-usd-") as folder:
-        archive, made = Path(folder) / "arrays.npz", Path(folder) / f"scene{'.usda' if path.suffix == '.usda' else '.usdc'}"
+        archive, made = Path(folder) / "arrays.npz", Path(folder) / f"scene{'.usda' if path.suffix.lower() == '.usda' else '.usdc'}"
         np.savez(archive, **arrays)  # type: ignore[arg-type]
         done = _work("write", archive, made, LONGEST)
         if done.returncode or not made.is_file():
@@ -121,6 +121,7 @@ def _work(task: str, source: Path, target: Path, seconds: int, *limits: str) -> 
 
 FORMAT = Format(
     suffix=".usdc",
+    other_suffixes=(".usda", ".usd"),
     write=write,
     read=read,
     marks=(b"PXR-USDC", b"#usda"),
