@@ -242,7 +242,7 @@ class Page {
   async load() {
     const fileBytes = bytesOf("scene");
     const mesh = new SplatMesh({ fileBytes, fileName: "scene.spz", extSplats: true });
-    mesh.scale.setScalar(UNIT);
+    mesh.scale.setScalar(UNIT / settings.unit);
     this.scene.add(mesh);
     await mesh.initialized;
     this.mesh = mesh;

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scene_experts.api.camera import Camera, from_trained, vector
 from scene_experts.core.errors import InputError, expect_words
 from scene_experts.data import views
+from scene_experts.data.fetch.catalog import Numbers, defaults_of
 from scene_experts.data.settings import Data
 from scene_experts.training import run_folder
 from scene_experts.view import paths
@@ -31,8 +32,11 @@ class Capture:
     seed: int
     """Seed of the random points, where the capture has any."""
 
-    def __init__(self, data: Data, loaded: views.Capture, seed: int = 0) -> None:
-        self.data, self.loaded, self.seed = data, loaded, seed
+    numbers: Numbers
+    """Numbers of its data set, (name, value), for a scene of the catalog; a training takes them where its recipe is given by name."""
+
+    def __init__(self, data: Data, loaded: views.Capture, seed: int = 0, numbers: Numbers = ()) -> None:
+        self.data, self.loaded, self.seed, self.numbers = data, loaded, seed, numbers
 
     @property
     def name(self) -> str:
@@ -171,7 +175,7 @@ class Capture:
         """Return the capture with the random points of another seed; the capture itself if it has no random points."""
         if seed == self.seed or (self.data.init != "random" and self.loaded.bounds is None):
             return self
-        return Capture(self.data, run_folder.load_capture(self.data, seed), seed)
+        return Capture(self.data, run_folder.load_capture(self.data, seed), seed, self.numbers)
 
     def _cameras(self, indices: Sequence[int]) -> list[Camera]:
         return [from_trained(self.loaded.views[i].camera, self.loaded.world) for i in indices]
@@ -225,7 +229,8 @@ def load_capture(
     Raises:
         InputError: The folder holds no usable capture, or an argument is invalid.
     """
-    chosen = normalise or ("none" if str(path).startswith("catalog:") else "extent")
+    brought = defaults_of(path)
+    chosen = normalise or brought.normalise
     data = Data(
         Path(path), images, resolution, split, missing, chosen, init, max_views, near, ignore_principal_point, background=background
     )
@@ -237,4 +242,4 @@ def load_capture(
             raise InputError(f"expected {name} as an integer of at least {least}, found {value!r}; correct it")
     expect_words(data)
     data = run_folder.named(data)
-    return Capture(data, run_folder.load_capture(data, seed), seed)
+    return Capture(data, run_folder.load_capture(data, seed), seed, brought.numbers)

@@ -260,7 +260,7 @@ class Run:
             format: "compact" is one small file of this package. "anchors" is the Scaffold-GS folder layout. "ply", "compressed-ply",
                 "splat", "spz", "sog", "glb", "usd" and "html" (a page with a viewer) are standard files of Gaussians; scenes of anchors
                 are baked for them, which takes minutes.
-            out: File or folder. Default: inside the run folder.
+            out: File or folder; a name without a suffix is a folder. Default: inside the run folder.
             sh_degree: Standard files: degree of the spherical harmonics, 0 to 3.
             max_gaussians: Standard files: keep this many Gaussians, those that contribute most; 0 keeps all.
             prune: Standard files: leave out the Gaussians that contribute least, up to this share (0 to 1) of all contributions.

@@ -21,7 +21,7 @@ from scene_experts.api.run import Run
 from scene_experts.core.errors import InputError
 from scene_experts.render import choose
 from scene_experts.training import loop, run_folder
-from scene_experts.training.config import RunConfig
+from scene_experts.training.config import RunConfig, with_numbers
 from scene_experts.training.events import Event
 from scene_experts.training.memory import forget_peak, reuse_freed
 from scene_experts.training.progress import TrainingProgress
@@ -61,8 +61,9 @@ class Trainer:
         """Prepare a training. Nothing is trained or written before the first event.
 
         Args:
-            method: A recipe, or the name of one.
-            capture: A capture, or its folder.
+            method: A recipe, or the name of one. By name, a scene of the catalog brings its data set's numbers (`Capture.numbers`), as
+                in the command.
+            capture: A capture, its folder, or "catalog:SCENE".
             out: Run folder to write, as `scene-experts train --out` does. Default: the scene stays in memory.
             resume: Continue from the newest whole checkpoint in `out`.
             overwrite: Start again in a folder that holds an earlier run, whose checkpoints are removed.
@@ -92,6 +93,8 @@ class Trainer:
         rasterize = choose(rasterizer, where, antialias=self.recipe.antialias, deterministic=deterministic)
         loaded = capture if isinstance(capture, Capture) else load_capture(capture, seed=self.recipe.seed)
         self.capture = loaded.with_seed(self.recipe.seed)
+        if isinstance(method, str):
+            self.recipe = with_numbers(self.recipe, self.capture.numbers)
         words = command_of(self.recipe, self.capture.data, folder, deterministic, stop_at)
         config = RunConfig(self.recipe, self.capture.data, words, deterministic, stop_at, run_folder.versions())
         self._run = loop.Run(
@@ -191,8 +194,9 @@ def train(
     Ctrl-C saves a training that has a folder and then raises KeyboardInterrupt; a second Ctrl-C does not wait.
 
     Args:
-        method: A recipe, or the name of one.
-        capture: A capture, or its folder.
+        method: A recipe, or the name of one. By name, a scene of the catalog brings its data set's numbers (`Capture.numbers`), as in
+            the command.
+        capture: A capture, its folder, or "catalog:SCENE".
         out: Run folder to write, as `scene-experts train --out` does. Default: the scene stays in memory.
         progress: Print iterations, losses and the PSNR of training views.
         settings: `resume`, `overwrite`, `stop_at`, `deterministic`, `device` and the other settings of `Trainer`.

@@ -11,6 +11,7 @@ from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import HELP, HELP_ALL, Command, HelpAsked, parse
 from scene_experts.commands import PROG
 from scene_experts.core.errors import InputError, expect_at_least, nearest
+from scene_experts.data.fetch.catalog import defaults_in, defaults_of
 from scene_experts.data.settings import Data
 
 SETTLE = 0.05  # share of the constant rates at the end of the joint training
@@ -77,7 +78,8 @@ def blocks(args: list[str]) -> int:
 
 def plan(args: list[str]) -> int:
     """Write a plan and print its commands."""
-    command = parse(PlanCommand, Command(f"{PROG} blocks plan", ("--data",)), args)
+    brought = {"data.normalise": defaults_in(args).normalise}
+    command = parse(PlanCommand, Command(f"{PROG} blocks plan", ("--data",), defaults=brought), args)
     expect_at_least([("--coarse-anchors", command.coarse_anchors, 0), ("--max-memory", command.max_memory, 0)])
 
     from scene_experts.core.io import write_bytes
@@ -109,7 +111,8 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]]) -> list[str]
     bounds: corners of the box of each block with its margin, in trained world units.
     """
     out, total, more = command.out, command.iterations, split_words(command.train)
-    data = [word for name, value in vars(command.data).items() if value != getattr(Data(Path()), name) for word in _flag(name, value)]
+    usual = Data(Path(), normalise=defaults_of(command.data.path).normalise)  # what `train` takes without options
+    data = [word for name, value in vars(command.data).items() if value != getattr(usual, name) for word in _flag(name, value)]
     train = [PROG, "train", command.recipe, *data, *more]
     coarse, merged = str(out / "coarse"), str(out / "merged")
     runs = [str(out / f"run{number}") for number in range(command.blocks)]

@@ -12,6 +12,7 @@ from scene_experts.arguments.help import columns
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
+from scene_experts.data.fetch.catalog import defaults_in
 from scene_experts.data.settings import Data
 from scene_experts.files.options import Options
 from scene_experts.files.registry import GAUSSIANS, about, format_named, format_names
@@ -29,7 +30,7 @@ class ExportCommand:
     format: Annotated[tuple[str, ...], Option(value="FORMAT")] = ("compact",)
     """File formats, from the list above. Several standard files share one bake."""
     out: Path | None = None
-    """File or folder to write; by default in the run folder. A folder for several formats."""
+    """File or folder to write; by default in the run folder. A name without a suffix is a folder; several formats need one."""
     hub: Annotated[Path | None, Option(value="FOLDER")] = None
     """Write a folder for a model hub: compact and spz (or --format), a picture and a card (README.md)."""
     licence: str | None = None
@@ -100,7 +101,8 @@ def export(args: list[str]) -> int:
 def import_(args: list[str]) -> int:
     """Make a run folder of a result folder or a file and print where it is."""
     text = f"{ImportCommand.__doc__}\n\n{formats_help()}"
-    command = parse(ImportCommand, Command(f"{PROG} import", ("--source",), FIRST, text), args)
+    brought = {"data.normalise": defaults_in(args).normalise}
+    command = parse(ImportCommand, Command(f"{PROG} import", ("--source",), FIRST, text, brought), args)
 
     from scene_experts.files.importing import import_files
     from scene_experts.training.run_folder import named

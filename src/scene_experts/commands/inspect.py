@@ -6,12 +6,14 @@ from dataclasses import dataclass
 
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
+from scene_experts.data.fetch.catalog import defaults_in
 from scene_experts.data.settings import Data
 
 
 def info(args: list[str]) -> int:
     about = "Show what a capture contains: views, picture sizes, cameras, points, split and warnings."
-    data = parse(Data, Command(f"{PROG} info", ("--data",), about=about), args)
+    brought = {"normalise": defaults_in(args).normalise}
+    data = parse(Data, Command(f"{PROG} info", ("--data",), about=about, defaults=brought), args)
 
     from rich.console import Console
 
@@ -23,7 +25,7 @@ def info(args: list[str]) -> int:
     capture = run_folder.load_capture(run_folder.named(data), look=True)
     print_summary(capture, console)
     lens = capture.images.sources[0].lens
-    console.print(propose_training(capture.root, lens.width, lens.height, len(capture.views)), markup=False, soft_wrap=True)
+    console.print(propose_training(data.path, lens.width, lens.height, len(capture.views)), markup=False, soft_wrap=True)
     return 0
 
 

@@ -24,7 +24,7 @@ from scene_experts.core.errors import InputError, few, nearest
 from scene_experts.core.group import Alone, join
 from scene_experts.core.signals import handled
 from scene_experts.data.capture import Capture
-from scene_experts.data.fetch.catalog import PREFIX, Numbers, one
+from scene_experts.data.fetch.catalog import defaults_in
 from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer
@@ -178,12 +178,12 @@ def parse_train(args: list[str]) -> TrainCommand:
             raise HelpAsked(help_of_recipes())
         raise InputError(no_recipe(args))
     text, cfg = RECIPES[name]
-    defaults, numbers = of_the_catalog(args)
+    brought = defaults_in(args)  # a scene of the catalog brings its units and numbers; options have the last word
     command = Command(
         f"{PROG} train {name}",
         first=FIRST,
         about=f"{text}.",
-        defaults={**defaults, "cfg": with_numbers(cfg, numbers)},
+        defaults={"data.normalise": brought.normalise, "cfg": with_numbers(cfg, brought.numbers)},
         elsewhere=other_recipes,
     )
     return parse(TrainCommand, command, args[1:])
@@ -203,12 +203,6 @@ def other_recipes(flag: str) -> str:
     """Which recipes have an option that the chosen one does not have."""
     found = [name for name, (_, cfg) in RECIPES.items() if any(flag in row.names for row in rows(TrainCommand, {"cfg": cfg}))]
     return f"this recipe does not have it ({few(found)} {'has' if len(found) == 1 else 'have'} it)" if found else ""
-
-
-def of_the_catalog(args: list[str]) -> tuple[dict[str, str], Numbers]:
-    """The defaults that a scene of the paper brings (its own units, its data set's numbers); options have the last word."""
-    named = next((word for arg in args if (word := arg.removeprefix("--data=")).startswith(PREFIX)), None)
-    return ({}, ()) if named is None else ({"data.normalise": "none"}, one(named).collection.numbers)
 
 
 def help_of_recipes() -> str:

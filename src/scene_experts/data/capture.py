@@ -19,7 +19,7 @@ from scene_experts.data import prepare
 from scene_experts.data.images import FrameSource, check_policy, probe
 from scene_experts.data.lens import Lens, centre_principal_point, to_pinhole
 from scene_experts.data.match import to_relative_name
-from scene_experts.data.readers import PosedImage, RawCapture, ReadOptions, find_reader, unrecognised_error
+from scene_experts.data.readers import PosedImage, RawCapture, ReadOptions, find_reader, tell_others, unrecognised_error
 from scene_experts.data.store import ImageStore
 from scene_experts.data.views import Capture, Frame, Vector, View, World
 
@@ -101,6 +101,7 @@ def _read(
     if reader is None:
         raise unrecognised_error(root)
     raw = reader.read(root, options)
+    raw = replace(raw, warnings=[*raw.warnings, *tell_others(root, reader)])
     return raw, _assemble(root, reader.name, raw, centred, background, cache_bytes)
 
 

@@ -91,8 +91,8 @@ def export(
     Args:
         run: The run, on the CPU. `run_folder.with_capture` says where its capture is if it moved.
         format: Name of the format.
-        out: File, or folder for it. Default: scene.SUFFIX in the run folder. With `options.levels`,
-            one file per level of detail beside it.
+        out: File, or folder for it; a name without a suffix is a folder. Default: scene.SUFFIX in
+            the run folder. With `options.levels`, one file per level of detail beside it.
         options: What to write, and whether to measure it.
         rasterize: Draws the views. Default: the fastest rasteriser on this CPU.
         tell: Called with the progress: what, done, total.
@@ -125,7 +125,7 @@ def export_several(
     """
     _check(options)
     if len(formats) > 1 and out is not None:
-        if out.is_file() or out.suffix:
+        if not out.is_dir() and (out.exists() or out.suffix):
             raise InputError(f"expected a folder as --out for several formats, found {out}; name a folder")
         out.mkdir(parents=True, exist_ok=True)
     works = [_Work(run, name, format_named(name), options, rasterize, tell, command) for name in dict.fromkeys(formats)]
@@ -172,17 +172,23 @@ def result_warnings(run: OpenRun) -> list[str]:
 
 
 def file_path(run: Path, name: str, format: Format, out: Path | None) -> Path:
-    """Where a file of a format goes: `out`, or scene.SUFFIX in the folder `out` or `run`.
+    """Where a file of a format goes: `out`, or scene.SUFFIX in the folder `out` or `run`. A name without a suffix is a folder.
 
-    Raises InputError for a name with the suffix of another format: programs go by it.
+    Raises InputError for a name with another suffix than the format's, because programs go by it, and for a file where the folder
+    should be.
     """
-    if out is None or out.is_dir():
+    if out is None or out.is_dir() or not out.suffix:
+        if out is not None and out.exists() and not out.is_dir():
+            raise InputError(
+                f"expected a folder, or a name that ends in {format.suffix}, as --out, found the file {out}; choose another name"
+            )
         return (out or run) / f"{NAME}{format.suffix}"
-    suffixes = {other: format_named(other).suffix for other in format_names()}
-    matching = {other: suffix for other, suffix in suffixes.items() if suffix and out.name.lower().endswith(suffix)}
-    found = max(matching, key=lambda other: len(matching[other]), default=name)
-    if found != name and matching[found] not in format.other_suffixes:
-        raise InputError(f"expected a name that ends in {format.suffix} for --format {name}, found {out.name}; correct --out or --format")
+    own = (format.suffix, *format.other_suffixes)
+    every = (*own, *(format_named(other).suffix for other in format_names()))
+    found = max((suffix for suffix in every if suffix and out.name.lower().endswith(suffix)), key=len, default=None)
+    if found not in own:
+        endings = " or ".join(own)
+        raise InputError(f"expected a name that ends in {endings} for --format {name}, found {out.name}; correct --out or --format")
     return out
 
 
@@ -388,12 +394,12 @@ def _export_gaussians(
         note = {name: value for name, value in about.items() if name != "antialias" or format.antialias}
         views = {} if format.view_note is None or capture is None else format.view_note(capture, world)
         titled = {} if options.title is None else {"title": options.title}
-        format.write(path, contents, note | views | titled)
+        told = format.write(path, contents, note | views | titled)
         facts: dict[str, Any] = {"file": path.name, "bytes": path.stat().st_size, "seconds": round(one.seconds, 1), "psnr": {}}
         frame = "the capture's own frame" if options.frame == "capture" else "the trained world"
         said = f"{len(contents):,} Gaussians, {facts['bytes'] / 1e6:.2f} MB, harmonics of degree {contents.degree}, in {frame}"
         how = f"; baked in {format_duration(one.seconds)}" if fresh else "; of the same bake"
-        lines = (f"wrote {path}", said + (how if bake else ""), *one.lines)
+        lines = (f"wrote {path}", said + (how if bake else ""), *one.lines, *([str(told)] if told is not None else []))
         written = Written(path, facts["bytes"], len(contents), lines)
         if options.measure and format.read is not None and not options.crop:
 

@@ -20,7 +20,8 @@ from scene_experts.scene import Draws, Scene
 from scene_experts.training.run_folder import OpenRun, capture_of
 
 LOSS = 1.0  # dB; a file that loses more gets a warning
-MENDS = "refine it (without --refine 0), or let it have more Gaussians (--max-gaussians, --prune) or a higher --sh-degree"
+OF_THE_BAKE = "refine it (without --refine 0), or let it have more Gaussians (--max-gaussians, --prune) or a higher --sh-degree"
+OF_THE_FORMAT = "the format holds the scene too coarsely: choose another --format"
 Tell = Callable[[str, int, int], None]
 """Reports the progress of long work: (what, done, total)."""
 
@@ -104,8 +105,10 @@ def cost(
         lines.append(f"on the way: baked {baked:.3f} dB{refined}; PSNR against the run's pictures {found['file'].first:.2f} dB")
     plain: dict[str, Any] = {name: {"photographs": round(s.photographs, 6), "run": round(s.first, 6)} for name, s in found.items()}
     psnr = {name: score.photographs for name, score in found.items()}
-    if "bake" in found and before - after > LOSS:
-        lines.append(f"warning: the file loses {before - after:.1f} dB against the run; {MENDS}")
+    if before - after > LOSS:
+        middle = found["bake"].photographs if "bake" in found else before
+        mend = OF_THE_BAKE if before - middle > middle - after else OF_THE_FORMAT
+        lines.append(f"warning: the file loses {before - after:.1f} dB against the run; {mend}")
     return Cost(tuple(lines), psnr, plain | {"views": len(views)})
 
 

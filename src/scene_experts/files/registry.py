@@ -85,7 +85,7 @@ class Format:
     """looks_like(path, first 4096 bytes): a further test, after `marks`. A format with neither is
     never recognised."""
     other_suffixes: tuple[str, ...] = ()
-    """Suffixes of other formats that are accepted in --out."""
+    """Other suffixes that are accepted in --out."""
     sh_degree: int = 3
     """Highest degree of spherical harmonics that a file holds."""
     antialias: bool = False

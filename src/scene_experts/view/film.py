@@ -105,9 +105,14 @@ def make_path(options: FilmOptions, capture: Capture) -> CameraPath:
 
 
 def resize_camera(camera: Camera, size: tuple[int, int] | None) -> Camera:
-    """Return the camera with another picture size. The picture is stretched."""
+    """Return the camera with another picture size and the same vertical field of view, as the other paths have it.
+
+    A wider picture shows more at the sides, a narrower one less; nothing is stretched.
+    """
     if size is None:
         return camera
     width, height = size
-    factor = torch.tensor([[width / camera.width], [height / camera.height], [1.0]])
-    return replace(camera, K=camera.K * factor, width=width, height=height)
+    factor = height / camera.height
+    K = camera.K * torch.tensor([[factor], [factor], [1.0]])
+    K[0, 2] += (width - factor * camera.width) / 2
+    return replace(camera, K=K, width=width, height=height)

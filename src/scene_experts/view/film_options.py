@@ -25,7 +25,7 @@ class FilmOptions:
     fps: float | None = None
     """Frames per second; by default 24, or what the path's file says."""
     size: Annotated[str | None, Option(value="WIDTHxHEIGHT")] = None
-    """Size of the picture in pixels; by default that of the training views."""
+    """Size of the picture in pixels; by default that of the training views. The vertical field of view stays."""
     show: tuple[Show, ...] = ("picture",)
     """What to show; several are placed side by side."""
     attribute: Literal["opacity", "cov", "color"] = "color"

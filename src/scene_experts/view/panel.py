@@ -28,7 +28,8 @@ HELP = """**Mouse**: drag to turn, right drag to move, wheel to go nearer.
 **Keys**: W A S D move, Q and E go down and up, arrows turn.
 
 **Show** chooses colours, depth, opacity or experts. **Views** goes to a photograph's place; its slider *photograph* draws the
-photograph over the scene. *cameras* shows all places; click one to go there. **Crop** hides what is outside a box.
+photograph over the scene. *cameras* shows all places; click one to go there. **Crop** hides what is outside a box,
+and shows the option of `scene-experts export` that does so in a file.
 **Camera path** records places and saves them for `scene-experts render --path FILE`."""
 EXPERTS = (
     "{} expert networks share the {}: a router chooses which of them decode each one. "
@@ -72,6 +73,7 @@ class Panel:
     chosen: Any
     near: Any
     crop: Any
+    crop_text: Any
 
     def __init__(
         self,
@@ -156,19 +158,24 @@ class Panel:
         self.chosen, self.names = chosen, names
 
     def add_crop_controls(self, scene: Scene) -> None:
-        """Add a crop box. Its sliders span the central 99 % of the rows along each axis."""
+        """Add a crop box in the capture's units. Its sliders span the central 99 % of the rows along each axis."""
         gui = self.server.gui
         xyz = scene.positions.cpu().float()
         low, high = (
             (torch.quantile(xyz[:: max(1, len(xyz) // 100_000)], q, dim=0) for q in (0.005, 0.995)) if len(xyz) else (xyz.new_zeros(3),) * 2
         )
+        least = 1e-3 / self.capture.world.scale
+        low, high = (self.capture.world.to_input(corner.double()) for corner in (low, high))
         with gui.add_folder("Crop", expand_by_default=False):
             self.crop = self.redraw_on_change(gui.add_checkbox("crop", initial_value=False))
             self.bounds = []
             for axis in range(3):
-                a, b = float(low[axis]), max(float(high[axis]), float(low[axis]) + 1e-3)
+                a, b = float(low[axis]), max(float(high[axis]), float(low[axis]) + least)
                 slider = gui.add_multi_slider("xyz"[axis], min=a, max=b, step=(b - a) / 200, initial_value=(a, b))
                 self.bounds.append(self.redraw_on_change(slider))
+            self.crop_text = gui.add_markdown(self.crop_words())
+        for slider in self.bounds:
+            slider.on_update(lambda _: setattr(self.crop_text, "content", self.crop_words()))
 
     # --- values of the controls
 
@@ -181,9 +188,17 @@ class Panel:
                 only = tuple(e for e, switch in enumerate(self.switches) if switch.value)
         box = None
         if self.crop.value:
-            ends = [sorted(map(float, bound.value)) for bound in self.bounds]
-            box = ((ends[0][0], ends[1][0], ends[2][0]), (ends[0][1], ends[1][1], ends[2][1]))
+            (x0, y0, z0), (x1, y1, z1) = self.capture.world.from_input(self.read_box()).tolist()
+            box = ((x0, y0, z0), (x1, y1, z1))
         return Look(self.show.value, attribute, only, box)
+
+    def read_box(self) -> torch.Tensor:
+        """Return the lower and the upper corner of the crop box, [2, 3] float64, in the capture's own frame."""
+        return torch.tensor([sorted(map(float, bound.value)) for bound in self.bounds], dtype=torch.float64).T
+
+    def crop_words(self) -> str:
+        """Return the option of `scene-experts export` that keeps what is in the crop box."""
+        return f"`--crop box:{','.join(f'{value:.9g}' for value in self.read_box().flatten().tolist())}`"
 
     def read_background(self) -> tuple[float, float, float]:
         """Return the background colour, RGB in [0, 1]."""

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import io
 import json
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+import scene_experts as se
 from scene_experts import cli
 from scene_experts.commands import catalog as command
+from scene_experts.commands.train import parse_train
 from scene_experts.data.fetch import download, obtain
 from scene_experts.data.fetch.catalog import one
 from scene_experts.data.settings import Data
@@ -53,6 +56,32 @@ def test_a_scene_from_its_source_to_a_trained_run(
     assert data == Data(captures / "bungeenerf" / "rome", resolution="as-is", split="mod8", normalise="none")
     assert (config.train.scene.voxel_rule, config.train.growth.init_factor) == ("squared_median", 128)
     assert json.loads((data.path / "source.json").read_text())["data_set"] == "BungeeNeRF"
+
+
+def test_every_command_reads_a_scene_alike(
+    captures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_capture(captures / "tandt" / "truck", views=5, size=(24, 16), points=120, scale=3.0)
+    plan = ["blocks", "plan", "catalog:truck", "--out", str(tmp_path / "plan"), "--blocks", "2", "--recipe", "scaffold-gs"]
+    for given in ([], ["--normalise", "extent"]):
+        assert cli.main([*plan, *given]) == 0
+        trains = [line for line in (tmp_path / "plan/commands.sh").read_text().splitlines() if " train " in line]
+        found = [parse_train(shlex.split(line)[2:]) for line in trains]
+        assert len(found) == 4 and {f.data.normalise for f in found} == {given[-1] if given else "none"}
+        assert {f.cfg.scene.voxel_size for f in found} == {0.01} and {str(f.data.path) for f in found} == {"catalog:truck"}
+    capsys.readouterr()
+    assert cli.main(["info", "catalog:truck"]) == 0
+    assert "--data catalog:truck " in capsys.readouterr().out
+    capture = se.load_capture("catalog:truck")
+    assert capture.loaded.world.identity and ("scene.voxel_size", 0.01) in capture.numbers
+    for where in ("catalog:truck", capture):
+        assert se.Trainer("scaffold-gs", where).recipe.scene.voxel_size == 0.01
+    assert se.Trainer(se.recipe("scaffold-gs"), capture).recipe.scene.voxel_size == 0  # a recipe is used as it is
+    assert se.Trainer("scaffold-gs", capture.path).recipe.scene.voxel_size == 0
+    asked = []
+    monkeypatch.setattr("scene_experts.files.importing.import_files", lambda source, data, out, iteration: asked.append(data))
+    assert cli.main(["import", "a.ply", "--data", "catalog:truck", "--out", str(tmp_path / "imported")]) == 0
+    assert asked == [capture.data]
 
 
 def test_another_folder_is_named_in_the_next_step(

@@ -124,7 +124,7 @@ def packable(run) -> None:
 def test_written_and_read_back_it_draws_the_same_picture(run, tmp_path, form):
     if form == "compact":
         packable(run)
-    target = tmp_path / "out" if form == "anchors" else tmp_path / "file"
+    target = tmp_path / "out" if form == "anchors" else tmp_path / "file.compact"
     (written,) = export_run(run.path, form, target)
     assert str(target) in written.lines[0] and "anchors" in written.lines[1] and written.rows == len(run.scene.positions)
     assert written.path.is_relative_to(target) and written.bytes > 1000
@@ -149,7 +149,7 @@ def test_a_folder_of_another_name_keeps_its_step(run, tmp_path):
 
 def test_the_cost_of_the_compact_file_is_measured_and_small(run, tmp_path):
     packable(run)
-    (written,) = export_run(run.path, "compact", tmp_path / "file", measure=True)
+    (written,) = export_run(run.path, "compact", tmp_path / "file.compact", measure=True)
     before, after = written.psnr["run"], written.psnr["file"]
     assert abs(after - before) < 0.05 and f"{before:.3f} dB" in written.lines[-1] and f"{after:.3f} dB" in written.lines[-1]
     capture, total = run_folder.load_capture(run.config.data), 0.0
@@ -197,7 +197,7 @@ def test_another_capture_gives_no_world_and_a_catalogs_name_is_understood(folder
     (tmp_path / "captures" / "tandt").mkdir(parents=True)
     (tmp_path / "captures" / "tandt" / "truck").symlink_to(folder)
     monkeypatch.setenv("SCENE_EXPERTS_CAPTURES", str(tmp_path / "captures"))
-    (written,) = export_run(opened.path, "compact", tmp_path / "file", data=Path("catalog:truck"), measure=True)
+    (written,) = export_run(opened.path, "compact", tmp_path / "file.compact", data=Path("catalog:truck"), measure=True)
     assert "PSNR" in written.lines[2]
 
 
@@ -206,7 +206,7 @@ def test_anchors_off_the_lattice_cannot_be_packed(run, tmp_path):
     opened = run_folder.open_run(run.path)
     opened.scene.table.facts["xyz"] = opened.scene.positions + 0.4 * opened.scene.voxel
     with pytest.raises(InputError, match="--format anchors"):
-        export(opened, "compact", tmp_path / "file")
+        export(opened, "compact", tmp_path / "file.compact")
 
 
 def test_levels_of_detail_are_written_with_their_columns_and_not_packed(folder, tmp_path):
@@ -304,6 +304,15 @@ def test_frames_and_folders(short, tmp_path):
     assert measured(short, tmp_path / "world.ply", World()) == pytest.approx(measured(short, tmp_path / "scene.ply"), abs=0.01)
 
 
+@pytest.mark.parametrize("short", ["3dgs"], indirect=True)
+def test_what_a_format_cannot_hold_is_told(short, tmp_path):
+    opened = run_folder.open_run(short)
+    with torch.no_grad():
+        opened.scene.table.params["log_scales"] += 20
+    (spz,), (sog,) = (export(opened, name, tmp_path, Options(measure=False)) for name in ("spz", "sog"))
+    assert spz.lines[-1].startswith("warning: ") and "SPZ" in spz.lines[-1] and not any("warning" in line for line in sog.lines)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("short", ["moe-gs"], indirect=True)
 def test_each_format_is_measured_from_its_own_file(short, tmp_path):
@@ -335,12 +344,27 @@ def test_what_cannot_be_is_refused_in_one_sentence(short, tmp_path):
 def test_the_name_of_a_file_may_not_say_another_format(tmp_path):
     ply, compressed = format_named("ply"), format_named("compressed-ply")
     assert file_path(tmp_path, "ply", ply, None) == tmp_path / "scene.ply" == file_path(Path("run"), "ply", ply, tmp_path)
-    assert file_path(tmp_path, "ply", ply, tmp_path / "a.bin") == tmp_path / "a.bin"
     for name in ("a.PLY", "a.compressed.ply"):
         assert file_path(tmp_path, "compressed-ply", compressed, tmp_path / name) == tmp_path / name
-    for name in ("a.spz", "a.compressed.ply"):
+    for name in ("a.spz", "a.compressed.ply", "a.bin", "a.v2"):
         with pytest.raises(InputError, match=naming(name, ".ply")):
             file_path(tmp_path, "ply", ply, tmp_path / name)
+    usd, glb = format_named("usd"), format_named("glb")
+    for name in ("a.usdc", "a.usda", "a.USD"):
+        assert file_path(tmp_path, "usd", usd, tmp_path / name) == tmp_path / name
+    for format, name in (("usd", "a.usdz"), ("glb", "a.gltf")):
+        with pytest.raises(InputError, match=naming(name, f"--format {format}")):
+            file_path(tmp_path, format, {"usd": usd, "glb": glb}[format], tmp_path / name)
+
+
+def test_a_name_without_a_suffix_is_a_folder(tmp_path):
+    ply, spz = format_named("ply"), format_named("spz")
+    (tmp_path / "made.v2").mkdir()
+    for name in ("new", "new/deeper", "made.v2"):
+        assert file_path(tmp_path, "ply", ply, tmp_path / name) == tmp_path / name / "scene.ply"
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(InputError, match=naming("taken", "folder")):
+        file_path(tmp_path, "spz", spz, tmp_path / "taken")
 
 
 def test_a_family_without_files_leaves_its_cameras_and_can_be_baked(folder, tmp_path, monkeypatch):
@@ -381,4 +405,4 @@ def test_levels_of_detail_become_one_file_each(tmp_path):
     sizes = [file.rows for file in files]
     assert sizes == sorted(set(sizes))  # a level without anchors gets no file
     assert json.loads((tmp_path / "out_level1.ply.json").read_text())["level"] == 1
-    assert export_run(short, "ply", tmp_path / "bare", refine=0, levels=True)[0].path.name == "bare_level0"
+    assert export_run(short, "ply", tmp_path / "bare", refine=0, levels=True)[0].path == tmp_path / "bare" / "scene_level0.ply"

@@ -10,7 +10,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.data.capture import load
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.files.gaussians.read import scene_of
-from scene_experts.files.measure import Painter, capture_if_there, cost, scored_views, scores, why_no_views
+from scene_experts.files.measure import Painter, Score, capture_if_there, cost, scored_views, scores, why_no_views
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from support.files import run_in_memory
@@ -64,6 +64,21 @@ def test_the_cost_of_a_file_in_figures_and_in_a_sentence(tmp_path):
     for nothing in (cost(run, dict, None), cost(run, dict, replace(capture, test=()))):
         assert nothing.psnr == {} == nothing.plain and len(nothing.lines) == 1
     assert "--data" in cost(run, dict, None).lines[0]
+    capture.images.close()
+
+
+def test_a_loss_is_a_warning_that_says_where_it_is(tmp_path, monkeypatch):
+    capture = load(make_capture(tmp_path, views=9, size=(24, 16), points=60).folder)
+    run = replace(run_in_memory("3dgs", 0), scene=RECIPES["3dgs"][1].scene.start(capture.points, capture.extent))
+    for levels, said in (
+        ({"run": 30, "file": 28}, "--format"),
+        ({"run": 30, "bake": 29.8, "file": 28}, "--format"),
+        ({"run": 30, "bake": 28.3, "file": 28}, "refine"),
+        ({"run": 30, "bake": 29, "file": 29.5}, None),
+    ):
+        monkeypatch.setattr("scene_experts.files.measure.scores", lambda *a, n=levels: {k: Score(v, 40) for k, v in n.items()})
+        told = [line for line in cost(run, dict, capture).lines if line.startswith("warning")]
+        assert len(told) == (said is not None) and all("2.0 dB" in line and said in line for line in told)
     capture.images.close()
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from scene_experts.files.select import parse_crop
 from scene_experts.training.events import Finished, Stepped
 
 pytest.importorskip("viser")
@@ -25,6 +26,20 @@ def test_cameras_and_anchors_are_shown_and_hidden(viewer):
     viewer.panel.show_frusta(False)
     viewer.panel.show_rows(False)
     assert viewer.server.scene.get_handle_by_name("/anchors") is None and viewer.server.scene.get_handle_by_name("/cameras/0") is None
+
+
+def test_the_crop_box_is_that_of_export(viewer):
+    panel, world = viewer.panel, viewer.capture.world
+    assert not world.identity
+    panel.crop.value = True
+    low, high = panel.bounds[0].value
+    panel.bounds[0].value = (low, (low + high) / 2)
+    assert panel.crop_text.content == panel.crop_words()
+    box = parse_crop(panel.crop_text.content.strip("`").removeprefix("--crop "))
+    xyz = panel.current()[0].positions.double()
+    lower, upper = map(torch.tensor, panel.read_look().box)
+    drawn = ((xyz >= lower) & (xyz <= upper)).all(1)
+    assert torch.equal(box.contains(world.to_input(xyz), viewer.capture), drawn) and 0 < int(drawn.sum()) < len(xyz)
 
 
 def test_curves_follow_a_training(viewer):

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 from scene_experts.core.errors import InputError, nearest
 
@@ -165,6 +167,31 @@ def one(word: str) -> CatalogScene:
     if len(found) != 1:
         raise InputError(f"expected one scene of the catalog, found '{word}', which names {len(found)}; choose one of {_names(found)}")
     return found[0]
+
+
+@dataclass(frozen=True)
+class Defaults:
+    """What a capture brings where no option says otherwise."""
+
+    normalise: Literal["extent", "none"] = "extent"
+    """How the world is scaled: the numbers of a data set are in its own units."""
+    numbers: Numbers = ()
+    """Numbers of its data set for a recipe that is chosen by name."""
+
+
+def defaults_of(capture: str | Path) -> Defaults:
+    """Return what a capture brings: `catalog:SCENE` the units and numbers of its data set, any other path nothing.
+
+    Its resolution and split are those that `obtain.resolve` puts in place of "auto". Raises InputError for an unknown scene.
+    """
+    word = str(capture)
+    return Defaults("none", one(word).collection.numbers) if word.startswith(PREFIX) else Defaults()
+
+
+def defaults_in(args: Sequence[str]) -> Defaults:
+    """Return what the capture among the words of a command brings. Raises InputError for an unknown scene."""
+    words = (arg.removeprefix("--data=") for arg in args)
+    return defaults_of(next((word for word in words if word.startswith(PREFIX)), ""))
 
 
 def _names(scenes: Sequence[CatalogScene]) -> str:

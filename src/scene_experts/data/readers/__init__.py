@@ -14,7 +14,18 @@ from scene_experts.core.errors import InputError
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers.reader import PosedImage, RawCapture, Reader, ReadOptions
 
-__all__ = ["READERS", "PosedImage", "RawCapture", "ReadOptions", "Reader", "find_reader", "is_capture", "register", "unrecognised_error"]
+__all__ = [
+    "READERS",
+    "PosedImage",
+    "RawCapture",
+    "ReadOptions",
+    "Reader",
+    "find_reader",
+    "is_capture",
+    "register",
+    "tell_others",
+    "unrecognised_error",
+]
 
 GROUP = "scene_experts.readers"
 READERS = (  # module:object, imported on first use; the first reader that recognises a folder reads it
@@ -55,6 +66,17 @@ def find_reader(folder: Path) -> Reader | None:
             if reader.recognise(folder):
                 return reader
     return None
+
+
+def tell_others(folder: Path, reader: Reader) -> list[str]:
+    """Return a warning if `folder` also holds a capture of a kind that a later built-in reader reads."""
+    built_in = _load_built_in()
+    later = built_in[built_in.index(reader) + 1 :] if reader in built_in else ()
+    return [
+        f"the folder is read as {reader.files}, and also holds {other.files}; move the files of the first away to read the second"
+        for other in later
+        if other.recognise(folder)
+    ][:1]
 
 
 def is_capture(folder: Path) -> bool:

@@ -40,7 +40,7 @@ class BlenderReader:
                 meta = transforms.read_meta(path)
                 for index, frame in enumerate(meta["frames"]):
                     name, image = transforms.find_image(folder, transforms.read_file_path(frame, index, path), None)
-                    lens = transforms.read_lens(meta, frame, path) if "fl_x" in {**meta, **frame} else None
+                    lens = transforms.read_lens(meta, frame, path, image)
                     angle = transforms.read_angle(meta, frame, path) if lens is None else 0.0
                     pose = transforms.read_pose(frame, path)
                     names.append(name)

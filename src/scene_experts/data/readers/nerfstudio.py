@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import CAPTURE
@@ -23,9 +24,10 @@ class NerfstudioReader:
         return (folder / "transforms.json").is_file()
 
     def read(self, folder: Path, options: ReadOptions) -> RawCapture:
-        """Read poses, masks, points and the test views that `test_filenames` names.
+        """Read poses, masks, points and the test views that `test_filenames`, or without it `val_filenames`, names.
 
-        `options.images` replaces the first folder of every file path. Frames without an image are dropped with a warning.
+        `options.images` replaces the first folder of every file path. Frames without an image are dropped with a warning; names of
+        no frame and absent masks get one too.
         Raises InputError if a file is damaged or no frame is left.
         """
         with guarding(folder, CAPTURE):
@@ -34,25 +36,50 @@ class NerfstudioReader:
     def _read(self, folder: Path, options: ReadOptions) -> RawCapture:
         path = folder / "transforms.json"
         meta = transforms.read_meta(path)
-        tests = meta.get("test_filenames") or []
-        if not isinstance(tests, list):
-            raise InputError(f"expected a list as test_filenames in {path}, found {shown(tests)}; restore the file")
-        tests = {name for name in tests if isinstance(name, str)}
+        warnings: list[str] = []
+        held = _held_out(meta, path, warnings)
         images: list[PosedImage | None] = []
         names: list[str] = []
-        warnings: list[str] = []
+        unmasked: list[str] = []
         for index, frame in enumerate(meta["frames"]):
-            name, image = transforms.find_image(folder, transforms.read_file_path(frame, index, path), options.images)
-            lens = transforms.read_lens(meta, frame, path)
+            stated = transforms.read_file_path(frame, index, path)
+            name, image = transforms.find_image(folder, stated, options.images)
+            lens = transforms.read_lens(meta, frame, path, image)
             given = folder / str(frame["mask_path"]) if frame.get("mask_path") else None
             mask = given if given and given.is_file() else image and find_mask(folder, name.partition("/")[2] or name, image)
+            if given and image and not mask:
+                unmasked.append(str(frame["mask_path"]))
             angle = transforms.read_angle(meta, frame, path) if lens is None else 0.0
             pose = transforms.read_pose(frame, path)
             names.append(name)
-            images.append(image and PosedImage(name, image, lens, pose, mask, angle, frame.get("file_path") in tests))
+            images.append(image and PosedImage(name, image, lens, pose, mask, angle, transforms.to_pure(stated) in held))
         kept = transforms.drop_absent(folder, images, names, warnings)
+        if unmasked:
+            warnings.append(f"{len(unmasked)} of {len(kept)} frames count whole because their mask is absent (first: {unmasked[0]})")
         points = transforms.read_points(folder, meta.get("ply_file_path"))
         return RawCapture(kept, points, warnings, points_source="the file that ply_file_path names")
+
+
+def _held_out(meta: dict[str, Any], path: Path, warnings: list[str]) -> set[PurePosixPath]:
+    """Return the file paths of the frames that are held out: those of test_filenames, else of val_filenames.
+
+    Adds warnings about names of no frame, and about validation frames beside test frames. Raises InputError for what is no list.
+    """
+    test, val = (_read_names(meta, f"{part}_filenames", path) for part in ("test", "val"))
+    key, held = ("test_filenames", test) if test or not val else ("val_filenames", val)
+    frames = {transforms.to_pure(frame["file_path"]) for frame in meta["frames"] if isinstance(frame.get("file_path"), str)}
+    if strange := sorted(map(str, held - frames)):
+        warnings.append(f"{len(strange)} of {len(held)} names in {key} are those of no frame (first: {strange[0]})")
+    if test and (shared := val & frames - test):
+        warnings.append(f"the {len(shared)} validation frames are training views, because test_filenames names the held-out ones")
+    return held
+
+
+def _read_names(meta: dict[str, Any], key: str, path: Path) -> set[PurePosixPath]:
+    names = meta.get(key) or []
+    if not isinstance(names, list):
+        raise InputError(f"expected a list as {key} in {path}, found {shown(names)}; restore the file")
+    return {transforms.to_pure(name) for name in names if isinstance(name, str)}
 
 
 READER = NerfstudioReader()

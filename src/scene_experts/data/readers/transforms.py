@@ -21,6 +21,7 @@ from scene_experts.core.io import read_json
 from scene_experts.core.reading.numbers import FARTHEST, shown
 from scene_experts.core.reading.source import describe, shorten
 from scene_experts.core.types import Points
+from scene_experts.data.images import probe
 from scene_experts.data.lens import Lens
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers import ply
@@ -28,6 +29,7 @@ from scene_experts.data.readers.reader import PosedImage
 
 PLY_NAMES = ("points3d.ply", "sparse_pc.ply", "points3D.ply")
 _PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "")
+_BESIDE_FOCAL = ("cx", "cy", "fl_y", *(f"k{i}" for i in range(1, 7)), "p1", "p2")
 _MODELS = ("OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL", *_PINHOLES)
 
 
@@ -57,13 +59,17 @@ def read_angle(meta: dict[str, Any], frame: dict[str, Any], path: Path) -> float
     return float(angle)
 
 
+def to_pure(name: str) -> PurePosixPath:
+    """Return the path that a name in the file stands for: "./a/b" and "a\\b" are the same as "a/b"."""
+    return PurePosixPath(name.replace("\\", "/"))
+
+
 def find_image(root: Path, file_path: str, images: str | None) -> tuple[str, Path | None]:
     """Return the name of a view and its file, or None instead of the file if it is absent.
 
     A path without an extension matches an image with any known extension. `images` replaces the first folder of the path.
     """
-    pure = PurePosixPath(file_path.replace("\\", "/"))
-    parts = [p for p in pure.parts if p != "."]
+    parts = list(to_pure(file_path).parts)
     if images is not None:
         parts = [images, *parts[1:]] if len(parts) > 1 else [images, *parts]
     name = "/".join(parts)
@@ -114,19 +120,24 @@ def read_pose(frame: dict[str, Any], path: Path) -> NDArray[np.float64]:
     return out
 
 
-def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path) -> Lens | None:
+def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path, image: Path | None) -> Lens | None:
     """Return the lens of a frame, or None if only the field of view is given. Values of the frame override shared ones.
 
-    Raises InputError for an unsupported camera model and for values that are not numbers.
+    Without a focal length, the field of view gives it; `image` gives the size where w and h are absent. `is_fisheye`
+    (instant-ngp) stands for a camera model. Raises InputError for an unsupported camera model and for values that are not numbers.
     """
     both = {**meta, **frame}
-    model = str(both.get("camera_model", "OPENCV")).upper()
+    model = str(both.get("camera_model", "OPENCV_FISHEYE" if both.get("is_fisheye") is True else "OPENCV")).upper()
     if model not in _MODELS:
         raise InputError(f"expected camera_model OPENCV, OPENCV_FISHEYE or PINHOLE in {path}, found {shown(model)}; convert the capture")
-    if "fl_x" not in both:
-        return None
+    given = "fl_x" in both
+    if not given:
+        if image is None or not (model == "OPENCV_FISHEYE" or any(both.get(name) for name in _BESIDE_FOCAL)):
+            return None
+        both = dict(zip("wh", probe(image)[0])) | both
     try:
-        width, height, fx = int(both["w"]), int(both["h"]), float(both["fl_x"])
+        width, height = int(both["w"]), int(both["h"])
+        fx = float(both["fl_x"]) if given else 0.5 * width / math.tan(0.5 * read_angle(meta, frame, path))
         fy = float(both.get("fl_y", fx))
         cx, cy = float(both.get("cx", width / 2)), float(both.get("cy", height / 2))
         k = [float(both.get(f"k{i}", 0.0) or 0.0) for i in range(1, 7)]
@@ -134,12 +145,15 @@ def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path) -> Lens |
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"expected numbers as w, h, fl_x, fl_y, cx and cy in {path}, found {describe(error)}; restore the file") from None
     if model in _PINHOLES:
-        return Lens("PINHOLE", width, height, (fx, fy, cx, cy))
-    if model == "OPENCV_FISHEYE":
-        return Lens(model, width, height, (fx, fy, cx, cy, *k[:4]))
-    if any(k[2:]):
-        return Lens("FULL_OPENCV", width, height, (fx, fy, cx, cy, k[0], k[1], *p, *k[2:]))
-    return Lens("OPENCV", width, height, (fx, fy, cx, cy, k[0], k[1], *p))
+        lens = Lens("PINHOLE", width, height, (fx, fy, cx, cy))
+    elif model == "OPENCV_FISHEYE":
+        lens = Lens(model, width, height, (fx, fy, cx, cy, *k[:4]))
+    elif any(k[2:]):
+        lens = Lens("FULL_OPENCV", width, height, (fx, fy, cx, cy, k[0], k[1], *p, *k[2:]))
+    else:
+        lens = Lens("OPENCV", width, height, (fx, fy, cx, cy, k[0], k[1], *p))
+    plain = not lens.distorted and fx == fy and (cx, cy) == (width / 2, height / 2)  # the field of view says it all
+    return None if plain and not given else lens
 
 
 def read_points(root: Path, named: object) -> Points | None:

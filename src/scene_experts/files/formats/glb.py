@@ -22,7 +22,7 @@ from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import whole_number
 from scene_experts.core.reading.plain import parse_json
 from scene_experts.core.reading.source import Source, opening
-from scene_experts.files.formats.pack import Floats, alphas, logits, tensor, to_bytes, turn, unit_quats
+from scene_experts.files.formats.pack import Floats, alphas, logits, tensor, to_bytes, turn, unit_quats, warn_of_transforms
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import Format
 from scene_experts.geometry.sh import C0
@@ -32,6 +32,12 @@ SETTINGS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projectio
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_STILL = {  # the transform of a node, by name, that changes nothing
+    "translation": [0, 0, 0],
+    "rotation": [0, 0, 0, 1],
+    "scale": [1, 1, 1],
+    "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
+}
 _HALF_TURN = np.array([[0, 0, 0, -1], [0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0.0]])  # (0, 0, 0, 1) times a quaternion (w, x, y, z)
 
 
@@ -77,7 +83,7 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of all primitives with the extension, together. Transforms of nodes are not applied.
+    """The Gaussians of all primitives with the extension, together. Transforms of nodes are not applied; a warning tells of them.
 
     Raises InputError for damaged files and for files without such a primitive.
     """
@@ -89,12 +95,32 @@ def read(path: Path) -> Splats:
             if NAME in scene.get("extensionsUsed", []):
                 return _splats(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3)))
             raise Damaged(f"no primitive with {NAME}")
+        if _has_transforms(scene):
+            warn_of_transforms(path)
         coefficients = min(part[4].shape[1] for part in found)
         join = lambda parts: parts[0] if len(parts) == 1 else np.concatenate(parts)  # noqa: E731
         means, scales, quats, opacity = (join([part[i] for part in found]) for i in range(4))
         sh = join([part[4][:, :coefficients] for part in found])
         found.clear()  # the copies below are as large
         return _splats(means, scales, quats, opacity, sh).checked(path)
+
+
+def _has_transforms(scene: dict[str, Any]) -> bool:
+    """Whether a node with Gaussians, or a node above one, has a transform other than the identity."""
+    nodes, meshes = scene.get("nodes", []), scene["meshes"]
+    above = {child: i for i, node in enumerate(nodes) for child in node.get("children", [])}
+    waiting = {i for i, node in enumerate(nodes) if "mesh" in node and _has_gaussians(meshes[node["mesh"]])}
+    seen: set[int] = set()
+    while waiting:
+        seen |= waiting
+        if any(nodes[i].get(name, still) != still for i in waiting for name, still in _STILL.items()):
+            return True
+        waiting = {above[i] for i in waiting if i in above} - seen  # a damaged file may have a circle
+    return False
+
+
+def _has_gaussians(mesh: dict[str, Any]) -> bool:
+    return any(NAME in p.get("extensions", {}) for p in mesh["primitives"])
 
 
 def _columns(splats: Splats) -> dict[str, NDArray[Any]]:

@@ -1,7 +1,7 @@
 """A page that shows the scene in any browser, opened from disk; it fetches nothing.
 
 Renderer, scene and start pose are in one file. The renderer is Spark on three.js (MIT), bundled by
-tools/viewer; the scene is an SPZ file in base64. The note may set the start: `camera`, an entry as
+tools/viewer; the scene is an SPZ file in base64, in a unit that suits its sizes. The note may set the start: `camera`, an entry as
 in cameras.json (position, rotation as rows of the 3x3 camera-to-world matrix, and fov in degrees or
 fy and height; width is optional), `cameras`, a list of such entries to step through, `flight`,
 a closed path of such entries, `background` (RGB in [0, 1]),
@@ -27,13 +27,14 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.numbers import number
 from scene_experts.core.reading.plain import parse_json
 from scene_experts.core.reading.source import opening
 from scene_experts.data.views import Capture, View, World
 from scene_experts.files.cameras import camera_entries
-from scene_experts.files.formats.pack import Floats
+from scene_experts.files.formats.pack import Floats, scaled
 from scene_experts.files.formats.splats import Splats
-from scene_experts.files.formats.spz import decode, spz_bytes
+from scene_experts.files.formats.spz import FARTHEST, decode, out_of_range, size_warning, spz_bytes
 from scene_experts.files.registry import Format
 from scene_experts.geometry.rotation import estimate_up
 from scene_experts.view.paths import choose_best_view, make_path
@@ -41,56 +42,78 @@ from scene_experts.view.region import find_region
 
 ASSETS = files("scene_experts.files.formats") / "assets"
 MARK = b'<meta name="generator" content="scene-experts">'
-_SCENE = b'<script type="text/plain" id="scene">'
-_SETTINGS = b'<script type="application/json" id="settings">'
+_SCENE, _SETTINGS = b'<script type="text/plain" id="scene">', b'<script type="application/json" id="settings">'
+_MOST = 60  # the unit of the scene lies within 2 to the power of this
 FLIGHT = 48  # poses of the flight, between which the page interpolates
 _FOV = 50.0  # degrees, without a camera
 Pose = dict[str, Any]
 
 
-def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
-    """Write the page. Raises InputError for invalid cameras in the note."""
+def write(path: Path, splats: Splats, note: dict[str, Any]) -> str | None:
+    """Write the page. Returns a warning about sizes that it cannot hold, or None. Raises InputError for invalid cameras in the note."""
+    settings, scene = page_settings(splats, note), scaled(splats, unit_of(splats))
     code = (ASSETS / "viewer.min.js.gz").read_bytes()
-    settings = json.dumps(page_settings(splats, note), allow_nan=False).replace("</", "<\\/")
     page = Template((ASSETS / "page.html").read_text()).substitute(
         title=markup.escape(str(note.get("title", "scene-experts"))),
         licences=(ASSETS / "LICENCES.txt").read_text().replace("--", "- -"),
         count=f"{len(splats):,}",
-        settings=settings,
-        scene=base64.b64encode(spz_bytes(splats)).decode(),
+        settings=json.dumps(settings, allow_nan=False).replace("</", "<\\/"),
+        scene=base64.b64encode(spz_bytes(scene)).decode(),
         code=base64.b64encode(code).decode(),
     )
     write_bytes(path, page.encode())
+    return size_warning(scene)
 
 
 def read(path: Path) -> Splats:
     """The Gaussians in a page that `write` made. Raises InputError for other and damaged pages."""
     with opening(path, budget.HTML) as source:
-        content = _content(source.read(), _SCENE)
+        page = source.read()
+        content = _script(page, _SCENE)
+        if content is None:
+            raise Damaged("no scene")
         try:
             scene = base64.b64decode(content, validate=True)
         except ValueError:
             raise Damaged("a scene that is not base64") from None
-        return decode(scene, source).checked(path)
+        unit = _settings(page).get("unit", 1.0)  # older pages have none
+        number(unit, "the unit of lengths", 2.0**-_MOST, 2.0**_MOST)
+        return scaled(decode(scene, source), 1 / unit).checked(path)
+
+
+def unit_of(splats: Splats) -> float:
+    """The factor by which the page multiplies lengths: 1 where SPZ holds every size and position, else the power of two that
+    brings the median size to the middle of its range, without a position beyond it."""
+    reach = float(splats.means.abs().max()) if len(splats) else 0.0
+    if reach < FARTHEST and not out_of_range(splats).any():
+        return 1.0
+    middle = (-2 - float(splats.log_scales.amax(1).median())) / math.log(2)
+    highest = math.floor(math.log2(FARTHEST / max(reach, 1e-30))) - 1
+    return 2.0 ** max(-_MOST, min(round(middle), highest, _MOST))
 
 
 def is_antialiased(path: Path) -> bool:
-    """Whether the settings of a page say that it is drawn with antialiasing; False for damaged pages."""
+    """Whether the settings of a page say that it is drawn with antialiasing. Raises InputError for damaged settings."""
     with opening(path, budget.HTML) as source:
-        try:
-            settings = parse_json(_content(source.read(), _SETTINGS))
-        except (ValueError, RecursionError):
-            return False
-    return isinstance(settings, dict) and settings.get("antialias") is True
+        return _settings(source.read()).get("antialias") is True
 
 
-def _content(page: bytes, tag: bytes) -> bytes:
-    """The content of the script that begins with `tag`. Raises Damaged if the page has none or ends in it."""
+def _settings(page: bytes) -> dict[str, Any]:
+    """The settings of a page; empty for a page without. Raises ValueError for damaged ones."""
+    content = _script(page, _SETTINGS)
+    if content is None:
+        return {}
+    settings = parse_json(content, budget.JSON)
+    if not isinstance(settings, dict):
+        raise Damaged("settings that are not an object")
+    return settings
+
+
+def _script(page: bytes, tag: bytes) -> bytes | None:
+    """The content of the script that begins with `tag`; None if the page has none or ends in it."""
     start = page.find(tag) + len(tag)
     end = page.find(b"</script>", start)
-    if start < len(tag) or end < 0:
-        raise Damaged("no scene")
-    return page[start:end]
+    return None if start < len(tag) or end < 0 else page[start:end]
 
 
 def view_note(capture: Capture, world: World) -> dict[str, Any]:
@@ -122,6 +145,7 @@ def page_settings(splats: Splats, note: Mapping[str, Any]) -> dict[str, Any]:
     places = torch.tensor([pose["position"] for pose in poses], dtype=torch.float64)
     return {
         "count": len(splats),
+        "unit": unit_of(splats),
         "pose": first,
         "poses": poses,
         "flight": [_pose(entry) for entry in note.get("flight") or []],

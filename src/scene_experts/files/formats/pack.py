@@ -3,6 +3,9 @@ bytes, turned frames, size limits."""
 
 from __future__ import annotations
 
+import logging
+import math
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -15,6 +18,7 @@ from scene_experts.core.reading.source import Source
 from scene_experts.files.formats.compact import AXIS_BITS, morton
 from scene_experts.files.formats.splats import Splats
 
+log: logging.Logger = logging.getLogger(__name__)
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
@@ -118,6 +122,19 @@ def turn(splats: Splats, axis: Literal["x", "z"]) -> Splats:
         splats.opacity_logit,
         splats.sh * torch.from_numpy(harmonics).float()[:, None],
     )
+
+
+def warn_of_transforms(path: Path) -> None:
+    """Log that a file places its Gaussians by transforms, which its reader does not apply."""
+    log.warning("%s moves, turns or scales its Gaussians by transforms of nodes, which are not applied: apply them before the import", path)
+
+
+def scaled(splats: Splats, factor: float) -> Splats:
+    """The Gaussians with all lengths times `factor`, above 0."""
+    if factor == 1:
+        return splats
+    means, log_scales = splats.means.double() * factor, splats.log_scales.double() + math.log(factor)
+    return Splats(means.float(), log_scales.float(), splats.quats, splats.opacity_logit, splats.sh)
 
 
 def tensor(values: NDArray[Any]) -> torch.Tensor:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
@@ -50,11 +51,33 @@ _STREAMS = ("positions", "alphas", "colors", "scales", "rotations", "sh")
 _COLOR = 0.15  # share of a byte's range per unit of the constant harmonic
 _MAX_BITS = 20  # of a position's fraction
 _ROTATION = 511 * np.sqrt(2)
+_LOG_SCALES = (-10.0, 255 / 16 - 10)
+FARTHEST = 1 << 22  # units; positions must be nearer
 
 
-def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
-    """Write version 3. Of the note it stores `antialias` only."""
+def write(path: Path, splats: Splats, note: dict[str, Any]) -> str | None:
+    """Write version 3. Of the note it stores `antialias` only. Returns a warning about sizes that the format cannot hold, or None."""
     write_bytes(path, spz_bytes(splats, antialias=bool(note.get("antialias", False))))
+    return size_warning(splats)
+
+
+def out_of_range(splats: Splats) -> Tensor:
+    """Which Gaussians [N] have a wrong size in the file: an axis longer than the longest that it holds, or all shorter than the
+    shortest. A single short axis is harmless: such a Gaussian stays flat."""
+    longest, (low, high), half_step = splats.log_scales.amax(1), _LOG_SCALES, 1 / 32
+    return (longest > high + half_step) | (longest < low - half_step)
+
+
+def size_warning(splats: Splats) -> str | None:
+    """A sentence about the Gaussians of `out_of_range`; None without any."""
+    count = int(out_of_range(splats).sum())
+    if not count:
+        return None
+    low, high = (float(f"{np.exp(value):.2g}") for value in _LOG_SCALES)
+    return (
+        f"warning: {count:,} of {len(splats):,} Gaussians have sizes outside {low:g} to {high:g} units, which SPZ cannot hold, "
+        "and are clipped; choose another --format (sog, ply)"
+    )
 
 
 def spz_bytes(splats: Splats, first_step: int = 1, rest_step: int = 1, antialias: bool = False) -> bytes:
@@ -70,8 +93,8 @@ def spz_bytes(splats: Splats, first_step: int = 1, rest_step: int = 1, antialias
     means = s.means.double().numpy()
     reach = float(np.abs(means).max()) if len(s) else 1.0
     bits = max(0, min(_MAX_BITS, 22 - int(np.floor(np.log2(max(reach, 1e-9))))))
-    if reach >= 1 << 22:
-        raise InputError(f"expected positions within {1 << 22:,} units for SPZ, found one at {reach:.3g}; remove far Gaussians")
+    if reach >= FARTHEST:
+        raise InputError(f"expected positions within {FARTHEST:,} units for SPZ, found one at {reach:.3g}; remove far Gaussians")
     fixed = np.clip(np.rint(means * (1 << bits)), -(1 << 23), (1 << 23) - 1).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(-1, 3, 4)[..., :3]
     colors = to_bytes(s.sh[:, 0].double().numpy() * _COLOR + 0.5)

@@ -24,7 +24,17 @@ from scene_experts.core.io import write_atomic
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.source import Source, opening, shorten
-from scene_experts.files.formats.pack import Floats, alphas, check_count, decoded_bytes, logits, tensor, turn, unit_quats
+from scene_experts.files.formats.pack import (
+    Floats,
+    alphas,
+    check_count,
+    decoded_bytes,
+    logits,
+    tensor,
+    turn,
+    unit_quats,
+    warn_of_transforms,
+)
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.formats.usd_worker import COEFFICIENTS, DAMAGED, MISSING
 from scene_experts.files.registry import Format
@@ -47,7 +57,7 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
         "note": np.array(json.dumps(note, default=str) if note else ""),
     }
     with tempfile.TemporaryDirectory(prefix="scene-experts-usd-") as folder:
-        archive, made = Path(folder) / "arrays.npz", Path(folder) / f"scene{'.usda' if path.suffix == '.usda' else '.usdc'}"
+        archive, made = Path(folder) / "arrays.npz", Path(folder) / f"scene{'.usda' if path.suffix.lower() == '.usda' else '.usdc'}"
         np.savez(archive, **arrays)  # type: ignore[arg-type]
         done = _work("write", archive, made, LONGEST)
         if done.returncode or not made.is_file():
@@ -56,7 +66,8 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of all prims of the kind, together. Transforms of prims are not applied; other files are not opened.
+    """The Gaussians of all prims of the kind, together. Transforms of prims are not applied, and a warning tells of
+    them; other files are not opened.
 
     Raises InputError for damaged files, for files without such a prim, and without usd-core.
     """
@@ -74,6 +85,9 @@ def read(path: Path) -> Splats:
         source.spend_bytes(3 * archive.stat().st_size)  # float32, and float64 beside it
         with np.load(archive) as data:
             found = [_prim(source, data, i) for i in range(int(data["count"]))]
+            moved = bool(data["moved"])
+        if moved:
+            warn_of_transforms(path)
         coefficients = min(part[4].shape[1] for part in found)
         means, scales, quats, opacity = (np.concatenate([part[i] for part in found]) for i in range(4))
         sh = np.concatenate([part[4][:, :coefficients] for part in found])
@@ -121,6 +135,7 @@ def _work(task: str, source: Path, target: Path, seconds: int, *limits: str) -> 
 
 FORMAT = Format(
     suffix=".usdc",
+    other_suffixes=(".usda", ".usd"),
     write=write,
     read=read,
     marks=(b"PXR-USDC", b"#usda"),

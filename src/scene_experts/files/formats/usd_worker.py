@@ -8,6 +8,7 @@ bytes and of processor time in seconds. No layer but the given one is opened: re
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,8 @@ def write(source: Path, target: Path) -> None:
 
 
 def read(source: Path, target: Path) -> str | None:
-    """Write the arrays of all prims of the kind `KIND`, with names as in the file, numbered by prim. Returns what is wrong, or None."""
+    """Write the arrays of all prims of the kind `KIND`, with names as in the file, numbered by prim, their `count`, and whether a
+    transform moves one (`moved`). Returns what is wrong, or None."""
     sdf = _pxr("Sdf")
     layer = sdf.Layer.OpenAsAnonymous(str(source))
     if layer is None:
@@ -64,7 +66,7 @@ def read(source: Path, target: Path) -> str | None:
     layer.Traverse(sdf.Path.absoluteRootPath, visit)
     if not prims:
         return f"no {KIND}"
-    out: dict[str, Any] = {"count": len(prims)}
+    out: dict[str, Any] = {"count": len(prims), "moved": any(_moves(above) for spec in prims for above in _with_parents(layer, spec))}
     for number, spec in enumerate(prims):
         degree = _default(spec, DEGREE)
         out[f"{number}:degree"] = 3 if degree is None else int(degree)  # the schema's default
@@ -77,6 +79,33 @@ def read(source: Path, target: Path) -> str | None:
             out[f"{number}:{name}"] = np.asarray(value, np.float32).reshape(-1, width)
     np.savez(target, **out)
     return None
+
+
+def _with_parents(layer: Any, spec: Any) -> Iterator[Any]:
+    """A prim and the prims above it."""
+    path = spec.path
+    while (found := layer.GetPrimAtPath(path)) is not None and path.IsPrimPath():
+        yield found
+        path = path.GetParentPath()
+
+
+def _moves(spec: Any) -> bool:
+    """Whether a prim has a transform other than the identity."""
+    for name in _default(spec, "xformOpOrder") or ():
+        name = str(name).removeprefix("!invert!")
+        if name in spec.attributes and not _is_still(name.split(":")[1], spec.attributes[name].default):
+            return True
+    return False
+
+
+def _is_still(kind: str, value: Any) -> bool:
+    """Whether an operation on the frame of a prim (`translate`, `rotateXYZ`, `orient`, ...) changes nothing at this value."""
+    if value is None:  # values over time
+        return False
+    if kind == "orient":
+        return bool(np.all(np.asarray(value.imaginary) == 0))
+    identity = np.eye(4) if kind == "transform" else 1.0 if kind.startswith("scale") else 0.0
+    return bool(np.all(np.asarray(value) == identity))
 
 
 def _default(spec: Any, name: str) -> Any:

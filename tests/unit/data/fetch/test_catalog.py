@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from importlib.resources import files
+from pathlib import Path
 
 import pytest
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.fetch.catalog import COLLECTIONS, SCENES, one, select
+from scene_experts.data.fetch.catalog import COLLECTIONS, SCENES, Defaults, defaults_in, defaults_of, one, select
 from scene_experts.data.images import check_policy
 from support.messages import naming
 
@@ -42,6 +43,15 @@ def test_words_select_scenes() -> None:
     assert one("Quebec").path == "bungeenerf/quebec"
     with pytest.raises(InputError, match=r"'tandt'.*truck, train"):
         one("tandt")
+
+
+def test_a_scene_brings_its_units_and_numbers() -> None:
+    brought = defaults_of("catalog:bonsai")
+    assert brought.normalise == "none" and ("scene.voxel_size", 0.001) in brought.numbers
+    for args in (["-s", "catalog:bonsai"], ["--data=catalog:mipnerf360/bonsai"], ["catalog:bonsai", "--out", "a"]):
+        assert defaults_in(args) == brought
+    for args in ([], ["bonsai"], ["--out", "x/catalog:bonsai"]):
+        assert defaults_in(args) == defaults_of(Path("bonsai")) == Defaults()
 
 
 @pytest.mark.parametrize(("word", "hint"), [("bonzai", "'bonsai'"), ("mipnerf/garden", "'mipnerf360/garden'"), ("tant", "'tandt'")])

@@ -13,6 +13,7 @@ from PIL import Image
 from scene_experts.core.errors import InputError
 from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
+from scene_experts.data.readers.colmap_model import write_model
 from scene_experts.data.summary import summarise
 from support.lenses import LENSES
 from support.synthetic import make_capture, make_nerfstudio, picture
@@ -96,6 +97,39 @@ def test_masks_of_nerfstudio(tmp_path: Path, place: str) -> None:
     capture = load(tmp_path)
     mask = capture.frame(1).mask
     assert mask is not None and not mask.any() and capture.frame(0).mask is None
+
+
+def test_an_absent_mask_is_told(tmp_path: Path) -> None:
+    make_nerfstudio(tmp_path, views=3, size=(24, 16), points=50)
+    edit(tmp_path / "transforms.json", lambda m: [f.update(mask_path=f"./stencils/{i}.png") for i, f in enumerate(m["frames"])])
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(np.zeros((16, 24), np.uint8)).save(tmp_path / "masks/view_001.png")  # found by its name
+    told = [w for w in load(tmp_path).warnings if "mask" in w]
+    assert len(told) == 1 and "2 of 3" in told[0] and "./stencils/0.png" in told[0]
+
+
+def test_names_of_held_out_frames_are_compared_as_paths(tmp_path: Path) -> None:
+    make_nerfstudio(tmp_path, views=6, size=(24, 16), points=50)
+    path = tmp_path / "transforms.json"
+    edit(path, lambda m: m.update(test_filenames=["./images/view_001.png", "images\\view_003.png", "images/gone.png"]))
+    capture = load(tmp_path)
+    assert (capture.split, capture.test) == ("files", (1, 3))
+    assert any("1 of 3" in w and "test_filenames" in w and "gone.png" in w for w in capture.warnings)
+    edit(path, lambda m: m.update(val_filenames=["images/view_004.png", "images/view_003.png"]))
+    capture = load(tmp_path)
+    assert capture.test == (1, 3) and any("1 validation" in w for w in capture.warnings)
+    edit(path, lambda m: m.pop("test_filenames"))
+    capture = load(tmp_path)
+    assert (capture.split, capture.test) == ("files", (3, 4)) and not any("filenames" in w for w in capture.warnings)
+
+
+def test_a_folder_of_two_kinds_says_which_is_read(tmp_path: Path) -> None:
+    made = make_nerfstudio(tmp_path, views=3, size=(24, 16), points=50)
+    assert not any("also holds" in w for w in load(tmp_path).warnings)
+    write_model(tmp_path / "colmap/sparse/0", made.model)
+    capture = load(tmp_path)
+    assert capture.kind == "colmap"
+    assert sum("COLMAP" in w and "also holds transforms.json" in w for w in capture.warnings) == 1
 
 
 def test_auto_uses_the_split_that_the_file_states(tmp_path: Path) -> None:

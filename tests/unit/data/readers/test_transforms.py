@@ -33,7 +33,7 @@ def test_frames_without_a_file_are_dropped_and_counted(tmp_path: Path) -> None:
 
 
 def test_shared_intrinsics_and_an_angle_of_view(tmp_path: Path) -> None:
-    make_nerfstudio(tmp_path, views=3, size=(48, 32), points=50, mixed_sizes=False)
+    make_nerfstudio(tmp_path, views=3, size=(48, 32), points=50, mixed_sizes=False, principal_point_offset=False)
     path = tmp_path / "transforms.json"
 
     def share(meta: dict) -> None:
@@ -53,6 +53,32 @@ def test_shared_intrinsics_and_an_angle_of_view(tmp_path: Path) -> None:
     edit(path, angle)
     camera = load(tmp_path).views[0].camera
     assert camera.fx == pytest.approx(24 / np.tan(0.6), rel=1e-6) and camera.cx == 24
+
+
+def test_the_fisheye_of_instant_ngp(tmp_path: Path) -> None:
+    make_nerfstudio(tmp_path, views=2, size=(48, 32), points=20, mixed_sizes=False, principal_point_offset=False)
+    path = tmp_path / "transforms.json"
+    bends = {"k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": -0.001}
+    edit(path, lambda m: [(f.pop("camera_model", None), f.update(bends, is_fisheye=True)) for f in m["frames"]])
+    edit(path, lambda m: m.pop("camera_model", None))
+    lens = load(tmp_path).images.sources[0].lens
+    assert lens.model == "OPENCV_FISHEYE" and lens.params[4:] == tuple(bends.values())
+    edit(path, lambda m: [f.update(camera_model="OPENCV") for f in m["frames"]])  # a stated model counts
+    assert load(tmp_path).images.sources[0].lens.model == "FULL_OPENCV"
+
+
+@pytest.mark.parametrize("sized", [True, False])
+def test_an_angle_of_view_keeps_the_centre_and_the_distortion(tmp_path: Path, sized: bool) -> None:
+    make_nerfstudio(tmp_path, views=2, size=(48, 32), points=20, mixed_sizes=False, principal_point_offset=False)
+    path = tmp_path / "transforms.json"
+    dropped = ("fl_x", "fl_y") if sized else ("fl_x", "fl_y", "w", "h")
+    edit(path, lambda m: [[f.pop(name) for name in dropped] for f in m["frames"]])
+    edit(path, lambda m: m.update(camera_angle_x=1.2))
+    assert load(tmp_path).images.sources[0].lens.model == "SIMPLE_PINHOLE"  # its centre is that of the picture
+    edit(path, lambda m: [f.update(camera_model="OPENCV", cx=20.0, k1=-0.1) for f in m["frames"]])
+    lens = load(tmp_path).images.sources[0].lens
+    assert (lens.model, lens.cx, lens.cy, lens.value("k1")) == ("OPENCV", 20.0, 16.0, -0.1)
+    assert lens.fx == lens.fy == pytest.approx(24 / np.tan(0.6))
 
 
 @pytest.mark.parametrize(

@@ -82,6 +82,23 @@ def test_normalised_bytes_and_strides(tmp_path):
     torch.testing.assert_close(found.means, s.means * torch.tensor([-1.0, -1.0, 1.0]))
 
 
+def test_transforms_of_nodes_are_told(tmp_path, caplog):
+    path = tmp_path / "a.glb"
+    glb.write(path, scene(5, 0), {})
+    doc, body = parsed(path)
+    identity = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    for nodes, told in (
+        ([{"mesh": 0, "rotation": [0, 0, 0, 1.0], "scale": [1, 1, 1]}, {"matrix": identity, "children": [0]}], False),
+        ([{"mesh": 0}, {"camera": 0, "translation": [1, 2, 3]}], False),
+        ([{"mesh": 0}, {"children": [0]}, {"children": [1], "translation": [0, 0, 1]}], True),
+        ([{"mesh": 0, "children": [1]}, {"children": [0], "scale": [2, 2, 2]}], True),
+        ([{"mesh": 0, "children": [0]}], False),
+    ):
+        rebuilt(path, doc | {"nodes": nodes}, body)
+        caplog.clear()
+        assert len(glb.read(path)) == 5 and (str(path) in caplog.text and "not applied" in caplog.text) is told
+
+
 def test_damaged_files(tmp_path):
     path = tmp_path / "a.glb"
     glb.write(path, scene(20, 1), {})

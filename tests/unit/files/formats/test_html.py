@@ -18,6 +18,7 @@ from scene_experts.core.types import Camera, Gaussians
 from scene_experts.data.views import View, World
 from scene_experts.files.formats import html
 from scene_experts.files.formats.html import page_settings, read, view_note, write
+from scene_experts.files.formats.pack import scaled
 from scene_experts.files.formats.splats import Splats
 from scene_experts.geometry.rotation import quat_to_matrix
 from scene_experts.geometry.sh import sh_to_rgb
@@ -58,11 +59,23 @@ def ours(s, entry):
     return (image.clamp(0, 1) * 255).round().byte().numpy()
 
 
-@pytest.mark.parametrize("page", [b"", b'id="settings">{}', b"{broken", b"[true]", b'{"antialias": 1}', b"[" * 10_000])
+SETTINGS = b'<script type="application/json" id="settings">'
+
+
+@pytest.mark.parametrize("page", [b"", SETTINGS, SETTINGS + b'{"antialias": 1}</script>', SETTINGS + b"{}</script>"])
 def test_settings_that_say_nothing_of_antialiasing(tmp_path, page):
-    tag = b'<script type="application/json" id="settings">'
-    (tmp_path / "a.html").write_bytes(tag + page + (b"</script>" if page else b""))
+    (tmp_path / "a.html").write_bytes(page)
     assert html.is_antialiased(tmp_path / "a.html") is False
+
+
+@pytest.mark.parametrize("settings", [b"{broken", b"[true]", b"[" * 10_000, b'{"unit": 0}', b'{"unit": "1"}'])
+def test_damaged_settings_are_refused(tmp_path, settings):
+    page = tmp_path / "a.html"
+    html.write(page, blobs(4), {})
+    start, rest = page.read_bytes().split(SETTINGS)
+    page.write_bytes(start + SETTINGS + settings + rest[rest.index(b"</script>") :])
+    with pytest.raises(InputError, match="expected a whole html page"):
+        html.read(page)
 
 
 def psnr(a, b):
@@ -134,6 +147,32 @@ def test_the_scene_comes_back_out_of_the_page(tmp_path):
     text = (tmp_path / "a.html").read_text()
     assert not re.search(r"""(src|href)=["']?(https?:)?//""", text) and "WORLD LABS" in text
     assert text.count("</script>") == 4
+
+
+@pytest.mark.parametrize("factor", [1e-9, 1e-4, 3e3, 1e9])
+def test_a_page_holds_scenes_in_any_unit(tmp_path, factor):
+    s = scaled(scene(200, 1, size=1.0), factor)
+    assert write(tmp_path / "a.html", s, {}) is None
+    found = read(tmp_path / "a.html")
+    check("html", scaled(found, 1 / factor), scaled(s, 1 / factor))
+    unit = page_settings(s, {})["unit"]
+    assert unit != 1 and math.frexp(unit)[0] == 0.5 and f'"unit": {unit}' in (tmp_path / "a.html").read_text()
+    assert page_settings(scene(200), {})["unit"] == 1
+    s.log_scales[0] += 30
+    assert "1 of 200" in str(write(tmp_path / "a.html", s, {}))
+
+
+def test_a_page_without_a_unit_has_that_of_the_capture(tmp_path):
+    s = scene(50, 1)
+    write(tmp_path / "a.html", s, {})
+    text, wanted = (tmp_path / "a.html").read_text(), read(tmp_path / "a.html")
+    for entry, same in (("", True), ('"unit": 0,', False), ('"unit": "2",', False), ('"unit": 1e99,', False)):
+        (tmp_path / "a.html").write_text(text.replace('"unit": 1.0,', entry))
+        if same:
+            assert torch.equal(read(tmp_path / "a.html").means, wanted.means)
+        else:
+            with pytest.raises(InputError, match="unit"):
+                read(tmp_path / "a.html")
 
 
 def test_settings_of_the_page():

@@ -101,6 +101,16 @@ def test_the_flag_of_antialiasing(tmp_path, asked):
         assert spz.is_antialiased(tmp_path / "c.spz") is False
 
 
+def test_sizes_that_the_format_cannot_hold_are_counted(tmp_path):
+    s = scene(100)
+    s.log_scales[:] = s.log_scales.clamp(-9, 5)
+    s.log_scales[:40, 0] = -20.0  # flat: harmless
+    assert spz.write(tmp_path / "a.spz", s, {}) is None
+    s.log_scales[10], s.log_scales[20, 1] = -11.0, 7.0
+    told = spz.write(tmp_path / "a.spz", s, {})
+    assert told is not None and told.startswith("warning: 2 of 100 ") and "4.5e-05 to 380 units" in told and "ply" in told
+
+
 def test_damaged_files(tmp_path):
     good = spz.spz_bytes(scene(30, 2))
     raw = gzip.decompress(good)

@@ -83,7 +83,7 @@ def test_round_trip_is_exact_and_usd_sees_the_scene_half_turned(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.foreign
-def test_text_files_and_damaged_files(tmp_path):
+def test_text_files_and_damaged_files(tmp_path, caplog):
     pytest.importorskip("pxr")
     path, s = tmp_path / "a.usda", scene(5, 1)
     usd.write(path, s, {})
@@ -94,6 +94,11 @@ def test_text_files_and_damaged_files(tmp_path):
         path.write_text(bad)
         with pytest.raises(InputError, match=naming(path)):
             registry.read(path)
+    for inside, told in (("", False), ("double3 xformOp:translate = (1, 2, 3)", True)):
+        order = 'uniform token[] xformOpOrder = ["xformOp:translate"]'
+        path.write_text(text.replace('"Scene"\n{', f'"Scene"\n{{\n    {inside}\n    {order}\n', 1))
+        caplog.clear()
+        assert len(registry.read(path)) == 5 and ("not applied" in caplog.text) is told
     binary = tmp_path / "b.usdc"
     binary.write_bytes(b"PXR-USDC" + bytes(range(256)) * 4)
     with pytest.raises(InputError, match=naming(binary)):

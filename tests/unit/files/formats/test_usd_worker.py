@@ -26,6 +26,27 @@ def test_values_are_looked_up_by_name():
     assert usd_worker._default(prim, "opacities").shape == (2,) and usd_worker._default(prim, "scales") is None
 
 
+@pytest.mark.parametrize(
+    ("operation", "value", "moves"),
+    [
+        ("translate", (0, 0, 0), False),
+        ("translate:pivot", (0, 1, 0), True),
+        ("rotateX", 90.0, True),
+        ("scale", (1, 1, 1), False),
+        ("scale", (2, 2, 2), True),
+        ("orient", SimpleNamespace(imaginary=(0, 0, 0)), False),
+        ("orient", SimpleNamespace(imaginary=(0, 1, 0)), True),
+        ("transform", np.eye(4), False),
+        ("transform", 2 * np.eye(4), True),
+        ("translate", None, True),
+    ],
+)
+def test_transforms_that_move_a_prim(operation, value, moves):
+    values = {f"xformOp:{operation}": value, "xformOpOrder": ["!resetXformStack!", f"!invert!xformOp:{operation}"]}
+    prim = SimpleNamespace(attributes={name: SimpleNamespace(default=v) for name, v in values.items()})
+    assert usd_worker._moves(prim) is moves and not usd_worker._moves(SimpleNamespace(attributes={}))
+
+
 def test_limits_are_limits_of_the_process(monkeypatch):
     resource = pytest.importorskip("resource")
     set_to = {}
