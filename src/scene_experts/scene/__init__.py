@@ -191,6 +191,10 @@ class SceneConfig(Part, ABC):
         """Last iteration of the experts' dense warm-up. 0 if there is none."""
         return 0
 
+    def phases(self) -> dict[str, int]:
+        """Return the last iteration of each phase that a training leaves for good, by the flag that sets it. Empty without phases."""
+        return {}
+
     @abstractmethod
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> Scene:
         """Create a scene from a point cloud and the cameras of the training views. Some families ignore the cameras."""

@@ -101,6 +101,9 @@ class Anchors(SceneConfig):
     def dense_until(self) -> int:
         return self.decoder.dense_until
 
+    def phases(self) -> dict[str, int]:
+        return {"--scene.decoder.warmup": self.dense_until, **self.select.phases()}
+
     def needs_whole_table(self) -> str:
         if self.select.has_levels:
             return "anchors on levels"
