@@ -143,11 +143,13 @@ def held(out: Path) -> Iterator[None]:
 
 
 def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False, exported: Iterable[Path] = ()) -> None:
-    """Prepare `out` for a run: call `check`, remove unfinished files of a killed training and the checkpoints and results of an
-    overwritten run, and write config.json."""
+    """Prepare `out` for a run: call `check`, remove unfinished files of a killed training, the metrics of a run that is not resumed and
+    the checkpoints and results of an overwritten run, and write config.json."""
     check(out, config, resume, overwrite)
     for unfinished in (path for pattern in _UNFINISHED for path in out.glob(pattern)):
         unfinished.unlink(missing_ok=True)
+    if not resume:
+        (out / "metrics.jsonl").unlink(missing_ok=True)  # a run with --init-from keeps the lines up to its start
     if overwrite:
         results = [out / f"{name}{suffix}.json" for name in ("results", "per_view") for suffix in ("", "_train", "_half")]
         others = [*exported, out / "report.html", out / "config.json"]
