@@ -107,7 +107,11 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]]) -> list[str]
     """The commands that train a coarse scene, the blocks, and the merged scene.
 
     bounds: corners of the box of each block with its margin, in trained world units.
+    Raises InputError for wrong options of the trainings.
     """
+    from scene_experts.commands.train import parse_train
+    from scene_experts.training.config import flags_of
+
     out, total, more = command.out, command.iterations, split_words(command.train)
     data = [word for name, value in vars(command.data).items() if value != getattr(Data(Path()), name) for word in _flag(name, value)]
     train = [PROG, "train", command.recipe, *data, *more]
@@ -115,9 +119,11 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]]) -> list[str]
     runs = [str(out / f"run{number}") for number in range(command.blocks)]
     memory = ["--max-memory", f"{command.max_memory:g}"] if command.max_memory else []
     few = ["--max-anchors", str(command.coarse_anchors)] if command.coarse_anchors else []
+    cfg = parse_train([*train[2:], "--out", coarse]).cfg
+    same = ["--rates.networks", "0", *flags_of(cfg, [("scene.decoder.speed", 0)])]  # what all anchors share stays equal in all blocks
     lines = [[*train, "--out", coarse, "--iterations", str(total), "--stop-at", str(max(1, total // 3)), *few, *memory]]
     for number, run in enumerate(runs):
-        views = ["--views", str(out / f"block{number}.json"), "--init-from", coarse, "--rates.networks", "0"]
+        views = ["--views", str(out / f"block{number}.json"), "--init-from", coarse, *same]
         inside = ["--growth.bounds", *(f"{side:.6g}" for side in bounds[number])]
         lines.append([*train, "--out", run, "--iterations", str(total), *views, *inside, *memory])
     lines.append([PROG, "blocks", "merge", str(out), "--runs", *runs, "--out", merged])

@@ -6,6 +6,7 @@ import pytest
 
 from scene_experts import cli
 from scene_experts.commands.train import parse_train
+from scene_experts.data.capture import load
 from support.synthetic import make_capture
 
 
@@ -33,6 +34,19 @@ def test_the_commands_of_a_plan_are_commands_of_train(capture, tmp_path, capsys)
     joint = trains[-1].cfg.rates  # the constant rates fall while the blocks are trained together
     assert joint.at("feature", 900, 990, 1.0) == pytest.approx(0.0075, rel=1e-3)
     assert joint.at("feature", 990, 990, 1.0) == pytest.approx(0.05 * 0.0075)
+
+
+@pytest.mark.parametrize("options", ["scaffold-gs-bank", "moe-gs-balance", "scaffold-gs --train=--scene.appearance=8"])
+def test_blocks_leave_what_all_anchors_share_as_it_is(options, capture, tmp_path):
+    assert cli.main(["blocks", "plan", str(capture), "--out", str(tmp_path), "--recipe", *options.split()]) == 0
+    line = next(line for line in (tmp_path / "commands.sh").read_text().splitlines() if "--init-from" in line)
+    cfg = parse_train(shlex.split(line)[2:]).cfg
+    loaded = load(capture)
+    scene = cfg.scene.start(loaded.points, loaded.extent, [loaded.views[i].camera for i in loaded.train])
+    loaded.images.close()
+    rates = {name: cfg.rates.at(name, 1, 100, 1.0) for name in scene.rate_groups()}
+    assert {name for name, rate in rates.items() if rate} == {"feature", "offsets", "log_scaling"}
+    assert getattr(cfg.scene.decoder, "speed", 0) == 0  # of the biases that balance the experts
 
 
 def test_words_that_do_not_fit(capture, tmp_path, capsys):
