@@ -192,9 +192,9 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
     training.seed_view(training.step + 1)
     exchange.finish()
     rows = exchange.rows() if cfg.sparse_adam or run.shard else None
-    if due := any(cfg.growth.reads(number) for number in numbers):
+    if any(cfg.growth.reads(number) for number in numbers):
         exchange.complete()
-    limited, before = run.max_memory > 0 and due, len(scene.table)
+    limited, before = run.max_memory > 0 and any(cfg.growth.adds(number) for number in numbers), len(scene.table)
     if limited:
         give_back()
     cap = exchange.limit(anchor_cap(scene, cfg.growth.max_anchors, run.max_memory, training.largest), run.max_memory > 0)

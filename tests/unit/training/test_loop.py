@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.schedule import Every
 from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
@@ -120,6 +121,18 @@ def test_memory_cap_stops_growth(folder, monkeypatch):
     monkeypatch.setattr("scene_experts.training.trial.check_start", lambda *args: None)
     capped = [e for e in events(config(), folder, stop_at=100, max_memory=0.002) if isinstance(e, Densified)]
     assert capped and not any(e.edit.grown for e in capped) and any(e.edit.capped for e in capped)
+
+
+def test_a_memory_cap_measures_only_where_rows_may_be_added(folder, monkeypatch):
+    asked: list[int] = []
+    monkeypatch.setattr("scene_experts.training.loop.give_back", lambda: asked.append(1))
+    made = config()
+    made = replace(made, growth=replace(made.growth, adjust=Every(0, 200, 5)))  # scaled to 4
+    list(events(made, folder, stop_at=8, max_memory=1000.0))
+    assert not asked
+    made = replace(made, growth=replace(made.growth, adjust=Every(0, 500, 5)))  # scaled to 10
+    list(events(made, folder, stop_at=8, max_memory=1000.0))
+    assert len(asked) == 2  # before and after iteration 5
 
 
 def test_a_start_beyond_the_memory_cap_is_refused_before_anything_is_written(folder, tmp_path):
