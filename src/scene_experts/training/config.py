@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 from scene_experts.arguments.option import Option
@@ -93,6 +94,7 @@ class RunConfig:
     deterministic: bool = False
     stop_at: int | None = None
     versions: dict[str, str] = field(default_factory=dict)
+    init_from: Path | None = None  # run folder whose scene the training started from; None: the points of the capture, or an older run
 
 
 def check(cfg: Train) -> None:

@@ -39,9 +39,9 @@ ROUTED = 16_384  # anchors sampled for the routing statistics; the shares are wi
 
 @dataclass(frozen=True)
 class Run:
-    """Options of a training run that do not affect its results, except for `stop_at`."""
+    """Options of a training run. The results depend on `config` and `max_memory`, and their rounding on `device`, `dtype` and `group`."""
 
-    config: RunConfig
+    config: RunConfig  # with `stop_at` and `init_from`
     out: Path | None = None  # the run folder; None writes no files
     device: str = "cpu"
     dtype: torch.dtype = torch.float32  # float64 is for tests of rounding errors with the reference rasteriser
@@ -51,7 +51,6 @@ class Run:
     log_every: int = 10  # iterations between Stepped events
     max_memory: float = 0.0  # GiB of memory (resident, or reserved on the GPU) at which densification stops; 0: no limit
     keep: int = 2  # number of checkpoints to keep
-    initial: Path | None = None  # run folder whose scene the training starts from; None: the points of the capture
     begin: Callable[[Training], None] = lambda training: None  # called once, before the first event
     watch: Callable[[Training], None] = lambda training: None  # called between iterations and not timed; the viewer renders here
     shard: bool = False  # divide the rows of the table among the processes
@@ -142,8 +141,8 @@ def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize
     training = resume(cfg, folder, run.device) if run.resume and folder else None
     if training and training.capture_id not in ("", capture.fingerprint()):
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
-    if training is None and run.initial is not None:
-        training = Training.start_from(cfg, run.initial, capture, run.device)
+    if training is None and run.config.init_from is not None:
+        training = Training.start_from(cfg, run.config.init_from, capture, run.device)
     training = training or Training.start(cfg, capture, run.device, run.dtype)
     training.capture_id = capture.fingerprint()
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])

@@ -163,6 +163,13 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False,
     _write_config(out, config)
 
 
+def as_begun(out: Path, config: RunConfig) -> RunConfig:
+    """Return the configuration with the `init_from` of the run in `out`, unless it has one or there is no run. For a run to resume."""
+    if config.init_from is not None or not (out / "config.json").is_file():
+        return config
+    return replace(config, init_from=read_config(out).init_from)
+
+
 def _write_config(out: Path, config: RunConfig) -> None:
     """Write config.json with the absolute path of the capture and its path relative to the run folder."""
     path = capture_place.absolute(named(config.data).path)
