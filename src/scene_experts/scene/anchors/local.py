@@ -86,6 +86,9 @@ class LocalHead(MixtureHead):
         self.router_w[:, -3:] = (2.0 * centres / spread).to(self.router_w)
         assert self.router_b is not None
         self.router_b.copy_(-centres.square().sum(1) / spread)
+        for parameter in (self.router_w, self.router_b):
+            for tensor in companions(parameter):  # its average: no moments, as nothing trains it
+                tensor.copy_(parameter)
 
     def route(self, feature: Tensor, step: int, position: Tensor | None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor]:
         """Route as `MixtureHead` does. During the warm-up, the gate of expert 0 is 1."""

@@ -92,14 +92,16 @@ def test_an_anchor_has_the_expert_of_the_nearest_centre():
 
 
 def test_moments_and_averages_are_copied_too():
-    made, held = scene(), {}
+    made, held, routers = scene(), {}, {}
     for head in made.heads.values():
         for p in (head.w1, head.b1, head.w2, head.b2):
             held[id(p)] = [torch.randn_like(p), torch.randn_like(p)]
+        routers |= {id(p): (p, torch.zeros_like(p)) for p in (head.router_w, head.router_b)}
     first = {key: [t[0].clone() for t in tensors] for key, tensors in held.items()}
-    split(made, lambda p: held[id(p)])
+    split(made, lambda p: held[id(p)] if id(p) in held else [routers[id(p)][1]])
     for key, tensors in held.items():
         assert all(torch.equal(t, f.expand_as(t)) for t, f in zip(tensors, first[key]))
+    assert all(average.any() and torch.equal(p, average) for p, average in routers.values())
 
 
 def test_other_iterations_change_nothing():
