@@ -186,7 +186,7 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
         shown = exchange.scene_of(cameras, numbers[turn_views[0]], Mode.TRAIN, rasterize.visible)
         done = see_view(training, run, capture, rasterize, numbers[place], *batch[place], scene=shown)
         del shown
-        exchange.add(done.decoded, done.render)
+        exchange.add(done.decoded, done.render, numbers[place])
     assert done is not None
     training.seed_view(training.step + 1)
     exchange.finish()
