@@ -11,7 +11,7 @@ changes its expert, and none needs a balancing loss.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -58,7 +58,8 @@ class LocalHead(MixtureHead):
     """A mixture whose router chooses by the nearest centre. `split` sets its weights; no loss trains them."""
 
     def __init__(self, config: Experts, *shape: Any) -> None:
-        super().__init__(config, *shape)
+        varied = config.expert_init == "variance"  # for means of many outputs; here one network begins alone
+        super().__init__(replace(config, expert_init="independent") if varied else config, *shape)
         for parameter in (self.router_w, self.router_b):
             assert parameter is not None
             parameter.requires_grad_(False).zero_()

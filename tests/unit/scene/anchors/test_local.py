@@ -158,5 +158,13 @@ def test_invalid_settings_are_refused():
         LocalExperts(shared=True).check()
 
 
+def test_the_first_weights_are_those_of_one_network_with_any_variance():
+    first = []
+    for how in ("independent", "variance"):
+        torch.manual_seed(0)
+        first.append(LocalExperts(expert_init=how).build("color", 35, 16, 30, 32).state_dict())
+    assert all(torch.equal(value, first[1][name]) for name, value in first[0].items())
+
+
 def test_the_heads_are_local():
     assert all(isinstance(head, LocalHead) for head in scene().heads.values())
