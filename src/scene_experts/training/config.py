@@ -58,7 +58,7 @@ class Train:
     random_background: bool = False
     """Use a random background colour in each iteration."""
     max_anchors: int = 0
-    """Stop densification at this number of anchors; 0 means no limit."""
+    """Stop densification at this number of anchors; 0 leaves that of the growth rule (a million for 3dgs-mcmc, otherwise none)."""
     sparse_adam: bool = False
     """Update only the rows that a view has decoded (SelectiveAdam of gsplat). Faster if views see a small part of the scene; changes the
     results."""

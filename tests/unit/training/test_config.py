@@ -25,6 +25,12 @@ def test_iterations_scale_windows_and_nothing_else():
 
 
 @pytest.mark.parametrize("name", list(RECIPES))
+def test_without_a_limit_of_the_run_the_limit_is_that_of_the_growth_rule(name):
+    assert RECIPES[name][1].scaled().growth.max_anchors == (1_000_000 if name == "3dgs-mcmc" else 0)
+    assert replace(RECIPES[name][1], max_anchors=7).scaled().growth.max_anchors == 7
+
+
+@pytest.mark.parametrize("name", list(RECIPES))
 def test_recipes_are_possible(name):
     check(RECIPES[name][1])
 
