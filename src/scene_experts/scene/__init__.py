@@ -195,6 +195,11 @@ class SceneConfig(Part, ABC):
         """Return the last iteration of each phase that a training leaves for good, by the flag that sets it. Empty without phases."""
         return {}
 
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Dotted paths of settings of a training that have no effect on this scene. A training warns where one was changed."""
+        return ()
+
     @abstractmethod
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> Scene:
         """Create a scene from a point cloud and the cameras of the training views. Some families ignore the cameras."""

@@ -52,6 +52,10 @@ class Explicit(SceneConfig):
     def grown_as(self) -> str:
         return "Gaussians"
 
+    @property
+    def unused(self) -> tuple[str, ...]:
+        return ("loss.opacity", "loss.load")
+
     def phases(self) -> dict[str, int]:
         return {"--scene.sh-ramp": self.sh_ramp * self.sh_degree - 1}
 

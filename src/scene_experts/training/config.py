@@ -122,6 +122,11 @@ def check(cfg: Train) -> None:
         raise InputError("expected an optimiser that can move some rows only for --sparse-adam, found another; leave the flag out")
 
 
+def find_unused(cfg: Train) -> list[str]:
+    """Return the flags of the settings that have no effect on the scene of `cfg` and do not have the default of their part."""
+    return [flag(place) for place in cfg.scene.unused if _has(cfg, place) and _changed(cfg, place)]
+
+
 def unregistered(value: Any) -> list[str]:
     """Return the class names of the parts of `value` that are not registered. A run with such a part cannot be opened again."""
     if not dataclasses.is_dataclass(value):
@@ -154,6 +159,12 @@ def _has(value: Any, place: str) -> bool:
     first, _, rest = place.partition(".")
     known = dataclasses.is_dataclass(value) and first in {f.name for f in dataclasses.fields(value)}
     return known and (not rest or _has(getattr(value, first), rest))
+
+
+def _changed(part: Any, place: str) -> bool:
+    first, _, rest = place.partition(".")
+    value = getattr(part, first)
+    return _changed(value, rest) if rest else value != next(f.default for f in dataclasses.fields(part) if f.name == first)
 
 
 def _put(part: Any, place: list[str], value: Any) -> Any:

@@ -23,7 +23,7 @@ from scene_experts.scene import Scene
 from scene_experts.strategy import Edit
 from scene_experts.strategy.survey import Photo, Survey
 from scene_experts.training.batch import Direct, check_batch, make_exchange
-from scene_experts.training.config import RunConfig, Train
+from scene_experts.training.config import RunConfig, Train, find_unused
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.guard import explain, find_broken
 from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
@@ -144,6 +144,8 @@ def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize
     if training is None and run.config.init_from is not None:
         training = Training.start_from(cfg, run.config.init_from, capture, run.device)
     training = training or Training.start(cfg, capture, run.device, run.dtype)
+    if unused := find_unused(cfg):
+        log.warning("without an effect on the scenes of this recipe: %s", ", ".join(unused))
     training.capture_id = capture.fingerprint()
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
     if run.max_memory > 0:

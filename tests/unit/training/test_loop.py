@@ -281,3 +281,13 @@ def test_what_an_iteration_leaves_holds_no_graph(folder):
     kept = without_graph(({"a": x}, [x, 3], None))
     assert not kept[0]["a"].requires_grad and not kept[1][0].requires_grad and kept[1][1:] == [3] and kept[2] is None
     capture.images.close()
+
+
+def test_a_setting_without_an_effect_is_said_at_the_start(folder, caplog):
+    made = config("scene-experts")
+    made = replace(made, scene=replace(made.scene, decoder=replace(made.scene.decoder, load_scope="all")))
+    list(events(made, folder, stop_at=1))
+    assert "--scene.decoder.load-scope" in caplog.text and caplog.text.count("effect") == 1
+    caplog.clear()
+    list(events(config("scene-experts"), folder, stop_at=1))
+    assert "effect" not in caplog.text

@@ -43,6 +43,10 @@ class LocalExperts(Experts):
 
     learns_routing: ClassVar[bool] = False
 
+    @property
+    def unused(self) -> tuple[str, ...]:
+        return ("loss.load", "rates.router_scale", "scene.decoder.load_scope", "scene.decoder.expert_init")
+
     def head(self) -> type[LocalHead]:
         return LocalHead
 

@@ -101,6 +101,10 @@ class Anchors(SceneConfig):
     def dense_until(self) -> int:
         return self.decoder.dense_until
 
+    @property
+    def unused(self) -> tuple[str, ...]:
+        return ("loss.mean_opacity", "loss.mean_size", *self.decoder.unused)
+
     def phases(self) -> dict[str, int]:
         return {"--scene.decoder.warmup": self.dense_until, **self.select.phases()}
 
