@@ -38,6 +38,8 @@ class Traits:
     """Edge of the finest lattice cell that rows lie on, trained world units; 0: rows lie on no lattice."""
     experts: int = 0
     """Experts per attribute; 0: the scene has no mixture of experts."""
+    dense_until: int = 0
+    """Last iteration of the experts' warm-up; 0 if there is none."""
     levels: int = 0
     """Levels of detail; 0: the scene has none. `Scene.at_level` draws fewer of them."""
     activation: bool = False

@@ -184,6 +184,7 @@ class AnchorScene(LatticeScene):
             "anchors",
             self.voxel,
             experts=max(head.experts for head in self.heads.values()),
+            dense_until=self.config.dense_until,
             levels=self.select.count,
             activation=True,
             appearance=self.config.appearance,
