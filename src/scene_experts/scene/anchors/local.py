@@ -86,6 +86,8 @@ class LocalHead(MixtureHead):
         for parameter in (self.w1, self.b1, self.w2, self.b2):
             for tensor in (parameter.data, *companions(parameter)):
                 tensor[1:] = tensor[:1].clone()
+        if len(positions) == 0:  # no places to divide: the router stays as it is
+            return
         centres, spread = find_centres(positions.cpu(), self.experts)
         self.router_w.zero_()
         self.router_w[:, -3:] = (2.0 * centres / spread).to(self.router_w)

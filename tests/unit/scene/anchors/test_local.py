@@ -150,6 +150,13 @@ def test_fewer_positions_than_centres(n):
     assert centres.shape == (8, 3) and centres.isfinite().all() and spread > 0
 
 
+def test_a_scene_that_lost_all_its_anchors_is_split_without_places():
+    made = scene()
+    for head in made.heads.values():
+        head.begin(WARM, WARM + 1, lambda: torch.zeros(0, 3), NONE)
+        assert torch.equal(head.w1, head.w1[:1].expand_as(head.w1)) and not head.router_w.any()
+
+
 def test_invalid_settings_are_refused():
     check(RECIPES["scene-experts"][1])
     with pytest.raises(InputError, match="positions"):
