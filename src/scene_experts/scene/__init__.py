@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -201,6 +201,10 @@ class SceneConfig(Part, ABC):
     def unused(self) -> tuple[str, ...]:
         """Dotted paths of settings of a training that have no effect on this scene. A training warns where one was changed."""
         return ()
+
+    def of_views(self, views: int) -> Self:
+        """Return the settings with which any number of training views is treated as `views` of them. The default depends on no number."""
+        return self
 
     @abstractmethod
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> Scene:

@@ -113,6 +113,11 @@ class Anchors(SceneConfig):
             return "anchors on levels"
         return "--scene.decoder.load-scope all" if self.decoder.balances_all else ""
 
+    def of_views(self, views: int) -> Self:
+        weight = find_weight(self.few_views, views)
+        fixed = replace(self, few_views=0, dropout=self.dropout * weight, view_jitter=self.view_jitter * weight)
+        return self if weight == 1 else fixed  # 1: with fewer views too
+
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
         """Create a scene with one anchor per occupied voxel of the point cloud."""
         return AnchorScene.from_points(self, points, extent, cameras)
