@@ -169,7 +169,7 @@ class AnchorScene(LatticeScene):
     ) -> None:
         """voxel: edge of the finest lattice cell; extent: the scene's R; both in trained world units. views: the training cameras' ids."""
         super().__init__(table, extent)
-        self.config, self.voxel = config, voxel
+        self.config, self.voxel, self.dense_until = config, voxel, config.dense_until
         self.select = select or AllAnchors()
         heads: dict[str, nn.Module] = {}
         for attribute in ATTRIBUTES:
@@ -189,7 +189,7 @@ class AnchorScene(LatticeScene):
             "anchors",
             self.voxel,
             experts=max(head.experts for head in self.heads.values()),
-            dense_until=self.config.dense_until,
+            dense_until=self.dense_until,
             levels=self.select.count,
             activation=True,
             appearance=self.config.appearance,
