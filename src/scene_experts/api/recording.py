@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -31,6 +32,8 @@ def train(run: loop.Run, capture: Capture, rasterize: Rasterizer, *, overwrite: 
     overwrite: start again in a folder that holds an earlier run.  tensorboard: write `run.out`/tensorboard too.
     Raises InputError if the folder cannot hold the run, and RunError if a file cannot be written.
     """
+    if run.out is not None and run.resume:
+        run = replace(run, config=run_folder.as_begun(run.out, run.config))
     if run.out is None or not run.group.first:  # process 0 writes all files
         yield from loop.train(run.config.train, run, capture, rasterize)
         return

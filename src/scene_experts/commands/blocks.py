@@ -97,7 +97,7 @@ def plan(args: list[str]) -> int:
     capture.images.close()
     found = make_blocks(capture, command.blocks, command.margin, command.share)
     write_plan(command.out, capture, found)
-    lines = commands(command, [block.bounds for block in found])
+    lines = commands(command, [block.bounds for block in found], len(capture.train))
     write_bytes(command.out / "commands.sh", ("#!/bin/sh\nset -e\n" + "\n".join(lines) + "\n").encode())
     for number, block in enumerate(found):
         print(f"block {number}: {len(block.views)} of {len(capture.train)} training views")
@@ -105,11 +105,16 @@ def plan(args: list[str]) -> int:
     return 0
 
 
-def commands(command: PlanCommand, bounds: list[tuple[float, ...]]) -> list[str]:
+def commands(command: PlanCommand, bounds: list[tuple[float, ...]], every: int = 0) -> list[str]:
     """The commands that train a coarse scene, the blocks, and the merged scene.
 
-    bounds: corners of the box of each block with its margin, in trained world units.
+    bounds: corners of the box of each block with its margin, in trained world units.  every: training views of the capture.
+    Raises InputError for wrong options of the trainings.
     """
+    from scene_experts.api.command_line import changes
+    from scene_experts.commands.train import parse_train
+    from scene_experts.training.config import flags_of
+
     out, total, more = command.out, command.iterations, split_words(command.train)
     usual = Data(Path(), normalise=defaults_of(command.data.path).normalise)  # what `train` takes without options
     data = [word for name, value in vars(command.data).items() if value != getattr(usual, name) for word in _flag(name, value)]
@@ -118,17 +123,31 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]]) -> list[str]
     runs = [str(out / f"run{number}") for number in range(command.blocks)]
     memory = ["--max-memory", f"{command.max_memory:g}"] if command.max_memory else []
     few = ["--max-anchors", str(command.coarse_anchors)] if command.coarse_anchors else []
+    cfg = parse_train([*train[2:], "--out", coarse]).cfg
+    own = flags_of(cfg, [("scene.decoder.speed", 0), *(changes(cfg.scene, cfg.scene.of_views(every), "scene.") or [])])
+    block = [PROG, "train", command.recipe, *data, *without(more, own[::2])]
+    same = ["--rates.networks", "0", *own]  # what all anchors share stays equal in all blocks
     lines = [[*train, "--out", coarse, "--iterations", str(total), "--stop-at", str(max(1, total // 3)), *few, *memory]]
     for number, run in enumerate(runs):
-        views = ["--views", str(out / f"block{number}.json"), "--init-from", coarse, "--rates.networks", "0"]
+        views = ["--views", str(out / f"block{number}.json"), "--init-from", coarse, *same]
         inside = ["--growth.bounds", *(f"{side:.6g}" for side in bounds[number])]
-        lines.append([*train, "--out", run, "--iterations", str(total), *views, *inside, *memory])
+        lines.append([*block, "--out", run, "--iterations", str(total), *views, *inside, *memory])
     lines.append([PROG, "blocks", "merge", str(out), "--runs", *runs, "--out", merged])
     both = total + max(1, total // 10)
     # the rates that a schedule leaves constant fall during the joint training: without it, the blocks' fit is shaken and not restored
     settle = ["--rates.anneal", str(SETTLE), "--rates.anneal-from", f"{total / both:.4f}"]
     lines.append([*train, "--out", str(out / "joint"), "--iterations", str(both), "--init-from", merged, *settle])
     return [shlex.join(line) for line in lines]
+
+
+def without(words: list[str], flags: list[str]) -> list[str]:
+    """Return the options `words` without these flags and their values."""
+    out, given = [], False  # given: the word before was one of the flags
+    for word in words:
+        name, equals, _ = word.partition("=")
+        out += [] if given or name in flags else [word]
+        given = not given and name in flags and not equals
+    return out
 
 
 def check_trainings(lines: list[str], data: Data) -> None:

@@ -156,11 +156,11 @@ def prepare(command: TrainCommand, line: str, group: Alone) -> tuple[TrainComman
 
 def run_of(command: TrainCommand, line: str) -> Run:
     """What the loop needs to know of the command, on the CPU. line: the command line, for config.json."""
+    start = None if command.init_from is None else command.init_from.absolute()
     return Run(
-        config=RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, run_folder.versions()),
+        config=RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, run_folder.versions(), start),
         out=command.out,
         resume=command.resume,
-        initial=command.init_from,
         shard=command.shard,
         save_every=command.save_every,
         preview_every=command.preview_every,

@@ -58,7 +58,8 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     for name in list(columns):
         tensors[name] = torch.cat(columns.pop(name))
     data = replace(configs[0].data, views=None)
-    config = replace(configs[0], data=data, command=f"merged from {len(runs)} blocks", versions=run_folder.versions(), stop_at=None)
+    command = f"merged from {len(runs)} blocks"
+    config = replace(configs[0], data=data, command=command, versions=run_folder.versions(), stop_at=None, init_from=None)
     run_folder.prepare(out, config, resume=False)
     meta = {"recipe": config.train.recipe, "step": step, "seconds": seconds, "capture": fingerprint}
     checkpoint.save(out / "checkpoints", step, tensors, {**lattice, **meta, "config": "imported"})

@@ -123,6 +123,8 @@ def write(store: Path, record: Record) -> Path:
     config = to_json(record.config)
     config["data"]["path"] = record.scene  # do not publish where the capture was
     config["command"] = ""
+    if start := config.pop("init_from"):
+        config["init_from"] = Path(start).name
     value = {
         "scene": record.scene,
         "key": record.key,

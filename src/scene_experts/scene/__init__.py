@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -38,6 +38,8 @@ class Traits:
     """Edge of the finest lattice cell that rows lie on, trained world units; 0: rows lie on no lattice."""
     experts: int = 0
     """Experts per attribute; 0: the scene has no mixture of experts."""
+    dense_until: int = 0
+    """Last iteration of the experts' warm-up; 0 if there is none."""
     levels: int = 0
     """Levels of detail; 0: the scene has none. `Scene.at_level` draws fewer of them."""
     activation: bool = False
@@ -190,6 +192,19 @@ class SceneConfig(Part, ABC):
     def dense_until(self) -> int:
         """Last iteration of the experts' dense warm-up. 0 if there is none."""
         return 0
+
+    def phases(self) -> dict[str, int]:
+        """Return the last iteration of each phase that a training leaves for good, by the flag that sets it. Empty without phases."""
+        return {}
+
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Dotted paths of settings of a training that have no effect on this scene. A training warns where one was changed."""
+        return ()
+
+    def of_views(self, views: int) -> Self:
+        """Return the settings with which any number of training views is treated as `views` of them. The default depends on no number."""
+        return self
 
     @abstractmethod
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> Scene:

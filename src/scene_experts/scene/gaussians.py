@@ -52,6 +52,13 @@ class Explicit(SceneConfig):
     def grown_as(self) -> str:
         return "Gaussians"
 
+    @property
+    def unused(self) -> tuple[str, ...]:
+        return ("loss.opacity", "loss.load")
+
+    def phases(self) -> dict[str, int]:
+        return {"--scene.sh-ramp": self.sh_ramp * self.sh_degree - 1}
+
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> GaussianScene:
         """Create one Gaussian per point of the cloud. Raises InputError if the cloud is empty."""
         if len(points.xyz) == 0:

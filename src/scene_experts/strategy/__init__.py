@@ -69,6 +69,13 @@ class Strategy(Part, Generic[S], ABC):
         """
         return True
 
+    def adds(self, step: int) -> bool:
+        """Whether `update` at `step` may add rows. The default is the safe answer, True.
+
+        With --max-memory, memory is measured and given back only then.
+        """
+        return True
+
     def survey(self, scene: S, survey: Survey, step: int, generator: torch.Generator) -> None:
         """Look at further training views before `update`. The default does nothing. generator: the only source of randomness."""
 

@@ -103,6 +103,9 @@ class AnchorControl(Strategy[L]):
         """Whether anchors are created or removed at `step`, or the statistics end."""
         return self.adjust.due(step) or step >= self.adjust.stop or step in self.mask_at
 
+    def adds(self, step: int) -> bool:
+        return self.enabled and self.adjust.due(step)
+
     def survey(self, scene: L, survey: Survey, step: int, generator: torch.Generator) -> None:
         """Measure errors over random training views before densification, and the contributions of all slots before a mask."""
         if self.error_views and self.grows_at(scene, step):

@@ -63,6 +63,9 @@ class MCMC(Strategy[GaussianScene]):
             ]
         )
 
+    def adds(self, step: int) -> bool:
+        return self.enabled and self.adjust.due(step)
+
     def update(self, scene: GaussianScene, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
         """Relocate and add Gaussians if densification is due at `step`. Returns None if it is not due.
 

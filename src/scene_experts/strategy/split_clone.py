@@ -97,6 +97,9 @@ class SplitClone(Strategy[GaussianScene]):
         """Whether densification is due at `step`, or the statistics end."""
         return self.adjust.due(step) or step >= self.adjust.stop
 
+    def adds(self, step: int) -> bool:
+        return self.enabled and self.adjust.due(step)
+
     def update(self, scene: GaussianScene, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
         """Clone, split, remove and reset Gaussians if due at `step`. Returns None if densification is not due.
 

@@ -48,10 +48,10 @@ class Direct:
         """Return the tensors of a checkpoint, in process 0. Every process must call this, after `complete`."""
         return self.training.tensors()
 
-    def add(self, decoded: Decoded, render: Render) -> None:
-        """Add a view of this process, after its backward pass."""
+    def add(self, decoded: Decoded, render: Render, number: int) -> None:
+        """Add a view of this process, after its backward pass. number: its iteration."""
         self._note_rows(decoded)
-        self.training.cfg.growth.observe(self.training.scene, decoded, render, self.training.step)
+        self.training.cfg.growth.observe(self.training.scene, decoded, render, number)
 
     def finish(self) -> None:
         """Complete the gradients of the batch, after its last view."""
@@ -109,9 +109,9 @@ class Reduced(Direct):
             )
         self.group.copy_from_first([value for name, value in training.tensors().items() if not name.startswith(("rng.", "queue"))])
 
-    def add(self, decoded: Decoded, render: Render) -> None:
+    def add(self, decoded: Decoded, render: Render, number: int) -> None:
         self._note_rows(decoded)
-        self.pending = self._observe(decoded, render, self.pending)
+        self.pending = self._observe(self.training.scene, decoded, render, number, self.pending)
 
     def finish(self) -> None:
         gradients, counts = _gradients(self.training), self.training.scene.counts()
@@ -148,12 +148,21 @@ class Reduced(Direct):
         self.group.sum(chosen)
         return None if chosen[-1] else chosen[:-1].nonzero().squeeze(1)
 
-    def _observe(self, decoded: Decoded, render: Render, into: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Add a view to the statistics `into` in place of those of the table, and return them."""
-        table = self.training.scene.table
+    def _observe(self, scene: Scene, decoded: Decoded, render: Render, number: int, into: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Add a view, that of iteration `number`, to the statistics `into` in place of those of the table, and return them.
+
+        Where this view does not count but another of the same turn does, they are zeros: all processes have the same columns.
+        """
+        table, growth = scene.table, self.training.cfg.growth
         kept, table.stats = table.stats, into
         try:
-            self.training.cfg.growth.observe(self.training.scene, decoded, render, self.training.step)
+            growth.observe(scene, decoded, render, number)
+            first = number - self.group.rank
+            for other in range(first, first + self.group.size):
+                if not table.stats:
+                    growth.observe(scene, decoded, render, other)
+                    for total in table.stats.values():
+                        total.zero_()
             return table.stats
         finally:
             table.stats = kept
@@ -190,7 +199,7 @@ class Ordered(Reduced):
         super().__init__(training, group, stop)
         self.total: Tensor | None = None
 
-    def add(self, decoded: Decoded, render: Render) -> None:
+    def add(self, decoded: Decoded, render: Render, number: int) -> None:
         self._note_rows(decoded)
         gradients = _gradients(self.training)
         flag = gradients[0].new_full((1,), float(bool(self.stop)))
@@ -198,7 +207,7 @@ class Ordered(Reduced):
             self.total = part.clone() if self.total is None else self.total.add_(part)
         for parameter in _parameters(self.training):
             parameter.grad = None
-        observed = self._observe(decoded, render, {})
+        observed = self._observe(self.training.scene, decoded, render, number, {})
         if observed:
             for part in self.group.gather(_flatten(list(observed.values()))):
                 self._add_statistics(observed, part)

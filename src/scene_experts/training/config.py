@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 from scene_experts.arguments.option import Option
@@ -57,7 +58,7 @@ class Train:
     random_background: bool = False
     """Use a random background colour in each iteration."""
     max_anchors: int = 0
-    """Stop densification at this number of anchors; 0 means no limit."""
+    """Stop densification at this number of anchors; 0 leaves that of the growth rule (a million for 3dgs-mcmc, otherwise none)."""
     sparse_adam: bool = False
     """Update only the rows that a view has decoded (SelectiveAdam of gsplat). Faster if views see a small part of the scene; changes the
     results."""
@@ -93,6 +94,7 @@ class RunConfig:
     deterministic: bool = False
     stop_at: int | None = None
     versions: dict[str, str] = field(default_factory=dict)
+    init_from: Path | None = None  # run folder whose scene the training started from; None: the points of the capture, or an older run
 
 
 def check(cfg: Train) -> None:
@@ -118,6 +120,11 @@ def check(cfg: Train) -> None:
         raise InputError(f"expected learning rates for {cfg.scene.family}, found those for {cfg.rates.family}; use a recipe where they fit")
     if cfg.sparse_adam and not cfg.optimizer.by_row:
         raise InputError("expected an optimiser that can move some rows only for --sparse-adam, found another; leave the flag out")
+
+
+def find_unused(cfg: Train) -> list[str]:
+    """Return the flags of the settings that have no effect on the scene of `cfg` and do not have the default of their part."""
+    return [flag(place) for place in cfg.scene.unused if _has(cfg, place) and _changed(cfg, place)]
 
 
 def unregistered(value: Any) -> list[str]:
@@ -152,6 +159,12 @@ def _has(value: Any, place: str) -> bool:
     first, _, rest = place.partition(".")
     known = dataclasses.is_dataclass(value) and first in {f.name for f in dataclasses.fields(value)}
     return known and (not rest or _has(getattr(value, first), rest))
+
+
+def _changed(part: Any, place: str) -> bool:
+    first, _, rest = place.partition(".")
+    value = getattr(part, first)
+    return _changed(value, rest) if rest else value != next(f.default for f in dataclasses.fields(part) if f.name == first)
 
 
 def _put(part: Any, place: list[str], value: Any) -> Any:

@@ -23,7 +23,7 @@ from scene_experts.scene import Scene
 from scene_experts.strategy import Edit
 from scene_experts.strategy.survey import Photo, Survey
 from scene_experts.training.batch import Direct, check_batch, make_exchange
-from scene_experts.training.config import RunConfig, Train
+from scene_experts.training.config import RunConfig, Train, find_unused
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.guard import explain, find_broken
 from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
@@ -39,9 +39,9 @@ ROUTED = 16_384  # anchors sampled for the routing statistics; the shares are wi
 
 @dataclass(frozen=True)
 class Run:
-    """Options of a training run that do not affect its results, except for `stop_at`."""
+    """Options of a training run. The results depend on `config` and `max_memory`, and their rounding on `device`, `dtype` and `group`."""
 
-    config: RunConfig
+    config: RunConfig  # with `stop_at` and `init_from`
     out: Path | None = None  # the run folder; None writes no files
     device: str = "cpu"
     dtype: torch.dtype = torch.float32  # float64 is for tests of rounding errors with the reference rasteriser
@@ -51,7 +51,6 @@ class Run:
     log_every: int = 10  # iterations between Stepped events
     max_memory: float = 0.0  # GiB of memory (resident, or reserved on the GPU) at which densification stops; 0: no limit
     keep: int = 2  # number of checkpoints to keep
-    initial: Path | None = None  # run folder whose scene the training starts from; None: the points of the capture
     begin: Callable[[Training], None] = lambda training: None  # called once, before the first event
     watch: Callable[[Training], None] = lambda training: None  # called between iterations and not timed; the viewer renders here
     shard: bool = False  # divide the rows of the table among the processes
@@ -142,9 +141,11 @@ def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize
     training = resume(cfg, folder, run.device) if run.resume and folder else None
     if training and training.capture_id not in ("", capture.fingerprint()):
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
-    if training is None and run.initial is not None:
-        training = Training.start_from(cfg, run.initial, capture, run.device)
+    if training is None and run.config.init_from is not None:
+        training = Training.start_from(cfg, run.config.init_from, capture, run.device)
     training = training or Training.start(cfg, capture, run.device, run.dtype)
+    if unused := find_unused(cfg):
+        log.warning("without an effect on the scenes of this recipe: %s", ", ".join(unused))
     training.capture_id = capture.fingerprint()
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
     if run.max_memory > 0:
@@ -187,14 +188,14 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
         shown = exchange.scene_of(cameras, numbers[turn_views[0]], Mode.TRAIN, rasterize.visible)
         done = see_view(training, run, capture, rasterize, numbers[place], *batch[place], scene=shown)
         del shown
-        exchange.add(done.decoded, done.render)
+        exchange.add(done.decoded, done.render, numbers[place])
     assert done is not None
     training.seed_view(training.step + 1)
     exchange.finish()
     rows = exchange.rows() if cfg.sparse_adam or run.shard else None
-    if due := any(cfg.growth.reads(number) for number in numbers):
+    if any(cfg.growth.reads(number) for number in numbers):
         exchange.complete()
-    limited, before = run.max_memory > 0 and due, len(scene.table)
+    limited, before = run.max_memory > 0 and any(cfg.growth.adds(number) for number in numbers), len(scene.table)
     if limited:
         give_back()
     cap = exchange.limit(anchor_cap(scene, cfg.growth.max_anchors, run.max_memory, training.largest), run.max_memory > 0)

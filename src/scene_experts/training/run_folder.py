@@ -144,11 +144,13 @@ def held(out: Path) -> Iterator[None]:
 
 
 def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False, exported: Iterable[Path] = ()) -> None:
-    """Prepare `out` for a run: call `check`, remove unfinished files of a killed training and the checkpoints and results of an
-    overwritten run, and write config.json."""
+    """Prepare `out` for a run: call `check`, remove unfinished files of a killed training, the metrics of a run that is not resumed and
+    the checkpoints and results of an overwritten run, and write config.json."""
     check(out, config, resume, overwrite)
     for unfinished in (path for pattern in _UNFINISHED for path in out.glob(pattern)):
         unfinished.unlink(missing_ok=True)
+    if not resume:
+        (out / "metrics.jsonl").unlink(missing_ok=True)  # a run with --init-from keeps the lines up to its start
     if overwrite:
         results = [out / f"{name}{suffix}.json" for name in ("results", "per_view") for suffix in ("", "_train", "_half")]
         others = [*exported, out / "report.html", out / "config.json"]
@@ -160,6 +162,13 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False,
         for sidecar in (out / "point_cloud").glob("iteration_*/scene.json"):  # a later iteration's would be taken for the new run's
             shutil.rmtree(sidecar.parent, ignore_errors=True)
     _write_config(out, config)
+
+
+def as_begun(out: Path, config: RunConfig) -> RunConfig:
+    """Return the configuration with the `init_from` of the run in `out`, unless it has one or there is no run. For a run to resume."""
+    if config.init_from is not None or not (out / "config.json").is_file():
+        return config
+    return replace(config, init_from=read_config(out).init_from)
 
 
 def _write_config(out: Path, config: RunConfig) -> None:

@@ -69,15 +69,15 @@ class Sharded(Reduced):
         return self.view
 
     @torch.no_grad()
-    def add(self, decoded: Decoded, render: Render) -> None:
+    def add(self, decoded: Decoded, render: Render, number: int) -> None:
         """Send the gradients and statistics of the rows of the view home, and add those that arrive to the rows of this process."""
         assert self.view is not None
         here, table, cfg = self.view.table, self.scene.table, self.training.cfg
-        cfg.growth.observe(self.view, decoded, render, self.training.step)
+        stats = self._observe(self.view, decoded, render, number, {})
         chosen = torch.zeros(len(here), dtype=torch.bool, device=here.device)
         chosen[decoded.rows] = True
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in here.params.values()]
-        stats, self.view = here.stats, None
+        self.view = None
         sent = [*gradients, *stats.values(), chosen]
         packed = pack_rows(sent)
         arrived = torch.empty_like(packed).index_copy_(0, self.order, packed)

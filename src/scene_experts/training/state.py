@@ -17,7 +17,7 @@ from scene_experts.core.plain import MOST_DIFFERENCES, differences, from_json, t
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding
 from scene_experts.data.capture import Capture
-from scene_experts.scene import Scene, restore_scene
+from scene_experts.scene import Scene, SceneConfig, restore_scene
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.training.average import Averages
 from scene_experts.training.clock import Clock
@@ -25,6 +25,7 @@ from scene_experts.training.config import Train
 from scene_experts.training.guard import check_state
 from scene_experts.training.memory import Largest
 from scene_experts.training.old_hash import old_hash
+from scene_experts.training.run_folder import read_config
 
 log: logging.Logger = logging.getLogger(__name__)
 
@@ -84,7 +85,8 @@ class Training:
 
         The scene has its averaged weights, if there are any. The optimiser, the statistics and the order of the views start anew.
 
-        Raises InputError if the run has no checkpoint, another recipe, capture or scene, or as many iterations as `cfg` already.
+        Raises InputError if the run has no checkpoint, another recipe, capture or scene, or as many iterations as `cfg` already, or if
+        `cfg` would put its scene back into a phase that it has left, such as the dense warm-up.
         """
         found = checkpoint.newest(run / "checkpoints")
         if found is None:
@@ -96,6 +98,7 @@ class Training:
         if not int(meta["step"]) < cfg.iterations or int(meta["step"]) % cfg.batch:
             more = f"above {meta['step']}" if int(meta["step"]) >= cfg.iterations else f"and a --batch that divides {meta['step']}"
             raise InputError(f"expected --iterations {more}, where the run of --init-from ended, found {cfg.iterations}; change it")
+        check_phases(cfg, read_config(run).train.scaled_scene(), int(meta["step"]))
         torch.manual_seed(cfg.seed)
         with guarding(run, RUN):
             training = cls(cfg, restore_foreign(cfg.scene, tensors, meta, averaged=True).to(device))
@@ -223,6 +226,20 @@ class Training:
         training.queue = tensors["queue"].tolist()
         training.step, training.clock, training.capture_id = int(meta["step"]), Clock.of(meta), meta.get("capture", "")
         return training
+
+
+def check_phases(cfg: Train, before: SceneConfig, step: int) -> None:
+    """Raise InputError if a scene that was trained with `before` until iteration `step` has left a phase in which `cfg` still is then.
+
+    Both must be scaled. In an earlier phase, other networks, levels or harmonics draw the scene than those that were trained last.
+    """
+    left = {flag for flag, last in before.phases().items() if step > last}
+    for flag, last in cfg.scene.phases().items():
+        if flag in left and step <= last:
+            raise InputError(
+                f"expected the phase of {flag} to end before iteration {step}, as the run of --init-from has left it there, "
+                f"found one until iteration {last}; give fewer --iterations or a smaller {flag}"
+            )
 
 
 def check_same(cfg: Train, meta: dict[str, Any]) -> None:

@@ -55,10 +55,15 @@ def paint(
         draws: The same scene frozen (`Scene.frozen`), which is faster. Expert pictures need the routing and do not use it.
 
     Raises:
-        InputError: if the look needs experts or an activation ratio and the scene has none.
+        InputError: if the look needs experts or an activation ratio and the scene has none, or not yet.
     """
     routed = look.only is not None or look.show in ("experts", "entropy")
     decoded = (scene if draws is None or routed else draws)(camera, step, Mode.DRAW, rasterize.visible)
+    if routed and not decoded.routing and step <= scene.traits.dense_until:
+        raise InputError(
+            f"expected a scene whose parts have their own experts, from iteration {scene.traits.dense_until + 1} on, found one network for "
+            f"all of it at iteration {step}; continue the training, or leave --show and --only out"
+        )
     gaussians = decoded.gaussians
     if look.only is not None:
         mine = assign_gaussians(require_routing(decoded, look.attribute), look.attribute, scene.K)

@@ -75,3 +75,14 @@ def test_nothing_is_written_without_a_folder_nor_before_the_first_event(tmp_path
     kinds = [type(event) for event in recording.train(run_in(None, capture), capture, CPU)]
     recording.train(run_in(tmp_path / "run", capture), capture, CPU)
     assert kinds[0] is Started and kinds[-1] is Finished and Saved not in kinds and not list(tmp_path.iterdir())
+
+
+def test_a_run_that_is_resumed_before_its_first_checkpoint_starts_from_the_scene_that_it_began_with(tmp_path, capture):
+    list(recording.train(run_in(tmp_path / "first", capture), capture, CPU))
+    longer = replace(RECIPES["scaffold-gs"][1], iterations=8)
+    begun = RunConfig(longer, Data(capture.root), init_from=tmp_path / "first")
+    run_folder.prepare(tmp_path / "second", begun, resume=False)  # and killed
+    resumed = Run(replace(begun, init_from=None), tmp_path / "second", resume=True)
+    events = list(recording.train(resumed, capture, CPU))
+    assert isinstance(events[0], Started) and events[0].step == 4
+    assert run_folder.read_config(tmp_path / "second") == replace(begun, data=Data(capture.root.absolute()))

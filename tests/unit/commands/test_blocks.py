@@ -6,12 +6,18 @@ import pytest
 
 from scene_experts import cli
 from scene_experts.commands.train import parse_train
+from scene_experts.data.capture import load
+from scene_experts.scene.anchors.few_views import find_weight
 from support.synthetic import make_capture
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     return make_capture(tmp_path_factory.mktemp("plan") / "box", views=9, size=(48, 32), points=300).folder
+
+
+def trainings(plan):
+    return [line for line in (plan / "commands.sh").read_text().splitlines() if " train " in line]
 
 
 def test_the_commands_of_a_plan_are_commands_of_train(capture, tmp_path, capsys):
@@ -33,6 +39,28 @@ def test_the_commands_of_a_plan_are_commands_of_train(capture, tmp_path, capsys)
     joint = trains[-1].cfg.rates  # the constant rates fall while the blocks are trained together
     assert joint.at("feature", 900, 990, 1.0) == pytest.approx(0.0075, rel=1e-3)
     assert joint.at("feature", 990, 990, 1.0) == pytest.approx(0.05 * 0.0075)
+
+
+@pytest.mark.parametrize("options", ["scaffold-gs-bank", "moe-gs-balance", "scaffold-gs --train=--scene.appearance=8"])
+def test_blocks_leave_what_all_anchors_share_as_it_is(options, capture, tmp_path):
+    assert cli.main(["blocks", "plan", str(capture), "--out", str(tmp_path), "--recipe", *options.split()]) == 0
+    cfg = parse_train(shlex.split(trainings(tmp_path)[1])[2:]).cfg
+    loaded = load(capture)
+    scene = cfg.scene.start(loaded.points, loaded.extent, [loaded.views[i].camera for i in loaded.train])
+    loaded.images.close()
+    rates = {name: cfg.rates.at(name, 1, 100, 1.0) for name in scene.rate_groups()}
+    assert {name for name, rate in rates.items() if rate} == {"feature", "offsets", "log_scaling"}
+    assert getattr(cfg.scene.decoder, "speed", 0) == 0  # of the biases that balance the experts
+
+
+@pytest.mark.parametrize(("few", "weight"), [(3, 0.0), (4, 0.25), (7, 1.0)])  # of 7 views
+def test_blocks_have_the_dropout_and_the_jitter_of_a_training_of_all_views(few, weight, capture, tmp_path):
+    recipe = ["--recipe", "scene-experts", f"--train=--scene.few-views={few} --scene.dropout 0.3"]
+    assert cli.main(["blocks", "plan", str(capture), "--out", str(tmp_path), *recipe]) == 0
+    coarse, block, *_, joint = (parse_train(shlex.split(line)[2:]).cfg.scene for line in trainings(tmp_path))
+    kept = find_weight(block.few_views, 2)
+    assert (block.dropout * kept, block.view_jitter * kept) == pytest.approx((0.3 * weight, 0.5 * weight))
+    assert coarse.few_views == joint.few_views == few
 
 
 def test_words_that_do_not_fit(capture, tmp_path, capsys):

@@ -52,6 +52,12 @@ def test_numbers_no_training_can_have_name_their_flag(flag, value):
         check_settings(parse_train(["moe-gs", *PLACES, flag, value]))
 
 
+def test_the_run_to_start_from_is_part_of_the_configuration(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run_of(parse_train(["moe-gs", *PLACES, "--init-from", "coarse"]), "").config.init_from == tmp_path / "coarse"
+    assert run_of(parse_train(["moe-gs", *PLACES]), "").config.init_from is None
+
+
 def test_a_restarted_process_continues_a_run_that_had_begun(tmp_path):
     group = Alone()
     command = parse_train(["moe-gs", "--data", "c", "--out", str(tmp_path), "--overwrite"])

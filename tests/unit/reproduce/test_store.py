@@ -27,6 +27,13 @@ def test_a_record_comes_back_as_it_was_without_the_place_of_the_capture(tmp_path
     assert [r.key for r in load(tmp_path)] == [made.key]
 
 
+def test_a_record_names_the_run_that_it_started_from_if_there_is_one(tmp_path):
+    made = record()
+    assert "init_from" not in unpack(json.loads(write(tmp_path, made).read_text()))["config"]
+    begun = replace(made, config=replace(made.config, init_from=Path("/home/someone/coarse")))
+    assert read(write(tmp_path, begun)).config.init_from == Path("coarse")
+
+
 def test_a_record_keeps_the_code_that_it_was_trained_with(tmp_path):
     made = replace(record(), code="0123456789ab")
     back = read(write(tmp_path, made))

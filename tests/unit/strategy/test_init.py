@@ -28,5 +28,14 @@ def test_impossible_numbers_are_refused(recipe):
         replace(strategy, max_anchors=-1).check()
 
 
+@pytest.mark.parametrize("recipe", METHODS)
+def test_rows_are_added_while_densification_runs_and_not_after_it(recipe):
+    strategy = RECIPES[recipe][1].growth
+    adjust = strategy.adjust
+    steps = [step for step in range(1, adjust.stop + 2 * adjust.interval) if strategy.adds(step)]
+    assert steps == list(range(adjust.start + adjust.interval, adjust.stop, adjust.interval))
+    assert not any(replace(strategy, enabled=False).adds(step) for step in steps)
+
+
 def test_an_edit_says_what_it_did():
     assert Edit(3, 1, 12) == Edit(grown=3, pruned=1, anchors=12, capped=False)

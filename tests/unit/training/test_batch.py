@@ -91,7 +91,7 @@ def test_unordered_sums_differ_by_rounding_alone(folder, tmp_path):
     list(events(cfg, folder, tmp_path / "one", stop_at=12))
     assert run_group(2, unordered) == [0, 0]
     one, two = last_tensors(tmp_path / "one"), last_tensors(tmp_path / "two")
-    assert one.keys() == two.keys() and one["stats.visits"].max() == 8  # the views of two batches
+    assert one.keys() == two.keys() and one["stats.visits"].max() == 7  # iterations 6 to 12: 5 is `start_stat`
     assert torch.allclose(one["network.opacity.w1"], two["network.opacity.w1"], rtol=1e-2, atol=1e-3)
     for name in ("visits", "count", "grad"):
         assert float(one[f"stats.{name}"].sum()) == pytest.approx(float(two[f"stats.{name}"].sum()), rel=1e-2)
@@ -132,6 +132,13 @@ def test_iterations_count_views(folder, tmp_path):
     assert [e.step for e in seen if isinstance(e, Previewed)] == [12, 20, 24]
     assert [e.step for e in seen if isinstance(e, Densified)] == [20]
     assert float(last_tensors(tmp_path)["adam.feature.0.step"]) == 6 - 1  # anchors miss the step of a densification
+
+
+def test_growth_observes_each_view_at_its_own_iteration(folder, monkeypatch):
+    cfg, seen = of_family("scaffold-gs"), []
+    monkeypatch.setattr(type(cfg.growth), "observe", lambda self, scene, decoded, render, step: seen.append(step))
+    list(events(cfg, folder, stop_at=8))
+    assert seen == [1, 2, 3, 4, 5, 6, 7, 8]
 
 
 @pytest.mark.parametrize(("power", "factor"), [(0.5, 2), (1.0, 4), (0.0, 1)])

@@ -8,7 +8,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.scene.gaussians import ExplicitRates
 from scene_experts.strategy.grow_octree import GrowOctree
 from scene_experts.strategy.split_clone import SplitClone
-from scene_experts.training.config import check
+from scene_experts.training.config import check, find_unused
 from scene_experts.training.losses import Weights
 from support.messages import naming
 
@@ -22,6 +22,12 @@ def test_iterations_scale_windows_and_nothing_else():
     assert RECIPES["moe-gs"][1].scaled() == RECIPES["moe-gs"][1]
     with pytest.raises(InputError, match="--iterations"):
         replace(RECIPES["moe-gs"][1], iterations=0).scaled()
+
+
+@pytest.mark.parametrize("name", list(RECIPES))
+def test_without_a_limit_of_the_run_the_limit_is_that_of_the_growth_rule(name):
+    assert RECIPES[name][1].scaled().growth.max_anchors == (1_000_000 if name == "3dgs-mcmc" else 0)
+    assert replace(RECIPES[name][1], max_anchors=7).scaled().growth.max_anchors == 7
 
 
 @pytest.mark.parametrize("name", list(RECIPES))
@@ -50,6 +56,29 @@ def test_impossible_settings_name_their_flag():
     check(replace(moe, rates=replace(moe.rates, feature=Rate(0.0, 0.0))))
     with pytest.raises(InputError, match=naming("--x", "nan")):
         expect_at_least([("--x", float("nan"), 0)])
+
+
+@pytest.mark.parametrize(
+    ("recipe", "part", "changes"),
+    [
+        ("scene-experts", "loss", {"load": 0.1, "mean_opacity": 0.1, "mean_size": 0.1}),
+        ("scene-experts", "rates", {"router_scale": 2.0}),
+        ("scaffold-gs", "loss", {"load": 0.1, "mean_size": 0.1}),
+        ("3dgs", "loss", {"load": 0.1, "opacity": 0.1}),
+        ("sags", "loss", {"load": 0.1, "mean_opacity": 0.1}),
+    ],
+)
+def test_settings_without_an_effect_are_found_and_no_others(recipe, part, changes):
+    cfg = RECIPES[recipe][1]
+    used = replace(cfg.loss, dssim=0.3)
+    for name, value in changes.items():
+        changed = replace(cfg, **{"loss": used, part: replace(used if part == "loss" else cfg.rates, **{name: value})})
+        assert find_unused(changed) == [f"--{part}.{name.replace('_', '-')}"]
+
+
+@pytest.mark.parametrize("name", list(RECIPES))
+def test_recipes_have_no_setting_without_an_effect(name):
+    assert find_unused(RECIPES[name][1]) == []
 
 
 def test_parts_that_do_not_fit_together_are_refused():

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.schedule import Every
 from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
@@ -120,6 +121,18 @@ def test_memory_cap_stops_growth(folder, monkeypatch):
     monkeypatch.setattr("scene_experts.training.trial.check_start", lambda *args: None)
     capped = [e for e in events(config(), folder, stop_at=100, max_memory=0.002) if isinstance(e, Densified)]
     assert capped and not any(e.edit.grown for e in capped) and any(e.edit.capped for e in capped)
+
+
+def test_a_memory_cap_measures_only_where_rows_may_be_added(folder, monkeypatch):
+    asked: list[int] = []
+    monkeypatch.setattr("scene_experts.training.loop.give_back", lambda: asked.append(1))
+    made = config()
+    made = replace(made, growth=replace(made.growth, adjust=Every(0, 200, 5)))  # scaled to 4
+    list(events(made, folder, stop_at=8, max_memory=1000.0))
+    assert not asked
+    made = replace(made, growth=replace(made.growth, adjust=Every(0, 500, 5)))  # scaled to 10
+    list(events(made, folder, stop_at=8, max_memory=1000.0))
+    assert len(asked) == 2  # before and after iteration 5
 
 
 def test_a_start_beyond_the_memory_cap_is_refused_before_anything_is_written(folder, tmp_path):
@@ -268,3 +281,13 @@ def test_what_an_iteration_leaves_holds_no_graph(folder):
     kept = without_graph(({"a": x}, [x, 3], None))
     assert not kept[0]["a"].requires_grad and not kept[1][0].requires_grad and kept[1][1:] == [3] and kept[2] is None
     capture.images.close()
+
+
+def test_a_setting_without_an_effect_is_said_at_the_start(folder, caplog):
+    made = config("scene-experts")
+    made = replace(made, scene=replace(made.scene, decoder=replace(made.scene.decoder, load_scope="all")))
+    list(events(made, folder, stop_at=1))
+    assert "--scene.decoder.load-scope" in caplog.text and caplog.text.count("effect") == 1
+    caplog.clear()
+    list(events(config("scene-experts"), folder, stop_at=1))
+    assert "effect" not in caplog.text

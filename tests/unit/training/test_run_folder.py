@@ -140,14 +140,14 @@ def test_overwriting_removes_what_belonged_to_the_old_run_and_nothing_else(run):
         "test/experts/cov.png",
     ]
     mine = ["notes.txt", "scene.blend", "scenery.ply"]
-    for name in (*exported, *mine, "results.json", "per_view_train.json", "report.html", "previews/000030.png"):
+    for name in (*exported, *mine, "results.json", "per_view_train.json", "report.html", "metrics.jsonl", "previews/000030.png"):
         (run / name).write_text("old")
     for name in ("iteration_20/scene.json", "iteration_7/mine.txt"):
         (run / "point_cloud" / name).parent.mkdir(parents=True)
         (run / "point_cloud" / name).write_text("old")
     other = RunConfig(RECIPES["scaffold-gs"][1], CONFIG.data)
     run_folder.check(run, other, resume=False, overwrite=True)
-    assert len(state(run)) == 16
+    assert len(state(run)) == 17
     run_folder.prepare(run, other, False, True, exported=[run / "scene.compact", run / "scene.ply.json"])
     assert state(run).keys() == {"config.json", *mine, "point_cloud/iteration_7/mine.txt"} and run_folder.read_config(run) == other
 

@@ -8,8 +8,11 @@ import torch
 from scene_experts import cli
 from scene_experts.core.errors import InputError
 from scene_experts.data.capture import load
+from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
 from scene_experts.scene import restore_scene
+from scene_experts.training import run_folder
+from scene_experts.training.config import RunConfig
 from scene_experts.training.old_hash import old_hash
 from scene_experts.training.run_folder import open_run
 from scene_experts.training.state import Training, resume, save
@@ -129,3 +132,22 @@ def test_a_training_starts_from_exactly_the_scene_of_another(tmp_path):
             Training.start_from(replace(cfg, iterations=iterations, batch=batch).scaled(), tmp_path / "run", capture, "cpu")
     with pytest.raises(InputError, match="--init-from"):
         Training.start_from(cfg.scaled(), tmp_path, capture, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("recipe", "flag"),
+    [("scene-experts", "--scene.decoder.warmup"), ("octree-gs", "--scene.select.coarse-until"), ("3dgs", "--scene.sh-ramp")],
+)
+def test_a_longer_schedule_does_not_put_a_scene_back_into_a_phase_that_it_has_left(recipe, flag, capture, tmp_path):
+    cfg = replace(RECIPES[recipe][1], iterations=1000)
+    run_folder.prepare(tmp_path, RunConfig(cfg, Data(capture.root)), resume=False)
+    training = Training.start(cfg.scaled(), capture, "cpu")
+    longer = replace(cfg, iterations=30_000).scaled()
+    training.step = 20  # within the phase
+    save(training, tmp_path / "checkpoints", keep=1)
+    assert Training.start_from(longer, tmp_path, capture, "cpu").step == 20
+    training.step = 600  # after it
+    save(training, tmp_path / "checkpoints", keep=1)
+    with pytest.raises(InputError, match=naming(flag, 600)):
+        Training.start_from(longer, tmp_path, capture, "cpu")
+    assert Training.start_from(replace(cfg, iterations=1500).scaled(), tmp_path, capture, "cpu").step == 600

@@ -9,6 +9,7 @@ from scene_experts.render import choose
 from scene_experts.scene import Traits
 from scene_experts.view.paint import PALETTE, Look, available_shows, color_ramp, color_rows, paint
 from scene_experts.view.show import SHOWS
+from support.messages import naming
 from support.scenes import CAMERA, start_scene
 
 BLACK = torch.zeros(3)
@@ -68,6 +69,12 @@ def test_a_scene_without_experts_has_no_expert_picture():
     with pytest.raises(InputError, match="color"):
         paint(start_scene("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("experts"))
     assert paint(start_scene("scaffold-gs"), CAMERA, 1, DRAW, BLACK, Look("activation")).shape == (32, 48, 3)
+
+
+@pytest.mark.parametrize("look", [Look("experts"), Look("entropy"), Look(only=(0,))])
+def test_a_scene_before_its_split_says_from_when_on_it_has_experts(look):
+    with pytest.raises(InputError, match=naming("10001", "500", "--only")):
+        paint(start_scene("scene-experts"), CAMERA, 500, DRAW, BLACK, look)
 
 
 def test_what_can_be_shown_follows_the_traits_of_a_scene():

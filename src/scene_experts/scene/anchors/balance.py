@@ -64,7 +64,7 @@ class BalancedHead(MixtureHead):
             if self.batch == 1:
                 self.move(count, self.config.speed)
             else:
-                self.counted = self.counted.to(count) + count
+                self.counted += count
         return routing, w
 
     def move(self, count: Tensor, speed: float) -> None:
@@ -72,7 +72,6 @@ class BalancedHead(MixtureHead):
         self.router_balance += speed * (count.mean() - count).sign()
 
     def counts(self) -> list[Tensor]:
-        self.counted = self.counted.to(self.router_balance)
         return [self.counted]
 
     def settle(self) -> None:

@@ -11,7 +11,7 @@ changes its expert, and none needs a balancing loss.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -43,6 +43,10 @@ class LocalExperts(Experts):
 
     learns_routing: ClassVar[bool] = False
 
+    @property
+    def unused(self) -> tuple[str, ...]:
+        return ("loss.load", "rates.router_scale", "scene.decoder.load_scope", "scene.decoder.expert_init")
+
     def head(self) -> type[LocalHead]:
         return LocalHead
 
@@ -58,7 +62,8 @@ class LocalHead(MixtureHead):
     """A mixture whose router chooses by the nearest centre. `split` sets its weights; no loss trains them."""
 
     def __init__(self, config: Experts, *shape: Any) -> None:
-        super().__init__(config, *shape)
+        varied = config.expert_init == "variance"  # for means of many outputs; here one network begins alone
+        super().__init__(replace(config, expert_init="independent") if varied else config, *shape)
         for parameter in (self.router_w, self.router_b):
             assert parameter is not None
             parameter.requires_grad_(False).zero_()
@@ -81,11 +86,16 @@ class LocalHead(MixtureHead):
         for parameter in (self.w1, self.b1, self.w2, self.b2):
             for tensor in (parameter.data, *companions(parameter)):
                 tensor[1:] = tensor[:1].clone()
+        if len(positions) == 0:  # no places to divide: the router stays as it is
+            return
         centres, spread = find_centres(positions.cpu(), self.experts)
         self.router_w.zero_()
         self.router_w[:, -3:] = (2.0 * centres / spread).to(self.router_w)
         assert self.router_b is not None
         self.router_b.copy_(-centres.square().sum(1) / spread)
+        for parameter in (self.router_w, self.router_b):
+            for tensor in companions(parameter):  # its average: no moments, as nothing trains it
+                tensor.copy_(parameter)
 
     def route(self, feature: Tensor, step: int, position: Tensor | None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor]:
         """Route as `MixtureHead` does. During the warm-up, the gate of expert 0 is 1."""

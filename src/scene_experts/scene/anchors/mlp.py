@@ -95,6 +95,11 @@ class Decoder(Part, ABC):
         """Whether the experts' load is balanced over all anchors instead of the visible ones."""
         return False
 
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Settings without an effect on these networks, as `SceneConfig.unused`."""
+        return ()
+
     @abstractmethod
     def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> nn.Module:
         """Build the `Head` of an attribute. It maps inputs [A, inputs] and features [A, feature] to outputs [A, outputs]."""
@@ -107,6 +112,10 @@ class Plain(Decoder):
 
     depth: int = 2
     """Number of linear layers per network."""
+
+    @property
+    def unused(self) -> tuple[str, ...]:
+        return ("loss.load", "rates.router_scale")
 
     def check(self) -> None:
         """Raises InputError for a network without a hidden layer."""

@@ -10,6 +10,8 @@ from scene_experts.core.schedule import Rate
 from scene_experts.scene import LearningRates
 from scene_experts.scene.anchors.mlp import ATTRIBUTES
 
+SHARED = ("mix", "appearance")  # beside the decoder networks, what all anchors share
+
 
 @register
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Rates(LearningRates):
     router_scale: float = 1.0
     """Factor of a router's learning rate over that of its attribute."""
     networks: float = 1.0
-    """Factor of the learning rates of the decoder networks and their routers."""
+    """Factor of the learning rates of the decoder networks and their routers. 0 also keeps the feature bank and the appearance codes."""
     anneal: float = 1.0
     """Final value of the learning rates that are constant otherwise (feature, log_scaling, cov), relative to their first; 1 leaves them
     constant."""
@@ -61,6 +63,8 @@ class Rates(LearningRates):
         value = rate.at(step, total) * factor
         if attribute in ATTRIBUTES and self.networks != 1.0:
             value *= self.networks
+        if attribute in SHARED and self.networks == 0:
+            return 0.0
         if self.anneal != 1.0 and rate.first == rate.last:
             past = (step / max(total, 1) - self.anneal_from) / (1.0 - self.anneal_from)
             value *= self.anneal ** min(max(past, 0.0), 1.0)

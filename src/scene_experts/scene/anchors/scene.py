@@ -101,10 +101,22 @@ class Anchors(SceneConfig):
     def dense_until(self) -> int:
         return self.decoder.dense_until
 
+    @property
+    def unused(self) -> tuple[str, ...]:
+        return ("loss.mean_opacity", "loss.mean_size", *self.decoder.unused)
+
+    def phases(self) -> dict[str, int]:
+        return {"--scene.decoder.warmup": self.dense_until, **self.select.phases()}
+
     def needs_whole_table(self) -> str:
         if self.select.has_levels:
             return "anchors on levels"
         return "--scene.decoder.load-scope all" if self.decoder.balances_all else ""
+
+    def of_views(self, views: int) -> Self:
+        weight = find_weight(self.few_views, views)
+        fixed = replace(self, few_views=0, dropout=self.dropout * weight, view_jitter=self.view_jitter * weight)
+        return self if weight == 1 else fixed  # 1: with fewer views too
 
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
         """Create a scene with one anchor per occupied voxel of the point cloud."""
@@ -157,7 +169,7 @@ class AnchorScene(LatticeScene):
     ) -> None:
         """voxel: edge of the finest lattice cell; extent: the scene's R; both in trained world units. views: the training cameras' ids."""
         super().__init__(table, extent)
-        self.config, self.voxel = config, voxel
+        self.config, self.voxel, self.dense_until = config, voxel, config.dense_until
         self.select = select or AllAnchors()
         heads: dict[str, nn.Module] = {}
         for attribute in ATTRIBUTES:
@@ -177,6 +189,7 @@ class AnchorScene(LatticeScene):
             "anchors",
             self.voxel,
             experts=max(head.experts for head in self.heads.values()),
+            dense_until=self.dense_until,
             levels=self.select.count,
             activation=True,
             appearance=self.config.appearance,

@@ -67,6 +67,10 @@ class Selection(Part, ABC):
     has_levels: ClassVar[bool] = False
     """Whether anchors lie on levels of detail."""
 
+    def phases(self) -> dict[str, int]:
+        """Return the last iterations of its phases, as `SceneConfig.phases`."""
+        return {}
+
     @abstractmethod
     def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
         """Create the initial anchors from points [P, 3]. Returns the facts of the rows, the edge of the finest cell and the selector."""
@@ -194,6 +198,9 @@ class Octree(Selection):
 
     def scaled(self, factor: float) -> Self:
         return replace(self, coarse_until=round(self.coarse_until * factor))
+
+    def phases(self) -> dict[str, int]:
+        return {"--scene.select.coarse-until": self.coarse_until} if self.coarse_to_fine else {}
 
     def turns(self, levels: Levels) -> list[float]:
         """Iterations after which one more level is used. Intervals shrink by `coarse_factor`; the last ends at `coarse_until`."""

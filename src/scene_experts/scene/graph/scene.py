@@ -70,6 +70,10 @@ class GraphPoints(SceneConfig):
     def grown_as(self) -> str:
         return "graph points"
 
+    @property
+    def unused(self) -> tuple[str, ...]:
+        return ("loss.load", "loss.mean_opacity", "loss.mean_size")
+
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> GraphScene:
         """Create points at the occupied voxels of the cloud and midpoints between them. Raises InputError if the cloud is empty."""
         if len(points.xyz) == 0:

@@ -92,14 +92,16 @@ def test_an_anchor_has_the_expert_of_the_nearest_centre():
 
 
 def test_moments_and_averages_are_copied_too():
-    made, held = scene(), {}
+    made, held, routers = scene(), {}, {}
     for head in made.heads.values():
         for p in (head.w1, head.b1, head.w2, head.b2):
             held[id(p)] = [torch.randn_like(p), torch.randn_like(p)]
+        routers |= {id(p): (p, torch.zeros_like(p)) for p in (head.router_w, head.router_b)}
     first = {key: [t[0].clone() for t in tensors] for key, tensors in held.items()}
-    split(made, lambda p: held[id(p)])
+    split(made, lambda p: held[id(p)] if id(p) in held else [routers[id(p)][1]])
     for key, tensors in held.items():
         assert all(torch.equal(t, f.expand_as(t)) for t, f in zip(tensors, first[key]))
+    assert all(average.any() and torch.equal(p, average) for p, average in routers.values())
 
 
 def test_other_iterations_change_nothing():
@@ -148,12 +150,27 @@ def test_fewer_positions_than_centres(n):
     assert centres.shape == (8, 3) and centres.isfinite().all() and spread > 0
 
 
+def test_a_scene_that_lost_all_its_anchors_is_split_without_places():
+    made = scene()
+    for head in made.heads.values():
+        head.begin(WARM, WARM + 1, lambda: torch.zeros(0, 3), NONE)
+        assert torch.equal(head.w1, head.w1[:1].expand_as(head.w1)) and not head.router_w.any()
+
+
 def test_invalid_settings_are_refused():
     check(RECIPES["scene-experts"][1])
     with pytest.raises(InputError, match="positions"):
         LocalExperts(router=Router()).check()
     with pytest.raises(InputError, match="shared"):
         LocalExperts(shared=True).check()
+
+
+def test_the_first_weights_are_those_of_one_network_with_any_variance():
+    first = []
+    for how in ("independent", "variance"):
+        torch.manual_seed(0)
+        first.append(LocalExperts(expert_init=how).build("color", 35, 16, 30, 32).state_dict())
+    assert all(torch.equal(value, first[1][name]) for name, value in first[0].items())
 
 
 def test_the_heads_are_local():

@@ -21,6 +21,9 @@ def test_rates_of_the_networks():
     assert rates.at("opacity", 1, 1000, 1.0) == pytest.approx(3 * Rates().at("opacity", 1, 1000, 1.0))
     assert rates.at("cov.router", 1, 1000, 1.0) == pytest.approx(1.5 * 0.004)
     assert rates.at("feature", 1, 1000, 1.0) == 0.0075
+    for group in ("mix", "appearance"):
+        assert rates.at(group, 1, 1000, 1.0) == Rates().at(group, 1, 1000, 1.0) > 0
+        assert Rates(networks=0.0).at(group, 1, 1000, 1.0) == 0
 
 
 @pytest.mark.parametrize("change", [{"anneal": 0.0}, {"anneal": 2.0}, {"anneal_from": 1.0}, {"networks": -1.0}])
