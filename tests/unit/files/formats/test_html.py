@@ -85,6 +85,28 @@ def psnr(a, b):
 @pytest.mark.slow
 @pytest.mark.foreign
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.parametrize("factor", [1e-5, 1e5])
+def test_a_scene_in_other_units_in_a_browser(tmp_path, factor):
+    playwright = pytest.importorskip("playwright.sync_api")
+    s, start = blobs(), pose(3)
+    far = {**start, "position": [factor * x for x in start["position"]]}
+    assert html.unit_of(scaled(s, factor)) != 1
+    write(tmp_path / "a.html", scaled(s, factor), {"camera": far, "cameras": [far], "background": BACKGROUND})
+    with playwright.sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        page.goto((tmp_path / "a.html").as_uri())
+        page.wait_for_function("window.sceneExperts", timeout=60_000)
+        page.add_style_tag(content="#bar { display: none }")
+        page.wait_for_function("sceneExperts.settled().then(() => true)", timeout=60_000)
+        shown = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
+        browser.close()
+    assert psnr(shown, ours(s, start)) > 28
+
+
+@pytest.mark.slow
+@pytest.mark.foreign
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 def test_the_page_in_a_browser(tmp_path):
     """The start pose, a pose set from outside, one from the link, a drag and a key: from disk, without a request to anywhere."""
     playwright = pytest.importorskip("playwright.sync_api")
