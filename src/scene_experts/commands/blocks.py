@@ -123,11 +123,12 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]], every: int =
     runs = [str(out / f"run{number}") for number in range(command.blocks)]
     memory = ["--max-memory", f"{command.max_memory:g}"] if command.max_memory else []
     few = ["--max-anchors", str(command.coarse_anchors)] if command.coarse_anchors else []
-    cfg = parse_train([*train[2:], "--out", coarse]).cfg
+    cfg = parse_train([*train[2:], "--out", coarse, "--iterations", str(total)]).cfg
+    until = max(1, total // 3, cfg.scaled_scene().dense_until)  # a scene is divided among experts before it is cut into blocks
     own = flags_of(cfg, [("scene.decoder.speed", 0), *(changes(cfg.scene, cfg.scene.of_views(every), "scene.") or [])])
     block = [PROG, "train", command.recipe, *data, *without(more, own[::2])]
     same = ["--rates.networks", "0", *own]  # what all anchors share stays equal in all blocks
-    lines = [[*train, "--out", coarse, "--iterations", str(total), "--stop-at", str(max(1, total // 3)), *few, *memory]]
+    lines = [[*train, "--out", coarse, "--iterations", str(total), "--stop-at", str(until), *few, *memory]]
     for number, run in enumerate(runs):
         views = ["--views", str(out / f"block{number}.json"), "--init-from", coarse, *same]
         inside = ["--growth.bounds", *(f"{side:.6g}" for side in bounds[number])]

@@ -41,6 +41,14 @@ def test_the_commands_of_a_plan_are_commands_of_train(capture, tmp_path, capsys)
     assert joint.at("feature", 990, 990, 1.0) == pytest.approx(0.05 * 0.0075)
 
 
+@pytest.mark.parametrize(("warmup", "until"), [(1500, 300), (15_000, 450)])
+def test_the_coarse_training_outlasts_the_warm_up(capture, tmp_path, warmup, until):
+    given = ["--blocks", "2", "--recipe", "scene-experts", "--iterations", "900", f"--train=--scene.decoder.warmup={warmup}"]
+    assert cli.main(["blocks", "plan", str(capture), "--out", str(tmp_path / "plan"), *given]) == 0
+    coarse = shlex.split((tmp_path / "plan/commands.sh").read_text().splitlines()[2])
+    assert parse_train(coarse[2:]).stop_at == until
+
+
 @pytest.mark.parametrize("options", ["scaffold-gs-bank", "moe-gs-balance", "scaffold-gs --train=--scene.appearance=8"])
 def test_blocks_leave_what_all_anchors_share_as_it_is(options, capture, tmp_path):
     assert cli.main(["blocks", "plan", str(capture), "--out", str(tmp_path), "--recipe", *options.split()]) == 0
