@@ -93,7 +93,8 @@ class TrainCommand:
     deterministic: bool = False
     """Give bit-identical results on the same machine, also after --resume. Slightly slower."""
     shard: bool = False
-    """Divide the anchors among the processes of torchrun, so that each needs less memory. The results are those without it."""
+    """Divide the anchors among the processes of torchrun, so that each needs less memory. The results are those without it,
+    up to rounding (docs/scaling.md)."""
     device: Device = "auto"
     """Device to train on. auto: CUDA if available."""
     rasterizer: Raster = "auto"
