@@ -279,6 +279,11 @@ def test_a_record_keeps_the_name_of_its_run():
     assert found == set(RECORDS.rglob("*.json"))
 
 
+@pytest.mark.parametrize("place", ["/root/", "/home/", "/work/", "/tmp/", "/Users/"])
+def test_no_record_names_a_place_of_the_machine_that_made_it(place):
+    assert [path for path in RECORDS.rglob("*.json") if place in path.read_text()] == []
+
+
 records = functools.cache(store.load)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -125,13 +126,14 @@ def write(store: Path, record: Record) -> Path:
     config["command"] = ""
     if start := config.pop("init_from"):
         config["init_from"] = Path(start).name
+    results = without_places(record.results)
     value = {
         "scene": record.scene,
         "key": record.key,
         "config_sha256": digest(config),
-        "results_sha256": digest(record.results),
+        "results_sha256": digest(results),
         "config": config,
-        "results": record.results,
+        "results": results,
         "per_view": record.per_view,
         "curves": record.curves,
     }
@@ -140,6 +142,13 @@ def write(store: Path, record: Record) -> Path:
     path = record_path(store, record)
     write_bytes(path, pack(value).encode())
     return path
+
+
+def without_places(results: dict[str, Any]) -> dict[str, Any]:
+    """Return the results with the names of the files of LPIPS's weights alone: where they were on a machine is not published."""
+    found = results.get("lpips_weights", {})
+    named = {net: place[: len("cache ")] * place.startswith("cache ") + re.split(r"[/\\]", place)[-1] for net, place in found.items()}
+    return {**results, "lpips_weights": named} if named else results
 
 
 def pack(value: dict[str, Any]) -> str:

@@ -145,7 +145,7 @@ def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize
         training = Training.start_from(cfg, run.config.init_from, capture, run.device)
     training = training or Training.start(cfg, capture, run.device, run.dtype)
     if unused := find_unused(cfg):
-        log.warning("without an effect on the scenes of this recipe: %s", ", ".join(unused))
+        log.warning("these options have no effect with this recipe: %s; leave them out", ", ".join(unused))
     training.capture_id = capture.fingerprint()
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
     if run.max_memory > 0:

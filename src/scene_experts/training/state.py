@@ -237,8 +237,8 @@ def check_phases(cfg: Train, before: SceneConfig, step: int) -> None:
     for flag, last in cfg.scene.phases().items():
         if flag in left and step <= last:
             raise InputError(
-                f"expected the phase of {flag} to end before iteration {step}, as the run of --init-from has left it there, "
-                f"found one until iteration {last}; give fewer --iterations or a smaller {flag}"
+                f"expected the phase of {flag} to end before iteration {step}, because the run of --init-from has left it, "
+                f"found one that lasts until iteration {last}; give fewer --iterations or a smaller {flag}"
             )
 
 

@@ -34,6 +34,21 @@ def test_a_record_names_the_run_that_it_started_from_if_there_is_one(tmp_path):
     assert read(write(tmp_path, begun)).config.init_from == Path("coarse")
 
 
+@pytest.mark.parametrize(
+    ("place", "kept"),
+    [
+        ("cache /home/some one/.cache/scene-experts/lpips_vgg.safetensors", "cache lpips_vgg.safetensors"),
+        ("/home/someone/vgg16.ckpt", "vgg16.ckpt"),
+        ("C:\\Users\\someone\\vgg16.ckpt", "vgg16.ckpt"),
+        ("vgg16.ckpt", "vgg16.ckpt"),
+    ],
+)
+def test_a_record_does_not_say_where_the_weights_of_lpips_were(tmp_path, place, kept):
+    made = record()
+    path = write(tmp_path, replace(made, results={**made.results, "lpips_weights": {"vgg": place}}))
+    assert read(path).results == {**made.results, "lpips_weights": {"vgg": kept}} and "some" not in path.read_text()
+
+
 def test_a_record_keeps_the_code_that_it_was_trained_with(tmp_path):
     made = replace(record(), code="0123456789ab")
     back = read(write(tmp_path, made))

@@ -55,7 +55,7 @@ class NerfstudioReader:
             images.append(image and PosedImage(name, image, lens, pose, mask, angle, transforms.to_pure(stated) in held))
         kept = transforms.drop_absent(folder, images, names, warnings)
         if unmasked:
-            warnings.append(f"{len(unmasked)} of {len(kept)} frames count whole because their mask is absent (first: {unmasked[0]})")
+            warnings.append(f"{len(unmasked)} of {len(kept)} frames are used whole, because their masks are absent (first: {unmasked[0]})")
         points = transforms.read_points(folder, meta.get("ply_file_path"))
         return RawCapture(kept, points, warnings, points_source="the file that ply_file_path names")
 
@@ -69,7 +69,7 @@ def _held_out(meta: dict[str, Any], path: Path, warnings: list[str]) -> set[Pure
     key, held = ("test_filenames", test) if test or not val else ("val_filenames", val)
     frames = {transforms.to_pure(frame["file_path"]) for frame in meta["frames"] if isinstance(frame.get("file_path"), str)}
     if strange := sorted(map(str, held - frames)):
-        warnings.append(f"{len(strange)} of {len(held)} names in {key} are those of no frame (first: {strange[0]})")
+        warnings.append(f"{len(strange)} of {len(held)} names in {key} match no frame (first: {strange[0]})")
     if test and (shared := val & frames - test):
         warnings.append(f"the {len(shared)} validation frames are training views, because test_filenames names the held-out ones")
     return held
