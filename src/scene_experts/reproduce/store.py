@@ -198,6 +198,11 @@ def load(store: Path) -> list[Record]:
     return [read(path) for path in sorted(store.glob("*/*/seed*.json"))]
 
 
+def load_like(store: Path, spec: Spec) -> list[Record]:
+    """Read the records of a run's scene and seed: `find` needs no others, and reading all takes seconds."""
+    return [read(path) for path in sorted((store / spec.scene.name).glob(f"*/seed{spec.seed}-*.json"))]
+
+
 def digest(value: Any) -> str:
     """Return the SHA-256 of a JSON value, whatever the order of its keys."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
