@@ -82,6 +82,16 @@ def test_a_row_that_lacks_a_scene_is_no_rival():
     assert (list(TABLE4.rows).index("MoE-GS"), 1) not in table.best and any("MoE-GS" in note and "train" in note for note in table.notes)
 
 
+def test_a_mean_without_the_runs_that_lack_a_score_is_no_rival():
+    scores = {"moe-gs": (0.25, None), "scaffold-gs-opacity": (0.2, 0.4)}
+    made = [record(recipe, s, lpips_3dgs=v) for recipe, both in scores.items() for s, v in zip(("truck", "train"), both)]
+    table = by_dataset(TABLE4, made, "captures", ["truck", "train"])
+    assert dict(zip((row[0] for row in table.rows), table.rows))["MoE-GS"][3] == "0.250"
+    assert {column for _, column in table.best} == {1, 2, 4} and "MoE-GS: no LPIPS (3DGS) of train (seed 0)." in table.notes
+    whole = by_dataset(TABLE4, [r for r in made if r.scene == "truck"], "captures", ["truck"])
+    assert {column for _, column in whole.best} == {1, 2, 3, 4} and not any("no LPIPS" in note for note in whole.notes)
+
+
 def test_notes_say_which_seeds_each_mean_is_of():
     pair = [record("moe-gs", s, seed, psnr=24.0 + seed) for s in ("truck", "train") for seed in (0, 1)]
     lacking = [record("scaffold-gs-opacity", s, seed) for s, seed in (("truck", 0), ("truck", 1), ("train", 0))]
