@@ -161,10 +161,12 @@ class Spec:
         return args
 
 
-def identity(scene: str, train: Train, data: Data, code: str = "") -> str:
-    """Return the hash that names a run: of the scene's name, the recipe with all numbers, how the capture is read (not of its path), and
-    the code of other packages (`code_of`)."""
-    text = json.dumps([scene, without_newer(to_json(train), train), data.settings(), *filter(None, [code])], sort_keys=True)
+def identity(scene: str, train: Train, data: Data, code: str = "", start: Path | None = None) -> str:
+    """Return the hash that names a run: of the scene's name, the recipe with all numbers, how the capture is read (not of its path),
+    the code of other packages (`code_of`), and the name of the run whose scene it started from."""
+    more = [code] if code else []
+    more += [f"from {start.name}"] if start else []
+    text = json.dumps([scene, without_newer(to_json(train), train), data.settings(), *more], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

@@ -50,13 +50,13 @@ class Record:
 
     @cached_property
     def key(self) -> str:
-        """As `Spec.key`."""
-        return identity(self.scene, self.config.train, self.config.data, self.code)
+        """As `Spec.key`; of a run that started from another one, a key that no `Spec` has."""
+        return identity(self.scene, self.config.train, self.config.data, self.code, self.config.init_from)
 
     @cached_property
     def numbers(self) -> str:
         """As `Spec.numbers`."""
-        return identity(self.scene, replace(self.config.train, recipe=""), self.config.data, self.code)
+        return identity(self.scene, replace(self.config.train, recipe=""), self.config.data, self.code, self.config.init_from)
 
     @property
     def recipe(self) -> str:

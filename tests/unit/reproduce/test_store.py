@@ -34,6 +34,16 @@ def test_a_record_names_the_run_that_it_started_from_if_there_is_one(tmp_path):
     assert read(write(tmp_path, begun)).config.init_from == Path("coarse")
 
 
+def test_a_run_that_started_from_another_one_is_not_taken_for_the_run_of_its_recipe(tmp_path):
+    spec = Spec(Scene("fox", OWN, Path("fox")), "moe-gs", 0, Scale(iterations=3000))
+    begun = replace(record(psnr=20.0), config=replace(record().config, init_from=Path("/home/someone/coarse")))
+    back = read(write(tmp_path, begun))
+    assert back.key == begun.key and find(load(tmp_path), spec) is None
+    write(tmp_path, record(psnr=30.0))
+    found = find(load(tmp_path), spec)
+    assert len(load(tmp_path)) == 2 and found is not None and found.results["psnr"] == 31.5
+
+
 @pytest.mark.parametrize(
     ("place", "kept"),
     [
