@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from scene_experts.core.errors import InputError, few
@@ -30,7 +31,8 @@ from scene_experts.training.run_folder import load_capture, read_config
 FORMAT = 2  # format 1 has a row for each view and each point of a curve
 POINTS = 60  # the most samples of a training curve
 CURVES = ("step", "seconds", "psnr", "anchors", "active", "routing", "entropy", "scene_routing", "scene_gates")
-PER_VIEW = ("psnr", "ssim", "lpips", "lpips_3dgs", "activation_ratio", "gaussians_rendered")
+MEANS = ("psnr", "ssim", "lpips", "lpips_3dgs")
+PER_VIEW = (*MEANS, "activation_ratio", "gaussians_rendered")
 
 
 @dataclass(frozen=True)
@@ -93,14 +95,24 @@ def read_run(run: Path, scene: str, code: str = "") -> Record:
 
 def _make_record(run: Path, scene: str, config: RunConfig, results: dict[str, Any], code: str) -> Record:
     views = read_json(run / "per_view.json", "scores by view")
+    per_view = {name: {k: facts[k] for k in PER_VIEW if facts.get(k) is not None} for name, facts in views.items()}
+    check_means(results, per_view, f"in {run}", f"run `scene-experts eval {run}` again")
     return Record(
         scene=scene,
         config=config,
         results=results,
-        per_view={name: {k: facts[k] for k in PER_VIEW if facts.get(k) is not None} for name, facts in views.items()},
+        per_view=per_view,
         curves=read_curves(run / "metrics.jsonl"),
         code=code,
     )
+
+
+def check_means(results: dict[str, Any], per_view: dict[str, dict[str, Any]], where: str, advice: str) -> None:
+    """Raise InputError where a mean score is not that of the scores by view: one of both is of another evaluation, or was edited."""
+    for metric in MEANS:
+        scores = [facts[metric] for facts in per_view.values() if metric in facts]
+        if scores and results.get(metric) is not None and abs(fmean(scores) - results[metric]) > 1e-6:
+            raise InputError(f"expected scores by view with the mean {metric} of the results {where}, found others; {advice}")
 
 
 def read_curves(path: Path) -> list[dict[str, Any]]:
@@ -190,6 +202,7 @@ def _read(path: Path) -> Record:
     kinds = (isinstance(scene, str), isinstance(code, str), isinstance(results, dict), isinstance(per_view, dict), isinstance(curves, list))
     if not all(kinds):
         raise Damaged("a scene, results, scores or curves of another form")
+    check_means(results, per_view, f"in {path}", "remove it and reproduce again")
     return Record(scene, from_json(RunConfig, value["config"]), results, per_view, curves, code)
 
 

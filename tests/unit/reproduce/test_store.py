@@ -106,10 +106,27 @@ def test_changed_figures_are_refused(tmp_path):
     path.write_text(json.dumps(value))
     with pytest.raises(InputError, match=naming(tmp_path)):
         read(path)
+    path = write(tmp_path, record())
+    value = json.loads(path.read_text())
+    value["per_view"]["scores"]["psnr"][0] += 1.0
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match=naming(tmp_path, "psnr")):
+        read(path)
     for other in ("{}", '{"format": 1}'):
         path.write_text(other)
         with pytest.raises(InputError, match=naming(tmp_path)):
             read(path)
+
+
+def test_scores_by_view_of_another_evaluation_are_refused(tmp_path):
+    made = record()
+    write_json(tmp_path / "config.json", {"format": 1, **to_json(made.config)})
+    write_json(tmp_path / "results.json", made.results)
+    write_json(tmp_path / "per_view.json", made.per_view)
+    assert read_run(tmp_path, "fox").per_view == made.per_view
+    write_json(tmp_path / "per_view.json", record(psnr=29.0).per_view)  # the next evaluation was killed between its two files
+    with pytest.raises(InputError, match=naming("scene-experts eval")):
+        read_run(tmp_path, "fox")
 
 
 def test_a_folder_without_results_is_refused(tmp_path):
