@@ -130,12 +130,14 @@ def text(value: Mean | None, column: str) -> str:
 
 
 def best(values: list[list[float | None]], columns: Sequence[str]) -> frozenset[tuple[int, int]]:
-    """Return the best cell of each of our columns, as (row, column of the table)."""
+    """Return the best cells of each of our columns, as (row, column of the table): all that read as the best one does."""
     out = set()
     for j, column in enumerate(columns):
-        present = [(row[j], i) for i, row in enumerate(values) if row[j] is not None]
-        if COLUMNS[column].best and len(present) > 1:
-            out.add((max(present, key=lambda pair: COLUMNS[column].best * pair[0])[1], j + 1))  # type: ignore[operator]
+        present = {i: value for i, row in enumerate(values) if (value := row[j]) is not None}
+        sign, digits = COLUMNS[column].best, COLUMNS[column].digits
+        if sign and len(present) > 1:
+            winner = f"{sign * max(sign * value for value in present.values()):.{digits}f}"
+            out |= {(i, j + 1) for i, value in present.items() if f"{value:.{digits}f}" == winner}
     return frozenset(out)
 
 

@@ -65,6 +65,14 @@ def test_scene_by_scene():
     assert alike.best == {([r[0] for r in alike.rows].index("MoE-GS"), 1)}
 
 
+def test_rows_that_read_alike_are_best_alike():
+    scores = {"moe-gs": 24.001, "moe-gs-no-cl": 24.0, "moe-gs-no-load": 23.99}
+    table = by_dataset(TABLE4, [record(recipe, "truck", psnr=psnr, views=1) for recipe, psnr in scores.items()], "captures", ["truck"])
+    names = [row[0] for row in table.rows]
+    assert {names[row] for row, column in table.best if column == 1} == {"MoE-GS", "w/o CL"}
+    assert {names[row] for row, column in table.best if column == 4} == {"MoE-GS", "w/o CL", "w/o L_load"}  # 10.0 MB each
+
+
 def test_the_three_files():
     table = by_dataset(TABLE4, runs(), "TanksAndTemples", ["truck"])
     files = write_all("Table 4", {"T&T": table})
