@@ -33,6 +33,13 @@ def on_common_scenes(records: Sequence[Record], recipes: Iterable[str]) -> list[
     return [r for rows in by.values() for r in rows if r.scene in scenes]
 
 
+def on_common_runs(records: Sequence[Record], recipes: Iterable[str]) -> list[Record]:
+    """As `on_common_scenes`, of the scenes with the seeds that every recipe with a run has: another seed moves a score too."""
+    by = {recipe: rows for recipe in recipes if (rows := select(records, recipe))}
+    runs = set.intersection(*({(r.scene, r.seed) for r in rows} for rows in by.values())) if by else set()
+    return [r for rows in by.values() for r in rows if (r.scene, r.seed) in runs]
+
+
 @dataclass(frozen=True)
 class Mean:
     """A mean over scenes. `spread` is its standard deviation over seeds; None with one seed."""
