@@ -233,9 +233,9 @@ def to_latex(table: ResultTable, caption: str) -> str:
 
 def escape(cell: str) -> str:
     """Escape what LaTeX would interpret."""
-    for old, new in (("\\", r"\textbackslash "), ("_", r"\_"), ("%", r"\%"), ("&", r"\&"), ("#", r"\#"), ("±", r"$\pm$")):
+    for old, new in (("\\", r"\textbackslash "), ("$", r"\$"), ("_", r"\_"), ("%", r"\%"), ("&", r"\&"), ("#", r"\#"), ("±", r"$\pm$")):
         cell = cell.replace(old, new)
-    return cell
+    return cell.replace("--", "-{}-")  # two hyphens of a flag, not a dash
 
 
 def to_csv(tables: dict[str, ResultTable]) -> str:

@@ -80,7 +80,7 @@ def test_the_three_files():
     assert files["csv"].splitlines()[0] == "table,row,column,value,spread"
     assert "T&T,w/o MoE,PSNR,23.00," in files["csv"] and "T&T,MoE-GS,PSNR,24.50,0.71" in files["csv"] and "w/o CL,PSNR," not in files["csv"]
     assert r"w/o L\_load" in to_latex(table, "T&T") and r"\caption{T\&T}" in to_latex(table, "T&T") and r"$\pm$" in files["tex"]
-    assert escape("50 %") == r"50 \%"
+    assert escape("50 %") == r"50 \%" and escape("moe-gs --scene.F 8") == "moe-gs -{}-scene.F 8" and escape("$ ±") == r"\$ $\pm$"
 
 
 def test_a_row_that_lacks_a_scene_is_no_rival():
