@@ -113,6 +113,7 @@ def describe_views(capture: Capture, cameras: Sequence[Camera], options: EvalOpt
         "resolution": capture.resolution,
         "mean_pixels": round(sum(c.width * c.height for c in cameras) / len(cameras)),
         **({} if capture.alpha_over is None else {"background": list(capture.alpha_over)}),
+        **({} if capture.points is None else {"points": len(capture.points.xyz)}),  # those of other poses are others
     }
 
 

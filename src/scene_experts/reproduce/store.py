@@ -234,19 +234,34 @@ def find_all(records: Sequence[Record], specs: Sequence[Spec]) -> list[Record]:
 
 
 def check_captures(records: Sequence[Record], specs: Sequence[Spec]) -> None:
-    """Raise InputError where a record of `specs` was scored on other views than its capture holds out: it belongs to another capture.
+    """Raise InputError where a record of `specs` belongs to another capture of that name: it was scored on other views than its capture
+    holds out, or had another number of 3D points, as after new camera poses.
 
-    Checks one run of each scene. Captures that cannot be read are skipped here; their training reports the error.
+    Checks the views of one run of each scene, and the points of all. Captures that cannot be read are skipped here; their training
+    reports the error.
     """
-    for spec, record in {spec.scene.name: (spec, record) for spec in specs if (record := find(records, spec))}.values():
+    by_scene: dict[str, list[tuple[Spec, Record]]] = {}
+    for spec in specs:
+        if record := find(records, spec):
+            by_scene.setdefault(spec.scene.name, []).append((spec, record))
+    for pairs in by_scene.values():
+        spec, record = pairs[-1]
         try:
             capture = load_capture(spec.data)
         except InputError:
             continue
         capture.images.close()
+        advice = "rename the folder, or give it its own --records"
         there, scored = sorted(capture.views[i].name for i in capture.test), sorted(record.per_view)
         if there != scored:
             raise InputError(
                 f"expected records of '{spec.scene.name}' with the views that {spec.scene.path} holds out ({few(there)}), "
-                f"found scores of {few(scored)} from another capture of that name; rename the folder, or give it its own --records"
+                f"found scores of {few(scored)} from another capture of that name; {advice}"
+            )
+        known = 0 if capture.points is None else len(capture.points.xyz)
+        counts = {record.results.get("points", known) for _, record in pairs} - {known}  # older records have no number of points
+        if counts:
+            raise InputError(
+                f"expected records of '{spec.scene.name}' with the {known:,} points of {spec.scene.path}, found {counts.pop():,} in a "
+                f"record: its camera poses were others; {advice}"
             )

@@ -46,6 +46,7 @@ class FakeCapture:
     split: str = "mod2"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     alpha_over: tuple[float, float, float] | None = None
+    points: Any = None
 
     @property
     def images(self) -> Any:

@@ -93,6 +93,17 @@ def test_records_of_another_capture_of_the_same_name_are_refused(tmp_path):
     check_captures([record(scene="box")], [replace(spec, scene=replace(spec.scene, path=tmp_path / "gone"))])
 
 
+def test_records_of_other_poses_of_the_same_photographs_are_refused(tmp_path):
+    box = make_capture(tmp_path / "box", views=9, points=700)
+    specs = [Spec(Scene("box", OWN, box.folder), recipe, 0, Scale(iterations=3000)) for recipe in ("scaffold-gs", "moe-gs")]
+    capture = load_capture(specs[0].data)
+    views = {capture.views[i].name: {"psnr": 30.0} for i in capture.test}
+    found = [replace(record(s.recipe, scene="box", psnr=30.0, views=1, points=n), per_view=views) for s, n in zip(specs, (651, 700))]
+    check_captures([replace(r, results={**r.results, "points": len(capture.points.xyz)}) for r in found], specs)
+    with pytest.raises(InputError, match=naming("651", "box", "--records")):
+        check_captures([found[0], replace(found[1], results={**found[1].results, "points": len(capture.points.xyz)})], specs)
+
+
 def test_changed_figures_are_refused(tmp_path):
     path = write(tmp_path, record())
     value = json.loads(path.read_text())
