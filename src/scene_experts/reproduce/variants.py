@@ -26,7 +26,7 @@ class _Holder:
 def split_name(text: str) -> tuple[str, str]:
     """Split "NAME=RECIPE FLAGS" into the name and the line "RECIPE FLAGS". Without a name, the name is the line."""
     name, found, line = text.partition("=")
-    return (name.strip(), line.strip()) if found and "--" not in name else (text.strip(), text.strip())
+    return (name.strip(), line.strip()) if found and name.strip() and "--" not in name else (text.strip(), text.strip())
 
 
 def base(line: str) -> str:
