@@ -5,7 +5,8 @@
 Rows of the table: the run in one piece; the merged scene; the merged scene after the joint training; and the control, the run in one
 piece after the same further training. The commands of the blocks are those of `scene-experts blocks plan`. The coarse scene is the
 checkpoint of the run in one piece at its iteration, as both have the same commands up to there; --own-coarse trains it apart. What is in
-OUT already is not made again, so a stopped comparison goes on. "GiB" is the largest resident memory of a process of the row.
+OUT already is not made again, so a stopped comparison goes on; the CPU seconds of a training that was stopped are those since its last
+start. "GiB" is the largest resident memory of a process of the row.
 """
 
 from __future__ import annotations
@@ -25,9 +26,15 @@ PROGRAM = [sys.executable, "-m", "scene_experts"]
 
 
 def run(out: Path, name: str, words: list[str]) -> None:
-    """Run a command once; OUT/name.json keeps its words, CPU seconds and largest resident memory. A training goes on where it stopped."""
+    """Run a command once; OUT/name.json keeps its words, CPU seconds and largest resident memory. A training goes on where it stopped.
+
+    Exits if the command of OUT/name.json is another one.
+    """
     record = out / f"{name}.json"
     if record.exists():
+        done = shlex.split(json.loads(record.read_text())["command"])
+        if [word for word in done if word != "--resume"] != words:
+            raise SystemExit(f"expected `{shlex.join(words)}` in {record}, found `{shlex.join(done)}`; give another --out")
         return
     if words[0] == "train" and (Path(words[words.index("--out") + 1]) / "checkpoints").exists():
         words = [*words, "--resume"]
@@ -71,9 +78,8 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     os.environ["OMP_NUM_THREADS"] = str(args.threads)
     options = f"--seed {args.seed} {args.train}".strip()
-    if not (plan / "commands.sh").exists():
-        words = ["--blocks", str(args.blocks), "--recipe", args.recipe, "--iterations", str(args.iterations), *shlex.split(args.plan)]
-        run(out, "make_plan", ["blocks", "plan", str(args.capture), "--out", str(plan), *words, f"--train={options}"])
+    words = ["--blocks", str(args.blocks), "--recipe", args.recipe, "--iterations", str(args.iterations), *shlex.split(args.plan)]
+    run(out, "make_plan", ["blocks", "plan", str(args.capture), "--out", str(plan), *words, f"--train={options}"])
     coarse, *blocks, merge, joint = (shlex.split(line)[1:] for line in (plan / "commands.sh").read_text().splitlines()[2:])
     at = coarse.index("--stop-at")
     whole = replace_options(coarse[:at] + coarse[at + 2 :], ["--out", str(out / "whole"), *shlex.split(args.whole)])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -36,12 +37,15 @@ def run(args: list[str]) -> None:
 
 
 def run_one(capture: Path, recipe: str, seed: int, iterations: int, folder: Path, extra: list[str]) -> dict:
-    """The results of one run; trains and scores it if they do not exist."""
-    results = folder / "results.json"
+    """The results of one run; trains and scores it if they do not exist. Exits if the folder has a run with other options."""
+    results, config = folder / "results.json", folder / "config.json"
+    train = ["train", recipe, "--data", str(capture), "--out", str(folder), "--iterations", str(iterations), "--seed", str(seed)]
+    train += ["--preview-every", "0", *extra]
+    wanted = shlex.join(["scene-experts", *train])
+    if config.exists() and (found := json.loads(config.read_text())["command"]) != wanted:
+        raise SystemExit(f"expected the run of `{wanted}` in {folder}, found that of `{found}`; give another --out")
     if not results.exists():
-        resume = ["--resume"] if (folder / "checkpoints").exists() else []
-        train = ["train", recipe, "--data", str(capture), "--out", str(folder), "--iterations", str(iterations), "--seed", str(seed)]
-        run([*train, "--preview-every", "0", *extra, *resume])
+        run([*train, *(["--resume"] if (folder / "checkpoints").exists() else [])])
         run(["eval", str(folder)])
     return json.loads(results.read_text())
 

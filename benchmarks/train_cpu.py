@@ -85,7 +85,7 @@ def main() -> None:
     for folder in args.captures:
         capture = load(folder)
         runners = rows[folder.name] = [start(recipe, folder, capture, args) for recipe in args.recipes]
-        for until in range(args.slice, args.iterations + 1, args.slice):
+        for until in [*range(args.slice, args.iterations, args.slice), args.iterations]:
             for runner in runners:
                 runner.advance(until)
             if args.out:

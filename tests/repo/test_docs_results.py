@@ -2,6 +2,7 @@
 
 import functools
 import importlib.util
+import itertools
 import json
 import re
 import shlex
@@ -192,6 +193,22 @@ def test_differences_seed_by_seed(capture):
     scaffold, moe = (recorded(capture, recipe, 7000) for recipe in SEEDED[:2])
     gains = [theirs["psnr"] - ours["psnr"] for ours, theirs in zip(scaffold, moe, strict=True)]
     assert row(capture, *(f"{gain:+.2f}" for gain in (*gains, statistics.fmean(gains)))) in lines("docs/results.md")
+
+
+def pooled(one: str, other: str) -> float:
+    """The standard deviation over seeds of the difference of two recipes in PSNR, dB, pooled over the captures."""
+    pairs = [zip(*(as_it_is(c, recipe, recipe.endswith("dist")) for recipe in (one, other)), strict=True) for c in CAPTURES]
+    return statistics.fmean(statistics.variance([a["psnr"] - b["psnr"] for a, b in pair]) for pair in pairs) ** 0.5
+
+
+def test_how_far_another_seed_moves_a_difference():
+    page, ours = " ".join((ROOT / "docs/results.md").read_text().split()), ("scene-experts", "scene-experts-one")
+    found = {pair: pooled(*pair) for pair in itertools.combinations((*SEEDED, *ours), 2)}
+    first = [sd for pair, sd in found.items() if set(pair) <= set(SEEDED)]
+    others = [sd for pair, sd in found.items() if set(pair) & set(ours)]
+    assert f"the difference of two of them by {min(first):.2f} to {max(first):.2f} dB" in page
+    assert f"Pairs with `scene-experts` or `scene-experts-one` have {min(others):.2f} to {max(others):.2f} dB" in page
+    assert f"with the {statistics.fmean(sd**2 for sd in found.values()) ** 0.5:.2f} dB that all ten pairs have together" in page
 
 
 @pytest.mark.parametrize("capture", ["buddha", "fox", "bonsai"])

@@ -28,10 +28,10 @@ FAILED = 6.0  # dB below the median of the views: such a view fails
 PROTOCOL = {  # what must agree before scores may be compared: key in results.json, name, option that sets it
     "capture": ("capture", "--data"),
     "resolution": ("resolution", "--resolution"),
-    "mean_pixels": ("picture size", "--resolution"),
     "split": ("split", "--split"),
     "views": ("views", "--views"),
     "view_count": ("number of views", "--max-views"),
+    "mean_pixels": ("picture size", "--resolution"),  # after the views: those of another split may have other sizes
     "appearance": ("appearance codes", "--appearance"),
     "masked": ("use of masks", "--data"),
     "background": ("background of transparent photographs", "--background"),
@@ -113,6 +113,7 @@ def describe_views(capture: Capture, cameras: Sequence[Camera], options: EvalOpt
         "resolution": capture.resolution,
         "mean_pixels": round(sum(c.width * c.height for c in cameras) / len(cameras)),
         **({} if capture.alpha_over is None else {"background": list(capture.alpha_over)}),
+        **({} if capture.points is None else {"points": len(capture.points.xyz)}),  # those of other poses are others
     }
 
 

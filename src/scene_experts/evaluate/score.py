@@ -103,9 +103,13 @@ def evaluate(
                 tell("rendering and scoring", n + 1, len(chosen))
             return found
 
-        by_place = {n: values for part in group.gather_values(group.agree(score_mine)) for n, values in part.items()}
+        parts = group.gather_values((group.agree(score_mine), perceptual.absent))
         if not group.first:
             return {}
+        by_place: dict[int, dict[str, Any]] = {}
+        for values, absent in parts:
+            by_place |= values
+            perceptual.absent.update(absent)  # a score that one process lacks is not the mean of the others' views
         per_view = {capture.views[index].name: by_place[n] for n, index in enumerate(chosen)}
         write_expert_strips(folder, scene, cameras[0], step, rasterize, background)
         found = {

@@ -213,7 +213,7 @@ def work(packed: bytes) -> tuple[str, str]:
         if not file.exists():
             why = f"expected the folder {folder} on the worker {worker.address}, found another one or none"
             return "input", f"{why}; give {flag} in a folder that all machines share"
-    if store.find(store.load(job.records), job.spec) is not None:
+    if store.find(store.load_like(job.records, job.spec), job.spec) is not None:
         return "done", f"{job.place} {job.spec.label}: done before"
     with FileLock(job.runs / ".kernels.lock"):
         build_kernels()

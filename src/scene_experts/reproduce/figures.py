@@ -13,7 +13,7 @@ from PIL import Image
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
 from scene_experts.reproduce.experiments import ROUTINGS, Experiment
-from scene_experts.reproduce.statistics import clock_of, mean, on_common_scenes, select
+from scene_experts.reproduce.statistics import clock_of, mean, on_common_runs, select
 from scene_experts.reproduce.store import Record
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # distinct for colour-blind readers
@@ -63,15 +63,18 @@ def relative_psnr(experiment: Experiment, records: Sequence[Record], scenes: Seq
     """Draw Figure 1(b): PSNR relative to the first row (3DGS) in %, scenes in the order of Scaffold-GS's anchor counts."""
     anchors = {s: m.value for s in scenes if (m := mean(select(records, "scaffold-gs", s), "anchors"))}
     (_, first), *others = experiment.rows.items()
-    base = {s: m.value for s in scenes if (m := mean(select(records, first, s), "psnr"))}
-    shown = sorted((s for s in scenes if s in anchors and s in base), key=lambda s: anchors[s])
+    shown = sorted((s for s in scenes if s in anchors and select(records, first, s)), key=lambda s: anchors[s])
     if not shown:
         return []
     figure, axes = canvas(width=max(6.4, 0.9 * len(shown)))
     for i, (name, recipe) in enumerate(others):
-        found = [(j, m.value) for j, s in enumerate(shown) if (m := mean(select(records, recipe, s), "psnr"))]
-        xs = [j + (i - (len(others) - 1) / 2) * 0.38 for j, _ in found]
-        axes[0, 0].bar(xs, [100 * (v / base[shown[j]] - 1) for j, v in found], 0.36, color=COLOURS[i], label=name)
+        found = []
+        for j, s in enumerate(shown):
+            both = on_common_runs([r for r in records if r.scene == s], (recipe, first))  # seeds of both
+            psnr, base = (mean(select(both, which), "psnr") for which in (recipe, first))
+            if psnr and base:
+                found.append((j + (i - (len(others) - 1) / 2) * 0.38, 100 * (psnr.value / base.value - 1)))
+        axes[0, 0].bar([x for x, _ in found], [height for _, height in found], 0.36, color=COLOURS[i], label=name)
     axes[0, 0].axhline(0, color="black", linewidth=0.8)
     axes[0, 0].set_xticks(range(len(shown)), [f"{s}\n{anchors[s] / 1000:.0f}k" for s in shown])
     axes[0, 0].set(ylabel="PSNR relative to 3DGS, %", xlabel="scene, sorted by the number of Scaffold-GS anchors")
@@ -104,7 +107,7 @@ def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str,
 def cost(experiment: Experiment, records: Sequence[Record], path: Path) -> list[Path]:
     """Draw Figure 6: PSNR against training time, one line per routing, one point per number of experts."""
     figure, axes = canvas()
-    drawn, records = False, on_common_scenes(records, experiment.rows.values())
+    drawn, records = False, on_common_runs(records, experiment.rows.values())
     clock = clock_of(records)
     for i, routing in enumerate(ROUTINGS):
         points = []
@@ -130,7 +133,7 @@ def layers(experiment: Experiment, records: Sequence[Record], path: Path) -> lis
     """Draw Figure 7: scores of Scaffold-GS against the number of linear layers."""
     columns = [("psnr", "PSNR, dB"), ("ssim", "SSIM"), ("lpips_3dgs", "LPIPS")]
     figure, axes = canvas(len(columns), width=4.2)
-    drawn, records = False, on_common_scenes(records, experiment.rows.values())
+    drawn, records = False, on_common_runs(records, experiment.rows.values())
     for axis, (column, title) in zip(axes[0], columns):
         found = [(int(name.split()[0]), mean(select(records, recipe), column)) for name, recipe in experiment.rows.items()]
         points = [(n, m) for n, m in found if m is not None]

@@ -21,7 +21,7 @@ from scene_experts.data.readers import is_capture, unrecognised_error
 from scene_experts.data.settings import Data
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.variants import base, flags, read_line
-from scene_experts.training.config import Train, flags_of, with_numbers
+from scene_experts.training.config import Train, flag, flags_of
 
 COLLECTIONS = {"mipnerf360": "MipNeRF360", "tandt": "TanksAndTemples", "db": "DeepBlending", "bungeenerf": "BungeeNeRF"}
 NEWER = {
@@ -113,7 +113,7 @@ class Spec:
 
     @property
     def train(self) -> Train:
-        cfg = with_numbers(read_line(self.recipe), self.scene.numbers)
+        cfg = read_line(self.recipe, self.scene.numbers)
         return replace(cfg, iterations=self.scale.length(cfg), seed=self.seed)
 
     @property
@@ -152,17 +152,21 @@ class Spec:
         """Return the arguments of `scene-experts` that train the run."""
         args = ["train", base(self.recipe), "--data", str(self.scene.path), "--out", str(out)]
         args += ["--iterations", str(self.train.iterations), "--seed", str(self.seed), "--preview-every", "0"]
-        args += flags_of(self.train, self.scene.numbers) + flags(self.recipe)
+        own = flags(self.recipe)
+        given = {word.partition("=")[0] for word in own}
+        args += flags_of(self.train, [(place, value) for place, value in self.scene.numbers if flag(place) not in given]) + own
         for name, value in vars(self.data).items():
             if name != "path" and value != getattr(Data(path=self.scene.path), name):
                 args += [f"--{name.replace('_', '-')}", str(value)]
         return args
 
 
-def identity(scene: str, train: Train, data: Data, code: str = "") -> str:
-    """Return the hash that names a run: of the scene's name, the recipe with all numbers, how the capture is read (not of its path), and
-    the code of other packages (`code_of`)."""
-    text = json.dumps([scene, without_newer(to_json(train), train), data.settings(), *filter(None, [code])], sort_keys=True)
+def identity(scene: str, train: Train, data: Data, code: str = "", start: Path | None = None) -> str:
+    """Return the hash that names a run: of the scene's name, the recipe with all numbers, how the capture is read (not of its path),
+    the code of other packages (`code_of`), and the name of the run whose scene it started from."""
+    more = [code] if code else []
+    more += [f"from {start.name}"] if start else []
+    text = json.dumps([scene, without_newer(to_json(train), train), data.settings(), *more], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

@@ -14,6 +14,7 @@ from scene_experts.reproduce.experiments import EXPERIMENTS, OURS, Experiment
 from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.plan import Scale, Scene, Spec, check_folders, drop_repeated, find_own_scenes, find_paper_scenes, list_runs
 from scene_experts.reproduce.variants import split_name
+from scene_experts.training.config import check
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,10 @@ class Plan:
 
 
 def make_plan(options: ReproduceOptions) -> Plan:
-    """The plan of the options. Raises InputError for unknown experiments, scenes and recipes, and for folders that are files."""
+    """The plan of the options.
+
+    Raises InputError for unknown experiments, scenes and recipes, for settings that `train` refuses, and for folders that are files.
+    """
     for folder in (options.out, options.runs, options.records):
         if folder and folder.exists() and not folder.is_dir():
             raise InputError(f"expected a folder at {folder}, found a file; choose another --out, --runs or --records")
@@ -41,6 +45,8 @@ def make_plan(options: ReproduceOptions) -> Plan:
     if not options.tables_only:
         check_folders(scenes)
     shown = list_runs(chosen, scenes, options.seeds or (0,), scale)
+    for spec in shown:
+        check(spec.train)
     records, runs = options.records or options.out / "records", options.runs or options.out / "runs"
     return Plan(chosen, scenes, shown, drop_repeated(shown), records, runs)
 

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,6 +19,7 @@ import torch
 
 from scene_experts.core.checkpoint import latest
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.io import locked
 from scene_experts.core.signals import PARENT
 from scene_experts.native import library as native
 from scene_experts.reproduce import store
@@ -58,7 +59,7 @@ class Runner:
     threads: int = 0
     """Threads of each run. 0: the cores shared among the workers."""
     patience: float = 0.0
-    """Seconds to wait for a run folder that another training holds."""
+    """Seconds to wait for a run that another command or training holds."""
     stop: threading.Event = field(default_factory=threading.Event)
     _running: set[subprocess.Popen[str]] = field(default_factory=set)
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -92,16 +93,29 @@ class Runner:
         return failures
 
     def run(self, spec: Spec, slot: int, place: str) -> Failure | None:
-        """Train, evaluate and record one run. `slot` is the number of its worker, `place` its number among all runs as text."""
+        """Train, evaluate and record one run, unless another command did or does it. `slot` is the number of its worker, `place` its
+        number among all runs as text."""
         folder = spec.folder(self.runs)
         log = folder.parent / f"{folder.name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
+        why = f"expected no other command at {folder}, found one at work; repeat the command when it has ended"
+        with ExitStack() as mine:
+            try:
+                mine.enter_context(self._patient(lambda: locked(folder.with_name(f"{folder.name}.lock"), why)))
+            except InputError as error:
+                return self.fail(spec, str(error), log, place)
+            if store.find(store.load_like(self.records, spec), spec) is not None:
+                self.say(f"{place} {spec.label}: done by another command")
+                return None
+            return self._run(spec, slot, place, folder, log)
+
+    def _run(self, spec: Spec, slot: int, place: str, folder: Path, log: Path) -> Failure | None:
         began = time.monotonic()
         self.say(f"{place} {spec.label} (log: {log})")
         train = spec.arguments(folder)
         if folder.exists():
             try:
-                with self._held(folder):
+                with self._patient(lambda: held(folder)):
                     if latest(folder / "checkpoints") is None:
                         shutil.rmtree(folder)  # it stopped before its first checkpoint
                     else:
@@ -127,13 +141,13 @@ class Runner:
         return None
 
     @contextmanager
-    def _held(self, folder: Path) -> Iterator[None]:
-        """Lock a run folder within `patience` seconds. Raises InputError if another training still holds it."""
+    def _patient(self, lock: Callable[[], AbstractContextManager[None]]) -> Iterator[None]:
+        """Hold a lock, for which it waits up to `patience` seconds. Raises InputError if another process still holds it."""
         until = time.monotonic() + self.patience
         with ExitStack() as stack:
             while True:
                 try:
-                    stack.enter_context(held(folder))
+                    stack.enter_context(lock())
                     break
                 except InputError:
                     if time.monotonic() >= until or self.stop.wait(1.0):

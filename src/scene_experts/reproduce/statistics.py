@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from scene_experts.reproduce.store import Record
 
 SEED_SD = {"psnr": 0.2, "ssim": 0.002, "lpips_3dgs": 0.004}
-"""Standard deviation over seeds of the difference of two runs on one capture, as measured in docs/results.md. PSNR in dB."""
+"""Assumed standard deviation over seeds of the difference of two runs on one capture. PSNR in dB. Pairs of recorded recipes have 0.15 to
+0.39 dB, 0.003 to 0.007 and 0.003 to 0.006 (docs/results.md)."""
 VIEW_SD = {"psnr": 0.4, "ssim": 0.003, "lpips_3dgs": 0.004}
 """The same over the views of a capture. Used for captures with a single view."""
 SEED_WEIGHT = 4
 """Degrees of freedom of SEED_SD where it is pooled with the variance of the measured seeds."""
-QUANTILES = {2: 4.302653, 3: 3.182446, 4: 2.776445, 5: 2.570582, 6: 2.446912}
-"""97.5 % quantiles of Student's t by degrees of freedom, where `student` is too coarse for the second decimal of an interval."""
 Verdict = Literal["confirmed", "contradicted", "undecided"]
 
 
@@ -33,6 +32,13 @@ def on_common_scenes(records: Sequence[Record], recipes: Iterable[str]) -> list[
     by = {recipe: rows for recipe in recipes if (rows := select(records, recipe))}
     scenes = set.intersection(*({r.scene for r in rows} for rows in by.values())) if by else set()
     return [r for rows in by.values() for r in rows if r.scene in scenes]
+
+
+def on_common_runs(records: Sequence[Record], recipes: Iterable[str]) -> list[Record]:
+    """As `on_common_scenes`, of the scenes with the seeds that every recipe with a run has: another seed moves a score too."""
+    by = {recipe: rows for recipe in recipes if (rows := select(records, recipe))}
+    runs = set.intersection(*({(r.scene, r.seed) for r in rows} for rows in by.values())) if by else set()
+    return [r for rows in by.values() for r in rows if (r.scene, r.seed) in runs]
 
 
 @dataclass(frozen=True)
@@ -153,22 +159,16 @@ def estimate_over_captures(means: Sequence[float]) -> tuple[float, float] | None
     """
     if len(means) < 3:
         return None
-    freedom = len(means) - 1
-    quantile = QUANTILES.get(freedom) or student(freedom)
-    centre, half = statistics.fmean(means), quantile * statistics.stdev(means) / len(means) ** 0.5
+    centre, half = statistics.fmean(means), student(len(means) - 1) * statistics.stdev(means) / len(means) ** 0.5
     return centre - half, centre + half
 
 
 def student(freedom: float) -> float:
-    """Return the 97.5 % quantile of Student's t (Abramowitz and Stegun 26.7.5). Its error is 1 % at 2 degrees of freedom, less above."""
-    z = 1.959964
-    terms = (
-        (z**3 + z) / 4,
-        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
-        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
-        (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
-    )
-    return z + sum(term / freedom ** (k + 1) for k, term in enumerate(terms))
+    """Return the 97.5 % quantile of Student's t for `freedom` degrees of freedom, at least 1. Its relative error is at most 1e-5."""
+    edges = np.linspace(0, min(np.pi / 2, 20 / freedom**0.5), 20_001)
+    weights = np.cos((edges[1:] + edges[:-1]) / 2) ** (freedom - 1)  # the density of the angle whose tangent is t / sqrt(freedom)
+    below = np.concatenate([[0.0], np.cumsum(weights)])
+    return float(np.tan(np.interp(0.95 * below[-1], below, edges)) * freedom**0.5)
 
 
 def compare_fit(a: Sequence[Record], b: Sequence[Record]) -> float | None:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from scene_experts.core.errors import InputError, few
@@ -30,7 +31,8 @@ from scene_experts.training.run_folder import load_capture, read_config
 FORMAT = 2  # format 1 has a row for each view and each point of a curve
 POINTS = 60  # the most samples of a training curve
 CURVES = ("step", "seconds", "psnr", "anchors", "active", "routing", "entropy", "scene_routing", "scene_gates")
-PER_VIEW = ("psnr", "ssim", "lpips", "lpips_3dgs", "activation_ratio", "gaussians_rendered")
+MEANS = ("psnr", "ssim", "lpips", "lpips_3dgs")
+PER_VIEW = (*MEANS, "activation_ratio", "gaussians_rendered")
 
 
 @dataclass(frozen=True)
@@ -50,13 +52,13 @@ class Record:
 
     @cached_property
     def key(self) -> str:
-        """As `Spec.key`."""
-        return identity(self.scene, self.config.train, self.config.data, self.code)
+        """As `Spec.key`; of a run that started from another one, a key that no `Spec` has."""
+        return identity(self.scene, self.config.train, self.config.data, self.code, self.config.init_from)
 
     @cached_property
     def numbers(self) -> str:
         """As `Spec.numbers`."""
-        return identity(self.scene, replace(self.config.train, recipe=""), self.config.data, self.code)
+        return identity(self.scene, replace(self.config.train, recipe=""), self.config.data, self.code, self.config.init_from)
 
     @property
     def recipe(self) -> str:
@@ -93,14 +95,24 @@ def read_run(run: Path, scene: str, code: str = "") -> Record:
 
 def _make_record(run: Path, scene: str, config: RunConfig, results: dict[str, Any], code: str) -> Record:
     views = read_json(run / "per_view.json", "scores by view")
+    per_view = {name: {k: facts[k] for k in PER_VIEW if facts.get(k) is not None} for name, facts in views.items()}
+    check_means(results, per_view, f"in {run}", f"run `scene-experts eval {run}` again")
     return Record(
         scene=scene,
         config=config,
         results=results,
-        per_view={name: {k: facts[k] for k in PER_VIEW if facts.get(k) is not None} for name, facts in views.items()},
+        per_view=per_view,
         curves=read_curves(run / "metrics.jsonl"),
         code=code,
     )
+
+
+def check_means(results: dict[str, Any], per_view: dict[str, dict[str, Any]], where: str, advice: str) -> None:
+    """Raise InputError where a mean score is not that of the scores by view: one of both is of another evaluation, or was edited."""
+    for metric in MEANS:
+        scores = [facts[metric] for facts in per_view.values() if metric in facts]
+        if scores and results.get(metric) is not None and abs(fmean(scores) - results[metric]) > 1e-6:
+            raise InputError(f"expected scores by view with the mean {metric} of the results {where}, found others; {advice}")
 
 
 def read_curves(path: Path) -> list[dict[str, Any]]:
@@ -190,12 +202,18 @@ def _read(path: Path) -> Record:
     kinds = (isinstance(scene, str), isinstance(code, str), isinstance(results, dict), isinstance(per_view, dict), isinstance(curves, list))
     if not all(kinds):
         raise Damaged("a scene, results, scores or curves of another form")
+    check_means(results, per_view, f"in {path}", "remove it and reproduce again")
     return Record(scene, from_json(RunConfig, value["config"]), results, per_view, curves, code)
 
 
 def load(store: Path) -> list[Record]:
     """Read every record below a folder, in the order of their paths."""
     return [read(path) for path in sorted(store.glob("*/*/seed*.json"))]
+
+
+def load_like(store: Path, spec: Spec) -> list[Record]:
+    """Read the records of a run's scene and seed: `find` needs no others, and reading all takes seconds."""
+    return [read(path) for path in sorted((store / spec.scene.name).glob(f"*/seed{spec.seed}-*.json"))]
 
 
 def digest(value: Any) -> str:
@@ -216,19 +234,34 @@ def find_all(records: Sequence[Record], specs: Sequence[Spec]) -> list[Record]:
 
 
 def check_captures(records: Sequence[Record], specs: Sequence[Spec]) -> None:
-    """Raise InputError where a record of `specs` was scored on other views than its capture holds out: it belongs to another capture.
+    """Raise InputError where a record of `specs` belongs to another capture of that name: it was scored on other views than its capture
+    holds out, or had another number of 3D points, as after new camera poses.
 
-    Checks one run of each scene. Captures that cannot be read are skipped here; their training reports the error.
+    Checks the views of one run of each scene, and the points of all. Captures that cannot be read are skipped here; their training
+    reports the error.
     """
-    for spec, record in {spec.scene.name: (spec, record) for spec in specs if (record := find(records, spec))}.values():
+    by_scene: dict[str, list[tuple[Spec, Record]]] = {}
+    for spec in specs:
+        if record := find(records, spec):
+            by_scene.setdefault(spec.scene.name, []).append((spec, record))
+    for pairs in by_scene.values():
+        spec, record = pairs[-1]
         try:
             capture = load_capture(spec.data)
         except InputError:
             continue
         capture.images.close()
+        advice = "rename the folder, or give it its own --records"
         there, scored = sorted(capture.views[i].name for i in capture.test), sorted(record.per_view)
         if there != scored:
             raise InputError(
                 f"expected records of '{spec.scene.name}' with the views that {spec.scene.path} holds out ({few(there)}), "
-                f"found scores of {few(scored)} from another capture of that name; rename the folder, or give it its own --records"
+                f"found scores of {few(scored)} from another capture of that name; {advice}"
+            )
+        known = 0 if capture.points is None else len(capture.points.xyz)
+        counts = {record.results.get("points", known) for _, record in pairs} - {known}  # older records have no number of points
+        if counts:
+            raise InputError(
+                f"expected records of '{spec.scene.name}' with the {known:,} points of {spec.scene.path}, found {counts.pop():,} in a "
+                f"record: its camera poses were others; {advice}"
             )

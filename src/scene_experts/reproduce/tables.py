@@ -42,9 +42,9 @@ def rows_of(experiment: Experiment, records: Sequence[Record], scenes: Sequence[
     return {name: [r for r in records if r.recipe == recipe and r.scene in scenes] for name, recipe in experiment.rows.items()}
 
 
-def cases(records: Sequence[Record]) -> set[tuple[str, int]]:
-    """Return the pairs of scene and seed that a mean covers."""
-    return {(r.scene, r.seed) for r in records}
+def cases(records: Sequence[Record], column: str | None = None) -> set[tuple[str, int]]:
+    """Return the pairs of scene and seed that a mean covers: of the records, or of those with a value of a column."""
+    return {(r.scene, r.seed) for r in records if column is None or r.value(column) is not None}
 
 
 def by_dataset(experiment: Experiment, records: Sequence[Record], dataset: str, scenes: Sequence[str]) -> ResultTable:
@@ -56,11 +56,11 @@ def by_dataset(experiment: Experiment, records: Sequence[Record], dataset: str, 
     titles = ["", *(COLUMNS[c].title for c in columns)]
     titles += [f"{COLUMNS[c].title} (paper)" for c in experiment.columns] if theirs else []
     rows, values = [], []
-    every = cases(together)
+    every = [cases(together, c) for c in columns]
     for name in experiment.rows:
         means = [mean(found[name], c) for c in columns]
-        fair = cases(found[name]) == every  # means over other scenes or seeds are not marked as best
-        values.append([m.value if m and fair else None for m in means])
+        fair = [cases(found[name], c) == whole for c, whole in zip(columns, every)]  # means over other scenes or seeds are not marked
+        values.append([m.value if m and f else None for m, f in zip(means, fair)])
         cells = [text(m, c) for m, c in zip(means, columns)]
         if theirs:
             numbers = theirs.get(name)
@@ -68,7 +68,7 @@ def by_dataset(experiment: Experiment, records: Sequence[Record], dataset: str, 
                 [f"{v:.{COLUMNS[c].digits}f}" for v, c in zip(numbers, experiment.columns)] if numbers else ["-"] * len(experiment.columns)
             )
         rows.append((name, *cells))
-    said = notes(found) + (time_notes(together) if {"train_seconds", "cpu_seconds"} & set(columns) else ())
+    said = notes(found) + lacking_notes(found, columns) + (time_notes(together) if {"train_seconds", "cpu_seconds"} & set(columns) else ())
     return ResultTable(tuple(titles), tuple(rows), best(values, columns), said)
 
 
@@ -130,12 +130,14 @@ def text(value: Mean | None, column: str) -> str:
 
 
 def best(values: list[list[float | None]], columns: Sequence[str]) -> frozenset[tuple[int, int]]:
-    """Return the best cell of each of our columns, as (row, column of the table)."""
+    """Return the best cells of each of our columns, as (row, column of the table): all that read as the best one does."""
     out = set()
     for j, column in enumerate(columns):
-        present = [(row[j], i) for i, row in enumerate(values) if row[j] is not None]
-        if COLUMNS[column].best and len(present) > 1:
-            out.add((max(present, key=lambda pair: COLUMNS[column].best * pair[0])[1], j + 1))  # type: ignore[operator]
+        present = {i: value for i, row in enumerate(values) if (value := row[j]) is not None}
+        sign, digits = COLUMNS[column].best, COLUMNS[column].digits
+        if sign and len(present) > 1:
+            winner = f"{sign * max(sign * value for value in present.values()):.{digits}f}"
+            out |= {(i, j + 1) for i, value in present.items() if f"{value:.{digits}f}" == winner}
     return frozenset(out)
 
 
@@ -173,6 +175,17 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
                 out.append(f"{name}: no run with seed {seed}{'' if set(fewer) == scenes else ' on ' + ', '.join(fewer)}.")
     if none:
         out.append(f"No run: {'; '.join(none)}.")
+    return tuple(out)
+
+
+def lacking_notes(found: dict[str, list[Record]], columns: Sequence[str]) -> tuple[str, ...]:
+    """Write a note for each mean that leaves runs out because they have no value, such as LPIPS where its weights were absent."""
+    out = []
+    for name, records in found.items():
+        for column in columns:
+            known = cases(records, column)
+            if known and (lacking := sorted(cases(records) - known)):
+                out.append(f"{name}: no {COLUMNS[column].title} of {', '.join(f'{scene} (seed {seed})' for scene, seed in lacking)}.")
     return tuple(out)
 
 
@@ -220,9 +233,9 @@ def to_latex(table: ResultTable, caption: str) -> str:
 
 def escape(cell: str) -> str:
     """Escape what LaTeX would interpret."""
-    for old, new in (("\\", r"\textbackslash "), ("_", r"\_"), ("%", r"\%"), ("&", r"\&"), ("#", r"\#"), ("±", r"$\pm$")):
+    for old, new in (("\\", r"\textbackslash "), ("$", r"\$"), ("_", r"\_"), ("%", r"\%"), ("&", r"\&"), ("#", r"\#"), ("±", r"$\pm$")):
         cell = cell.replace(old, new)
-    return cell
+    return cell.replace("--", "-{}-")  # two hyphens of a flag, not a dash
 
 
 def to_csv(tables: dict[str, ResultTable]) -> str:

@@ -10,8 +10,9 @@ from typing import Annotated
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, HelpAsked, parse
 from scene_experts.core.errors import InputError, nearest
+from scene_experts.data.fetch.catalog import Numbers
 from scene_experts.recipes import RECIPES
-from scene_experts.training.config import Train
+from scene_experts.training.config import Train, with_numbers
 
 SET_HERE = ("--iterations", "--seed")
 """Flags that `reproduce` sets itself."""
@@ -25,7 +26,7 @@ class _Holder:
 def split_name(text: str) -> tuple[str, str]:
     """Split "NAME=RECIPE FLAGS" into the name and the line "RECIPE FLAGS". Without a name, the name is the line."""
     name, found, line = text.partition("=")
-    return (name.strip(), line.strip()) if found and "--" not in name else (text.strip(), text.strip())
+    return (name.strip(), line.strip()) if found and name.strip() and "--" not in name else (text.strip(), text.strip())
 
 
 def base(line: str) -> str:
@@ -42,13 +43,16 @@ def flags(line: str) -> list[str]:
 
 
 @functools.cache
-def read_line(line: str) -> Train:
-    """Return the settings of a recipe with flags; their recipe is the whole line. Raises InputError for unknown recipes and flags."""
+def read_line(line: str, numbers: Numbers = ()) -> Train:
+    """Return the settings of a recipe with flags; their recipe is the whole line. Raises InputError for unknown recipes and flags.
+
+    numbers: Settings of a scene's protocol; flags have the last word.
+    """
     words = line.split(maxsplit=1)
     if not words or words[0] not in RECIPES:
         name = words[0] if words else ""
         raise InputError(f"expected --recipes among {', '.join(RECIPES)}, found '{name}'{nearest(name, RECIPES)}; change it")
-    _, cfg = RECIPES[words[0]]
+    cfg = with_numbers(RECIPES[words[0]][1], numbers)
     given = flags(line)
     if not given:
         return cfg

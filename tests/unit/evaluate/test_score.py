@@ -16,7 +16,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Render, Routing
-from scene_experts.evaluate import metrics, pictures, weights
+from scene_experts.evaluate import metrics, pictures, score, weights
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.results import About
 from scene_experts.evaluate.score import evaluate
@@ -46,6 +46,7 @@ class FakeCapture:
     split: str = "mod2"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     alpha_over: tuple[float, float, float] | None = None
+    points: Any = None
 
     @property
     def images(self) -> Any:
@@ -154,6 +155,19 @@ def test_two_processes_share_the_views(tmp_path: Path) -> None:
     two = json.loads((tmp_path / "two" / "results.json").read_text())
     assert (one["psnr"], one["ssim"], one["view_count"]) == (two["psnr"], two["ssim"], two["view_count"])
     assert len(list((tmp_path / "two" / "test" / "side_by_side").rglob("*.png"))) == 2
+
+
+def test_a_score_that_one_process_lacks_is_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def member(group: Any) -> None:
+        known = metrics.Perceptual({"vgg": lambda x, y: 0.5}, {}, {"lpips_alex": "no weights"})  # type: ignore[dict-item]
+        found = known if group.first else metrics.Perceptual(absent=dict.fromkeys(metrics.NETWORKS, "none on the second machine"))
+        monkeypatch.setattr(score, "load_perceptual", lambda *_: found)
+        evaluated(tmp_path, group=group)
+
+    assert run_group(2, member) == [0, 0]
+    results, per_view = (json.loads((tmp_path / name).read_text()) for name in ("results.json", "per_view.json"))
+    assert per_view["day/0.jpg"]["lpips"] == 0.5 and "lpips" not in per_view["day/2.jpg"]
+    assert results["lpips"] is None and results["absent"]["lpips"] == "none on the second machine"
 
 
 def test_scores_are_those_of_the_8_bit_files(tmp_path: Path) -> None:

@@ -52,6 +52,24 @@ def test_figure_1b_is_relative_to_3dgs_in_order_of_anchors(tmp_path, monkeypatch
     assert heights == [5.0, 10.0, 15.0] and [round(bar.get_x() + bar.get_width() / 2) for bar in axes.patches] == [0, 1, 1]
 
 
+def test_figures_compare_the_same_seeds(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure) or [path])
+    runs = [record("3dgs", seed=s, psnr=psnr, views=1) for s, psnr in ((0, 20.0), (1, 10.0))]
+    runs += [record("scaffold-gs", psnr=21.0, views=1), record("moe-gs", seed=2, psnr=30.0, views=1)]
+    figures.relative_psnr(EXPERIMENTS["fig1b"], runs, ["fox"], tmp_path / "fig1b")
+    assert [round(bar.get_height(), 6) for bar in drawn[0].axes[0].patches] == [5.0]  # seed 0; moe-gs has no seed of 3dgs
+    deep = [record(f"scaffold-gs-depth{n}", seed=s, psnr=30.0 - 10 * s, views=1) for n, seeds in ((2, (0, 1)), (3, (0,))) for s in seeds]
+    figures.layers(EXPERIMENTS["fig7"], deep, tmp_path / "fig7")
+    assert list(drawn[1].axes[0].lines[0].get_ydata()) == [30.0, 30.0]
+    timed = [
+        record(recipe, seed=s, psnr=30.0 - 10 * s, views=1)
+        for recipe, s in (("moe-gs-e2-top1", 0), ("moe-gs-e2-top1", 1), ("moe-gs-e3-top1", 0))
+    ]
+    figures.cost(EXPERIMENTS["fig6"], timed, tmp_path / "fig6")
+    assert list(drawn[2].axes[0].lines[0].get_ydata()) == [30.0, 30.0]
+
+
 def test_a_picture_in_an_svg_is_the_picture(tmp_path):
     Image.new("RGB", (30, 20), (255, 0, 0)).save(tmp_path / "fig5_fox.png")
     text = figures.wrap_in_svg(tmp_path / "fig5_fox.png").read_text()

@@ -141,6 +141,15 @@ def test_the_papers_scenes_bring_the_numbers_of_their_scripts():
             assert any(flags_of(cfg, [(place, 0)]) for _, cfg in RECIPES.values()), place
 
 
+@pytest.mark.parametrize("given", ["--scene.voxel-size 0.02", "--scene.voxel-size=0.02"])
+def test_flags_of_a_recipe_have_the_last_word_over_the_numbers_of_a_scene(given):
+    truck = Scene("truck", "TanksAndTemples", Path("truck"), {}, catalog.TANDT.numbers)
+    spec = Spec(truck, f"scaffold-gs {given}", 0, Scale())
+    made = parse_train(spec.arguments(Path("run"))[1:]).cfg
+    assert made.scene.voxel_size == spec.train.scene.voxel_size == 0.02
+    assert replace(made, recipe="") == replace(spec.train, recipe="")
+
+
 def test_the_catalog_and_the_experiments_know_the_same_scenes():
     assert {s.name: COLLECTIONS[s.collection.key] for s in catalog.SCENES} == {s: d for d, scenes in DATASETS.items() for s in scenes}
 

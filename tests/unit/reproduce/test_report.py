@@ -63,3 +63,9 @@ def test_short_trainings_are_said_to_be_no_judges():
     several = report.caveat([record("octree-gs"), record()])[0]
     assert all(fact in several for fact in ("3,000", "13", "17"))
     assert "200" in report.caveat([record(iterations=200)])[0]
+
+
+def test_the_longer_schedule_of_octree_gs_does_not_hide_that_the_others_are_short():
+    scaled = [record("moe-gs", iterations=22_500), record("octree-gs", iterations=30_000)]  # --scale 0.75
+    assert "22,500 iterations" in report.caveat(scaled)[0]
+    assert report.caveat([record("moe-gs", iterations=30_000), record("octree-gs", iterations=40_000)]) == []

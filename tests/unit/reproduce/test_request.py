@@ -21,6 +21,19 @@ def test_comparisons_that_cannot_be(given, fact):
         choose_experiments(ReproduceOptions(("compare",), **given))
 
 
+@pytest.mark.parametrize(
+    ("recipe", "seed", "flag"),
+    [("moe-gs --scene.hidden 0", 0, "--scene.hidden"), ("moe-gs --batch 4", 0, "--batch"), ("moe-gs --scene.hidden 16", 2**63, "--seed")],
+)
+def test_settings_that_train_refuses_are_refused_before_the_first_run(tmp_path, recipe, seed, flag):
+    (tmp_path / "box").mkdir()
+    (tmp_path / "box" / "transforms.json").touch()
+    options = {"captures": (tmp_path / "box",), "out": tmp_path / "out", "iterations": 30, "seeds": (seed,)}
+    with pytest.raises(InputError, match=naming(flag)):
+        make_plan(ReproduceOptions(("compare",), recipes=("scaffold-gs", recipe), **options))
+    assert len(make_plan(ReproduceOptions(("table1",), **{**options, "seeds": (0,)})).wanted) == 5
+
+
 def test_a_baseline_needs_a_comparison():
     with pytest.raises(InputError, match="--baseline"):
         choose_experiments(ReproduceOptions(("table1",), recipes=("moe-gs", "scaffold-gs"), baseline=("moe-gs",)))

@@ -133,6 +133,27 @@ def test_a_run_that_another_process_is_at_is_left_alone(runner):
     assert str(folder) in failure.why and (folder / "metrics.jsonl").read_text() == "the other's" and not runner.calls
 
 
+def test_what_another_command_records_meanwhile_is_not_done_again(runner):
+    runner.after = lambda made, folder: store.write(runner.records, record(seed=1))
+    assert runner.run_all([spec(), spec(seed=1)]) == [] and len(runner.calls) == 2
+
+
+@pytest.mark.parametrize("what", ["train", "eval"])
+def test_a_run_that_another_command_trains_or_scores_is_left_alone(tmp_path, runner, what):
+    other, failures = Fake(runner.runs, runner.records, say=lambda _: None), []
+    other.calls, other.broken = [], set()  # type: ignore[attr-defined]
+    call = runner.call
+
+    def at_work(args, slot, log):
+        if args[0] == what:
+            failures.extend(other.run_all([spec()]))
+        return call(args, slot, log)
+
+    runner.call = at_work
+    assert runner.run_all([spec()]) == [] and other.calls == []  # type: ignore[attr-defined]
+    assert len(failures) == 1 and str(spec().folder(runner.runs)) in failures[0].why
+
+
 def test_run_folders_go_when_asked_after_what_else_is_taken(runner):
     seen = []
     runner.discard, runner.after = True, lambda made, folder: seen.append((made.recipe, folder.is_dir()))

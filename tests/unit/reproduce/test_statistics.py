@@ -45,9 +45,12 @@ def test_equal_gains_on_every_view_leave_the_doubt_of_other_seeds():
     assert (d.verdict(1), d.verdict(-1)) == ("confirmed", "contradicted")
 
 
-@pytest.mark.parametrize(("freedom", "value"), [(2, 4.303), (4, 2.776), (10, 2.228), (30, 2.042), (1e9, 1.960)])
+QUANTILES = [(1, 12.706205), (1.5, 6.016663), (2, 4.302653), (2.5, 3.574655), (4, 2.776445), (10, 2.228139), (1e9, 1.959964)]
+
+
+@pytest.mark.parametrize(("freedom", "value"), QUANTILES)
 def test_quantiles_of_student(freedom, value):
-    assert student(freedom) == pytest.approx(value, rel=0.01)
+    assert student(freedom) == pytest.approx(value, rel=2e-6)
 
 
 @pytest.mark.parametrize(("captures", "seeds", "views"), [(1, 1, 7), (7, 1, 9), (1, 2, 32), (7, 3, 9), (3, 3, 3)])

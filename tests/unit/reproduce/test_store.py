@@ -34,6 +34,16 @@ def test_a_record_names_the_run_that_it_started_from_if_there_is_one(tmp_path):
     assert read(write(tmp_path, begun)).config.init_from == Path("coarse")
 
 
+def test_a_run_that_started_from_another_one_is_not_taken_for_the_run_of_its_recipe(tmp_path):
+    spec = Spec(Scene("fox", OWN, Path("fox")), "moe-gs", 0, Scale(iterations=3000))
+    begun = replace(record(psnr=20.0), config=replace(record().config, init_from=Path("/home/someone/coarse")))
+    back = read(write(tmp_path, begun))
+    assert back.key == begun.key and find(load(tmp_path), spec) is None
+    write(tmp_path, record(psnr=30.0))
+    found = find(load(tmp_path), spec)
+    assert len(load(tmp_path)) == 2 and found is not None and found.results["psnr"] == 31.5
+
+
 @pytest.mark.parametrize(
     ("place", "kept"),
     [
@@ -83,6 +93,17 @@ def test_records_of_another_capture_of_the_same_name_are_refused(tmp_path):
     check_captures([record(scene="box")], [replace(spec, scene=replace(spec.scene, path=tmp_path / "gone"))])
 
 
+def test_records_of_other_poses_of_the_same_photographs_are_refused(tmp_path):
+    box = make_capture(tmp_path / "box", views=9, points=700)
+    specs = [Spec(Scene("box", OWN, box.folder), recipe, 0, Scale(iterations=3000)) for recipe in ("scaffold-gs", "moe-gs")]
+    capture = load_capture(specs[0].data)
+    views = {capture.views[i].name: {"psnr": 30.0} for i in capture.test}
+    found = [replace(record(s.recipe, scene="box", psnr=30.0, views=1, points=n), per_view=views) for s, n in zip(specs, (651, 700))]
+    check_captures([replace(r, results={**r.results, "points": len(capture.points.xyz)}) for r in found], specs)
+    with pytest.raises(InputError, match=naming("651", "box", "--records")):
+        check_captures([found[0], replace(found[1], results={**found[1].results, "points": len(capture.points.xyz)})], specs)
+
+
 def test_changed_figures_are_refused(tmp_path):
     path = write(tmp_path, record())
     value = json.loads(path.read_text())
@@ -96,10 +117,27 @@ def test_changed_figures_are_refused(tmp_path):
     path.write_text(json.dumps(value))
     with pytest.raises(InputError, match=naming(tmp_path)):
         read(path)
+    path = write(tmp_path, record())
+    value = json.loads(path.read_text())
+    value["per_view"]["scores"]["psnr"][0] += 1.0
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match=naming(tmp_path, "psnr")):
+        read(path)
     for other in ("{}", '{"format": 1}'):
         path.write_text(other)
         with pytest.raises(InputError, match=naming(tmp_path)):
             read(path)
+
+
+def test_scores_by_view_of_another_evaluation_are_refused(tmp_path):
+    made = record()
+    write_json(tmp_path / "config.json", {"format": 1, **to_json(made.config)})
+    write_json(tmp_path / "results.json", made.results)
+    write_json(tmp_path / "per_view.json", made.per_view)
+    assert read_run(tmp_path, "fox").per_view == made.per_view
+    write_json(tmp_path / "per_view.json", record(psnr=29.0).per_view)  # the next evaluation was killed between its two files
+    with pytest.raises(InputError, match=naming("scene-experts eval")):
+        read_run(tmp_path, "fox")
 
 
 def test_a_folder_without_results_is_refused(tmp_path):

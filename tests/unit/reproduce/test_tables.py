@@ -65,6 +65,14 @@ def test_scene_by_scene():
     assert alike.best == {([r[0] for r in alike.rows].index("MoE-GS"), 1)}
 
 
+def test_rows_that_read_alike_are_best_alike():
+    scores = {"moe-gs": 24.001, "moe-gs-no-cl": 24.0, "moe-gs-no-load": 23.99}
+    table = by_dataset(TABLE4, [record(recipe, "truck", psnr=psnr, views=1) for recipe, psnr in scores.items()], "captures", ["truck"])
+    names = [row[0] for row in table.rows]
+    assert {names[row] for row, column in table.best if column == 1} == {"MoE-GS", "w/o CL"}
+    assert {names[row] for row, column in table.best if column == 4} == {"MoE-GS", "w/o CL", "w/o L_load"}  # 10.0 MB each
+
+
 def test_the_three_files():
     table = by_dataset(TABLE4, runs(), "TanksAndTemples", ["truck"])
     files = write_all("Table 4", {"T&T": table})
@@ -72,7 +80,7 @@ def test_the_three_files():
     assert files["csv"].splitlines()[0] == "table,row,column,value,spread"
     assert "T&T,w/o MoE,PSNR,23.00," in files["csv"] and "T&T,MoE-GS,PSNR,24.50,0.71" in files["csv"] and "w/o CL,PSNR," not in files["csv"]
     assert r"w/o L\_load" in to_latex(table, "T&T") and r"\caption{T\&T}" in to_latex(table, "T&T") and r"$\pm$" in files["tex"]
-    assert escape("50 %") == r"50 \%"
+    assert escape("50 %") == r"50 \%" and escape("moe-gs --scene.F 8") == "moe-gs -{}-scene.F 8" and escape("$ ±") == r"\$ $\pm$"
 
 
 def test_a_row_that_lacks_a_scene_is_no_rival():
@@ -80,6 +88,16 @@ def test_a_row_that_lacks_a_scene_is_no_rival():
         TABLE4, [*runs(), record("scaffold-gs-opacity", "train", 0, psnr=10.0, views=1)], "TanksAndTemples", ["truck", "train"]
     )
     assert (list(TABLE4.rows).index("MoE-GS"), 1) not in table.best and any("MoE-GS" in note and "train" in note for note in table.notes)
+
+
+def test_a_mean_without_the_runs_that_lack_a_score_is_no_rival():
+    scores = {"moe-gs": (0.25, None), "scaffold-gs-opacity": (0.2, 0.4)}
+    made = [record(recipe, s, lpips_3dgs=v) for recipe, both in scores.items() for s, v in zip(("truck", "train"), both)]
+    table = by_dataset(TABLE4, made, "captures", ["truck", "train"])
+    assert dict(zip((row[0] for row in table.rows), table.rows))["MoE-GS"][3] == "0.250"
+    assert {column for _, column in table.best} == {1, 2, 4} and "MoE-GS: no LPIPS (3DGS) of train (seed 0)." in table.notes
+    whole = by_dataset(TABLE4, [r for r in made if r.scene == "truck"], "captures", ["truck"])
+    assert {column for _, column in whole.best} == {1, 2, 3, 4} and not any("no LPIPS" in note for note in whole.notes)
 
 
 def test_notes_say_which_seeds_each_mean_is_of():

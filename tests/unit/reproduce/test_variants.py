@@ -34,6 +34,7 @@ def test_a_name_comes_before_the_line(text, name, line):
 
 def test_an_equals_sign_of_a_flag_is_no_name():
     assert split_name("moe-gs --scene.hidden=8") == ("moe-gs --scene.hidden=8",) * 2
+    assert split_name("=moe-gs") == ("=moe-gs",) * 2  # a row without a name is none
 
 
 @pytest.mark.parametrize(
