@@ -49,9 +49,15 @@ def test_columns_that_do_not_fit():
         {"network.heads.opacity.w1": torch.tensor([1 + 1j])},
         {"network.heads.opacity.w1": torch.tensor([1e300], dtype=torch.float64)},
         {"params.feature": tensors["params.feature"].double() + 1e300},
+        {"facts.slots": torch.ones(len(level), 1, dtype=torch.bool)},
+        {"facts.slots": torch.ones(len(level), config.K)},
+        {"facts.interval": torch.ones(len(level), 3)},
+        {"facts.interval": torch.ones(len(level), dtype=torch.int64)},
     ):
         with pytest.raises(Damaged):
             check_fit(config, tensors | change, meta)
+    slots = torch.ones(len(level), config.K, dtype=torch.bool)
+    check_fit(config, tensors | {"facts.slots": slots, "facts.interval": torch.ones(len(level))}, meta)
     with pytest.raises(Damaged):
         check_fit(config, {k: v for k, v in tensors.items() if k != "facts.xyz"}, meta)
 
@@ -61,7 +67,7 @@ def test_metadata_out_of_range():
     for change in ({"extent": 0.0}, {"extent": 1e300}, {"step": -1}, {"step": 1 << 60}, {"voxel": float("nan")}):
         with pytest.raises(Damaged):
             check_fit(config, tensors, meta | change)
-    for change in ({"count": 1 << 40}, {"fork": 0}, {"edge": -1.0}, {"origin": [0, 0]}, {"standard": None}, {"first": 99}):
+    for change in ({"count": 1 << 40}, {"fork": 0}, {"edge": -1.0}, {"origin": [0, 0]}, {"standard": None}, {"first": 99}, {"rule": "x"}):
         with pytest.raises(Damaged):
             check_fit(config, tensors, meta | {"levels": meta["levels"] | change})
 
