@@ -15,12 +15,11 @@ from torch.overrides import TorchFunctionMode
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import FARTHEST, all_finite, expect_range, number, shown, whole_number
 from scene_experts.scene import Scene, SceneConfig, restore_scene
-from scene_experts.scene.anchors.levels import LevelRule
+from scene_experts.scene.anchors.levels import MOST_FORK, MOST_LEVELS, LevelRule
 
 _CREATE = (torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn)
 
 _MOST_FLOAT32 = torch.finfo(torch.float32).max
-MOST_LEVELS, MOST_FORK = 64, 1024  # of levels of detail
 MOST_STEPS = 1 << 40  # iterations of a training
 
 
