@@ -52,8 +52,9 @@ def restore_foreign(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[
     Raises Damaged also for settings that ask for larger networks than the stored ones, before their memory is allocated.
     """
     check_fit(config, tensors, meta)
-    stored = [value.numel() for name, value in tensors.items() if name.startswith("network.")]
-    with _Limited(20_000 + 200 * len(stored), 2 * sum(stored) + (1 << 20)):
+    stored = [value for name, value in tensors.items() if name.startswith("network.")]
+    experts = sum(len(value) for value in stored if value.dim() == 3)  # of the layers of all heads; each is initialised on its own
+    with _Limited(20_000 + 200 * len(stored) + 20 * experts, 2 * sum(value.numel() for value in stored) + (1 << 20)):
         return restore_scene(config, tensors, meta, averaged)
 
 

@@ -7,6 +7,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.types import Points
 from scene_experts.recipes import RECIPES
 from scene_experts.scene import restore_scene
 from scene_experts.scene.fit import check_fit, restore_foreign
@@ -32,6 +33,15 @@ def test_scenes_that_fit(recipe):
     wanted = restore_scene(config, tensors, meta)
     assert torch.equal(state, torch.get_rng_state())
     assert all(torch.equal(value, wanted.network_tensors()[name]) for name, value in found.network_tensors().items())
+
+
+def test_many_experts_fit():
+    config = RECIPES["moe-gs"][1].scene
+    config = replace(config, F=1, hidden=1, K=1, decoder=replace(config.decoder, num=800))
+    scene = config.start(Points(torch.rand(9, 3, dtype=torch.float64), torch.zeros(9, 3, dtype=torch.uint8)), 5.0)
+    tensors = {f"params.{k}": v.detach() for k, v in scene.table.params.items()} | {f"facts.{k}": v for k, v in scene.table.facts.items()}
+    tensors |= {f"network.{k}": v.detach() for k, v in scene.network_tensors().items()}
+    assert restore_foreign(config, tensors, {**scene.meta(), "step": 3}).traits.experts == 800
 
 
 def test_columns_that_do_not_fit():
