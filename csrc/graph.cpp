@@ -84,8 +84,8 @@ void scatter_level(const Level& level, const float* unit, const float* grad, int
 inline Level describe_level(const int64_t* cells, const int64_t* rows, int64_t l) {
   int64_t first = 0;
   for (int64_t i = 0; i < l; ++i) first += rows[i];
-  const int64_t side = cells[l] + 1;
-  return {first, rows[l], cells[l], side * side * side <= rows[l]};
+  const double side = static_cast<double>(cells[l] + 1);  // its cube may exceed 64 bits
+  return {first, rows[l], cells[l], side * side * side <= static_cast<double>(rows[l])};
 }
 }  // namespace
 

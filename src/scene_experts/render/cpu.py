@@ -1,7 +1,8 @@
 """The fast CPU rasteriser: the image that reference.py defines and all its gradients, computed by the compiled library (csrc/raster*).
 
-It works in float32 and, like the reference, does not normalise quaternions. Two correct rasterisers may differ by up to 4e-3 in single
-pixels whose alpha is within rounding of 1/255 or whose transmittance is within rounding of the stop, so compare means and quantiles.
+It works in float32 and, like the reference, does not normalise quaternions. Two correct rasterisers may differ in single pixels by 4e-3 of
+a colour where an alpha is within rounding of 1/255, and by 1e-2 where a transmittance is within rounding of the stop (two alphas of 0.99
+are), so compare means and quantiles.
 """
 
 from __future__ import annotations

@@ -5,7 +5,8 @@ whatever extent gsplat sorts with (since 1.5 it is smaller for faint Gaussians a
 channel over a background of 0. The gradient of the 2D mean is converted from px to NDC. The antialiasing factor is at least 0.005.
 
 These differences remain with gsplat 1.5.3: alpha is clamped at 0.999 instead of 0.99 (since 1.6 at 0.99). A pixel stops at T <= 1e-4
-instead of T < 1e-4. Quaternions are normalised inside, so their gradient has no component along the quaternion. Sums on the GPU are not
+instead of T < 1e-4. Quaternions are normalised inside, so their gradient has no component along the quaternion. Where the factor without
+its floor takes an opacity below 1/255, nothing is drawn; the reference draws an alpha of at most 0.005. Sums on the GPU are not
 deterministic in the last bits.
 
 gsplat is imported on first use. Without a prebuilt wheel it then compiles its CUDA code once, which takes minutes.

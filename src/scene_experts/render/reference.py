@@ -114,7 +114,7 @@ class ReferenceRasterizer:
         places = entries.split(counts)
         pairs = len(entries) * block[0] * block[1]
         recompute = torch.is_grad_enabled() and splats.requires_grad and pairs > _CHECKPOINT
-        blank = splats.new_tensor([0.0, 0.0, 0.0, 0.0, 1.0]).expand(block[0] * block[1], 5)
+        blank = _blend(splats[:0], _pixel_centres((0, 0), block, splats), False)  # of the splats, so that the picture can go backward
         tiles = []
         for number, part in enumerate(lists):
             if not len(part) and len(lists) > 1:

@@ -6,20 +6,20 @@ A scene indexes its columns without further checks, and its settings decide how 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from scene_experts.core.reading.budget import Damaged
-from scene_experts.core.reading.numbers import FARTHEST, all_finite, expect_range, number, whole_number
+from scene_experts.core.reading.numbers import FARTHEST, all_finite, expect_range, number, shown, whole_number
 from scene_experts.scene import Scene, SceneConfig, restore_scene
+from scene_experts.scene.anchors.levels import MOST_FORK, MOST_LEVELS, LevelRule
 
 _CREATE = (torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn)
 
 _MOST_FLOAT32 = torch.finfo(torch.float32).max
-MOST_LEVELS, MOST_FORK = 64, 1024  # of levels of detail
 MOST_STEPS = 1 << 40  # iterations of a training
 
 
@@ -52,8 +52,9 @@ def restore_foreign(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[
     Raises Damaged also for settings that ask for larger networks than the stored ones, before their memory is allocated.
     """
     check_fit(config, tensors, meta)
-    stored = [value.numel() for name, value in tensors.items() if name.startswith("network.")]
-    with _Limited(20_000 + 200 * len(stored), 2 * sum(stored) + (1 << 20)):
+    stored = [value for name, value in tensors.items() if name.startswith("network.")]
+    experts = sum(len(value) for value in stored if value.dim() == 3)  # of the layers of all heads; each is initialised on its own
+    with _Limited(20_000 + 200 * len(stored) + 20 * experts, 2 * sum(value.numel() for value in stored) + (1 << 20)):
         return restore_scene(config, tensors, meta, averaged)
 
 
@@ -69,6 +70,11 @@ def check_columns(shapes: dict[str, tuple[int, ...]], columns: dict[str, Tensor]
         whole = name in ("facts.cell", "facts.level")
         if columns[name].dtype != torch.int64 if whole else not columns[name].is_floating_point():
             raise Damaged(f"{name} of type {columns[name].dtype}")
+    optional = {"facts.interval": (), "facts.slots": shapes.get("params.offsets", (0,))[:1]}  # of the smoothing filter; of masked slots
+    for name in optional.keys() & columns.keys():
+        fits = columns[name].dtype == torch.bool if name == "facts.slots" else columns[name].is_floating_point()
+        if not fits or tuple(columns[name].shape[1:]) != optional[name]:
+            raise Damaged(f"{name} of shape {list(columns[name].shape)} and type {columns[name].dtype}")
 
 
 def check_levels(meta: dict[str, Any], level: Tensor | None) -> None:
@@ -78,6 +84,8 @@ def check_levels(meta: dict[str, Any], level: Tensor | None) -> None:
     whole_number(meta["fork"], "the fork of levels", 2, MOST_FORK)
     for name, low in (("edge", 1e-15), ("standard", 1e-15), ("threshold", -FARTHEST)):
         number(meta[name], f"the {name} of levels", low, FARTHEST)
+    if meta["rule"] not in get_args(LevelRule):
+        raise Damaged(f"{shown(meta['rule'])} as the rule of levels")
     for place in (meta["origin"], *meta["cameras"]):
         if len([number(v, "a position", -FARTHEST, FARTHEST) for v in place]) != 3:
             raise Damaged("a position of another number of coordinates")

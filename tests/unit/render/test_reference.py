@@ -293,7 +293,7 @@ def test_radius_does_not_depend_on_opacity() -> None:
     assert faint.radii.item() == ReferenceRasterizer()(one(opacity=1.0), plain_camera(), BLACK).radii.item() > 0
 
 
-@pytest.mark.parametrize("g", [make_scene(0), one(z=-5.0)], ids=["none", "all behind"])
+@pytest.mark.parametrize("g", [make_scene(0), one(z=-5.0), one(opacity=1e-3)], ids=["none", "all behind", "all too faint"])
 def test_an_empty_picture_is_the_background_and_can_go_backward(g: Gaussians) -> None:
     means = g.means.clone().requires_grad_()
     background = torch.tensor([0.1, 0.2, 0.3], dtype=F64, requires_grad=True)

@@ -7,6 +7,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.types import Points
 from scene_experts.recipes import RECIPES
 from scene_experts.scene import restore_scene
 from scene_experts.scene.fit import check_fit, restore_foreign
@@ -34,6 +35,15 @@ def test_scenes_that_fit(recipe):
     assert all(torch.equal(value, wanted.network_tensors()[name]) for name, value in found.network_tensors().items())
 
 
+def test_many_experts_fit():
+    config = RECIPES["moe-gs"][1].scene
+    config = replace(config, F=1, hidden=1, K=1, decoder=replace(config.decoder, num=800))
+    scene = config.start(Points(torch.rand(9, 3, dtype=torch.float64), torch.zeros(9, 3, dtype=torch.uint8)), 5.0)
+    tensors = {f"params.{k}": v.detach() for k, v in scene.table.params.items()} | {f"facts.{k}": v for k, v in scene.table.facts.items()}
+    tensors |= {f"network.{k}": v.detach() for k, v in scene.network_tensors().items()}
+    assert restore_foreign(config, tensors, {**scene.meta(), "step": 3}).traits.experts == 800
+
+
 def test_columns_that_do_not_fit():
     config, tensors, meta = stored("octree-moe-gs")
     level = tensors["facts.level"]
@@ -49,9 +59,15 @@ def test_columns_that_do_not_fit():
         {"network.heads.opacity.w1": torch.tensor([1 + 1j])},
         {"network.heads.opacity.w1": torch.tensor([1e300], dtype=torch.float64)},
         {"params.feature": tensors["params.feature"].double() + 1e300},
+        {"facts.slots": torch.ones(len(level), 1, dtype=torch.bool)},
+        {"facts.slots": torch.ones(len(level), config.K)},
+        {"facts.interval": torch.ones(len(level), 3)},
+        {"facts.interval": torch.ones(len(level), dtype=torch.int64)},
     ):
         with pytest.raises(Damaged):
             check_fit(config, tensors | change, meta)
+    slots = torch.ones(len(level), config.K, dtype=torch.bool)
+    check_fit(config, tensors | {"facts.slots": slots, "facts.interval": torch.ones(len(level))}, meta)
     with pytest.raises(Damaged):
         check_fit(config, {k: v for k, v in tensors.items() if k != "facts.xyz"}, meta)
 
@@ -61,7 +77,7 @@ def test_metadata_out_of_range():
     for change in ({"extent": 0.0}, {"extent": 1e300}, {"step": -1}, {"step": 1 << 60}, {"voxel": float("nan")}):
         with pytest.raises(Damaged):
             check_fit(config, tensors, meta | change)
-    for change in ({"count": 1 << 40}, {"fork": 0}, {"edge": -1.0}, {"origin": [0, 0]}, {"standard": None}, {"first": 99}):
+    for change in ({"count": 1 << 40}, {"fork": 0}, {"edge": -1.0}, {"origin": [0, 0]}, {"standard": None}, {"first": 99}, {"rule": "x"}):
         with pytest.raises(Damaged):
             check_fit(config, tensors, meta | {"levels": meta["levels"] | change})
 

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from scene_experts.core.errors import expect_at_least
+from scene_experts.core.errors import InputError, expect_at_least
 from scene_experts.core.parts import register
 from scene_experts.core.types import Mode, Routing
 from scene_experts.scene.anchors.experts import Experts, MixtureHead, top_k
@@ -35,6 +35,8 @@ class BalancedExperts(Experts):
     def check(self) -> None:
         super().check()
         expect_at_least([("--scene.decoder.speed", self.speed, 0)])
+        if self.router.weights == "margin":  # a bias may choose an expert of a smaller gate than the others': its margin is below 0
+            raise InputError("expected --scene.decoder.router.weights softmax for experts balanced by biases, found margin; leave it out")
 
 
 class BalancedHead(MixtureHead):

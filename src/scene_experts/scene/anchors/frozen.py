@@ -93,6 +93,11 @@ class Frozen:
         codes = self.scene.codes
         return self.weights if codes is None else {**self.weights, "color": _detach(fold(self.weights["color"], codes(camera, Mode.DRAW)))}
 
+    def _routers(self) -> dict[str, HeadWeights]:
+        """Return heads that route as those of every camera do: with any code, because the routing does not depend on it."""
+        codes = self.scene.codes
+        return self.weights if codes is None else {**self.weights, "color": _detach(fold(self.weights["color"], codes.table[0]))}
+
     def _call(self, rows: Tensor, position: Tensor, heads: dict[str, HeadWeights]) -> tuple:
         """Return the arguments of the library and the tensors that they point to."""
         plan = native_decode.make_plan(rows, self.xyz, position, heads, self.with_dist, self.scene.extent, False)
@@ -100,9 +105,7 @@ class Frozen:
         return native_decode.make_call(plan, self.columns, weights), (plan, weights)
 
     def _keep(self) -> tuple[Kept, ...]:
-        heads, N, nowhere = self.weights, len(self.xyz), torch.zeros(3)
-        if self.scene.codes is not None:  # any code will do: the routing does not depend on it
-            heads = {**heads, "color": _detach(fold(heads["color"], self.scene.codes.table[0]))}
+        heads, N, nowhere = self._routers(), len(self.xyz), torch.zeros(3)
         call, alive = self._call(torch.arange(N), nowhere, heads)
         routed = [h.router_w is not None for h in heads.values()]
         gates = [torch.empty(N, head.E) if r else None for r, head in zip(routed, call.heads)]
@@ -134,4 +137,4 @@ class FrozenCuda(Frozen):
         return Decoded(gaussians, rows, raw, {})
 
     def _keep(self) -> triton_decode.Routes:  # type: ignore[override]
-        return triton_decode.Routes(self.xyz, self.columns, self.weights, self.with_dist, self.scene.extent)
+        return triton_decode.Routes(self.xyz, self.columns, self._routers(), self.with_dist, self.scene.extent)

@@ -19,6 +19,7 @@ from scene_experts.geometry.voxel import AXIS_LIMIT, find_unique_cells, to_latti
 log: logging.Logger = logging.getLogger(__name__)
 LevelRule = Literal["round", "floor", "ceil", "blend"]
 MOST_CELLS = AXIS_LIMIT - 1  # maximum number of cells per axis of the cube, at any level
+MOST_LEVELS, MOST_FORK = 64, 1024  # that a checkpoint may have
 
 
 @dataclass(frozen=True)

@@ -216,6 +216,8 @@ class Octree(Selection):
         )
         expect_at_least([("--scene.select.coarse-until", self.coarse_until, 0), ("--scene.select.extend", self.extend, 1)])
         bounds = [
+            ("fork", self.fork, self.fork <= lattices.MOST_FORK, f"of at most {lattices.MOST_FORK:,}"),
+            ("count", self.count, self.count <= lattices.MOST_LEVELS, f"of at most {lattices.MOST_LEVELS}"),
             ("dist-ratio", self.dist_ratio, 0.5 < self.dist_ratio <= 1, "above 0.5 and at most 1"),
             ("visible-threshold", self.visible_threshold, self.visible_threshold < 1, "below 1"),
             ("coarseness", self.coarseness, self.coarseness > 0, "above 0"),

@@ -22,6 +22,7 @@ PRIMES = (1, 2_654_435_761, 805_459_861)  # eq. 4 of the paper
 INITIAL = 1e-4  # features are initialised uniformly in [-INITIAL, INITIAL]
 MOST_LEVELS = 64
 LARGEST = 24  # 2^24 rows per level, the largest size in the paper
+FINEST = 53  # 2^53 cells per axis: their numbers are exact, and their corners have 64 bits
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,11 @@ class HashGrid:
             raise InputError(f"expected --scene.grid.levels of at most {MOST_LEVELS}, found {self.levels}; give a smaller number")
         if self.log2_table > LARGEST:
             raise InputError(f"expected --scene.grid.log2-table of at most {LARGEST}, found {self.log2_table}; give a smaller number")
+        if math.log2(self.base) + (self.levels - 1) * math.log2(self.growth) > FINEST:
+            raise InputError(
+                f"expected at most 2^{FINEST} cells per axis at the finest level, found {self.base} x {self.growth:g}^{self.levels - 1}; "
+                "lower --scene.grid.levels, --scene.grid.growth or --scene.grid.base"
+            )
 
     def resolutions(self) -> list[int]:
         """Number of cells per axis of each level."""

@@ -14,8 +14,9 @@ from scene_experts.core.plain import to_json
 from scene_experts.core.types import Mode
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.balance import BalancedExperts, BalancedHead
-from scene_experts.scene.anchors.experts import Experts, MixtureHead
+from scene_experts.scene.anchors.experts import Experts, MixtureHead, Router
 from scene_experts.training.config import check
+from support.messages import naming
 from support.scenes import start_scene
 
 SOURCE = Path(scene_experts.__file__).parent
@@ -107,6 +108,13 @@ def test_the_recipe_and_its_flags():
     assert recipe.loss.load == 0 and recipe.loss.opacity == 0.01 and recipe.scene.decoder == BalancedExperts()
     with pytest.raises(InputError, match=r"--scene\.decoder\.speed"):
         BalancedExperts(speed=-1.0).check()
+
+
+def test_margin_weights_are_refused():
+    """A bias may choose an expert whose gate is smaller than one that is not chosen: its margin, and the weight, would be below 0."""
+    config = BalancedExperts(router=Router(weights="margin"))
+    with pytest.raises(InputError, match=naming("--scene.decoder.router.weights", "margin")):
+        config.check()
     scene = start_scene("moe-gs-balance")
     assert all(isinstance(h, BalancedHead) for h in scene.heads.values()) and scene.native_weights(STEP) is None
     assert {f"{a}.router_balance" for a in ("opacity", "cov", "color")} <= set(scene.network_tensors())

@@ -8,9 +8,12 @@ import torch
 from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
 from scene_experts.recipes import RECIPES
+from scene_experts.scene.anchors import native_decode, triton_decode
+from scene_experts.scene.anchors import scene as anchors
 from scene_experts.scene.anchors.experts import Experts, Router
-from scene_experts.scene.anchors.frozen import Frozen
+from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
+from support.interpret import DEVICE, kernels
 from support.messages import naming
 
 needs_native = pytest.mark.skipif(native.load() is None, reason="no compiled library")
@@ -87,6 +90,33 @@ def test_other_heads_draw_the_same_bits(config):
         scene.config = composed
         exact = scene(camera(1), DONE, Mode.DRAW, halves)
     torch.testing.assert_close(frozen(camera(1), DONE, Mode.DRAW, halves).raw_opacity, exact.raw_opacity, atol=1e-5, rtol=1e-4)
+
+
+def test_on_cuda_appearance_codes_are_folded_before_the_routing():
+    """Plain networks route nothing, so this needs no kernel."""
+    scene = trained(Anchors(appearance=6), n=20)
+    weights = {a: scene.heads[a].weights(DONE) for a in scene.heads}
+    assert FrozenCuda(scene, weights, DONE).kept.heads[2].attribute == "color"
+
+
+@pytest.mark.parametrize(
+    "config",
+    [Anchors(), Anchors(appearance=6, decoder=Experts()), Anchors(add_dist=("color",), decoder=Experts(top_k=1, attributes=("cov",)))],
+    ids=["plain", "appearance", "one attribute"],
+)
+def test_on_cuda_the_same_bits_are_drawn(config, monkeypatch):
+    kernels()
+    monkeypatch.setattr(native_decode, "decode", triton_decode.decode)  # what a scene on CUDA calls, here also for one in the interpreter
+    monkeypatch.setattr(anchors, "no_kernels", lambda device: None)
+    scene = trained(config, n=60).to(DEVICE)
+    view = camera(1).to(DEVICE)
+    seen = lambda means, scales, camera: torch.arange(len(means), device=means.device) % 3 != 1  # noqa: E731
+    for step in (1, DONE):
+        weights = scene.native_weights(step)
+        assert weights is not None
+        with torch.no_grad():
+            expected = scene(view, step, Mode.DRAW, seen)
+        same(FrozenCuda(scene, weights, step)(view, step, Mode.DRAW, seen), expected)
 
 
 @needs_native

@@ -8,7 +8,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.recipes import RECIPES
-from scene_experts.scene.anchors.levels import Levels
+from scene_experts.scene.anchors.levels import MOST_FORK, MOST_LEVELS, Levels
 from scene_experts.scene.anchors.select import AllAnchors, LevelSelector, Octree, fade_opacities, visible_rows
 from support.messages import naming
 from support.octree import camera_at, slow_level
@@ -165,6 +165,10 @@ def test_impossible_numbers_are_refused():
     for name, value in impossible.items():
         with pytest.raises(InputError, match=naming(f"--scene.select.{name.replace('_', '-')}", value)):
             Octree(**{name: value}).check()
+    Octree(fork=MOST_FORK, count=MOST_LEVELS).check()
+    for name, most in (("fork", MOST_FORK), ("count", MOST_LEVELS)):  # more of them could be trained, but no checkpoint of it could be read
+        with pytest.raises(InputError, match=naming(f"--scene.select.{name}", f"{most:,}", most + 1)):
+            Octree(**{name: most + 1}).check()
     assert start(base_layer=19)[2].lattices.count == 1
     for layer in (20, 1000):
         with pytest.raises(InputError, match=naming(f"2^{layer}", "--scene.select.base-layer")):

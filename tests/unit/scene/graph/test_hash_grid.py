@@ -96,8 +96,17 @@ def test_no_places_and_sizes_that_cannot_be():
             HashGrid(**wrong).check()
 
 
+def test_cells_too_fine_to_number_are_refused():
+    HashGrid(levels=64).check()
+    for wrong in ({"levels": 64, "growth": 2.0}, {"levels": 64, "growth": 1e6}, {"growth": float("inf")}):
+        with pytest.raises(InputError, match=naming("--scene.grid.levels", "--scene.grid.growth")):
+            HashGrid(**wrong).check()
+
+
 @pytest.mark.skipif(native.load() is None, reason="needs the compiled library")
-@pytest.mark.parametrize("config", [HashGrid(), SMALL, HashGrid(levels=3, features=1, coordinates="world")])
+@pytest.mark.parametrize(
+    "config", [HashGrid(), SMALL, HashGrid(levels=3, features=1, coordinates="world"), HashGrid(levels=2, base=2**21 - 1, growth=1.5)]
+)
 def test_the_compiled_form_is_the_plain_one(config, monkeypatch):
     grid = built(config, torch.float32)
     for n in (0, 1, 1500):
