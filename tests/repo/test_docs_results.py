@@ -14,6 +14,7 @@ import pytest
 
 from scene_experts import cli
 from scene_experts.reproduce import figures, store
+from scene_experts.reproduce.statistics import SEED_SD
 from support.places import ROOT
 
 RECORDS = ROOT / "results" / "records"
@@ -195,10 +196,10 @@ def test_differences_seed_by_seed(capture):
     assert row(capture, *(f"{gain:+.2f}" for gain in (*gains, statistics.fmean(gains)))) in lines("docs/results.md")
 
 
-def pooled(one: str, other: str) -> float:
-    """The standard deviation over seeds of the difference of two recipes in PSNR, dB, pooled over the captures."""
+def pooled(one: str, other: str, score: str = "psnr") -> float:
+    """The standard deviation over seeds of the difference of two recipes in a score (PSNR in dB), pooled over the captures."""
     pairs = [zip(*(as_it_is(c, recipe, recipe.endswith("dist")) for recipe in (one, other)), strict=True) for c in CAPTURES]
-    return statistics.fmean(statistics.variance([a["psnr"] - b["psnr"] for a, b in pair]) for pair in pairs) ** 0.5
+    return statistics.fmean(statistics.variance([a[score] - b[score] for a, b in pair]) for pair in pairs) ** 0.5
 
 
 def test_how_far_another_seed_moves_a_difference():
@@ -208,7 +209,10 @@ def test_how_far_another_seed_moves_a_difference():
     others = [sd for pair, sd in found.items() if set(pair) & set(ours)]
     assert f"the difference of two of them by {min(first):.2f} to {max(first):.2f} dB" in page
     assert f"Pairs with `scene-experts` or `scene-experts-one` have {min(others):.2f} to {max(others):.2f} dB" in page
-    assert f"with the {statistics.fmean(sd**2 for sd in found.values()) ** 0.5:.2f} dB that all ten pairs have together" in page
+    assert f"assume the {SEED_SD['psnr']} dB that all ten pairs have together (SSIM and LPIPS {SEED_SD['ssim']:g})" in page
+    for score, assumed in SEED_SD.items():
+        together = statistics.fmean(pooled(*pair, score) ** 2 for pair in found) ** 0.5
+        assert together == pytest.approx(assumed, abs=0.005 if score == "psnr" else 0.0005)
 
 
 @pytest.mark.parametrize("capture", ["buddha", "fox", "bonsai"])

@@ -99,11 +99,11 @@ def test_only_what_both_have_is_paired():
 
 
 def test_one_seed_leaves_room_for_what_another_would_change():
-    a, b = ([record(recipe, scene=s, psnr=p) for s in "vwxyz"] for recipe, p in (("moe-gs", 30.3), ("scaffold-gs", 30.0)))
+    a, b = ([record(recipe, scene=s, psnr=p) for s in "vwxyz"] for recipe, p in (("moe-gs", 30.5), ("scaffold-gs", 30.0)))
     one, five = difference(a[:1], b[:1]), difference(a, b)
     width = student(SEED_WEIGHT) * SEED_SD["psnr"]
-    assert one is not None and one.low == pytest.approx(0.3 - width) and one.verdict(1) == "undecided"
-    assert five is not None and five.low == pytest.approx(0.3 - width / math.sqrt(5)) and five.verdict(1) == "confirmed"
+    assert one is not None and one.low == pytest.approx(0.5 - width) and one.verdict(1) == "undecided"
+    assert five is not None and five.low == pytest.approx(0.5 - width / math.sqrt(5)) and five.verdict(1) == "confirmed"
 
 
 def test_fit_is_paired_over_iterations_of_the_second_half():
