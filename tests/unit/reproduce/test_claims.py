@@ -59,7 +59,7 @@ def test_balance_is_the_busiest_experts_share():
 
 
 def test_depth_that_helps_contradicts():
-    flat = [record("scaffold-gs-depth2", psnr=30.0), record("scaffold-gs-depth3", psnr=29.5)]
+    flat = [record("scaffold-gs-depth2", psnr=30.0), record("scaffold-gs-depth3", psnr=29.0)]
     assert get(flat, "linear layers").verdict == "confirmed"
     assert get([*flat, record("scaffold-gs-depth4", psnr=32.0)], "linear layers").verdict == "contradicted"
 
