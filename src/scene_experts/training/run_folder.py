@@ -94,7 +94,7 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
     if resume:
         _check_same(out, read_config(out), config)
     elif not overwrite and any((out / "checkpoints").glob("ckpt_*.safetensors")):
-        imported = config.command.startswith("import ")
+        imported = config.command.startswith(("import ", "merged "))
         go_on = "" if imported else "continue it with --resume, replace it with --overwrite (in Python: resume=True, overwrite=True), or "
         raise InputError(f"expected a new or empty run folder, found checkpoints in {out}; {go_on}choose another folder (--out)")
 

@@ -221,11 +221,12 @@ def test_near_of_the_users_choice(tmp_path):
         run_folder.load_capture(Data(folder, near=0.0))
 
 
-def test_an_import_over_another_run_is_not_told_to_resume(tmp_path):
+@pytest.mark.parametrize("command", ["import scene.ply", "merged from 2 blocks"])
+def test_an_import_over_another_run_is_not_told_to_resume(command, tmp_path):
     (tmp_path / "checkpoints").mkdir(parents=True)
     (tmp_path / "checkpoints" / "ckpt_000001.safetensors").write_bytes(b"")
     with pytest.raises(InputError, match="--out") as error:
-        run_folder.check(tmp_path, replace(CONFIG, command="import scene.ply"), resume=False)
+        run_folder.check(tmp_path, replace(CONFIG, command=command), resume=False)
     assert "--resume" not in str(error.value)
 
 
