@@ -74,7 +74,7 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
 
     Raises:
         InputError: The folder holds another run or foreign files, the settings are not finite, or the run to resume has another
-            recipe, other capture settings or other training settings.
+            recipe, other capture settings, other training settings or another start.
     """
     place = next(p for p in (out, *out.absolute().parents) if p.exists())
     if not place.is_dir():
@@ -128,6 +128,16 @@ def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
             f"expected the settings that the run in {out} began with, found other settings: {few(other, MOST_DIFFERENCES)}; "
             f"resume with the run's own flags, or choose another --out"
         )
+    older = found.init_from is None and "--init-from" in found.command  # a run that does not record its start
+    if config.init_from is not None and not older and _place(config.init_from) != _place(found.init_from):
+        was = "none" if found.init_from is None else str(found.init_from)
+        raise InputError(
+            f"expected the --init-from that the run in {out} began with ({was}), found {config.init_from}; leave it out, or choose another --out"
+        )
+
+
+def _place(path: Path | None) -> Path | None:
+    return None if path is None else path.resolve()
 
 
 _UNFINISHED = (".config.json.*.part", ".cfg_args.*.part", "checkpoints/.*.part", "previews/.*.part", "point_cloud/*/.*.part")
@@ -147,6 +157,8 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False,
     """Prepare `out` for a run: call `check`, remove unfinished files of a killed training, the metrics of a run that is not resumed and
     the checkpoints and results of an overwritten run, and write config.json."""
     check(out, config, resume, overwrite)
+    if resume:  # a run is deterministic if all parts of its training were
+        config = replace(config, deterministic=config.deterministic and read_config(out).deterministic)
     for unfinished in (path for pattern in _UNFINISHED for path in out.glob(pattern)):
         unfinished.unlink(missing_ok=True)
     if not resume:
@@ -169,6 +181,12 @@ def as_begun(out: Path, config: RunConfig) -> RunConfig:
     if config.init_from is not None or not (out / "config.json").is_file():
         return config
     return replace(config, init_from=read_config(out).init_from)
+
+
+def as_trained(out: Path, config: RunConfig) -> RunConfig:
+    """Return the configuration of the run in `out` with the capture at the place of `config`. For a run whose training has ended."""
+    found = read_config(out)
+    return replace(found, data=replace(found.data, path=config.data.path))
 
 
 def _write_config(out: Path, config: RunConfig) -> None:

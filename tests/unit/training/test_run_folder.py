@@ -111,6 +111,7 @@ def test_a_checkpoint_of_another_recipe_in_the_folder(run):
         (RunConfig(replace(CFG, loss=replace(CFG.loss, load=0.5)), CONFIG.data), {"resume": True}, ["loss.load", 0.01, 0.5]),
         (RunConfig(CFG, replace(CONFIG.data, split="first:2")), {"resume": True}, ["split", "auto", "first:2"]),
         (RunConfig(replace(CFG, loss=replace(CFG.loss, load=float("nan"))), CONFIG.data), {"resume": False}, ["nan"]),
+        (replace(CONFIG, init_from=Path("/coarse")), {"resume": True}, ["--init-from", "none", "/coarse"]),
     ],
 )
 def test_what_is_refused_changes_nothing(config, options, facts, run):
@@ -127,6 +128,20 @@ def test_resuming_may_move_the_capture_and_the_stop(run):
     assert run_folder.read_config(run) == CONFIG, "checking writes nothing"
     run_folder.prepare(run, moved, resume=True)
     assert run_folder.read_config(run) == moved and checkpoint.latest(run / "checkpoints") is not None
+
+
+def test_a_resumed_run_has_one_start_and_is_deterministic_as_a_whole(run):
+    begun = replace(CONFIG, init_from=run / "coarse", deterministic=True)
+    run_folder.prepare(run, begun, resume=False, overwrite=True)
+    for same in (begun, replace(begun, init_from=run / ".." / run.name / "coarse"), replace(begun, init_from=None)):
+        run_folder.check(run, same, resume=True)
+    with pytest.raises(InputError, match=naming("--init-from", run / "coarse", run / "other")):
+        run_folder.check(run, replace(begun, init_from=run / "other"), resume=True)
+    for given in (True, False, True):
+        run_folder.prepare(run, replace(begun, deterministic=given), resume=True)
+    assert not run_folder.read_config(run).deterministic
+    run_folder.prepare(run, replace(CONFIG, command="scene-experts train moe-gs --init-from coarse"), resume=False, overwrite=True)
+    run_folder.check(run, begun, resume=True)  # older versions did not record the start
 
 
 def test_overwriting_removes_what_belonged_to_the_old_run_and_nothing_else(run):
