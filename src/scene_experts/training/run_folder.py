@@ -130,9 +130,9 @@ def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
         )
     older = found.init_from is None and "--init-from" in found.command  # a run that does not record its start
     if config.init_from is not None and not older and _place(config.init_from) != _place(found.init_from):
-        was = "none" if found.init_from is None else str(found.init_from)
         raise InputError(
-            f"expected the --init-from that the run in {out} began with ({was}), found {config.init_from}; leave it out, or choose another --out"
+            f"expected the --init-from that the run in {out} began with ({found.init_from or 'none'}), found {config.init_from}; "
+            "leave it out, or choose another --out"
         )
 
 
