@@ -73,8 +73,8 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
     """Check that a run can be written to `out`. Changes nothing on disk.
 
     Raises:
-        InputError: The folder holds another run or foreign files, the settings are not finite, or the run to resume has another
-            recipe, other capture settings, other training settings or another start.
+        InputError: The folder holds another run or foreign files or its path is not UTF-8, the settings are not finite, or the run to
+            resume has another recipe, other capture settings, other training settings or another start.
     """
     place = next(p for p in (out, *out.absolute().parents) if p.exists())
     if not place.is_dir():
@@ -83,6 +83,10 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
         json.dumps(to_json(config), allow_nan=False)
     except ValueError:
         raise InputError("expected finite numbers in every setting, found nan or infinity; correct the flag") from None
+    try:
+        str(out.absolute()).encode()
+    except UnicodeEncodeError:  # safetensors would write checkpoints there, but not read them
+        raise InputError(f"expected a run folder whose path is UTF-8, found {str(out)!r}; choose another --out") from None
     if out.resolve() == config.data.path.resolve():
         raise InputError(f"expected a folder of its own for the run, found the capture's at {out}; choose another --out")
     if foreign := _foreign(out):

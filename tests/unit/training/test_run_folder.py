@@ -195,6 +195,11 @@ def test_places_that_cannot_be_a_run_folder(tmp_path):
     assert not (tmp_path / "new").exists() and (tmp_path / "file").read_text() == "x"
 
 
+def test_a_path_that_checkpoints_could_not_be_read_from_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"UTF-8.*caf\\udce9.*--out"):
+        run_folder.check(tmp_path / "caf\udce9", CONFIG, resume=False)
+
+
 def test_one_training_holds_a_run_folder(tmp_path):
     with run_folder.held(tmp_path / "run"):
         with pytest.raises(InputError, match=naming(tmp_path / "run")), run_folder.held(tmp_path / "run"):
