@@ -82,7 +82,7 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
 def _check_box(blocks: Sequence[Block], number: int, run: OpenRun) -> None:
     """Raise InputError if a run was trained for another box than that of its block. Warns if its training has not ended."""
     train, last = run.config.train, run.config.stop_at or run.config.train.iterations
-    bounds = getattr(train.growth, "bounds", ())  # empty: a run that creates anchors everywhere fits every block
+    bounds = train.growth.box  # empty: a run that creates anchors everywhere fits every block
     if bounds and not _is_same_box(bounds, blocks[number]):
         other = next((f"that of block {i}" for i, block in enumerate(blocks) if _is_same_box(bounds, block)), "one of another plan")
         raise InputError(f"expected the run of block {number} at {run.path}, found {other}; name the runs in the plan's order")
