@@ -73,8 +73,8 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
     """Check that a run can be written to `out`. Changes nothing on disk.
 
     Raises:
-        InputError: The folder holds another run or foreign files or its path is not UTF-8, the settings are not finite, or the run to
-            resume has another recipe, other capture settings, other training settings or another start.
+        InputError: The folder holds another run or foreign files, is that of `init_from`, or has a path that is not UTF-8, the settings
+            are not finite, or the run to resume has another recipe, other capture settings, other training settings or another start.
     """
     place = next(p for p in (out, *out.absolute().parents) if p.exists())
     if not place.is_dir():
@@ -89,6 +89,8 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
         raise InputError(f"expected a run folder whose path is UTF-8, found {str(out)!r}; choose another --out") from None
     if out.resolve() == config.data.path.resolve():
         raise InputError(f"expected a folder of its own for the run, found the capture's at {out}; choose another --out")
+    if not resume and _place(config.init_from) == out.resolve():  # until the new run has a checkpoint, its start would exist nowhere
+        raise InputError(f"expected another folder for the run than that of --init-from, found {out} for both; choose another --out")
     if foreign := _foreign(out):
         raise InputError(f"expected a new or empty folder or an earlier run at {out}, found {foreign} in it; choose another --out")
     if resume and overwrite:

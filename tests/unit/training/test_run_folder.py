@@ -144,6 +144,13 @@ def test_a_resumed_run_has_one_start_and_is_deterministic_as_a_whole(run):
     run_folder.check(run, begun, resume=True)  # older versions did not record the start
 
 
+def test_a_run_is_not_written_over_the_run_that_it_starts_from(run):
+    before, config = state(run), replace(CONFIG, init_from=run / ".." / run.name)
+    with pytest.raises(InputError, match=naming("--init-from", run, "--out")):
+        run_folder.prepare(run, config, resume=False, overwrite=True)
+    assert state(run) == before
+
+
 def test_overwriting_removes_what_belonged_to_the_old_run_and_nothing_else(run):
     (run / "previews").mkdir()
     for kind in ("renders", "experts"):
