@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import sys
 import warnings
@@ -20,6 +21,8 @@ SLOW = ("capture", "train", "eval", "render", "view", "export", "import")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command. Returns the exit code: 0 for success, 1 for a failure, 2 for invalid input."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a name that its encoding cannot write ends no work; so it is for stderr already
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         return dispatch(list(sys.argv[1:] if argv is None else argv))
     except BrokenPipeError:  # the reader (`| head`) has closed the pipe

@@ -1,5 +1,6 @@
 """The command line: help, one-sentence errors, exit codes."""
 
+import io
 import json
 import re
 import signal
@@ -250,3 +251,13 @@ def test_too_little_memory_is_one_sentence(error, capsys, monkeypatch):
     monkeypatch.setattr(commands, "run", lambda *args: (_ for _ in ()).throw(RuntimeError("a fault of ours")))
     with pytest.raises(RuntimeError):
         cli.main(["info"])
+
+
+def test_names_that_the_terminal_cannot_write_end_no_work(capture, tmp_path, monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(written, encoding="ascii"))
+    out = tmp_path / "früh"
+    words = ["--data", str(capture), "--out", str(out), "--iterations", "1", "--preview-every", "0", "--device", "cpu"]
+    assert cli.main(["train", "scaffold-gs", *words]) == 0
+    sys.stdout.flush()
+    assert rb"fr\xfch" in written.getvalue() and (out / "point_cloud/iteration_1/point_cloud.ply").is_file()

@@ -41,9 +41,11 @@ def train(run: loop.Run, capture: Capture, rasterize: Rasterizer, *, overwrite: 
     with ExitStack() as folder, Recorder(run.out, tensorboard) as record:
         for event in loop.train(run.config.train, run, capture, rasterize):
             if isinstance(event, Started):  # the training can start: from here on the folder may change
-                complete = event.step == event.total and is_exported(run.out, event.step)
+                ended = run.resume and event.step >= event.total
+                complete = ended and is_exported(run.out, event.step)
                 folder.enter_context(run_folder.held(run.out))
-                run_folder.prepare(run.out, run.config, run.resume, overwrite, exported_files(run.out))
+                config = run_folder.as_trained(run.out, run.config) if ended else run.config
+                run_folder.prepare(run.out, config, run.resume, overwrite, exported_files(run.out))
             record(event)
             if isinstance(event, Finished):
                 finished = event  # yielded last; the loop ends first and frees its memory

@@ -134,7 +134,7 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]], every: int =
         inside = ["--growth.bounds", *(f"{side:.6g}" for side in bounds[number])]
         lines.append([*block, "--out", run, "--iterations", str(total), *views, *inside, *memory])
     lines.append([PROG, "blocks", "merge", str(out), "--runs", *runs, "--out", merged])
-    both = total + max(1, total // 10)
+    both = total + -(-max(1, total // 10) // cfg.batch) * cfg.batch  # as `total`, a multiple of the batch
     # the rates that a schedule leaves constant fall during the joint training: without it, the blocks' fit is shaken and not restored
     settle = ["--rates.anneal", str(SETTLE), "--rates.anneal-from", f"{total / both:.4f}"]
     lines.append([*train, "--out", str(out / "joint"), "--iterations", str(both), "--init-from", merged, *settle])
@@ -154,10 +154,13 @@ def without(words: list[str], flags: list[str]) -> list[str]:
 def check_trainings(lines: list[str], data: Data) -> None:
     """Raise InputError if the options of a training in `lines` are wrong, or change how the capture `data` of the plan is read."""
     from scene_experts.commands.train import parse_train
+    from scene_experts.training.config import check
 
     for words in map(shlex.split, lines):
         if words[1] == "train":
-            found = vars(parse_train(words[2:]).data)
+            train = parse_train(words[2:])
+            check(train.cfg)
+            found = vars(train.data)
             for name in (name for name, value in vars(data).items() if name != "views" and value != found[name]):
                 option = f"--{name.replace('_', '-')}"
                 raise InputError(f"expected options of the training in --train, found {option}; give it to `{PROG} blocks plan` itself")

@@ -40,9 +40,10 @@ def view(args: list[str]) -> int:
     from scene_experts.render import as_trained
     from scene_experts.training import run_folder
     from scene_experts.view.gate import is_local
-    from scene_experts.view.server import Viewer, check_port, import_viser
+    from scene_experts.view.server import Viewer, check_host, check_port, import_viser
 
     check_port(command.port)
+    check_host(command.host)
     import_viser()  # reports a missing package before anything is read
     device, rasterize = backend(command.device, command.rasterizer, False, False)
     opened = run_folder.open_run(command.run, device, command.step)

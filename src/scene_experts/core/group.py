@@ -164,6 +164,7 @@ class Group(Alone):
         first = next((number for number, found in enumerate(errors) if found), None)
         if first is None:
             return result
+        self.leave()  # without it, gloo's threads may abort the process, which then has another exit code
         if first == self.rank and error is not None:
             raise error
         raise SystemExit(2 if errors[first][0] is InputError else 1)  # type: ignore[index]

@@ -61,7 +61,7 @@ def make_blocks(capture: Capture, count: int, margin: float = 0.1, share: float 
             at least to the block of which it sees most.
 
     Raises:
-        InputError: The capture has no points, the numbers are out of range, or a block would have no view.
+        InputError: The capture has no points, the numbers are out of range, or a block would have no point or no view.
     """
     expect_at_least([("--blocks", count, 1), ("--margin", margin, 0), ("--share", share, 0)])
     if capture.points is None or len(capture.points.xyz) < count:
@@ -85,7 +85,10 @@ def make_blocks(capture: Capture, count: int, margin: float = 0.1, share: float 
 
 
 def split_box(xyz: Tensor, box: Block, count: int) -> list[Block]:
-    """Split a box into `count` boxes with equal numbers of the points [N, 3], each time across its longest side."""
+    """Split a box into `count` boxes with equal numbers of the points [N, 3], each time across its longest side.
+
+    Raises InputError if a box would have no point, because too many points have the same coordinate.
+    """
     if count == 1:
         return [box]
     first = count // 2
@@ -94,6 +97,9 @@ def split_box(xyz: Tensor, box: Block, count: int) -> list[Block]:
     low, high = list(box.low), list(box.high)
     low[axis] = high[axis] = at
     below = xyz[:, axis] < at
+    if not below.any():
+        same = int((xyz[:, axis] == at).sum())
+        raise InputError(f"expected points that {count} blocks can divide, found {same} with the same coordinate; give smaller --blocks")
     left, right = Block(box.low, tuple(high)), Block(tuple(low), box.high)
     return split_box(xyz[below], left, first) + split_box(xyz[~below], right, count - first)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +14,13 @@ from torch import Tensor
 
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
-from scene_experts.data.blocks import read_plan
+from scene_experts.data.blocks import Block, read_plan
 from scene_experts.files.export import write_result_folder
 from scene_experts.scene import Scene
 from scene_experts.training import run_folder
+from scene_experts.training.run_folder import OpenRun
+
+log: logging.Logger = logging.getLogger(__name__)
 
 
 def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
@@ -27,8 +32,8 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
         out: New run folder, with configuration, checkpoint and result folder.
 
     Raises:
-        InputError: The number of runs differs from that of the blocks, or the runs have other captures, lattices or networks than the
-            first one. The message names the run.
+        InputError: The number of runs differs from that of the blocks, a run was trained for another box, or the runs have other
+            captures, lattices or networks than the first one. The message names the run.
     """
     fingerprint, blocks = read_plan(plan)
     if len(runs) != len(blocks):
@@ -37,17 +42,18 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     networks: dict[str, Tensor] = {}
     lattice: dict[str, Any] = {}
     configs, step, seconds = [], 0, 0.0
-    for block, path in zip(blocks, runs):  # one run in memory at a time
+    for number, path in enumerate(runs):  # one run in memory at a time
         run = run_folder.open_run(path)
         scene = run.scene
         if not scene.traits.voxel:
             raise InputError(f"expected a scene of anchors in {path}, found one of {scene.traits.rows}; train an anchor recipe")
         if run.capture != fingerprint:
             raise InputError(f"expected a run on the capture of the plan, found one on another in {path}; use the plan's command")
+        _check_box(blocks, number, run)
         if not configs:
             networks, lattice = {name: value.detach().clone() for name, value in scene.network_tensors().items()}, scene.meta()
         _check_same(lattice, networks, scene, path)
-        rows = block.holds(scene.positions.detach())
+        rows = blocks[number].holds(scene.positions.detach())
         for name, column in scene.table.columns().items():
             kind = "params" if name in scene.table.params else "facts"
             columns.setdefault(f"{kind}.{name}", []).append(column.detach()[rows])
@@ -71,6 +77,21 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     finally:
         capture.images.close()
     return len(merged.scene.table)
+
+
+def _check_box(blocks: Sequence[Block], number: int, run: OpenRun) -> None:
+    """Raise InputError if a run was trained for another box than that of its block. Warns if its training has not ended."""
+    train, last = run.config.train, run.config.stop_at or run.config.train.iterations
+    bounds = train.growth.box  # empty: a run that creates anchors everywhere fits every block
+    if bounds and not _is_same_box(bounds, blocks[number]):
+        other = next((f"that of block {i}" for i, block in enumerate(blocks) if _is_same_box(bounds, block)), "one of another plan")
+        raise InputError(f"expected the run of block {number} at {run.path}, found {other}; name the runs in the plan's order")
+    if run.step < last:
+        log.warning("the run of block %d ended at iteration %s of %s: %s", number, f"{run.step:,}", f"{last:,}", run.path)
+
+
+def _is_same_box(bounds: Sequence[float], block: Block) -> bool:
+    return all(math.isclose(a, b, rel_tol=1e-5) for a, b in zip(bounds, block.bounds))  # a plan writes six digits
 
 
 def _check_same(lattice: dict[str, Any], networks: dict[str, Tensor], scene: Scene, path: Path) -> None:

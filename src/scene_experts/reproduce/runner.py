@@ -128,7 +128,7 @@ class Runner:
             if self.stop.is_set():
                 return None  # the same command resumes it
             if code != 0:
-                return self.fail(spec, last_line(log) or f"exit code {code}", log, place)
+                return self.fail(spec, reason(code, log), log, place)
         try:
             record = store.read_run(folder, spec.scene.name, spec.code)
             store.write(self.records, record)
@@ -221,6 +221,16 @@ def build_kernels() -> None:
     if torch.cuda.is_available():
         code = "from scene_experts.render.gsplat import explain_missing; explain_missing()"
         subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
+
+
+def reason(code: int, log: Path) -> str:
+    """Return why a command with the exit code `code` failed: the last line of its log, and the signal that has ended it, if one has."""
+    said = last_line(log)
+    if code >= 0:
+        return said or f"exit code {code}"
+    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+    memory = " (often for too little memory)" if name == "SIGKILL" else ""
+    return f"the process was ended by {name}{memory}; repeat the command to continue. Its last line: {said or 'none'}"
 
 
 def last_line(log: Path) -> str:

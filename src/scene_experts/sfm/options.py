@@ -7,6 +7,7 @@ from typing import Literal
 
 from scene_experts.core.errors import InputError, expect_at_least
 
+LARGEST = 2**31 - 1  # COLMAP's numbers have 32 bits
 MOST_FRAMES = 5000  # more frame numbers do not fit into one ffmpeg command
 CameraModel = Literal[
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE"
@@ -40,5 +41,8 @@ class Options:
         """Raises InputError, naming the option, for invalid settings."""
         expect_at_least([("--frames", self.frames, 3), ("--max-side", self.max_side, 64)])
         expect_at_least([("--threads", self.threads, 0), ("--seed", self.seed, 0)])
+        for flag, value in (("--max-side", self.max_side), ("--threads", self.threads), ("--seed", self.seed)):
+            if value > LARGEST:
+                raise InputError(f"expected {flag} of at most {LARGEST}, found {value}; give a smaller number")
         if self.frames > MOST_FRAMES:
             raise InputError(f"expected --frames of at most {MOST_FRAMES:,}, found {self.frames:,}; 100 to 300 frames are enough")

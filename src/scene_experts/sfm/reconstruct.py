@@ -28,7 +28,7 @@ from scene_experts.sfm.masks import write_masks
 from scene_experts.sfm.options import Matching, Options
 from scene_experts.sfm.photos import Photo
 
-LOG, NOTE = "colmap.log", "capture.json"
+LOG, NOTE, VIDEO = "colmap.log", "capture.json", "video.txt"
 INSTALL = "pip install 'scene-experts[sfm]'"
 MOST_EXHAUSTIVE = 300  # photographs that are all matched with each other: 44,850 pairs, about ten minutes on two cores
 NEIGHBOURS = 10  # following photographs that each photograph is matched with
@@ -64,8 +64,11 @@ def reconstruct(
         if source.is_file():
             say(f"reading {source.name}: the sharpest of its frames are used")
             found = extract_photos(source, images, options, progress)
+        elif own:
+            found = photos.check_in_place(found, source)
         else:
-            found = photos.check_in_place(found, source) if own else photos.copy_photos(found, source, images)
+            (folder / work.DONE / VIDEO).unlink(missing_ok=True)  # the images are no longer its frames
+            found = photos.copy_photos(found, source, images)
         groups = photos.group_by_camera(found)
         names = [photo.name for photo in found]
         pairs = choose_pairs(len(names), options.matching)
@@ -130,10 +133,11 @@ def check_request(source: Path, out: Path, overwrite: bool) -> None:
 
 def extract_photos(video: Path, images: Path, options: Options, progress: Progress) -> list[Photo]:
     """Extract the frames of a video into `images` and return them. Frames of an earlier call with the same video are reused."""
-    note, mark = images.with_name("video.txt"), f"{video.name} {video.stat().st_size} {video.stat().st_mtime_ns} {options.frames}"
+    note, mark = images.with_name(VIDEO), f"{video.name} {video.stat().st_size} {video.stat().st_mtime_ns} {options.frames}"
     if not note.is_file() or note.read_text() != mark:
         work.remove(images)
-        note.unlink(missing_ok=True)
+        for old in (note, images.with_name(photos.COPIED)):
+            old.unlink(missing_ok=True)
         names = frames.extract_frames(video, images, options.frames, progress)
         if len(names) < photos.FEWEST:
             raise InputError(f"expected a video of at least {photos.FEWEST} frames at {video}, found {len(names)}; use a longer video")

@@ -50,6 +50,11 @@ class Strategy(Part, Generic[S], ABC):
         """Whether the statistics use absolute pixel gradients (`types.Render.mean2d_grad`)."""
         return False
 
+    @property
+    def box(self) -> tuple[float, ...]:
+        """Low and high corner (x, y, z, x, y, z) of the box in which rows are created, in trained world units; empty means everywhere."""
+        return ()
+
     def needs_whole_table(self) -> str:
         """Return the setting that needs all rows in every process, for the message of --shard; "" if none does. The default refuses."""
         return "this growth rule"

@@ -67,6 +67,10 @@ class AnchorControl(Strategy[L]):
         """Whether the statistics use absolute pixel gradients."""
         return self.gradient == "absolute"
 
+    @property
+    def box(self) -> tuple[float, ...]:
+        return self.bounds
+
     def scaled(self, factor: float) -> Self:
         """Scale the schedule to a training `factor` times as long. The interval, gates and thresholds do not change."""
         used = factor if self.mask_contribution > 0 else 1.0  # older checkpoints do not have an unused value

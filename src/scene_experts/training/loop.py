@@ -91,7 +91,7 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     rasterize = for_growth(rasterize, cfg.growth.absolute)
     training = run.group.agree(lambda: begin(cfg, run, capture, folder, rasterize))
     exchange = start_exchange(training, run)
-    total = min(cfg.iterations, -(-(run.config.stop_at or cfg.iterations) // cfg.batch) * cfg.batch)
+    total = last_iteration(cfg, run)
     writes = folder is not None and run.group.first
     run.begin(training)
     yield Started(training.step, total, training.scene.table.total, training.scene.traits)
@@ -136,6 +136,11 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
         yield Finished(training.step, training.clock.seconds)
 
 
+def last_iteration(cfg: Train, run: Run) -> int:
+    """Return the iteration at which a training ends: `stop_at` at the end of its batch, or all iterations."""
+    return min(cfg.iterations, -(-(run.config.stop_at or cfg.iterations) // cfg.batch) * cfg.batch)
+
+
 def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize: Rasterizer) -> Training:
     """Start a training, or restore it from the newest whole checkpoint in `folder`. `cfg` must be scaled. Raises InputError as `train`."""
     training = resume(cfg, folder, run.device) if run.resume and folder else None
@@ -143,6 +148,9 @@ def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
     if training is None and run.config.init_from is not None:
         training = Training.start_from(cfg, run.config.init_from, capture, run.device)
+        if training.step >= last_iteration(cfg, run):
+            found = f"found {run.config.stop_at}; give a larger number or leave it out"
+            raise InputError(f"expected --stop-at above {training.step}, where the run of --init-from ended, {found}")
     training = training or Training.start(cfg, capture, run.device, run.dtype)
     if unused := find_unused(cfg):
         log.warning("these options have no effect with this recipe: %s; leave them out", ", ".join(unused))

@@ -48,7 +48,7 @@ class Recorder:
             case Started():
                 self.truncate(event.step)
                 if self.writer:
-                    self.board = self.writer(str(self.out / "tensorboard"))
+                    self.board = self.writer(str(self.out / "tensorboard"), purge_step=event.step + 1)  # hides what is written again
             case Stepped():
                 self.write_line(asdict(event))
                 if self.board:

@@ -73,8 +73,8 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
     """Check that a run can be written to `out`. Changes nothing on disk.
 
     Raises:
-        InputError: The folder holds another run or foreign files, the settings are not finite, or the run to resume has another
-            recipe, other capture settings or other training settings.
+        InputError: The folder holds another run or foreign files, is that of `init_from`, or has a path that is not UTF-8, the settings
+            are not finite, or the run to resume has another recipe, other capture settings, other training settings or another start.
     """
     place = next(p for p in (out, *out.absolute().parents) if p.exists())
     if not place.is_dir():
@@ -83,8 +83,14 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
         json.dumps(to_json(config), allow_nan=False)
     except ValueError:
         raise InputError("expected finite numbers in every setting, found nan or infinity; correct the flag") from None
+    try:
+        str(out.absolute()).encode()
+    except UnicodeEncodeError:  # safetensors would write checkpoints there, but not read them
+        raise InputError(f"expected a run folder whose path is UTF-8, found {str(out)!r}; choose another --out") from None
     if out.resolve() == config.data.path.resolve():
         raise InputError(f"expected a folder of its own for the run, found the capture's at {out}; choose another --out")
+    if not resume and _place(config.init_from) == out.resolve():  # until the new run has a checkpoint, its start would exist nowhere
+        raise InputError(f"expected another folder for the run than that of --init-from, found {out} for both; choose another --out")
     if foreign := _foreign(out):
         raise InputError(f"expected a new or empty folder or an earlier run at {out}, found {foreign} in it; choose another --out")
     if resume and overwrite:
@@ -94,7 +100,7 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
     if resume:
         _check_same(out, read_config(out), config)
     elif not overwrite and any((out / "checkpoints").glob("ckpt_*.safetensors")):
-        imported = config.command.startswith("import ")
+        imported = config.command.startswith(("import ", "merged "))
         go_on = "" if imported else "continue it with --resume, replace it with --overwrite (in Python: resume=True, overwrite=True), or "
         raise InputError(f"expected a new or empty run folder, found checkpoints in {out}; {go_on}choose another folder (--out)")
 
@@ -128,6 +134,16 @@ def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
             f"expected the settings that the run in {out} began with, found other settings: {few(other, MOST_DIFFERENCES)}; "
             f"resume with the run's own flags, or choose another --out"
         )
+    older = found.init_from is None and "--init-from" in found.command  # a run that does not record its start
+    if config.init_from is not None and not older and _place(config.init_from) != _place(found.init_from):
+        raise InputError(
+            f"expected the --init-from that the run in {out} began with ({found.init_from or 'none'}), found {config.init_from}; "
+            "leave it out, or choose another --out"
+        )
+
+
+def _place(path: Path | None) -> Path | None:
+    return None if path is None else path.resolve()
 
 
 _UNFINISHED = (".config.json.*.part", ".cfg_args.*.part", "checkpoints/.*.part", "previews/.*.part", "point_cloud/*/.*.part")
@@ -147,6 +163,8 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False,
     """Prepare `out` for a run: call `check`, remove unfinished files of a killed training, the metrics of a run that is not resumed and
     the checkpoints and results of an overwritten run, and write config.json."""
     check(out, config, resume, overwrite)
+    if resume:  # a run is deterministic if all parts of its training were
+        config = replace(config, deterministic=config.deterministic and read_config(out).deterministic)
     for unfinished in (path for pattern in _UNFINISHED for path in out.glob(pattern)):
         unfinished.unlink(missing_ok=True)
     if not resume:
@@ -169,6 +187,12 @@ def as_begun(out: Path, config: RunConfig) -> RunConfig:
     if config.init_from is not None or not (out / "config.json").is_file():
         return config
     return replace(config, init_from=read_config(out).init_from)
+
+
+def as_trained(out: Path, config: RunConfig) -> RunConfig:
+    """Return the configuration of the run in `out` with the capture at the place of `config`. For a run whose training has ended."""
+    found = read_config(out)
+    return replace(found, data=replace(found.data, path=config.data.path))
 
 
 def _write_config(out: Path, config: RunConfig) -> None:

@@ -7,6 +7,7 @@ gets small pictures while its camera moves and a full-size picture when it rests
 from __future__ import annotations
 
 import logging
+import socket
 import threading
 import time
 import warnings
@@ -68,6 +69,17 @@ def check_port(port: int) -> None:
     """Raise InputError if a number is not a port. 0 lets the system choose one."""
     if not 0 <= port <= 65535:
         raise InputError(f"expected --port between 0 and 65535, found {port}; choose another port")
+
+
+def check_host(host: str) -> None:
+    """Raise InputError if this machine cannot listen on an address. viser would wait for it for ever."""
+    try:
+        family = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0][0]
+        socket.create_server((host, 0), family=family).close()
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or error
+        advice = "leave it out, or give 0.0.0.0 for all addresses of this machine"
+        raise InputError(f"expected --host as an address of this machine, found '{host}' ({why}); {advice}") from None
 
 
 @dataclass

@@ -67,7 +67,8 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: i
     except (OSError, RuntimeError) as error:
         if isinstance(error, RunError):
             raise
-        raise RunError(f"cannot write {path}: {error}; free some space, or give a folder as --out for PNG files") from error
+        why = (str(error).strip().splitlines() or [type(error).__name__])[-1]  # ffmpeg's message begins with how it was built
+        raise RunError(f"cannot write {path}: {why}; free some space, or give a folder as --out for PNG files") from error
     return count
 
 

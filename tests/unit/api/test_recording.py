@@ -60,6 +60,16 @@ def test_a_complete_run_keeps_its_layout(tmp_path, capture):
         assert not left.exists()
 
 
+def test_a_run_that_has_ended_keeps_its_configuration(tmp_path, capture):
+    list(recording.train(run_in(tmp_path, capture), capture, CPU))
+    before = (tmp_path / "config.json").read_bytes()
+    again = run_in(tmp_path, capture, resume=True)
+    other = replace(again.config, stop_at=2, deterministic=True, command="another", versions={"torch": "0"})
+    events = list(recording.train(replace(again, config=other), capture, CPU))
+    assert [type(event) for event in events] == [Started, Finished] and events[-1].step == 4
+    assert (tmp_path / "config.json").read_bytes() == before
+
+
 def test_a_stopped_run_is_saved_and_has_no_layout_yet(tmp_path, capture):
     run = run_in(tmp_path, capture)
     events = []
@@ -86,3 +96,12 @@ def test_a_run_that_is_resumed_before_its_first_checkpoint_starts_from_the_scene
     events = list(recording.train(resumed, capture, CPU))
     assert isinstance(events[0], Started) and events[0].step == 4
     assert run_folder.read_config(tmp_path / "second") == replace(begun, data=Data(capture.root.absolute()))
+
+
+def test_a_stop_before_the_start_of_init_from_is_refused(tmp_path, capture):
+    list(recording.train(run_in(tmp_path / "first", capture), capture, CPU))
+    longer = replace(RECIPES["scaffold-gs"][1], iterations=8)
+    begun = RunConfig(longer, Data(capture.root), stop_at=4, init_from=tmp_path / "first")
+    with pytest.raises(InputError, match=naming("--stop-at", 4)):
+        list(recording.train(Run(begun, tmp_path / "second"), capture, CPU))
+    assert not (tmp_path / "second").exists()

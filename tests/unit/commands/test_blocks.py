@@ -8,6 +8,7 @@ from scene_experts import cli
 from scene_experts.commands.train import parse_train
 from scene_experts.data.capture import load
 from scene_experts.scene.anchors.few_views import find_weight
+from scene_experts.training.config import check
 from support.synthetic import make_capture
 
 
@@ -39,6 +40,15 @@ def test_the_commands_of_a_plan_are_commands_of_train(capture, tmp_path, capsys)
     joint = trains[-1].cfg.rates  # the constant rates fall while the blocks are trained together
     assert joint.at("feature", 900, 990, 1.0) == pytest.approx(0.0075, rel=1e-3)
     assert joint.at("feature", 990, 990, 1.0) == pytest.approx(0.05 * 0.0075)
+
+
+@pytest.mark.parametrize(("batch", "iterations", "joint"), [(1, 100, 110), (4, 100, 112), (50, 100, 150)])
+def test_the_joint_training_ends_with_a_whole_batch(batch, iterations, joint, capture, tmp_path):
+    given = ["--blocks", "2", "--iterations", str(iterations), f"--train=--batch {batch}"]
+    assert cli.main(["blocks", "plan", str(capture), "--out", str(tmp_path / "plan"), *given]) == 0
+    cfg = parse_train(shlex.split(trainings(tmp_path / "plan")[-1])[2:]).cfg
+    assert cfg.iterations == joint
+    check(cfg)
 
 
 @pytest.mark.parametrize(("warmup", "until"), [(1500, 300), (15_000, 450)])
@@ -80,6 +90,9 @@ def test_words_that_do_not_fit(capture, tmp_path, capsys):
         (["blocks", "plan", str(capture), *out, "--blocks", "0"], "--blocks"),
         (["blocks", "plan", str(capture), *out, "--views", "x.json"], "--views"),
         (["blocks", "plan", str(capture), *out, "--train=--seeed 3"], "seeed"),
+        (["blocks", "plan", str(capture), *out, "--train=--seed -1"], "--seed of at least 0"),
+        (["blocks", "plan", str(capture), *out, "--iterations", "100", "--train=--batch 8"], "--batch 8 divides"),
+        (["blocks", "plan", str(capture), *out, "--blocks", "300"], "same coordinate; give smaller --blocks"),
         (["blocks", "plan", str(capture), *out, "--train=--seed '3"], "--train"),
         (["blocks", "plan", str(capture), *out, "--train=--resolution longest:40"], "--resolution"),
         (["blocks", "merge", str(tmp_path), *out, "--runs", str(tmp_path)], "plan.json"),

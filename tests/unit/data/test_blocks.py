@@ -29,6 +29,14 @@ def test_every_place_lies_in_one_block_and_points_are_shared_evenly(count):
     assert max(sizes) - min(sizes) <= count
 
 
+def test_points_at_one_place_are_not_divided():
+    xyz = torch.zeros(8, 3, dtype=torch.float64)
+    xyz[:2, 1] = 1.0
+    assert len(split_box(xyz, Block((-math.inf,) * 3, (math.inf,) * 3), 1)) == 1
+    with pytest.raises(InputError, match=r"2 blocks can divide, found 6 .*--blocks"):
+        split_box(xyz, Block((-math.inf,) * 3, (math.inf,) * 3), 2)
+
+
 def test_every_training_view_has_a_block_and_held_out_views_have_none(capture):
     blocks = make_blocks(capture, 3)
     named = {name for block in blocks for name in block.views}

@@ -91,21 +91,22 @@ def test_mask_files_multiply_with_alpha_and_follow_the_size(tmp_path: Path) -> N
     assert mask is not None and mask.shape == (4, 3) and mask[:, 0].max() == 0 and mask[:, 2].min() == 255
 
 
-def test_exif_is_applied_only_on_request(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_exif_is_applied_only_on_request(name: str, tmp_path: Path) -> None:
     pixels = noise(10, 16)
     exif = Image.Exif()
     exif[0x0112] = 6
-    Image.fromarray(pixels).save(tmp_path / "a.png", exif=exif)
-    assert probe(tmp_path / "a.png") == ((16, 10), (10, 16))
-    rgb, _ = decode(FrameSource(tmp_path / "a.png", pinhole(16, 10), (16, 10)))
+    Image.fromarray(pixels).save(tmp_path / name, exif=exif)
+    assert probe(tmp_path / name) == ((16, 10), (10, 16))
+    rgb, _ = decode(FrameSource(tmp_path / name, pinhole(16, 10), (16, 10)))
     np.testing.assert_array_equal(rgb, pixels)
-    rgb, _ = decode(FrameSource(tmp_path / "a.png", pinhole(10, 16), (10, 16), turn=True))
+    rgb, _ = decode(FrameSource(tmp_path / name, pinhole(10, 16), (10, 16), turn=True))
     np.testing.assert_array_equal(rgb, np.rot90(pixels, -1))
     stencil = np.zeros((10, 16), np.uint8)
     stencil[:3] = 255
     for mask in (stencil, np.ascontiguousarray(np.rot90(stencil, -1))):  # a mask of the stored pixels, or of the rotated ones
         Image.fromarray(mask).save(tmp_path / "m.png")
-        found = decode(FrameSource(tmp_path / "a.png", pinhole(10, 16), (10, 16), mask=tmp_path / "m.png", turn=True))[1]
+        found = decode(FrameSource(tmp_path / name, pinhole(10, 16), (10, 16), mask=tmp_path / "m.png", turn=True))[1]
         np.testing.assert_array_equal(found, np.rot90(stencil, -1))
 
 

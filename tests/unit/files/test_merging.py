@@ -1,6 +1,7 @@
 """Blocks that are trained alone and merged: no anchor twice, and nothing but anchors of their own block."""
 
 import json
+import shlex
 
 import pytest
 import torch
@@ -88,3 +89,37 @@ def test_each_block_needs_its_run(tmp_path):
         merge_blocks(tmp_path, [tmp_path], tmp_path / "out")
     with pytest.raises(InputError, match=r"config\.json"):
         merge_blocks(tmp_path, [tmp_path, tmp_path], tmp_path / "out")
+
+
+@pytest.fixture
+def planned(tmp_path):
+    """A plan of two blocks whose commands have trained the coarse scene and the blocks, the second one until half of its iterations."""
+    capture = make_capture(tmp_path / "box", views=6, size=(24, 16), points=100).folder
+    more = "--train=--preview-every 0 --device cpu"
+    call("blocks", "plan", capture, "--out", tmp_path / "plan", "--blocks", 2, "--iterations", 12, more)
+    coarse, first, second, *_ = (shlex.split(line)[1:] for line in (tmp_path / "plan/commands.sh").read_text().splitlines()[2:])
+    for words in (coarse, first, [*second, "--stop-at", "6"]):
+        call(*words)
+    return tmp_path / "plan", second
+
+
+def test_runs_in_another_order_than_the_plan_are_refused(planned, tmp_path):
+    plan, _ = planned
+    with pytest.raises(InputError, match=r"block 0 at .*run1, found that of block 1; .*order"):
+        merge_blocks(plan, [plan / "run1", plan / "run0"], tmp_path / "out")
+    call("blocks", "plan", tmp_path / "box", "--out", tmp_path / "other", "--blocks", 2, "--margin", 0.3)
+    with pytest.raises(InputError, match=r"block 0 at .*run0, found one of another plan"):
+        merge_blocks(tmp_path / "other", [plan / "run0", plan / "run1"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_block_whose_training_has_not_ended_is_told(planned, tmp_path, caplog):
+    plan, second = planned
+    config = plan / "run1/config.json"  # as after a signal: stopped, but not by --stop-at
+    config.write_text(json.dumps(json.loads(config.read_text()) | {"stop_at": None}))
+    merge_blocks(plan, [plan / "run0", plan / "run1"], tmp_path / "early")
+    assert "block 1 ended at iteration 6 of 12" in caplog.text and "block 0" not in caplog.text
+    call(*second, "--resume")
+    caplog.clear()
+    merge_blocks(plan, [plan / "run0", plan / "run1"], tmp_path / "merged")
+    assert "ended at" not in caplog.text

@@ -2,6 +2,7 @@
 
 import signal
 import subprocess
+import sys
 import threading
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,7 +15,7 @@ from scene_experts.core.plain import to_json
 from scene_experts.reproduce import runner as module
 from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec
-from scene_experts.reproduce.runner import Runner, last_line, visible_device
+from scene_experts.reproduce.runner import Runner, last_line, reason, visible_device
 from scene_experts.training.config import RunConfig
 from scene_experts.training.run_folder import held
 from support.records import record
@@ -81,6 +82,16 @@ def test_one_failure_does_not_lose_the_rest(runner):
     assert [f.spec.recipe for f in failures] == ["moe-gs"] and "expected luck" in failures[0].why
     assert [r.recipe for r in store.load(runner.records)] == ["scaffold-gs"]
     assert "expected luck" in last_line(failures[0].log)
+
+
+def test_a_process_that_a_signal_has_ended_is_told_apart_from_an_error(tmp_path):
+    log = tmp_path / "run.log"
+    assert reason(3, log) == "exit code 3"
+    log.write_text("200/3,000  0:10 left\n\n")
+    assert reason(1, log) == "200/3,000  0:10 left"
+    killed = subprocess.run([sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"], check=False).returncode
+    assert all(word in reason(killed, log) for word in ("SIGKILL", "memory", "200/3,000"))
+    assert "SIGTERM" in reason(-signal.SIGTERM, log) and "memory" not in reason(-signal.SIGTERM, log)
 
 
 def test_a_picture_that_fails_does_not_lose_the_rest_either(runner):

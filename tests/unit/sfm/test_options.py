@@ -14,6 +14,9 @@ from scene_experts.sfm.options import MOST_FRAMES, Options
         (Options(max_side=10), "--max-side"),
         (Options(threads=-1), "--threads"),
         (Options(seed=-1), "--seed"),
+        (Options(seed=2**31), "--seed"),
+        (Options(max_side=2**31), "--max-side"),
+        (Options(threads=2**31), "--threads"),
     ],
 )
 def test_invalid_settings_name_their_option(options, flag):

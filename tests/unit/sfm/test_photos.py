@@ -62,22 +62,24 @@ def test_a_camera_is_one_size_maker_and_focal_length(tmp_path):
     assert group_by_camera(find_photos(tmp_path)) == [["1.jpg", "3.jpg"], ["2.jpg"], ["4.jpg"], ["5.jpg"]]
 
 
-def test_rotated_photographs_and_their_masks_are_written_upright(tmp_path):
+@pytest.mark.parametrize(("suffix", "form"), [(".jpg", "JPEG"), (".tif", "TIFF")])
+def test_rotated_photographs_and_their_masks_are_written_upright(suffix, form, tmp_path):
     source, target = tmp_path / "photos", tmp_path / "work" / "images"
     for i, orientation in enumerate((6, 1, 6)):
-        write_turned(source / f"{i}.jpg", orientation)
+        write_turned(source / f"{i}{suffix}", orientation, form)
         mask = np.zeros((30, 40), np.uint8)
         mask[:10] = 255
         Image.fromarray(mask).save(source / f"{i}_mask.png")
     for _ in range(2):
         found = copy_photos(find_photos(source), source, target)
-    assert [p.size for p in found] == [(30, 40), (40, 30), (30, 40)] and group_by_camera(found) == [["0.jpg", "2.jpg"], ["1.jpg"]]
+    assert [p.size for p in found] == [(30, 40), (40, 30), (30, 40)]
+    assert group_by_camera(found) == [[f"0{suffix}", f"2{suffix}"], [f"1{suffix}"]]
     assert group_by_camera(find_photos(target)) == group_by_camera(found) and len(list(target.iterdir())) == 6
-    for name in ("0.jpg", "0_mask.png"):
+    for name in (f"0{suffix}", "0_mask.png"):
         with Image.open(target / name) as picture:
             red = picture.convert("RGB")
             assert red.getpixel((28, 20))[0] > 200 and red.getpixel((2, 20))[0] < 60
-    assert (target / "1.jpg").read_bytes() == (source / "1.jpg").read_bytes()
+    assert (target / f"1{suffix}").read_bytes() == (source / f"1{suffix}").read_bytes()
     assert [p.orientation for p in check_in_place(find_photos(source), source)] == [6, 1, 6]
 
 

@@ -127,6 +127,23 @@ def test_frames_of_a_video_are_extracted_once(tmp_path, monkeypatch):
     assert taken == [5, 4, 2]
 
 
+def test_photographs_and_frames_are_not_taken_for_each_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "run_worker", fake_worker())
+
+    def take(video, folder, count, progress):
+        for i in range(count):
+            write_photo(folder / f"{i}.jpg", size=(80, 60))
+        return list(range(count))
+
+    monkeypatch.setattr(run.frames, "extract_frames", take)
+    video, source, images = tmp_path / "walk.mp4", write_black(tmp_path / "photos"), tmp_path / "out" / NAME / "done/images"
+    video.write_bytes(b"frames")
+    for asked, size in [(video, (80, 60)), (source, (64, 48)), (video, (80, 60)), (source, (64, 48))]:
+        with pytest.raises(InputError, match=naming(asked)):
+            make(asked, tmp_path / "out", Options(frames=3))
+        assert {Image.open(path).size for path in images.iterdir()} == {size}
+
+
 def test_only_the_same_request_reuses_its_database(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "run_worker", fake_worker())
     source, kept = write_black(tmp_path / "photos"), tmp_path / "out" / NAME / "database" / "colmap.db"

@@ -50,6 +50,19 @@ def test_tensorboard_files_appear_when_asked(tmp_path):
     assert list((tmp_path / "tensorboard").glob("events.out.*"))
 
 
+def test_tensorboard_hides_what_a_resumed_or_a_new_run_writes_again(tmp_path):
+    loaded = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    shown = []
+    for start, end in ((0, 30), (10, 40), (0, 20)):
+        with Recorder(tmp_path, True) as record:
+            record(Started(start, end, 10, TRAITS))
+            for i in range(start + 10, end + 1, 10):
+                record(step(i))
+        board = loaded.EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+        shown.append([event.step for event in board.Scalars("psnr/train")])
+    assert shown == [[10, 20, 30], [10, 20, 30, 40], [10, 20]]
+
+
 def test_a_folder_that_cannot_be_written_is_reported(tmp_path):
     with Recorder(tmp_path / "no" / "folder", False) as record, pytest.raises(RunError, match=naming("metrics.jsonl")):
         record(step(1))

@@ -111,6 +111,7 @@ def test_a_checkpoint_of_another_recipe_in_the_folder(run):
         (RunConfig(replace(CFG, loss=replace(CFG.loss, load=0.5)), CONFIG.data), {"resume": True}, ["loss.load", 0.01, 0.5]),
         (RunConfig(CFG, replace(CONFIG.data, split="first:2")), {"resume": True}, ["split", "auto", "first:2"]),
         (RunConfig(replace(CFG, loss=replace(CFG.loss, load=float("nan"))), CONFIG.data), {"resume": False}, ["nan"]),
+        (replace(CONFIG, init_from=Path("/coarse")), {"resume": True}, ["--init-from", "none", "/coarse"]),
     ],
 )
 def test_what_is_refused_changes_nothing(config, options, facts, run):
@@ -127,6 +128,27 @@ def test_resuming_may_move_the_capture_and_the_stop(run):
     assert run_folder.read_config(run) == CONFIG, "checking writes nothing"
     run_folder.prepare(run, moved, resume=True)
     assert run_folder.read_config(run) == moved and checkpoint.latest(run / "checkpoints") is not None
+
+
+def test_a_resumed_run_has_one_start_and_is_deterministic_as_a_whole(run):
+    begun = replace(CONFIG, init_from=run / "coarse", deterministic=True)
+    run_folder.prepare(run, begun, resume=False, overwrite=True)
+    for same in (begun, replace(begun, init_from=run / ".." / run.name / "coarse"), replace(begun, init_from=None)):
+        run_folder.check(run, same, resume=True)
+    with pytest.raises(InputError, match=naming("--init-from", run / "coarse", run / "other")):
+        run_folder.check(run, replace(begun, init_from=run / "other"), resume=True)
+    for given in (True, False, True):
+        run_folder.prepare(run, replace(begun, deterministic=given), resume=True)
+    assert not run_folder.read_config(run).deterministic
+    run_folder.prepare(run, replace(CONFIG, command="scene-experts train moe-gs --init-from coarse"), resume=False, overwrite=True)
+    run_folder.check(run, begun, resume=True)  # older versions did not record the start
+
+
+def test_a_run_is_not_written_over_the_run_that_it_starts_from(run):
+    before, config = state(run), replace(CONFIG, init_from=run / ".." / run.name)
+    with pytest.raises(InputError, match=naming("--init-from", run, "--out")):
+        run_folder.prepare(run, config, resume=False, overwrite=True)
+    assert state(run) == before
 
 
 def test_overwriting_removes_what_belonged_to_the_old_run_and_nothing_else(run):
@@ -180,6 +202,11 @@ def test_places_that_cannot_be_a_run_folder(tmp_path):
     assert not (tmp_path / "new").exists() and (tmp_path / "file").read_text() == "x"
 
 
+def test_a_path_that_checkpoints_could_not_be_read_from_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"UTF-8.*caf\\udce9.*--out"):
+        run_folder.check(tmp_path / "caf\udce9", CONFIG, resume=False)
+
+
 def test_one_training_holds_a_run_folder(tmp_path):
     with run_folder.held(tmp_path / "run"):
         with pytest.raises(InputError, match=naming(tmp_path / "run")), run_folder.held(tmp_path / "run"):
@@ -221,11 +248,12 @@ def test_near_of_the_users_choice(tmp_path):
         run_folder.load_capture(Data(folder, near=0.0))
 
 
-def test_an_import_over_another_run_is_not_told_to_resume(tmp_path):
+@pytest.mark.parametrize("command", ["import scene.ply", "merged from 2 blocks"])
+def test_an_import_over_another_run_is_not_told_to_resume(command, tmp_path):
     (tmp_path / "checkpoints").mkdir(parents=True)
     (tmp_path / "checkpoints" / "ckpt_000001.safetensors").write_bytes(b"")
     with pytest.raises(InputError, match="--out") as error:
-        run_folder.check(tmp_path, replace(CONFIG, command="import scene.ply"), resume=False)
+        run_folder.check(tmp_path, replace(CONFIG, command=command), resume=False)
     assert "--resume" not in str(error.value)
 
 

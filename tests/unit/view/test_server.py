@@ -11,7 +11,7 @@ from scene_experts.view.paint import paint
 from scene_experts.view.paths import choose_best_view
 
 pytest.importorskip("viser")
-from scene_experts.view.server import Client, Viewer
+from scene_experts.view.server import Client, Viewer, check_host
 from support.viewers import DRAW, Handle, joined
 
 
@@ -123,6 +123,11 @@ def test_a_budget_leaves_clients_for_the_next_turn(viewer):
     assert sum(len(h.pictures) for h in handles) == 1
     viewer.draw()
     assert all(h.pictures for h in handles)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "0.0.0.0"])
+def test_addresses_of_this_machine(host):
+    check_host(host)
 
 
 def test_a_taken_port_is_reported(viewer, capture):

@@ -61,6 +61,18 @@ def test_an_incomplete_video_is_an_error(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_only_the_last_line_of_the_encoders_message_is_shown(tmp_path, monkeypatch):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+
+    def fail(path):
+        raise RuntimeError("FFMPEG call failed with 183:\nffmpeg version 9 built with gcc\nmoov atom not found\n")
+
+    monkeypatch.setattr(ffmpeg, "count_frames_and_secs", fail)
+    with pytest.raises(RunError, match=r"a\.mp4: moov atom not found; free some space") as error:
+        video.write_video(tmp_path / "a.mp4", frames(), 12.0)
+    assert "gcc" not in str(error.value)
+
+
 def test_a_video_reads_back(tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     assert video.write_video(tmp_path / "v.mp4", frames(), 12.0) == 6

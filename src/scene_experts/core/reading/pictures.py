@@ -17,12 +17,13 @@ FORMATS = ("BMP", "GIF", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
 """The formats that are read, by their content. Pillow's others are not: each decoder is a way in."""
 HEIC = "HEIF"  # read too where pillow-heif has registered it, by those who pass `heic`
 SIDE_LIMIT = 1 << 17  # px
+ORIENTATION = 0x0112  # tag of EXIF and TIFF
 _STORED = 4  # bytes per pixel in Pillow's memory, at most
 
 
 @contextmanager
 def opening_picture(path: Path, budget: Budget = budgets.PICTURE, heic: bool = False) -> Iterator[Image.Image]:
-    """Open the picture at `path` without decoding it. The block decodes it.
+    """Open the picture at `path` without decoding it. The block decodes it to the pixels as they are stored, whatever its EXIF orientation.
 
     `heic` admits HEIC photographs where pillow-heif reads them.
     Raises InputError if it is absent, damaged, of another format or beyond the budget, or if the block fails.
@@ -30,7 +31,22 @@ def opening_picture(path: Path, budget: Budget = budgets.PICTURE, heic: bool = F
     formats = (*FORMATS, HEIC) if heic and HEIC in Image.OPEN else FORMATS
     with opening(path, budget) as source, source.stream() as stream, Image.open(stream, formats=formats) as image:
         check_size(source, image)
+        keep_as_stored(image)
         yield image
+
+
+def keep_as_stored(image: Image.Image) -> None:
+    """Decode a TIFF file with an orientation to its stored pixels. Pillow would turn it upright and drop the orientation, unlike the
+    pictures of other formats, and unlike COLMAP."""
+    if image.format != "TIFF":
+        return
+    exif = image.getexif()
+    orientation = exif.get(ORIENTATION, 1)
+    if orientation != 1:
+        exif[ORIENTATION] = 1
+        image.load()
+        exif[ORIENTATION] = orientation
+        image._size = image.im.size  # pyright: ignore[reportPrivateUsage]
 
 
 def decode_picture(data: bytes, pixels: int, format: str) -> Image.Image:

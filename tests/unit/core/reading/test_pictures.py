@@ -2,8 +2,9 @@
 
 import io
 
+import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import PICTURE, Damaged
@@ -15,6 +16,21 @@ def test_a_picture(tmp_path):
     Image.new("RGB", (3, 2), (1, 2, 3)).save(tmp_path / "a.png")
     with opening_picture(tmp_path / "a.png", PICTURE) as image:
         assert image.size == (3, 2) and image.convert("RGB").getpixel((0, 0)) == (1, 2, 3)
+
+
+@pytest.mark.parametrize("orientation", range(2, 9))
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "packed.tif"])
+def test_pixels_are_as_stored_whatever_the_orientation(name, orientation, tmp_path):
+    """Pillow turns the pixels of TIFF files on its own, and forgets their orientation."""
+    pixels = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
+    exif = Image.Exif()
+    exif[0x0112], exif[0x010F] = orientation, "maker"
+    Image.fromarray(pixels).save(tmp_path / name, exif=exif, **({"compression": "tiff_lzw"} if name == "packed.tif" else {}))
+    with opening_picture(tmp_path / name, PICTURE) as image:
+        assert image.size == (6, 4) and image.getexif()[0x0112] == orientation and image.getexif()[0x010F] == "maker"
+        assert np.array_equal(np.asarray(image), pixels)
+        upright = ImageOps.exif_transpose(image)
+        assert upright.size == ((4, 6) if orientation >= 5 else (6, 4)) and 0x0112 not in upright.getexif()
 
 
 def test_pictures_that_are_refused(tmp_path):
