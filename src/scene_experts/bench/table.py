@@ -17,7 +17,7 @@ from scene_experts.bench import parts, raster, step
 from scene_experts.bench.machine import Machine, describe, measure_clock, measure_copy, measure_multiply_adds
 from scene_experts.bench.measure import Figure, Missing, Result
 from scene_experts.core.errors import InputError
-from scene_experts.core.io import write_json
+from scene_experts.core.io import check_writable, write_json
 from scene_experts.native import library as native
 
 
@@ -70,11 +70,18 @@ def _list_groups(machine: Machine, size: Size, share: float) -> Iterator[tuple[s
 
 
 def run(seconds: float, threads: int | None, json: Path | None, console: Console) -> int:
-    """Measure, print, and write `json` if it is given. Raises InputError for an invalid budget or number of threads."""
+    """Measure, print, and write `json` if it is given.
+
+    Raises InputError for an invalid budget or number of threads, and RunError where `json` cannot be written, before it measures.
+    """
     if not 0 < seconds < float("inf"):
         raise InputError(f"expected --seconds above 0, found {seconds:g}; use --seconds 60")
     if threads is not None and threads < 1:
         raise InputError(f"expected --threads of at least 1, found {threads}; omit it to use torch's setting")
+    if json is not None:
+        if json.is_dir():
+            raise InputError(f"expected --json as a file, found the folder {json}; add a name")
+        check_writable(json, "--json")
     began = time.perf_counter()
     with console.status("measuring") as status:
         machine, size, results = measure(seconds, threads or torch.get_num_threads(), lambda what: status.update(f"measuring {what}"))

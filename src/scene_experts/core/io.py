@@ -58,19 +58,22 @@ _PLACE = (
 )  # errors of the path, not of free space
 
 
-def _unwritable(path: Path, error: OSError) -> RunError:
+def _unwritable(path: Path, error: OSError, option: str = "--out") -> RunError:
     advice = "choose" if error.errno in _PLACE else "free some space or choose"
-    return RunError(f"cannot write {path}: {error.strerror or error}; {advice} another folder with --out")
+    return RunError(f"cannot write {path}: {error.strerror or error}; {advice} another folder with {option}")
 
 
-def check_writable(path: Path) -> None:
-    """Create the folder of `path` and check that files can be created in it. Raises RunError if not. Call it before long work."""
+def check_writable(path: Path, option: str = "--out") -> None:
+    """Create the folder of `path`, which `option` has named, and check that files can be created in it. Call it before long work.
+
+    Raises RunError if not.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
-        raise _unwritable(path, error) from error
+        raise _unwritable(path, error, option) from error
 
 
 @contextmanager

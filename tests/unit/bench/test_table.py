@@ -8,6 +8,7 @@ from rich.console import Console
 
 from scene_experts.bench import table
 from scene_experts.bench.measure import Figure, Missing
+from scene_experts.core.errors import InputError, RunError
 from scene_experts.native import library as native
 
 
@@ -35,6 +36,15 @@ def test_without_the_library_the_report_names_what_is_missing(no_library, tmp_pa
     assert found["machine"]["level"] is None and found["machine"]["multiply_adds"] is None
     assert {m["name"] for m in found["missing"]} >= {"compiled rasteriser", "compiled decode", "fused loss", "gain of threads"}
     assert {"one network in torch", "Top-2 of 5 in torch", "in torch", "whole step"} <= {f["name"] for f in found["figures"]}
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_measuring(tmp_path, monkeypatch):
+    monkeypatch.setattr(table, "measure", None)
+    (tmp_path / "file").touch()
+    with pytest.raises(RunError, match="another folder with --json"):
+        table.run(1, 1, tmp_path / "file" / "b.json", Console(file=io.StringIO()))
+    with pytest.raises(InputError, match="add a name"):
+        table.run(1, 1, tmp_path, Console(file=io.StringIO()))
 
 
 def test_the_table_names_the_peer_of_every_ratio():
