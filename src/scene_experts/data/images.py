@@ -199,9 +199,11 @@ def _make_grid(lens: Lens) -> Tensor:
     u = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
     for top in range(0, pinhole.height, 64):  # strips keep the float64 temporaries small
         v = (np.arange(top, min(top + 64, pinhole.height)) + 0.5 - pinhole.cy) / pinhole.fy
-        du, dv = lens.distort(*np.meshgrid(u, v))
+        rays = np.meshgrid(u, v)
+        du, dv = lens.distort(*rays)
         out[top : top + 64, :, 0] = (du * lens.fx + lens.cx) * 2 / lens.width - 1
         out[top : top + 64, :, 1] = (dv * lens.fy + lens.cy) * 2 / lens.height - 1
+        out[top : top + 64][lens.is_folded(*rays)] = 2  # outside: the photograph does not show these rays
     return torch.from_numpy(out)
 
 

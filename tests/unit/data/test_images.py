@@ -129,6 +129,17 @@ def test_undistorted_photograph_is_the_pinhole_picture(tmp_path: Path, lens: Len
     assert np.median(error) < 0.004 and error.mean() < 0.02  # the second sampling slightly blurs the edges of objects
 
 
+def test_rays_beyond_the_fold_of_a_lens_do_not_count(tmp_path: Path) -> None:
+    lens = Lens("SIMPLE_RADIAL", 192, 108, (87.0, 96.0, 54.0, -0.15))  # rays beyond radius 1.49 fall back into the photograph
+    Image.fromarray(noise(108, 192)).save(tmp_path / "a.png")
+    flat = to_pinhole(lens)
+    _, mask = decode(FrameSource(tmp_path / "a.png", lens, (flat.width, flat.height)))
+    y, x = np.mgrid[: flat.height, : flat.width] + 0.5
+    radius = np.hypot((x - flat.cx) / flat.fx, (y - flat.cy) / flat.fy)
+    assert mask is not None
+    np.testing.assert_array_equal(mask, np.where(radius > 1 / np.sqrt(3 * 0.15), 0, 255))
+
+
 def test_policies() -> None:
     assert check_policy("auto") == "cap1600"
     assert target_size("as-is", (4946, 3286)) == (4946, 3286)
