@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from numbers import Integral
+from numbers import Real
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scene_experts.api import checked
 from scene_experts.api.camera import Camera, from_trained, vector
 from scene_experts.core.errors import InputError, expect_words
 from scene_experts.data import views
@@ -231,15 +232,16 @@ def load_capture(
     """
     brought = defaults_of(path)
     chosen = normalise or brought.normalise
-    data = Data(
-        Path(path), images, resolution, split, missing, chosen, init, max_views, near, ignore_principal_point, background=background
-    )
     for name, value in (("resolution", resolution), ("split", split)):
         if not isinstance(value, str):
             raise InputError(f"expected {name} as text such as 'longest:800' or 'mod8', found {value!r}; write it in quotes")
-    for name, value, least in (("seed", seed, 0), ("max_views", 1 if max_views is None else max_views, 1)):
-        if not isinstance(value, Integral) or value < least:
-            raise InputError(f"expected {name} as an integer of at least {least}, found {value!r}; correct it")
+    seed = checked.integer("seed", seed, 0)
+    max_views = None if max_views is None else checked.integer("max_views", max_views, 1)
+    near = None if near is None else checked.real("near", near)
+    centred = checked.boolean("ignore_principal_point", ignore_principal_point)
+    if isinstance(background, (tuple, list)) and all(isinstance(part, Real) for part in background):
+        background = tuple(map(float, background))  # type: ignore[assignment] - its length is checked below
+    data = Data(Path(path), images, resolution, split, missing, chosen, init, max_views, near, centred, background=background)
     expect_words(data)
     data = run_folder.named(data)
     return Capture(data, run_folder.load_capture(data, seed), seed, brought.numbers)

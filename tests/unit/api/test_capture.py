@@ -75,6 +75,8 @@ def test_an_orbit_goes_around_the_centre(capture):
         ({"resolution": "huge"}, "resolution"),
         ({"background": (0.0, 0.0, 2.0)}, "background"),
         ({"near": -1.0}, "near"),
+        ({"near": "0.1"}, "near.*'0.1'"),
+        ({"ignore_principal_point": 1}, "ignore_principal_point"),
         ({"background": (0, 0)}, "background"),
         ({"background": "white"}, "background"),
         ({"max_views": 0}, "max_views"),
