@@ -169,7 +169,7 @@ def to_8_bit(image: Image.Image) -> Image.Image:
 
 
 def _load_mask(source: FrameSource) -> Image.Image | None:
-    """Load the mask file as L, at its own size.
+    """Load the mask file as L, at its own size. Raises InputError if it has another aspect ratio than the photograph.
 
     If the photograph was rotated and the mask was not, the mask is rotated by its own EXIF orientation or by the photograph's.
     """
@@ -177,8 +177,23 @@ def _load_mask(source: FrameSource) -> Image.Image | None:
         return None
     with opening_picture(source.mask, MASK) as image:
         out = to_mask(image)
-    if not source.turn or (out.width > out.height) == (source.lens.width > source.lens.height):
-        return out
+    if source.turn and (out.width > out.height) != (source.lens.width > source.lens.height):
+        out = _turn_mask(source, out)
+    if not fits(out.size, (source.lens.width, source.lens.height)):
+        raise InputError(
+            f"expected the mask {source.mask} with the aspect ratio of its photograph ({source.lens.width}x{source.lens.height}), found "
+            f"{out.width}x{out.height}; make it of the photograph's pixels as they are stored"
+        )
+    return out
+
+
+def fits(size: Size, whole: Size) -> bool:
+    """Return whether a picture of `size` is one of `whole` at another scale. Sides are whole pixels, so ratios may differ by one."""
+    (w, h), (width, height) = size, whole
+    return abs(w * height - h * width) <= max(w, h, width, height, 0.01 * w * height)
+
+
+def _turn_mask(source: FrameSource, out: Image.Image) -> Image.Image:
     exif = out.getexif()
     if exif.get(_ORIENTATION, 1) == 1:
         with opening_picture(source.path, PHOTOGRAPH) as photograph:

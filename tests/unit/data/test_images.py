@@ -91,6 +91,18 @@ def test_mask_files_multiply_with_alpha_and_follow_the_size(tmp_path: Path) -> N
     assert mask is not None and mask.shape == (4, 3) and mask[:, 0].max() == 0 and mask[:, 2].min() == 255
 
 
+@pytest.mark.parametrize(("size", "fine"), [((8, 6), True), ((15, 11), True), ((64, 48), True), ((6, 8), False), ((20, 3), False)])
+def test_a_mask_of_another_shape_is_refused(tmp_path: Path, size: tuple[int, int], fine: bool) -> None:
+    Image.new("L", size).save(tmp_path / "m.png")  # of a rotated or of another photograph: stretched, it would hide what counts
+    made = source(tmp_path / "a.png", noise(48, 64), mask=tmp_path / "m.png")
+    if fine:
+        mask = decode(made)[1]
+        assert mask is not None and mask.shape == (48, 64)
+    else:
+        with pytest.raises(InputError, match=naming(tmp_path / "m.png")):
+            decode(made)
+
+
 @pytest.mark.parametrize("name", ["a.png", "a.tif"])
 def test_exif_is_applied_only_on_request(name: str, tmp_path: Path) -> None:
     pixels = noise(10, 16)
