@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scene_experts.api import checked
 from scene_experts.api.camera import Camera, from_trained, vector
-from scene_experts.core.errors import InputError, expect_words
+from scene_experts.core.errors import InputError, expect_among, expect_words
 from scene_experts.data import views
 from scene_experts.data.fetch.catalog import Numbers, defaults_of
 from scene_experts.data.settings import Data
@@ -51,7 +51,8 @@ class Capture:
 
     @property
     def names(self) -> list[str]:
-        """File names of the photographs, relative to the image folder, in the order of the views."""
+        """Names of the photographs, as the capture states them (COLMAP: relative to the image folder), in the order of
+        the views."""
         return [view.name for view in self.loaded.views]
 
     @property
@@ -162,14 +163,16 @@ class Capture:
 
         Args:
             kind: "orbit" goes once around `centre`. "spiral" circles in front of a scene that faces one way. "views" moves smoothly
-                through the training cameras. "auto" chooses an orbit if the cameras surround the scene, else a spiral.
+                through the training cameras. "auto" chooses an orbit if the cameras surround the scene, else a spiral, or "views" where
+                a spiral looks where no photograph does.
             frames: Number of cameras, at least 1.
             size: Width and height of the pictures, px. Default: those of the median training camera.
 
         Raises:
             InputError: The kind is unknown, or there are no frames.
         """
-        made = paths.make_path(kind, self.loaded, frames, size)
+        expect_among("kind", kind, paths.NAMES)
+        made = paths.make_path(kind, self.loaded, checked.integer("frames", frames, 1), size)
         return [from_trained(camera, self.loaded.world) for camera in made.cameras]
 
     def with_seed(self, seed: int) -> Capture:
