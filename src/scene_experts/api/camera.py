@@ -114,7 +114,8 @@ class Camera:
         """Return a camera from its pose and intrinsics.
 
         Args:
-            camera_to_world: [4, 4] or [3, 4] Rotation and translation, OpenCV axes.
+            camera_to_world: [4, 4] or [3, 4] Rotation and translation, OpenCV axes. A rounded rotation becomes the nearest exact one, so
+                `position` is the given centre.
             width: Width of the picture, px.
             height: Height of the picture, px.
             fx: Horizontal focal length, px, above 0.
@@ -129,8 +130,11 @@ class Camera:
         given = np.array(camera_to_world, dtype=np.float64) if is_numbers(camera_to_world) else np.zeros(0)
         pose = matrix(np.vstack([given, [0, 0, 0, 1]]) if given.shape == (3, 4) else given, 4, "camera_to_world")
         K = [[fx, 0, width / 2 if cx is None else cx], [0, fx if fy is None else fy, height / 2 if cy is None else cy], [0, 0, 1]]
-        back = np.eye(4)
-        back[:3, :3], back[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+        rotation, back = pose[:3, :3], np.eye(4)
+        u, scales, v = np.linalg.svd(rotation)
+        if np.abs(scales - 1).max() <= 5e-4:  # anything else is refused below
+            rotation = u @ v
+        back[:3, :3], back[:3, 3] = rotation.T, -rotation.T @ pose[:3, 3]
         return cls(back, np.array(K, dtype=np.float64), width, height, near)
 
     @property

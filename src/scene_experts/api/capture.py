@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from numbers import Integral
+from numbers import Real
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scene_experts.api import checked
 from scene_experts.api.camera import Camera, from_trained, vector
-from scene_experts.core.errors import InputError, expect_words
+from scene_experts.core.errors import InputError, expect_among, expect_words
 from scene_experts.data import views
 from scene_experts.data.fetch.catalog import Numbers, defaults_of
 from scene_experts.data.settings import Data
@@ -50,7 +51,8 @@ class Capture:
 
     @property
     def names(self) -> list[str]:
-        """File names of the photographs, relative to the image folder, in the order of the views."""
+        """Names of the photographs, as the capture states them (COLMAP: relative to the image folder), in the order of
+        the views."""
         return [view.name for view in self.loaded.views]
 
     @property
@@ -161,14 +163,16 @@ class Capture:
 
         Args:
             kind: "orbit" goes once around `centre`. "spiral" circles in front of a scene that faces one way. "views" moves smoothly
-                through the training cameras. "auto" chooses an orbit if the cameras surround the scene, else a spiral.
+                through the training cameras. "auto" chooses an orbit if the cameras surround the scene, else a spiral, or "views" where
+                a spiral looks where no photograph does.
             frames: Number of cameras, at least 1.
             size: Width and height of the pictures, px. Default: those of the median training camera.
 
         Raises:
             InputError: The kind is unknown, or there are no frames.
         """
-        made = paths.make_path(kind, self.loaded, frames, size)
+        expect_among("kind", kind, paths.NAMES)
+        made = paths.make_path(kind, self.loaded, checked.integer("frames", frames, 1), size)
         return [from_trained(camera, self.loaded.world) for camera in made.cameras]
 
     def with_seed(self, seed: int) -> Capture:
@@ -231,15 +235,16 @@ def load_capture(
     """
     brought = defaults_of(path)
     chosen = normalise or brought.normalise
-    data = Data(
-        Path(path), images, resolution, split, missing, chosen, init, max_views, near, ignore_principal_point, background=background
-    )
     for name, value in (("resolution", resolution), ("split", split)):
         if not isinstance(value, str):
             raise InputError(f"expected {name} as text such as 'longest:800' or 'mod8', found {value!r}; write it in quotes")
-    for name, value, least in (("seed", seed, 0), ("max_views", 1 if max_views is None else max_views, 1)):
-        if not isinstance(value, Integral) or value < least:
-            raise InputError(f"expected {name} as an integer of at least {least}, found {value!r}; correct it")
+    seed = checked.integer("seed", seed, 0)
+    max_views = None if max_views is None else checked.integer("max_views", max_views, 1)
+    near = None if near is None else checked.real("near", near)
+    centred = checked.boolean("ignore_principal_point", ignore_principal_point)
+    if isinstance(background, (tuple, list)) and all(isinstance(part, Real) for part in background):
+        background = tuple(map(float, background))  # type: ignore[assignment] - its length is checked below
+    data = Data(Path(path), images, resolution, split, missing, chosen, init, max_views, near, centred, background=background)
     expect_words(data)
     data = run_folder.named(data)
     return Capture(data, run_folder.load_capture(data, seed), seed, brought.numbers)

@@ -11,7 +11,7 @@ from typing import TypedDict, Unpack
 
 from rich.console import Console
 
-from scene_experts.api import recording
+from scene_experts.api import checked, recording
 from scene_experts.api.backend import Device, Raster, device_of
 from scene_experts.api.backend import deterministic as deterministic_algorithms
 from scene_experts.api.capture import Capture, load_capture
@@ -87,8 +87,9 @@ class Trainer:
         folder = None if out is None else Path(out)
         if folder is None and (resume or overwrite or tensorboard):
             raise InputError("expected a run folder `out` for resume, overwrite or tensorboard, found None; name one")
-        if log_every < 1:
-            raise InputError(f"expected log_every of at least 1, found {log_every}; give a larger number")
+        stop_at = None if stop_at is None else checked.integer("stop_at", stop_at, 1)
+        save_every, preview_every = checked.integer("save_every", save_every, 1), checked.integer("preview_every", preview_every, 0)
+        log_every, deterministic = checked.integer("log_every", log_every, 1), checked.boolean("deterministic", deterministic)
         where = device_of(device, rasterizer)
         rasterize = choose(rasterizer, where, antialias=self.recipe.antialias, deterministic=deterministic)
         loaded = capture if isinstance(capture, Capture) else load_capture(capture, seed=self.recipe.seed)

@@ -16,7 +16,7 @@ from scene_experts.core.reading.numbers import FARTHEST, expect_range, number
 from scene_experts.core.reading.source import guarding, sentence
 from scene_experts.core.types import Camera
 from scene_experts.data import prepare
-from scene_experts.data.images import FrameSource, check_policy, probe
+from scene_experts.data.images import FrameSource, check_policy, fits, probe
 from scene_experts.data.lens import Lens, centre_principal_point, to_pinhole
 from scene_experts.data.match import to_relative_name
 from scene_experts.data.readers import PosedImage, RawCapture, ReadOptions, find_reader, tell_others, unrecognised_error
@@ -167,10 +167,8 @@ def _fit_lens(image: PosedImage) -> tuple[Lens, bool]:
         f = 0.5 * w / np.tan(0.5 * image.angle)
         return Lens("SIMPLE_PINHOLE", w, h, (f, w / 2, h / 2)), False
     for size in dict.fromkeys((stored, turned)):
-        (w, h), lens = size, image.lens
-        # the sides of a downscaled copy are rounded to whole pixels, so aspect ratios may differ by a pixel
-        if abs(w * lens.height - h * lens.width) <= max(lens.width, lens.height, 0.01 * w * lens.height):
-            return lens.resize(w, h), size != stored
+        if fits(size, (image.lens.width, image.lens.height)):
+            return image.lens.resize(*size), size != stored
     raise InputError(
         f"expected {image.path} with the aspect ratio of its camera ({image.lens.width}x{image.lens.height}), found "
         f"{stored[0]}x{stored[1]}; use the photographs that the cameras were reconstructed from"

@@ -169,7 +169,7 @@ def to_8_bit(image: Image.Image) -> Image.Image:
 
 
 def _load_mask(source: FrameSource) -> Image.Image | None:
-    """Load the mask file as L, at its own size.
+    """Load the mask file as L, at its own size. Raises InputError if it has another aspect ratio than the photograph.
 
     If the photograph was rotated and the mask was not, the mask is rotated by its own EXIF orientation or by the photograph's.
     """
@@ -177,8 +177,23 @@ def _load_mask(source: FrameSource) -> Image.Image | None:
         return None
     with opening_picture(source.mask, MASK) as image:
         out = to_mask(image)
-    if not source.turn or (out.width > out.height) == (source.lens.width > source.lens.height):
-        return out
+    if source.turn and (out.width > out.height) != (source.lens.width > source.lens.height):
+        out = _turn_mask(source, out)
+    if not fits(out.size, (source.lens.width, source.lens.height)):
+        raise InputError(
+            f"expected the mask {source.mask} with the aspect ratio of its photograph ({source.lens.width}x{source.lens.height}), found "
+            f"{out.width}x{out.height}; make it of the photograph's pixels as they are stored"
+        )
+    return out
+
+
+def fits(size: Size, whole: Size) -> bool:
+    """Return whether a picture of `size` is one of `whole` at another scale. Sides are whole pixels, so ratios may differ by one."""
+    (w, h), (width, height) = size, whole
+    return abs(w * height - h * width) <= max(w, h, width, height, 0.01 * w * height)
+
+
+def _turn_mask(source: FrameSource, out: Image.Image) -> Image.Image:
     exif = out.getexif()
     if exif.get(_ORIENTATION, 1) == 1:
         with opening_picture(source.path, PHOTOGRAPH) as photograph:
@@ -199,9 +214,11 @@ def _make_grid(lens: Lens) -> Tensor:
     u = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
     for top in range(0, pinhole.height, 64):  # strips keep the float64 temporaries small
         v = (np.arange(top, min(top + 64, pinhole.height)) + 0.5 - pinhole.cy) / pinhole.fy
-        du, dv = lens.distort(*np.meshgrid(u, v))
+        rays = np.meshgrid(u, v)
+        du, dv = lens.distort(*rays)
         out[top : top + 64, :, 0] = (du * lens.fx + lens.cx) * 2 / lens.width - 1
         out[top : top + 64, :, 1] = (dv * lens.fy + lens.cy) * 2 / lens.height - 1
+        out[top : top + 64][lens.is_folded(*rays)] = 2  # outside: the photograph does not show these rays
     return torch.from_numpy(out)
 
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -118,15 +119,42 @@ class Lens:
         return self._distort_polynomial(u, v)
 
     def undistort(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Invert `distort` by Newton's method. Rays over 88 degrees from the axis of a fisheye lens are clamped to 88 degrees."""
+        """Invert `distort` by Newton's method. Rays over 88 degrees from the axis of a fisheye lens are clamped to 88 degrees.
+
+        The result is NaN where no ray nearer to the axis than `find_fold` gets there, as in the corners of a photograph whose polynomial
+        was fitted to its middle.
+        """
         if self.model == "FOV":
             return _undistort_fov(self.value("omega"), u, v)
         a, b = self._undistort_polynomial(u, v)
+        with np.errstate(all="ignore"):  # where Newton's method diverges
+            x, y = self._distort_polynomial(a, b)
+            found = (np.hypot(x - u, y - v) <= 1e-6 * (1 + np.hypot(u, v))) & (np.hypot(a, b) <= self.find_fold())
+        a, b = np.where(found, a, np.nan), np.where(found, b, np.nan)
         if self.model in FISHEYE:
             theta = np.hypot(a, b)
             s = np.where(theta > 1e-8, np.tan(np.minimum(theta, _LARGEST_ANGLE)) / np.maximum(theta, 1e-8), 1.0)
             a, b = a * s, b * s
         return a, b
+
+    def find_fold(self) -> float:
+        """Return the radius at which the radial polynomial turns back, so that rays further out fall onto nearer ones; infinity: nowhere.
+
+        The radius is that of (u, v), and the angle from the axis in radians for a fisheye lens.
+        """
+        k = [self.value(n) for n in ("k1", "k2", "k3", "k4", "k5", "k6")]
+        full, x = self.model == "FULL_OPENCV", np.polynomial.Polynomial([0.0, 1.0])  # x = radius squared
+        above = np.polynomial.Polynomial([1.0, *(k[:3] if full else k[:4])])
+        below = np.polynomial.Polynomial([1.0, *k[3:]] if full else [1.0])
+        slope = (above + 2 * x * above.deriv()) * below - 2 * x * above * below.deriv()  # of radius * above / below, times below squared
+        roots = np.concatenate([part.trim().roots() for part in (slope, below)])
+        ahead = roots[(roots.imag == 0) & (roots.real > 0)].real
+        return math.sqrt(ahead.min()) if len(ahead) else math.inf
+
+    def is_folded(self, u: Array, v: Array) -> NDArray[np.bool_]:
+        """Return which rays lie beyond `find_fold`: the photograph does not show them, wherever `distort` puts them."""
+        r = np.hypot(u, v)
+        return (np.arctan(r) if self.model in FISHEYE else r) > self.find_fold()
 
     def _distort_polynomial(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Apply the radial, tangential and thin-prism terms, the polynomial part of every model (formulas of OpenCV and COLMAP)."""
@@ -194,7 +222,8 @@ def to_pinhole(lens: Lens) -> Lens:
     """Return the pinhole camera that `lens` is undistorted to: the same focal lengths and the largest size without empty pixels.
 
     As in COLMAP, the image border is undistorted, and each axis is grown or cropped about the principal point until every output
-    pixel lies inside the photograph, within 0.2 to 2 times the original size. A lens without distortion keeps its size.
+    pixel lies inside the photograph, within 0.2 to 2 times the original size. Border pixels that no ray reaches do not count; a side
+    without any other pixel lies at the fold of the lens. A lens without distortion keeps its size.
     """
     w, h = lens.width, lens.height
     if not lens.distorted:
@@ -204,11 +233,18 @@ def to_pinhole(lens: Lens) -> Lens:
         u, v = lens.undistort((x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy)
         return u * lens.fx + lens.cx, v * lens.fy + lens.cy
 
+    fold = lens.find_fold()
+    reach = math.tan(min(fold, _LARGEST_ANGLE)) if lens.model in FISHEYE else fold
+
+    def innermost(side: Array, choose: Callable[[Array], np.floating], farthest: float) -> float:
+        reached = side[np.isfinite(side)]
+        return float(choose(reached)) if len(reached) else farthest
+
     rows, cols = np.arange(h) + 0.5, np.arange(w) + 0.5
-    left = border(np.full(h, 0.5), rows)[0].max()
-    right = border(np.full(h, w - 0.5), rows)[0].min()
-    top = border(cols, np.full(w, 0.5))[1].max()
-    bottom = border(cols, np.full(w, h - 0.5))[1].min()
+    left = innermost(border(np.full(h, 0.5), rows)[0], np.max, lens.cx - reach * lens.fx)
+    right = innermost(border(np.full(h, w - 0.5), rows)[0], np.min, lens.cx + reach * lens.fx)
+    top = innermost(border(cols, np.full(w, 0.5))[1], np.max, lens.cy - reach * lens.fy)
+    bottom = innermost(border(cols, np.full(w, h - 0.5))[1], np.min, lens.cy + reach * lens.fy)
     # The principal point keeps its fraction of the image, hence the larger (stricter) of the two ratios.
     scale_x = 1 / max(lens.cx / max(lens.cx - left, 1e-9), (w - 0.5 - lens.cx) / max(right - lens.cx, 1e-9))
     scale_y = 1 / max(lens.cy / max(lens.cy - top, 1e-9), (h - 0.5 - lens.cy) / max(bottom - lens.cy, 1e-9))

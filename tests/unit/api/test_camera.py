@@ -29,6 +29,13 @@ def test_a_pose_and_intrinsics_make_the_same_camera():
     assert other.resized(128, 24).K.tolist() == [[100, 0, 60], [0, 30, 10], [0, 0, 1]]
 
 
+def test_a_rounded_rotation_does_not_move_the_camera():
+    pose = np.round(se.Camera.look_at((500, 300, 20), (497, 301, 19), width=64, height=48).camera_to_world, 4)
+    camera = se.Camera.from_pose(pose, width=64, height=48, fx=50)
+    assert np.allclose(camera.position, (500, 300, 20), rtol=0, atol=1e-9)
+    assert np.allclose(camera.camera_to_world, pose, rtol=0, atol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [

@@ -60,8 +60,13 @@ def test_an_orbit_goes_around_the_centre(capture):
     away = [np.linalg.norm(camera.position - capture.centre) for camera in cameras]
     assert len(cameras) == 5 and np.allclose(away, away[0]) and {(c.width, c.height) for c in cameras} == {(20, 10)}
     assert len(capture.camera_path(frames=3)) == 3
-    for kind, frames in (("zigzag", 3), ("orbit", 0)):
-        with pytest.raises(se.InputError):
+    for kind, frames, said in (
+        ("zigzag", 3, "kind"),
+        ("test", 3, "kind among auto, orbit, spiral, views,"),
+        ("orbit", 0, "frames"),
+        ("orbit", 2.5, "frames"),
+    ):
+        with pytest.raises(se.InputError, match=said):
             capture.camera_path(kind, frames=frames)
 
 
@@ -75,6 +80,8 @@ def test_an_orbit_goes_around_the_centre(capture):
         ({"resolution": "huge"}, "resolution"),
         ({"background": (0.0, 0.0, 2.0)}, "background"),
         ({"near": -1.0}, "near"),
+        ({"near": "0.1"}, "near.*'0.1'"),
+        ({"ignore_principal_point": 1}, "ignore_principal_point"),
         ({"background": (0, 0)}, "background"),
         ({"background": "white"}, "background"),
         ({"max_views": 0}, "max_views"),

@@ -135,10 +135,13 @@ def test_ctrl_c_saves_and_is_raised(capture, tmp_path, monkeypatch):
     [
         ({"resume": True}, "out"),
         ({"tensorboard": True}, "out"),
-        ({"save_every": 0}, "save-every"),
-        ({"preview_every": -1}, "preview-every"),
+        ({"save_every": 0}, "save_every"),
+        ({"save_every": 1.5}, "save_every.*1.5"),
+        ({"preview_every": -1}, "preview_every"),
         ({"log_every": 0}, "log_every"),
-        ({"stop_at": 0}, "stop-at"),
+        ({"stop_at": 0}, "stop_at"),
+        ({"stop_at": 4.0}, "stop_at.*4.0"),
+        ({"deterministic": 1}, "deterministic"),
         ({"max_memory": -1.0}, "max-memory"),
         ({"device": "gpu"}, "'gpu'"),
         ({"rasterizer": "opengl"}, "opengl"),
@@ -148,6 +151,15 @@ def test_settings_that_cannot_be_used_are_named(capture, settings, said):
     with pytest.raises(se.InputError, match=said) as error:
         se.Trainer("moe-gs", capture, **settings)
     assert "\n" not in str(error.value)
+
+
+def test_numbers_of_numpy_are_written_as_plain_ones(folder, small, tmp_path):
+    read = {"max_views": np.int64(8), "near": np.float32(0.25), "ignore_principal_point": np.bool_(True)}
+    capture = se.load_capture(folder, background=(np.float32(0), 0, 1), **read)
+    run = se.train(small, capture, tmp_path / "run", progress=False, stop_at=np.int64(4), deterministic=np.bool_(True))
+    data = se.open_run(tmp_path / "run").capture.data
+    assert run.step == 4 and (data.max_views, data.near, data.ignore_principal_point) == (8, 0.25, True)
+    assert se.train(small, capture, progress=False).save(tmp_path / "saved").step == 6
 
 
 def test_an_earlier_run_is_not_lost_by_accident(run, capture, small, folder):

@@ -91,6 +91,18 @@ def test_mask_files_multiply_with_alpha_and_follow_the_size(tmp_path: Path) -> N
     assert mask is not None and mask.shape == (4, 3) and mask[:, 0].max() == 0 and mask[:, 2].min() == 255
 
 
+@pytest.mark.parametrize(("size", "fine"), [((8, 6), True), ((15, 11), True), ((64, 48), True), ((6, 8), False), ((20, 3), False)])
+def test_a_mask_of_another_shape_is_refused(tmp_path: Path, size: tuple[int, int], fine: bool) -> None:
+    Image.new("L", size).save(tmp_path / "m.png")  # of a rotated or of another photograph: stretched, it would hide what counts
+    made = source(tmp_path / "a.png", noise(48, 64), mask=tmp_path / "m.png")
+    if fine:
+        mask = decode(made)[1]
+        assert mask is not None and mask.shape == (48, 64)
+    else:
+        with pytest.raises(InputError, match=naming(tmp_path / "m.png")):
+            decode(made)
+
+
 @pytest.mark.parametrize("name", ["a.png", "a.tif"])
 def test_exif_is_applied_only_on_request(name: str, tmp_path: Path) -> None:
     pixels = noise(10, 16)
@@ -127,6 +139,17 @@ def test_undistorted_photograph_is_the_pinhole_picture(tmp_path: Path, lens: Len
     truth = picture(flat, pose, 1.0, (0, 0, 0))
     error = np.abs(rgb.numpy() / 255 - truth)
     assert np.median(error) < 0.004 and error.mean() < 0.02  # the second sampling slightly blurs the edges of objects
+
+
+def test_rays_beyond_the_fold_of_a_lens_do_not_count(tmp_path: Path) -> None:
+    lens = Lens("SIMPLE_RADIAL", 192, 108, (87.0, 96.0, 54.0, -0.15))  # rays beyond radius 1.49 fall back into the photograph
+    Image.fromarray(noise(108, 192)).save(tmp_path / "a.png")
+    flat = to_pinhole(lens)
+    _, mask = decode(FrameSource(tmp_path / "a.png", lens, (flat.width, flat.height)))
+    y, x = np.mgrid[: flat.height, : flat.width] + 0.5
+    radius = np.hypot((x - flat.cx) / flat.fx, (y - flat.cy) / flat.fy)
+    assert mask is not None
+    np.testing.assert_array_equal(mask, np.where(radius > 1 / np.sqrt(3 * 0.15), 0, 255))
 
 
 def test_policies() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -116,6 +117,31 @@ def test_distorted_only_with_a_coefficient() -> None:
 def test_a_wide_fisheye_gets_a_bounded_picture() -> None:
     flat = to_pinhole(Lens("OPENCV_FISHEYE", 200, 200, (60, 60, 100, 100, 0, 0, 0, 0)))  # a field of view of about 190 degrees
     assert 40 <= flat.width <= 400 and 40 <= flat.height <= 400
+
+
+@pytest.mark.parametrize(
+    ("lens", "size"),
+    [
+        (Lens("SIMPLE_RADIAL", 192, 108, (120.0, 96.0, 54.0, -0.2)), (237, 111)),  # as pycolmap 4.2: no ray reaches the corners
+        (Lens("SIMPLE_RADIAL", 192, 108, (87.0, 96.0, 54.0, -0.15)), (259, 114)),  # nor the left and right sides, which lie at the fold
+    ],
+)
+def test_a_border_that_no_ray_reaches_does_not_crop_the_picture(lens: Lens, size: tuple[int, int]) -> None:
+    flat = to_pinhole(lens)
+    assert (flat.width, flat.height) == size
+    corner = np.array([-lens.cx / lens.fx]), np.array([-lens.cy / lens.fy])
+    assert np.isnan(lens.undistort(*corner)).all()
+
+
+def test_the_fold_is_where_the_distorted_radius_is_largest() -> None:
+    zero, none = np.zeros(20001), math.inf
+    radii = np.linspace(0, 3, 20001)
+    for lens in (*LENSES, Lens("SIMPLE_RADIAL", 8, 8, (9.0, 4.0, 4.0, -0.2)), Lens("RADIAL", 8, 8, (9.0, 4.0, 4.0, -0.2, 0.01))):
+        radial = Lens(lens.model, 8, 8, tuple(0.0 if n[0] in "ps" else p for n, p in zip(MODELS[lens.model], lens.params)))
+        seen = radial._distort_polynomial(radii, zero)[0] if lens.model != "FOV" else radii
+        falls = np.flatnonzero(np.diff(seen) < 0)
+        fold = lens.find_fold()
+        assert (fold if fold < 3 else none) == pytest.approx(radii[falls[0]] if len(falls) else none, abs=1e-3), lens.model
 
 
 def test_centred_principal_point() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import CAPTURE
 from scene_experts.core.reading.source import guarding
 from scene_experts.data.readers import transforms
@@ -25,8 +26,14 @@ class BlenderReader:
     def read(self, folder: Path, options: ReadOptions) -> RawCapture:
         """Read poses, the split and, if there are any, points. Alpha is composited over `options.background` (default white).
 
-        Frames without an image are dropped with a warning. Raises InputError if a file is damaged or no frame is left.
+        Frames without an image are dropped with a warning. Raises InputError if a file is damaged, if no frame is left, and for
+        `options.images`: each file path names its folder.
         """
+        if options.images is not None:
+            raise InputError(
+                f"expected no image folder {options.images} for {folder}, whose transforms_*.json name the photographs; leave "
+                f"--images out, and resize with --resolution factor:N"
+            )
         with guarding(folder, CAPTURE):
             return self._read(folder, options)
 

@@ -240,17 +240,24 @@ def _read_cameras_txt(source: Source) -> Iterator[tuple[int, Lens]]:
 
 
 def _read_images_txt(source: Source, observations: bool) -> Iterator[tuple[ColmapImage, NDArray | None]]:
-    lines = _read_lines(source)
-    while lines and not lines[-1].strip():
-        lines.pop()
-    for i in range(0, len(lines), 2):  # two lines per image; the second lists its observations and may be empty
-        parts = lines[i].split(maxsplit=9)
+    lines = iter(_read_lines(source))
+    for line in lines:  # two lines per image; the second lists its observations and may be empty
+        if not line.strip():
+            continue
+        parts, second = line.split(maxsplit=9), next(lines, "")
         try:
             q, t = [float(p) for p in parts[1:5]], [float(p) for p in parts[5:8]]
             image = ColmapImage(int(parts[0]), parts[9].strip(), (q[0], q[1], q[2], q[3]), (t[0], t[1], t[2]), int(parts[8]))
-            seen = _parse_observations(lines[i + 1] if i + 1 < len(lines) else "") if observations else None
         except (ValueError, IndexError):
-            raise _bad_line_error(source.path, lines[i]) from None
+            raise _bad_line_error(source.path, line) from None
+        try:
+            float((second.rsplit(maxsplit=1) or ["0"])[-1])  # the next image, read as observations, would be lost
+            seen = _parse_observations(second) if observations else None
+        except ValueError:
+            raise InputError(
+                f"expected the observations of {shorten(image.name)} in {source.path} in the line after it (an empty line for none), found "
+                f"{second[:60]!r}; restore the file"
+            ) from None
         yield image, seen
 
 

@@ -16,6 +16,8 @@ from scene_experts.core.reading.vertices import read_header, read_table
 def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Return xyz [P, 3] float64 and rgb [P, 3] uint8 of the vertices in `path`. Without colours, rgb is 128 (grey).
 
+    Colours are 0 to 255, floats in [0, 1], or 0 to 65535 of 16 bits; the largest value of the file tells which.
+
     Raises InputError if the file is not a PLY file whose first element is `vertex` without list properties, is truncated, or has
     colours that are not finite. Points without a usable position are dropped with a warning.
     """
@@ -30,6 +32,9 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
             return xyz[kept], np.full((int(kept.sum()), 3), 128, np.uint8)
         rgb = np.stack([columns[name] for name in ("red", "green", "blue")], 1)
         expect_range(rgb, "colours")
-        if rgb.dtype.kind == "f" and not header.ascii:  # some tools write colours in [0, 1]
+        kind, most = np.dtype(dict(header.fields)["red"]), rgb.max(initial=0)
+        if kind.kind == "f" and most <= 1:  # some tools write colours in [0, 1]
             rgb = rgb * 255
+        elif kind.kind == "u" and kind.itemsize == 2 and most > 255:  # others with 16 bits
+            rgb = rgb / 257
         return xyz[kept], np.clip(np.rint(rgb), 0, 255).astype(np.uint8)[kept]

@@ -29,7 +29,7 @@ from scene_experts.data.readers.reader import PosedImage
 
 PLY_NAMES = ("points3d.ply", "sparse_pc.ply", "points3D.ply")
 _PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "")
-_BESIDE_FOCAL = ("cx", "cy", "fl_y", *(f"k{i}" for i in range(1, 7)), "p1", "p2")
+_BESIDE_FOCAL = ("cx", "cy", "fl_y", "camera_angle_y", *(f"k{i}" for i in range(1, 7)), "p1", "p2")
 _MODELS = ("OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL", *_PINHOLES)
 
 
@@ -51,11 +51,13 @@ def read_file_path(frame: dict[str, Any], index: int, path: Path) -> str:
     return value
 
 
-def read_angle(meta: dict[str, Any], frame: dict[str, Any], path: Path) -> float:
-    """Return the horizontal field of view in radians of a frame without a focal length. Raises InputError if it has neither."""
-    angle = {**meta, **frame}.get("camera_angle_x")
+def read_angle(meta: dict[str, Any], frame: dict[str, Any], path: Path, axis: str = "x") -> float:
+    """Return the field of view along an axis, in radians, of a frame without a focal length. Raises InputError if it has neither."""
+    angle = {**meta, **frame}.get(f"camera_angle_{axis}")
     if not isinstance(angle, (int, float)) or not 1e-6 < angle < math.pi - 1e-6:
-        raise InputError(f"expected fl_x, or camera_angle_x between 0 and pi, in {path}, found {shown(angle)}; add the focal length")
+        raise InputError(
+            f"expected fl_{axis}, or camera_angle_{axis} between 0 and pi, in {path}, found {shown(angle)}; add the focal length"
+        )
     return float(angle)
 
 
@@ -124,7 +126,8 @@ def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path, image: Pa
     """Return the lens of a frame, or None if only the field of view is given. Values of the frame override shared ones.
 
     Without a focal length, the field of view gives it; `image` gives the size where w and h are absent. `is_fisheye`
-    (instant-ngp) stands for a camera model. Raises InputError for an unsupported camera model and for values that are not numbers.
+    (instant-ngp) stands for a camera model. Raises InputError for an unsupported camera model, for values that are not numbers, and for
+    k4 without k5 and k6 outside a fisheye and FULL_OPENCV: nerfstudio multiplies by its term, OpenCV divides by it.
     """
     both = {**meta, **frame}
     model = str(both.get("camera_model", "OPENCV_FISHEYE" if both.get("is_fisheye") is True else "OPENCV")).upper()
@@ -139,11 +142,19 @@ def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path, image: Pa
         width, height = int(both["w"]), int(both["h"])
         fx = float(both["fl_x"]) if given else 0.5 * width / math.tan(0.5 * read_angle(meta, frame, path))
         fy = float(both.get("fl_y", fx))
+        if not given and "fl_y" not in both and both.get("camera_angle_y") is not None:
+            other = 0.5 * height / math.tan(0.5 * read_angle(meta, frame, path, "y"))
+            fy = fx if math.isclose(fx, other, rel_tol=1e-3) else other  # the angles of square pixels are rounded
         cx, cy = float(both.get("cx", width / 2)), float(both.get("cy", height / 2))
         k = [float(both.get(f"k{i}", 0.0) or 0.0) for i in range(1, 7)]
         p = [float(both.get(f"p{i}", 0.0) or 0.0) for i in (1, 2)]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"expected numbers as w, h, fl_x, fl_y, cx and cy in {path}, found {describe(error)}; restore the file") from None
+    if k[3] and not any(k[4:]) and model not in (*_PINHOLES, "OPENCV_FISHEYE", "FULL_OPENCV"):
+        raise InputError(
+            f"expected no k4 beside camera_model {model} in {path}, found {k[3]:g}, which programs use in different ways; fit the lens "
+            f"without k4, or write FULL_OPENCV if it is that of OpenCV"
+        )
     if model in _PINHOLES:
         lens = Lens("PINHOLE", width, height, (fx, fy, cx, cy))
     elif model == "OPENCV_FISHEYE":

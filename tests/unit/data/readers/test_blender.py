@@ -33,6 +33,14 @@ def test_split_pose_and_background(tmp_path: Path) -> None:
         assert capture.background == colour
 
 
+@pytest.mark.parametrize("words", [{"images": "train"}, {"resolution": "inria:2"}])
+def test_another_image_folder_is_refused(tmp_path: Path, words: dict) -> None:
+    make_blender(tmp_path)
+    (tmp_path / "images_2").mkdir()
+    with pytest.raises(InputError, match="--images"):
+        load(tmp_path, init="random", **words)
+
+
 def test_random_points_fill_the_cube_of_3dgs(tmp_path: Path) -> None:
     make_blender(tmp_path)
     capture = load(tmp_path, init="random")

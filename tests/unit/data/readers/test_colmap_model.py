@@ -85,6 +85,15 @@ def test_text_with_observations_and_blank_lines(tmp_path: Path) -> None:
     np.testing.assert_array_equal(got.rgb, [[255, 0, 7]])
 
 
+def test_text_without_lines_of_observations_loses_no_image(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 64 48 50 32 24 0.1\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 1 1 a.png\n2 1 0 0 0 0 0 2 1 b.png\n")
+    with pytest.raises(InputError, match=r"observations of a\.png"):
+        read_model(tmp_path)
+    (tmp_path / "images.txt").write_text("# c\n\n1 1 0 0 0 0 0 1 1 a.png\n1 2 -1\n\n2 1 0 0 0 0 0 2 1 b.png\n")  # COLMAP skips blank lines
+    assert [i.name for i in read_model(tmp_path).images] == ["a.png", "b.png"]
+
+
 def test_75_thousand_points_are_read_within_two_seconds(tmp_path: Path) -> None:
     made, count = model(), 75_000
     rng = np.random.default_rng(0)

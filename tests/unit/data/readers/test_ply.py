@@ -36,8 +36,22 @@ def test_three_encodings(tmp_path: Path, kind: str) -> None:
     np.testing.assert_array_equal(rgb, RGB)
 
 
-def test_float_colours(tmp_path: Path) -> None:
-    write(tmp_path / "p.ply", "binary_little_endian", "float")
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_float_colours(tmp_path: Path, kind: str) -> None:
+    write(tmp_path / "p.ply", kind, "float")
+    np.testing.assert_array_equal(read_points(tmp_path / "p.ply")[1], RGB)
+
+
+@pytest.mark.parametrize(("colour", "factor"), [("float", 1), ("ushort", 257), ("ushort", 1)])
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_colours_of_other_types(tmp_path: Path, kind: str, colour: str, factor: int) -> None:
+    fields = [("p", "<f4", 3), ("c", {"float": "<f4", "ushort": "<u2"}[colour], 3)]
+    head = f"ply\nformat {kind} 1.0\nelement vertex 2\n" + "".join(f"property float {a}\n" for a in "xyz")
+    head += "".join(f"property {colour} {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
+    table = np.zeros(2, np.dtype(fields))
+    table["c"] = RGB.astype(int) * factor
+    rows = "\n".join(" ".join(map(str, (*p, *c))) for p, c in table.tolist()) + "\n"
+    (tmp_path / "p.ply").write_bytes(head.encode() + (rows.encode() if kind == "ascii" else table.tobytes()))
     np.testing.assert_array_equal(read_points(tmp_path / "p.ply")[1], RGB)
 
 

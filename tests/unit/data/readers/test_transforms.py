@@ -63,8 +63,25 @@ def test_the_fisheye_of_instant_ngp(tmp_path: Path) -> None:
     edit(path, lambda m: m.pop("camera_model", None))
     lens = load(tmp_path).images.sources[0].lens
     assert lens.model == "OPENCV_FISHEYE" and lens.params[4:] == tuple(bends.values())
-    edit(path, lambda m: [f.update(camera_model="OPENCV") for f in m["frames"]])  # a stated model counts
+    edit(path, lambda m: [f.update(camera_model="FULL_OPENCV") for f in m["frames"]])  # a stated model counts
     assert load(tmp_path).images.sources[0].lens.model == "FULL_OPENCV"
+    edit(path, lambda m: [f.update(camera_model="OPENCV") for f in m["frames"]])
+    with pytest.raises(InputError, match="k4"):  # of nerfstudio or of OpenCV?
+        load(tmp_path)
+
+
+def test_two_angles_of_view_give_two_focal_lengths(tmp_path: Path) -> None:
+    make_nerfstudio(tmp_path, views=2, size=(48, 32), points=20, mixed_sizes=False, principal_point_offset=False)
+    path = tmp_path / "transforms.json"
+    edit(path, lambda m: [[f.pop(name) for name in ("fl_x", "fl_y", "w", "h")] for f in m["frames"]])
+    edit(path, lambda m: m.update(camera_angle_x=1.2, camera_angle_y=0.6))
+    lens = load(tmp_path).images.sources[0].lens
+    assert (lens.fx, lens.fy) == (pytest.approx(24 / np.tan(0.6)), pytest.approx(16 / np.tan(0.3)))
+    edit(path, lambda m: m.update(camera_angle_y=round(2 * np.arctan(16 / lens.fx), 4)))  # of square pixels
+    assert load(tmp_path).images.sources[0].lens.model == "SIMPLE_PINHOLE"
+    edit(path, lambda m: m.update(camera_angle_y=4.0))
+    with pytest.raises(InputError, match=r"camera_angle_y.*4"):
+        load(tmp_path)
 
 
 @pytest.mark.parametrize("sized", [True, False])
