@@ -115,17 +115,18 @@ def turn(splats: Splats, axis: Literal["x", "z"]) -> Splats:
     return flip(splats, _SIGNS[axis])
 
 
-def flip(splats: Splats, signs: tuple[int, int, int]) -> Splats:
+def flip(splats: Splats, signs: tuple[int, int, int], reuse: bool = False) -> Splats:
     """The Gaussians in a frame whose axes x, y, z are these signs (1 or -1) times the old ones. Applied twice it changes nothing.
-    Scales keep their axes."""
+    Scales keep their axes. reuse: write the harmonics, most of the memory, over those of `splats`."""
     x, y, z = signs
-    harmonics = np.prod(np.where(np.array(_PARITY[: splats.sh.shape[1]]) == 1, np.array(signs), 1), axis=1)
+    parities = np.prod(np.where(np.array(_PARITY[: splats.sh.shape[1]]) == 1, np.array(signs), 1), axis=1)
+    factors = torch.from_numpy(parities).float()[:, None]
     return Splats(
         splats.means * torch.tensor(signs, dtype=torch.float32),
         splats.log_scales,
         splats.quats * torch.tensor([1, y * z, x * z, x * y], dtype=torch.float32),
         splats.opacity_logit,
-        splats.sh * torch.from_numpy(harmonics).float()[:, None],
+        splats.sh.mul_(factors) if reuse else splats.sh * factors,
     )
 
 

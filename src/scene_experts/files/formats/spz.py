@@ -143,7 +143,7 @@ def decode(data: bytes, source: Source) -> Splats:
     sh[:, 1:] /= 128
     scales = streams["scales"].reshape(n, 3) / 16.0 - 10
     stored = Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(streams["alphas"])), torch.from_numpy(sh))
-    return flip(stored, _signs(records))
+    return flip(stored, _signs(records), reuse=True)
 
 
 # --- containers ---------------------------------------------------------------------------------------------------------------------------
