@@ -59,7 +59,10 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
     with tempfile.TemporaryDirectory(prefix="scene-experts-usd-") as folder:
         archive, made = Path(folder) / "arrays.npz", Path(folder) / f"scene{'.usda' if path.suffix.lower() == '.usda' else '.usdc'}"
         np.savez(archive, **arrays)  # type: ignore[arg-type]
-        done = _work("write", archive, made, LONGEST)
+        try:
+            done = _work("write", archive, made, LONGEST)
+        except Damaged as error:  # no file is at fault
+            raise RunError(f"usd-core could not write {path}: {error}") from None
         if done.returncode or not made.is_file():
             raise RunError(f"usd-core could not write {path}: {shorten(done.stderr) or f'exit code {done.returncode}'}")
         write_atomic(path, lambda temporary: temporary.write_bytes(made.read_bytes()))
