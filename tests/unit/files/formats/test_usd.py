@@ -112,6 +112,10 @@ def test_text_files_and_damaged_files(tmp_path, caplog):
         path.write_text(text.replace('"Scene"\n{', f'"Scene"\n{{\n    {inside}\n    {order}\n', 1))
         caplog.clear()
         assert len(registry.read(path)) == 5 and ("not applied" in caplog.text) is told
+    for up, told in (('    upAxis = "Z"\n', True), ("", False)):  # y is up where a file does not say
+        path.write_text(text.replace('    upAxis = "Y"\n', up))
+        caplog.clear()
+        assert len(registry.read(path)) == 5 and ("axis Z up" in caplog.text) is told
     binary = tmp_path / "b.usdc"
     binary.write_bytes(b"PXR-USDC" + bytes(range(256)) * 4)
     with pytest.raises(InputError, match=naming(binary)):
