@@ -182,7 +182,10 @@ class Page {
       return found.length === count && found.every(Number.isFinite) ? found : null;
     };
     const [position, r, fov] = [numbers("position", 3), numbers("rotation", 9), numbers("fov", 1)];
-    if (position && r) this.setPose({ position, rotation: [r.slice(0, 3), r.slice(3, 6), r.slice(6)], fov: fov?.[0] });
+    // an absent field of view reads as 0
+    if (position && r) this.setPose({
+      position, rotation: [r.slice(0, 3), r.slice(3, 6), r.slice(6)], fov: fov?.[0] > 0 && fov[0] < 180 ? fov[0] : undefined,
+    });
   }
 
   writeHash() {

@@ -132,7 +132,7 @@ def export_several(
     standard, places = [], []
     for work in works:
         if work.format.family == GAUSSIANS:
-            if run.scene.traits.sh_degree is None:  # it will be baked
+            if not work.is_direct:  # it will be baked
                 work = replace(work, options=replace(options, sh_degree=min(options.sh_degree, work.format.sh_degree)))
             standard.append(work)
             places.append(file_path(run.path, work.name, work.format, out))
@@ -389,7 +389,7 @@ def _export_gaussians(
         if fresh:
             made[key] = _make_gaussians(work, world, capture)
         one = made[key]
-        contents, bake = one.contents, not work.is_direct
+        contents, bake = one.contents.up_to_degree(format.sh_degree), not work.is_direct
         about = _describe(work, contents, level) | one.about
         note = {name: value for name, value in about.items() if name != "antialias" or format.antialias}
         views = {} if format.view_note is None or capture is None else format.view_note(capture, world)

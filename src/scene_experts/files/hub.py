@@ -27,7 +27,7 @@ from scene_experts.evaluate.results import load_results
 from scene_experts.files.export import Written, export_several
 from scene_experts.files.measure import Painter, Tell, capture_if_there
 from scene_experts.files.options import DEFAULT, Options
-from scene_experts.files.registry import formats_of
+from scene_experts.files.registry import GAUSSIANS, format_named, formats_of
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.view.paths import choose_best_view
 
@@ -82,7 +82,8 @@ def write_hub(
         write_picture(folder / PREVIEW, draw_preview(run, capture))
     names = tuple(formats) or default_formats(run)
     written = export_several(run, names, folder, options, tell=tell, command=command)
-    write_bytes(folder / CARD, make_card(run, written, find_scores(run), licence, notices).encode())
+    imports = options.frame == "capture" or any(format_named(name).family != GAUSSIANS for name in names)
+    write_bytes(folder / CARD, make_card(run, written, find_scores(run), licence, notices, imports).encode())
     return written
 
 
@@ -119,8 +120,11 @@ def copy_notices(capture: Path, folder: Path) -> list[str]:
     return names
 
 
-def make_card(run: OpenRun, files: Sequence[Written], scores: dict[str, Any], licence: str, notices: Sequence[str]) -> str:
-    """The text of the card. scores: the content of results.json, or empty."""
+def make_card(
+    run: OpenRun, files: Sequence[Written], scores: dict[str, Any], licence: str, notices: Sequence[str], imports: bool = True
+) -> str:
+    """The text of the card. scores: the content of results.json, or empty. imports: whether `import` reads the first of the files, or
+    the result folder that it is in."""
     recipe, scene = run.config.train.recipe, run.config.data.path.name or "scene"
     metrics = [{"type": name, "name": title, "value": round(float(scores[name]), 4)} for name, title in METRICS.items() if scores.get(name)]
     head: dict[str, Any] = {
@@ -137,13 +141,19 @@ def make_card(run: OpenRun, files: Sequence[Written], scores: dict[str, Any], li
     maker = f"scene-experts {scene_experts.__version__}"
     lines += [f"![{scene}]({PREVIEW})", "", f"A 3D scene of Gaussians, trained from photographs by {maker} with"]
     lines += [f"the recipe `{recipe}` for {run.step:,} iterations.", "", "| file | content |", "|---|---|"]
-    kinds = {".compact": f"{run.scene.traits.rows} with their networks"}
-    named = [(file, kinds.get(file.path.suffix, "Gaussians")) for file in files]
-    lines += [f"| `{file.path.name}` | {file.rows:,} {kind}, {file.bytes / 1e6:.1f} MB |" for file, kind in named]
-    lines += ["", "## Open it", "", "```sh", "pip install scene-experts"]
-    lines += ["# CAPTURE: folder of its photographs with poses; the run can be drawn, scored and converted"]
-    lines += [f"scene-experts import {files[0].path.name} --data CAPTURE --out RUN"]
-    lines += ["```", ""]
+    for file in files:
+        folder = file.path.is_dir()  # point_cloud/iteration_N of a result folder
+        name = f"{file.path.parent.name}/{file.path.name}" if folder else file.path.name
+        kind = f"{run.scene.traits.rows} with their networks" if folder or file.path.suffix == ".compact" else "Gaussians"
+        lines.append(f"| `{name}` | {file.rows:,} {kind}, {file.bytes / 1e6:.1f} MB |")
+    lines += ["", "## Open it", ""]
+    if imports:
+        lines += ["```sh", "pip install scene-experts"]
+        lines += ["# CAPTURE: folder of its photographs with poses; the run can be drawn, scored and converted"]
+        lines += [f"scene-experts import {'.' if files[0].path.is_dir() else files[0].path.name} --data CAPTURE --out RUN"]
+        lines += ["```", ""]
+    else:
+        lines += ["The Gaussians are in the frame that the scene was trained in, not in that of its photographs.", ""]
     if any(file.path.suffix == ".spz" for file in files):
         lines += ["Viewers of Gaussian splats open the `.spz` file directly.", ""]
     if metrics:

@@ -313,6 +313,15 @@ def test_what_a_format_cannot_hold_is_told(short, tmp_path):
     assert spz.lines[-1].startswith("warning: ") and "SPZ" in spz.lines[-1] and not any("warning" in line for line in sog.lines)
 
 
+@pytest.mark.parametrize("short", ["3dgs"], indirect=True)
+@pytest.mark.parametrize("prune", [0.0, 0.02])
+def test_what_is_said_of_the_harmonics_is_what_the_file_holds(short, tmp_path, prune):
+    (written,) = export_run(short, "splat", tmp_path / "a.splat", prune=prune, refine=0)
+    about = json.loads((tmp_path / "a.splat.json").read_text())
+    assert about["sh_degree"] == registry.read(written.path).degree == 0 and "degree 0" in written.lines[1]
+    assert not prune or about["bake"]["sh_degree"] == 0  # colours are fitted for what the file holds
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("short", ["moe-gs"], indirect=True)
 def test_each_format_is_measured_from_its_own_file(short, tmp_path):

@@ -52,6 +52,18 @@ def test_the_card_states_licence_tags_scores_and_files(tmp_path):
     assert "model-index" not in head and head["license"] == "unknown" and "not stated" in body
 
 
+def test_the_card_names_a_result_folder_and_offers_no_import_that_would_be_refused(tmp_path):
+    config = SimpleNamespace(train=SimpleNamespace(recipe="moe-gs"), data=SimpleNamespace(path=tmp_path / "banana"))
+    run = SimpleNamespace(config=config, step=40, scene=SimpleNamespace(traits=SimpleNamespace(rows="anchors")))
+    folder = tmp_path / "point_cloud" / "iteration_40"
+    folder.mkdir(parents=True)
+    card = hub.make_card(run, [Written(folder, 3_000_000, 400, ())], {}, "mit", [])  # type: ignore[arg-type]
+    assert "| `point_cloud/iteration_40` | 400 anchors with their networks" in card and "scene-experts import . --data" in card
+    spz = [Written(tmp_path / "scene.spz", 900_000, 4000, ())]
+    card = hub.make_card(run, spz, {}, "mit", [], imports=False)  # type: ignore[arg-type]
+    assert "scene-experts import" not in card and "trained in" in card and "`.spz`" in card
+
+
 def test_scores_are_those_of_the_iteration_that_is_written(tmp_path, caplog):
     run = SimpleNamespace(path=tmp_path, step=2000)
     assert hub.find_scores(run) == {}  # type: ignore[arg-type]

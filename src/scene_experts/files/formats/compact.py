@@ -99,7 +99,7 @@ def write(path: Path, data: AnchorData, note: dict[str, Any], coding: Coding = C
         value = data.columns[name]
         array = value.detach().cpu().float().numpy().reshape(n, int(np.prod(value.shape[1:])))[order]
         if drawn is not None and name == "offsets":  # those of masked slots are left out
-            array = array.reshape(n, -1, 3)[drawn]
+            array = array.reshape(*drawn.shape, 3)[drawn]
         if not np.isfinite(array).all():
             raise InputError(f"expected finite {name}, found others in {(~np.isfinite(array)).any(1).sum():,} anchors; train again")
         codes[name], parts = _encode(array, getattr(coding, name, "float32"))
@@ -206,7 +206,7 @@ def _decode(tensors: dict[str, Tensor], name: str, code: str, n: int, width: int
 
 def _decode_slots(blob: NDArray[np.uint8], n: int, K: int) -> Tensor:
     """The masks [N, K] bool of slots."""
-    planes = inflate(blob, n * -(-K // 8)).reshape(-1, n)
+    planes = inflate(blob, n * -(-K // 8)).reshape(-(-K // 8), n)
     return torch.from_numpy(np.ascontiguousarray(np.unpackbits(planes.T, axis=1, count=K).astype(bool)))
 
 

@@ -8,6 +8,7 @@ the points in viewers without the extension.
 from __future__ import annotations
 
 import json
+import logging
 import re
 import struct
 from pathlib import Path
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import Damaged
-from scene_experts.core.reading.numbers import whole_number
+from scene_experts.core.reading.numbers import shown, whole_number
 from scene_experts.core.reading.plain import parse_json
 from scene_experts.core.reading.source import Source, opening
 from scene_experts.files.formats.pack import Floats, alphas, logits, tensor, to_bytes, turn, unit_quats, warn_of_transforms
@@ -27,6 +28,7 @@ from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import Format
 from scene_experts.geometry.sh import C0
 
+log: logging.Logger = logging.getLogger(__name__)
 NAME = "KHR_gaussian_splatting"
 SETTINGS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective", "sortingMethod": "cameraDistance"}
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
@@ -83,7 +85,8 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of all primitives with the extension, together. Transforms of nodes are not applied; a warning tells of them.
+    """The Gaussians of all primitives with the extension, together. Transforms of nodes are not applied, and colours of another space
+    are not converted; a warning tells of them.
 
     Raises InputError for damaged files and for files without such a primitive.
     """
@@ -97,6 +100,10 @@ def read(path: Path) -> Splats:
             raise Damaged(f"no primitive with {NAME}")
         if _has_transforms(scene):
             warn_of_transforms(path)
+        for name in ("kernel", "colorSpace"):
+            others = {shown(p["extensions"][NAME].get(name, SETTINGS[name])) for p in primitives} - {repr(SETTINGS[name])}
+            if others:
+                log.warning("%s has Gaussians of the %s %s, which are read as %r", path, name, ", ".join(sorted(others)), SETTINGS[name])
         coefficients = min(part[4].shape[1] for part in found)
         join = lambda parts: parts[0] if len(parts) == 1 else np.concatenate(parts)  # noqa: E731
         means, scales, quats, opacity = (join([part[i] for part in found]) for i in range(4))

@@ -112,15 +112,21 @@ def logits(opacity: Floats, edge: float = 1e-7) -> NDArray[np.float32]:
 def turn(splats: Splats, axis: Literal["x", "z"]) -> Splats:
     """The Gaussians after half a turn of the frame about an axis. Applied twice it changes nothing.
     Scales keep their axes."""
-    signs = np.array(_SIGNS[axis])
-    harmonics = np.prod(np.where(np.array(_PARITY[: splats.sh.shape[1]]) == 1, signs, 1), axis=1)
-    vector = torch.from_numpy(signs).float()
+    return flip(splats, _SIGNS[axis])
+
+
+def flip(splats: Splats, signs: tuple[int, int, int], reuse: bool = False) -> Splats:
+    """The Gaussians in a frame whose axes x, y, z are these signs (1 or -1) times the old ones. Applied twice it changes nothing.
+    Scales keep their axes. reuse: write the harmonics, most of the memory, over those of `splats`."""
+    x, y, z = signs
+    parities = np.prod(np.where(np.array(_PARITY[: splats.sh.shape[1]]) == 1, np.array(signs), 1), axis=1)
+    factors = torch.from_numpy(parities).float()[:, None]
     return Splats(
-        splats.means * vector,
+        splats.means * torch.tensor(signs, dtype=torch.float32),
         splats.log_scales,
-        splats.quats * torch.cat([torch.ones(1), vector]),
+        splats.quats * torch.tensor([1, y * z, x * z, x * y], dtype=torch.float32),
         splats.opacity_logit,
-        splats.sh * torch.from_numpy(harmonics).float()[:, None],
+        splats.sh.mul_(factors) if reuse else splats.sh * factors,
     )
 
 

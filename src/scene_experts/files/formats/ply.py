@@ -9,6 +9,7 @@ same tables.
 from __future__ import annotations
 
 import json
+import logging
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,9 +29,11 @@ from scene_experts.core.reading.vertices import HEADER_LIMIT, read_header, read_
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import Format
 
+log: logging.Logger = logging.getLogger(__name__)
 Columns = dict[str, NDArray[np.generic]]
 
 NOTE_MARK = "scene-experts"
+_FILTER = "filter_3D"  # column of Mip-Splatting: by how much each Gaussian is smoothed when it is drawn
 _NOTE_LIMIT = 1 << 16  # other readers hold header lines in small buffers
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
 
@@ -169,8 +172,8 @@ def write(path: Path, splats: Splats, note: Mapping[str, Any], normals: bool = T
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of 3DGS's file. Raises InputError for other or damaged files, and for anchors,
-    whose networks are elsewhere."""
+    """The Gaussians of 3DGS's file. The smoothing filter of Mip-Splatting is not applied; a warning tells of it. Raises InputError
+    for other or damaged files, and for anchors, whose networks are elsewhere."""
     columns = read_vertices(path)
     if "f_offset_0" in columns:
         raise InputError(
@@ -181,6 +184,8 @@ def read(path: Path) -> Splats:
     rest_names = numbered_names(columns, "f_rest_")
     if len(rest_names) not in (0, 9, 24, 45):
         raise InputError(f"expected 0, 9, 24 or 45 f_rest columns in {path}, found {len(rest_names)}; write the file again")
+    if _FILTER in columns:
+        log.warning("%s has a smoothing filter (%s), which is not applied: fuse it (create_fused_ply.py) before the import", path, _FILTER)
     with guarding(path, budget.PLY):
         return splats_in(columns, rest_names, path).checked(path)
 

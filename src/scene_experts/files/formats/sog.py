@@ -56,7 +56,7 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)  # a fixed date: equal scenes give equal bytes
 
 
 def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
-    """Write the file; the note goes into the asset entry of meta.json."""
+    """Write the file; the note goes into the asset entry of meta.json, its entry `antialias` into that of the format."""
     write_bytes(path, sog_bytes(splats, note))
 
 
@@ -84,6 +84,7 @@ def sog_bytes(splats: Splats, note: dict[str, Any]) -> bytes:
     colors = np.concatenate([nearest_levels(dc, color_book), to_bytes(alphas(s))[:, None]], 1)
     meta: dict[str, Any] = {
         "version": 2,
+        "antialias": bool(note.get("antialias", False)),
         "asset": {"generator": "scene-experts", **({"scene-experts": note} if note else {})},
         "count": n,
         "means": {
@@ -106,6 +107,12 @@ def read(path: Path) -> Splats:
     """The Gaussians of a file of version 2. Raises InputError for other or damaged files."""
     with opening(path, budget.SOG) as source, open_zip(source) as archive:
         return _decode(source, archive).checked(path)
+
+
+def is_antialiased(path: Path) -> bool:
+    """Whether a file says that it is drawn with antialiasing. Raises InputError for a damaged file."""
+    with opening(path, budget.SOG) as source, open_zip(source) as archive:
+        return parse_json(archive.read("meta.json", _META_LIMIT)).get("antialias") is True
 
 
 def _decode(source: Source, archive: Archive) -> Splats:
@@ -224,4 +231,6 @@ FORMAT = Format(
     read=read,
     marks=(b"PK\x03\x04",),
     looks_like=looks_like,
+    antialias=True,
+    is_antialiased=is_antialiased,
 )

@@ -9,7 +9,7 @@ OpenCV axes). A format with another frame or unit converts in its own module.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torch import Tensor
@@ -50,6 +50,10 @@ class Splats:
     def rows(self, index: Tensor) -> Splats:
         """The Gaussians at `index` (int64 [M] or bool [N]), in that order."""
         return Splats(self.means[index], self.log_scales[index], self.quats[index], self.opacity_logit[index], self.sh[index])
+
+    def up_to_degree(self, degree: int) -> Splats:
+        """The Gaussians without the harmonics above a degree."""
+        return self if self.degree <= degree else replace(self, sh=self.sh[:, : (degree + 1) ** 2])
 
     def expect_finite(self, where: str) -> None:
         """Raises InputError, naming `where`, for values that are not finite."""

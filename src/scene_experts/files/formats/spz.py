@@ -4,7 +4,8 @@ It is written as version 3 (one gzip stream, which every reader accepts) and rea
 (4 needs `zstandard`). The file stores one attribute after the other: positions in 24-bit fixed
 point, opacity, colour, log scale (steps of 1/16 from -10), rotation (the smallest three components,
 10 bits each), and harmonics over [-1, 1]. The frame is x right, y up, z back: half a turn about x
-from ours.
+from ours. Files of other programs may hold further records (type, length, content). The one that names another frame is
+followed, others are passed over.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from scene_experts.files.formats.pack import (
     byte_logits,
     check_count,
     decoded_bytes,
+    flip,
     from_smallest_three,
     morton_order,
     smallest_three,
@@ -47,6 +49,10 @@ MAGIC, HEADER = 0x5053474E, struct.Struct("<IIIBBBB")
 V4_HEADER = struct.Struct("<IIIBBBBI12x")
 _ZSTD_WINDOW = 1 << 27  # bytes that a zstd frame may look back, which the decoder allocates
 ANTIALIASED, _FLAGS = 1, 14  # a bit of the flags, and the offset of the flags in the header of every version
+EXTENDED = 2  # a bit of the flags: records follow the attributes, or in version 4 the header
+FRAME = 0xADBE0003  # type of the record that names the frame, by a number
+_OWN_FRAME = (1, -1, -1)  # signs of our axes in the frame of a file without such a record
+_RECORDS = 1 << 20  # bytes of all records, at most
 _STREAMS = ("positions", "alphas", "colors", "scales", "rotations", "sh")
 _COLOR = 0.15  # share of a byte's range per unit of the constant harmonic
 _MAX_BITS = 20  # of a position's fraction
@@ -124,7 +130,7 @@ def is_antialiased(path: Path) -> bool:
 
 def decode(data: bytes, source: Source) -> Splats:
     """The Gaussians in the bytes of a file. Raises Damaged."""
-    version, n, degree, bits, streams = _streams_v4(data, source) if data[:4] == b"NGSP" else _streams_gzip(data, source)
+    version, n, degree, bits, records, streams = _streams_v4(data, source) if data[:4] == b"NGSP" else _streams_gzip(data, source)
     means = _positions(streams["positions"], version, n, bits)
     if not np.isfinite(means).all():
         raise Damaged("positions that are not finite")
@@ -136,7 +142,8 @@ def decode(data: bytes, source: Source) -> Splats:
     sh[:, 1:] -= 128
     sh[:, 1:] /= 128
     scales = streams["scales"].reshape(n, 3) / 16.0 - 10
-    return turn(Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(streams["alphas"])), torch.from_numpy(sh)), "x")
+    stored = Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(streams["alphas"])), torch.from_numpy(sh))
+    return flip(stored, _signs(records), reuse=True)
 
 
 # --- containers ---------------------------------------------------------------------------------------------------------------------------
@@ -156,26 +163,44 @@ def _sizes(version: int, n: int, degree: int) -> dict[str, int]:
     return {name: n * width for name, width in zip(_STREAMS, widths)}
 
 
-def _streams_gzip(data: bytes, source: Source) -> tuple[int, int, int, int, dict[str, Bytes]]:
-    """Version, count, degree, bits of fraction and the streams of versions 1 to 3."""
+def _signs(records: bytes) -> tuple[int, int, int]:
+    """The signs of our axes in the frame that the records name. Raises Damaged for a frame whose axes are in another order.
+
+    Frame n is 1 + 1 (x right, else left) + 2 (y up, else down) + 4 (z forward, else back); 0 says nothing.
+    """
+    at = 0
+    while at + 8 <= len(records):
+        kind, size = struct.unpack_from("<II", records, at)
+        if kind == FRAME and size == 4 and at + 12 <= len(records):
+            frame = int.from_bytes(records[at + 8 : at + 12], "little")
+            if frame > 8:
+                raise Damaged(f"frame {frame}, whose axes are in another order than x, y, z")
+            bits = frame - 1
+            return _OWN_FRAME if frame == 0 else (1 if bits & 1 else -1, -1 if bits & 2 else 1, 1 if bits & 4 else -1)
+        at += 8 + size
+    return _OWN_FRAME
+
+
+def _streams_gzip(data: bytes, source: Source) -> tuple[int, int, int, int, bytes, dict[str, Bytes]]:
+    """Version, count, degree, bits of fraction, the records and the streams of versions 1 to 3."""
     machine = zlib.decompressobj(31)
     head = machine.decompress(data, HEADER.size)
     if len(head) < HEADER.size:
         raise Damaged("no whole header")
-    magic, version, n, degree, bits, _, _ = HEADER.unpack(head)
+    magic, version, n, degree, bits, flags, _ = HEADER.unpack(head)
     _check_header(source, magic, version, n, degree, bits, range(1, 4))
     sizes = _sizes(version, n, degree)
     total = sum(sizes.values())
-    body = machine.decompress(machine.unconsumed_tail, total + 1)
-    if len(body) != total:
+    body = machine.decompress(machine.unconsumed_tail, total + (_RECORDS if flags & EXTENDED else 1))
+    if len(body) < total or (len(body) > total and not flags & EXTENDED):
         raise Damaged(f"{len(body):,} bytes of attributes where {total:,} are expected")
     ends = np.cumsum([0, *sizes.values()])
     flat = np.frombuffer(body, np.uint8)
-    return version, n, degree, bits, {name: flat[ends[i] : ends[i + 1]] for i, name in enumerate(_STREAMS)}
+    return version, n, degree, bits, body[total:], {name: flat[ends[i] : ends[i + 1]] for i, name in enumerate(_STREAMS)}
 
 
-def _streams_v4(data: bytes, source: Source) -> tuple[int, int, int, int, dict[str, Bytes]]:
-    """The same for version 4: a plain header, a table of sizes, and one zstd stream per attribute."""
+def _streams_v4(data: bytes, source: Source) -> tuple[int, int, int, int, bytes, dict[str, Bytes]]:
+    """The same for version 4: a plain header, the records, a table of sizes, and one zstd stream per attribute."""
     try:
         import zstandard
     except ImportError:
@@ -184,7 +209,7 @@ def _streams_v4(data: bytes, source: Source) -> tuple[int, int, int, int, dict[s
         ) from None
     if len(data) < V4_HEADER.size:
         raise Damaged("no whole header")
-    magic, version, n, degree, bits, _, count, table = V4_HEADER.unpack_from(data)
+    magic, version, n, degree, bits, flags, count, table = V4_HEADER.unpack_from(data)
     _check_header(source, magic, version, n, degree, bits, range(4, 5))
     sizes = {name: size for name, size in _sizes(version, n, degree).items() if size or count == len(_STREAMS)}
     if count != len(sizes) or table < V4_HEADER.size or table + 16 * count > len(data):
@@ -198,7 +223,8 @@ def _streams_v4(data: bytes, source: Source) -> tuple[int, int, int, int, dict[s
         if raw != size or len(part) != packed:
             raise Damaged(f"a stream of {name} that is not {size:,} bytes long")
         out[name] = np.frombuffer(_unpack_zstd(zstandard, part, size), np.uint8)
-    return version, n, degree, bits, out
+    records = data[V4_HEADER.size : table] if flags & EXTENDED else b""
+    return version, n, degree, bits, records[:_RECORDS], out
 
 
 def _unpack_zstd(zstandard: Any, part: bytes, size: int) -> bytes:

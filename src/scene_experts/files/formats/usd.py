@@ -8,6 +8,7 @@ one. usd-core runs in a process of its own (`usd_worker.py`).
 from __future__ import annotations
 
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -39,6 +40,7 @@ from scene_experts.files.formats.splats import Splats
 from scene_experts.files.formats.usd_worker import COEFFICIENTS, DAMAGED, MISSING
 from scene_experts.files.registry import Format
 
+log: logging.Logger = logging.getLogger(__name__)
 LONGEST = 3600  # seconds that a file may take to be written
 _LOADED = 1 << 30  # bytes of addresses that Python, NumPy and usd-core reserve with one thread
 _STARTING = 60  # seconds that usd-core may take to start on a busy machine, beside the time limit of a file
@@ -59,15 +61,18 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
     with tempfile.TemporaryDirectory(prefix="scene-experts-usd-") as folder:
         archive, made = Path(folder) / "arrays.npz", Path(folder) / f"scene{'.usda' if path.suffix.lower() == '.usda' else '.usdc'}"
         np.savez(archive, **arrays)  # type: ignore[arg-type]
-        done = _work("write", archive, made, LONGEST)
+        try:
+            done = _work("write", archive, made, LONGEST)
+        except Damaged as error:  # no file is at fault
+            raise RunError(f"usd-core could not write {path}: {error}") from None
         if done.returncode or not made.is_file():
             raise RunError(f"usd-core could not write {path}: {shorten(done.stderr) or f'exit code {done.returncode}'}")
         write_atomic(path, lambda temporary: temporary.write_bytes(made.read_bytes()))
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of all prims of the kind, together. Transforms of prims are not applied, and a warning tells of
-    them; other files are not opened.
+    """The Gaussians of all prims of the kind, together. Transforms of prims are not applied, and y is taken as up; a warning tells
+    where that is wrong. Other files are not opened.
 
     Raises InputError for damaged files, for files without such a prim, and without usd-core.
     """
@@ -85,9 +90,11 @@ def read(path: Path) -> Splats:
         source.spend_bytes(3 * archive.stat().st_size)  # float32, and float64 beside it
         with np.load(archive) as data:
             found = [_prim(source, data, i) for i in range(int(data["count"]))]
-            moved = bool(data["moved"])
+            moved, up = bool(data["moved"]), str(data["up"])
         if moved:
             warn_of_transforms(path)
+        if up != "Y":
+            log.warning("%s has the axis %s up, and is read as if it were Y: turn it before the import", path, shorten(up, 20))
         coefficients = min(part[4].shape[1] for part in found)
         means, scales, quats, opacity = (np.concatenate([part[i] for part in found]) for i in range(4))
         sh = np.concatenate([part[4][:, :coefficients] for part in found])

@@ -50,8 +50,8 @@ def write(source: Path, target: Path) -> None:
 
 
 def read(source: Path, target: Path) -> str | None:
-    """Write the arrays of all prims of the kind `KIND`, with names as in the file, numbered by prim, their `count`, and whether a
-    transform moves one (`moved`). Returns what is wrong, or None."""
+    """Write the arrays of all prims of the kind `KIND`, with names as in the file, numbered by prim, their `count`, whether a
+    transform moves one (`moved`), and the name of the axis that is up (`up`). Returns what is wrong, or None."""
     sdf = _pxr("Sdf")
     layer = sdf.Layer.OpenAsAnonymous(str(source))
     if layer is None:
@@ -67,6 +67,8 @@ def read(source: Path, target: Path) -> str | None:
     if not prims:
         return f"no {KIND}"
     out: dict[str, Any] = {"count": len(prims), "moved": any(_moves(above) for spec in prims for above in _with_parents(layer, spec))}
+    root = layer.pseudoRoot
+    out["up"] = str(root.GetInfo("upAxis")) if root.HasInfo("upAxis") else "Y"
     for number, spec in enumerate(prims):
         degree = _default(spec, DEGREE)
         out[f"{number}:degree"] = 3 if degree is None else int(degree)  # the schema's default

@@ -44,9 +44,9 @@ def find(source: Path, iteration: int | None) -> Path | None:
 def read(source: Path, data: Data, iteration: int | None) -> Imported:
     """The run in a file of Gaussians, published or ours, in the frame and unit of the capture.
 
-    The recipe is 3DGS and the step 0 unless the file, the description beside it (FILE.json) or its
-    folder says otherwise. Raises InputError where a description says that the file is in another
-    frame.
+    The recipe is 3DGS and the step 0, or `iteration`, unless the description or the name of its folder
+    says otherwise. Whether it is drawn with antialiasing, the description beside it (FILE.json) or the file
+    says. Raises InputError where the former says that the file is in another frame.
     """
     antialias = is_antialiased(source)
     about = result_folder.read_description(source.parent) or {}

@@ -99,6 +99,17 @@ def test_masked_slots_take_no_room(tmp_path):
     assert masked.per_anchor < whole.per_anchor - 0.6 * 2 * 3 * K + 4  # the masks take 2 bytes
 
 
+@pytest.mark.parametrize("n", [0, 1])
+def test_masks_of_none_and_one(tmp_path, n):
+    s = {name: value[:n] for name, value in scene().items()}
+    columns = {"xyz": torch.zeros(n, 3), **{name: s[name] for name in ("feature", "log_scaling", "offsets")}}
+    slots = torch.zeros(n, K, dtype=torch.bool)
+    data = AnchorData(columns | {"slots": slots}, by_file_name(networks()), ABOUT, s["cells"], 0.0013, ORIGIN)
+    compact.write(tmp_path / "a", data, {})
+    found = read(tmp_path / "a").columns
+    assert torch.equal(found["slots"], slots) and torch.equal(found["offsets"], torch.zeros(n, K, 3))
+
+
 @pytest.mark.parametrize("spread", [3, 300, 2**20 - 2])
 def test_cells_come_back_bit_for_bit(tmp_path, spread):
     s = scene(spread=spread)

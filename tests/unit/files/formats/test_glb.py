@@ -99,6 +99,19 @@ def test_transforms_of_nodes_are_told(tmp_path, caplog):
         assert len(glb.read(path)) == 5 and (str(path) in caplog.text and "not applied" in caplog.text) is told
 
 
+@pytest.mark.parametrize(("name", "value"), [("colorSpace", "lin_rec709_display"), ("kernel", "box"), ("sortingMethod", "other")])
+def test_another_colour_space_or_kernel_is_told(tmp_path, caplog, name, value):
+    path = tmp_path / "a.glb"
+    glb.write(path, scene(5, 1), {})
+    glb.read(path)
+    assert not caplog.records
+    doc, body = parsed(path)
+    doc["meshes"][0]["primitives"][0]["extensions"][glb.NAME][name] = value
+    rebuilt(path, doc, body)
+    assert len(glb.read(path)) == 5
+    assert (value in caplog.text and str(path) in caplog.text) is (name != "sortingMethod")  # how it is drawn is not what it is
+
+
 def test_damaged_files(tmp_path):
     path = tmp_path / "a.glb"
     glb.write(path, scene(20, 1), {})

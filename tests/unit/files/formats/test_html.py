@@ -139,6 +139,10 @@ def test_the_page_in_a_browser(tmp_path):
         page.evaluate(f"location.hash = 'position={numbers(first['position'])}&rotation={numbers(first['rotation'])}&fov={FOV}'")
         page.wait_for_timeout(200)
         assert psnr(shot(), start) > 40
+        for fov in ("", "&fov=0", "&fov=200"):  # a link without a usable field of view has that of the scene
+            page.evaluate(f"location.hash = 'position={numbers(first['position'])}&rotation={numbers(first['rotation'])}{fov}'")
+            page.wait_for_timeout(200)
+            assert page.evaluate("sceneExperts.pose().fov") == pytest.approx(FOV) and psnr(shot(), start) > 40
         page.keyboard.press("]")
         assert psnr(shot(), moved) > 40
         other = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})

@@ -1,5 +1,6 @@
 """What packed formats share, against the definitions of rotation, covariance and harmonics."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,18 @@ def test_a_turned_frame_shows_the_same_scene(axis, signs, degree):
     torch.testing.assert_close(sh_to_rgb(t.sh, look @ turn, degree), sh_to_rgb(s.sh, look, degree), rtol=1e-4, atol=1e-5)
     again = pack.turn(t, axis)
     assert all(torch.equal(getattr(again, name), getattr(s, name)) for name in ("means", "quats", "sh"))
+
+
+@pytest.mark.parametrize("signs", list(itertools.product((1, -1), repeat=3)))
+def test_flipped_axes_show_the_same_scene_also_in_a_mirror(signs):
+    s = scene(40, 3)
+    t = pack.flip(s, signs)
+    axes, look = torch.diag(torch.tensor(signs).float()), torch.randn(40, 3)
+    assert torch.equal(t.means, s.means @ axes)
+    unit = lambda x: torch.nn.functional.normalize(x.quats, dim=1)  # noqa: E731
+    ours = covariance(unit(s), s.log_scales.exp())
+    torch.testing.assert_close(covariance(unit(t), t.log_scales.exp()), axes @ ours @ axes, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(sh_to_rgb(t.sh, look @ axes, 3), sh_to_rgb(s.sh, look, 3), rtol=1e-4, atol=1e-5)
 
 
 def test_smallest_three_and_back():

@@ -11,6 +11,7 @@ from scene_experts.files.formats import ply
 from scene_experts.files.formats.splats import Splats
 from support.files import write_anchor_ply
 from support.messages import naming
+from support.splats import splats
 
 K, F = 10, 32
 
@@ -206,3 +207,13 @@ def test_the_names_in_a_header(tmp_path):
     assert ply.property_names(tmp_path / "a.ply") == {"x", "f_dc_0"}
     (tmp_path / "b").write_bytes(b"other")
     assert ply.property_names(tmp_path / "b") == set() == ply.property_names(tmp_path / "absent")
+
+
+def test_the_filter_of_mip_splatting_is_told(tmp_path, caplog):
+    ply.write(tmp_path / "a.ply", splats(4), {})
+    ply.read(tmp_path / "a.ply")
+    assert not caplog.records
+    columns = ply.read_vertices(tmp_path / "a.ply") | {"filter_3D": np.full(4, 0.1, np.float32)}
+    ply.write_vertices(tmp_path / "b.ply", columns)
+    assert len(ply.read(tmp_path / "b.ply")) == 4
+    assert str(tmp_path / "b.ply") in caplog.text and "filter_3D" in caplog.text and "not applied" in caplog.text

@@ -42,6 +42,21 @@ def test_the_palette_is_near_and_the_bytes_are_the_same_twice(tmp_path):
     assert meta["version"] == 2 and meta["count"] == 5000 and meta["asset"]["scene-experts"] == {"a": 1} and meta["shN"]["count"] <= 4096
 
 
+@pytest.mark.parametrize("asked", [False, True])
+def test_the_entry_of_antialiasing(tmp_path, asked):
+    """The format's description requires it; viewers draw the file by it."""
+    sog.write(tmp_path / "a.sog", scene(50, 1), {"antialias": asked})
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        assert json.loads(archive.read("meta.json"))["antialias"] is asked
+    assert sog.FORMAT.antialias and sog.FORMAT.is_antialiased is sog.is_antialiased and sog.is_antialiased(tmp_path / "a.sog") is asked
+    for content in ({"version": 2}, {"antialias": 1}):
+        (tmp_path / "b.sog").write_bytes(sog._zip({"meta.json": json.dumps(content).encode()}))
+        assert sog.is_antialiased(tmp_path / "b.sog") is False
+    (tmp_path / "b.sog").write_bytes(sog._zip({"meta.json": b"[1]"}))
+    with pytest.raises(InputError, match=naming("b.sog")):
+        sog.is_antialiased(tmp_path / "b.sog")
+
+
 @pytest.mark.slow
 def test_a_scene_of_usual_size_takes_seconds():
     began = time.process_time()

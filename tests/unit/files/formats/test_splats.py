@@ -17,6 +17,8 @@ def test_degree_length_and_rows(degree):
     part = s.rows(torch.tensor([4, 0]))
     assert len(part) == 2 and torch.equal(part.sh[0], s.sh[4]) and torch.equal(part.quats[1], s.quats[0])
     assert len(s.rows(torch.zeros(5, dtype=torch.bool))) == 0
+    assert s.up_to_degree(3) is s and s.up_to_degree(1).degree == min(degree, 1)
+    assert torch.equal(s.up_to_degree(0).sh, s.sh[:, :1])
 
 
 @pytest.mark.parametrize("name", ["means", "log_scales", "quats", "opacity_logit", "sh"])

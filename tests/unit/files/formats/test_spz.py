@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from scene_experts.core.errors import InputError
 from scene_experts.files.formats import spz
-from scene_experts.files.formats.splats import Splats
+from scene_experts.files.formats.pack import flip, turn
+from scene_experts.files.formats.splats import NAMES, Splats
 from support.messages import naming
 from support.splat_quanta import check, scene
 
@@ -99,6 +100,43 @@ def test_the_flag_of_antialiasing(tmp_path, asked):
     for broken in (b"", b"NGSP", b"\x1f\x8b rubbish"):
         (tmp_path / "c.spz").write_bytes(broken)
         assert spz.is_antialiased(tmp_path / "c.spz") is False
+
+
+FRAMES = {0: (1, -1, -1), 1: (-1, 1, -1), 2: (1, 1, -1), 3: (-1, -1, -1), 4: (1, -1, -1), 5: (-1, 1, 1), 6: (1, 1, 1), 8: (1, -1, 1)}
+"""Frame in a file (LDB is 1, RDB 2, LUB 3, RUB 4, LDF 5, RDF 6, RUF 8; 0 is unknown) -> its axes in ours, which is RDF."""
+
+
+def with_records(s, kind, records):
+    """A file with records: at the end of the gzip stream, or in version 4 between the header and the table."""
+    data = bytearray(version_4(s) if kind == 4 else gzip.decompress(spz.spz_bytes(s)))
+    data[14] |= spz.EXTENDED
+    if kind != 4:
+        return gzip.compress(bytes(data) + records)
+    data[16:20] = struct.pack("<I", 32 + len(records))
+    return bytes(data[:32]) + records + bytes(data[32:])
+
+
+@pytest.mark.parametrize("kind", [3, 4])
+@pytest.mark.parametrize("frame", list(FRAMES))
+def test_records_of_other_programs_are_passed_over_and_their_frame_is_followed(tmp_path, kind, frame):
+    s = scene(50, 2)
+    own = read(tmp_path, spz.spz_bytes(s))
+    orbit = struct.pack("<IIfff", 0xADBE0002, 12, -0.5, 0.5, 1.0)
+    found = read(tmp_path, with_records(s, kind, orbit))
+    named = read(tmp_path, with_records(s, kind, orbit + struct.pack("<III", spz.FRAME, 4, frame)))
+    wanted = flip(turn(own, "x"), FRAMES[frame])
+    for name in NAMES:
+        assert torch.equal(getattr(found, name), getattr(own, name))
+        assert torch.equal(getattr(named, name), getattr(wanted, name))
+
+
+@pytest.mark.parametrize("kind", [3, 4])
+def test_records_that_do_not_fit(tmp_path, kind):
+    s = scene(50, 2)
+    for odd in (b"", b"\0" * 5, struct.pack("<If", 0xADBE0002, -0.5), struct.pack("<II", spz.FRAME, 4)):  # older files have no lengths
+        assert len(read(tmp_path, with_records(s, kind, odd))) == 50
+    with pytest.raises(InputError, match=naming("a.spz", 16)):
+        read(tmp_path, with_records(s, kind, struct.pack("<III", spz.FRAME, 4, 16)))
 
 
 def test_sizes_that_the_format_cannot_hold_are_counted(tmp_path):

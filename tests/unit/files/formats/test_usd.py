@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, RunError
 from scene_experts.files import registry
 from scene_experts.files.formats import usd
 from scene_experts.files.formats.usd_worker import COEFFICIENTS
@@ -39,6 +39,19 @@ def test_without_the_library_one_sentence_says_what_to_install(monkeypatch, tmp_
     (tmp_path / "a.usdc").write_bytes(b"PXR-USDC" + bytes(80))
     with pytest.raises(InputError, match="usd-core"):
         registry.read(tmp_path / "a.usdc")
+
+
+def test_a_worker_that_takes_too_long_is_told_in_one_sentence(monkeypatch, tmp_path):
+    def wait(command, **rest):
+        raise subprocess.TimeoutExpired(command, rest["timeout"])
+
+    monkeypatch.setattr(usd, "expect_library", lambda: None)
+    monkeypatch.setattr(usd.subprocess, "run", wait)
+    with pytest.raises(RunError, match=naming("a.usdc", "3600 s")):
+        usd.write(tmp_path / "a.usdc", scene(3), {})
+    (tmp_path / "a.usdc").write_bytes(b"PXR-USDC" + bytes(80))
+    with pytest.raises(InputError, match="takes longer"):
+        usd.read(tmp_path / "a.usdc")
 
 
 def test_arrays_that_do_not_fit_are_refused():
@@ -99,6 +112,10 @@ def test_text_files_and_damaged_files(tmp_path, caplog):
         path.write_text(text.replace('"Scene"\n{', f'"Scene"\n{{\n    {inside}\n    {order}\n', 1))
         caplog.clear()
         assert len(registry.read(path)) == 5 and ("not applied" in caplog.text) is told
+    for up, told in (('    upAxis = "Z"\n', True), ("", False)):  # y is up where a file does not say
+        path.write_text(text.replace('    upAxis = "Y"\n', up))
+        caplog.clear()
+        assert len(registry.read(path)) == 5 and ("axis Z up" in caplog.text) is told
     binary = tmp_path / "b.usdc"
     binary.write_bytes(b"PXR-USDC" + bytes(range(256)) * 4)
     with pytest.raises(InputError, match=naming(binary)):

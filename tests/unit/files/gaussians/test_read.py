@@ -137,7 +137,7 @@ def test_beside_a_description_of_more_harmonics_the_file_says_the_degree(made, t
     assert opened.step == 90 and opened.scene.config.sh_degree == 0
 
 
-@pytest.mark.parametrize("format", ["spz", "html", "ply", "compressed-ply"])
+@pytest.mark.parametrize("format", ["spz", "html", "ply", "compressed-ply", "sog"])
 def test_a_file_says_by_itself_whether_it_is_antialiased(made, tmp_path, format):
     run, folder = made
     opened, name = run_folder.open_run(run), f"scene{registry.format_named(format).suffix}"
