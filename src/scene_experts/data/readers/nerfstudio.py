@@ -63,15 +63,18 @@ class NerfstudioReader:
 def _held_out(meta: dict[str, Any], path: Path, warnings: list[str]) -> set[PurePosixPath]:
     """Return the file paths of the frames that are held out: those of test_filenames, else of val_filenames.
 
-    Adds warnings about names of no frame, and about validation frames beside test frames. Raises InputError for what is no list.
+    Adds warnings about names of no frame, about validation frames beside test frames, and about frames that train_filenames does not
+    name. Raises InputError for what is no list.
     """
-    test, val = (_read_names(meta, f"{part}_filenames", path) for part in ("test", "val"))
+    train, test, val = (_read_names(meta, f"{part}_filenames", path) for part in ("train", "test", "val"))
     key, held = ("test_filenames", test) if test or not val else ("val_filenames", val)
     frames = {transforms.to_pure(frame["file_path"]) for frame in meta["frames"] if isinstance(frame.get("file_path"), str)}
     if strange := sorted(map(str, held - frames)):
         warnings.append(f"{len(strange)} of {len(held)} names in {key} match no frame (first: {strange[0]})")
     if test and (shared := val & frames - test):
         warnings.append(f"the {len(shared)} validation frames are training views, because test_filenames names the held-out ones")
+    if train and (more := sorted(map(str, frames - train - test - val))):
+        warnings.append(f"train_filenames does not name {len(more)} frames that are training views too (first: {more[0]})")
     return held
 
 
