@@ -99,7 +99,9 @@ def split_box(xyz: Tensor, box: Block, count: int) -> list[Block]:
     below = xyz[:, axis] < at
     if not below.any():
         same = int((xyz[:, axis] == at).sum())
-        raise InputError(f"expected points that {count} blocks can divide, found {same} with the same coordinate; give smaller --blocks")
+        raise InputError(
+            f"expected points that can be divided into {count} blocks, found {same} with the same coordinate; give smaller --blocks"
+        )
     left, right = Block(box.low, tuple(high)), Block(tuple(low), box.high)
     return split_box(xyz[below], left, first) + split_box(xyz[~below], right, count - first)
 

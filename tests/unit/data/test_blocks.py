@@ -33,7 +33,7 @@ def test_points_at_one_place_are_not_divided():
     xyz = torch.zeros(8, 3, dtype=torch.float64)
     xyz[:2, 1] = 1.0
     assert len(split_box(xyz, Block((-math.inf,) * 3, (math.inf,) * 3), 1)) == 1
-    with pytest.raises(InputError, match=r"2 blocks can divide, found 6 .*--blocks"):
+    with pytest.raises(InputError, match=r"into 2 blocks, found 6 .*--blocks"):
         split_box(xyz, Block((-math.inf,) * 3, (math.inf,) * 3), 2)
 
 

@@ -74,7 +74,9 @@ def _held_out(meta: dict[str, Any], path: Path, warnings: list[str]) -> set[Pure
     if test and (shared := val & frames - test):
         warnings.append(f"the {len(shared)} validation frames are training views, because test_filenames names the held-out ones")
     if train and (more := sorted(map(str, frames - train - test - val))):
-        warnings.append(f"train_filenames does not name {len(more)} frames that are training views too (first: {more[0]})")
+        warnings.append(
+            f"{len(more)} of {len(frames)} frames are training views, though train_filenames does not name them (first: {more[0]})"
+        )
     return held
 
 

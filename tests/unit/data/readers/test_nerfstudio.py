@@ -123,7 +123,7 @@ def test_names_of_held_out_frames_are_compared_as_paths(tmp_path: Path) -> None:
     assert (capture.split, capture.test) == ("files", (3, 4)) and not any("filenames" in w for w in capture.warnings)
     edit(path, lambda m: m.update(train_filenames=["images/view_000.png", "./images/view_001.png", "images/view_002.png"]))
     capture = load(tmp_path)
-    assert capture.train == (0, 1, 2, 5) and any("does not name 1 frames" in w and "images/view_005.png" in w for w in capture.warnings)
+    assert capture.train == (0, 1, 2, 5) and any("1 of 6 frames" in w and "images/view_005.png" in w for w in capture.warnings)
 
 
 def test_a_folder_of_two_kinds_says_which_is_read(tmp_path: Path) -> None:
