@@ -19,7 +19,7 @@ from scene_experts.core.io import check_writable, read_json, write_bytes, write_
 from scene_experts.core.plain import to_json
 from scene_experts.data.settings import Data
 from scene_experts.data.views import Capture, World
-from scene_experts.files.cameras import write_cameras
+from scene_experts.files.cameras import first_width, write_cameras
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.measure import Painter, Tell, capture_if_there, cost
 from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
@@ -160,7 +160,8 @@ def write_result_folder(run: OpenRun, capture: Capture, out: Path | None = None)
     """
     out = out or run.path
     family = family_named(run.scene.traits.family)
-    folder = out if family is None else write_scene_folder(run, family, capture.world, out)
+    width = capture.views[0].camera.width
+    folder = out if family is None else write_scene_folder(run, family, capture.world, out, width)
     write_cameras(out / "cameras.json", capture)
     return folder
 
@@ -274,35 +275,40 @@ def _export_scene(work: _Work, out: Path | None) -> Written:
 
 def _export_folder(work: _Work, family: Family, world: World, out: Path) -> Written:
     run = work.run
-    folder = write_scene_folder(run, family, world, out)
-    if out != run.path and (run.path / "cameras.json").is_file():
-        write_bytes(out / "cameras.json", (run.path / "cameras.json").read_bytes())
+    cameras = run.path / "cameras.json"
+    folder = write_scene_folder(run, family, world, out, first_width(cameras) if cameras.is_file() else None)
+    if out != run.path and cameras.is_file():
+        write_bytes(out / "cameras.json", cameras.read_bytes())
     size, rows = sum(p.stat().st_size for p in folder.iterdir()), len(run.scene.positions)
     said = f"{rows:,} {run.scene.traits.rows}, {size / 1e6:.2f} MB with networks, in the capture's own frame"
     return Written(folder, size, rows, (f"wrote {folder}", said, *family.warnings(run)))
 
 
-def write_scene_folder(run: OpenRun, family: Family, world: World, out: Path) -> Path:
+def write_scene_folder(run: OpenRun, family: Family, world: World, out: Path, width: int | None) -> Path:
     """Write point_cloud/iteration_N with the scene and its description, and cfg_args above it; return
-    the iteration's folder. The description comes last: a folder that has it is complete."""
+    the iteration's folder. The description comes last: a folder that has it is complete.
+
+    width: Of the views trained on, in px; None if it is unknown.
+    """
     folder = out / "point_cloud" / f"iteration_{run.step}"
     about = family.describe(run, world) | _trained(run)
     settings = family.write(run, world, folder, about)
     if settings:
-        every = settings | capture_settings(run.config.data)
+        every = settings | capture_settings(run.config.data, width)
         text = ", ".join(f"{name}={value!r}" for name, value in every.items())
         write_bytes(out / "cfg_args", f"Namespace({text})".encode())
     write_json(folder / DESCRIPTION, about)
     return folder
 
 
-def capture_settings(data: Data) -> dict[str, Any]:
+def capture_settings(data: Data, width: int | None = None) -> dict[str, Any]:
     """Return the settings for cfg_args that say where the capture is and how the published tools
     read it, as closely as their settings can express ours.
 
     source_path is the path that the run was given. resolution: -1 limits the width to 1600 px, 1, 2,
-    4 and 8 divide the sides, other numbers are the width in px. eval holds out every 8th view; with
-    lod, from 1 to 49, the views 0 to lod instead.
+    4 and 8 divide the sides, other numbers are the width in px: `width`, that of the views trained on.
+    Where it is unknown, -1 stands for a width that only the photographs tell. eval holds out every 8th
+    view; with lod, from 1 to 49, the views 0 to lod instead.
     """
     kind, _, number = data.resolution.partition(":")
     held = data.split.removeprefix("first:")
@@ -310,11 +316,18 @@ def capture_settings(data: Data) -> dict[str, Any]:
     # NeRF-synthetic captures are white by default; the published tools recognise them by this file too.
     synthetic = (data.path / "transforms_train.json").is_file()
     white = (data.background is None and synthetic) or data.background == (1.0, 1.0, 1.0)
-    divided = kind == "factor" and float(number) in (1, 2, 4, 8)
+    if kind in ("cap1600", "inria"):
+        resolution = -1
+    elif kind == "as-is":
+        resolution = 1
+    elif kind == "factor" and float(number) in (1, 2, 4, 8):
+        resolution = int(float(number))
+    else:
+        resolution = width or -1
     return {
         "source_path": str(data.path),
         "images": data.images or (f"images_{number}" if kind == "inria" else "images"),
-        "resolution": 1 if kind == "as-is" else int(float(number)) if divided or kind == "longest" else -1,
+        "resolution": resolution,
         "white_background": white,
         "data_device": "cuda",
         "eval": data.split != "none",
