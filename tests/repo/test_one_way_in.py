@@ -39,7 +39,6 @@ ALLOWED = {  # file: why it may open files by itself
     "sfm/worker.py": "messages of the process that started it",
     "training/memory.py": "/proc",
     "training/record.py": "the metrics of the run itself",
-    "view/keyframes.py": "a path that the viewer has just written",
 }
 
 

@@ -12,7 +12,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.training.config import Train, flag
 
 
-def command_of(cfg: Train, data: Data, out: Path | None, deterministic: bool, stop_at: int | None) -> str:
+def command_of(cfg: Train, data: Data, out: Path | None, deterministic: bool, stop_at: int | None, max_memory: float = 0.0) -> str:
     """`scene-experts train ...` with every number that differs from the recipe; empty where no command can say it."""
     if cfg.recipe not in RECIPES:
         return ""
@@ -22,6 +22,7 @@ def command_of(cfg: Train, data: Data, out: Path | None, deterministic: bool, st
     words = ["scene-experts", "train", cfg.recipe, "--data", str(data.path), "--out", str(out)]
     words += [word for place, value in [*(changes(Data(data.path), data) or []), *changed] for word in words_of(place, value)]
     words += ["--deterministic"] * deterministic + ([] if stop_at is None else ["--stop-at", str(stop_at)])
+    words += ["--max-memory", str(max_memory)] if max_memory else []
     return shlex.join(words)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -176,7 +176,7 @@ class Run:
         return Layers(numpy(drawn.image.clamp(0, 1)), numpy(depth), numpy(drawn.alpha.clamp(0, 1)))
 
     def write_video(
-        self, out: str | Path, cameras: Sequence[Camera], *, fps: float = 24.0, show: Show = "picture", quality: int = 8
+        self, out: str | Path, cameras: Iterable[Camera], *, fps: float = 24.0, show: Show = "picture", quality: int = 8
     ) -> Path:
         """Render cameras to a video or to numbered PNG files.
 
@@ -194,7 +194,7 @@ class Run:
             InputError: There is no camera, the cameras differ in size, a value is out of range, or the encoder is not installed.
             RunError: The encoder fails, or the disk is full.
         """
-        path = Path(out)
+        path, cameras = Path(out), list(cameras)
         if not cameras or not 0 < fps < 1000 or not 1 <= quality <= 10:
             raise InputError(f"expected cameras, fps above 0 and quality from 1 to 10, found {len(cameras)} cameras, {fps} and {quality}")
         if path.suffix and not video.is_video(path) and not path.is_dir():

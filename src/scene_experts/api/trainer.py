@@ -96,7 +96,7 @@ class Trainer:
         self.capture = loaded.with_seed(self.recipe.seed)
         if isinstance(method, str):
             self.recipe = with_numbers(self.recipe, self.capture.numbers)
-        words = command_of(self.recipe, self.capture.data, folder, deterministic, stop_at)
+        words = command_of(self.recipe, self.capture.data, folder, deterministic, stop_at, max_memory)
         config = RunConfig(self.recipe, self.capture.data, words, deterministic, stop_at, run_folder.versions())
         self._run = loop.Run(
             config=config,
@@ -137,7 +137,8 @@ class Trainer:
             return Run(run_folder.open_run(out, self._run.device), self._run.device, self._rasterize, capture=self.capture)
         if training is None:
             raise InputError("expected a training that has begun, found one without an event; iterate over it first")
-        opened = OpenRun(out or Path(), self._run.config, training.scene, training.step, training.clock, training.capture_id)
+        about = (training.capture_id, training.poses)
+        opened = OpenRun(out or Path(), self._run.config, training.scene, training.step, training.clock, *about)
         return Run(opened, self._run.device, self._rasterize, capture=self.capture, training=training)
 
     def stop(self, reason: str = "stop") -> None:

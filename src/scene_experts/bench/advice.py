@@ -68,7 +68,7 @@ def suggest(width: int, height: int, views: int, picture: float | None = None) -
         iterations = min(iterations, FEW_ITERATIONS) if views <= FEW else iterations
         if side >= max(width, height):
             side = 0
-        scale = side / max(width, height) if side else min(1.0, 1600 / max(width, height))  # `train` limits photographs to 1,600 px
+        scale = side / max(width, height) if side else min(1.0, 1600 / width)  # `train` limits the width to 1,600 px
         minutes = estimate_minutes(round(width * scale), round(height * scale), iterations, picture, threads)
         advice = Advice(side, iterations, minutes)
         if minutes <= LIMIT:

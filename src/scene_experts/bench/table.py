@@ -76,8 +76,9 @@ def run(seconds: float, threads: int | None, json: Path | None, console: Console
     """
     if not 0 < seconds < float("inf"):
         raise InputError(f"expected --seconds above 0, found {seconds:g}; use --seconds 60")
-    if threads is not None and threads < 1:
-        raise InputError(f"expected --threads of at least 1, found {threads}; omit it to use torch's setting")
+    most = 4 * native.count_cores()  # thousands of threads exhaust the process
+    if threads is not None and not 1 <= threads <= most:
+        raise InputError(f"expected --threads from 1 to {most}, found {threads}; omit it to use torch's setting")
     if json is not None:
         if json.is_dir():
             raise InputError(f"expected --json as a file, found the folder {json}; add a name")

@@ -41,6 +41,7 @@ def capture(args: list[str]) -> int:
     from rich.console import Console
 
     from scene_experts.commands.next_step import propose_training
+    from scene_experts.data.settings import Data
     from scene_experts.sfm.reconstruct import reconstruct
     from scene_experts.training.progress import ProgressBar
 
@@ -51,7 +52,7 @@ def capture(args: list[str]) -> int:
     for line in summarise(note):
         say(line)
     width, height = note["size"]
-    say(propose_training(command.out, width, height, note["with_pose"]))
+    say(propose_training(Data(command.out), width, height, note["with_pose"]))
     return 0
 
 

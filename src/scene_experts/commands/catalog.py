@@ -94,8 +94,9 @@ def catalog(args: list[str]) -> int:
 def table(scenes: tuple[CatalogScene, ...] | list[CatalogScene], root: Path) -> Table:
     """A table with a row per scene."""
     out = Table(box=None, pad_edge=False)
-    for name in ("scene", "data set", "archive", "views", "resolution", "split", "downloaded"):
-        out.add_column(name, no_wrap=True)
+    for name in ("scene", "data set", "archive", "views", "resolution", "split", "here"):
+        least = max(len(s.name) for s in scenes) if name == "scene" else None  # the words that one has to type are never cut
+        out.add_column(name, no_wrap=name in ("scene", "views"), overflow="fold", min_width=least)
     for s in scenes:
         views = "" if s.views is None else str(s.views)
         here = "yes" if is_present(root, s) else ""

@@ -47,8 +47,19 @@ class Check:
 
 def diagnose() -> list[Check]:
     """Run all checks. They install, download and change nothing, and raise no exception."""
-    checks = (python, pytorch, cuda, native_library, gsplat, triton, machine, memory, lpips)
-    return [*map(_guarded, checks), *(_guarded(partial(extra, name)) for name in EXTRAS)]
+    checks: dict[str, Callable[[], Check]] = {
+        "Python": python,
+        "torch": pytorch,
+        "CUDA": cuda,
+        "CPU library": native_library,
+        "gsplat": gsplat,
+        "triton": triton,
+        "cores": machine,
+        "memory": memory,
+        "LPIPS weights": lpips,
+        **{name: partial(extra, name) for name in EXTRAS},
+    }
+    return [_guarded(name, check) for name, check in checks.items()]
 
 
 def run(console: Console) -> int:
@@ -189,9 +200,9 @@ def _version(name: str) -> str | None:
         return "version unknown"
 
 
-def _guarded(check: Callable[[], Check]) -> Check:
+def _guarded(name: str, check: Callable[[], Check]) -> Check:
     try:
         return check()
     except Exception as error:  # the report must appear whatever is broken
-        name = check.args[0] if isinstance(check, partial) else check.__name__.replace("_", " ")
-        return Check(name, False, f"the check itself failed: {type(error).__name__}: {error}", "report this")
+        needed = name in ("Python", "torch")
+        return Check(name, False, f"the check itself failed: {type(error).__name__}: {error}", "report this", needed)

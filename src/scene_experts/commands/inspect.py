@@ -25,7 +25,7 @@ def info(args: list[str]) -> int:
     capture = run_folder.load_capture(run_folder.named(data), look=True)
     print_summary(capture, console)
     lens = capture.images.sources[0].lens
-    console.print(propose_training(data.path, lens.width, lens.height, len(capture.views)), markup=False, soft_wrap=True)
+    console.print(propose_training(data, lens.width, lens.height, len(capture.views)), markup=False, soft_wrap=True)
     return 0
 
 

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import shlex
-from pathlib import Path
 
 from scene_experts.commands import PROG
+from scene_experts.data.settings import Data
 
 
-def propose_training(capture: Path, width: int, height: int, views: int) -> str:
-    """Return a command that trains on `views` photographs of this size, with its estimated time here."""
+def propose_training(data: Data, width: int, height: int, views: int) -> str:
+    """Return a command that trains on `views` photographs of this size, read as `data` says, with its estimated time here.
+
+    The resolution is the one that is estimated, not that of `data`.
+    """
+    from scene_experts.api.command_line import changes, words_of
     from scene_experts.bench.advice import suggest
+    from scene_experts.data.fetch.catalog import defaults_of
 
+    plain = Data(data.path, resolution=data.resolution, normalise=defaults_of(data.path).normalise)
+    read = [word for place, value in changes(plain, data) or [] for word in words_of(place, value)]
     advice = suggest(width, height, views)
     time = f"  # {advice}" if str(advice) else ""
-    return f"next: {shlex.join([PROG, 'train', 'scene-experts', '--data', str(capture), '--out', 'RUN', *advice.flags])}{time}"
+    return f"next: {shlex.join([PROG, 'train', 'scene-experts', '--data', str(data.path), '--out', 'RUN', *read, *advice.flags])}{time}"

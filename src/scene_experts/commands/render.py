@@ -61,7 +61,8 @@ def render(args: list[str]) -> int:
         unseen = count_unseen(film.path, capture)
         if unseen > UNSEEN * len(film.path):
             text = f"{unseen} of {len(film.path)} frames look in a direction that no photograph has (within {SEEN:.0f} degrees)"
-            print(f"warning: {text} and may show fog; --path spiral or views stays near the photographs", file=sys.stderr)
+            nearer = "--path views" if command.options.path == "spiral" else "--path spiral or views"
+            print(f"warning: {text} and may show fog; {nearer} stays near the photographs", file=sys.stderr)
         if command.save_path:
             film.write_path(command.save_path)
         out = command.out or command.run / "renders" / f"{Path(command.options.path).stem}.mp4"

@@ -14,6 +14,7 @@ from scene_experts.core.types import Camera, Points
 from scene_experts.data.store import ImageStore
 
 Vector = tuple[float, float, float]
+SAMPLED = 4  # views whose poses identify those of a capture
 
 
 @dataclass(frozen=True)
@@ -125,3 +126,44 @@ class Capture:
         train = sorted(self.train + self.left_out) if self.left_out else self.train
         content = [[(v.name, v.camera.width, v.camera.height) for v in self.views], train, self.test]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+    def poses(self) -> str:
+        """Return the poses of up to four views in the capture's own frame, as text that `same_poses` compares.
+
+        Each view has its camera's centre, forward axis and down axis, nine numbers.
+        """
+        if not self.views:
+            return ""
+        chosen = sorted({round(i * (len(self.views) - 1) / (SAMPLED - 1)) for i in range(SAMPLED)})
+        out = []
+        for camera in (self.views[i].camera for i in chosen):
+            pose = camera.world_to_cam.double()
+            centre = self.world.to_input(-(pose[:3, :3].T @ pose[:3, 3]))
+            axes = torch.cat((pose[2, :3], pose[1, :3]))
+            out.append(" ".join([*(f"{v:.9g}" for v in centre.tolist()), *(f"{v:.5g}" for v in axes.tolist())]))
+        return "; ".join(out)
+
+
+def same_poses(one: object, other: object) -> bool:
+    """Whether two texts of `Capture.poses` agree within a thousandth: of the distance between the cameras, and of a unit axis.
+
+    A text that is empty or no such text agrees with every other, as checkpoints of earlier versions have none.
+    """
+    ours, theirs = _parse_poses(one), _parse_poses(other)
+    if ours is None or theirs is None:
+        return True
+    if ours.shape != theirs.shape:
+        return False
+    spread = max(float((centres[:, None] - centres).norm(dim=2).max()) for centres in (ours[:, :3], theirs[:, :3]))
+    reach = spread or max(1.0, float(ours[:, :3].abs().max()))
+    return bool(((ours - theirs).abs() <= 1e-3 * torch.tensor([reach] * 3 + [1.0] * 6, dtype=torch.float64)).all())
+
+
+def _parse_poses(text: object) -> Tensor | None:
+    if not isinstance(text, str) or len(text) > 200 * SAMPLED:
+        return None
+    try:
+        rows = torch.tensor([[float(word) for word in row.split()] for row in text.split(";")], dtype=torch.float64)
+    except ValueError:
+        return None
+    return rows if rows.dim() == 2 and rows.shape[1] == 9 and bool(rows.isfinite().all()) else None

@@ -14,6 +14,7 @@ import numpy as np
 from scene_experts.core.errors import InputError, few
 from scene_experts.core.io import read_json
 from scene_experts.core.types import Camera
+from scene_experts.data.views import same_poses
 from scene_experts.evaluate.experts import measure_scene_shares
 from scene_experts.evaluate.metrics import VARIANTS, Perceptual
 from scene_experts.evaluate.options import EvalOptions
@@ -113,6 +114,7 @@ def describe_views(capture: Capture, cameras: Sequence[Camera], options: EvalOpt
         "resolution": capture.resolution,
         "mean_pixels": round(sum(c.width * c.height for c in cameras) / len(cameras)),
         **({} if capture.alpha_over is None else {"background": list(capture.alpha_over)}),
+        "poses": capture.poses(),
         **({} if capture.points is None else {"points": len(capture.points.xyz)}),  # those of other poses are others
     }
 
@@ -192,6 +194,8 @@ def find_difference(names: Sequence[str], results: Sequence[dict[str, Any]]) -> 
             ours, theirs = (r.get(key, DEFAULTS.get(key)) for r in (one, other))
             if ours != theirs:
                 return f"the same {what}, found {ours} in {first} and {theirs} in {second}", option
+        if not same_poses(one.get("poses"), other.get("poses")):
+            return f"the same camera poses, found others in {second} than in {first}", "--data"
     return None
 
 

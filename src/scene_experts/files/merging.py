@@ -15,6 +15,7 @@ from torch import Tensor
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.data.blocks import Block, read_plan
+from scene_experts.data.views import same_poses
 from scene_experts.files.export import write_result_folder
 from scene_experts.scene import Scene
 from scene_experts.training import run_folder
@@ -41,7 +42,7 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     columns: dict[str, list[Tensor]] = {}
     networks: dict[str, Tensor] = {}
     lattice: dict[str, Any] = {}
-    configs, step, seconds = [], 0, 0.0
+    configs, step, seconds, poses = [], 0, 0.0, ""
     for number, path in enumerate(runs):  # one run in memory at a time
         run = run_folder.open_run(path)
         scene = run.scene
@@ -49,6 +50,9 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
             raise InputError(f"expected a scene of anchors in {path}, found one of {scene.traits.rows}; train an anchor recipe")
         if run.capture != fingerprint:
             raise InputError(f"expected a run on the capture of the plan, found one on another in {path}; use the plan's command")
+        if not same_poses(poses, run.poses):
+            raise InputError(f"expected runs on one capture, found other camera poses in {path} than in {runs[0]}; train it again")
+        poses = poses or run.poses
         _check_box(blocks, number, run)
         if not configs:
             networks, lattice = {name: value.detach().clone() for name, value in scene.network_tensors().items()}, scene.meta()
@@ -67,7 +71,7 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     command = f"merged from {len(runs)} blocks"
     config = replace(configs[0], data=data, command=command, versions=run_folder.versions(), stop_at=None, init_from=None)
     run_folder.prepare(out, config, resume=False)
-    meta = {"recipe": config.train.recipe, "step": step, "seconds": seconds, "capture": fingerprint}
+    meta = {"recipe": config.train.recipe, "step": step, "seconds": seconds, "capture": fingerprint, "poses": poses}
     checkpoint.save(out / "checkpoints", step, tensors, {**lattice, **meta, "config": "imported"})
     del tensors
     merged = run_folder.open_run(out)

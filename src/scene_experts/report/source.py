@@ -12,6 +12,7 @@ from scene_experts.core.io import read_json
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.plain import read_json_lines
 from scene_experts.core.reading.source import guarding, inside
+from scene_experts.data.views import same_poses
 from scene_experts.evaluate.results import load_results
 from scene_experts.evaluate.tables import distinguish_runs
 from scene_experts.training import run_folder
@@ -55,10 +56,18 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def group_by_capture(sources: Sequence[Source]) -> dict[str, list[Source]]:
-    """Group runs by the name of their capture: only these can have views in common."""
+    """Group runs by the name and the camera poses of their capture: only these can have views in common.
+
+    The keys are the names, with a number where captures of one name have other poses.
+    """
     groups: dict[str, list[Source]] = {}
     for s in sources:
-        groups.setdefault(str(s.results.get("capture", "?")), []).append(s)
+        name, number = str(s.results.get("capture", "?")), 1
+        key = name
+        while key in groups and not same_poses(groups[key][0].results.get("poses"), s.results.get("poses")):
+            number += 1
+            key = f"{name} ({number})"
+        groups.setdefault(key, []).append(s)
     return groups
 
 

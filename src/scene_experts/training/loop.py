@@ -28,6 +28,7 @@ from scene_experts.training.events import Densified, Event, Finished, Previewed,
 from scene_experts.training.guard import explain, find_broken
 from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
 from scene_experts.training.memory import anchor_cap, give_back, peak_bytes
+from scene_experts.training.run_folder import expect_poses
 from scene_experts.training.shards import Sharded, check_shard
 from scene_experts.training.state import Training, resume, save
 from scene_experts.training.trial import fit_memory
@@ -146,6 +147,8 @@ def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize
     training = resume(cfg, folder, run.device) if run.resume and folder else None
     if training and training.capture_id not in ("", capture.fingerprint()):
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
+    if training:
+        expect_poses(training.poses, capture, folder and folder.parent)
     if training is None and run.config.init_from is not None:
         training = Training.start_from(cfg, run.config.init_from, capture, run.device)
         if training.step >= last_iteration(cfg, run):
@@ -154,7 +157,7 @@ def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize
     training = training or Training.start(cfg, capture, run.device, run.dtype)
     if unused := find_unused(cfg):
         log.warning("these options have no effect with this recipe: %s; leave them out", ", ".join(unused))
-    training.capture_id = capture.fingerprint()
+    training.capture_id, training.poses = capture.fingerprint(), capture.poses()
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
     if run.max_memory > 0:
         fit_memory(training, run.max_memory, capture, lambda *view: see_view(training, run, capture, rasterize, *view))

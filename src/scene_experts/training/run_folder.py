@@ -36,6 +36,7 @@ from scene_experts.data.blocks import read_view_names
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
 from scene_experts.data.settings import Data
+from scene_experts.data.views import same_poses
 from scene_experts.recipes import RECIPES
 from scene_experts.scene import Scene
 from scene_experts.scene.fit import restore_foreign
@@ -57,6 +58,7 @@ class OpenRun:
     step: int
     clock: Clock  # of the training
     capture: str = ""  # fingerprint of the capture that the run was trained on; empty if unknown
+    poses: str = ""  # of that capture, see `Capture.poses`; empty if unknown
 
 
 def versions() -> dict[str, str]:
@@ -289,7 +291,18 @@ def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
     if run.capture not in ("", capture.fingerprint()):
         capture.images.close()
         raise InputError(f"expected the capture that {run.path} was trained on, found other views in {capture.root}; give the right --data")
+    expect_poses(run.poses, capture, run.path)
     return capture
+
+
+def expect_poses(poses: object, capture: Capture, run: Path | None) -> None:
+    """Raise InputError, and close the capture, if its cameras are not where they were (`poses`) when `run` was trained."""
+    if not same_poses(poses, capture.poses()):
+        capture.images.close()
+        raise InputError(
+            f"expected the camera poses that {run or 'this run'} was trained with, found others in {capture.root} (`capture --overwrite` "
+            "computes new ones); restore the former poses, or train anew"
+        )
 
 
 def with_capture(run: OpenRun, data: Path | None) -> OpenRun:
@@ -307,7 +320,7 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     with guarding(run, RUN):
         checkpoint.expect(meta, recipe=config.train.recipe)
         scene = restore_foreign(config.train.scaled_scene(), tensors, meta, averaged=True)
-        opened = OpenRun(run, config, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""))
+        opened = OpenRun(run, config, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""), meta.get("poses", ""))
     return replace(opened, scene=scene.to(device))
 
 

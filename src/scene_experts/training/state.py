@@ -25,7 +25,7 @@ from scene_experts.training.config import Train
 from scene_experts.training.guard import check_state
 from scene_experts.training.memory import Largest
 from scene_experts.training.old_hash import old_hash
-from scene_experts.training.run_folder import read_config
+from scene_experts.training.run_folder import expect_poses, read_config
 
 log: logging.Logger = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ class Training:
         self.largest = Largest()
         self.clock = Clock()
         self.queue: list[int] = []
-        self.capture_id = ""  # fingerprint of the capture
+        self.capture_id = self.poses = ""  # fingerprint and poses of the capture
         self.views_rng = torch.Generator().manual_seed(cfg.seed)  # for the order of views and for backgrounds
         self.growth_rng = torch.Generator().manual_seed(cfg.seed + 1)  # for densification
         columns = scene.table.params
@@ -95,6 +95,7 @@ class Training:
         checkpoint.expect(meta, recipe=cfg.recipe)
         if meta.get("capture", "") not in ("", capture.fingerprint()):
             raise InputError(f"expected a run on the capture {capture.root} for --init-from, found one on another; use the same --data")
+        expect_poses(meta.get("poses"), capture, run)
         if not int(meta["step"]) < cfg.iterations or int(meta["step"]) % cfg.batch:
             more = f"above {meta['step']}" if int(meta["step"]) >= cfg.iterations else f"and a --batch that divides {meta['step']}"
             raise InputError(f"expected --iterations {more}, where the run of --init-from ended, found {cfg.iterations}; change it")
@@ -200,6 +201,7 @@ class Training:
             **self.scene.meta(),
             "train": to_json(self.cfg),
             "capture": self.capture_id,
+            "poses": self.poses,
         }
 
     @classmethod
@@ -224,7 +226,8 @@ class Training:
         training.views_rng.set_state(tensors["rng.views"])
         training.growth_rng.set_state(tensors["rng.growth"])
         training.queue = tensors["queue"].tolist()
-        training.step, training.clock, training.capture_id = int(meta["step"]), Clock.of(meta), meta.get("capture", "")
+        training.step, training.clock = int(meta["step"]), Clock.of(meta)
+        training.capture_id, training.poses = meta.get("capture", ""), meta.get("poses", "")
         return training
 
 

@@ -13,6 +13,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.progress import Progress
 from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
+from scene_experts.data.views import same_poses
 from scene_experts.evaluate.pictures import join_pictures, to_8bit
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.training.run_folder import OpenRun
@@ -80,8 +81,10 @@ def make_film(options: FilmOptions, runs: Sequence[OpenRun], capture: Capture) -
             has = f"experts 1 to {count}" if count else "no experts"
             raise InputError(f"expected --only among the experts of {run.path}, which has {has}, found {max(options.only)}; change it")
     for other in runs[1:]:
-        if other.capture and other.capture != runs[0].capture:
-            raise InputError(f"expected runs of one capture, found another in {other.path}; leave it out of --beside")
+        if (other.capture and other.capture != runs[0].capture) or not same_poses(other.poses, runs[0].poses):
+            raise InputError(
+                f"expected runs of one capture, with one --resolution and --split, found another in {other.path}; leave it out of --beside"
+            )
     return Film(options, runs, capture, make_path(options, capture))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from dataclasses import dataclass, field, replace
@@ -11,6 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from scene_experts.core.errors import RunError
+from scene_experts.core.io import write_json
 from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
 from scene_experts.geometry.poses import interpolate_poses, make_pose, with_fov
@@ -31,7 +34,7 @@ class Keyframes:
     capture: Capture
     folder: Path | None = None  # folder that paths are saved in; None: the working directory
     keys: list[Camera] = field(default_factory=list)
-    playing: set[int] = field(default_factory=set)  # clients that move along the path; they stop when they are removed from here
+    playing: dict[int, object] = field(default_factory=dict)  # flights by client; one that is not here any more stops
 
     def __post_init__(self) -> None:
         gui = self.server.gui
@@ -40,8 +43,8 @@ class Keyframes:
             add, clear = gui.add_button("add keyframe"), gui.add_button("clear")
             self.seconds: Any = gui.add_number("seconds between keyframes", initial_value=2.0, min=0.1, max=60.0, step=0.1)
             self.loop: Any = gui.add_checkbox("loop", initial_value=False)
-            play, save = gui.add_button("play"), gui.add_button("save")
-            around = gui.add_button("fly around the scene")
+            play, save = gui.add_button("play or stop"), gui.add_button("save")
+            around = gui.add_button("fly around the scene, or stop")
         add.on_click(lambda event: self.add(event.client))
         clear.on_click(lambda _: self.clear())
         play.on_click(lambda event: self.play(event.client))
@@ -63,8 +66,9 @@ class Keyframes:
         self.words.content = f"{len(self.keys)} keyframes"
 
     def clear(self) -> None:
-        """Remove all keyframes."""
+        """Remove all keyframes, and stop all flights."""
         self.keys.clear()
+        self.playing.clear()
         self.words.content = "no keyframes"
 
     def make_path(self) -> CameraPath:
@@ -72,50 +76,55 @@ class Keyframes:
         return CameraPath(tuple(self.keys), 1 / float(self.seconds.value))
 
     def save(self, client: Any) -> None:
-        """Write the path to a file and send it to the browser."""
+        """Send the path to the browser and write it to a file. A file that cannot be written is reported, and the browser has the path."""
         if not self.keys:
             self.words.content = "no keyframes to save; add one first"
             return
         folder = self.folder or Path.cwd()
         path = folder / f"path_{time.strftime('%Y%m%d_%H%M%S')}.json"
-        path_files.write_path(path, self.make_path(), self.capture.world, loop=bool(self.loop.value), play_fps=24.0)
-        self.words.content = f"saved {path}"
+        made = path_files.describe_path(self.make_path(), self.capture.world, loop=bool(self.loop.value), play_fps=24.0)
         if client is not None:
-            client.send_file_download(path.name, path.read_bytes())
+            client.send_file_download(path.name, json.dumps(made, indent=2).encode())
+        try:
+            write_json(path, made)
+            self.words.content = f"saved {path}"
+        except (RunError, OSError) as error:
+            self.words.content = f"sent to the browser only: {error}" if client is not None else f"not saved: {error}"
 
     def play(self, client: Any) -> None:
-        """Move a client along the path, in a thread of its own."""
+        """Move a client along the keyframes, in a thread of its own, or stop it."""
         if client is None or len(self.keys) < 2:
             self.words.content = "add at least two keyframes to play"
             return
-        if client.client_id not in self.playing:
-            threading.Thread(target=self.move_client, args=(client,), daemon=True).start()
+        self.toggle(client, list(self.keys), bool(self.loop.value), float(self.seconds.value))
 
     def fly_around(self, client: Any) -> None:
-        """Replace the keyframes by a closed path that fits the capture, and move a client along it."""
-        self.keys = [with_fov(camera, camera.fov, *SIZE) for camera in make_path("auto", self.capture, AROUND).cameras]
-        self.loop.value, self.seconds.value = True, ROUND / AROUND
-        self.words.content = f"{len(self.keys)} keyframes around the scene"
-        self.play(client)
+        """Move a client along a closed path that fits the capture, or stop it. The keyframes stay as they are."""
+        if client is not None:
+            self.toggle(client, list(make_path("auto", self.capture, AROUND).cameras), True, ROUND / AROUND)
 
-    def move_client(self, client: Any, fps: float = 15.0) -> None:
-        """Move a client along the path; returns at its end or when the client leaves."""
-        self.playing.add(client.client_id)
-        try:
-            self._move_client(client, fps)
-        finally:
-            self.playing.discard(client.client_id)
+    def toggle(self, client: Any, keys: list[Camera], loop: bool, seconds: float) -> None:
+        """Start a flight of a client along `keys`, `seconds` from one to the next, or stop the one that is on its way."""
+        if not self.stop(client.client_id):
+            threading.Thread(target=self.move_client, args=(client, keys, loop, seconds), daemon=True).start()
 
-    def _move_client(self, client: Any, fps: float) -> None:
-        rotations = torch.stack([key.world_to_cam[:3, :3].T.double() for key in self.keys])
-        places = torch.stack([key.position.double() for key in self.keys])
-        gaps = len(self.keys) - (0 if self.loop.value else 1)
-        frames = max(2, round(gaps * float(self.seconds.value) * fps))
-        for made in interpolate_poses(places, rotations, frames, loop=bool(self.loop.value)):
-            if client.client_id not in self.playing:
+    def stop(self, client: int) -> bool:
+        """Stop the flight of a client; return whether there was one."""
+        return self.playing.pop(client, None) is not None
+
+    def move_client(self, client: Any, keys: list[Camera], loop: bool, seconds: float, fps: float = 15.0) -> None:
+        """Move a client along `keys`; returns at the end, or when the flight is stopped or the client leaves."""
+        flight = self.playing[client.client_id] = object()
+        rotations = torch.stack([key.world_to_cam[:3, :3].T.double() for key in keys])
+        places = torch.stack([key.position.double() for key in keys])
+        frames = max(2, round((len(keys) - (0 if loop else 1)) * seconds * fps))
+        for made in interpolate_poses(places, rotations, frames, loop=loop):
+            if self.playing.get(client.client_id) is not flight:
                 return
             rotation, place = made[:3, :3].T, -(made[:3, :3].T @ made[:3, 3])
             with client.atomic():
                 client.camera.wxyz = tuple(matrix_to_quat(rotation).tolist())
                 client.camera.position = tuple(place.tolist())
             time.sleep(1 / fps)
+        if self.playing.get(client.client_id) is flight:
+            self.stop(client.client_id)

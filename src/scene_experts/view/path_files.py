@@ -27,9 +27,14 @@ OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  
 
 
 def write_path(path: Path, cameras: CameraPath, world: World, loop: bool = False, play_fps: float | None = None) -> None:
-    """Write every camera as a keyframe in the capture's own frame.
+    """Write every camera as a keyframe in the capture's own frame, as `describe_path` has them."""
+    write_json(path, describe_path(cameras, world, loop, play_fps))
 
-    The file is {"format": 1, "fps", "loop", "width", "height", "keyframes": [{"time", "camera_to_world", "fov"}]} with times in
+
+def describe_path(cameras: CameraPath, world: World, loop: bool = False, play_fps: float | None = None) -> dict[str, Any]:
+    """Return the cameras of a path as keyframes in the capture's own frame, as JSON values.
+
+    They are {"format": 1, "fps", "loop", "width", "height", "keyframes": [{"time", "camera_to_world", "fov"}]} with times in
     seconds, 4x4 matrices with OpenCV axes and vertical fields of view in degrees.
 
     play_fps: Frames per second between the keyframes. None is `cameras.fps`, one frame per keyframe.
@@ -39,7 +44,7 @@ def write_path(path: Path, cameras: CameraPath, world: World, loop: bool = False
         for i, camera in enumerate(cameras.cameras)
     ]
     first = cameras.cameras[0]
-    value = {
+    return {
         "format": FORMAT,
         "fps": play_fps or cameras.fps,
         "loop": loop,
@@ -47,7 +52,6 @@ def write_path(path: Path, cameras: CameraPath, world: World, loop: bool = False
         "height": first.height,
         "keyframes": keys,
     }
-    write_json(path, value)
 
 
 def write_nerfstudio(path: Path, cameras: CameraPath, world: World) -> None:

@@ -29,10 +29,10 @@ from scene_experts.geometry.poses import make_pose, with_fov
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Draws, Scene
-from scene_experts.view.gate import Gate, guarding, is_local
+from scene_experts.view.gate import Gate, guarding
 from scene_experts.view.paint import paint
 from scene_experts.view.panel import Panel
-from scene_experts.view.paths import analyse_cameras, choose_best_view
+from scene_experts.view.paths import analyse_cameras, choose_best_view, median_depth
 from scene_experts.view.region import Region, find_region
 
 log: logging.Logger = logging.getLogger(__name__)
@@ -135,8 +135,10 @@ class Viewer:
         rig = analyse_cameras(self.capture)
         self.server.scene.set_up_direction(tuple(rig.up.tolist()))
         self.centre: Tensor = rig.centre
-        self.region: Region = find_region(rig.positions, float((rig.positions - rig.centre).norm(dim=1).median()))
-        self.reach: float = float((rig.positions - rig.centre).norm(dim=1).median())
+        # photographs that were all taken from one point look at nothing in common: the points say how far the scene is
+        depth = median_depth(self.capture, rig.positions.mean(0), rig.forward[0])
+        self.reach: float = max(float((rig.positions - rig.centre).norm(dim=1).median()), 0.05 * depth)
+        self.region: Region = find_region(rig.positions, self.reach)
         self.first: int = choose_best_view(self.capture)  # where clients start
         self.set_start()
         self.panel: Panel = Panel(self.server, self.capture, self.current, self.request_redraw, self.go_to_view, self.paths)
@@ -152,7 +154,8 @@ class Viewer:
     @property
     def url(self) -> str:
         """Address of the page, with the token if one is needed."""
-        name = "localhost" if is_local(self.host) or self.host in ("", "0.0.0.0", "::") else self.host
+        everywhere = self.host in ("", "0.0.0.0", "::", "127.0.0.1")  # localhost is one of these addresses
+        name = "localhost" if everywhere else self.host
         address = f"http://{f'[{name}]' if ':' in name else name}:{self.server.get_port()}"
         return f"{address}/?token={self.gate.token}" if self.gate.token else address
 
@@ -169,7 +172,7 @@ class Viewer:
         def _(_: Any) -> None:
             now = time.monotonic()
             client.moved, client.wanted = now, True
-            if now > client.arriving:
+            if now > client.arriving and not self.stands_at_view(client):  # a window that changes its size sends a camera too
                 client.at_view = None
             self.changed.set()
 
@@ -177,7 +180,7 @@ class Viewer:
         """Remove a client."""
         with self.lock:
             self.clients.pop(handle.client_id, None)
-        self.panel.keyframes.playing.discard(handle.client_id)
+        self.panel.keyframes.stop(handle.client_id)
 
     def request_redraw(self) -> None:
         """Draw a new picture for every client."""
@@ -204,6 +207,15 @@ class Viewer:
         forward = camera.world_to_cam[2, :3].double()
         return max(float((self.centre - camera.position.double()) @ forward), 0.1 * self.reach)
 
+    def stands_at_view(self, client: Client) -> bool:
+        """Return whether a client still has the pose of the view that it was moved to."""
+        if client.at_view is None:
+            return False
+        camera, seen = self.capture.views[client.at_view].camera, client.handle.camera
+        moved = torch.tensor(np.asarray(seen.position), dtype=torch.float64) - camera.position.double()
+        turned = matrix_to_quat(camera.world_to_cam[:3, :3].T.double()) @ torch.tensor(np.asarray(seen.wxyz), dtype=torch.float64)
+        return float(moved.norm()) <= 1e-4 * self.region.radius and abs(float(turned)) > 1 - 1e-6
+
     def go_to_view(self, view: int, clients: list[Client] | None = None) -> None:
         """Move clients (None: all) to the camera of a view."""
         camera = self.capture.views[view].camera
@@ -213,6 +225,7 @@ class Viewer:
         with self.lock:
             chosen = list(self.clients.values()) if clients is None else clients
         for client in chosen:
+            self.panel.keyframes.stop(client.handle.client_id)
             with client.handle.atomic():
                 client.handle.camera.wxyz = tuple(matrix_to_quat(rotation).tolist())
                 client.handle.camera.position = tuple(place.tolist())

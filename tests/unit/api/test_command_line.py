@@ -44,3 +44,8 @@ def test_what_no_command_can_say_is_left_empty():
     assert command_of(replace(cfg, recipe="mine"), data, OUT, False, None) == ""
     assert command_of(replace(cfg, scene=se.recipe("sags").scene), data, OUT, False, None) == ""
     assert command_of(cfg, data, None, False, None) == ""
+
+
+def test_a_limit_of_memory_is_said():
+    words = shlex.split(command_of(se.recipe("moe-gs"), Data(Path("c")), OUT, False, None, 6.5))
+    assert parse_train(words[2:]).max_memory == 6.5

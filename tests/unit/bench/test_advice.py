@@ -28,6 +28,11 @@ def test_small_photographs_are_never_enlarged():
     assert found.side == 0 and "--resolution" not in found.flags
 
 
+def test_the_time_is_that_of_pictures_of_at_most_1600_pixels_of_width():
+    upright, level = (advice.suggest(*size, 100, 1e-4) for size in ((3000, 4000), (4000, 3000)))
+    assert upright.side == level.side == 0 and upright.minutes > 1.5 * level.minutes
+
+
 def test_few_photographs_get_a_shorter_training():
     assert advice.suggest(1200, 800, 30, 1e-4).iterations == 4000 and advice.suggest(1200, 800, 31, 1e-4).iterations == 7000
 

@@ -19,7 +19,7 @@ def test_a_short_bench_prints_a_table_and_writes_json(capsys, tmp_path):
     assert all(f["peer"] for f in found["figures"] if f["ratio"] is not None)
 
 
-@pytest.mark.parametrize("args", [["--seconds", "0"], ["--seconds", "nan"], ["--threads", "0"]])
+@pytest.mark.parametrize("args", [["--seconds", "0"], ["--seconds", "nan"], ["--threads", "0"], ["--threads", "100000"]])
 def test_what_cannot_be_measured_is_one_sentence(args):
     with pytest.raises(InputError, match=args[0]):
         bench(args)

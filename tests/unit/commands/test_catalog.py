@@ -16,7 +16,7 @@ from scene_experts import cli
 from scene_experts.commands import catalog as command
 from scene_experts.commands.train import parse_train
 from scene_experts.data.fetch import download, obtain
-from scene_experts.data.fetch.catalog import one
+from scene_experts.data.fetch.catalog import SCENES, one
 from scene_experts.data.settings import Data
 from scene_experts.training import run_folder
 from support.archives import in_folder, read_tree, write_tar
@@ -101,6 +101,7 @@ def test_the_table_and_the_particulars(captures: Path, capsys: pytest.CaptureFix
     lines = capsys.readouterr().out.splitlines()
     rows = {line.split()[0]: line.split() for line in lines[1:18]}
     assert len(rows) == 17 and rows["truck"][-3:] == ["as-is", "mod8", "yes"] and rows["bonsai"][-2:] == ["inria:2", "mod8"]
+    assert set(rows) == {scene.name for scene in SCENES}  # whole, also in a narrow terminal
     assert any("non-commercial" in line for line in lines) and str(captures) in lines[-1]
     assert cli.main(["catalog", "quebec", "truck"]) == 0
     out = capsys.readouterr().out

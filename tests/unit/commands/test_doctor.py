@@ -81,6 +81,21 @@ def test_a_check_that_breaks_is_reported(monkeypatch: pytest.MonkeyPatch) -> Non
     assert not check.ok and "damaged library" in check.found
 
 
+@pytest.mark.parametrize(
+    ("check", "name"), [("cuda", "CUDA"), ("native_library", "CPU library"), ("pytorch", "torch"), ("lpips", "LPIPS weights")]
+)
+def test_the_report_appears_whatever_check_breaks(monkeypatch: pytest.MonkeyPatch, check: str, name: str) -> None:
+    def broken() -> Check:
+        raise RuntimeError("CUDA error: all CUDA-capable devices are busy")
+
+    whole = [found.name for found in doctor.diagnose()]
+    monkeypatch.setattr(doctor, check, broken)
+    checks = doctor.diagnose()
+    assert [found.name for found in checks] == whole
+    assert "are busy" in next(found.found for found in checks if found.name == name)
+    assert doctor.render(checks).splitlines()[-1] and doctor.exit_code(checks) == (check == "pytorch")
+
+
 def test_verdicts() -> None:
     good = [Check(name, True, "x", needed=name in ("Python", "torch")) for name in NAMES]
     without = lambda *names: [Check(c.name, c.name not in names, "x", "do this", c.needed) for c in good]  # noqa: E731

@@ -10,7 +10,7 @@ import torch
 
 from scene_experts.core.types import Camera
 from scene_experts.data.capture import load
-from scene_experts.data.views import World
+from scene_experts.data.views import World, same_poses
 from support.synthetic import look_at, make_capture
 
 WORLD = World(3.5, (10.0, -20.0, 0.5))
@@ -61,3 +61,32 @@ def test_a_fingerprint_follows_the_views_their_sizes_and_the_split_not_the_place
         replace(capture, views=capture.views[1:]),
     ]
     assert len({one, *(c.fingerprint() for c in others)}) == 4
+
+
+def test_poses_are_those_of_the_captures_own_frame_and_tell_other_frames_apart(tmp_path) -> None:
+    def poses(name: str, **how) -> str:
+        capture = load(make_capture(tmp_path / name, **{"views": 7, "size": (16, 12), "points": 20, **how}).folder, split="none")
+        capture.images.close()
+        return capture.poses()
+
+    found = poses("one")
+    rows = np.array([[float(word) for word in row.split()] for row in found.split(";")])
+    folder = tmp_path / "one"
+    capture = load(folder)
+    for row, view in zip(rows, (capture.views[i] for i in (0, 2, 4, 6)), strict=True):
+        camera = capture.world.camera_to_input(view.camera)
+        np.testing.assert_allclose(row[:3], camera.position, atol=1e-5)
+        np.testing.assert_allclose(row[3:], camera.world_to_cam[[2, 1], :3].flatten(), atol=1e-4)
+    capture.images.close()
+    far = make_capture(tmp_path / "far", views=7, size=(16, 12), points=20, scale=300.0).folder
+    one, two = load(far), load(far, normalise="none")
+    assert one.world != two.world and same_poses(one.poses(), two.poses()) and not same_poses(found, one.poses())
+    for other in ({"scale": 2.0}, {"scale": 1.01}, {"seed": 1}, {"views": 8}, {"views": 1}):
+        assert not same_poses(found, poses(str(other), **other)), other
+    assert same_poses(found, poses("again"))
+    near = "; ".join(" ".join(f"{float(word) + 1e-4}" for word in row.split()) for row in found.split(";"))
+    assert same_poses(found, near)
+    for unknown in ("", None, 3, "a b", "1 2; 3", "nan " * 9, "1 " * 5000):
+        assert same_poses(found, unknown) and same_poses(unknown, found)
+    single = poses("single", views=1)
+    assert single.count(";") == 0 and same_poses(single, single) and not same_poses(single, poses("single moved", views=1, scale=2.0))

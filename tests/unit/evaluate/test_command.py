@@ -29,8 +29,12 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
     config = RunConfig(cfg, Data(Path("old"), split="mod:4"), versions={"torch": "x"})
     closed: list[bool] = []
     seen: dict[str, Any] = {}
-    opened = SimpleNamespace(config=config, scene="scene", step=250, clock=Clock(9.0, 17.0, {"cores": 2}), capture="a", path=tmp_path)
-    capture = SimpleNamespace(root="new", fingerprint=lambda: "a", images=SimpleNamespace(close=lambda: closed.append(True)))
+    opened = SimpleNamespace(
+        config=config, scene="scene", step=250, clock=Clock(9.0, 17.0, {"cores": 2}), capture="a", poses="", path=tmp_path
+    )
+    capture = SimpleNamespace(
+        root="new", fingerprint=lambda: "a", poses=lambda: "", images=SimpleNamespace(close=lambda: closed.append(True))
+    )
 
     def load(data: Data, seed: int) -> Any:
         seen["data"] = data

@@ -73,6 +73,13 @@ def test_photographs_over_other_backgrounds_are_not_compared():
             check_protocol("abc", runs)
 
 
+def test_captures_of_one_name_with_other_poses_are_not_compared():
+    old = {"capture": "scene", "split": "mod8"}
+    one, two = ({**old, "poses": f"{x} 0 0 1 0 0 0 1 0; 0 1 0 1 0 0 0 1 0"} for x in (1.0, 2.0))
+    assert find_difference("abc", [old, one, one]) is None
+    assert find_difference("abc", [old, one, two]) == ("the same camera poses, found others in c than in b", "--data")
+
+
 def test_the_background_is_stated_where_photographs_are_transparent(tmp_path):
     opaque = make_capture(tmp_path / "colmap", views=3, size=(16, 12), points=20).folder
     make_blender(tmp_path / "blender", views=3, size=16)

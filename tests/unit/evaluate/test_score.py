@@ -60,6 +60,9 @@ class FakeCapture:
     def frame(self, index: int) -> Any:
         return SimpleNamespace(rgb=photo(index), mask=self.mask)
 
+    def poses(self):
+        return ""
+
 
 class FakeScene(Scene):
     """A scene that decodes 2 of 6 anchors. 3 of their 8 Gaussians have positive opacity."""

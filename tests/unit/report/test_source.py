@@ -24,6 +24,17 @@ def test_runs_of_one_capture_are_grouped_and_have_views_in_common(tmp_path):
     assert find_common_views([sources[0], read_run(tmp_path / "b")]) == names[1:]
 
 
+def test_captures_of_one_name_with_other_poses_are_two_groups(tmp_path):
+    sources = []
+    for name, x in (("a", 1.0), ("b", 2.0), ("c", 1.0)):
+        folder = make_run(tmp_path / name)
+        results = json.loads((folder / "results.json").read_text())
+        write_json(folder / "results.json", {**results, "poses": f"{x} 0 0 1 0 0 0 1 0; 0 1 0 1 0 0 0 1 0"})
+        sources.append(read_run(folder))
+    name = sources[0].results["capture"]
+    assert group_by_capture(sources) == {name: [sources[0], sources[2]], f"{name} (2)": [sources[1]]}
+
+
 def test_scores_by_view_must_name_files_in_the_run(tmp_path):
     folder = make_run(tmp_path)
     write_json(folder / "per_view.json", {"a": {"file": "../../secret.png", "psnr": 3.0}})

@@ -49,6 +49,15 @@ def test_resumed_equals_uninterrupted_bit_for_bit_while_rows_come_and_go(recipe,
     assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "parts"))
 
 
+def test_other_camera_poses_are_refused(folder, tmp_path):
+    cfg, other = config(), make_capture(tmp_path / "other", views=16, scale=2.0).folder
+    list(events(cfg, folder, tmp_path / "run", stop_at=20))
+    with pytest.raises(InputError, match=naming(tmp_path / "run", "camera poses")):
+        list(events(cfg, other, tmp_path / "run", stop_at=40, resume=True))
+    with pytest.raises(InputError, match=naming(tmp_path / "run", "camera poses")):
+        Training.start_from(cfg.scaled(), tmp_path / "run", load(other), "cpu")
+
+
 def test_stopping_saves_and_goes_on(folder, tmp_path):
     cfg, reasons = config(), []
     seen = []

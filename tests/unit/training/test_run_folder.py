@@ -93,6 +93,10 @@ def test_a_capture_that_is_not_here_is_asked_for_by_its_flag(run, tmp_path, monk
     assert run_folder.capture_of(replace(opened, capture=found.fingerprint())).root == Path("capture")
     with pytest.raises(InputError, match=naming("capture", "--data")):
         run_folder.capture_of(replace(opened, capture="of other views"))
+    assert run_folder.capture_of(replace(opened, poses=found.poses())).root == Path("capture")
+    make_capture(tmp_path / "home" / "capture", views=3, scale=2.0)  # as `capture --overwrite` may do
+    with pytest.raises(InputError, match=naming(run, "capture", "--overwrite")):
+        run_folder.capture_of(replace(opened, capture=found.fingerprint(), poses=found.poses()))
 
 
 def test_a_checkpoint_of_another_recipe_in_the_folder(run):

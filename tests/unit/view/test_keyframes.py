@@ -1,6 +1,8 @@
 """Keyframes: set where a client stands, saved as a path that `render` reads, played back."""
 
 import json
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -29,6 +31,11 @@ def test_keyframes_become_a_path_that_render_reads(viewer, capture, tmp_path):
     handle.send_file_download = lambda name, data: sent.append((name, data))
     keys.save(handle)
     assert sent and json.loads(sent[0][1])["format"] == 1
+    keys.folder = path  # a file: nothing can be written there
+    keys.save(handle)
+    assert len(sent) == 2 and sent[1][1] == sent[0][1] and "browser only" in keys.words.content
+    keys.save(None)
+    assert "not saved" in keys.words.content
     keys.clear()
     assert keys.keys == []
 
@@ -40,15 +47,47 @@ def test_playing_moves_the_client(viewer):
     for x in (0.0, 1.0):
         handle.camera.position = np.array([x, 0.0, 0.0])
         keys.add(handle)
-    keys.seconds.value = 0.1
     handle.camera.position = np.array([9.0, 9.0, 9.0])
-    keys.move_client(handle, fps=50.0)
-    assert np.allclose(handle.camera.position, [1.0, 0, 0], atol=1e-5)
+    keys.move_client(handle, keys.keys, loop=False, seconds=0.1, fps=50.0)
+    assert np.allclose(handle.camera.position, [1.0, 0, 0], atol=1e-5) and not keys.playing
 
 
-def test_a_flight_around_the_scene_is_made_of_keyframes(viewer, monkeypatch):
+def test_a_flight_around_the_scene_leaves_the_keyframes(viewer, monkeypatch):
     handle, keys = joined(viewer), viewer.panel.keyframes
-    played = []
-    monkeypatch.setattr(keys, "play", played.append)
+    flown = []
+    monkeypatch.setattr(keys, "move_client", lambda *what: flown.append(what))
+    keys.add(handle)
     keys.fly_around(handle)
-    assert len(keys.keys) == 24 and keys.loop.value and played == [handle]
+    keys.fly_around(None)
+    wait(lambda: flown)
+    assert len(keys.keys) == 1 and not keys.loop.value
+    assert [(who, len(cameras), loop) for who, cameras, loop, _ in flown] == [(handle, 24, True)]
+
+
+@pytest.mark.parametrize("end", ["fly", "play", "clear", "view", "leave"])
+def test_a_flight_can_be_stopped(viewer, end):
+    handle, keys = joined(viewer), viewer.panel.keyframes
+    for x in (0.0, 1.0):
+        handle.camera.position = np.array([x, 0.0, 0.0])
+        keys.add(handle)
+    keys.fly_around(handle)
+    wait(lambda: keys.playing)
+    if end == "fly":
+        keys.fly_around(handle)
+    elif end == "play":
+        keys.play(handle)
+    elif end == "clear":
+        keys.clear()
+    elif end == "view":
+        viewer.go_to_view(1)
+    else:
+        viewer.disconnect(handle)
+    assert not keys.playing
+    wait(lambda: not [thread for thread in threading.enumerate() if "move_client" in thread.name])
+
+
+def wait(until) -> None:
+    end = time.monotonic() + 60
+    while not until():
+        assert time.monotonic() < end
+        time.sleep(0.01)

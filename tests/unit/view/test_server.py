@@ -1,17 +1,23 @@
 """The viewer without a browser: clients connect, move, disconnect and send nonsense. test_view_browser.py tests it in a browser."""
 
+import socket
 import time
+import urllib.request
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from scene_experts.data.capture import load
 from scene_experts.evaluate.pictures import to_8bit
+from scene_experts.recipes import RECIPES
 from scene_experts.view.paint import paint
 from scene_experts.view.paths import choose_best_view
 
 pytest.importorskip("viser")
 from scene_experts.view.server import Client, Viewer, check_host
+from support.synthetic import make_capture
 from support.viewers import DRAW, Handle, joined
 
 
@@ -142,3 +148,53 @@ def test_a_taken_port_is_reported(viewer, capture):
 def test_clients_are_due_when_something_changed():
     client = Client(Handle())
     assert client.wanted and not client.full and not client.is_moving(time.monotonic())
+
+
+def test_where_all_photographs_are_from_one_point_a_client_turns_with_the_views(tmp_path):
+    capture = load(make_capture(tmp_path, views=4).folder)
+    turned = []
+    for view in capture.views:
+        pose = view.camera.world_to_cam.clone()
+        pose[:3, 3] = 0.0  # all at the origin
+        turned.append(replace(view, camera=replace(view.camera, world_to_cam=pose)))
+    scene = RECIPES["scaffold-gs"][1].scene.start(capture.points, capture.extent)
+    made = Viewer(replace(capture, views=tuple(turned)), lambda: (scene, 2000), DRAW, port=0)
+    try:
+        assert made.region.radius > 0.01
+        handle = joined(made)
+        for number, view in enumerate(turned):
+            made.go_to_view(number)
+            ahead = torch.tensor(handle.camera.look_at) - torch.tensor(handle.camera.position)
+            assert ahead.norm() > 0.001 and torch.allclose((ahead / ahead.norm()).float(), view.camera.world_to_cam[2, :3], atol=1e-4)
+    finally:
+        made.close()
+        capture.images.close()
+
+
+def test_a_window_that_changes_its_size_leaves_the_client_at_its_view(viewer):
+    handle = joined(viewer)
+    viewer.clients[0].arriving = 0.0
+    handle.camera.aspect = 2.0
+    handle.move()
+    assert viewer.clients[0].at_view is not None
+    handle.camera.position = np.array(handle.camera.position) + 0.1
+    handle.move()
+    assert viewer.clients[0].at_view is None
+
+
+@pytest.mark.parametrize(
+    ("host", "name"), [("127.0.0.1", "localhost"), ("127.0.0.2", "127.0.0.2"), ("localhost", "localhost"), ("::1", "[::1]")]
+)
+def test_the_address_of_a_local_host_answers(viewer, host, name):
+    try:
+        with socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET):
+            pass
+    except OSError:
+        pytest.skip(f"{host} is no address of this machine")
+    made = Viewer(viewer.capture, viewer.current, DRAW, host=host, port=0)
+    try:
+        assert made.url == f"http://{name}:{made.server.get_port()}"
+        with urllib.request.urlopen(made.url, timeout=60) as answer:
+            assert answer.status == 200
+    finally:
+        made.close()
