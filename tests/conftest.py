@@ -27,6 +27,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(skip)
 
 
+@pytest.fixture(autouse=True)
+def _restore_algorithms():
+    """Undo what `--deterministic` sets for the whole process, so that no test depends on those before it."""
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
 def cores() -> int:
     """Return the number of cores that this process may use: its CPU affinity, limited by the quota of its container."""
     bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -7,8 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from scene_experts.core.errors import InputError
-from scene_experts.core.io import read_json, write_json
+from scene_experts.core.io import write_json
 from scene_experts.data.views import Capture, View, World
 
 
@@ -45,12 +44,3 @@ def write_cameras(path: Path, capture: Capture) -> None:
     """Write the views of a capture, those held out first, then those trained on."""
     views = [capture.views[i] for i in (*capture.test, *capture.train)]
     write_json(path, camera_entries(views, capture.world))
-
-
-def first_width(path: Path) -> int | None:
-    """Return the width in px of the first view of a cameras.json, or None if the file does not say it."""
-    try:
-        width = read_json(path, "list of views")[0]["width"]
-    except (InputError, LookupError, TypeError):
-        return None
-    return width if type(width) is int and width > 0 else None

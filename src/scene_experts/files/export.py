@@ -19,7 +19,7 @@ from scene_experts.core.io import check_writable, read_json, write_bytes, write_
 from scene_experts.core.plain import to_json
 from scene_experts.data.settings import Data
 from scene_experts.data.views import Capture, World
-from scene_experts.files.cameras import first_width, write_cameras
+from scene_experts.files.cameras import write_cameras
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.measure import Painter, Tell, capture_if_there, cost
 from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
@@ -276,7 +276,7 @@ def _export_scene(work: _Work, out: Path | None) -> Written:
 def _export_folder(work: _Work, family: Family, world: World, out: Path) -> Written:
     run = work.run
     cameras = run.path / "cameras.json"
-    folder = write_scene_folder(run, family, world, out, first_width(cameras) if cameras.is_file() else None)
+    folder = write_scene_folder(run, family, world, out, width_in(cameras) if cameras.is_file() else None)
     if out != run.path and cameras.is_file():
         write_bytes(out / "cameras.json", cameras.read_bytes())
     size, rows = sum(p.stat().st_size for p in folder.iterdir()), len(run.scene.positions)
@@ -299,6 +299,15 @@ def write_scene_folder(run: OpenRun, family: Family, world: World, out: Path, wi
         write_bytes(out / "cfg_args", f"Namespace({text})".encode())
     write_json(folder / DESCRIPTION, about)
     return folder
+
+
+def width_in(path: Path) -> int | None:
+    """Return the width in px of the first view of a cameras.json, or None if the file does not say it."""
+    try:
+        width = read_json(path, "list of views")[0]["width"]
+    except (InputError, LookupError, TypeError):
+        return None
+    return width if type(width) is int and width > 0 else None
 
 
 def capture_settings(data: Data, width: int | None = None) -> dict[str, Any]:

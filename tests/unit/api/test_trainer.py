@@ -18,12 +18,6 @@ from scene_experts.training.run_folder import read_config
 FLAGS = ["--iterations", "6", "--scene.voxel-size", "0.2", "--deterministic", "--device", "cpu", "--save-every", "3"]
 
 
-@pytest.fixture(autouse=True)
-def _undeterministic():
-    yield
-    torch.use_deterministic_algorithms(False)  # the command leaves them on
-
-
 def tensors(run: Path, step: int = 6) -> dict[str, torch.Tensor]:
     return checkpoint.load(run / f"checkpoints/ckpt_{step:06d}.safetensors")[0]
 

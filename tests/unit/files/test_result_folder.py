@@ -7,8 +7,7 @@ import pytest
 from scene_experts.core.errors import InputError
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
-from scene_experts.files.cameras import first_width
-from scene_experts.files.export import capture_settings
+from scene_experts.files.export import capture_settings, width_in
 from scene_experts.files.result_folder import (
     expect_world,
     is_result,
@@ -163,4 +162,4 @@ def test_another_world_is_refused():
 )
 def test_the_width_of_the_first_view(tmp_path, text, width):
     (tmp_path / "cameras.json").write_text(text)
-    assert first_width(tmp_path / "cameras.json") == width
+    assert width_in(tmp_path / "cameras.json") == width
