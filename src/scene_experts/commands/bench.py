@@ -16,7 +16,7 @@ class BenchCommand:
     seconds: float = 60.0
     """Approximate duration in seconds. Below 30, smaller scenes are measured."""
     threads: int | None = None
-    """Number of threads to compare with one thread; by default PyTorch's setting."""
+    """Number of threads to compare with one thread, at most four times the cores; by default PyTorch's setting."""
     json: Path | None = None
     """Also write the measurements to this file."""
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Points
 from scene_experts.data.store import ImageStore
 
@@ -128,9 +129,9 @@ class Capture:
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
     def poses(self) -> str:
-        """Return the poses of up to four views in the capture's own frame, as text that `same_poses` compares.
+        """Return the poses of up to four views, the first and the last among them, as text that `same_poses` compares.
 
-        Each view has its camera's centre, forward axis and down axis, nine numbers.
+        Each view has nine numbers: the centre of its camera in the capture's own frame and unit, its forward axis and its down axis.
         """
         if not self.views:
             return ""
@@ -143,11 +144,21 @@ class Capture:
             out.append(" ".join([*(f"{v:.9g}" for v in centre.tolist()), *(f"{v:.5g}" for v in axes.tolist())]))
         return "; ".join(out)
 
+    def expect_poses(self, poses: object, run: Path | None) -> None:
+        """Raise InputError, and close the capture, if its cameras are not where they were (`poses`) when `run` was trained."""
+        if not same_poses(poses, self.poses()):
+            self.images.close()
+            raise InputError(
+                f"expected the camera poses that {run or 'this run'} was trained with, found others in {self.root} (`capture --overwrite` "
+                "computes new ones); restore the former poses, or train anew"
+            )
+
 
 def same_poses(one: object, other: object) -> bool:
-    """Whether two texts of `Capture.poses` agree within a thousandth: of the distance between the cameras, and of a unit axis.
+    """Return whether two texts of `Capture.poses` agree.
 
-    A text that is empty or no such text agrees with every other, as checkpoints of earlier versions have none.
+    Centres may differ by a thousandth of the largest distance between the cameras, and entries of the axes by 0.001. A value that is no
+    such text agrees with every other, as checkpoints of earlier versions have none.
     """
     ours, theirs = _parse_poses(one), _parse_poses(other)
     if ours is None or theirs is None:

@@ -28,7 +28,6 @@ from scene_experts.training.events import Densified, Event, Finished, Previewed,
 from scene_experts.training.guard import explain, find_broken
 from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
 from scene_experts.training.memory import anchor_cap, give_back, peak_bytes
-from scene_experts.training.run_folder import expect_poses
 from scene_experts.training.shards import Sharded, check_shard
 from scene_experts.training.state import Training, resume, save
 from scene_experts.training.trial import fit_memory
@@ -148,7 +147,7 @@ def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize
     if training and training.capture_id not in ("", capture.fingerprint()):
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
     if training:
-        expect_poses(training.poses, capture, folder and folder.parent)
+        capture.expect_poses(training.poses, folder and folder.parent)
     if training is None and run.config.init_from is not None:
         training = Training.start_from(cfg, run.config.init_from, capture, run.device)
         if training.step >= last_iteration(cfg, run):

@@ -36,7 +36,6 @@ from scene_experts.data.blocks import read_view_names
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
 from scene_experts.data.settings import Data
-from scene_experts.data.views import same_poses
 from scene_experts.recipes import RECIPES
 from scene_experts.scene import Scene
 from scene_experts.scene.fit import restore_foreign
@@ -291,18 +290,8 @@ def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
     if run.capture not in ("", capture.fingerprint()):
         capture.images.close()
         raise InputError(f"expected the capture that {run.path} was trained on, found other views in {capture.root}; give the right --data")
-    expect_poses(run.poses, capture, run.path)
+    capture.expect_poses(run.poses, run.path)
     return capture
-
-
-def expect_poses(poses: object, capture: Capture, run: Path | None) -> None:
-    """Raise InputError, and close the capture, if its cameras are not where they were (`poses`) when `run` was trained."""
-    if not same_poses(poses, capture.poses()):
-        capture.images.close()
-        raise InputError(
-            f"expected the camera poses that {run or 'this run'} was trained with, found others in {capture.root} (`capture --overwrite` "
-            "computes new ones); restore the former poses, or train anew"
-        )
 
 
 def with_capture(run: OpenRun, data: Path | None) -> OpenRun:

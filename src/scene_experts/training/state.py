@@ -25,7 +25,7 @@ from scene_experts.training.config import Train
 from scene_experts.training.guard import check_state
 from scene_experts.training.memory import Largest
 from scene_experts.training.old_hash import old_hash
-from scene_experts.training.run_folder import expect_poses, read_config
+from scene_experts.training.run_folder import read_config
 
 log: logging.Logger = logging.getLogger(__name__)
 
@@ -95,7 +95,7 @@ class Training:
         checkpoint.expect(meta, recipe=cfg.recipe)
         if meta.get("capture", "") not in ("", capture.fingerprint()):
             raise InputError(f"expected a run on the capture {capture.root} for --init-from, found one on another; use the same --data")
-        expect_poses(meta.get("poses"), capture, run)
+        capture.expect_poses(meta.get("poses"), run)
         if not int(meta["step"]) < cfg.iterations or int(meta["step"]) % cfg.batch:
             more = f"above {meta['step']}" if int(meta["step"]) >= cfg.iterations else f"and a --batch that divides {meta['step']}"
             raise InputError(f"expected --iterations {more}, where the run of --init-from ended, found {cfg.iterations}; change it")

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from scene_experts.core.errors import RunError
 from scene_experts.core.io import write_json
@@ -26,6 +27,22 @@ MOST_KEYS = 200
 AROUND, ROUND = 24, 16.0  # keyframes and seconds of the path around the scene
 
 
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """A path that a client is moved along."""
+
+    keys: tuple[Camera, ...]
+    loop: bool  # whether it returns to the first key
+    seconds: float  # from one key to the next
+
+    def poses(self, fps: float) -> list[Tensor]:
+        """Return the world-to-camera matrices [4, 4] at `fps` frames per second."""
+        rotations = torch.stack([key.world_to_cam[:3, :3].T.double() for key in self.keys])
+        places = torch.stack([key.position.double() for key in self.keys])
+        gaps = len(self.keys) - (0 if self.loop else 1)
+        return interpolate_poses(places, rotations, max(2, round(gaps * self.seconds * fps)), loop=self.loop)
+
+
 @dataclass
 class Keyframes:
     """The controls of camera paths."""
@@ -34,7 +51,7 @@ class Keyframes:
     capture: Capture
     folder: Path | None = None  # folder that paths are saved in; None: the working directory
     keys: list[Camera] = field(default_factory=list)
-    playing: dict[int, object] = field(default_factory=dict)  # flights by client; one that is not here any more stops
+    playing: dict[int, Flight] = field(default_factory=dict)  # by client; a flight that is not here any more stops
 
     def __post_init__(self) -> None:
         gui = self.server.gui
@@ -96,35 +113,34 @@ class Keyframes:
         if client is None or len(self.keys) < 2:
             self.words.content = "add at least two keyframes to play"
             return
-        self.toggle(client, list(self.keys), bool(self.loop.value), float(self.seconds.value))
+        self.toggle(client, Flight(tuple(self.keys), bool(self.loop.value), float(self.seconds.value)))
 
     def fly_around(self, client: Any) -> None:
         """Move a client along a closed path that fits the capture, or stop it. The keyframes stay as they are."""
         if client is not None:
-            self.toggle(client, list(make_path("auto", self.capture, AROUND).cameras), True, ROUND / AROUND)
+            self.toggle(client, Flight(make_path("auto", self.capture, AROUND).cameras, True, ROUND / AROUND))
 
-    def toggle(self, client: Any, keys: list[Camera], loop: bool, seconds: float) -> None:
-        """Start a flight of a client along `keys`, `seconds` from one to the next, or stop the one that is on its way."""
+    def toggle(self, client: Any, flight: Flight) -> None:
+        """Start a flight of a client, or stop the one that is on its way."""
         if not self.stop(client.client_id):
-            threading.Thread(target=self.move_client, args=(client, keys, loop, seconds), daemon=True).start()
+            self.playing[client.client_id] = flight
+            threading.Thread(target=self.move_client, args=(client, flight), daemon=True).start()
 
     def stop(self, client: int) -> bool:
-        """Stop the flight of a client; return whether there was one."""
+        """Stop the flight of a client. Returns whether there was one."""
         return self.playing.pop(client, None) is not None
 
-    def move_client(self, client: Any, keys: list[Camera], loop: bool, seconds: float, fps: float = 15.0) -> None:
-        """Move a client along `keys`; returns at the end, or when the flight is stopped or the client leaves."""
-        flight = self.playing[client.client_id] = object()
-        rotations = torch.stack([key.world_to_cam[:3, :3].T.double() for key in keys])
-        places = torch.stack([key.position.double() for key in keys])
-        frames = max(2, round((len(keys) - (0 if loop else 1)) * seconds * fps))
-        for made in interpolate_poses(places, rotations, frames, loop=loop):
-            if self.playing.get(client.client_id) is not flight:
-                return
-            rotation, place = made[:3, :3].T, -(made[:3, :3].T @ made[:3, 3])
-            with client.atomic():
-                client.camera.wxyz = tuple(matrix_to_quat(rotation).tolist())
-                client.camera.position = tuple(place.tolist())
-            time.sleep(1 / fps)
-        if self.playing.get(client.client_id) is flight:
-            self.stop(client.client_id)
+    def move_client(self, client: Any, flight: Flight, fps: float = 15.0) -> None:
+        """Move a client along its flight. Returns at the end, or when `playing` does not have the flight any more."""
+        try:
+            for pose in flight.poses(fps):
+                if self.playing.get(client.client_id) is not flight:
+                    return
+                rotation, place = pose[:3, :3].T, -(pose[:3, :3].T @ pose[:3, 3])
+                with client.atomic():
+                    client.camera.wxyz = tuple(matrix_to_quat(rotation).tolist())
+                    client.camera.position = tuple(place.tolist())
+                time.sleep(1 / fps)
+        finally:
+            if self.playing.get(client.client_id) is flight:
+                self.stop(client.client_id)

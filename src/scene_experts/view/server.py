@@ -154,8 +154,7 @@ class Viewer:
     @property
     def url(self) -> str:
         """Address of the page, with the token if one is needed."""
-        everywhere = self.host in ("", "0.0.0.0", "::", "127.0.0.1")  # localhost is one of these addresses
-        name = "localhost" if everywhere else self.host
+        name = "localhost" if self.host in ("", "0.0.0.0", "::", "127.0.0.1") else self.host
         address = f"http://{f'[{name}]' if ':' in name else name}:{self.server.get_port()}"
         return f"{address}/?token={self.gate.token}" if self.gate.token else address
 

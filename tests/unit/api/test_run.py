@@ -107,7 +107,7 @@ def test_files_come_back(run, capture, tmp_path):
 
 def test_frames_go_to_pictures_or_a_video(run, capture, tmp_path):
     cameras = capture.camera_path("orbit", frames=3, size=(16, 16))
-    folder = run.write_video(tmp_path / "frames", cameras)
+    folder = run.write_video(tmp_path / "frames", (camera for camera in cameras))
     assert sorted(path.name for path in folder.glob("*.png")) == ["00000.png", "00001.png", "00002.png"]
     first = np.asarray(Image.open(folder / "00000.png"))
     assert np.array_equal(first, to_8bit(torch.from_numpy(run.render(cameras[0]))))

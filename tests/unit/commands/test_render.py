@@ -1,11 +1,16 @@
 """`scene-experts render` as a user runs it, on a run of a few iterations."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from scene_experts import cli
+from scene_experts.core.errors import InputError
 from scene_experts.evaluate import pictures
+from scene_experts.training import run_folder
+from scene_experts.view.film import make_film
+from scene_experts.view.film_options import FilmOptions
 from support.synthetic import make_capture
 
 
@@ -49,6 +54,23 @@ def test_a_video_lands_in_the_run_folder(run, capsys):
     pytest.importorskip("imageio_ffmpeg")
     assert cli.main(["render", str(run), "--path", "spiral", "--size", "32x32", "--seconds", "0.5"]) == 0
     assert (run / "renders" / "spiral.mp4").stat().st_size > 500
+
+
+def test_a_run_with_other_camera_poses_is_not_shown_beside(run):
+    opened = run_folder.open_run(run)
+    capture = run_folder.capture_of(opened)
+    assert len(make_film(FilmOptions(path="test"), [opened, opened], capture).runs) == 2
+    moved = replace(opened, poses="; ".join(f"{x} 0 0 1 0 0 0 1 0" for x in range(4)))
+    with pytest.raises(InputError, match="one capture"):
+        make_film(FilmOptions(path="test"), [opened, moved], capture)
+    capture.images.close()
+
+
+@pytest.mark.parametrize(("path", "said"), [("orbit", "--path spiral or views stays"), ("spiral", "fog; --path views stays")])
+def test_a_path_away_from_the_photographs_is_warned_of(run, tmp_path, monkeypatch, capsys, path, said):
+    monkeypatch.setattr("scene_experts.view.paths.count_unseen", lambda path, capture: len(path))
+    assert cli.main(["render", str(run), "--path", path, "--out", str(tmp_path), "--size", "16x16", "--frames", "2"]) == 0
+    assert said in capsys.readouterr().err
 
 
 def test_flags_that_no_video_can_have(run, tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from scene_experts import cli
 from scene_experts.core.errors import InputError
 from scene_experts.data.blocks import read_plan
 from scene_experts.files.merging import merge_blocks
+from scene_experts.training import run_folder
 from scene_experts.training.run_folder import open_run
 from support.synthetic import make_capture
 
@@ -111,6 +113,15 @@ def test_runs_in_another_order_than_the_plan_are_refused(planned, tmp_path):
     with pytest.raises(InputError, match=r"block 0 at .*run0, found one of another plan"):
         merge_blocks(tmp_path / "other", [plan / "run0", plan / "run1"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_runs_with_other_camera_poses_are_refused(planned, tmp_path, monkeypatch):
+    plan, _ = planned
+    runs = [plan / "run0", plan / "run1"]
+    poses = {runs[0]: "1 0 0 1 0 0 0 1 0", runs[1]: "2 0 0 1 0 0 0 1 0"}
+    monkeypatch.setattr(run_folder, "open_run", lambda path: replace(open_run(path), poses=poses[path]))
+    with pytest.raises(InputError, match=r"camera poses in \S*" + runs[1].name):
+        merge_blocks(plan, runs, tmp_path / "merged")
 
 
 def test_a_block_whose_training_has_not_ended_is_told(planned, tmp_path, caplog):

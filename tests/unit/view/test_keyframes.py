@@ -11,6 +11,7 @@ from scene_experts.view import path_files
 from support.viewers import joined
 
 pytest.importorskip("viser")
+from scene_experts.view.keyframes import Flight
 
 
 def test_keyframes_become_a_path_that_render_reads(viewer, capture, tmp_path):
@@ -48,8 +49,19 @@ def test_playing_moves_the_client(viewer):
         handle.camera.position = np.array([x, 0.0, 0.0])
         keys.add(handle)
     handle.camera.position = np.array([9.0, 9.0, 9.0])
-    keys.move_client(handle, keys.keys, loop=False, seconds=0.1, fps=50.0)
+    flight = keys.playing[0] = Flight(tuple(keys.keys), loop=False, seconds=0.1)
+    keys.move_client(handle, flight, fps=50.0)
     assert np.allclose(handle.camera.position, [1.0, 0, 0], atol=1e-5) and not keys.playing
+
+
+def test_a_flight_whose_client_fails_is_over(viewer):
+    handle, keys = joined(viewer), viewer.panel.keyframes
+    camera = viewer.capture.views[0].camera
+    flight = keys.playing[0] = Flight((camera, camera), loop=False, seconds=0.1)
+    handle.atomic = None
+    with pytest.raises(TypeError):
+        keys.move_client(handle, flight)
+    assert not keys.playing
 
 
 def test_a_flight_around_the_scene_leaves_the_keyframes(viewer, monkeypatch):
@@ -61,7 +73,8 @@ def test_a_flight_around_the_scene_leaves_the_keyframes(viewer, monkeypatch):
     keys.fly_around(None)
     wait(lambda: flown)
     assert len(keys.keys) == 1 and not keys.loop.value
-    assert [(who, len(cameras), loop) for who, cameras, loop, _ in flown] == [(handle, 24, True)]
+    ((who, flight),) = flown
+    assert who is handle and len(flight.keys) == 24 and flight.loop and flight.seconds * 24 == 16.0
 
 
 @pytest.mark.parametrize("end", ["fly", "play", "clear", "view", "leave"])
