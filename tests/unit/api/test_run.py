@@ -107,12 +107,12 @@ def test_files_come_back(run, capture, tmp_path):
 
 def test_frames_go_to_pictures_or_a_video(run, capture, tmp_path):
     cameras = capture.camera_path("orbit", frames=3, size=(16, 16))
-    folder = run.write_video(tmp_path / "frames", (camera for camera in cameras))
+    folder = run.write_video(tmp_path / "frames", cameras)
     assert sorted(path.name for path in folder.glob("*.png")) == ["00000.png", "00001.png", "00002.png"]
     first = np.asarray(Image.open(folder / "00000.png"))
     assert np.array_equal(first, to_8bit(torch.from_numpy(run.render(cameras[0]))))
     pytest.importorskip("imageio_ffmpeg")
-    assert run.write_video(tmp_path / "orbit.mp4", cameras, fps=3).stat().st_size > 500
+    assert run.write_video(tmp_path / "orbit.mp4", (camera for camera in cameras), fps=3).stat().st_size > 500
     with pytest.raises(se.InputError):
         run.write_video(tmp_path / "sizes.mp4", [cameras[0], cameras[1].resized(20, 20)])
     for out, some, fps in (("a.mp4", [], 24.0), ("a.mp4", cameras, 0.0), ("a.txt", cameras, 24.0)):
