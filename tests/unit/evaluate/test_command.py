@@ -30,10 +30,13 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
     closed: list[bool] = []
     seen: dict[str, Any] = {}
     opened = SimpleNamespace(
-        config=config, scene="scene", step=250, clock=Clock(9.0, 17.0, {"cores": 2}), capture="a", poses="", path=tmp_path
+        config=config, scene="scene", step=250, clock=Clock(9.0, 17.0, {"cores": 2}), capture="a", poses="four", path=tmp_path
     )
     capture = SimpleNamespace(
-        root="new", fingerprint=lambda: "a", poses=lambda: "", images=SimpleNamespace(close=lambda: closed.append(True))
+        root="new",
+        fingerprint=lambda: "a",
+        expect_poses=lambda poses, run: seen.update(poses=(poses, run)),
+        images=SimpleNamespace(close=lambda: closed.append(True)),
     )
 
     def load(data: Data, seed: int) -> Any:
@@ -52,7 +55,7 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert result == {"psnr": 1.0} and closed == [True]
     assert seen["data"] == Data(Path("new"), split="mod:4")
     assert seen["args"] == ("scene", capture, Raster(antialias), tmp_path, EvalOptions("train", lpips=False))
-    assert seen["step"] == 250
+    assert seen["step"] == 250 and seen["poses"] == ("four", tmp_path)
     about = seen["about"]
     assert (about.recipe, about.iterations, about.seed, about.versions) == ("moe-gs", 300, 4, {"torch": "x"})
     assert (about.train_seconds, about.cpu_seconds, about.load) == (9.0, 17.0, {"cores": 2})
