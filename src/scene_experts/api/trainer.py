@@ -97,7 +97,7 @@ class Trainer:
         if isinstance(method, str):
             self.recipe = with_numbers(self.recipe, self.capture.numbers)
         words = command_of(self.recipe, self.capture.data, folder, deterministic, stop_at, max_memory)
-        config = RunConfig(self.recipe, self.capture.data, words, deterministic, stop_at, run_folder.versions())
+        config = RunConfig(self.recipe, self.capture.data, words, deterministic, stop_at, run_folder.versions(), max_memory)
         self._run = loop.Run(
             config=config,
             out=folder,

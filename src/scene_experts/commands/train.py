@@ -31,7 +31,7 @@ from scene_experts.render import Rasterizer
 from scene_experts.training import run_folder
 from scene_experts.training.batch import check_batch
 from scene_experts.training.config import RunConfig, Train, with_numbers
-from scene_experts.training.events import Exported
+from scene_experts.training.events import Exported, Stopped
 from scene_experts.training.loop import Run
 from scene_experts.training.memory import reuse_freed
 from scene_experts.training.progress import TrainingProgress
@@ -158,8 +158,9 @@ def prepare(command: TrainCommand, line: str, group: Alone) -> tuple[TrainComman
 def run_of(command: TrainCommand, line: str) -> Run:
     """What the loop needs to know of the command, on the CPU. line: the command line, for config.json."""
     start = None if command.init_from is None else command.init_from.absolute()
+    versions, most = run_folder.versions(), command.max_memory
     return Run(
-        config=RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, run_folder.versions(), start),
+        config=RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, versions, most, start),
         out=command.out,
         resume=command.resume,
         shard=command.shard,
@@ -229,7 +230,7 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
             raise KeyboardInterrupt  # a second signal does not wait
         run.stop.append(signal.Signals(number).name)
 
-    live, exported = None, False
+    live, exported, stopped = None, False, False
     if command.viewer:
         say = lambda url: console.print(f"viewer: {url}", soft_wrap=True)  # noqa: E731
         label = f"{command.cfg.recipe} on {capture.name}"
@@ -239,6 +240,7 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
         try:
             for event in recording.train(run, capture, rasterize, overwrite=command.overwrite, tensorboard=command.tensorboard):
                 progress(event)
+                stopped = stopped or isinstance(event, Stopped)
                 if isinstance(event, Exported):
                     exported = True
                     for warning in event.warnings:
@@ -249,7 +251,7 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
             if live:
                 live.close()
             capture.images.close()
-    if run.stop:
+    if stopped:
         return 128 + signal.Signals[run.stop[0]]  # saved, but incomplete: `train && eval` must not go on
     if exported:
         console.print(f"next: {shlex.join([PROG, 'eval', str(command.out)])}", soft_wrap=True)

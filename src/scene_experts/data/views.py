@@ -128,6 +128,11 @@ class Capture:
         content = [[(v.name, v.camera.width, v.camera.height) for v in self.views], train, self.test]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
+    def chosen(self) -> str:
+        """Return a short hash of the names of the training views if --views leaves some out, else an empty string."""
+        names = [self.views[i].name for i in self.train] if self.left_out else []
+        return hashlib.sha256(json.dumps(names).encode()).hexdigest()[:16] if names else ""
+
     def poses(self) -> str:
         """Return the poses of up to four views, the first and the last among them, as text that `same_poses` compares.
 

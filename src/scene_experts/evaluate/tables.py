@@ -142,8 +142,10 @@ def _warn_of_few_views(results: Sequence[dict[str, Any]]) -> tuple[str, ...]:
 
 def to_markdown(table: ResultTable) -> str:
     """Return a Markdown table with the best of each column in bold and the notes below."""
-    rows = [[f"**{cell}**" if (i, j) in table.best else cell for j, cell in enumerate(row)] for i, row in enumerate(table.rows)]
-    lines = ["| " + " | ".join(table.titles) + " |", "|---|" + "---:|" * (len(table.titles) - 1)]
+    rows = [[cell.replace("|", "\\|") for cell in row] for row in table.rows]
+    rows = [[f"**{cell}**" if (i, j) in table.best else cell for j, cell in enumerate(row)] for i, row in enumerate(rows)]
+    titles = (title.replace("|", "\\|") for title in table.titles)
+    lines = ["| " + " | ".join(titles) + " |", "|---|" + "---:|" * (len(table.titles) - 1)]
     lines += ["| " + " | ".join(row) + " |" for row in rows]
     return "\n".join(lines + ["", *table.notes] if table.notes else lines) + "\n"
 

@@ -170,14 +170,16 @@ def check_experts(by: Groups) -> list[Finding]:
 
 
 def compare_parts(claim: str, by: Groups, pairs: dict[str, tuple[str, str]], judge: Callable[[Difference], Verdict]) -> Finding:
-    """Judge a claim with several parts, each a difference of two recipes. One part can contradict it; all must confirm it."""
+    """Judge a claim with several parts, each a difference of two recipes. One part can contradict it; all must have runs and confirm it."""
     found = {name: d for name, (a, b) in pairs.items() if (d := difference(by.get(a, []), by.get(b, []))) is not None}
     if not found:
         return Finding(claim, None, "no runs")
     verdicts = {name: judge(d) for name, d in found.items()}
-    every = set(verdicts.values())
-    one: Verdict = "contradicted" if "contradicted" in every else "confirmed" if every == {"confirmed"} else "undecided"
-    return Finding(claim, one, "; ".join(f"{name}: {verdicts[name]}, {describe(d)}" if name else describe(d) for name, d in found.items()))
+    every, missing = set(verdicts.values()), [name for name in pairs if name not in found]
+    confirmed = every == {"confirmed"} and not missing
+    one: Verdict = "contradicted" if "contradicted" in every else "confirmed" if confirmed else "undecided"
+    measured = [f"{name}: {verdicts[name]}, {describe(d)}" if name else describe(d) for name, d in found.items()]
+    return Finding(claim, one, "; ".join([*measured, *([f"no runs: {', '.join(missing)}"] if missing else [])]))
 
 
 def to_markdown(findings: Sequence[Finding]) -> str:

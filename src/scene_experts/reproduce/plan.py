@@ -220,7 +220,7 @@ def find_own_scenes(captures: Sequence[Path]) -> list[Scene]:
         if not scene.path.is_dir():
             raise InputError(f"expected a capture folder at {scene.path}, found none; correct --captures")
         if sum(other.name == scene.name for other in scenes) > 1:
-            raise InputError(f"expected captures with different names, found several called '{scene.name}'; rename or link one of them")
+            raise InputError(f"expected captures with different names, found several called '{scene.name}'; rename one of them")
     return scenes
 
 

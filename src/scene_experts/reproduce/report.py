@@ -48,7 +48,7 @@ def write(
     claimed = any(experiment.name != COMPARE for experiment in experiments)
     if claimed:
         page += ["## The paper's claims", "", *caveat(records), claims.to_markdown(claims.check(records))]
-    noise = f"{SEED_SD['psnr']} dB with {SEED_WEIGHT} degrees of freedom"
+    noise = f"{SEED_SD['psnr']} dB (SSIM {SEED_SD['ssim']}, LPIPS (3DGS) {SEED_SD['lpips_3dgs']}) with {SEED_WEIGHT} degrees of freedom"
     page += [
         "Differences are paired by view and seed. The interval covers other views and other seeds of these captures (Student's t).",
         "The interval over capture means covers other captures: Student's t with the captures as the sample, from three captures on."

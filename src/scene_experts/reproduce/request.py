@@ -98,7 +98,7 @@ def written_command(options: ReproduceOptions, scenes: list[Scene]) -> str:
     """The command that makes these tables and figures, without paths of this machine."""
     words = ["scene-experts", "reproduce", *options.experiments]
     if options.captures:
-        words += ["--captures", *(f"CAPTURES/{scene.name}" for scene in scenes)]
+        words += ["--captures", *(shlex.quote(f"CAPTURES/{scene.name}") for scene in scenes)]
     for name in ("scenes", "scale", "iterations", "resolution", "seeds", "recipes", "baseline"):
         value = getattr(options, name)
         if value != getattr(ReproduceOptions(()), name):

@@ -175,13 +175,13 @@ def student(freedom: float) -> float:
 def compare_fit(a: Sequence[Record], b: Sequence[Record]) -> float | None:
     """Average A - B in PSNR (dB) of the training views, paired by iteration, over the second half of the trainings.
 
-    Trainings with the same seed see the same views in the same order, whatever the recipe. The mean is over seeds, then over captures.
-    None where nothing pairs.
+    Trainings with the same seed see the same views in the same order, whatever the recipe, unless one draws random backgrounds and the
+    other does not: such pairs are left out. The mean is over seeds, then over captures. None where nothing pairs.
     """
-    theirs = {(r.scene, r.seed): training_psnr(r) for r in b}
+    theirs = {(r.scene, r.seed, r.config.train.random_background): training_psnr(r) for r in b}
     found: dict[str, list[float]] = {}
     for record in a:
-        mine, other = training_psnr(record), theirs.get((record.scene, record.seed), {})
+        mine, other = training_psnr(record), theirs.get((record.scene, record.seed, record.config.train.random_background), {})
         steps = [step for step in mine if step in other and 2 * step > record.config.train.iterations]
         if steps:
             found.setdefault(record.scene, []).append(statistics.fmean(mine[step] - other[step] for step in steps))

@@ -22,6 +22,7 @@ from scene_experts.core.plain import from_json, to_json
 from scene_experts.core.reading.budget import JSON, RUN, Damaged
 from scene_experts.core.reading.plain import read_json_lines
 from scene_experts.core.reading.source import guarding
+from scene_experts.data.views import same_poses
 from scene_experts.evaluate.results import load_results
 from scene_experts.reproduce.columns import columns, length, rows, text
 from scene_experts.reproduce.plan import Spec, identity
@@ -88,6 +89,10 @@ def read_run(run: Path, scene: str, code: str = "") -> Record:
         raise InputError(
             f"expected scores after all {config.train.iterations:,} iterations in {run}, found scores after {results['step']:,}; "
             f"finish the training with `scene-experts train --resume` and the run's own flags, then run `scene-experts eval {run}`"
+        )
+    if config.max_memory > 0:
+        raise InputError(
+            f"expected a run whose growth memory does not limit, found --max-memory {config.max_memory:g} in {run}; train without it"
         )
     with guarding(run, RUN):
         return _make_record(run, scene, config, results, code)
@@ -235,10 +240,10 @@ def find_all(records: Sequence[Record], specs: Sequence[Spec]) -> list[Record]:
 
 def check_captures(records: Sequence[Record], specs: Sequence[Spec]) -> None:
     """Raise InputError where a record of `specs` belongs to another capture of that name: it was scored on other views than its capture
-    holds out, or had another number of 3D points, as after new camera poses.
+    holds out, had another number of 3D points or other camera poses, as after new structure from motion.
 
-    Checks the views of one run of each scene, and the points of all. Captures that cannot be read are skipped here; their training
-    reports the error.
+    Checks the views of one run of each scene, and the points and poses of all. Captures that cannot be read are skipped here; their
+    training reports the error.
     """
     by_scene: dict[str, list[tuple[Spec, Record]]] = {}
     for spec in specs:
@@ -264,4 +269,9 @@ def check_captures(records: Sequence[Record], specs: Sequence[Spec]) -> None:
             raise InputError(
                 f"expected records of '{spec.scene.name}' with the {known:,} points of {spec.scene.path}, found {counts.pop():,} in a "
                 f"record: its camera poses were others; {advice}"
+            )
+        poses = capture.poses()
+        if not all(same_poses(record.results.get("poses"), poses) for _, record in pairs):  # older records have no poses
+            raise InputError(
+                f"expected records of '{spec.scene.name}' with the camera poses of {spec.scene.path}, found others in a record; {advice}"
             )

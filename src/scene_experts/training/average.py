@@ -37,8 +37,8 @@ class Average(Part):
             raise InputError(f"expected --average.span from 0 to 1, found {self.span}; it is a share of the training")
 
     def due(self, step: int) -> bool:
-        """Whether the average is updated after iteration `step`."""
-        return self.span > 0 and step % self.interval == 0
+        """Whether the average is updated after iteration `step`. Before the first interval ends, the average is the last weights."""
+        return self.span > 0 and (step < self.interval or step % self.interval == 0)
 
     def weight(self, step: int, total: int) -> float:
         """Return the weight of the new values in the update after iteration `step` of `total`, in (0, 1]."""

@@ -94,6 +94,7 @@ class RunConfig:
     deterministic: bool = False
     stop_at: int | None = None
     versions: dict[str, str] = field(default_factory=dict)
+    max_memory: float = 0.0  # GiB at which growth stopped, so that the results depend on the machine; 0: no limit, or an older run
     init_from: Path | None = None  # run folder whose scene the training started from; None: the points of the capture, or an older run
 
 
@@ -124,7 +125,10 @@ def check(cfg: Train) -> None:
 
 def find_unused(cfg: Train) -> list[str]:
     """Return the flags of the settings that have no effect on the scene of `cfg` and do not have the default of their part."""
-    return [flag(place) for place in cfg.scene.unused if _has(cfg, place) and _changed(cfg, place)]
+    places = [place for place in cfg.scene.unused if _has(cfg, place) and _changed(cfg, place)]
+    if cfg.sparse_adam and cfg.loss.regularises and not {"loss.mean_opacity", "loss.mean_size"} & set(cfg.scene.unused):
+        places.append("sparse_adam")  # these losses move every row
+    return [flag(place) for place in places]
 
 
 def unregistered(value: Any) -> list[str]:

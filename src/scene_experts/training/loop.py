@@ -148,15 +148,17 @@ def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
     if training:
         capture.expect_poses(training.poses, folder and folder.parent)
+    if training and training.chosen not in (None, capture.chosen()):
+        raise InputError("expected the training views that this run began with, found others; restore the file of --views, or train anew")
     if training is None and run.config.init_from is not None:
-        training = Training.start_from(cfg, run.config.init_from, capture, run.device)
+        training = Training.start_from(cfg, run.config.init_from, capture, run.device, run.config)
         if training.step >= last_iteration(cfg, run):
             found = f"found {run.config.stop_at}; give a larger number or leave it out"
             raise InputError(f"expected --stop-at above {training.step}, where the run of --init-from ended, {found}")
     training = training or Training.start(cfg, capture, run.device, run.dtype)
     if unused := find_unused(cfg):
         log.warning("these options have no effect with this recipe: %s; leave them out", ", ".join(unused))
-    training.capture_id, training.poses = capture.fingerprint(), capture.poses()
+    training.capture_id, training.poses, training.chosen = capture.fingerprint(), capture.poses(), capture.chosen()
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
     if run.max_memory > 0:
         fit_memory(training, run.max_memory, capture, lambda *view: see_view(training, run, capture, rasterize, *view))

@@ -103,13 +103,18 @@ class Weights(Part):
         on = step is None or (step >= self.opacity_from and (self.opacity_until is None or step <= self.opacity_until))
         return self.opacity != 0 and on
 
+    @property
+    def regularises(self) -> bool:
+        """Whether a loss acts on all Gaussians of a scene of plain Gaussians, drawn or not."""
+        return bool(self.mean_opacity or self.mean_size)
+
     def needs_scene_opacity(self, step: int) -> bool:
         """Whether `Decoded.scene_opacity` is needed at `step`."""
         return self.opacity_scope == "all" and self.has_hinge(step)
 
     def reaches_every_row(self, decoded: Decoded) -> bool:
         """Whether the loss has a gradient for rows of the table that the view did not decode."""
-        population = decoded.population is not None and bool(self.mean_opacity or self.mean_size)
+        population = decoded.population is not None and self.regularises
         routing = any(len(r.gates) != len(decoded.rows) for r in decoded.routing.values())
         return decoded.scene_opacity is not None or population or routing
 

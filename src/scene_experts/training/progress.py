@@ -81,9 +81,9 @@ class TrainingProgress:
             case Saved():
                 self.print_line(f"saved {event.path}")
             case Stopped():
-                self.print_line(
-                    f"stopped at iteration {event.step:,} ({event.reason}); the run is saved: continue with --resume, or use it as it is"
-                )
+                kept = not self.out or any((self.out / "checkpoints").glob("ckpt_*.safetensors"))
+                state = "the run is saved: continue with --resume, or use it as it is" if kept else "nothing is saved yet: train again"
+                self.print_line(f"stopped at iteration {event.step:,} ({event.reason}); {state}")
             case Exported():
                 self.print_line(f"wrote {event.path}")
             case Finished():

@@ -164,8 +164,10 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False,
     """Prepare `out` for a run: call `check`, remove unfinished files of a killed training, the metrics of a run that is not resumed and
     the checkpoints and results of an overwritten run, and write config.json."""
     check(out, config, resume, overwrite)
-    if resume:  # a run is deterministic if all parts of its training were
-        config = replace(config, deterministic=config.deterministic and read_config(out).deterministic)
+    if resume:  # a run is deterministic if all parts of its training were, and limited if one part was
+        begun = read_config(out)
+        limit = config.max_memory or begun.max_memory
+        config = replace(config, deterministic=config.deterministic and begun.deterministic, max_memory=limit)
     for unfinished in (path for pattern in _UNFINISHED for path in out.glob(pattern)):
         unfinished.unlink(missing_ok=True)
     if not resume:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,12 @@ from scene_experts.core.plain import MOST_DIFFERENCES, differences, from_json, t
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding
 from scene_experts.data.capture import Capture
+from scene_experts.data.settings import Data
 from scene_experts.scene import Scene, SceneConfig, restore_scene
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.training.average import Averages
 from scene_experts.training.clock import Clock
-from scene_experts.training.config import Train
+from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.guard import check_state
 from scene_experts.training.memory import Largest
 from scene_experts.training.old_hash import old_hash
@@ -48,6 +50,7 @@ class Training:
         self.clock = Clock()
         self.queue: list[int] = []
         self.capture_id = self.poses = ""  # fingerprint and poses of the capture
+        self.chosen: str | None = None  # `Capture.chosen`; None: not known
         self.views_rng = torch.Generator().manual_seed(cfg.seed)  # for the order of views and for backgrounds
         self.growth_rng = torch.Generator().manual_seed(cfg.seed + 1)  # for densification
         columns = scene.table.params
@@ -80,29 +83,45 @@ class Training:
         return cls(cfg, scene.to(device, dtype))
 
     @classmethod
-    def start_from(cls, cfg: Train, run: Path, capture: Capture, device: str) -> Training:
+    def start_from(cls, cfg: Train, run: Path, capture: Capture, device: str, now: RunConfig) -> Training:
         """Create a training of `cfg`, which must be scaled, that starts from the scene of a run folder, at its iteration.
 
         The scene has its averaged weights, if there are any. The optimiser, the statistics and the order of the views start anew.
+        now: The configuration of the new run, with the settings before scaling.
 
-        Raises InputError if the run has no checkpoint, another recipe, capture or scene, or as many iterations as `cfg` already, or if
-        `cfg` would put its scene back into a phase that it has left, such as the dense warm-up.
+        Raises InputError if the run has no checkpoint, another recipe, capture, world or scene, or as many iterations as `cfg` already, or
+        if `cfg` would put its scene back into a phase that it has left, such as the dense warm-up.
         """
         found = checkpoint.newest(run / "checkpoints")
         if found is None:
             raise InputError(f"expected a trained run for --init-from at {run}, found none; give the folder that `train --out` wrote")
         tensors, meta = found
         checkpoint.expect(meta, recipe=cfg.recipe)
+        before = read_config(run)
         if meta.get("capture", "") not in ("", capture.fingerprint()):
-            raise InputError(f"expected a run on the capture {capture.root} for --init-from, found one on another; use the same --data")
+            other = _changes(replace(before.data, path=Path(), views=None), replace(now.data, path=Path(), views=None))
+            raise InputError(
+                f"expected the views that {run} of --init-from was trained on, found others in {capture.root}{other}; "
+                "use its --data, --resolution, --split and --max-views"
+            )
+        if before.data.normalise != now.data.normalise:  # its anchors lie in another world
+            raise InputError(
+                f"expected --normalise {before.data.normalise}, the world that {run} of --init-from was trained in, "
+                f"found {now.data.normalise}; give --normalise {before.data.normalise}"
+            )
         capture.expect_poses(meta.get("poses"), run)
         if not int(meta["step"]) < cfg.iterations or int(meta["step"]) % cfg.batch:
             more = f"above {meta['step']}" if int(meta["step"]) >= cfg.iterations else f"and a --batch that divides {meta['step']}"
             raise InputError(f"expected --iterations {more}, where the run of --init-from ended, found {cfg.iterations}; change it")
-        check_phases(cfg, read_config(run).train.scaled_scene(), int(meta["step"]))
+        check_phases(cfg, before.train.scaled_scene(), int(meta["step"]))
         torch.manual_seed(cfg.seed)
-        with guarding(run, RUN):
-            training = cls(cfg, restore_foreign(cfg.scene, tensors, meta, averaged=True).to(device))
+        try:
+            with guarding(run, RUN):
+                training = cls(cfg, restore_foreign(cfg.scene, tensors, meta, averaged=True).to(device))
+        except InputError as error:
+            if other := _changes(before.train.scene, now.train.scene, "scene"):
+                raise InputError(f"expected a scene of the kind that {run} of --init-from has{other}; use the flags of that run") from error
+            raise
         training.step = int(meta["step"])
         return training
 
@@ -202,6 +221,7 @@ class Training:
             "train": to_json(self.cfg),
             "capture": self.capture_id,
             "poses": self.poses,
+            "chosen": self.chosen,
         }
 
     @classmethod
@@ -228,7 +248,14 @@ class Training:
         training.queue = tensors["queue"].tolist()
         training.step, training.clock = int(meta["step"]), Clock.of(meta)
         training.capture_id, training.poses = meta.get("capture", ""), meta.get("poses", "")
+        training.chosen = meta.get("chosen")
         return training
+
+
+def _changes(before: Data | SceneConfig, now: Data | SceneConfig, where: str = "") -> str:
+    """Return ": SETTING was A, is now B" for the settings that differ, or an empty string."""
+    found = differences(to_json(before), to_json(now), where)
+    return f": {few(found, MOST_DIFFERENCES)}" if found else ""
 
 
 def check_phases(cfg: Train, before: SceneConfig, step: int) -> None:

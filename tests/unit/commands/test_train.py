@@ -1,5 +1,6 @@
 """From the flags of `train` to what the loop is given."""
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -145,6 +146,19 @@ def test_a_finished_run_keeps_its_files_when_resumed(tmp_path):
     assert (layout / "point_cloud.ply").read_bytes() == b"mine"
     (layout / "point_cloud.ply").unlink()
     assert train([*args, "--resume"]) == 0 and (layout / "point_cloud.ply").is_file()  # a run that was killed before it wrote them
+
+
+def test_a_signal_after_the_last_iteration_ends_a_whole_run_as_a_success(tmp_path, monkeypatch, capsys):
+    capture, export = make_capture(tmp_path / "capture", views=9, size=(48, 32)).folder, recording.export_layout
+
+    def interrupted(*args):
+        signal.raise_signal(signal.SIGINT)
+        return export(*args)
+
+    monkeypatch.setattr(recording, "export_layout", interrupted)
+    args = ["--data", str(capture), "--out", str(tmp_path / "run"), "--iterations", "3", "--preview-every", "0"]
+    assert train(["scaffold-gs", *args]) == 0
+    assert (tmp_path / "run" / "point_cloud" / "iteration_3" / "point_cloud.ply").is_file() and "next:" in capsys.readouterr().out
 
 
 def test_two_trainings_into_one_folder(tmp_path):

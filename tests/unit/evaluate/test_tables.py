@@ -67,6 +67,11 @@ def test_markdown(runs: list[Path]) -> None:
     assert lines[-1].startswith("lpips_alex") and lines[-1].endswith("no weights: run this")
 
 
+def test_a_bar_in_a_name_does_not_divide_a_markdown_row() -> None:
+    table = tables.ResultTable(("recipe", "a|b"), (("x|y", "1.0"),), frozenset({(0, 1)}), ())
+    assert tables.to_markdown(table) == "| recipe | a\\|b |\n|---|---:|\n| x\\|y | **1.0** |\n"
+
+
 def test_csv_is_plain_numbers(runs: list[Path]) -> None:
     rows = list(csv.DictReader(io.StringIO(printed(runs, "csv"))))
     assert [r["run"] for r in rows] == ["scaffold-gs", "moe-gs"]

@@ -1,6 +1,7 @@
 """Means, spreads and paired differences against numbers worked out by hand."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -115,6 +116,9 @@ def test_fit_is_paired_over_iterations_of_the_second_half():
     b.curves.pop()
     d = difference([a], [b])
     assert d is not None and d.fit == pytest.approx(0.5)
+    other = replace(b, config=replace(b.config, train=replace(b.config.train, random_background=True)))
+    d = difference([a], [other])  # random backgrounds change the order of the views
+    assert d is not None and d.fit is None
     b.curves.clear()
     d = difference([a], [b])
     assert d is not None and d.fit is None

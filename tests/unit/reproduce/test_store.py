@@ -104,6 +104,25 @@ def test_records_of_other_poses_of_the_same_photographs_are_refused(tmp_path):
         check_captures([found[0], replace(found[1], results={**found[1].results, "points": len(capture.points.xyz)})], specs)
 
 
+def test_records_of_other_cameras_with_the_same_points_are_refused(tmp_path):
+    box, moved = make_capture(tmp_path / "box", views=9), make_capture(tmp_path / "other" / "box", views=9, scale=2.0)
+    spec = Spec(Scene("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
+    capture, other = load_capture(spec.data), load_capture(replace(spec.data, path=moved.folder))
+    own = replace(record(scene="box"), per_view={capture.views[i].name: {"psnr": 30.0} for i in capture.test})
+    check_captures([replace(own, results={**own.results, "poses": capture.poses()})], [spec])
+    with pytest.raises(InputError, match=naming("camera poses", "--records")):
+        check_captures([replace(own, results={**own.results, "poses": other.poses()})], [spec])
+
+
+def test_a_run_that_memory_may_have_limited_is_no_record(tmp_path):
+    made = record()
+    write_json(tmp_path / "config.json", {"format": 1, **to_json(replace(made.config, max_memory=2.0))})
+    write_json(tmp_path / "results.json", made.results)
+    write_json(tmp_path / "per_view.json", made.per_view)
+    with pytest.raises(InputError, match=naming("--max-memory 2")):
+        read_run(tmp_path, "fox")
+
+
 def test_changed_figures_are_refused(tmp_path):
     path = write(tmp_path, record())
     value = json.loads(path.read_text())

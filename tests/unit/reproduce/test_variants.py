@@ -75,6 +75,7 @@ def test_a_comparison_shows_the_names_and_its_command_quotes_the_lines(tmp_path)
     plan = make_plan(options)
     assert [spec.recipe for spec in plan.shown] == ["moe-gs", LINE]
     assert f"'narrow={LINE}' --baseline narrow" in written_command(options, plan.scenes)
+    assert "--captures 'CAPTURES/my photos' --rec" in written_command(options, [replace(plan.scenes[0], name="my photos")])
     experiment = make_comparison(options)
     assert experiment.rows == {"moe-gs": "moe-gs", "narrow": LINE} and experiment.baselines == (LINE,)
     narrow = record("moe-gs", "x")

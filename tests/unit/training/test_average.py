@@ -49,6 +49,15 @@ def test_the_mean_of_all_then_an_exponential_average(recipe, capture):
     torch.testing.assert_close(training.scene.table.averages[name], start + expected)
 
 
+def test_before_the_first_interval_ends_the_average_is_the_last_weights(capture):
+    cfg = replace(RECIPES["moe-gs"][1], iterations=100, average=Average(span=0.5, interval=30))
+    training = Training.start(cfg.scaled(), capture, "cpu")
+    name = next(iter(training.scene.table.params))
+    for steps, behind in ((1, 0), (28, 0), (1, 0), (29, 29)):  # iterations 1, 29, 30 and 59: then 30 is the only one of the average
+        move(training, steps)
+        torch.testing.assert_close(training.scene.table.averages[name] + behind, training.scene.table.params[name].detach())
+
+
 def test_rows_stay_aligned(capture):
     training = started(capture)
     table = training.scene.table

@@ -81,6 +81,13 @@ def test_recipes_have_no_setting_without_an_effect(name):
     assert find_unused(RECIPES[name][1]) == []
 
 
+def test_options_that_the_scene_or_a_loss_overrules_have_no_effect():
+    scaffold, mcmc, plain = (RECIPES[name][1] for name in ("scaffold-gs", "3dgs-mcmc", "3dgs"))
+    assert find_unused(replace(scaffold, scene=replace(scaffold.scene, quat_align=True))) == ["--scene.quat-align"]
+    assert find_unused(replace(mcmc, sparse_adam=True)) == ["--sparse-adam"]  # its regularisers move every row
+    assert find_unused(replace(plain, sparse_adam=True)) == find_unused(replace(scaffold, sparse_adam=True)) == []
+
+
 def test_parts_that_do_not_fit_together_are_refused():
     moe = RECIPES["moe-gs"][1]
     for wrong, said in (

@@ -19,6 +19,7 @@ from scene_experts.scene.anchors.scene import Anchors
 from scene_experts.scene.gaussians import Explicit
 from scene_experts.scene.graph.scene import GraphPoints
 from scene_experts.strategy.split_clone import SplitClone
+from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Densified, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.loop import Run, iterate, measure_step, without_graph
@@ -51,11 +52,25 @@ def test_resumed_equals_uninterrupted_bit_for_bit_while_rows_come_and_go(recipe,
 
 def test_other_camera_poses_are_refused(folder, tmp_path):
     cfg, other = config(), make_capture(tmp_path / "other", views=16, scale=2.0).folder
+    run_folder.prepare(tmp_path / "run", RunConfig(cfg, Data(folder)), resume=False)
     list(events(cfg, folder, tmp_path / "run", stop_at=20))
     with pytest.raises(InputError, match=naming(tmp_path / "run", "camera poses")):
         list(events(cfg, other, tmp_path / "run", stop_at=40, resume=True))
     with pytest.raises(InputError, match=naming(tmp_path / "run", "camera poses")):
-        Training.start_from(cfg.scaled(), tmp_path / "run", load(other), "cpu")
+        Training.start_from(cfg.scaled(), tmp_path / "run", load(other), "cpu", RunConfig(cfg, Data(other)))
+
+
+def test_a_run_goes_on_with_the_training_views_that_it_began_with(folder, tmp_path):
+    def chosen(*names):
+        (tmp_path / "views.json").write_text(json.dumps([f"view_{n:03}.png" for n in names]))
+        return run_folder.load_capture(Data(folder, views=tmp_path / "views.json"))
+
+    cfg, out = config(), tmp_path / "run"
+    list(events(cfg, folder, out, world=chosen(1, 2, 3), stop_at=5))
+    for world in (chosen(4, 5, 6), load(folder)):
+        with pytest.raises(InputError, match="--views"):
+            list(events(cfg, folder, out, world=world, stop_at=10, resume=True))
+    assert list(events(cfg, folder, out, world=chosen(3, 1, 2), stop_at=10, resume=True))[-1].step == 10
 
 
 def test_stopping_saves_and_goes_on(folder, tmp_path):

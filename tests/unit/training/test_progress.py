@@ -37,6 +37,17 @@ def test_a_log_file_gets_plain_lines():
     assert "--resume" in text and "\x1b" not in text
 
 
+def test_a_run_that_ends_before_its_first_checkpoint_is_not_called_saved(tmp_path):
+    out = io.StringIO()
+    with TrainingProgress(Console(file=out, width=200), every=0.0, out=tmp_path) as show:
+        show(Stopped(0, "SIGTERM"))
+        assert "nothing is saved" in out.getvalue() and "--resume" not in out.getvalue()
+        (tmp_path / "checkpoints").mkdir()
+        (tmp_path / "checkpoints" / "ckpt_000010.safetensors").touch()
+        show(Stopped(10, "SIGTERM"))
+    assert "--resume" in out.getvalue()
+
+
 def test_a_narrow_terminal_shows_the_time_that_is_left():
     console = Console(file=io.StringIO(), force_terminal=True, width=60)
     with TrainingProgress(console, every=0.0) as show:

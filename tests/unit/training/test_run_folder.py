@@ -134,6 +134,13 @@ def test_resuming_may_move_the_capture_and_the_stop(run):
     assert run_folder.read_config(run) == moved and checkpoint.latest(run / "checkpoints") is not None
 
 
+def test_a_run_that_memory_limited_in_one_part_is_a_limited_run(run):
+    run_folder.prepare(run, replace(CONFIG, max_memory=2.0), resume=False, overwrite=True)
+    (run / "checkpoints").mkdir(exist_ok=True)
+    run_folder.prepare(run, CONFIG, resume=True)
+    assert run_folder.read_config(run).max_memory == 2.0
+
+
 def test_a_resumed_run_has_one_start_and_is_deterministic_as_a_whole(run):
     begun = replace(CONFIG, init_from=run / "coarse", deterministic=True)
     run_folder.prepare(run, begun, resume=False, overwrite=True)

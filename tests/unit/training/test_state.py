@@ -119,7 +119,7 @@ def test_a_training_starts_from_exactly_the_scene_of_another(tmp_path):
     words = ["--iterations", "40", "--average.span", "0.5", "--preview-every", "0", "--device", "cpu"]
     assert cli.main(["train", "moe-gs", "--data", str(folder), "--out", str(tmp_path / "run"), "--stop-at", "20", *words]) == 0
     capture = load(folder)
-    training = Training.start_from(cfg.scaled(), tmp_path / "run", capture, "cpu")
+    training = Training.start_from(cfg.scaled(), tmp_path / "run", capture, "cpu", RunConfig(cfg, Data(folder)))
     capture.images.close()
     scene = open_run(tmp_path / "run").scene
     assert training.step == 20 and not training.optimizer.state
@@ -129,9 +129,39 @@ def test_a_training_starts_from_exactly_the_scene_of_another(tmp_path):
         assert torch.equal(training.scene.network_tensors()[name], value), name
     for iterations, batch in ((20, 1), (60, 6)):
         with pytest.raises(InputError, match="--iterations"):
-            Training.start_from(replace(cfg, iterations=iterations, batch=batch).scaled(), tmp_path / "run", capture, "cpu")
+            other = replace(cfg, iterations=iterations, batch=batch)
+            Training.start_from(other.scaled(), tmp_path / "run", capture, "cpu", RunConfig(other, Data(folder)))
     with pytest.raises(InputError, match="--init-from"):
-        Training.start_from(cfg.scaled(), tmp_path, capture, "cpu")
+        Training.start_from(cfg.scaled(), tmp_path, capture, "cpu", RunConfig(cfg, Data(folder)))
+
+
+def test_a_start_in_another_world_or_from_other_views_or_networks_names_the_flag(tmp_path):
+    folder, cfg = make_capture(tmp_path / "box", views=9, size=(48, 32), points=300).folder, RECIPES["scaffold-gs"][1]
+    run_folder.prepare(tmp_path / "run", RunConfig(replace(cfg, iterations=100), Data(folder)), resume=False)
+
+    def start(data, **scene):
+        now = replace(cfg, scene=replace(cfg.scene, **scene))
+        capture = run_folder.load_capture(data)
+        capture.images.close()
+        return Training.start_from(now.scaled(), tmp_path / "run", capture, "cpu", RunConfig(now, data))
+
+    capture = load(folder)
+    first = Training.start(cfg.scaled(), capture, "cpu")
+    first.capture_id, first.poses, first.step = capture.fingerprint(), capture.poses(), 10
+    capture.images.close()
+    save(first, tmp_path / "checkpoints", keep=1)
+    (tmp_path / "checkpoints").rename(tmp_path / "run" / "checkpoints")
+    assert start(Data(folder)).step == 10
+    for data, scene, *words in (
+        (Data(folder, normalise="none"), {}, "--normalise extent"),
+        (Data(folder, resolution="longest:32"), {}, "resolution was auto, is now longest:32", "--resolution"),
+        (Data(folder, max_views=5), {}, "max_views", "--max-views"),
+        (Data(folder), {"K": 5}, "scene.K was 10, is now 5"),
+        (Data(folder), {"hidden": 16}, "scene.hidden was 32, is now 16"),
+        (Data(folder), {"appearance": 4}, "scene.appearance was 0, is now 4"),
+    ):
+        with pytest.raises(InputError, match=naming(tmp_path / "run", *words)):
+            start(data, **scene)
 
 
 @pytest.mark.parametrize(
@@ -142,12 +172,12 @@ def test_a_longer_schedule_does_not_put_a_scene_back_into_a_phase_that_it_has_le
     cfg = replace(RECIPES[recipe][1], iterations=1000)
     run_folder.prepare(tmp_path, RunConfig(cfg, Data(capture.root)), resume=False)
     training = Training.start(cfg.scaled(), capture, "cpu")
-    longer = replace(cfg, iterations=30_000).scaled()
+    now, longer = RunConfig(cfg, Data(capture.root)), replace(cfg, iterations=30_000).scaled()
     training.step = 20  # within the phase
     save(training, tmp_path / "checkpoints", keep=1)
-    assert Training.start_from(longer, tmp_path, capture, "cpu").step == 20
+    assert Training.start_from(longer, tmp_path, capture, "cpu", now).step == 20
     training.step = 600  # after it
     save(training, tmp_path / "checkpoints", keep=1)
     with pytest.raises(InputError, match=naming(flag, 600)):
-        Training.start_from(longer, tmp_path, capture, "cpu")
-    assert Training.start_from(replace(cfg, iterations=1500).scaled(), tmp_path, capture, "cpu").step == 600
+        Training.start_from(longer, tmp_path, capture, "cpu", now)
+    assert Training.start_from(replace(cfg, iterations=1500).scaled(), tmp_path, capture, "cpu", now).step == 600

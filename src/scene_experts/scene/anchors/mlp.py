@@ -115,7 +115,7 @@ class Plain(Decoder):
 
     @property
     def unused(self) -> tuple[str, ...]:
-        return ("loss.load", "rates.router_scale")
+        return ("loss.load", "rates.router_scale", "scene.quat_align")
 
     def check(self) -> None:
         """Raises InputError for a network without a hidden layer."""
