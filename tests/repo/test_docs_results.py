@@ -67,7 +67,7 @@ def test_means_over_seeds(capture, recipe):
 
 ORDER = ("fox", "colosseum", "bonsai", "buddha", "brighton", "fern", "kitchen")
 SCORES = ((("psnr",), 2), (("lpips",), 3), (("size", "MB"), 1))
-BESIDE = {"scaffold-gs": 3, "scaffold-gs-opacity": 1, "moe-gs": 3, "scene-experts-one": 3, "scene-experts-wide": 1, "scene-experts": 3}
+BESIDE = {"scaffold-gs": 3, "scaffold-gs-opacity": 3, "moe-gs": 3, "scene-experts-one": 3, "scene-experts-wide": 1, "scene-experts": 3}
 """The number of seeds of each recipe beside scene-experts."""
 
 
