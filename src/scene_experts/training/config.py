@@ -94,7 +94,7 @@ class RunConfig:
     deterministic: bool = False
     stop_at: int | None = None
     versions: dict[str, str] = field(default_factory=dict)
-    max_memory: float = 0.0  # GiB at which growth stopped, so that the results depend on the machine; 0: no limit, or an older run
+    max_memory: float = 0.0  # GiB at which growth stops, so the results may depend on the machine; 0: no limit, or an older run
     init_from: Path | None = None  # run folder whose scene the training started from; None: the points of the capture, or an older run
 
 
