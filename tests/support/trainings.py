@@ -1,4 +1,4 @@
-"""Run short trainings: settings, events and the tensors of the last checkpoint."""
+"""Run short trainings: settings, starts, events and the tensors of the last checkpoint."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +12,11 @@ from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig
 from scene_experts.training.loop import Run, train
+from scene_experts.training.state import Training
+
+CHANGE = 0.01  # standard deviation, of each parameter before the first step
+
+_start = Training.start  # as it is, for tests that put `start_changed` in its place
 
 
 def config(recipe="moe-gs", **changes):
@@ -19,6 +24,20 @@ def config(recipe="moe-gs", **changes):
     cfg = replace(RECIPES[recipe][1], **{"iterations": 600, **changes})
     growth = replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=20))
     return replace(cfg, growth=replace(growth, success_threshold=0.05) if hasattr(growth, "success_threshold") else growth)
+
+
+@torch.no_grad()
+def start_changed(cfg, capture, device="cpu", dtype=torch.float32, change=CHANGE) -> Training:
+    """Start a training and change its parameters a little.
+
+    A training starts with the Gaussians of an anchor at one place, and its first steps move them by equal lengths. Depths are then equal up
+    to rounding, which decides the order of drawing. It differs between processors, devices and precisions, and so do the pictures.
+    """
+    training, generator = _start(cfg, capture, device, dtype), torch.Generator().manual_seed(0)
+    for group in training.scene.rate_groups().values():
+        for p in group:
+            p.add_((change * torch.randn(p.shape, generator=generator)).to(device, dtype))
+    return training
 
 
 def events(cfg, folder, out=None, rasterizer="auto", world=None, **run):

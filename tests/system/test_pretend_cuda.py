@@ -81,11 +81,11 @@ def test_a_step_differs_only_where_an_alpha_lies_on_its_threshold(folder):
 
 @pytest.mark.slow
 def test_steps_of_a_training_as_it_starts(folder):
-    """In the second step of octree-gs, depths are equal up to rounding."""
-    found = passed(run(folder, "compare", "sags:unchanged", "octree-gs:unchanged"))
-    octree, sags = found["octree-gs:unchanged"], found["sags:unchanged"]
-    assert max(*sags["losses"], *sags["gradients"], *octree["losses"]) < CLOSE, found
-    assert sum(difference > CLOSE for difference in octree["gradients"]) <= 1 and max(octree["gradients"]) < 2e-2, octree
+    """Rounding decides which of two equal depths is first (octree-gs, second step), and which of two equal features is the maximum (sags).
+    How it decides depends on the processor: one step of the ten may differ."""
+    for word, found in passed(run(folder, "compare", "sags:unchanged", "octree-gs:unchanged")).items():
+        assert len(found["losses"]) == 10 and max(found["losses"]) < CLOSE, (word, found)
+        assert sum(difference > CLOSE for difference in found["gradients"]) <= 1 and max(found["gradients"]) < 2e-2, (word, found)
 
 
 @pytest.mark.slow

@@ -8,9 +8,7 @@ nearer to it than float32 can tell, rounding decides whether a pixel has a Gauss
 RECIPE:alone: both train on their own. Then `gradients` is empty.
 RECIPE:unchanged: as RECIPE, and the training starts as it is, without the change that follows.
 
-A training starts with the Gaussians of an anchor at one place, and its first steps move them by equal lengths. Depths are then equal up to
-rounding, rounding decides which Gaussian is drawn first, and the pictures differ, on one CPU between float32 and float64 as well. So the
-parameters are changed a little before the first step.
+A training as it starts has equal depths (`start_changed` says why), so the parameters are changed a little before the first step.
 Densification is off: it draws random numbers on the device of the scene.
 """
 
@@ -30,10 +28,10 @@ from scene_experts.training import loop
 from scene_experts.training.config import Train
 from scene_experts.training.state import Training
 from support.pretend.setup import answer, load_small, run_of, short
+from support.trainings import CHANGE, start_changed
 
 TEN = 10
 TINY = 1e-2
-CHANGE = 0.01  # standard deviation, of each parameter before the first step
 
 
 class Steps:
@@ -101,25 +99,15 @@ def measure_nearest(g: Gaussians, camera: Camera) -> float:
     return float((alpha[p.radii > 0] / reference.MIN_ALPHA - 1).abs().min())
 
 
-@torch.no_grad()
-def begin(cfg: Train, capture: Capture, device: str, change: float = CHANGE) -> Training:
-    """Start a training and change its parameters a little. change: standard deviation."""
-    training, generator = Training.start(cfg, capture, device), torch.Generator().manual_seed(0)
-    for group in training.scene.rate_groups().values():
-        for p in group:
-            p.add_((change * torch.randn(p.shape, generator=generator)).to(device))
-    return training
-
-
 def compare(capture: Capture, word: str) -> dict[str, list[float]]:
     recipe, _, how = word.partition(":")
     cfg = short(recipe)
     cfg: Train = replace(cfg, growth=replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=10**6)))
     on_cuda, on_cpu = GsplatRasterizer(antialias=cfg.antialias), Watched(antialias=cfg.antialias)
-    plain = Steps(begin(cfg, capture, "cpu", 0.0 if how == "unchanged" else CHANGE), capture, "cpu", on_cpu)
+    plain = Steps(start_changed(cfg, capture, change=0.0 if how == "unchanged" else CHANGE), capture, "cpu", on_cpu)
     found: dict[str, list[float]] = {"losses": [], "gradients": [], "close": []}
     if how == "alone":
-        alone = Steps(begin(cfg, capture, "cuda"), capture, "cuda", on_cuda)
+        alone = Steps(start_changed(cfg, capture, "cuda"), capture, "cuda", on_cuda)
         found["losses"] = [abs(alone.take() / plain.take() - 1) for _ in range(TEN)]
         return found
     for _ in range(TEN):

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -29,9 +30,11 @@ from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.loop import Run, train
+from scene_experts.training.state import Training
 from support.files import export_run
 from support.messages import naming
 from support.synthetic import make_capture
+from support.trainings import start_changed
 
 STEPS = 25
 
@@ -42,14 +45,16 @@ def folder(tmp_path_factory) -> Path:
 
 
 def trained(recipe: str, folder: Path, out: Path) -> run_folder.OpenRun:
-    """A short run that has passed its warm-up, written out as `train` does; the distance is an input so that units show."""
+    """A short run that has passed its warm-up, written out as `train` does; the distance is an input so that units show. No two depths are
+    equal, or rounding would decide the order of drawing."""
     base = with_extras(recipe)
     cfg = replace(base, iterations=300, scene=replace(base.scene, add_dist=("color", "cov")))
     config = RunConfig(cfg, Data(folder), stop_at=STEPS)
     run_folder.prepare(out, config, resume=False)
     capture = run_folder.load_capture(config.data)
-    for _ in train(cfg, Run(config, out=out), capture, choose("auto", "cpu")):
-        pass
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Training, "start", partial(start_changed, change=1e-3))
+        list(train(cfg, Run(config, out=out), capture, choose("auto", "cpu")))
     opened = run_folder.open_run(out)
     write_result_folder(opened, capture)
     capture.images.close()
