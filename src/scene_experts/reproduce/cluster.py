@@ -162,8 +162,23 @@ def connect(address: str) -> Iterator[Client]:
         from distributed import Client
     except ImportError as error:
         raise InputError("expected the package distributed for --cluster, found none; pip install 'scene-experts[cluster]'") from error
+
+    class Closing(Client):
+        """A client that is closed at once if it cannot connect.
+
+        Dask leaves it to the garbage collector, which may close it while this thread starts another client and holds the lock that closing
+        takes: the program then waits for ever.
+        """
+
+        def __init__(self) -> None:
+            try:
+                super().__init__(address, timeout=CONNECT, set_as_default=False)
+            except BaseException:
+                self.close()
+                raise
+
     try:
-        client = Client(address, timeout=CONNECT, set_as_default=False)
+        client = Closing()
     except (OSError, TimeoutError, ValueError, TypeError) as error:
         why = f"expected a Dask scheduler at --cluster {address}, found none that answers; start one with `dask scheduler`"
         raise InputError(f"{why}, or correct the address") from error

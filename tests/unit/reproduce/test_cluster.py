@@ -1,5 +1,6 @@
 """Runs on a Dask cluster: what a worker is sent and says, and three runs of which one loses its worker."""
 
+import gc
 import os
 import pickle
 import signal
@@ -64,6 +65,22 @@ def test_an_address_that_does_not_answer(tmp_path, monkeypatch):
         spec = Spec(Scene("box", OWN, tmp_path), "moe-gs", 0, Scale(iterations=10))
         with pytest.raises(InputError, match=address):
             runner.run_all([spec])
+
+
+def test_a_client_that_cannot_connect_is_closed_before_the_garbage_collector_comes(monkeypatch):
+    """The collector may come while a thread holds the lock that closing takes, and then that thread waits for ever."""
+    monkeypatch.setattr(module, "CONNECT", 1.0)
+    clients = lambda: [thing for thing in gc.get_objects() if issubclass(type(thing), distributed.Client)]  # noqa: E731
+    before = clients()
+    gc.disable()
+    try:
+        for address in ("tcp://127.0.0.1:9", "nonsense://x"):
+            with pytest.raises(InputError), module.connect(address):
+                pass
+        made = [client for client in clients() if client not in before]
+    finally:
+        gc.enable()
+    assert {client.status for client in made} == {"closed"}
 
 
 def test_without_distributed_the_extra_is_named(monkeypatch):
