@@ -36,6 +36,7 @@ FAMILIES = {
 GROUPS = [list(LEAN)[:2], list(LEAN)[2:], *(list(FAMILIES)[i : i + 2] for i in range(0, len(FAMILIES), 2))]  # a process each
 CLOSE = 1e-4  # relative, of losses and gradients
 ROUNDING = 6e-7  # relative, of an alpha in float32: ten times that of one number
+PIXEL = 6e-7  # of a colour in [0, 1] in float32
 DRAWN = {"picture": 1e-5, "depth": 1e-5, "gradients": 1e-4}
 
 
@@ -81,11 +82,11 @@ def test_a_step_differs_only_where_an_alpha_lies_on_its_threshold(folder):
 
 @pytest.mark.slow
 def test_steps_of_a_training_as_it_starts(folder):
-    """Rounding decides which of two equal depths is first (octree-gs, second step), and which of two equal features is the maximum (sags).
-    How it decides depends on the processor: one step of the ten may differ."""
+    """A gradient differs only where a colour equals the photograph up to rounding, and in one step of octree-gs, where depths are equal."""
     for word, found in passed(run(folder, "compare", "sags:unchanged", "octree-gs:unchanged")).items():
-        assert len(found["losses"]) == 10 and max(found["losses"]) < CLOSE, (word, found)
-        assert sum(difference > CLOSE for difference in found["gradients"]) <= 1 and max(found["gradients"]) < 2e-2, (word, found)
+        clear = [gradient for gradient, error in zip(found["gradients"], found["errors"]) if error > PIXEL]
+        assert len(clear) >= 5 and sum(gradient > CLOSE for gradient in clear) <= (word == "octree-gs:unchanged"), (word, found)
+        assert max(found["losses"]) < CLOSE and max(found["gradients"]) < 2e-2, (word, found)
 
 
 @pytest.mark.slow
