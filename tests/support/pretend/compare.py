@@ -5,8 +5,8 @@
 RECIPE: each step starts on both from the same checkpoint, that of the CPU. `losses` and `gradients` are the differences. `close` is how
 near the nearest alpha of the picture lies to 1/255, relative, in float64. Below that threshold a Gaussian is skipped: where an alpha lies
 nearer to it than float32 can tell, rounding decides whether a pixel has a Gaussian, and one gradient differs. `errors` is the smallest
-difference of a colour from the photograph. The L1 loss has a kink at 0: where a colour equals the photograph up to rounding, rounding decides
-the sign of its gradient.
+difference of a colour from the photograph. The L1 loss has a kink at 0: where a colour equals the photograph up to rounding, rounding
+decides the sign of its gradient.
 RECIPE:alone: both train on their own. Then `gradients` is empty.
 RECIPE:unchanged: as RECIPE, and the training starts as it is, without the change that follows.
 
