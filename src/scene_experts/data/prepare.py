@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -83,12 +84,15 @@ def hold_out(capture: Capture, split: str) -> Capture:
 
     Args:
         split: "modN" or "mod:N" holds out every Nth view, beginning with the first ("mod8" is the protocol of 3DGS);
-            "first:N" holds out the first N; "none" holds out none; "files" keeps the split that the files state.
+            "fold:K/N" holds out every Nth view, beginning with the Kth, so that the folds 1/N to N/N hold out each
+            view once; "first:N" holds out the first N; "none" holds out none; "files" keeps the split that the files
+            state.
 
     Raises:
         InputError: for another word, if the files state no split, or if no training view is left.
     """
     every, first = split.removeprefix("mod").removeprefix(":"), split.removeprefix("first:")
+    fold = re.fullmatch(r"fold:([1-9]\d*)/([1-9]\d*)", split)
     indices = range(len(capture.views))
     if split == "files":
         test = capture.test
@@ -101,10 +105,12 @@ def hold_out(capture: Capture, split: str) -> Capture:
         test = ()
     elif split.startswith("mod") and every.isdecimal() and int(every) >= 2:
         test = tuple(i for i in indices if i % int(every) == 0)
+    elif fold is not None and int(fold[1]) <= int(fold[2]) > 1:
+        test = tuple(i for i in indices if i % int(fold[2]) == int(fold[1]) - 1)
     elif split.startswith("first:") and first.isdecimal() and int(first) >= 1:
         test = tuple(indices[: int(first)])
     else:
-        raise InputError(f"expected --split mod8 (or another modN), first:N, none or files, found {split!r}; choose one")
+        raise InputError(f"expected --split mod8 (or another modN), fold:K/N, first:N, none or files, found {split!r}; choose one")
     held = set(test)
     train = tuple(i for i in indices if i not in held)
     if not train:

@@ -22,7 +22,7 @@ class Data:
     """Size of the training pictures: as-is, factor:N (sides divided by N), longest:PX, cap1600 (width at most 1600 px), share:S (a
     share of what cap1600 gives), inria:N (as factor:N from the folder images_N) or auto (cap1600)."""
     split: Annotated[str, Option(value="RULE")] = "auto"
-    """Which views are held out: mod8 (every 8th), mod:N (every Nth), first:N, none, files (as the capture's files say) or auto (files if
+    """Which views are held out: mod8 (every 8th), mod:N (every Nth), fold:K/N (every Nth from the Kth), first:N, none, files (as the capture's files say) or auto (files if
     they say it, else mod8)."""
     missing: Literal["error", "drop"] = "error"
     """What to do if the photograph of a view is missing: stop, or drop the view."""

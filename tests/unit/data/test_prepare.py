@@ -33,13 +33,13 @@ def same(a: Capture, b: Capture) -> bool:
 
 def test_splits(capture: Capture) -> None:
     ten = range(10)
-    for split, test in (("mod8", (0, 8)), ("mod:5", (0, 5)), ("first:3", (0, 1, 2)), ("none", ())):
+    for split, test in (("mod8", (0, 8)), ("mod:5", (0, 5)), ("first:3", (0, 1, 2)), ("fold:2/5", (1, 6)), ("none", ())):
         out = prepare.hold_out(capture, split)
         assert out.test == test and out.train == tuple(i for i in ten if i not in test)
     assert prepare.hold_out(capture, "mod:5").split == "mod5"
 
 
-@pytest.mark.parametrize("split", ["mod1", "modx", "first:0", "half", "files", "first:10", "", "mod²", "first:²"])
+@pytest.mark.parametrize("split", ["mod1", "modx", "first:0", "fold:0/5", "fold:6/5", "fold:1/1", "half", "files", "first:10", "", "mod²", "first:²"])
 def test_bad_splits(capture: Capture, split: str) -> None:
     with pytest.raises(InputError, match="--split"):
         prepare.hold_out(capture, split)
