@@ -18,10 +18,11 @@ import torch
 from scene_experts.bench.measure import Clock, Subject, choose_clock, measure_minima
 from scene_experts.bench.step import AT, make_work
 from scene_experts.core.types import Mode
+from scene_experts.data import capture as captures
 from scene_experts.evaluate import timing
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
-from scene_experts.training.run_folder import load_capture, open_run
+from scene_experts.training.run_folder import open_run
 
 KINDS = (
     *("scaffold-gs", "moe-gs", "moe-gs-dist", "moe-gs-posrouter"),
@@ -68,7 +69,7 @@ def measure_runs(folders: list[Path]) -> None:
     print("| run | own decode ms | frozen ms | raster ms | FPS, own decode | FPS, frozen |\n|---|---|---|---|---|---|")
     for folder in folders:
         run = open_run(folder)
-        capture = load_capture(run.config.data, run.config.train.seed)
+        capture = captures.load(run.config.data, run.config.train.seed)
         cameras = [capture.views[i].camera for i in capture.test or capture.train]
         background = torch.tensor(capture.background)
         s = timing.measure_speed(run.scene, cameras, run.step, choose("auto", "cpu"), background)

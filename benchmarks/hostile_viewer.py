@@ -109,9 +109,10 @@ def measure(capture_path: Path, recipe: str, spell: int, most: int) -> tuple[flo
     from scene_experts.render import choose
     from scene_experts.training import loop
     from scene_experts.training.config import RunConfig
+    from scene_experts.training.options import TrainOptions
     from scene_experts.view.live import Live
 
-    capture = captures.load(capture_path, resolution="factor:4")
+    capture = captures.load(Data(capture_path, resolution="factor:4"))
     cfg = RECIPES[recipe][1]
     cfg = replace(cfg, growth=replace(cfg.growth, enabled=False))
     rasterize, said = choose("auto", "cpu"), []
@@ -121,7 +122,12 @@ def measure(capture_path: Path, recipe: str, spell: int, most: int) -> tuple[flo
         live(training)
         times.append(time.monotonic())
 
-    events = loop.train(cfg, loop.Run(RunConfig(cfg, Data(capture_path)), watch=watch, log_every=1), capture, rasterize)
+    events = loop.train(
+        cfg,
+        loop.Job(RunConfig(cfg, Data(capture_path)), watch=watch, options=TrainOptions(log_every=1, preview_every=0)),
+        capture,
+        rasterize,
+    )
 
     def measure_spell(iterations: int) -> list[float]:
         times.clear()

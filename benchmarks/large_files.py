@@ -52,6 +52,7 @@ def make_capture(folder: Path, share: float) -> Callable[[], Any]:
     from scene_experts.data import capture
     from scene_experts.data.lens import Lens
     from scene_experts.data.readers.colmap_model import ColmapImage, Model, write_model
+    from scene_experts.data.settings import Data
 
     views, points = int(5000 * share), int(1_000_000 * share)
     rng = np.random.default_rng(0)
@@ -66,7 +67,7 @@ def make_capture(folder: Path, share: float) -> Callable[[], Any]:
     xyz, rgb = rng.normal(size=(points, 3)), rng.integers(0, 255, (points, 3), np.uint8)
     lens = Lens("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
     write_model(folder / "sparse" / "0", Model({1: lens}, tuple(images), np.arange(points), xyz, rgb, np.ones(points)))
-    return lambda: capture.load(folder)
+    return lambda: capture.load(Data(folder))
 
 
 MAKE = {"ply": make_ply, "compact": make_compact, "capture": make_capture}

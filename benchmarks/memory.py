@@ -27,7 +27,8 @@ from scene_experts.render import choose
 from scene_experts.training import memory
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Densified
-from scene_experts.training.loop import Run, iterate, train
+from scene_experts.training.loop import Job, iterate, train
+from scene_experts.training.options import TrainOptions
 from scene_experts.training.state import Training
 
 
@@ -78,7 +79,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    capture = multiply_points(load(args.capture), args.anchors, args.spread)
+    capture = multiply_points(load(Data(args.capture)), args.anchors, args.spread)
     for index in capture.train:
         capture.frame(index)
     rasterize = Watched(choose("auto", "cpu"))
@@ -87,12 +88,16 @@ def main() -> None:
     cfg = replace(
         recipe, scene=replace(recipe.scene, voxel_size=1e-3), growth=growth, iterations=30_000, max_anchors=args.anchors * 11 // 10
     )
-    warm_up(cfg, load(args.capture), rasterize)
+    warm_up(cfg, load(Data(args.capture)), rasterize)
     Path("/proc/self/clear_refs").write_text("5")  # reset the peak
     level = read_status("VmRSS")
     print(f"{args.recipe} on {capture.name}, {args.threads} thread(s); level after import and images {level / 1e6:.0f} MB")
     with tempfile.TemporaryDirectory() as folder:
-        run = Run(RunConfig(cfg, Data(args.capture), stop_at=args.iterations), out=Path(folder), save_every=args.iterations // 2)
+        run = Job(
+            RunConfig(cfg, Data(args.capture), stop_at=args.iterations),
+            out=Path(folder),
+            options=TrainOptions(save_every=args.iterations // 2, preview_every=0),
+        )
         rows, peak = 0, level
         for event in train(cfg, run, capture, rasterize):  # type: ignore[arg-type]
             if read_status("VmHWM") > peak:
@@ -107,7 +112,7 @@ def warm_up(cfg, capture: Capture, rasterize: Watched) -> None:
     """Run two iterations on the unchanged capture, which loads libraries, threads and code into memory."""
     training = Training.start(replace(cfg, max_anchors=0), capture, "cpu")
     for _ in range(2):
-        iterate(training, Run(RunConfig(cfg, Data(capture.root))), capture, rasterize)  # type: ignore[arg-type]
+        iterate(training, Job(RunConfig(cfg, Data(capture.root))), capture, rasterize)  # type: ignore[arg-type]
     capture.images.close()
     rasterize.largest = 0
 

@@ -169,7 +169,7 @@ def measure_views(count: int) -> list[Row]:
         folder = Path(name)
         write_views(folder, count)
         rows, kept = Rows(), []
-        rows.add("load capture", lambda: kept.append(load(folder, cache_bytes=64 << 20)), again=False)
+        rows.add("load capture", lambda: kept.append(load(Data(folder), cache_bytes=64 << 20)), again=False)
         capture = kept[0]
         rows.add("fingerprint", capture.fingerprint, again=False)
         training = Training(*_small(capture))

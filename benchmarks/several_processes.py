@@ -31,8 +31,9 @@ from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.events import Densified
-from scene_experts.training.loop import Run, train
+from scene_experts.training.loop import Job, train
 from scene_experts.training.memory import reuse_freed
+from scene_experts.training.options import TrainOptions
 
 
 def settings(recipe: str, args: argparse.Namespace) -> Train:
@@ -50,19 +51,18 @@ def member(rank: int, size: int, port: int, recipe: str, out: Path, args: argpar
     torch.set_num_threads(1)
     reuse_freed()
     group, cfg = join("cpu"), settings(recipe, args)
-    capture = load(args.capture, resolution=args.resolution)
+    capture = load(Data(args.capture, resolution=args.resolution))
     if args.points and capture.points is not None:
         every = -(-len(capture.points.xyz) // args.points)
         capture = replace(capture, points=Points(capture.points.xyz[::every], capture.points.rgb[::every]))
     for index in capture.train:
         capture.frame(index)  # decoded once and kept: not what is measured
     state = []
-    run = Run(
+    run = Job(
         RunConfig(cfg, Data(args.capture), deterministic=args.deterministic),
         out=out,
         group=group,
-        save_every=10**9,
-        log_every=10**9,
+        options=TrainOptions(save_every=10**9, preview_every=0, log_every=10**9),
         begin=state.append,
     )
     edits = [e.edit for e in train(cfg, run, capture, choose("auto", "cpu", deterministic=True)) if isinstance(e, Densified)]

@@ -38,8 +38,9 @@ from scene_experts.render import choose
 from scene_experts.training import shards
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Densified
-from scene_experts.training.loop import Run, train
+from scene_experts.training.loop import Job, train
 from scene_experts.training.memory import forget_peak, peak_bytes, reuse_freed, used_bytes
+from scene_experts.training.options import TrainOptions
 
 
 def size_of(tensors: list[Tensor]) -> int:
@@ -100,13 +101,13 @@ def member(rank: int, size: int, port: int, out: Path, args: argparse.Namespace)
     growth: Any = replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=args.interval))
     cfg = replace(cfg, growth=growth, batch=args.batch, iterations=args.steps * args.batch)
     cfg = replace(cfg, scene=replace(cfg.scene, voxel_size=args.voxel_size))  # type: ignore[call-arg]
-    capture = load(args.capture, resolution=args.resolution)
+    capture = load(Data(args.capture, resolution=args.resolution))
     for index in capture.train:
         capture.frame(index)  # decoded once and kept: not what is measured
     forget_peak()
     meter, before = Meter(), used_bytes(torch.device("cpu"))
     config = RunConfig(cfg, Data(args.capture), deterministic=True)
-    run = Run(config, out=out, group=group, shard=True, save_every=10**9, log_every=10**9)
+    run = Job(config, out=out, group=group, shard=True, options=TrainOptions(save_every=10**9, preview_every=0, log_every=10**9))
     rows, edits, peak = 0, 0, 0
 
     def watch(training: Any) -> None:  # after each step; the save at the end comes later

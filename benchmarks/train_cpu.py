@@ -23,7 +23,7 @@ from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Event, Stepped
-from scene_experts.training.loop import Run, train
+from scene_experts.training.loop import Job, train
 from scene_experts.training.state import Training
 
 
@@ -56,7 +56,7 @@ def start(recipe: str, folder: Path, capture: Capture, args: argparse.Namespace)
     """Begin the training of a recipe; nothing is computed yet."""
     cfg = replace(RECIPES[recipe][1], iterations=args.iterations)
     begun: list[Training] = []
-    run = Run(RunConfig(cfg, Data(folder)), begin=begun.append)
+    run = Job(RunConfig(cfg, Data(folder)), begin=begun.append)
     return Runner(recipe, train(cfg, run, capture, choose("auto", "cpu")), begun)
 
 
@@ -83,7 +83,7 @@ def main() -> None:
     args = parser.parse_args()
     rows: dict[str, list[Runner]] = {}
     for folder in args.captures:
-        capture = load(folder)
+        capture = load(Data(folder))
         runners = rows[folder.name] = [start(recipe, folder, capture, args) for recipe in args.recipes]
         for until in [*range(args.slice, args.iterations, args.slice), args.iterations]:
             for runner in runners:

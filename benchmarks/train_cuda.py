@@ -34,7 +34,8 @@ from scene_experts.render import Rasterizer, choose
 from scene_experts.training import loop as training
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.events import Finished, Stepped
-from scene_experts.training.loop import Run
+from scene_experts.training.loop import Job
+from scene_experts.training.options import TrainOptions
 from scene_experts.training.state import Training, resume
 
 PEER = "gsplat, explicit"
@@ -68,7 +69,7 @@ def main(argv: list[str] | None = None, draw: explicit_gsplat.Draw = explicit_gs
         raise SystemExit("expected a CUDA device, found none; run this on a machine with one")
     args.out.mkdir(parents=True, exist_ok=True)
     results = read_results(args)
-    capture = load(args.data, resolution=args.resolution)
+    capture = load(Data(args.data, resolution=args.resolution))
     rasterize = choose("auto", args.device)
     for name in list_pending(args.recipes, results):
         if time.monotonic() > deadline:
@@ -122,10 +123,12 @@ def train_recipe(
     config = RunConfig(cfg, Data(args.data, resolution=args.resolution))
     if args.device == "cuda":  # compile the kernels of gsplat and Triton before timing: a few steps, dense and sparse
         short = replace(cfg, iterations=min(20, args.iterations))
-        for _ in training.train(short, Run(replace(config, train=short), device=args.device), capture, rasterize):
+        for _ in training.train(short, Job(replace(config, train=short), device=args.device), capture, rasterize):
             pass
         torch.cuda.reset_peak_memory_stats()
-    run = Run(config, args.out / name, args.device, resume=True, save_every=10**9, log_every=100, keep=1)
+    run = Job(
+        config, args.out / name, args.device, options=TrainOptions(resume=True, save_every=10**9, preview_every=0, log_every=100), keep=1
+    )
     finished = False
     for event in training.train(cfg, run, capture, rasterize):
         if isinstance(event, Stepped):

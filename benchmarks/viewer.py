@@ -24,11 +24,13 @@ from pathlib import Path
 
 import torch
 
+from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.geometry.rotation import matrix_to_quat
 from scene_experts.render import Rasterizer, choose
 from scene_experts.training import loop as train
 from scene_experts.training import run_folder
+from scene_experts.training.options import TrainOptions
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.view import paths, server
 from scene_experts.view.live import Live
@@ -128,7 +130,7 @@ def measure_training(run: OpenRun, capture: Capture, rasterize: Rasterizer, spel
 
     cfg = run.config.train
     config = replace(run.config, stop_at=None)
-    state = train.train(cfg, train.Run(config=config, watch=watch, log_every=1), capture, rasterize)
+    state = train.train(cfg, train.Job(config=config, watch=watch, options=TrainOptions(log_every=1, preview_every=0)), capture, rasterize)
     took: dict[bool, list[float]] = {True: [], False: []}
 
     def spell(iterations: int) -> list[float]:
@@ -170,7 +172,7 @@ def main() -> None:
     args = parser.parse_args()
     run = run_folder.open_run(args.run, "cpu")
     data = run.config.data if args.data is None else replace(run.config.data, path=args.data)
-    capture = run_folder.load_capture(data, run.config.train.seed)
+    capture = captures.load(data, run.config.train.seed)
     rasterize = replace(choose("auto", "cpu"), antialias=run.config.train.antialias)  # type: ignore[type-var]
     size = (args.width, args.height)
     try:

@@ -5,8 +5,8 @@
 // distance, position). The 1 multiplies the bias of the first layer; the position is an input of routers that
 // ask for it. Each of the three heads (opacity, covariance, colour) has E experts W2 relu(.. relu(W1 z)) + b2,
 // followed by tanh, identity or sigmoid. Their outputs are mixed with weights: none (one network), all gates
-// (dense), or the softmax over the k largest logits (ties go to the lowest index). Heads with `linear` mix before
-// the activation. With `shared`, the last expert is always among the k chosen. Heads with `margin` have other weights: a chosen gate minus the largest gate that is not chosen.
+// (dense), or the softmax over the k largest logits (ties go to the lowest index). A head with several experts and no
+// router weights is routed outside: the mixture weights are inputs, and their gradients are outputs.
 //
 // The work is divided into chunks of CHUNK anchors. Within a chunk, the anchors of one expert are gathered, so
 // that its weights stay in the L1 cache (products.h). Covariance and colour are computed only for anchors that
@@ -26,15 +26,13 @@ constexpr int CHUNK = 256;   // anchors per chunk
 constexpr int BLOCK = 48;    // anchors per block of one expert
 constexpr int BUFFERS = 16;  // partial sums of weight gradients
 constexpr int COV = 7;       // 3 scale, 4 rotation
-constexpr float LEAST_MARGIN = 1e-4f;  // added to margins: the weights stay finite where all gates are equal
 
 using Head = SeDecodeHead;
 using Decode = SeDecode;
 
-inline bool has_one_expert(const Head& h) { return h.E == 1 || h.k == 1; }       // one expert of weight 1 per anchor
-inline bool mixes_linearly(const Head& h, int i) { return i == 1 || h.linear; }  // the activation of head i is applied after the mixture
-inline bool activates_mixture(const Head& h) { return has_one_expert(h) || h.linear; }
-inline bool uses_all_experts(const Head& h) { return !h.router_w || h.k == 0; }  // every expert sees every anchor
+inline bool has_one_expert(const Head& h) { return h.E == 1 || (h.k == 1 && h.router_w); }  // one expert of weight 1 per anchor
+inline bool mixes_linearly(int i) { return i == 1; }                                        // head i has no activation
+inline bool uses_all_experts(const Head& h) { return h.k == 0; }                            // every expert sees every anchor
 inline int experts_per_anchor(const Head& h) { return static_cast<int>(h.k ? h.k : h.E); }
 inline int64_t count_chunks(const Decode& d) { return (d.A + CHUNK - 1) / CHUNK; }
 // Row of gates, chosen and chosen_weight that belongs to `anchor`.

@@ -75,7 +75,10 @@ class Backward {
       const int step = block_size(g.n);
       for (int from = 0; from < g.n; from += step) differentiate_block(i, g, from, std::min(step, g.n - from));
     }
-    if (head.router_w) differentiate_routing(d_, s_, chunk, i, w_);
+    if (head.router_w)
+      differentiate_routing(d_, s_, chunk, i, w_);
+    else if (head.d_weight)  // routed outside
+      std::copy_n(w_.weights, int64_t(chunk.n) * experts_per_anchor(head), head.d_weight + chunk.begin * experts_per_anchor(head));
   }
 
   // Differentiate one expert on a block of its anchors.
@@ -90,13 +93,13 @@ class Backward {
     copy_block_inputs(w_, s_, g, from, n);
     float *h = compute_hidden(expert, s_, i, L, n, w_), *dh = h + layer, *other = dh + layer, *y = w_.out,
           *dy = y + int64_t(BLOCK + SLACK) * Op;
-    if (!has_one_expert(head) && !mixes_linearly(head, i)) {
+    if (!has_one_expert(head) && !mixes_linearly(i)) {
       compute_outputs(expert, s_, i, n, h, y);
       activate(i, y, n * Op);
     }
     compute_output_gradients(i, n, anchor, place, weight, expert.b2.data(), y, dy);
     multiply(n, Hp, s_.out[i], dy, Op, expert.w2.data(), Hp, nullptr, Store{dh, Hp});
-    if (mixes_linearly(head, i) && !has_one_expert(head))
+    if (mixes_linearly(i) && !has_one_expert(head))
       apply_weights(n, Hp, Op, place, weight, h, dh, dy, sums_ + at.b2);
     else {
       mask_relu(n * Hp, h, dh);
@@ -124,7 +127,7 @@ class Backward {
   void compute_output_gradients(int i, int n, const int* anchor, const int* place, const float* weight, const float* bias, const float* y,
                                 float* dy) {
     const int Op = s_.Op[i];
-    const bool single = has_one_expert(d_.heads[i]), linear = mixes_linearly(d_.heads[i], i);
+    const bool single = has_one_expert(d_.heads[i]), linear = mixes_linearly(i);
     for (int t = 0; t < n; ++t, y += Op, dy += Op) {
       const float* given = w_.mixed[i] + int64_t(anchor[t]) * Op;
       const Vec share = broadcast(weight[t]);

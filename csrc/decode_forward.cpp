@@ -29,7 +29,7 @@ void decode_head(const Decode& d, const Sizes& s, const Packed& packed, const Ch
       copy_block_inputs(w, s, g, from, n);
       float* h = compute_hidden(expert, s, i, static_cast<int>(head.L), n, w);
       compute_outputs(expert, s, i, n, h, y);
-      if (!head.linear || has_one_expert(head)) activate(i, y, n * Op);
+      activate(i, y, n * Op);
       for (int t = 0; t < n; ++t) {
         float *to = mixed + int64_t(anchor[t]) * Op, *own = y + int64_t(t) * Op;
         if (has_one_expert(head)) {
@@ -41,7 +41,6 @@ void decode_head(const Decode& d, const Sizes& s, const Packed& packed, const Ch
       }
     }
   }
-  if (head.linear && !has_one_expert(head)) activate(i, mixed, chunk.n * Op);
 }
 
 // Call f(sizes, packed weights, chunk, workspace) for each chunk of anchors, on all threads. Return 1 if memory

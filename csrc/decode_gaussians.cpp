@@ -70,7 +70,7 @@ void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk
     for (int slot = 0; slot < s.Op[0]; slot += LANES) {
       const int n = std::max(0, std::min(LANES, K - slot));
       const Vec sigma = load_part(raw + slot, n), g = d_raw ? load_part(d_raw + slot, n) : broadcast(0.f);
-      store(opacity + slot, activates_mixture(d.heads[0]) ? g * (broadcast(1.f) - sigma * sigma) : g);
+      store(opacity + slot, has_one_expert(d.heads[0]) ? g * (broadcast(1.f) - sigma * sigma) : g);
     }
     F32x4 to_reach = broadcast4(0.f), to_size = broadcast4(0.f);
     if (w.live[a]) {
@@ -82,7 +82,7 @@ void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk
       for_each_drawn(w, K, a, [&](int slot) {
         if (d.d_opacities) {  // not added to the value just stored: a load after a wider masked store stalls
           const float g = d.d_opacities[at] + (d_raw ? d_raw[slot] : 0.f);
-          opacity[slot] = activates_mixture(d.heads[0]) ? g * (1.f - raw[slot] * raw[slot]) : g;
+          opacity[slot] = has_one_expert(d.heads[0]) ? g * (1.f - raw[slot] * raw[slot]) : g;
         }
         if (d.d_means) {
           const F32x4 g = load3(d.d_means + 3 * at) * reach;
@@ -103,7 +103,7 @@ void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk
         }
         if (d.d_colors) {
           const F32x4 g = load3(d.d_colors + 3 * at), c = load3(d.colors + 3 * at);
-          store3(color + 3 * slot, activates_mixture(d.heads[2]) ? g * (c - c * c) : g);
+          store3(color + 3 * slot, has_one_expert(d.heads[2]) ? g * (c - c * c) : g);
         }
         ++at;
       });

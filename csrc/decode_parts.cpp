@@ -176,7 +176,7 @@ void group_by_expert(const Decode& d, const Head& head, const Chunk& chunk, bool
       if (e) std::copy_n(w.anchor, live, anchor);
       for (int i = 0; i < live; ++i) {
         place[i] = anchor[i] * E + e;
-        weight[i] = head.router_w ? head.gates[routing_row(d, chunk.begin + anchor[i]) * E + e] : 1.f;
+        weight[i] = E > 1 ? head.gates[routing_row(d, chunk.begin + anchor[i]) * E + e] : 1.f;
       }
       if (live) found.push_back({e, e * live, live});
     }

@@ -45,36 +45,6 @@ void choose(float* logits, int E, int k, int n, float* values, float* places) {
     }
 }
 
-// Weights of the k chosen experts: gate - largest gate that is not chosen + LEAST_MARGIN, scaled to sum to 1. gates [E][CHUNK].
-void weigh_by_margin(const float* gates, int E, int k, int n, const float* places, float* weights) {
-  for (int a = 0; a < n; ++a) {
-    uint64_t chosen = 0;
-    for (int r = 0; r < k; ++r) chosen |= uint64_t(1) << static_cast<int>(places[r * CHUNK + a]);
-    float rest = 0.f, total = 0.f;
-    for (int e = 0; e < E; ++e)
-      if (!(chosen >> e & 1)) rest = std::max(rest, gates[e * CHUNK + a]);
-    for (int r = 0; r < k; ++r)
-      total += weights[r * CHUNK + a] = gates[static_cast<int>(places[r * CHUNK + a]) * CHUNK + a] - rest + LEAST_MARGIN;
-    for (int r = 0; r < k; ++r) weights[r * CHUNK + a] /= total;
-  }
-}
-
-// From the gradients `own` [k] of margin weights to those of the gates, added to `to` [E].
-void differentiate_margin(const float* gates, int E, int k, const int64_t* chosen, const float* mix, const float* own, float* to) {
-  uint64_t taken = 0;
-  for (int r = 0; r < k; ++r) taken |= uint64_t(1) << chosen[r];
-  int rest = -1;  // the largest gate that is not chosen; ties go to the lowest index
-  for (int e = 0; e < E; ++e)
-    if (!(taken >> e & 1) && (rest < 0 || gates[e] > gates[rest])) rest = e;
-  float total = 0.f, mean = 0.f, sum = 0.f;
-  for (int r = 0; r < k; ++r) total += gates[chosen[r]] - (rest < 0 ? 0.f : gates[rest]) + LEAST_MARGIN, mean += mix[r] * own[r];
-  for (int r = 0; r < k; ++r) {
-    const float g = (own[r] - mean) / total;
-    to[chosen[r]] += g, sum += g;
-  }
-  if (rest >= 0) to[rest] -= sum;
-}
-
 }  // namespace
 
 void route(const Decode& d, const Sizes& s, const Packed& packed, const Chunk& chunk, Work& w) {
@@ -95,13 +65,8 @@ void route(const Decode& d, const Sizes& s, const Packed& packed, const Chunk& c
     for (int a = 0; a < n; ++a)
       for (int e = 0; e < E; ++e) gates[a * E + e] = mine[e * CHUNK + a];
     if (!k) continue;
-    choose(copy, E - head.shared, k - head.shared, n, values, places);
-    if (head.shared)
-      for (int a = 0; a < n; ++a) values[(k - 1) * CHUNK + a] = copy[(E - 1) * CHUNK + a], places[(k - 1) * CHUNK + a] = E - 1;
-    if (head.margin)
-      weigh_by_margin(mine, E, k, n, places, values);
-    else
-      softmax(values, k, n);
+    choose(copy, E, k, n, values, places);
+    softmax(values, k, n);
     int64_t* chosen = head.chosen + chunk.begin * k;
     float* mix = head.chosen_weight + chunk.begin * k;
     for (int a = 0; a < n; ++a)
@@ -123,17 +88,15 @@ void differentiate_routing(const Decode& d, const Sizes& s, const Chunk& chunk, 
     const float *gates = head.gates + anchor * E, *direct = head.d_gates ? head.d_gates + anchor * E : nullptr;
     const float* mix = head.chosen_weight + anchor * k;
     const int64_t* chosen = head.chosen + anchor * k;
-    const bool margin = head.margin && k > 1;
     float mean = 0;
-    if (dense || direct || margin) {
+    if (dense || direct) {
       for (int e = 0; e < E; ++e) to[e] = (direct ? direct[e] : 0.f) + (dense ? own[e] : 0.f);
-      if (margin) differentiate_margin(gates, E, k, chosen, mix, own, to);
       for (int e = 0; e < E; ++e) mean += gates[e] * to[e];
       for (int e = 0; e < E; ++e) to[e] = gates[e] * (to[e] - mean);
     } else {
       for (int e = 0; e < E; ++e) to[e] = 0.f;
     }
-    if (k <= 1 || margin) continue;
+    if (k <= 1) continue;
     mean = 0;
     for (int r = 0; r < k; ++r) mean += mix[r] * own[r];
     for (int r = 0; r < k; ++r) to[chosen[r]] += mix[r] * (own[r] - mean);

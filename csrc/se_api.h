@@ -73,20 +73,18 @@ SE_EXPORT void se_raster_count(const void* state, int64_t* counts, double* secon
 // ---- Decode of anchors ----------------------------------------------------------------------------------------------------------
 
 typedef struct {
-  const float *router_w, *router_b;  // [E, F] or [E, F + 3], [E]; null without a router, router_b also without a bias
+  const float *router_w, *router_b;  // [E, F] or [E, F + 3], [E]; null without a router, or if the caller routes
   const float *w1, *b1;              // [E, H, D] [E, H]
   const float *middle_w, *middle_b;  // [E, L, H, H] [E, L, H]; null if L = 0
   const float *w2, *b2;              // [E, out, H] [E, out]
-  float* gates;                      // [A, E], softmax over all logits; null without a router
-  int64_t* chosen;                   // [A, k]; null without a router or if k = 0
-  float* chosen_weight;              // [A, k], mixture weights of the chosen experts; null like `chosen`
+  float* gates;           // [A, E], softmax over all logits; null if E = 1. Where the caller routes: input, the mixture weights if k = 0
+  int64_t* chosen;        // [A, k]; null if k = 0. Input where the caller routes
+  float* chosen_weight;   // [A, k], mixture weights of the chosen experts; null if k = 0. Input where the caller routes
   float *d_router_w, *d_router_b, *d_w1, *d_b1, *d_middle_w, *d_middle_b, *d_w2, *d_b2;  // gradients; null like the tensors
   const float* d_gates;                                                                  // [A, E]; null: zero
+  float* d_weight;  // output where the caller routes: [A, k], or [A, E] if k = 0; null otherwise
   int64_t E, k, H, L, out;                                                               // out: outputs of an expert
   int64_t distance, position;  // 1 if the first layer sees the distance; 1 if the router sees the position
-  int64_t linear;              // 1: outputs are mixed before the activation, not after it
-  int64_t shared;              // 1: the last expert decodes every anchor; it is the last of the k chosen
-  int64_t margin;              // 1: mixture weights are proportional to a gate minus the largest gate that is not chosen, plus 1e-4
 } SeDecodeHead;
 
 typedef struct {

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 import scene_experts as se
-from scene_experts.core.errors import expect_at_least
+from scene_experts.core.fields import NotNegative
 from scene_experts.core.parts import extend, register
 from scene_experts.training.losses import Sample, Weights
 
@@ -17,12 +17,8 @@ from scene_experts.training.losses import Sample, Weights
 @register
 @dataclass(frozen=True)
 class BinaryOpacity(Weights):
-    binary: float = 0.0
+    binary: NotNegative = 0.0
     """Weight of the mean of 4 o (1 - o) over the opacities o of the Gaussians: 0 where each is 0 or 1, 1 where all are 0.5."""
-
-    def check(self) -> None:
-        super().check()
-        expect_at_least([("--loss.binary", self.binary, 0)])
 
 
 def binary_term(weights: BinaryOpacity, sample: Sample) -> dict[str, Tensor]:

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from scene_experts.scene.anchors.balance import BalancedExperts
-from scene_experts.scene.anchors.experts import Experts, Router
+from scene_experts.scene.anchors.balance import Balanced
+from scene_experts.scene.anchors.experts import Experts
 from scene_experts.scene.anchors.features import FeatureBank
-from scene_experts.scene.anchors.local import LocalExperts
-from scene_experts.scene.anchors.mlp import ATTRIBUTES, Decoder, Plain
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, Attribute, Decoder, Plain
+from scene_experts.scene.anchors.places import Places
 from scene_experts.scene.anchors.rates import Rates
+from scene_experts.scene.anchors.routers import Linear
 from scene_experts.scene.anchors.scene import Anchors
 from scene_experts.scene.anchors.select import Octree
 from scene_experts.scene.gaussians import Explicit, ExplicitRates
@@ -56,8 +57,8 @@ gs_mcmc: Train = replace(
 sags: Train = Train(recipe="sags", scene=GraphPoints(), loss=Weights(scale=0.0), growth=GrowPoints(), rates=GraphRates())
 
 
-def _moe(name: str, *, loss: Weights = moe_gs.loss, add_dist: tuple[str, ...] = (), decoder: Experts = EXPERTS, **experts: object) -> Train:
-    decoder = replace(decoder, **experts)  # type: ignore[arg-type]
+def _moe(name: str, *, loss: Weights = moe_gs.loss, add_dist: tuple[Attribute, ...] = (), **experts: object) -> Train:
+    decoder = replace(EXPERTS, **experts)  # type: ignore[arg-type]
     return replace(moe_gs, recipe=name, scene=replace(moe_gs.scene, decoder=decoder, add_dist=add_dist), loss=loss)
 
 
@@ -79,7 +80,7 @@ OWN: dict[str, Recipe] = {
     "scaffold-gs": ("Scaffold-GS: one network per attribute (the baseline)", scaffold_gs),
     "scene-experts": (
         "Scene Experts: five experts per attribute, each for one part of the scene (ours)",
-        _flagship("scene-experts", LocalExperts(), 64),
+        _flagship("scene-experts", Experts(num=5, top_k=1, warmup=10_000, router=Places()), 64),
     ),
     "scene-experts-one": (
         "scene-experts with one network of the same decode cost per attribute (control)",
@@ -117,11 +118,11 @@ OWN: dict[str, Recipe] = {
     "moe-gs-dist": ("The decoders also see the distance, as the paper's text says", _moe("moe-gs-dist", add_dist=ATTRIBUTES)),
     "moe-gs-posrouter": (
         "The routers also see the anchor's position (appendix)",
-        _moe("moe-gs-posrouter", router=Router(input_pos=True)),
+        _moe("moe-gs-posrouter", router=Linear(input_pos=True)),
     ),
     "moe-gs-balance": (
         "Biases balance the experts instead of L_load (Wang et al. 2024; not in the paper)",
-        _moe("moe-gs-balance", loss=replace(moe_gs.loss, load=0.0), decoder=BalancedExperts()),
+        _moe("moe-gs-balance", loss=replace(moe_gs.loss, load=0.0), router=Balanced()),
     ),
     "moe-gs-e3-no-load": (
         "Three experts without L_load (Figure 3a)",

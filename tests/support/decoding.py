@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from scene_experts.core.types import Gaussians
+from scene_experts.core.types import Gaussians, Routing
 from scene_experts.scene.anchors.mlp import CHANNELS, HeadWeights
 
 ATTRIBUTES = ("opacity", "cov", "color")
@@ -27,9 +27,6 @@ def problem(
     shuffled=False,
     depth=2,
     position=(),
-    linear=(),
-    margin=(),
-    shared=(),
 ):
     """Float64 inputs of a random scene; `k` is per attribute or one for all, 0 for a plain network."""
     g = torch.Generator().manual_seed(seed)
@@ -51,20 +48,28 @@ def problem(
             randn(experts, depth - 2, H, H) / 3 if depth > 2 else None,
             randn(experts, depth - 2, H) / 3 if depth > 2 else None,
             a in position,
-            a in linear,
-            a in shared,
-            a in margin,
         )
     rows = rows if shuffled else rows.sort().values
     return rows, columns, torch.tensor([0.3, -0.2, 2.5], dtype=torch.float64), heads, {a: a in distance for a in ATTRIBUTES}
 
 
-def oracle(rows, columns, camera, heads, with_dist):
-    """Section 3 of Scaffold-GS with eq. 3 - 5 of Scene Experts, one anchor after the other."""
+def without_routers(heads, A, attributes=ATTRIBUTES, seed=3):
+    """Return heads that are routed outside, and invented routing and weights for them, which do not sum to 1."""
+    g, outside = torch.Generator().manual_seed(seed), {}
+    heads = {a: replace(h, router_w=None, router_b=None, position=False) if a in attributes else h for a, h in heads.items()}
+    for a in attributes:
+        E, k = len(heads[a].w1), heads[a].k
+        chosen = None if k is None else torch.rand(A, E, generator=g).argsort(dim=1)[:, :k]
+        outside[a] = Routing(torch.zeros(A, E), chosen), (torch.rand(A, k or E, generator=g) + 0.3).double()
+    return heads, outside
+
+
+def oracle(rows, columns, camera, heads, with_dist, outside=None):
+    """Section 3 of Scaffold-GS with eq. 3 - 5 of Scene Experts, one anchor after the other. outside: given mixture weights."""
     K = columns["offsets"].shape[1]
     parts = {name: [] for name in ("means", "quats", "scales", "opacities", "colors", "source")}
     raws, gates, chosen = [], {a: [] for a in ATTRIBUTES}, {a: [] for a in ATTRIBUTES}
-    for row in rows.tolist():
+    for i, row in enumerate(rows.tolist()):
         v = columns["xyz"][row] - camera
         f, distance = columns["feature"][row], v.norm()
         y = {}
@@ -75,26 +80,25 @@ def oracle(rows, columns, camera, heads, with_dist):
                 u = (h.w1[e] @ z + h.b1[e]).relu()
                 for w, b in [] if h.middle_w is None else zip(h.middle_w[e], h.middle_b[e]):
                     u = (w @ u + b).relu()
-                y = h.w2[e] @ u + h.b2[e]
-                return y if h.linear else ACTIVATIONS[a](y)
+                return ACTIVATIONS[a](h.w2[e] @ u + h.b2[e])
 
+            if outside and a in outside:
+                routing, weight = outside[a]
+                picked = range(len(h.w1)) if routing.chosen is None else routing.chosen[i].tolist()
+                y[a] = sum(weight[i, j] * expert(e) for j, e in enumerate(picked))
+                continue
             if h.router_w is None:
-                y[a] = ACTIVATIONS[a](expert(0)) if h.linear else expert(0)
+                y[a] = expert(0)
                 continue
             seen = torch.cat([f, columns["xyz"][row] / EXTENT]) if h.position else f
             logits = h.router_w @ seen + (0 if h.router_b is None else h.router_b)
             g = logits.softmax(0)
-            routed = len(g) - h.shared
             picked = range(len(g))
             if h.k is not None:
-                picked = sorted(range(routed), key=lambda e: (-float(logits[e].detach()), e))[: h.k - h.shared] + [routed] * h.shared
-            share = g
-            if h.margin and h.k is not None:
-                share = g + 1e-4 - max([g[e] for e in range(len(g)) if e not in picked], default=0.0)
-            y[a] = sum(share[e] / sum(share[j] for j in picked) * expert(e) for e in picked)
-            y[a] = ACTIVATIONS[a](y[a]) if h.linear else y[a]
-            gates[a].append(logits[:routed].softmax(0))
-            chosen[a].append(list(picked)[: len(picked) - h.shared])
+                picked = sorted(picked, key=lambda e: (-float(logits[e].detach()), e))[: h.k]
+            y[a] = sum(g[e] / sum(g[j] for j in picked) * expert(e) for e in picked)
+            gates[a].append(g)
+            chosen[a].append(list(picked))
         raws.append(y["opacity"])
         size = columns["log_scaling"][row].exp()
         for slot in range(K):
@@ -177,13 +181,14 @@ CASES = {
     "routers that see positions": {"position": ATTRIBUTES},
     "one router that does": {"position": ("cov",), "F": 12, "distance": ("color",)},
     "rows in any order": {"shuffled": True},
-    "mixed before the activation": {"linear": ATTRIBUTES, "E": 5},
-    "one mixed before, dense": {"linear": ("color",), "k": None},
-    "a shared expert": {"shared": ATTRIBUTES, "E": 5},
-    "one shared expert, dense": {"shared": ("cov",), "k": None, "linear": ("cov", "color")},
-    "a shared expert, more": {"shared": ("opacity", "color"), "linear": ("opacity",), "E": 6, "k": (4, 2, 6)},
-    "margin weights": {"margin": ATTRIBUTES, "E": 5},
-    "margin weights, all chosen": {"margin": ("cov", "opacity"), "k": 3, "distance": ("cov",)},
-    "margin weights, others": {"margin": ("cov", "color"), "linear": ("opacity", "color"), "E": 16, "k": (2, 5, 16)},
     "one anchor": {"A": 1, "N": 1, "seed": 1},
 }
+
+OUTSIDE = {
+    "top-2": ({}, ATTRIBUTES),
+    "top-1": ({"k": 1}, ATTRIBUTES),
+    "dense": ({"k": None}, ATTRIBUTES),
+    "one attribute": ({"E": 5, "k": (2, 1, 3), "position": ATTRIBUTES}, ("cov",)),
+    "two attributes": ({"E": 4, "k": (None, 2, 0), "distance": ("color",)}, ("opacity", "cov")),
+}
+"""Problems by name, each with the attributes that are routed outside."""

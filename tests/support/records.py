@@ -26,5 +26,5 @@ def record(
         **results,
     }
     cfg = replace(RECIPES[recipe][1], iterations=iterations, seed=seed)
-    curves = [{"step": s, "seconds": s / 10, "psnr": 20.0, "routing": {"cov": [0.5, 0.3, 0.2]}} for s in (10, 20, 30)]
-    return Record(scene, RunConfig(cfg, Data(Path(scene))), found, per_view, curves)
+    curves = [{"step": s, "seconds": s / 10, "psnr": 20.0, "scene_routing": {"cov": [0.5, 0.3, 0.2]}} for s in (10, 20, 30)]
+    return Record(scene, RunConfig(cfg, Data(Path(scene))), found, per_view, curves, 20.0)

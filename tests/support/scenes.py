@@ -5,6 +5,7 @@ import torch
 from scene_experts.core.types import Camera, Points
 from scene_experts.recipes import RECIPES
 from scene_experts.scene import Scene
+from scene_experts.training.config import Train
 
 # one recipe of every scene family and of every kind of mixture
 METHODS = (
@@ -23,8 +24,9 @@ METHODS = (
 CAMERA = Camera(torch.eye(4), torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), 48, 32, 0.2)
 
 
-def start_scene(recipe: str) -> Scene:
-    """The untrained scene of a recipe, from 200 points."""
+def start_scene(recipe: str | Train) -> Scene:
+    """The untrained scene of a recipe, or of the recipe of a name, from 200 points."""
     torch.manual_seed(0)
     points = Points(torch.randn(200, 3, dtype=torch.float64) + torch.tensor([0.0, 0, 4]), torch.full((200, 3), 128, dtype=torch.uint8))
-    return RECIPES[recipe][1].scene.start(points, 5.0, [CAMERA])
+    cfg = RECIPES[recipe][1] if isinstance(recipe, str) else recipe
+    return cfg.scene.start(points, 5.0, [CAMERA])

@@ -6,13 +6,14 @@ from pathlib import Path
 import torch
 
 from scene_experts.core import checkpoint
-from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig
-from scene_experts.training.loop import Run, train
+from scene_experts.training.loop import Job, train
+from scene_experts.training.options import TrainOptions
 from scene_experts.training.state import Training
+from support.captures import load
 
 CHANGE = 0.01  # standard deviation, of each parameter before the first step
 
@@ -46,7 +47,9 @@ def events(cfg, folder, out=None, rasterizer="auto", world=None, **run):
     ordered: sum in the order of the views, as `--deterministic` does.
     """
     capture = world or load(folder)
-    made = Run(RunConfig(cfg, Data(folder), deterministic=run.pop("ordered", False), stop_at=run.pop("stop_at", None)), out=out, **run)
+    options = {"preview_every": 0, **{name: run.pop(name) for name in vars(TrainOptions()) if name in run and name != "device"}}
+    config = RunConfig.of(cfg, Data(folder), TrainOptions(deterministic=run.pop("ordered", False), **options), "", {})
+    made = Job(config, out, options=TrainOptions(**options), **run)
     try:
         yield from train(cfg, made, capture, choose(rasterizer, "cpu", deterministic=True))
     finally:

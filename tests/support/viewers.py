@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from scene_experts.data.capture import load
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
+from support.captures import load
 from support.synthetic import make_capture
 
 DRAW = choose("auto", "cpu")

@@ -47,7 +47,7 @@ def test_slices_until_the_table(folder, tmp_path, capsys):
 
 
 def test_the_peer_resumes(folder, tmp_path):
-    from scene_experts.data.capture import load
+    from support.captures import load
 
     capture = load(folder)
     whole = explicit_gsplat.Training(capture, 60, 6, tmp_path / "whole", "cpu", draw)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from scene_experts.data.capture import Capture, load
+from scene_experts.data.capture import Capture
 from scene_experts.data.summary import summarise
+from support.captures import load
 from support.places import DEMO
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 import make_city
 from scene_experts.data.blocks import make_blocks
-from scene_experts.data.capture import load
+from support.captures import load
 
 
 def test_a_small_city_is_a_capture_with_exact_cameras(tmp_path):

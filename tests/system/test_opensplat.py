@@ -12,7 +12,7 @@ from support.synthetic import make_capture
 PROGRAM = """#!{python}
 import shutil, sys
 from pathlib import Path
-from scene_experts.data.capture import load
+from support.captures import load
 assert sys.argv[2:4] == ["-n", "20"] and "--keep-crs" in sys.argv
 capture = load(Path(sys.argv[1]), split="none")
 assert len(capture.views) == 7 and all(max(v.camera.width, v.camera.height) <= 32 for v in capture.views)

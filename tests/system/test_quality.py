@@ -11,14 +11,14 @@ import pytest
 import torch
 
 from scene_experts.core.types import Mode
-from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig
-from scene_experts.training.loop import Run, train
+from scene_experts.training.loop import Job, train
 from scene_experts.training.state import Training
+from support.captures import load
 from support.golden import recorded
 from support.places import DEMO, GOLDEN
 from support.synthetic import make_capture
@@ -55,7 +55,7 @@ def held_out(captures):
         cfg = replace(cfg, growth=replace(cfg.growth, enabled=grow))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("scene_experts.training.loop.Training", Kept)
-            for _ in train(cfg, Run(RunConfig(cfg, Data(capture.root))), capture, draw):
+            for _ in train(cfg, Job(RunConfig(cfg, Data(capture.root))), capture, draw):
                 pass
         return last["scene"]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from numbers import Real
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from scene_experts.api import checked
 from scene_experts.api.camera import Camera, from_trained, vector
-from scene_experts.core.errors import InputError, expect_among, expect_words
+from scene_experts.core.errors import InputError, expect_among
+from scene_experts.data import capture as captures
 from scene_experts.data import views
 from scene_experts.data.fetch.catalog import Numbers, defaults_of
 from scene_experts.data.settings import Data
@@ -179,7 +179,7 @@ class Capture:
         """Return the capture with the random points of another seed; the capture itself if it has no random points."""
         if seed == self.seed or (self.data.init != "random" and self.loaded.bounds is None):
             return self
-        return Capture(self.data, run_folder.load_capture(self.data, seed), seed, self.numbers)
+        return Capture(self.data, captures.load(self.data, seed), seed, self.numbers)
 
     def _cameras(self, indices: Sequence[int]) -> list[Camera]:
         return [from_trained(self.loaded.views[i].camera, self.loaded.world) for i in indices]
@@ -234,17 +234,7 @@ def load_capture(
         InputError: The folder holds no usable capture, or an argument is invalid.
     """
     brought = defaults_of(path)
-    chosen = normalise or brought.normalise
-    for name, value in (("resolution", resolution), ("split", split)):
-        if not isinstance(value, str):
-            raise InputError(f"expected {name} as text such as 'longest:800' or 'mod8', found {value!r}; write it in quotes")
+    data = checked.fields(Data, {**locals(), "path": Path(path), "normalise": normalise or brought.normalise})
     seed = checked.integer("seed", seed, 0)
-    max_views = None if max_views is None else checked.integer("max_views", max_views, 1)
-    near = None if near is None else checked.real("near", near)
-    centred = checked.boolean("ignore_principal_point", ignore_principal_point)
-    if isinstance(background, (tuple, list)) and all(isinstance(part, Real) for part in background):
-        background = tuple(map(float, background))  # type: ignore[assignment] - its length is checked below
-    data = Data(Path(path), images, resolution, split, missing, chosen, init, max_views, near, centred, background=background)
-    expect_words(data)
     data = run_folder.named(data)
-    return Capture(data, run_folder.load_capture(data, seed), seed, brought.numbers)
+    return Capture(data, captures.load(data, seed), seed, brought.numbers)

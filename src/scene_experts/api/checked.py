@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import math
+import typing
+from collections.abc import Mapping
 from numbers import Integral, Real
+from typing import Any, TypeVar
 
 import numpy as np
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_value, notes_of
+
+T = TypeVar("T")
 
 
-def integer(name: str, value: object, least: int) -> int:
+def integer(name: str, value: object, least: int | None = None) -> int:
     """Return an integer of at least `least`. Raises InputError, naming the argument, for anything else."""
-    if not isinstance(value, Integral) or value < least:
-        raise InputError(f"expected {name} as an integer of at least {least}, found {value!r}; correct it")
+    if not isinstance(value, Integral) or (least is not None and value < least):
+        what = "an integer" if least is None else f"an integer of at least {least}"
+        raise InputError(f"expected {name} as {what}, found {value!r}; correct it")
     return int(value)
 
 
@@ -29,3 +36,33 @@ def boolean(name: str, value: object) -> bool:
     if not isinstance(value, (bool, np.bool_)):
         raise InputError(f"expected {name} as True or False, found {value!r}; correct it")
     return bool(value)
+
+
+def fields(kind: type[T], given: Mapping[str, Any]) -> T:
+    """Return a dataclass of options from the values in `given` that have the names of its fields.
+
+    Raises InputError, naming the argument, for a value of another type or out of range.
+    """
+    values = {name: _of_type(inner, name, given[name]) for name, (inner, _) in notes_of(kind).items() if name in given}
+    for name, value in values.items():
+        check_value(kind, name, value, name)
+    return kind(**values)
+
+
+def _of_type(kind: Any, name: str, value: Any) -> Any:
+    inner = [each for each in typing.get_args(kind) if each is not type(None)] if _optional(kind) else [kind]
+    if value is None and _optional(kind):
+        return None
+    if typing.get_origin(inner[0]) is tuple:
+        wanted = typing.get_args(inner[0])
+        if not isinstance(value, (tuple, list)) or len(value) != len(wanted):
+            raise InputError(f"expected {name} as {len(wanted)} numbers, found {value!r}; correct it")
+        return tuple(_of_type(each, name, part) for each, part in zip(wanted, value))
+    if inner[0] is str and not isinstance(value, str):
+        raise InputError(f"expected {name} as text, found {value!r}; write it in quotes")
+    known = {bool: boolean, int: integer, float: real}.get(inner[0])
+    return value if known is None else known(name, value)
+
+
+def _optional(kind: Any) -> bool:
+    return type(None) in typing.get_args(kind)

@@ -7,12 +7,17 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+from scene_experts.core.fields import flag_of
 from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
-from scene_experts.training.config import Train, flag
+from scene_experts.training.config import Train
+from scene_experts.training.options import TrainOptions
+
+RECORDED = ("deterministic", "stop_at", "max_memory")
+"""Options of a training that its results depend on."""
 
 
-def command_of(cfg: Train, data: Data, out: Path | None, deterministic: bool, stop_at: int | None, max_memory: float = 0.0) -> str:
+def command_of(cfg: Train, data: Data, out: Path | None, options: TrainOptions) -> str:
     """`scene-experts train ...` with every number that differs from the recipe; empty where no command can say it."""
     if cfg.recipe not in RECIPES:
         return ""
@@ -21,8 +26,7 @@ def command_of(cfg: Train, data: Data, out: Path | None, deterministic: bool, st
         return ""
     words = ["scene-experts", "train", cfg.recipe, "--data", str(data.path), "--out", str(out)]
     words += [word for place, value in [*(changes(Data(data.path), data) or []), *changed] for word in words_of(place, value)]
-    words += ["--deterministic"] * deterministic + ([] if stop_at is None else ["--stop-at", str(stop_at)])
-    words += ["--max-memory", str(max_memory)] if max_memory else []
+    words += [word for name in RECORDED for word in words_of(name, getattr(options, name)) if getattr(options, name)]
     return shlex.join(words)
 
 
@@ -44,6 +48,6 @@ def changes(old: Any, new: Any, above: str = "") -> list[tuple[str, Any]] | None
 def words_of(place: str, value: Any) -> list[str]:
     """The flag that sets a number."""
     if isinstance(value, bool):
-        head, _, last = flag(place).removeprefix("--").rpartition(".")
+        head, _, last = flag_of(place).removeprefix("--").rpartition(".")
         return [f"--{head}{'.' if head else ''}{'' if value else 'no-'}{last}"]
-    return [flag(place), *((map(str, value) if value else ["none"]) if isinstance(value, tuple) else [str(value)])]
+    return [flag_of(place), *((map(str, value) if value else ["none"]) if isinstance(value, tuple) else [str(value)])]

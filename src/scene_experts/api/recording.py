@@ -10,7 +10,8 @@ from pathlib import Path
 
 import torch
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.data.capture import Capture
 from scene_experts.files.export import result_warnings, write_result_folder
 from scene_experts.files.registry import exported_files
@@ -23,29 +24,29 @@ from scene_experts.training.memory import give_back, used_bytes
 from scene_experts.training.record import Recorder
 
 
-def train(run: loop.Run, capture: Capture, rasterize: Rasterizer, *, overwrite: bool = False, tensorboard: bool = False) -> Iterator[Event]:
+def train(run: loop.Job, capture: Capture, rasterize: Rasterizer) -> Iterator[Event]:
     """Train the recipe of `run.config` on a capture; yields the events of the training.
 
     With a folder `run.out`: hold it, write config.json, metrics.jsonl, previews, checkpoints and, once the training is complete,
     the Scaffold-GS layout (or that of the recipe's family). Nothing is written before the first event. Without one, nothing is written.
 
-    overwrite: start again in a folder that holds an earlier run.  tensorboard: write `run.out`/tensorboard too.
     Raises InputError if the folder cannot hold the run, and RunError if a file cannot be written.
     """
-    if run.out is not None and run.resume:
+    options = run.options
+    if run.out is not None and options.resume:
         run = replace(run, config=run_folder.as_begun(run.out, run.config))
     if run.out is None or not run.group.first:  # process 0 writes all files
         yield from loop.train(run.config.train, run, capture, rasterize)
         return
     finished, complete = None, False
-    with ExitStack() as folder, Recorder(run.out, tensorboard) as record:
+    with ExitStack() as folder, Recorder(run.out, options.tensorboard) as record:
         for event in loop.train(run.config.train, run, capture, rasterize):
             if isinstance(event, Started):  # the training can start: from here on the folder may change
-                ended = run.resume and event.step >= event.total
+                ended = options.resume and event.step >= event.total
                 complete = ended and is_exported(run.out, event.step)
                 folder.enter_context(run_folder.held(run.out))
                 config = run_folder.as_trained(run.out, run.config) if ended else run.config
-                run_folder.prepare(run.out, config, run.resume, overwrite, exported_files(run.out))
+                run_folder.prepare(run.out, config, options.resume, options.overwrite, exported_files(run.out))
             record(event)
             if isinstance(event, Finished):
                 finished = event  # yielded last; the loop ends first and frees its memory
@@ -71,11 +72,9 @@ def export_layout(out: Path, capture: Capture) -> Exported:
     return Exported(opened.step, write_result_folder(opened, capture), tuple(result_warnings(opened)))
 
 
-def check_settings(run: loop.Run) -> None:
+def check_settings(run: loop.Job) -> None:
     """Raises InputError, naming the flag, for invalid settings."""
-    stop_at = 1 if run.config.stop_at is None else run.config.stop_at
-    numbers = [("--save-every", run.save_every, 1), ("--preview-every", run.preview_every, 0), ("--stop-at", stop_at, 1)]
-    expect_at_least([*numbers, ("--max-memory", run.max_memory, 0)])
+    check_fields(run.options)
     if run.max_memory > 0 and not used_bytes(torch.device("cpu")):
         raise InputError(f"expected a system that reports a process's memory for --max-memory, found {sys.platform}; use --max-anchors")
     check(run.config.train)

@@ -24,6 +24,7 @@ from scene_experts.training import loop, run_folder
 from scene_experts.training.config import RunConfig, with_numbers
 from scene_experts.training.events import Event
 from scene_experts.training.memory import forget_peak, reuse_freed
+from scene_experts.training.options import TrainOptions
 from scene_experts.training.progress import TrainingProgress
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.state import Training
@@ -87,35 +88,23 @@ class Trainer:
         folder = None if out is None else Path(out)
         if folder is None and (resume or overwrite or tensorboard):
             raise InputError("expected a run folder `out` for resume, overwrite or tensorboard, found None; name one")
-        stop_at = None if stop_at is None else checked.integer("stop_at", stop_at, 1)
-        save_every, preview_every = checked.integer("save_every", save_every, 1), checked.integer("preview_every", preview_every, 0)
-        log_every, deterministic = checked.integer("log_every", log_every, 1), checked.boolean("deterministic", deterministic)
-        where = device_of(device, rasterizer)
-        rasterize = choose(rasterizer, where, antialias=self.recipe.antialias, deterministic=deterministic)
+        options = checked.fields(TrainOptions, locals())
+        where = device_of(options.device, options.rasterizer)
+        rasterize = choose(options.rasterizer, where, antialias=self.recipe.antialias, deterministic=options.deterministic)
         loaded = capture if isinstance(capture, Capture) else load_capture(capture, seed=self.recipe.seed)
         self.capture = loaded.with_seed(self.recipe.seed)
         if isinstance(method, str):
             self.recipe = with_numbers(self.recipe, self.capture.numbers)
-        words = command_of(self.recipe, self.capture.data, folder, deterministic, stop_at, max_memory)
-        config = RunConfig(self.recipe, self.capture.data, words, deterministic, stop_at, run_folder.versions(), max_memory)
-        self._run = loop.Run(
-            config=config,
-            out=folder,
-            device=where,
-            resume=resume,
-            save_every=save_every,
-            preview_every=preview_every,
-            log_every=log_every,
-            max_memory=max_memory,
-            begin=self._begin,
-        )
+        words = command_of(self.recipe, self.capture.data, folder, options)
+        config = RunConfig.of(self.recipe, self.capture.data, options, words, run_folder.versions())
+        self._run = loop.Job(config, folder, where, options=options, begin=self._begin)
         recording.check_settings(self._run)
         if folder is not None:
             run_folder.check(folder, config, resume, overwrite)
-        self._rasterize, self._deterministic = rasterize, deterministic
+        self._rasterize = rasterize
         self._training: Training | None = None
         self._ended = False
-        self._events = self._train(overwrite, tensorboard)
+        self._events = self._train()
 
     def __iter__(self) -> Iterator[Event]:
         """Return the trainer itself: a loop continues where an earlier one was left."""
@@ -154,10 +143,10 @@ class Trainer:
     def _begin(self, training: Training) -> None:
         self._training = training
 
-    def _train(self, overwrite: bool, tensorboard: bool) -> Iterator[Event]:
+    def _train(self) -> Iterator[Event]:
         reuse_freed()
-        with deterministic_algorithms(self._deterministic):
-            yield from recording.train(self._run, self.capture.loaded, self._rasterize, overwrite=overwrite, tensorboard=tensorboard)
+        with deterministic_algorithms(self._run.options.deterministic):
+            yield from recording.train(self._run, self.capture.loaded, self._rasterize)
         self._ended = True
         if self._run.out is not None:
             self._training = None  # the run is in its folder now

@@ -10,6 +10,7 @@ from dataclasses import fields
 from scene_experts.arguments import docs
 from scene_experts.arguments.table import Row
 from scene_experts.arguments.values import format_value, list_choices, placeholder
+from scene_experts.core.fields import Range, note
 
 INDENT = 2
 COLUMN = 26  # column where the text of an option starts
@@ -124,7 +125,9 @@ def describe(row: Row) -> str:
         text = f"{above}: {text[0].lower()}{text[1:]}" if above else text
     if choices := list_choices(row.kind):
         text = f"{text} One of {choices}.".strip()
+    limits = note(row.owner, row.place[-1], Range)
+    inside = str(limits).removeprefix("of ") if limits is not None and limits.two_sided else ""
     plain = row.required or row.default is None or row.default is False or row.default == ()
-    if plain or "default" in text:
-        return text
-    return f"{text} (default: {'on' if row.default is True else format_value(row.default)})".strip()
+    default = "" if plain or "default" in text else f"default: {'on' if row.default is True else format_value(row.default)}"
+    notes = "; ".join(filter(None, (inside, default)))
+    return f"{text} ({notes})".strip() if notes else text

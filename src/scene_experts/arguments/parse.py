@@ -8,9 +8,10 @@ from dataclasses import MISSING, dataclass, field
 from typing import Any, TypeVar
 
 from scene_experts.arguments.help import format_usage, page, stands_for
-from scene_experts.arguments.table import Place, Row, make, rows
+from scene_experts.arguments.table import Place, Row, choose_parts, make, rows
 from scene_experts.arguments.values import NONE, convert, count, format_value, without_none
 from scene_experts.core.errors import InputError, nearest
+from scene_experts.core.fields import check_value
 
 T = TypeVar("T")
 NUMBER = re.compile(r"-(\d|\.\d|inf|nan)")
@@ -44,15 +45,29 @@ def parse(kind: type[T], command: Command, args: Sequence[str]) -> T:
 
     Raises InputError if the arguments are invalid, and HelpAsked for -h, --help and --help-all.
     """
-    table = rows(kind, command.defaults)
+    defaults = choose_parts(kind, command.defaults, lambda row: _word_after(row.flag, args))
+    table = rows(kind, defaults)
     if any(arg in HELP or arg == HELP_ALL for arg in args):
         raise HelpAsked(page(kind, command.name, command.about, table, command.positional, () if HELP_ALL in args else command.first))
     given = _Reader(command, table).read(list(args))
+    chosen = {row.place for row in table if row.part is not None}
     missing = [row for row in table if row.required and row.place not in given]
     if missing:
         how = format_usage(command.name, table, command.positional)
         raise InputError(f"expected {_both(missing, command)}, found {_none(missing)}; write {how}")
-    return make(kind, given, command.defaults)
+    for row in table:
+        if row.place in given:
+            check_value(row.owner, row.place[-1], given[row.place], row.flag)
+    return make(kind, {place: value for place, value in given.items() if place not in chosen}, defaults)
+
+
+def _word_after(flag: str, args: Sequence[str]) -> str | None:
+    """Return the value that follows an option, or None if it is not given."""
+    for i, arg in enumerate(args):
+        name, joined, value = arg.partition("=")
+        if name.replace("_", "-") == flag:
+            return value if joined else next(iter(args[i + 1 : i + 2]), None)
+    return None
 
 
 class _Reader:

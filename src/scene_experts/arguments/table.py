@@ -6,11 +6,13 @@ import dataclasses
 import functools
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from scene_experts.arguments.option import Option
+from scene_experts.core.fields import Chosen, note, notes_of
+from scene_experts.core.parts import Part, choices
 
 Place = tuple[str, ...]
 """Field names from the root to a value, for example ("cfg", "scene", "voxel_size")."""
@@ -32,6 +34,8 @@ class Row:
     """The dataclass that declares the field."""
     within: tuple[type, str] | None = None
     """The dataclass and field that hold the owner; None at the root."""
+    part: Part | None = None
+    """The default part, where the option chooses another one by its name."""
 
     @property
     def required(self) -> bool:
@@ -72,11 +76,30 @@ def _rows(kind: type, value: Any, prefix: str, place: Place, defaults: Mapping[s
         name = option.name if option.name is not None else field.name.replace("_", "-")
         if option.hidden or not field.init or (part is None and _may_be_dataclass(inner)):
             continue
+        if part is not None and note(kind, field.name, Chosen) is not None:
+            names = Literal[tuple(choices(inner))]  # type: ignore[valid-type]
+            out.append(Row(f"--{prefix}{name}", here, names, default.name, option, kind, within, default))
         if part is not None:
             out += _rows(part, default, f"{prefix}{name}." if name else prefix, here, defaults, (kind, field.name))
         else:
             out.append(Row(f"--{prefix}{name}", here, inner, default, option, kind, within))
     return out
+
+
+def choose_parts(kind: type, defaults: Mapping[str, Any], chosen: Callable[[Row], str | None]) -> dict[str, Any]:
+    """Return the defaults with the parts that `chosen` names, for the rows that choose one. Settings that a part shares with
+    the one that it replaces keep their values."""
+    found = dict(defaults)
+    for row in rows(kind, defaults):
+        name = chosen(row) if row.part is not None else None
+        if row.part is None or name is None or name == row.part.name:  # type: ignore[attr-defined]
+            continue
+        base = notes_of(row.owner)[row.place[-1]][0]
+        part = choices(base).get(name)
+        if part is not None:
+            kept = {f.name for f in fields(part) if f.init} & {f.name for f in fields(row.part)}
+            found[".".join(row.place)] = part(**{name: getattr(row.part, name) for name in kept})
+    return found
 
 
 def make(kind: type, given: Mapping[Place, Any], defaults: Mapping[str, Any]) -> Any:

@@ -83,6 +83,7 @@ def plan(args: list[str]) -> int:
     expect_at_least([("--coarse-anchors", command.coarse_anchors, 0), ("--max-memory", command.max_memory, 0)])
 
     from scene_experts.core.io import write_bytes
+    from scene_experts.data import capture as captures
     from scene_experts.data.blocks import make_blocks, write_plan
     from scene_experts.recipes import RECIPES
     from scene_experts.training import run_folder
@@ -93,7 +94,7 @@ def plan(args: list[str]) -> int:
         raise InputError(f"expected a recipe as --recipe, found '{command.recipe}'{nearest(command.recipe, RECIPES)}; change it")
     lines = commands(command, [(0.0, 0.0, 0.0, 1.0, 1.0, 1.0)] * command.blocks)  # a wrong option is found before the capture is read
     check_trainings(lines, command.data)
-    capture = run_folder.load_capture(run_folder.named(command.data))
+    capture = captures.load(run_folder.named(command.data))
     capture.images.close()
     found = make_blocks(capture, command.blocks, command.margin, command.share)
     write_plan(command.out, capture, found)
@@ -125,7 +126,7 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]], every: int =
     few = ["--max-anchors", str(command.coarse_anchors)] if command.coarse_anchors else []
     cfg = parse_train([*train[2:], "--out", coarse, "--iterations", str(total)]).cfg
     until = max(1, total // 3, cfg.scaled_scene().dense_until)  # a scene is divided among experts before it is cut into blocks
-    own = flags_of(cfg, [("scene.decoder.speed", 0), *(changes(cfg.scene, cfg.scene.of_views(every), "scene.") or [])])
+    own = flags_of(cfg, [("scene.decoder.router.speed", 0), *(changes(cfg.scene, cfg.scene.of_views(every), "scene.") or [])])
     block = [PROG, "train", command.recipe, *data, *without(more, own[::2])]
     same = ["--rates.networks", "0", *own]  # what all anchors share stays equal in all blocks
     lines = [[*train, "--out", coarse, "--iterations", str(total), "--stop-at", str(until), *few, *memory]]

@@ -106,10 +106,10 @@ def table(scenes: tuple[CatalogScene, ...] | list[CatalogScene], root: Path) -> 
 
 def describe(scene: CatalogScene, root: Path) -> list[str]:
     """The lines that describe a scene, with the steps to download it by hand."""
-    from scene_experts.training.config import flag
+    from scene_experts.core.fields import flag_of
 
     c, a = scene.collection, scene.collection.archive
-    numbers = " ".join(f"{flag(place)} {value}" for place, value in c.numbers)
+    numbers = " ".join(f"{flag_of(place)} {value}" for place, value in c.numbers)
     lines = [
         f"{scene.name}: {c.title} ({c.source})",
         f"  licence     {c.licence}",

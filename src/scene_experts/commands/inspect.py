@@ -18,11 +18,12 @@ def info(args: list[str]) -> int:
     from rich.console import Console
 
     from scene_experts.commands.next_step import propose_training
+    from scene_experts.data import capture as captures
     from scene_experts.data.summary import print_summary
     from scene_experts.training import run_folder
 
     console = Console(markup=False, highlight=False)
-    capture = run_folder.load_capture(run_folder.named(data), look=True)
+    capture = captures.load(run_folder.named(data), allow_no_points=True)
     print_summary(capture, console)
     lens = capture.images.sources[0].lens
     console.print(propose_training(data, lens.width, lens.height, len(capture.views)), markup=False, soft_wrap=True)

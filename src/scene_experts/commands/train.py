@@ -19,10 +19,10 @@ from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import HELP, HELP_ALL, Command, HelpAsked, parse
 from scene_experts.arguments.table import rows
 from scene_experts.commands import PROG
-from scene_experts.core.choices import Device, Raster
 from scene_experts.core.errors import InputError, few, nearest
 from scene_experts.core.group import Alone, join
 from scene_experts.core.signals import handled
+from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.catalog import defaults_in
 from scene_experts.data.settings import Data
@@ -32,8 +32,9 @@ from scene_experts.training import run_folder
 from scene_experts.training.batch import check_batch
 from scene_experts.training.config import RunConfig, Train, with_numbers
 from scene_experts.training.events import Exported, Stopped
-from scene_experts.training.loop import Run
+from scene_experts.training.loop import Job
 from scene_experts.training.memory import reuse_freed
+from scene_experts.training.options import TrainOptions
 from scene_experts.training.progress import TrainingProgress
 from scene_experts.training.shards import check_shard
 from scene_experts.view.live import Live
@@ -82,40 +83,21 @@ class TrainCommand:
     out: Annotated[Path, Option(short="-m", value="RUN")]
     """Run folder to write."""
     cfg: Annotated[Train, Option(name="")]
+    options: Annotated[TrainOptions, Option(name="")] = TrainOptions()
     init_from: Annotated[Path | None, Option(value="RUN")] = None
     """Start from the scene of this run, at its iteration; --iterations counts its iterations too. The optimiser starts anew."""
-    overwrite: bool = False
-    """Replace the run in the folder: its checkpoints and results are deleted."""
-    resume: bool = False
-    """Continue from the newest intact checkpoint of the run."""
-    stop_at: int | None = None
-    """Stop at this iteration and leave the schedule as it is; --iterations rescales the schedule."""
-    deterministic: bool = False
-    """Give bit-identical results on the same machine, also after --resume. Slightly slower."""
     shard: bool = False
     """Divide the anchors among the processes of torchrun, so that each needs less memory. The results are those without it,
     up to rounding (docs/scaling.md)."""
-    device: Device = "auto"
-    """Device to train on. auto: CUDA if available."""
-    rasterizer: Raster = "auto"
-    """Rasteriser. auto: the fastest that works on the device."""
-    save_every: int = 5000
-    """Iterations between checkpoints."""
-    preview_every: int = 1000
-    """Iterations between previews of a held-out view in RUN/previews; 0 means none."""
-    max_memory: float = 0.0
-    """Stop densification at this resident memory in GiB; 0 means no limit."""
     viewer: bool = False
     """Show the training in a browser while it runs (needs `pip install 'scene-experts[viewer]'`)."""
     port: int = 8080
     """Port of the viewer. It only accepts connections from this machine."""
-    tensorboard: bool = False
-    """Also write RUN/tensorboard (needs `pip install 'scene-experts[tensorboard]'`)."""
 
 
 def train(args: list[str]) -> int:
     command = parse_train(args)
-    group = join(device_of(command.device))
+    group = join(device_of(command.options.device))
     command = after_restart(replace(command, viewer=command.viewer and group.first), group)
     line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # the command of the whole run
     command, run, capture, rasterize = group.agree(lambda: prepare(command, line, group))
@@ -133,10 +115,10 @@ def train(args: list[str]) -> int:
 def after_restart(command: TrainCommand, group: Alone) -> TrainCommand:
     """Let a command that `torchrun` has restarted continue its run, if the run had begun."""
     begun = group.restarts > 0 and (command.out / "config.json").is_file()
-    return replace(command, resume=True, overwrite=False) if begun else command
+    return replace(command, options=replace(command.options, resume=True, overwrite=False)) if begun else command
 
 
-def prepare(command: TrainCommand, line: str, group: Alone) -> tuple[TrainCommand, Run, Capture, Rasterizer]:
+def prepare(command: TrainCommand, line: str, group: Alone) -> tuple[TrainCommand, Job, Capture, Rasterizer]:
     """Check the options and load the capture. Nothing is written. Raises InputError for invalid options or an invalid capture."""
     if command.viewer:
         check_port(command.port)
@@ -146,28 +128,21 @@ def prepare(command: TrainCommand, line: str, group: Alone) -> tuple[TrainComman
     recording.check_settings(run)
     check_batch(command.cfg.batch, group.size)
     if command.shard:
-        check_shard(command.cfg, command.max_memory, command.viewer)
+        check_shard(command.cfg, command.options.max_memory, command.viewer)
     reuse_freed()
+    options = command.options
     device, rasterize = group.in_turn(
-        lambda: backend(command.device, command.rasterizer, command.cfg.antialias, command.deterministic),
+        lambda: backend(options.device, options.rasterizer, command.cfg.antialias, options.deterministic),
     )
-    run_folder.check(command.out, run.config, command.resume, command.overwrite)
-    return command, replace(run, device=device), run_folder.load_capture(command.data, command.cfg.seed), rasterize
+    run_folder.check(command.out, run.config, options.resume, options.overwrite)
+    return command, replace(run, device=device), captures.load(command.data, command.cfg.seed), rasterize
 
 
-def run_of(command: TrainCommand, line: str) -> Run:
+def run_of(command: TrainCommand, line: str) -> Job:
     """What the loop needs to know of the command, on the CPU. line: the command line, for config.json."""
     start = None if command.init_from is None else command.init_from.absolute()
-    versions, most = run_folder.versions(), command.max_memory
-    return Run(
-        config=RunConfig(command.cfg, command.data, line, command.deterministic, command.stop_at, versions, most, start),
-        out=command.out,
-        resume=command.resume,
-        shard=command.shard,
-        save_every=command.save_every,
-        preview_every=command.preview_every,
-        max_memory=command.max_memory,
-    )
+    config = RunConfig.of(command.cfg, command.data, command.options, line, run_folder.versions(), start)
+    return Job(config, command.out, options=command.options, shard=command.shard)
 
 
 def parse_train(args: list[str]) -> TrainCommand:
@@ -222,7 +197,7 @@ def help_of_recipes() -> str:
     return "\n\n".join([*parts, f"`{PROG} train RECIPE --help` shows the options of a recipe."])
 
 
-def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasterizer, console: Console) -> int:
+def follow(command: TrainCommand, run: Job, capture: Capture, rasterize: Rasterizer, console: Console) -> int:
     """Train and show the events; Ctrl-C, SIGTERM and a closed terminal save and end the run."""
 
     def stop(number: int, _: object) -> None:
@@ -238,7 +213,7 @@ def follow(command: TrainCommand, run: Run, capture: Capture, rasterize: Rasteri
         run = replace(run, watch=live)
     with handled(stop), TrainingProgress(console, out=command.out) as progress:
         try:
-            for event in recording.train(run, capture, rasterize, overwrite=command.overwrite, tensorboard=command.tensorboard):
+            for event in recording.train(run, capture, rasterize):
                 progress(event)
                 stopped = stopped or isinstance(event, Stopped)
                 if isinstance(event, Exported):

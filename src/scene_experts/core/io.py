@@ -56,6 +56,7 @@ _PLACE = (
     errno.EPERM,
     errno.EROFS,
 )  # errors of the path, not of free space
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)  # of a file system without locks
 
 
 def _unwritable(path: Path, error: OSError, option: str = "--out") -> RunError:
@@ -85,10 +86,29 @@ def locked(path: Path, busy: str) -> Iterator[None]:
     except Timeout:
         raise InputError(busy) from None
     except (NotImplementedError, OSError) as error:
-        if isinstance(error, OSError) and error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP):
+        if isinstance(error, OSError) and error.errno not in _NO_LOCKS:
             raise _unwritable(path, error) from error
         log.warning("%s is on a file system without locks; do not use this folder from two processes at once", path.parent)
         yield
+        return
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextmanager
+def waiting(path: Path) -> Iterator[None]:
+    """Hold the lock file `path` for a moment; wait while another process holds it. Raises RunError after a minute."""
+    lock = _make_lock(path)
+    try:
+        lock.acquire(timeout=60)
+    except Timeout:
+        raise RunError(f"cannot write beside {path}: another process has held this lock for a minute; end it") from None
+    except (NotImplementedError, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in _NO_LOCKS:
+            raise _unwritable(path, error) from error
+        yield  # a file system without locks
         return
     try:
         yield

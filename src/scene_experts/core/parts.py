@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
+
+from scene_experts.core.fields import scale
 
 
 @dataclasses.dataclass(frozen=True)
@@ -11,15 +13,18 @@ class Part:
     """A part of a recipe: a frozen dataclass of numbers.
 
     Each field is a flag on the command line, and the docstring of the field is its help text. config.json stores the class name of a
-    part. Parts of other packages must be registered with `register`.
+    part. Annotations of a field state its range, whether it is scaled and where it has an effect (`core/fields.py`). A part with
+    relations between fields has a method `check(flag)`, which raises InputError. Parts of other packages must be registered with
+    `register`.
     """
 
-    def scaled(self, factor: float) -> Self:
-        """Return the part with its schedule scaled by `factor`. The default returns the part unchanged."""
-        return self
+    changes: ClassVar[tuple[str, ...]] = ()
+    """One sentence for each change, since the first release, of what the part computes with the same settings, a new default included.
+    Their number is part of the names of runs and records with this part, so that only these are trained again."""
 
-    def check(self) -> None:
-        """Check the settings. Raises InputError, which names the flag, if a setting is invalid. The default accepts all settings."""
+    def scaled(self, factor: float) -> Self:
+        """Return the part for a training that is `factor` times as long: settings marked `SCALES` are multiplied."""
+        return scale(self, factor)
 
 
 P = TypeVar("P", bound=Part)
@@ -62,6 +67,11 @@ def find(name: str, kind: type[P]) -> type[P] | None:
     """Return the registered subclass of `kind` with the name `name`, or None."""
     part = _REGISTERED.get(name)
     return part if part is not None and issubclass(part, kind) else None
+
+
+def choices(kind: type[P]) -> dict[str, type[P]]:
+    """Return the registered subclasses of `kind` that have a `name`, by that name."""
+    return {str(part.name): part for part in _REGISTERED.values() if issubclass(part, kind) and hasattr(part, "name")}  # type: ignore[attr-defined]
 
 
 def names_of(kind: type[Part]) -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import default_of
 from scene_experts.core.parts import Part, find, names_of
 from scene_experts.core.reading.source import shorten
 
@@ -27,6 +28,27 @@ def to_json(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [to_json(v) for v in value]
     return str(value) if isinstance(value, Path) else value
+
+
+def lean(value: Any) -> Any:
+    """Convert nested dataclasses to plain JSON values without the settings that have the default of their dataclass.
+
+    `from_json` reads the result back. A part with `changes` has their number under "version".
+    """
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return to_json(value)
+    own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    kept = {f.name: lean(own[f.name]) for f in dataclasses.fields(value) if own[f.name] != default_of(f) or versions_of(own[f.name])}
+    version = {"version": len(value.changes)} if isinstance(value, Part) and value.changes else {}
+    return {"type": type(value).__name__, **version, **kept}
+
+
+def versions_of(value: Any) -> bool:
+    """Whether a dataclass or one in it is a part with `changes`."""
+    if not dataclasses.is_dataclass(value):
+        return False
+    changed = isinstance(value, Part) and bool(value.changes)
+    return changed or any(versions_of(getattr(value, f.name)) for f in dataclasses.fields(value))
 
 
 def from_json(kind: Any, value: Any, where: str = "config") -> Any:
@@ -93,7 +115,7 @@ def _from_object(kind: Any, value: Any, where: str) -> Any:
     _expect(isinstance(value, dict), "an object", where, value)
     hints = typing.get_type_hints(kind)  # without the annotations for the command line
     known = {f.name for f in dataclasses.fields(kind)}
-    unknown = set(value) - known - {"type"}
+    unknown = set(value) - known - {"type", "version"}
     _expect(not unknown, f"only the keys {sorted(known)}", where, sorted(unknown))
     needed = [f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING]
     _expect(not set(needed) - set(value), f"the keys {needed}", where, sorted(set(value) - {"type"}))

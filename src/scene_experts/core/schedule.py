@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Annotated
+
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import SCALES, Count, Flag
 
 
 @dataclass(frozen=True)
 class Every:
     """True at the multiples of `interval` strictly between `start` and `stop` (as Scaffold-GS compares them)."""
 
-    start: int
+    start: Annotated[int, SCALES]
     """Iteration after which it begins."""
-    stop: int
+    stop: Annotated[int, SCALES]
     """Iteration before which it ends."""
-    interval: int
+    interval: Count
     """Iterations between two steps."""
 
     def due(self, step: int) -> bool:
@@ -23,10 +27,6 @@ class Every:
     def count(self, last: int) -> int:
         """Return the number of iterations from 1 to `last` at which it is true."""
         return sum(self.due(step) for step in range(self.interval, min(self.stop, last + 1), self.interval))
-
-    def scaled(self, factor: float) -> Every:
-        """Return the window for a training that is `factor` times as long. The interval does not change."""
-        return replace(self, start=round(self.start * factor), stop=round(self.stop * factor))
 
 
 def passes(step: int, views: int, interval: int) -> bool:
@@ -54,3 +54,7 @@ class Rate:
 
     def times(self, factor: float) -> Rate:
         return Rate(self.first * factor, self.last * factor)
+
+    def check(self, flag: Flag) -> None:
+        if not (self.first > 0 < self.last or self.first == self.last == 0):
+            raise InputError(f"expected {flag('')} to run between two rates above 0, or to be 0, found {self.first} and {self.last}")

@@ -145,5 +145,4 @@ class Decoded:
     rows: Tensor  # [A] int64, rows of the table that were decoded
     raw_opacity: Tensor | None  # [A, K] before masking; None for explicit scenes
     routing: dict[str, Routing]  # by attribute; empty without experts
-    scene_opacity: Tensor | None = None  # [N, K] of all anchors, visible or not; only if the loss needs it
     population: tuple[Tensor, Tensor] | None = None  # explicit scenes: opacity logits [N], log-scales [N, 3] of all Gaussians

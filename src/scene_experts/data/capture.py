@@ -5,104 +5,88 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 
-from scene_experts.core.errors import InputError, nearest
+from scene_experts.core.errors import InputError, few, nearest
+from scene_experts.core.fields import check_fields
 from scene_experts.core.reading.budget import CAPTURE
 from scene_experts.core.reading.numbers import FARTHEST, expect_range, number
 from scene_experts.core.reading.source import guarding, sentence
 from scene_experts.core.types import Camera
 from scene_experts.data import prepare
+from scene_experts.data.blocks import read_view_names
 from scene_experts.data.images import FrameSource, check_policy, fits, probe
 from scene_experts.data.lens import Lens, centre_principal_point, to_pinhole
 from scene_experts.data.match import to_relative_name
 from scene_experts.data.readers import PosedImage, RawCapture, ReadOptions, find_reader, tell_others, unrecognised_error
+from scene_experts.data.settings import Data
 from scene_experts.data.store import ImageStore
 from scene_experts.data.views import Capture, Frame, Vector, View, World
 
 __all__ = ["Capture", "Frame", "View", "World", "load"]
 
 
-def load(
-    path: Path | str,
-    *,
-    images: str | None = None,
-    resolution: str = "auto",
-    split: str = "auto",
-    normalise: Literal["extent", "none"] = "extent",
-    init: Literal["points", "random"] = "points",
-    max_views: int | None = None,
-    ignore_principal_point: bool = False,
-    background: Vector | None = None,
-    cache_bytes: int | None = None,
-    missing: Literal["error", "drop"] = "error",
-    seed: int = 0,
-    allow_no_points: bool = False,
-) -> Capture:
-    """Load the capture in the folder `path`.
+def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_bytes: int | None = None) -> Capture:
+    """Load the capture that `data` describes.
 
     The kind is recognised by its files: COLMAP (sparse/0 and images), NeRF-synthetic (transforms_train.json), nerfstudio
     (transforms.json), or a kind whose reader was registered (see `data.readers`).
 
     Args:
-        images: Folder of the photographs, relative to `path`, e.g. "images_4". Intrinsics are scaled to the sizes found there.
-        resolution: "auto" (the same as "cap1600"), "as-is", "cap1600", "factor:N", "longest:N", "share:S", or "inria:N" (the
-            folder images_N without resizing). See `images.target_size`.
-        split: "auto", "modN", "first:N", "none" or "files". "auto" is "files" if the files state a split, otherwise "mod8".
-            See `prepare.hold_out`.
-        normalise: "extent" trains in a world that is centred on the mean training camera and has extent 5; "none" trains in
-            the capture's own frame.
-        init: "points" requires 3D points; "random" replaces them by random points.
-        max_views: Largest number of views, spread evenly over the sorted names. None loads all.
-        ignore_principal_point: Assume the principal point at the image centre, as the original code of 3DGS does.
-        background: RGB in [0, 1] behind the scene. None is white for NeRF-synthetic and black otherwise.
-        cache_bytes: Memory for decoded frames. None is a third of the free memory.
-        missing: "error" or "drop", for absent images of a COLMAP capture.
-        seed: Seed of the random points.
+        seed: Seed of random points.
         allow_no_points: Load a capture without 3D points, with a warning. Training cannot start from it.
+        cache_bytes: Memory for decoded frames. None is a third of the free memory.
 
     Raises:
-        InputError: if the capture or an argument cannot be used. The message says what to change.
+        InputError: if the capture or a setting cannot be used. The message says what to change.
     """
-    root = Path(path)
-    policy = check_policy(resolution)
+    check_fields(data)
+    root, policy = data.path, check_policy(data.resolution)
     with guarding(root, CAPTURE):  # a reader of another package may raise anything
-        raw, capture = _read(root, images, policy, missing, ignore_principal_point, background, cache_bytes)
-        if max_views is not None:
-            capture = prepare.limit_views(capture, max_views)
+        raw, capture = _read(data, policy, cache_bytes)
+        if data.max_views is not None:
+            capture = prepare.limit_views(capture, data.max_views)
         capture = prepare.drop_outlier_views(capture)
         auto = "files" if capture.states_split or capture.test else "mod8"
-        capture = prepare.measure_extent(prepare.hold_out(capture, auto if split == "auto" else split))
-        if normalise == "extent":
+        capture = prepare.measure_extent(prepare.hold_out(capture, auto if data.split == "auto" else data.split))
+        if data.normalise == "extent":
             capture = prepare.normalise(capture)
         capture = prepare.drop_outliers(capture)
-        if init == "random" or (capture.points is None and capture.bounds is not None):
-            capture = _add_random_points(capture, seed, warn=init != "random")
+        if data.init == "random" or (capture.points is None and capture.bounds is not None):
+            capture = _add_random_points(capture, seed, warn=data.init != "random")
         elif capture.points is None:
             capture = _check_no_points(capture, raw.points_source, allow_no_points)
-        return _finish(prepare.downscale(capture, policy))
+        capture = _finish(prepare.downscale(capture, policy))
+    if data.views is not None:
+        capture = choose_views(capture, data.views)
+    if data.near is None:
+        return capture
+    return replace(capture, views=tuple(replace(v, camera=replace(v.camera, near=data.near)) for v in capture.views))
 
 
-def _read(
-    root: Path,
-    images: str | None,
-    policy: str,
-    missing: Literal["error", "drop"],
-    centred: bool,
-    background: Vector | None,
-    cache_bytes: int | None,
-) -> tuple[RawCapture, Capture]:
-    """Read the capture in `root` in its own frame, at the resolution of its files."""
-    options = ReadOptions(_find_image_folder(root, images, policy), background, missing)
+def choose_views(capture: Capture, path: Path) -> Capture:
+    """Return the capture with only those training views that the JSON list at `path` names. Raises InputError for unknown names."""
+    names = set(read_view_names(path))
+    chosen = tuple(index for index in capture.train if capture.views[index].name in names)
+    if len(chosen) < len(names):
+        unknown = sorted(names - {capture.views[index].name for index in chosen})
+        capture.images.close()
+        raise InputError(f"expected training views of {capture.root} in {path}, found {few(unknown)}; correct --views")
+    return replace(capture, train=chosen, left_out=tuple(index for index in capture.train if index not in chosen))
+
+
+def _read(data: Data, policy: str, cache_bytes: int | None) -> tuple[RawCapture, Capture]:
+    """Read a capture in its own frame, at the resolution of its files."""
+    root, background = data.path, data.background
+    options = ReadOptions(_find_image_folder(root, data.images, policy), background, data.missing)
     reader = find_reader(root)
     if reader is None:
         raise unrecognised_error(root)
     raw = reader.read(root, options)
     raw = replace(raw, warnings=[*raw.warnings, *tell_others(root, reader)])
-    return raw, _assemble(root, reader.name, raw, centred, background, cache_bytes)
+    return raw, _assemble(root, reader.name, raw, data.ignore_principal_point, background, cache_bytes)
 
 
 def _find_image_folder(root: Path, images: str | None, policy: str) -> str | None:

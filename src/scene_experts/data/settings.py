@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from scene_experts.arguments.option import Option
+from scene_experts.core.fields import Range
+from scene_experts.core.plain import lean
 
 
 @dataclass(frozen=True)
@@ -22,8 +25,8 @@ class Data:
     """Size of the training pictures: as-is, factor:N (sides divided by N), longest:PX, cap1600 (width at most 1600 px), share:S (a
     share of what cap1600 gives), inria:N (as factor:N from the folder images_N) or auto (cap1600)."""
     split: Annotated[str, Option(value="RULE")] = "auto"
-    """Which views are held out: mod8 (every 8th), mod:N (every Nth), fold:K/N (every Nth from the Kth), first:N, none, files (as the capture's files say) or auto (files if
-    they say it, else mod8)."""
+    """Which views are held out: mod8 (every 8th), mod:N (every Nth), fold:K/N (every Nth from the Kth), first:N, none, files
+    (as the capture's files say) or auto (files if they say it, else mod8)."""
     missing: Literal["error", "drop"] = "error"
     """What to do if the photograph of a view is missing: stop, or drop the view."""
     normalise: Literal["extent", "none"] = "extent"
@@ -31,22 +34,18 @@ class Data:
     own units."""
     init: Literal["points", "random"] = "points"
     """Start from the capture's 3D points, or from random points."""
-    max_views: int | None = None
+    max_views: Annotated[int | None, Range(1)] = None
     """Use at most this many views, evenly spread."""
-    near: float | None = None
+    near: Annotated[float | None, Range(above=0, below=math.inf)] = None
     """Nearest depth that is drawn, in trained units; by default min(0.2, 0.02 x scene radius). The reference implementations use 0.2 in any
     unit."""
     ignore_principal_point: bool = False
     """Assume that the principal point is the centre of the picture, as the reference implementations do."""
     views: Annotated[Path | None, Option(value="FILE")] = None
     """Train only on the training views that this JSON list names. The world and the held-out views stay those of the whole capture."""
-    background: tuple[float, float, float] | None = None
-    """Background colour, RGB in [0, 1]; by default that of the kind of capture (white for NeRF-synthetic, else black)."""
+    background: Annotated[tuple[float, float, float] | None, Range(0, 1)] = None
+    """Background colour, RGB; by default that of the kind of capture (white for NeRF-synthetic, else black)."""
 
     def settings(self) -> dict[str, Any]:
-        """How the capture is read, as plain JSON, without its path."""
-        values = {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items() if name != "path"}
-        views = values.pop("views")  # newer than the first records, so left out unless it is given
-        if views is not None:
-            values["views"] = str(views)
-        return {"type": "Data", **values}
+        """What differs from the defaults of how a capture is read, as plain JSON, without its path."""
+        return {name: value for name, value in lean(self).items() if name != "path"}

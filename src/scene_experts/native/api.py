@@ -10,7 +10,7 @@ import ctypes
 from ctypes import POINTER, Structure, c_double, c_float, c_int32, c_int64, c_void_p
 from typing import Any
 
-ABI_VERSION = 9
+ABI_VERSION = 10
 
 HEAD_TENSORS = ("router_w", "router_b", "w1", "b1", "middle_w", "middle_b", "w2", "b2")
 """The weights of a decoder head, in the order of `SeDecodeHead`."""
@@ -50,8 +50,8 @@ class SeRasterBackward(Structure):
 class SeDecodeHead(Structure):
     _fields_ = [
         *_fields(c_void_p, *HEAD_TENSORS, "gates", "chosen", "chosen_weight"),
-        *_fields(c_void_p, *(f"d_{name}" for name in (*HEAD_TENSORS, "gates"))),
-        *_fields(c_int64, "E", "k", "H", "L", "out", "distance", "position", "linear", "shared", "margin"),
+        *_fields(c_void_p, *(f"d_{name}" for name in (*HEAD_TENSORS, "gates", "weight"))),
+        *_fields(c_int64, "E", "k", "H", "L", "out", "distance", "position"),
     ]
 
 

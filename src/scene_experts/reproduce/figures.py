@@ -86,13 +86,12 @@ def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str,
     """Draw Figure 3: each expert's share of the assignments (of the gates while dense) during training, one panel per row."""
     found = [(name, select(records, recipe, scene)) for name, recipe in experiment.rows.items()]
     found = [(name, min(rows, key=lambda r: r.seed)) for name, rows in found if rows]
-    found = [(name, record) for name, record in found if any(attribute in c.get("routing", {}) for c in record.curves)]
+    found = [(name, record) for name, record in found if any(attribute in c.get("scene_routing", {}) for c in record.curves)]
     if not found:
         return []
     figure, axes = canvas(len(found))
     for axis, (name, record) in zip(axes[0], found):
-        whose = "scene_routing" if any("scene_routing" in c for c in record.curves) else "routing"  # older records: anchors of one view
-        points = [(c["step"], c[whose][attribute]) for c in record.curves if attribute in c.get(whose, {})]
+        points = [(c["step"], c["scene_routing"][attribute]) for c in record.curves if attribute in c.get("scene_routing", {})]
         for e in range(len(points[0][1]) if points else 0):
             axis.plot([s for s, _ in points], [100 * v[e] for _, v in points], color=COLOURS[e], label=f"expert {e + 1}")
         dense = record.config.train.scaled().scene.dense_until

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.plain import to_json
+from scene_experts.core.fields import flag_of
+from scene_experts.core.plain import lean
 from scene_experts.data.fetch import catalog
 from scene_experts.data.fetch.obtain import is_present
 from scene_experts.data.images import check_policy
@@ -21,38 +22,9 @@ from scene_experts.data.readers import is_capture, unrecognised_error
 from scene_experts.data.settings import Data
 from scene_experts.reproduce.experiments import Experiment
 from scene_experts.reproduce.variants import base, flags, read_line
-from scene_experts.training.config import Train, flag, flags_of
+from scene_experts.training.config import Train, flags_of
 
 COLLECTIONS = {"mipnerf360": "MipNeRF360", "tandt": "TanksAndTemples", "db": "DeepBlending", "bungeenerf": "BungeeNeRF"}
-NEWER = {
-    "optimizer",
-    "average",
-    "batch",
-    "batch_rates",
-    "loss.residual_quantile",
-    "loss.residual_weight",
-    "loss.residual_from",
-    "growth.gradient",
-    "growth.error_views",
-    "growth.error_quantile",
-    "growth.error_share",
-    "growth.least_contribution",
-    "growth.mask_contribution",
-    "growth.mask_at",
-    "growth.mask_views",
-    "growth.bounds",
-    "rates.networks",
-    "rates.anneal",
-    "rates.anneal_from",
-    "scene.smoothing",
-    "scene.dropout",
-    "scene.dropout_full",
-    "scene.few_views",
-    "scene.view_jitter",
-    "scene.decoder.shared",
-    "scene.decoder.router.weights",
-}
-"""Settings of Train that the first records do not have. Their default values do not change a run's hash: add each new setting here."""
 OWN = "captures"  # the data set of the user's own captures
 
 
@@ -154,7 +126,7 @@ class Spec:
         args += ["--iterations", str(self.train.iterations), "--seed", str(self.seed), "--preview-every", "0"]
         own = flags(self.recipe)
         given = {word.partition("=")[0] for word in own}
-        args += flags_of(self.train, [(place, value) for place, value in self.scene.numbers if flag(place) not in given]) + own
+        args += flags_of(self.train, [(place, value) for place, value in self.scene.numbers if flag_of(place) not in given]) + own
         for name, value in vars(self.data).items():
             if name != "path" and value != getattr(Data(path=self.scene.path), name):
                 args += [f"--{name.replace('_', '-')}", str(value)]
@@ -162,11 +134,11 @@ class Spec:
 
 
 def identity(scene: str, train: Train, data: Data, code: str = "", start: Path | None = None) -> str:
-    """Return the hash that names a run: of the scene's name, the recipe with all numbers, how the capture is read (not of its path),
-    the code of other packages (`code_of`), and the name of the run whose scene it started from."""
+    """Return the hash that names a run: of the scene's name, what differs from the defaults of the recipe's parts (`lean`) and of how the
+    capture is read (not its path), the code of other packages (`code_of`), and the name of the run whose scene it started from."""
     more = [code] if code else []
     more += [f"from {start.name}"] if start else []
-    text = json.dumps([scene, without_newer(to_json(train), train), data.settings(), *more], sort_keys=True)
+    text = json.dumps([scene, lean(train), data.settings(), *more], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
@@ -198,19 +170,6 @@ def parts_of(value: Any) -> Iterator[Any]:
     elif isinstance(value, (tuple, list)):
         for entry in value:
             yield from parts_of(entry)
-
-
-def without_newer(plain: dict[str, Any], part: Any, place: str = "") -> dict[str, Any]:
-    """Return `plain`, the JSON of a dataclass `part` of Train, without the settings of NEWER that have their defaults."""
-    kept = dict(plain)
-    for f in dataclasses.fields(part):
-        name, value = f"{place}{f.name}", getattr(part, f.name)
-        default = f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
-        if name in NEWER and value == default:
-            del kept[f.name]
-        elif dataclasses.is_dataclass(value):
-            kept[f.name] = without_newer(plain[f.name], value, f"{name}.")
-    return kept
 
 
 def find_own_scenes(captures: Sequence[Path]) -> list[Scene]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from scene_experts.core.io import write_bytes
+from scene_experts.data import capture as captures
 from scene_experts.evaluate import pictures
 from scene_experts.evaluate.experts import draw_expert_strip
 from scene_experts.evaluate.tables import ResultTable
@@ -142,7 +143,7 @@ def strip_path(out: Path, scene: str) -> Path:
 def draw_experts(spec: Spec, run: Path, out: Path, attribute: str = "color") -> Path:
     """Draw Figure 5 of a run: the first held-out view, then the anchors of each expert alone. Returns `strip_path`."""
     opened = run_folder.open_run(run)
-    capture = run_folder.load_capture(replace(opened.config.data, path=spec.scene.path), spec.seed)
+    capture = captures.load(replace(opened.config.data, path=spec.scene.path), spec.seed)
     try:
         index = (capture.test or capture.train)[0]
         rasterize = choose("auto", "cpu", antialias=opened.config.train.antialias)

@@ -173,24 +173,24 @@ def student(freedom: float) -> float:
 
 
 def compare_fit(a: Sequence[Record], b: Sequence[Record]) -> float | None:
-    """Average A - B in PSNR (dB) of the training views, paired by iteration, over the second half of the trainings.
+    """Average A - B in PSNR (dB) of the training views over the second half of the trainings (`Record.fit`), paired by run.
 
     Trainings with the same seed see the same views in the same order, whatever the recipe, unless one draws random backgrounds and the
     other does not: such pairs are left out. The mean is over seeds, then over captures. None where nothing pairs.
     """
-    theirs = {(r.scene, r.seed, r.config.train.random_background): training_psnr(r) for r in b}
+    theirs = {_views_seen(r): r.fit for r in b}
     found: dict[str, list[float]] = {}
     for record in a:
-        mine, other = training_psnr(record), theirs.get((record.scene, record.seed, record.config.train.random_background), {})
-        steps = [step for step in mine if step in other and 2 * step > record.config.train.iterations]
-        if steps:
-            found.setdefault(record.scene, []).append(statistics.fmean(mine[step] - other[step] for step in steps))
+        other = theirs.get(_views_seen(record))
+        if record.fit is not None and other is not None:
+            found.setdefault(record.scene, []).append(record.fit - other)
     return statistics.fmean(statistics.fmean(seeds) for seeds in found.values()) if found else None
 
 
-def training_psnr(record: Record) -> dict[int, float]:
-    """Return the PSNR (dB) of each iteration's training view, by iteration."""
-    return {point["step"]: point["psnr"] for point in record.curves if point.get("psnr") is not None}
+def _views_seen(record: Record) -> tuple[str, int, bool, int]:
+    """Return what decides which training views are drawn at which logged iteration, and over which background."""
+    train = record.config.train
+    return record.scene, record.seed, train.random_background, train.iterations
 
 
 def clock_of(records: Iterable[Record]) -> str:

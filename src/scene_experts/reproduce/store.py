@@ -1,6 +1,7 @@
-"""Records of finished runs: one JSON file a run with its configuration, results, scores by view and training curves.
+"""Records of finished runs: one JSON file a capture, with the configuration, results, scores by view and curves of each run.
 
-A record holds everything that the tables and figures need. It takes about 20 kB, so it can be committed where checkpoints cannot.
+A record holds everything that the tables and figures need. It takes at most 8 kB, so it can be committed where checkpoints
+cannot. Its configuration states what differs from the defaults (`core.plain.lean`).
 """
 
 from __future__ import annotations
@@ -17,21 +18,25 @@ from statistics import fmean
 from typing import Any
 
 from scene_experts.core.errors import InputError, few
-from scene_experts.core.io import read_json, write_bytes
-from scene_experts.core.plain import from_json, to_json
+from scene_experts.core.io import read_json, waiting, write_bytes
+from scene_experts.core.plain import from_json, lean
 from scene_experts.core.reading.budget import JSON, RUN, Damaged
 from scene_experts.core.reading.plain import read_json_lines
 from scene_experts.core.reading.source import guarding
+from scene_experts.data import capture as captures
 from scene_experts.data.views import same_poses
 from scene_experts.evaluate.results import load_results
 from scene_experts.reproduce.columns import columns, length, rows, text
 from scene_experts.reproduce.plan import Spec, identity
 from scene_experts.training.config import RunConfig
-from scene_experts.training.run_folder import load_capture, read_config
+from scene_experts.training.run_folder import read_config
 
-FORMAT = 2  # format 1 has a row for each view and each point of a curve
-POINTS = 60  # the most samples of a training curve
-CURVES = ("step", "seconds", "psnr", "anchors", "active", "routing", "entropy", "scene_routing", "scene_gates")
+FORMAT = 3
+DIGITS = 6  # decimals of numbers
+SAMPLES = 60  # the most iterations whose PSNR counts in `Record.fit`
+POINTS = 30  # the most points of a training curve
+CURVES = {"step": 0, "seconds": 1, "psnr": 3, "anchors": 0, "scene_routing": 3}
+"""Columns of a curve, and their decimals."""
 MEANS = ("psnr", "ssim", "lpips", "lpips_3dgs")
 PER_VIEW = (*MEANS, "activation_ratio", "gaussians_rendered")
 
@@ -40,8 +45,10 @@ PER_VIEW = (*MEANS, "activation_ratio", "gaussians_rendered")
 class Record:
     """One finished run.
 
-    `results` is its results.json. `per_view` maps the name of a held-out view to its scores (PER_VIEW). `curves` holds the values of
-    CURVES at up to POINTS iterations. `code` is a hash of the code of other packages that it was trained with (`plan.code_of`).
+    `results` is its results.json. `per_view` maps the name of a held-out view to its scores (PER_VIEW). `curves` holds the
+    values of CURVES at up to POINTS iterations. `fit` is the mean PSNR (dB) of the training views over the second half of the
+    training, at up to SAMPLES iterations in all; None where none was logged. `code` is a hash of the code of other packages
+    that it was trained with (`plan.code_of`).
     """
 
     scene: str
@@ -49,6 +56,7 @@ class Record:
     results: dict[str, Any]
     per_view: dict[str, dict[str, Any]]
     curves: list[dict[str, Any]]
+    fit: float | None = None
     code: str = ""
 
     @cached_property
@@ -102,14 +110,8 @@ def _make_record(run: Path, scene: str, config: RunConfig, results: dict[str, An
     views = read_json(run / "per_view.json", "scores by view")
     per_view = {name: {k: facts[k] for k in PER_VIEW if facts.get(k) is not None} for name, facts in views.items()}
     check_means(results, per_view, f"in {run}", f"run `scene-experts eval {run}` again")
-    return Record(
-        scene=scene,
-        config=config,
-        results=results,
-        per_view=per_view,
-        curves=read_curves(run / "metrics.jsonl"),
-        code=code,
-    )
+    lines = read_curves(run / "metrics.jsonl")
+    return Record(scene, config, results, per_view, thin(lines), fit_of(lines, config.train.iterations), code)
 
 
 def check_means(results: dict[str, Any], per_view: dict[str, dict[str, Any]], where: str, advice: str) -> None:
@@ -121,104 +123,144 @@ def check_means(results: dict[str, Any], per_view: dict[str, dict[str, Any]], wh
 
 
 def read_curves(path: Path) -> list[dict[str, Any]]:
-    """Read up to POINTS lines of a metrics file, evenly spread, with the last line among them."""
+    """Read up to SAMPLES lines of a metrics file, evenly spread, with the last line among them."""
     lines = []
     for found in read_json_lines(path) if path.is_file() else []:
         psnr = found.get("psnr")
         if isinstance(psnr, (int, float)) and math.isfinite(psnr):
             lines.append({k: found[k] for k in CURVES if k in found})
-    if len(lines) <= POINTS:
-        return lines
-    return [lines[round(i * (len(lines) - 1) / (POINTS - 1))] for i in range(POINTS)]
+    return spread(lines, SAMPLES)
 
 
-def record_path(store: Path, record: Record) -> Path:
-    return store / record.scene / record.recipe / f"seed{record.seed}-{record.key}.json"
+def fit_of(lines: Sequence[dict[str, Any]], iterations: int) -> float | None:
+    """Return the mean PSNR (dB) of the training views in the second half of a training; None without any."""
+    late = [line["psnr"] for line in lines if 2 * line["step"] > iterations]
+    return fmean(late) if late else None
+
+
+def thin(lines: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return up to POINTS of the lines, with the decimals of CURVES. Every second one has the shares of the experts."""
+    found = [{name: rounded(value, CURVES[name]) for name, value in line.items()} for line in spread(lines, POINTS)]
+    return [{**line, "scene_routing": {}} if i % 2 and "scene_routing" in line else line for i, line in enumerate(found)]
+
+
+def spread(lines: Sequence[Any], most: int) -> list[Any]:
+    """Return at most `most` of the lines, evenly spread, the first and the last among them."""
+    if len(lines) <= most:
+        return list(lines)
+    return [lines[round(i * (len(lines) - 1) / (most - 1))] for i in range(most)]
+
+
+def record_path(store: Path, scene: str) -> Path:
+    """Return the file with the records of a capture."""
+    return store / f"{scene}.json"
 
 
 def write(store: Path, record: Record) -> Path:
-    """Write a record with hashes of its configuration and its results; return its path."""
-    config = to_json(record.config)
-    config["data"]["path"] = record.scene  # do not publish where the capture was
-    config["command"] = ""
-    if start := config.pop("init_from"):
-        config["init_from"] = Path(start).name
-    results = without_places(record.results)
-    value = {
-        "scene": record.scene,
-        "key": record.key,
-        "config_sha256": digest(config),
-        "results_sha256": digest(results),
-        "config": config,
-        "results": results,
-        "per_view": record.per_view,
-        "curves": record.curves,
-    }
-    if record.code:
-        value["code"] = record.code
-    path = record_path(store, record)
-    write_bytes(path, pack(value).encode())
+    """Add a record to the file of its capture, in place of one of the same run; return the path of the file.
+
+    Several processes, also of several machines, may write at once.
+    """
+    path = record_path(store, record.scene)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with waiting(path.with_name(f".{path.name}.lock")):
+        found = {each["key"]: each for each in _read_file(path)} if path.is_file() else {}
+        found[record.key] = pack(record)
+        lines = (text(each, 0) for each in sorted(found.values(), key=lambda each: (each["recipe"], each["seed"], each["key"])))
+        body = ",\n".join(lines)
+        write_bytes(path, f'{{"format":{FORMAT},"scene":{json.dumps(record.scene)},"runs":[\n{body}\n]}}\n'.encode())
     return path
+
+
+def pack(record: Record) -> dict[str, Any]:
+    """Return the JSON of a record: what differs from the defaults, scores by view and curves as columns, and a checksum."""
+    config = lean(replace(record.config, data=replace(record.config.data, path=Path(record.scene)), command="", versions={}))
+    if start := config.pop("init_from", None):
+        config["init_from"] = Path(start).name
+    value = {
+        "key": record.key,
+        "recipe": record.recipe,
+        "seed": record.seed,
+        "config": config,
+        "results": short_results(record.results),
+        "per_view": {"names": list(record.per_view), "scores": columns(rounded(list(record.per_view.values())))},
+        "curves": columns(record.curves),
+        "fit": rounded(record.fit),
+        **({"code": record.code} if record.code else {}),
+    }
+    return {**value, "sha256": digest(value)}
+
+
+def short_results(results: dict[str, Any]) -> dict[str, Any]:
+    """Return results as a record keeps them: shares of experts with 3 decimals, no places of a machine."""
+    own = rounded(without_places(results))
+    return {**own, "experts": rounded(own["experts"], 3)} if "experts" in own else own
+
+
+def rounded(value: Any, digits: int = DIGITS) -> Any:
+    """Return a JSON value whose numbers have at most `digits` decimals."""
+    if isinstance(value, dict):
+        return {name: rounded(each, digits) for name, each in value.items()}
+    if isinstance(value, list):
+        return [rounded(each, digits) for each in value]
+    return round(value, digits) if isinstance(value, float) else value
 
 
 def without_places(results: dict[str, Any]) -> dict[str, Any]:
     """Return the results with the names of the files of LPIPS's weights alone: where they were on a machine is not published."""
     found = results.get("lpips_weights", {})
-    named = {net: place[: len("cache ")] * place.startswith("cache ") + re.split(r"[/\\]", place)[-1] for net, place in found.items()}
+    cached = {net: "cache " * place.startswith("cache ") for net, place in found.items()}
+    named = {net: cached[net] + re.split(r"[/\\]", place.removeprefix(cached[net]))[-1] for net, place in found.items()}
     return {**results, "lpips_weights": named} if named else results
 
 
-def pack(value: dict[str, Any]) -> str:
-    """Return the text of a record file: scores by view and curves as columns, one entry a line."""
-    views, curves = value["per_view"], value["curves"]
-    scores = {"names": list(views), "scores": columns(list(views.values()))}
-    return text({"format": FORMAT, **value, "per_view": scores, "curves": columns(curves)}) + "\n"
+def read(path: Path) -> list[Record]:
+    """Read the records of a file, without those of parts that compute something else by now (`Part.changes`).
+
+    Raises InputError where it is something else or was edited by hand.
+    """
+    with guarding(path, JSON, "records of runs"):
+        values = _read_file(path)
+        found = [_unpack(path, value) for value in values]
+        return [record for record, value in zip(found, values) if record.key == value["key"]]
 
 
-def unpack(value: dict[str, Any]) -> dict[str, Any]:
-    """Return the value that `pack` was given, from the JSON of either format."""
-    if value["format"] == 1:
-        return value
-    views, curves = value["per_view"], value["curves"]
-    scores = dict(zip(views["names"], rows(views["scores"], len(views["names"])), strict=True))
-    return {**value, "per_view": scores, "curves": rows(curves, length(curves))}
+def _read_file(path: Path) -> list[dict[str, Any]]:
+    value = read_json(path, "records of runs")
+    if not isinstance(value, dict) or value.get("format") != FORMAT or not isinstance(value.get("runs"), list):
+        raise InputError(f"expected records of runs (format {FORMAT}) in {path}, found something else; remove it and reproduce again")
+    return [{**run, "scene": value.get("scene")} if isinstance(run, dict) else {} for run in value["runs"]]
 
 
-def read(path: Path) -> Record:
-    """Read a record file. Raises InputError where it is something else or was edited by hand."""
-    with guarding(path, JSON, "record of a run"):
-        return _read(path)
-
-
-def _read(path: Path) -> Record:
-    value = read_json(path, "record of a run")
-    parts = {"scene", "config", "results", "per_view", "curves", "config_sha256", "results_sha256"}
-    if not isinstance(value, dict) or value.get("format") not in (1, FORMAT) or not parts <= value.keys():
-        raise InputError(f"expected a record of a run (format {FORMAT}) in {path}, found something else; remove it and reproduce again")
-    for part in ("config", "results"):
-        if digest(value[part]) != value[f"{part}_sha256"]:
-            raise InputError(f"expected {part} with the recorded checksum in {path}, found edited values; remove it and reproduce again")
+def _unpack(path: Path, value: dict[str, Any]) -> Record:
+    parts = ("key", "config", "results", "per_view", "curves", "fit", "sha256")
+    if not all(part in value for part in parts) or not isinstance(value["scene"], str):
+        raise Damaged(f"a run without {next((part for part in parts if part not in value), 'scene')}")
+    own = {name: each for name, each in value.items() if name not in ("scene", "sha256")}
+    if digest(own) != value["sha256"]:
+        raise InputError(f"expected a run with its recorded checksum in {path}, found edited values; remove it and reproduce again")
     try:
-        value = unpack(value)
+        views, curves = value["per_view"], value["curves"]
+        per_view = dict(zip(views["names"], rows(views["scores"], len(views["names"])), strict=True))
+        points = rows(curves, length(curves))
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"expected columns of equal length in {path}, found others ({error}); remove it and reproduce again") from error
-    scene, results, per_view, curves = (value[name] for name in ("scene", "results", "per_view", "curves"))
-    code = value.get("code", "")
-    kinds = (isinstance(scene, str), isinstance(code, str), isinstance(results, dict), isinstance(per_view, dict), isinstance(curves, list))
-    if not all(kinds):
-        raise Damaged("a scene, results, scores or curves of another form")
+    results, fit, code = value["results"], value["fit"], value.get("code", "")
+    if not (isinstance(results, dict) and isinstance(fit, (float, int, type(None))) and isinstance(code, str)):
+        raise Damaged("results or a fit of another form")
     check_means(results, per_view, f"in {path}", "remove it and reproduce again")
-    return Record(scene, from_json(RunConfig, value["config"]), results, per_view, curves, code)
+    return Record(value["scene"], from_json(RunConfig, value["config"]), results, per_view, points, fit, code)
 
 
 def load(store: Path) -> list[Record]:
-    """Read every record below a folder, in the order of their paths."""
-    return [read(path) for path in sorted(store.glob("*/*/seed*.json"))]
+    """Read every record in a folder, in the order of captures, recipes and seeds."""
+    return [record for path in sorted(store.glob("*.json")) for record in read(path)]
 
 
 def load_like(store: Path, spec: Spec) -> list[Record]:
-    """Read the records of a run's scene and seed: `find` needs no others, and reading all takes seconds."""
-    return [read(path) for path in sorted((store / spec.scene.name).glob(f"*/seed{spec.seed}-*.json"))]
+    """Read the records of a run's capture: `find` needs no others."""
+    path = record_path(store, spec.scene.name)
+    return read(path) if path.is_file() else []
 
 
 def digest(value: Any) -> str:
@@ -252,7 +294,7 @@ def check_captures(records: Sequence[Record], specs: Sequence[Spec]) -> None:
     for pairs in by_scene.values():
         spec, record = pairs[-1]
         try:
-            capture = load_capture(spec.data)
+            capture = captures.load(spec.data)
         except InputError:
             continue
         capture.images.close()

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.parts import Part
-from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Mode, Points, Routing
 
@@ -22,6 +21,9 @@ if TYPE_CHECKING:
 
 Cull = Callable[[Tensor, Tensor, Camera], Tensor]
 """The rasteriser's visibility test: means [n, 3], scales [n, 3], camera -> [n] bool."""
+OPACITY = "an opacity network"
+ROUTERS = "routers that losses train"
+EXPLICIT = "explicit Gaussians"
 Draws = Callable[[Camera, int, Mode, Cull], Decoded]
 """Signature of a scene's forward pass: (camera, step, mode, cull) -> Decoded."""
 
@@ -112,10 +114,6 @@ class Scene(nn.Module):
         """Routing of all rows, or of at most `most` evenly spaced rows, by attribute. Empty for a scene without experts."""
         return {}
 
-    def scene_opacity(self, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Tensor | None:
-        """Raw opacities [N, K] of all rows for `camera`, visible or not. None if no network predicts opacities."""
-        return None
-
     def rows_by_level(self) -> list[int]:
         """Number of rows per level of detail, coarse to fine. Empty for a scene without levels."""
         return []
@@ -134,16 +132,13 @@ class Scene(nn.Module):
         """
         return self
 
-    def set_batch(self, views: int) -> None:
-        """Tell the scene how many views an optimiser step sees. The default does nothing."""
+    def describe_decode(self, step: int) -> str:
+        """Say which implementation decodes the scene at `step`, and why not the fastest. Empty for a scene with one."""
+        return ""
 
-    def counts(self) -> list[Tensor]:
-        """Return what the scene has counted in the training views of a batch of more than one view, for `settle`. All processes add up
-        these tensors in place. The default counts nothing."""
-        return []
-
-    def settle(self) -> None:
-        """Use the counts of a whole batch of more than one view, and begin to count anew. The default does nothing."""
+    def end_batch(self, views: int) -> None:
+        """Learn what no gradient teaches, once for a batch of `views` views, before the optimiser's step. The gradients of all views are
+        added up by then, and divided by their number. The default does nothing."""
 
     def set_training_cameras(self, cameras: Sequence[Camera]) -> None:
         """Give the scene the cameras of its training views, before each training or its resumption. The default does nothing."""
@@ -194,13 +189,13 @@ class SceneConfig(Part, ABC):
         return 0
 
     def phases(self) -> dict[str, int]:
-        """Return the last iteration of each phase that a training leaves for good, by the flag that sets it. Empty without phases."""
+        """Return the last iteration of each phase that a training leaves for good, by the dotted path of the field that sets it."""
         return {}
 
     @property
-    def unused(self) -> tuple[str, ...]:
-        """Dotted paths of settings of a training that have no effect on this scene. A training warns where one was changed."""
-        return ()
+    def has(self) -> frozenset[str]:
+        """What the scene has of OPACITY, ROUTERS and EXPLICIT. Settings that need another have no effect; a training warns about them."""
+        return frozenset()
 
     def of_views(self, views: int) -> Self:
         """Return the settings with which any number of training views is treated as `views` of them. The default depends on no number."""
@@ -255,10 +250,3 @@ class LearningRates(Part, ABC):
     @abstractmethod
     def at(self, group: str, step: int, total: int, extent: float) -> float:
         """Learning rate of `group` at `step` of `total`. extent: the extent R of the scene, in trained world units."""
-
-    def check(self) -> None:
-        """Raises InputError with the name of the flag unless each rate is either always positive or always 0."""
-        for name, rate in vars(self).items():
-            if isinstance(rate, Rate) and not (rate.first > 0 < rate.last or rate.first == rate.last == 0):
-                flag = f"--rates.{name.replace('_', '-')}"
-                raise InputError(f"expected {flag} to run between two rates above 0, or to be 0, found {rate.first} and {rate.last}")

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
+from scene_experts.core.fields import check_fields
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import FARTHEST, all_finite, expect_range, number, shown, whole_number
 from scene_experts.scene import Scene, SceneConfig, restore_scene
@@ -29,7 +30,7 @@ def check_fit(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[str, A
     Raises Damaged for columns of other shapes or types, values that are not finite, metadata out of range, and settings that ask for
     larger networks than the stored ones; InputError for invalid settings.
     """
-    config.check()
+    check_fields(config, "scene")
     number(meta["extent"], "the extent", 1e-15, FARTHEST)
     number(meta.get("voxel", 0.0), "the edge of a cell", 0, FARTHEST)
     whole_number(meta.get("step", 0), "the iteration", 0, MOST_STEPS)

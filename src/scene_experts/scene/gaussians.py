@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import Positive, Range, Scales
 from scene_experts.core.parts import register
 from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
@@ -24,7 +25,7 @@ from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.sh import MAX_DEGREE, rgb_to_dc
 from scene_experts.geometry.sh_colors import compute_sh_colors
-from scene_experts.scene import Cull, LearningRates, Scene, SceneConfig, Traits
+from scene_experts.scene import EXPLICIT, Cull, LearningRates, Scene, SceneConfig, Traits
 
 COLUMNS = ("means", "log_scales", "quats", "raw_opacity", "sh_dc", "sh_rest")
 FILE_VALUES = 3 + 3 + 1 + 3 + 4  # position, normal, opacity, scale and rotation in the 3DGS file, without the harmonics
@@ -39,13 +40,13 @@ class Explicit(SceneConfig):
 
     family = "gaussians"
 
-    sh_degree: int = 3
+    sh_degree: Annotated[int, Range(0, MAX_DEGREE)] = 3
     """Highest degree of the spherical harmonics, 0 to 3."""
-    sh_ramp: int = 1000
+    sh_ramp: Annotated[int, Range(1), Scales(least=1)] = 1000
     """Iterations until the next degree is used; the first degree is 0."""
-    opacity: float = 0.1
+    opacity: Annotated[float, Range(above=0, below=1)] = 0.1
     """Initial opacity of every Gaussian."""
-    size: float = 1.0
+    size: Positive = 1.0
     """Initial size of a Gaussian, in mean distances to its nearest neighbours."""
 
     @property
@@ -53,11 +54,11 @@ class Explicit(SceneConfig):
         return "Gaussians"
 
     @property
-    def unused(self) -> tuple[str, ...]:
-        return ("loss.opacity", "loss.load")
+    def has(self) -> frozenset[str]:
+        return frozenset({EXPLICIT})
 
     def phases(self) -> dict[str, int]:
-        return {"--scene.sh-ramp": self.sh_ramp * self.sh_degree - 1}
+        return {"sh_ramp": self.sh_ramp * self.sh_degree - 1}
 
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> GaussianScene:
         """Create one Gaussian per point of the cloud. Raises InputError if the cloud is empty."""
@@ -87,20 +88,6 @@ class Explicit(SceneConfig):
         if set(table.params) != set(COLUMNS) or table.params["sh_rest"].shape[1] != (self.sh_degree + 1) ** 2 - 1:
             raise InputError("expected the columns of explicit Gaussians in the checkpoint, found others; use its own run folder")
         return GaussianScene(self, table, float(meta["extent"]))
-
-    def scaled(self, factor: float) -> Self:
-        """Scale `sh_ramp` to a training `factor` times as long."""
-        return replace(self, sh_ramp=max(1, round(self.sh_ramp * factor)))
-
-    def check(self) -> None:
-        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
-        expect_at_least([("--scene.sh-degree", self.sh_degree, 0), ("--scene.sh-ramp", self.sh_ramp, 1)])
-        if self.sh_degree > MAX_DEGREE:
-            raise InputError(f"expected --scene.sh-degree of at most {MAX_DEGREE}, found {self.sh_degree}; give a lower degree")
-        if not 0 < self.opacity < 1 or not 0 < self.size < math.inf:
-            raise InputError(
-                f"expected --scene.opacity between 0 and 1 and --scene.size above 0, found {self.opacity} and {self.size}; correct them"
-            )
 
 
 class GaussianScene(Scene):

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Generic
 import torch
 from typing_extensions import TypeVar
 
+from scene_experts.core.fields import CountOrNone
 from scene_experts.core.parts import Part
 from scene_experts.core.types import Decoded, Render
 from scene_experts.scene import Scene
@@ -40,7 +41,7 @@ class Strategy(Part, Generic[S], ABC):
     grows: ClassVar[str]
     """What the rule grows; `SceneConfig.grown_as` of its scenes."""
 
-    max_anchors: int = 0
+    max_anchors: CountOrNone = 0
     """Never more rows than this; 0 is no cap."""
     enabled: bool = True
     """Whether rows are added and removed at all."""

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
-from typing import Literal, Self
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from torch import Tensor
 from typing_extensions import TypeVar
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import SCALES, CountOrNone, Flag, NotNegative, Range
 from scene_experts.core.schedule import Every
 from scene_experts.core.types import Decoded, Render
 from scene_experts.scene import LatticeScene
@@ -25,8 +25,10 @@ class AnchorControl(Strategy[L]):
     """Hyper-parameters of density control for anchors. Subclasses implement `grow`."""
 
     grows = "anchors"
+    largest_log_size: ClassVar[float | None] = 0.05
+    """Upper bound of the logarithms of the Gaussians' sizes after each densification step, as in Scaffold-GS; None: no bound."""
 
-    start_stat: int = 500
+    start_stat: Annotated[int, SCALES] = 500
     """Iteration from which statistics are collected."""
     adjust: Every = Every(1500, 15_000, 100)
     """When densification runs."""
@@ -38,25 +40,23 @@ class AnchorControl(Strategy[L]):
     """Share of the interval in which an anchor must be seen before it can be removed; half of it before it can grow."""
     min_opacity: float = 0.005
     """Anchors whose mean opacity is lower are removed."""
-    scale_clamp: Literal["log0.05", "linear0.05", "off"] = "log0.05"
-    """Upper bound of the Gaussians' sizes after each densification step: 0.05 in log space, 0.05 in linear units, or off."""
-    error_views: int = 0
+    error_views: CountOrNone = 0
     """Number of random training views whose errors decide at each densification step where anchors are created (FastGS); 0 means that
     errors do not count."""
-    error_quantile: float = 0.7
+    error_quantile: Annotated[float, Range(0, below=1)] = 0.7
     """Quantile of a view's pixel errors above which an error is high."""
-    error_share: float = 0.3
+    error_share: NotNegative = 0.3
     """Share of a Gaussian's contribution that must lie on pixels with high errors before it can create an anchor."""
-    least_contribution: float = 0.0
+    least_contribution: NotNegative = 0.0
     """Anchors that contribute less than this many pixels to each of at least 8 of the error views are removed; 0 removes none."""
-    mask_contribution: float = 0.0
+    mask_contribution: NotNegative = 0.0
     """Gaussians of an anchor that contribute less than this many pixels to every training view are no longer drawn, and anchors without
     others are removed; 0 masks none."""
-    mask_at: tuple[int, ...] = (20_000, 30_000)
+    mask_at: Annotated[tuple[int, ...], SCALES] = (20_000, 30_000)
     """Iterations at which Gaussians are masked."""
-    mask_views: int = 0
+    mask_views: CountOrNone = 0
     """Number of random training views that a mask looks at; 0 means all."""
-    max_anchors: int = 0
+    max_anchors: CountOrNone = 0
     """Maximum number of anchors; 0 means no limit. Anchors with the largest gradients are created first."""
     bounds: tuple[float, ...] = ()
     """Corners (low x, y, z, high x, y, z) of the box in which anchors are created, in trained world units; empty means everywhere. Blocks
@@ -71,29 +71,17 @@ class AnchorControl(Strategy[L]):
     def box(self) -> tuple[float, ...]:
         return self.bounds
 
-    def scaled(self, factor: float) -> Self:
-        """Scale the schedule to a training `factor` times as long. The interval, gates and thresholds do not change."""
-        used = factor if self.mask_contribution > 0 else 1.0  # older checkpoints do not have an unused value
-        at = tuple(round(step * used) for step in self.mask_at)
-        return replace(self, start_stat=round(self.start_stat * factor), adjust=self.adjust.scaled(factor), mask_at=at)
-
     def count_steps(self, iterations: int) -> int:
         """Number of densification steps in a training of `iterations` iterations."""
         return self.adjust.count(iterations)
 
-    def check(self) -> None:
-        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
-        names = ("max_anchors", "error_views", "error_share", "least_contribution", "mask_contribution", "mask_views")
-        least = [(f"--growth.{name.replace('_', '-')}", getattr(self, name), 0) for name in names]
-        expect_at_least([("--growth.adjust.interval", self.adjust.interval, 1), *least])
+    def check(self, flag: Flag) -> None:
         low, high = self.bounds[:3], self.bounds[3:]
         if self.bounds and not (len(high) == 3 and all(a < b for a, b in zip(low, high))):
             found = " ".join(f"{side:g}" for side in self.bounds)
-            raise InputError(f"expected --growth.bounds as a low and a high corner, x y z x y z, found {found}; correct the numbers")
-        if not 0 <= self.error_quantile < 1:
-            raise InputError(f"expected --growth.error-quantile from 0 to below 1, found {self.error_quantile}; correct it")
+            raise InputError(f"expected {flag('bounds')} as a low and a high corner, x y z x y z, found {found}; correct the numbers")
         if self.least_contribution > 0 and not self.error_views:
-            raise InputError("expected --growth.error-views with --growth.least-contribution, found none; give for example 8 views")
+            raise InputError(f"expected {flag('error_views')} with {flag('least_contribution')}, found none; give for example 8 views")
 
     def observe(self, scene: L, decoded: Decoded, render: Render, step: int) -> None:
         """Add one view to the statistics, after its backward pass."""
@@ -170,6 +158,6 @@ class AnchorControl(Strategy[L]):
         for name in ("visits", "opacity"):
             table.stats[name][seen] = 0.0
         pruned = table.drop(faint)
-        if self.scale_clamp != "off":
-            table.params["log_scaling"][:, 3:].clamp_(max=0.05 if self.scale_clamp == "log0.05" else math.log(0.05))
+        if self.largest_log_size is not None:
+            table.params["log_scaling"][:, 3:].clamp_(max=self.largest_log_size)
         return pruned

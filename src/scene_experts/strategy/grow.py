@@ -7,11 +7,12 @@ coarse to fine. Anchors with a low mean opacity are removed. Cells are integers,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import expect_at_least
+from scene_experts.core.fields import Count, Range, flag_of
 from scene_experts.core.parts import register
 from scene_experts.core.random import generator_on
 from scene_experts.core.shard import NUMBER
@@ -28,22 +29,14 @@ _COLUMNS = 8  # columns of the features that are copied at once
 class GrowAnchors(AnchorControl[L]):
     """Densification of Scaffold-GS."""
 
-    levels: int = 3
+    levels: Count = 3
     """Number of voxel sizes at which anchors are created in one step."""
-    init_factor: int = 16
+    init_factor: Count = 16
     """Voxel size of the coarsest of these levels, in units of the scene's voxel size."""
-    hierarchy_factor: int = 4
+    hierarchy_factor: Annotated[int, Range(2)] = 4
     """Ratio of the voxel sizes of two successive levels."""
     elimination: bool = True
     """Keep only a random part of the candidates: half at the coarsest level, then 3/4, then 7/8."""
-    parity_level_skip: bool = False
-    """Reproduce a quirk of Scaffold-GS: skip the finer levels while a step has created no anchor yet."""
-
-    def check(self) -> None:
-        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
-        super().check()
-        expect_at_least([("--growth.hierarchy-factor", self.hierarchy_factor, 2), ("--growth.init-factor", self.init_factor, 1)])
-        expect_at_least([("--growth.levels", self.levels, 1)])
 
     def cell_factors(self) -> list[int]:
         """Cell edges of the levels, coarse to fine, in units of the scene's voxel size: [16, 4, 1] by default.
@@ -69,7 +62,7 @@ class GrowAnchors(AnchorControl[L]):
 
     def needs_whole_table(self) -> str:
         surveys = ("error_views", "least_contribution", "mask_contribution")
-        return next((f"--growth.{name.replace('_', '-')}" for name in surveys if getattr(self, name)), "")
+        return next((flag_of(f"growth.{name}") for name in surveys if getattr(self, name)), "")
 
     def search(self, scene: L, generator: torch.Generator, cap: int = 0) -> tuple[list[dict[str, Tensor]], int, bool]:
         """Find the anchors to create and reset the statistics of the slots that were seen often enough.
@@ -81,8 +74,6 @@ class GrowAnchors(AnchorControl[L]):
         features = table.params["feature"]
         cells, rows, born, capped = table.facts["cell"], [], 0, False
         for level, factor in enumerate(self.cell_factors()):
-            if self.parity_level_skip and level > 0 and not born:
-                continue
             chosen = g >= self.grad_threshold * (self.hierarchy_factor // 2) ** level
             if self.elimination:
                 own = generator_on(g.device, generator)
@@ -129,8 +120,6 @@ class GrowAnchors(AnchorControl[L]):
         eligible, slots, g, parents, fine = self.candidates(scene)
         cells, rows, born, capped = table.facts["cell"], [], 0, False
         for level, factor in enumerate(self.cell_factors()):
-            if self.parity_level_skip and level > 0 and not born:
-                continue
             chosen = g >= self.grad_threshold * (self.hierarchy_factor // 2) ** level
             if self.elimination:
                 chosen &= shard.draw(generator, table.facts[NUMBER], slots, scene.K) > 0.5 ** (level + 1)

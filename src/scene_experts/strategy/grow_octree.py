@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.fields import NotNegative
 from scene_experts.core.parts import register
 from scene_experts.core.schedule import Every
 from scene_experts.scene.anchors.levels import Levels
@@ -31,22 +31,12 @@ class GrowOctree(AnchorControl[AnchorScene]):
 
     adjust: Every = Every(1500, 25_000, 100)
     """When densification runs."""
-    update_ratio: float = 0.2
+    update_ratio: NotNegative = 0.2
     """The gradient threshold grows by the factor fork^update_ratio from level to level."""
     extra_ratio: float = 0.25
     """Anchors whose mean gradient reaches this share of the threshold of their level request finer levels."""
     extra_up: float = 0.01
     """Level increment per densification step."""
-    parity_coarse_gate: bool = False
-    """Reproduce a bug of Octree-GS: create and request finer levels before the coarse phase has ended."""
-    parity_extra_level: bool = False
-    """Reproduce a bug of Octree-GS: add the level increment once per level instead of once."""
-
-    def check(self) -> None:
-        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
-        super().check()
-        if not self.update_ratio >= 0:
-            raise InputError(f"expected --growth.update-ratio of at least 0, found {self.update_ratio}; give a larger number")
 
     @torch.no_grad()
     def grow(self, scene: AnchorScene, generator: torch.Generator, step: int = 0, cap: int = 0) -> tuple[int, bool]:
@@ -56,7 +46,7 @@ class GrowOctree(AnchorControl[AnchorScene]):
         """
         table, levels = scene.table, scene.select.lattices
         assert levels is not None
-        refine = self.parity_coarse_gate or not scene.select.coarse(step)
+        refine = not scene.select.coarse(step)
         eligible, g, mean = self.gradients(table.stats)
         strong = g >= self.grad_threshold  # level 0 has the lowest threshold
         if self.error_views and "wrong" in table.stats:
@@ -118,7 +108,4 @@ class GrowOctree(AnchorControl[AnchorScene]):
     def extra(self, mean: Tensor, level: Tensor, levels: Levels) -> Tensor:
         """Increments [N] of the level that anchors request, from their mean gradients `mean` [N] and levels `level` [N]."""
         thresholds = self.extra_ratio * mean.new_tensor([self.threshold(i, levels) for i in range(levels.count)])
-        if self.parity_extra_level:
-            times = sum(((mean >= thresholds[int(i)]).to(mean.dtype) for i in level.unique()), start=torch.zeros_like(mean))
-            return self.extra_up * times
         return self.extra_up * (mean >= thresholds[level]).to(mean.dtype)

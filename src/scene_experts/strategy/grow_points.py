@@ -17,11 +17,10 @@ class GrowPoints(GrowAnchors):
     """Densification of SAGS. It differs from that of anchors in the definition of a visit, and it does not clamp sizes."""
 
     grows = "graph points"
+    largest_log_size = None
 
     success_threshold: float = 0.6
     """Share of the interval in which an anchor must be seen before it can be removed; half of it before it can grow."""
-    scale_clamp: Literal["log0.05", "linear0.05", "off"] = "off"
-    """Upper bound of the Gaussians' sizes after each densification step: 0.05 in log space, 0.05 in linear units, or off."""
     visits: Literal["drawn", "seen"] = "drawn"
     """drawn: a view counts only for the points that it draws, so a point that is never drawn is never removed (SAGS). seen: a view counts
     for all points that it decodes."""

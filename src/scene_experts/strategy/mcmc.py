@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import expect_at_least
+from scene_experts.core.fields import CountOrNone, NotNegative, Range
 from scene_experts.core.parts import register
 from scene_experts.core.random import generator_on
 from scene_experts.core.schedule import Every
@@ -37,31 +37,16 @@ class MCMC(Strategy[GaussianScene]):
     """When Gaussians are relocated and added."""
     min_opacity: float = 0.005
     """Gaussians with a lower opacity are relocated."""
-    growth: float = 1.05
+    growth: Annotated[float, Range(1)] = 1.05
     """Factor by which the number of Gaussians grows in one step, at most."""
-    noise: float = 500_000.0
+    noise: NotNegative = 500_000.0
     """Scale of the noise on positions, times their learning rate; 0 means no noise."""
-    max_anchors: int = 1_000_000
+    max_anchors: CountOrNone = 1_000_000
     """Maximum number of Gaussians; 0 means no limit."""
-
-    def scaled(self, factor: float) -> Self:
-        """Scale the schedule to a training `factor` times as long. The interval does not change."""
-        return replace(self, adjust=self.adjust.scaled(factor))
 
     def count_steps(self, iterations: int) -> int:
         """Number of densification steps in a training of `iterations` iterations."""
         return self.adjust.count(iterations)
-
-    def check(self) -> None:
-        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
-        expect_at_least(
-            [
-                ("--growth.adjust.interval", self.adjust.interval, 1),
-                ("--growth.growth", self.growth, 1),
-                ("--growth.noise", self.noise, 0),
-                ("--growth.max-anchors", self.max_anchors, 0),
-            ]
-        )
 
     def adds(self, step: int) -> bool:
         return self.enabled and self.adjust.due(step)

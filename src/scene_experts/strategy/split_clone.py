@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.fields import Count, CountOrNone, Range
 from scene_experts.core.parts import register
 from scene_experts.core.random import generator_on
 from scene_experts.core.schedule import Every
@@ -48,13 +48,11 @@ class SplitClone(Strategy[GaussianScene]):
     """Gaussians larger than this share of the scene's extent are removed after the first opacity reset."""
     reset: Every = Every(0, 15_000, 3000)
     """When opacities are reset."""
-    reset_least: int = 1000
+    reset_least: Count = 1000
     """Minimum number of iterations between resets, however short the training is."""
-    reset_opacity: float = 0.01
+    reset_opacity: Annotated[float, Range(above=0, below=1)] = 0.01
     """Upper bound of the opacities after a reset."""
-    reset_at_start: bool = False
-    """Also reset at adjust.start, as 3DGS does for captures with a white background."""
-    max_anchors: int = 0
+    max_anchors: CountOrNone = 0
     """Maximum number of Gaussians; 0 means no limit. Gaussians with the largest gradients are added first."""
 
     @property
@@ -68,20 +66,12 @@ class SplitClone(Strategy[GaussianScene]):
         The reset interval scales too, but not below `reset_least`. The densification interval does not change.
         """
         least = min(self.reset_least, self.reset.interval)
-        reset = replace(self.reset.scaled(factor), interval=max(1, least, round(self.reset.interval * factor)))
-        return replace(self, adjust=self.adjust.scaled(factor), reset=reset)
+        made = super().scaled(factor)
+        return replace(made, reset=replace(made.reset, interval=max(1, least, round(self.reset.interval * factor))))
 
     def count_steps(self, iterations: int) -> int:
         """Number of densification steps in a training of `iterations` iterations."""
         return self.adjust.count(iterations)
-
-    def check(self) -> None:
-        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
-        intervals = [("--growth.adjust.interval", self.adjust.interval, 1), ("--growth.reset.interval", self.reset.interval, 1)]
-        intervals += [("--growth.reset-least", self.reset_least, 1)]
-        expect_at_least([*intervals, ("--growth.max-anchors", self.max_anchors, 0)])
-        if not 0 < self.reset_opacity < 1:
-            raise InputError(f"expected --growth.reset-opacity between 0 and 1, found {self.reset_opacity}; correct it")
 
     def observe(self, scene: GaussianScene, decoded: Decoded, render: Render, step: int) -> None:
         """Add one view to the statistics, after its backward pass."""
@@ -119,7 +109,7 @@ class SplitClone(Strategy[GaussianScene]):
             for column in table.params.values():
                 column.grad = None  # in 3DGS, the optimiser skips all Gaussians in a densification step
             edit = Edit(grown, pruned, len(table), capped)
-        if self.reset.due(step) or (self.reset_at_start and step == self.adjust.start):
+        if self.reset.due(step):
             self.press_opacities(scene)
         return edit
 

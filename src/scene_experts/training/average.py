@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.fields import Count, Share
 from scene_experts.core.parts import Part, register
 from scene_experts.scene import Scene
 
@@ -25,16 +25,10 @@ from scene_experts.scene import Scene
 class Average(Part):
     """Which average of the weights is evaluated and exported; flags under --average."""
 
-    span: float = 0.0
+    span: Share = 0.0
     """Share of the training that the average spans (0.05 to 0.2 are useful); 0 uses the last weights."""
-    interval: int = 10
+    interval: Count = 10
     """Iterations between two updates of the average."""
-
-    def check(self) -> None:
-        """Check the settings. Raises InputError, which names the flag, if one is invalid."""
-        expect_at_least([("--average.interval", self.interval, 1)])
-        if not 0 <= self.span <= 1:
-            raise InputError(f"expected --average.span from 0 to 1, found {self.span}; it is a share of the training")
 
     def due(self, step: int) -> bool:
         """Whether the average is updated after iteration `step`. Before the first interval ends, the average is the last weights."""

@@ -58,7 +58,7 @@ class Direct:
         if self.training.cfg.batch > 1:
             for gradient in _gradients(self.training):
                 gradient /= self.training.cfg.batch
-            self.training.scene.settle()
+        self.training.scene.end_batch(self.training.cfg.batch)
 
     def complete(self) -> None:
         """Complete the statistics of the table, before they are read or saved."""
@@ -114,11 +114,11 @@ class Reduced(Direct):
         self.pending = self._observe(self.training.scene, decoded, render, number, self.pending)
 
     def finish(self) -> None:
-        gradients, counts = _gradients(self.training), self.training.scene.counts()
+        gradients = _gradients(self.training)
         flag = gradients[0].new_full((1,), float(bool(self.stop)))
-        flat = _flatten([*gradients, *counts, flag])
+        flat = _flatten([*gradients, flag])
         self.group.sum(flat)
-        self._use(flat, counts)
+        self._use(flat)
 
     def complete(self) -> None:
         if not self.pending:
@@ -175,16 +175,14 @@ class Reduced(Direct):
                 stats[name] = torch.zeros_like(value)
             stats[name] += part.view_as(value)
 
-    def _use(self, flat: Tensor, counts: list[Tensor]) -> None:
-        """Take gradients, counts and the request to stop from their sums over the batch."""
+    def _use(self, flat: Tensor) -> None:
+        """Take the gradients and the request to stop from their sums over the batch."""
         parameters = _parameters(self.training)
-        *parts, flag = flat.split([t.numel() for t in (*parameters, *counts)] + [1])
-        flat[: flat.numel() - 1 - sum(count.numel() for count in counts)] /= self.training.cfg.batch
+        *parts, flag = flat.split([t.numel() for t in parameters] + [1])
+        flat[:-1] /= self.training.cfg.batch
         for parameter, part in zip(parameters, parts):
             parameter.grad = part.view_as(parameter)
-        for count, part in zip(counts, parts[len(parameters) :]):
-            count.copy_(part)
-        self.training.scene.settle()
+        self.training.scene.end_batch(self.training.cfg.batch)
         if flag:
             self.agreed = True
             if not self.stop:
@@ -214,11 +212,8 @@ class Ordered(Reduced):
 
     def finish(self) -> None:
         assert self.total is not None
-        counts = self.training.scene.counts()  # whole numbers: their sums are exact in any order
-        for count in counts:
-            self.group.sum(count)
         total, self.total = self.total, None
-        self._use(torch.cat([total[:-1], *(count.to(total) for count in counts), total[-1:]]), counts)
+        self._use(total)
 
 
 def make_exchange(training: Training, group: Alone, stop: list[str], deterministic: bool) -> Direct:

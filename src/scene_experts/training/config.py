@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from scene_experts.arguments.option import Option
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import Count, CountOrNone, Range, Share, changed_without, check_fields, flag_of, scale
 from scene_experts.core.parts import Part, find
 from scene_experts.data.settings import Data
-from scene_experts.scene import LearningRates, SceneConfig
+from scene_experts.scene import EXPLICIT, LearningRates, SceneConfig
 from scene_experts.scene.anchors.rates import Rates
 from scene_experts.scene.anchors.scene import Anchors
 from scene_experts.strategy import Strategy
@@ -20,6 +21,7 @@ from scene_experts.strategy.grow import GrowAnchors
 from scene_experts.training.average import Average
 from scene_experts.training.losses import Weights
 from scene_experts.training.optim import Adam, Optimizer
+from scene_experts.training.options import TrainOptions
 
 SCHEDULE = 30_000  # default length of the schedule, iterations; recipes may override it
 LARGEST_SEED = 2**63 - 2  # torch accepts signed 64-bit seeds, and densification uses seed + 1
@@ -43,21 +45,21 @@ class Train:
     """The optimiser."""
     average: Average = Average()
     """An average of the weights, which is evaluated and exported in place of the last weights."""
-    iterations: int = SCHEDULE
+    iterations: Count = SCHEDULE
     """Number of training iterations. Another number rescales the whole schedule (learning rates, densification, warm-up)."""
-    batch: int = 1
+    batch: Count = 1
     """Training views per optimiser step. Iterations count views, so N iterations make N / batch steps. Several processes (torchrun) share
     the views of a batch."""
-    batch_rates: float = 0.5
-    """Learning rates are multiplied by batch to this power, from 0 to 1. 0.5 keeps the variance of what a view moves (Zhao et al. 2024),
+    batch_rates: Share = 0.5
+    """Learning rates are multiplied by batch to this power. 0.5 keeps the variance of what a view moves (Zhao et al. 2024),
     1 keeps how far the views together move."""
-    seed: int = 0
-    """Seed of all random numbers, at least 0."""
+    seed: Annotated[int, Range(0, LARGEST_SEED)] = 0
+    """Seed of all random numbers."""
     antialias: bool = False
     """Compensate the opacity for the 0.3 px blur (2D filter of Mip-Splatting)."""
     random_background: bool = False
     """Use a random background colour in each iteration."""
-    max_anchors: int = 0
+    max_anchors: CountOrNone = 0
     """Stop densification at this number of anchors; 0 leaves that of the growth rule (a million for 3dgs-mcmc, otherwise none)."""
     sparse_adam: bool = False
     """Update only the rows that a view has decoded (SelectiveAdam of gsplat). Faster if views see a small part of the scene; changes the
@@ -68,9 +70,8 @@ class Train:
     def scaled(self) -> Train:
         """Return a copy whose schedule is scaled by iterations / schedule. Raises InputError if `iterations` is below 1."""
         factor = self._factor()
-        growth = replace(self.growth.scaled(factor), max_anchors=self.max_anchors or self.growth.max_anchors)
-        scaled = {name: getattr(self, name).scaled(factor) for name in ("scene", "loss", "rates", "optimizer")}
-        return replace(self, **scaled, growth=growth)
+        made = scale(self, factor)
+        return replace(made, growth=replace(made.growth, max_anchors=self.max_anchors or self.growth.max_anchors))
 
     def scaled_scene(self) -> SceneConfig:
         """Return the scene's settings of `scaled()`: all that drawing a trained scene needs. Raises InputError as `scaled` does."""
@@ -94,23 +95,23 @@ class RunConfig:
     deterministic: bool = False
     stop_at: int | None = None
     versions: dict[str, str] = field(default_factory=dict)
-    max_memory: float = 0.0  # GiB at which growth stops, so the results may depend on the machine; 0: no limit, or an older run
-    init_from: Path | None = None  # run folder whose scene the training started from; None: the points of the capture, or an older run
+    max_memory: float = 0.0  # GiB at which growth stops, so the results may depend on the machine; 0: no limit
+    init_from: Path | None = None  # run folder whose scene the training started from; None: the points of the capture
+
+    @classmethod
+    def of(
+        cls, train: Train, data: Data, options: TrainOptions, command: str, versions: dict[str, str], init_from: Path | None = None
+    ) -> RunConfig:
+        """The configuration of a training with `options`."""
+        return cls(train, data, command, options.deterministic, options.stop_at, versions, options.max_memory, init_from)
 
 
 def check(cfg: Train) -> None:
     """Check the settings. Raises InputError, which names the flag, if a setting is invalid."""
-    expect_at_least([("--iterations", cfg.iterations, 1), ("--seed", cfg.seed, 0), ("--max-anchors", cfg.max_anchors, 0)])
-    expect_at_least([("--batch", cfg.batch, 1)])
-    if cfg.seed > LARGEST_SEED:
-        raise InputError(f"expected --seed of at most {LARGEST_SEED}, found {cfg.seed}; give a smaller number")
-    if not 0 <= cfg.batch_rates <= 1:
-        raise InputError(f"expected --batch-rates from 0 to 1, found {cfg.batch_rates}; 0.5 is the default")
+    check_fields(cfg)
     if cfg.iterations % cfg.batch:
         nearest = max(1, round(cfg.iterations / cfg.batch)) * cfg.batch
         raise InputError(f"expected --iterations that --batch {cfg.batch} divides, found {cfg.iterations}; give for example {nearest}")
-    for part in (cfg.scene, cfg.loss, cfg.growth, cfg.rates, cfg.optimizer, cfg.average):
-        part.check()
     if unknown := unregistered(cfg):
         raise InputError(f"expected registered parts in the recipe, found {unknown[0]}; decorate its class with @register")
     if cfg.growth.grows != cfg.scene.grown_as:
@@ -125,10 +126,10 @@ def check(cfg: Train) -> None:
 
 def find_unused(cfg: Train) -> list[str]:
     """Return the flags of the settings that have no effect on the scene of `cfg` and do not have the default of their part."""
-    places = [place for place in cfg.scene.unused if _has(cfg, place) and _changed(cfg, place)]
-    if cfg.sparse_adam and cfg.loss.regularises and not {"loss.mean_opacity", "loss.mean_size"} & set(cfg.scene.unused):
+    places = list(changed_without(cfg, cfg.scene.has))
+    if cfg.sparse_adam and cfg.loss.regularises and EXPLICIT in cfg.scene.has:
         places.append("sparse_adam")  # these losses move every row
-    return [flag(place) for place in places]
+    return [flag_of(place) for place in places]
 
 
 def unregistered(value: Any) -> list[str]:
@@ -151,24 +152,13 @@ def with_numbers(cfg: Train, numbers: Sequence[tuple[str, Any]]) -> Train:
 def flags_of(cfg: Train, numbers: Sequence[tuple[str, Any]]) -> list[str]:
     """Return the command-line arguments of `train` for the same values. Ignores unknown paths."""
     found = [(place, value) for place, value in numbers if _has(cfg, place)]
-    return [word for place, value in found for word in (flag(place), str(value))]
-
-
-def flag(place: str) -> str:
-    """Return the flag of a dotted path, for example --scene.voxel-size."""
-    return f"--{place.replace('_', '-')}"
+    return [word for place, value in found for word in (flag_of(place), str(value))]
 
 
 def _has(value: Any, place: str) -> bool:
     first, _, rest = place.partition(".")
     known = dataclasses.is_dataclass(value) and first in {f.name for f in dataclasses.fields(value)}
     return known and (not rest or _has(getattr(value, first), rest))
-
-
-def _changed(part: Any, place: str) -> bool:
-    first, _, rest = place.partition(".")
-    value = getattr(part, first)
-    return _changed(value, rest) if rest else value != next(f.default for f in dataclasses.fields(part) if f.name == first)
 
 
 def _put(part: Any, place: list[str], value: Any) -> Any:

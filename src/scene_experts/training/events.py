@@ -23,6 +23,8 @@ class Started:
     """Number of rows: anchors, Gaussians or graph points."""
     traits: Traits
     """What the scene is and can do."""
+    decode: str = ""
+    """Which implementation decodes the scene in the first iteration, and why not the fused one; empty without a choice."""
 
 
 @dataclass(frozen=True)

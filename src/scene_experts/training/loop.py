@@ -28,6 +28,7 @@ from scene_experts.training.events import Densified, Event, Finished, Previewed,
 from scene_experts.training.guard import explain, find_broken
 from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
 from scene_experts.training.memory import anchor_cap, give_back, peak_bytes
+from scene_experts.training.options import TrainOptions
 from scene_experts.training.shards import Sharded, check_shard
 from scene_experts.training.state import Training, resume, save
 from scene_experts.training.trial import fit_memory
@@ -38,24 +39,25 @@ ROUTED = 16_384  # anchors sampled for the routing statistics; the shares are wi
 
 
 @dataclass(frozen=True)
-class Run:
-    """Options of a training run. The results depend on `config` and `max_memory`, and their rounding on `device`, `dtype` and `group`."""
+class Job:
+    """A training to be done: what is trained, where and how. `config` has the settings that results depend on."""
 
-    config: RunConfig  # with `stop_at` and `init_from`
+    config: RunConfig  # with `stop_at`, `max_memory` and `init_from`
     out: Path | None = None  # the run folder; None writes no files
     device: str = "cpu"
     dtype: torch.dtype = torch.float32  # float64 is for tests of rounding errors with the reference rasteriser
-    resume: bool = False
-    save_every: int = 5000  # iterations between checkpoints; the last iteration is always saved
-    preview_every: int = 0  # iterations between previews of one held-out view; 0: none
-    log_every: int = 10  # iterations between Stepped events
-    max_memory: float = 0.0  # GiB of memory (resident, or reserved on the GPU) at which densification stops; 0: no limit
+    options: TrainOptions = TrainOptions(preview_every=0)
     keep: int = 2  # number of checkpoints to keep
     begin: Callable[[Training], None] = lambda training: None  # called once, before the first event
     watch: Callable[[Training], None] = lambda training: None  # called between iterations and not timed; the viewer renders here
     shard: bool = False  # divide the rows of the table among the processes
     group: Alone = field(default_factory=Alone)  # the processes that share the views of each batch; process 0 writes all files
     stop: list[str] = field(default_factory=list)  # append a reason to save and stop, for example from a signal handler
+
+    @property
+    def max_memory(self) -> float:
+        """GiB of memory at which densification stops; 0: no limit."""
+        return self.config.max_memory
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,12 @@ class Iteration:
     edits: tuple[tuple[int, Edit], ...] = ()  # iteration and result of each densification step
 
 
-def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iterator[Event]:
+def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iterator[Event]:
     """Train a scene on a capture, from scratch or from the newest valid checkpoint of the run.
 
     Args:
         cfg: The settings before scaling. This function scales the schedule.
-        run: Options of the run.
+        run: What is trained, where and how.
         capture: The views and points to train on.
         rasterize: The rasteriser.
 
@@ -94,7 +96,8 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
     total = last_iteration(cfg, run)
     writes = folder is not None and run.group.first
     run.begin(training)
-    yield Started(training.step, total, training.scene.table.total, training.scene.traits)
+    about = training.scene.describe_decode(training.step + 1)
+    yield Started(training.step, total, training.scene.table.total, training.scene.traits, about)
     saved, parts = training.step, {}
     while training.step < total and not exchange.stopping:
         with training.clock.running():
@@ -105,15 +108,15 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
             raise RunError(explain(f"the parameter '{broken}' or its gradient", step, folder))
         for number, edit in done.edits:
             yield Densified(number, edit)
-        if step == total or passes(step, cfg.batch, run.log_every):
+        if step == total or passes(step, cfg.batch, run.options.log_every):
             check_finite(step, parts)
             if run.group.first:
                 yield measure_step(training, done)
-        if run.preview_every and (step == total or passes(step, cfg.batch, run.preview_every)):
+        if run.options.preview_every and (step == total or passes(step, cfg.batch, run.options.preview_every)):
             shown = preview(training, run, capture, rasterize, exchange)
             if shown is not None:
                 yield shown
-        if folder and (step == total or passes(step, cfg.batch, run.save_every)):
+        if folder and (step == total or passes(step, cfg.batch, run.options.save_every)):
             check_finite(step, parts)
             exchange.complete()
             tensors = exchange.tensors()
@@ -136,14 +139,14 @@ def train(cfg: Train, run: Run, capture: Capture, rasterize: Rasterizer) -> Iter
         yield Finished(training.step, training.clock.seconds)
 
 
-def last_iteration(cfg: Train, run: Run) -> int:
+def last_iteration(cfg: Train, run: Job) -> int:
     """Return the iteration at which a training ends: `stop_at` at the end of its batch, or all iterations."""
     return min(cfg.iterations, -(-(run.config.stop_at or cfg.iterations) // cfg.batch) * cfg.batch)
 
 
-def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize: Rasterizer) -> Training:
+def begin(cfg: Train, run: Job, capture: Capture, folder: Path | None, rasterize: Rasterizer) -> Training:
     """Start a training, or restore it from the newest whole checkpoint in `folder`. `cfg` must be scaled. Raises InputError as `train`."""
-    training = resume(cfg, folder, run.device) if run.resume and folder else None
+    training = resume(cfg, folder, run.device) if run.options.resume and folder else None
     if training and training.capture_id not in ("", capture.fingerprint()):
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
     if training:
@@ -165,7 +168,7 @@ def begin(cfg: Train, run: Run, capture: Capture, folder: Path | None, rasterize
     return training
 
 
-def start_exchange(training: Training, run: Run) -> Direct:
+def start_exchange(training: Training, run: Job) -> Direct:
     """Return the exchange of a training, and divide or compare the scenes of the processes. Raises InputError as `train`."""
     if run.shard:
         check_batch(training.cfg.batch, run.group.size)
@@ -177,7 +180,7 @@ def start_exchange(training: Training, run: Run) -> Direct:
     return exchange
 
 
-def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterizer, exchange: Direct | None = None) -> Iteration:
+def iterate(training: Training, run: Job, capture: Capture, rasterize: Rasterizer, exchange: Direct | None = None) -> Iteration:
     """See the views of one batch and take one optimiser step. Iterations count views, so the step advances by `cfg.batch`.
 
     The order is that of the paper: learning rates; view, decoding, rendering, loss, gradients; densification; Adam.
@@ -228,7 +231,7 @@ def iterate(training: Training, run: Run, capture: Capture, rasterize: Rasterize
 
 def see_view(
     training: Training,
-    run: Run,
+    run: Job,
     capture: Capture,
     rasterize: Rasterizer,
     number: int,
@@ -248,8 +251,6 @@ def see_view(
     background = torch.tensor(capture.background) if color is None else color
     training.seed_view(number)
     decoded = scene(camera, number, Mode.TRAIN, rasterize.visible)
-    if cfg.loss.needs_scene_opacity(number):
-        decoded = replace(decoded, scene_opacity=scene.scene_opacity(camera, number, Mode.TRAIN))
     render = rasterize(decoded.gaussians, camera, upload(background, run.device, run.dtype))
     parts = compute_terms(Sample(decoded, render, target, mask, number), cfg.loss)
     loss = torch.stack(list(parts.values())).sum()
@@ -260,7 +261,7 @@ def see_view(
     return Iteration(decoded, render, parts, target, mask)
 
 
-def survey_of(training: Training, run: Run, capture: Capture, rasterize: Rasterizer) -> Survey:
+def survey_of(training: Training, run: Job, capture: Capture, rasterize: Rasterizer) -> Survey:
     """Return the training views as densification can look at them."""
 
     def photo(index: int) -> Photo:
@@ -333,7 +334,7 @@ def use(r: Routing) -> list[float]:
 
 
 @torch.no_grad()
-def preview(training: Training, run: Run, capture: Capture, rasterize: Rasterizer, exchange: Direct | None = None) -> Previewed | None:
+def preview(training: Training, run: Job, capture: Capture, rasterize: Rasterizer, exchange: Direct | None = None) -> Previewed | None:
     """Render one held-out view, or a training view if none is held out, in process 0. Every process must call this."""
     exchange = exchange or Direct(training, run.group, run.stop)
     index = (capture.test or capture.train)[0]

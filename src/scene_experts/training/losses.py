@@ -7,17 +7,18 @@ Equation numbers refer to "Scene Experts" (MoE-GS, AAAI 2026). The photometric l
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, Self
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.fields import SCALES, Needs, NotNegative, Share
 from scene_experts.core.parts import Part, register
 from scene_experts.core.types import Decoded, Render, Routing
 from scene_experts.native import terms as native_terms
+from scene_experts.scene import EXPLICIT, OPACITY, ROUTERS
 from scene_experts.training.photometric import photometric
 from scene_experts.training.robust import weigh_residuals
 
@@ -47,56 +48,31 @@ class Weights(Part):
 
     terms: ClassVar[tuple[Term, ...]] = ()
 
-    dssim: float = 0.2
+    dssim: Share = 0.2
     """Weight of 1 - SSIM; L1 has the weight 1 - dssim."""
-    scale: float = 0.01
+    scale: NotNegative = 0.01
     """Weight of the mean volume of the rendered Gaussians."""
-    opacity: float = 0.0
+    opacity: Annotated[NotNegative, Needs(OPACITY)] = 0.0
     """Weight of the opacity hinge (eq. 8)."""
-    load: float = 0.0
+    load: Annotated[NotNegative, Needs(ROUTERS)] = 0.0
     """Weight of the load balancing (eq. 6 and 7)."""
     tau: float = 0.0
     """Opacity below which the hinge acts."""
-    opacity_scope: Literal["visible", "rendered_anchors", "all"] = "visible"
-    """Opacities in the hinge: those of all visible anchors, of anchors with a rendered Gaussian, or of all anchors."""
-    load_reduce: Literal["sum", "mean"] = "sum"
-    """How L_load is reduced over the attributes with experts."""
-    load_phase: Literal["exclusive", "both"] = "exclusive"
-    """exclusive: eq. 7 during the dense warm-up, eq. 6 after it. both: after it, the sum of the two."""
-    load_normalise_by_k: bool = False
-    """Divide eq. 6 by k, so that perfect balance is 1 for every k."""
-    mean_opacity: float = 0.0
+    mean_opacity: Annotated[NotNegative, Needs(EXPLICIT)] = 0.0
     """Weight of the mean opacity of all explicit Gaussians (3DGS-MCMC)."""
-    mean_size: float = 0.0
+    mean_size: Annotated[NotNegative, Needs(EXPLICIT)] = 0.0
     """Weight of the mean size of all explicit Gaussians over the three axes (3DGS-MCMC)."""
-    opacity_from: int = 0
+    opacity_from: Annotated[int, SCALES] = 0
     """First iteration with the opacity hinge."""
-    opacity_until: int | None = None
+    opacity_until: Annotated[int | None, SCALES] = None
     """Last iteration with the opacity hinge; none means the last iteration of the training."""
-    residual_quantile: float = 1.0
+    residual_quantile: Share = 1.0
     """Share of each picture's pixels that count in full, those with the smallest residuals; 1 means all. Below 1, things that move between
     the photographs count less."""
-    residual_weight: float = 0.0
+    residual_weight: Share = 0.0
     """Weight of the pixels with larger residuals."""
-    residual_from: int = 1500
+    residual_from: Annotated[int, SCALES] = 1500
     """First iteration in which pixels with large residuals count less."""
-
-    def scaled(self, factor: float) -> Self:
-        """Return the weights for a training that is `factor` times as long. The windows are scaled."""
-        until = None if self.opacity_until is None else round(self.opacity_until * factor)
-        opacity, residual = round(self.opacity_from * factor), round(self.residual_from * factor)
-        residual = residual if self.residual_quantile < 1 else self.residual_from  # unused: older checkpoints do not have it
-        return replace(self, opacity_from=opacity, opacity_until=until, residual_from=residual)
-
-    def check(self) -> None:
-        """Check the weights. Raises InputError, which names the flag, if a weight is below 0 or `dssim` is above 1."""
-        names = ("dssim", "scale", "opacity", "load", "mean_opacity", "mean_size")
-        expect_at_least([(f"--loss.{name.replace('_', '-')}", getattr(self, name), 0) for name in names])
-        if self.dssim > 1:
-            raise InputError(f"expected --loss.dssim of at most 1, found {self.dssim}; L1 gets the rest of 1, so give a smaller number")
-        for name in ("residual_quantile", "residual_weight"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"expected --loss.{name.replace('_', '-')} from 0 to 1, found {getattr(self, name)}; correct it")
 
     def has_hinge(self, step: int | None) -> bool:
         """Whether the opacity hinge is active at `step`. None ignores its window."""
@@ -108,15 +84,9 @@ class Weights(Part):
         """Whether a loss acts on all Gaussians of a scene of plain Gaussians, drawn or not."""
         return bool(self.mean_opacity or self.mean_size)
 
-    def needs_scene_opacity(self, step: int) -> bool:
-        """Whether `Decoded.scene_opacity` is needed at `step`."""
-        return self.opacity_scope == "all" and self.has_hinge(step)
-
     def reaches_every_row(self, decoded: Decoded) -> bool:
         """Whether the loss has a gradient for rows of the table that the view did not decode."""
-        population = decoded.population is not None and self.regularises
-        routing = any(len(r.gates) != len(decoded.rows) for r in decoded.routing.values())
-        return decoded.scene_opacity is not None or population or routing
+        return decoded.population is not None and self.regularises
 
 
 def compute_terms(sample: Sample, weights: Weights) -> dict[str, Tensor]:
@@ -148,7 +118,7 @@ def hinge_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
     """The opacity hinge (eq. 8)."""
     if not w.has_hinge(sample.step) or sample.decoded.raw_opacity is None:
         return {}
-    return {"opacity": w.opacity * opacity_hinge(hinge_opacities(sample.decoded, sample.render, w), w.tau)}
+    return {"opacity": w.opacity * opacity_hinge(sample.decoded.raw_opacity, w.tau)}
 
 
 def mean_opacity_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
@@ -169,27 +139,13 @@ def mean_size_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
 
 def load_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
     """The load-balancing loss of the experts (eq. 6, 7)."""
-    return {"load": w.load * load(sample.decoded.routing, w)} if w.load != 0 and sample.decoded.routing else {}
+    return {"load": w.load * load(sample.decoded.routing)} if w.load != 0 and sample.decoded.routing else {}
 
 
 Weights.terms = (photometric_terms, volume_term, hinge_term, mean_opacity_term, mean_size_term, load_term)
 
 
 # --- functions that the terms use ---------------------------------------------------------------------------------------------------------
-
-
-def hinge_opacities(decoded: Decoded, render: Render, w: Weights) -> Tensor:
-    """Return the raw opacities [.., K] that `w.opacity_scope` selects. "all" requires `decoded.scene_opacity`, else ValueError."""
-    assert decoded.raw_opacity is not None
-    if w.opacity_scope == "visible":
-        return decoded.raw_opacity
-    if w.opacity_scope == "all":
-        if decoded.scene_opacity is None:
-            raise ValueError("expected decoded.scene_opacity for the hinge over all anchors, found none")
-        return decoded.scene_opacity
-    K = decoded.raw_opacity.shape[1]
-    drawn = torch.div(decoded.gaussians.source[render.radii > 0], K, rounding_mode="floor")
-    return decoded.raw_opacity[torch.isin(decoded.rows, drawn)]
 
 
 def volume(scales: Tensor) -> Tensor:
@@ -231,22 +187,13 @@ def load_dense(gates: Tensor) -> Tensor:
     return gates.shape[1] * _mean(gates).square().sum()
 
 
-def load(routing: dict[str, Routing], w: Weights) -> Tensor:
-    """Load-balancing loss over all attributes with experts, []. Each attribute uses eq. 7 while dense, else eq. 6 (`load_phase`).
+def load(routing: dict[str, Routing]) -> Tensor:
+    """Load-balancing loss, []: the sum over the attributes with experts of eq. 7 while dense, of eq. 6 after it.
 
     `routing` must not be empty.
     """
-    values = []
-    for r in routing.values():
-        if r.chosen is None:
-            values.append(load_dense(r.gates))
-            continue
-        value = load_sparse(r.gates, r.chosen)
-        if w.load_normalise_by_k:
-            value = value / r.chosen.shape[1]
-        values.append(value + load_dense(r.gates) if w.load_phase == "both" else value)
-    total = torch.stack(values).sum()
-    return total / len(values) if w.load_reduce == "mean" else total
+    values = [load_dense(r.gates) if r.chosen is None else load_sparse(r.gates, r.chosen) for r in routing.values()]
+    return torch.stack(values).sum()
 
 
 def _mean(gates: Tensor) -> Tensor:

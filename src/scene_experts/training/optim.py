@@ -11,12 +11,12 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.fields import NotNegative, Range
 from scene_experts.core.parts import Part, register
 from scene_experts.core.transfer import upload
 from scene_experts.native import library as native
@@ -59,9 +59,9 @@ class Adam(Optimizer):
     prefix = "adam"
     by_row = True
 
-    betas: tuple[float, float] = (0.9, 0.999)
+    betas: Annotated[tuple[float, float], Range(0, below=1)] = (0.9, 0.999)
     """Decay rates of the first and second moment."""
-    eps: float = 1e-15
+    eps: NotNegative = 1e-15
     """Term added to the denominator."""
 
     def for_batch(self, views: int) -> Self:
@@ -71,12 +71,6 @@ class Adam(Optimizer):
 
     def build(self, groups: list[dict[str, Any]]) -> FusedAdam:
         return FusedAdam(groups, betas=self.betas, eps=self.eps)
-
-    def check(self) -> None:
-        """Raises InputError, naming the flag, for invalid settings."""
-        expect_at_least([("--optimizer.eps", self.eps, 0), *(("--optimizer.betas", beta, 0) for beta in self.betas)])
-        if max(self.betas) >= 1:
-            raise InputError(f"expected --optimizer.betas below 1, found {self.betas}; give smaller numbers")
 
 
 class FusedAdam(torch.optim.Adam):

@@ -70,6 +70,8 @@ class TrainingProgress:
                 self.traits, rows = event.traits, event.traits.rows
                 lattice = f" on a lattice of {event.traits.voxel:.3g}" if event.traits.voxel else ""
                 self.print_line(f"{verb}: {event.anchors:,} {rows}{lattice}, {event.total:,} iterations")
+                if event.decode:
+                    self.print_line(f"decode: {event.decode}")
             case Stepped():
                 self.show_step(event)
             case Densified():

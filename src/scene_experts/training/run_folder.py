@@ -11,13 +11,11 @@ RUN/.lock                            held by the training that writes to this fo
 from __future__ import annotations
 
 import json
-import math
 import platform
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +30,6 @@ from scene_experts.core.plain import MOST_DIFFERENCES, UnknownPart, differences,
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding
 from scene_experts.data import capture as captures
-from scene_experts.data.blocks import read_view_names
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
 from scene_experts.data.settings import Data
@@ -135,8 +132,7 @@ def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
             f"expected the settings that the run in {out} began with, found other settings: {few(other, MOST_DIFFERENCES)}; "
             f"resume with the run's own flags, or choose another --out"
         )
-    older = found.init_from is None and "--init-from" in found.command  # a run that does not record its start
-    if config.init_from is not None and not older and _place(config.init_from) != _place(found.init_from):
+    if config.init_from is not None and _place(config.init_from) != _place(found.init_from):
         raise InputError(
             f"expected the --init-from that the run in {out} began with ({found.init_from or 'none'}), found {config.init_from}; "
             "leave it out, or choose another --out"
@@ -233,52 +229,6 @@ def named(data: Data) -> Data:
     return replace(data, path=path, resolution=resolution, split=split, views=views)
 
 
-def load_capture(data: Data, seed: int = 0, look: bool = False) -> Capture:
-    """Load the capture that `data` describes. `look` accepts a capture without points, which cannot be trained on.
-
-    Raises InputError if `background` is not three numbers in [0, 1], if `near` is not positive, or if the capture cannot be read.
-    """
-    if data.background is not None and not _is_colour(data.background):
-        found = list(data.background) if isinstance(data.background, tuple) else repr(data.background)
-        raise InputError(f"expected --background as three numbers between 0 and 1, found {found}; correct them")
-    if data.near is not None and not 0 < data.near < math.inf:
-        raise InputError(f"expected --near as a positive length, found {data.near}; leave it out for min(0.2, 0.02 R)")
-    capture = captures.load(
-        data.path,
-        images=data.images,
-        resolution=data.resolution,
-        split=data.split,
-        missing=data.missing,
-        normalise=data.normalise,
-        init=data.init,
-        max_views=data.max_views,
-        ignore_principal_point=data.ignore_principal_point,
-        background=data.background,
-        seed=seed,
-        allow_no_points=look,
-    )
-    if data.views is not None:
-        capture = choose_views(capture, data.views)
-    if data.near is None:
-        return capture
-    return replace(capture, views=tuple(replace(v, camera=replace(v.camera, near=data.near)) for v in capture.views))
-
-
-def _is_colour(value: object) -> bool:
-    return isinstance(value, (tuple, list)) and len(value) == 3 and all(isinstance(v, Real) and 0 <= float(v) <= 1 for v in value)
-
-
-def choose_views(capture: Capture, path: Path) -> Capture:
-    """Return the capture with only those training views that the JSON list at `path` names. Raises InputError for unknown names."""
-    names = set(read_view_names(path))
-    chosen = tuple(index for index in capture.train if capture.views[index].name in names)
-    if len(chosen) < len(names):
-        unknown = sorted(names - {capture.views[index].name for index in chosen})
-        capture.images.close()
-        raise InputError(f"expected training views of {capture.root} in {path}, found {few(unknown)}; correct --views")
-    return replace(capture, train=chosen, left_out=tuple(index for index in capture.train if index not in chosen))
-
-
 def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
     """Load the capture that a run was trained on. `data` is its new location if it has moved.
 
@@ -288,7 +238,7 @@ def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
     where = named(run.config.data if data is None else replace(run.config.data, path=data))
     if data is None and not where.path.exists():
         raise InputError(f"expected the run's capture at {where.path}, found nothing there; say where it is with --data")
-    capture = load_capture(where, run.config.train.seed)
+    capture = captures.load(where, run.config.train.seed)
     if run.capture not in ("", capture.fingerprint()):
         capture.images.close()
         raise InputError(f"expected the capture that {run.path} was trained on, found other views in {capture.root}; give the right --data")

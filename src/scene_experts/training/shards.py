@@ -101,9 +101,7 @@ class Sharded(Reduced):
         assert self.total is not None
         if not self.ordered:
             self.group.sum(self.total)
-        counts, batch = self.scene.counts(), self.training.cfg.batch
-        for count in counts:
-            self.group.sum(count)
+        batch = self.training.cfg.batch
         *parts, flag = self.total.split([p.numel() for p in self._networks()] + [1])
         for parameter, part in zip(self._networks(), parts):
             parameter.grad = part.view_as(parameter) / batch
@@ -111,8 +109,7 @@ class Sharded(Reduced):
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
             parameter.grad /= batch
-        if batch > 1:
-            self.scene.settle()
+        self.scene.end_batch(batch)
         self.total = None
         if flag:
             self.agreed = True
@@ -161,7 +158,6 @@ class Sharded(Reduced):
 def check_shard(cfg: Train, max_memory: float, viewer: bool) -> None:
     """Raise InputError, which names --shard, if a setting needs all rows in one process."""
     why = cfg.scene.needs_whole_table() or cfg.growth.needs_whole_table()
-    why = why or ("--loss.opacity-scope all" if cfg.loss.opacity_scope == "all" else "")
     why = why or ("--max-memory" if max_memory > 0 else "--viewer" if viewer else "")
     if why:
         raise InputError(f"expected settings that --shard can divide among the processes, found {why}; leave one of the two out")

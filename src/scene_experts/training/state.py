@@ -14,6 +14,7 @@ from torch import Tensor
 
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError, few
+from scene_experts.core.fields import flag_of
 from scene_experts.core.plain import MOST_DIFFERENCES, differences, from_json, to_json
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding
@@ -26,7 +27,6 @@ from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.guard import check_state
 from scene_experts.training.memory import Largest
-from scene_experts.training.old_hash import old_hash
 from scene_experts.training.run_folder import read_config
 
 log: logging.Logger = logging.getLogger(__name__)
@@ -57,7 +57,6 @@ class Training:
         named = scene.rate_groups().items()
         groups = [{"params": params, "name": name, "lr": 0.0, "by_row": name in columns} for name, params in named]
         self.optimizer = cfg.optimizer.for_batch(cfg.batch).build(groups)
-        scene.set_batch(cfg.batch)
         scene.table.attach(self.optimizer)
         self.averages = Averages(scene) if cfg.average.span > 0 else None
 
@@ -263,24 +262,22 @@ def check_phases(cfg: Train, before: SceneConfig, step: int) -> None:
 
     Both must be scaled. In an earlier phase, other networks, levels or harmonics draw the scene than those that were trained last.
     """
-    left = {flag for flag, last in before.phases().items() if step > last}
-    for flag, last in cfg.scene.phases().items():
-        if flag in left and step <= last:
+    left = {place for place, last in before.phases().items() if step > last}
+    for place, last in cfg.scene.phases().items():
+        if place in left and step <= last:
             raise InputError(
-                f"expected the phase of {flag} to end before iteration {step}, because the run of --init-from has left it, "
-                f"found one that lasts until iteration {last}; give fewer --iterations or a smaller {flag}"
+                f"expected the phase of {flag_of(f'scene.{place}')} to end before iteration {step}, because the run of --init-from "
+                f"has left it, "
+                f"found one that lasts until iteration {last}; give fewer --iterations or a smaller value"
             )
 
 
 def check_same(cfg: Train, meta: dict[str, Any]) -> None:
-    """Raise InputError if the checkpoint of `meta` was trained with settings other than `cfg`, which must be scaled.
-
-    Settings that are newer than the checkpoint have their defaults.
-    """
-    if "train" in meta:
+    """Raise InputError if the checkpoint of `meta` was trained with settings other than `cfg`, which must be scaled."""
+    if "train" not in meta:
+        other = "it was imported, and has no state of an optimiser"
+    else:
         other = few(differences(to_json(from_json(Train, meta["train"])), to_json(cfg)), MOST_DIFFERENCES)
-    else:  # an older checkpoint, which stores only a hash
-        other = "" if meta["config"] == old_hash(cfg) else "it does not say which"
     if other:
         raise InputError(
             f"expected a checkpoint of this configuration, found one trained with other settings: {other}; "

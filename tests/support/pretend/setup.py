@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import _disable_current_modes
 import support.pretend.gsplat_stand_in  # noqa: F401  before gsplat is imported
 from scene_experts.core import random
 from scene_experts.core.types import Points
-from scene_experts.data.capture import Capture, load
+from scene_experts.data.capture import Capture
 from scene_experts.data.settings import Data
 from scene_experts.evaluate import score, timing
 from scene_experts.native import triton
@@ -24,6 +24,8 @@ from scene_experts.render import gsplat
 from scene_experts.training import loop
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.optim import FusedAdam
+from scene_experts.training.options import TrainOptions
+from support.captures import load
 from support.places import DEMO
 from support.pretend.tensors import Pretender, Pretending, counts
 
@@ -51,8 +53,8 @@ def short(recipe: str, **changes: Any) -> Train:
     return replace(cfg, growth=replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=4))).scaled()
 
 
-def run_of(cfg: Train, device: str) -> loop.Run:
-    return loop.Run(RunConfig(cfg, Data(Path("nowhere"))), device=device, log_every=10**9)
+def run_of(cfg: Train, device: str) -> loop.Job:
+    return loop.Job(RunConfig(cfg, Data(Path("nowhere"))), device=device, options=TrainOptions(log_every=10**9, preview_every=0))
 
 
 def prepare() -> None:

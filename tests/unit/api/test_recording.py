@@ -7,14 +7,16 @@ import pytest
 
 from scene_experts.api import recording
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import Capture, load
+from scene_experts.data.capture import Capture
 from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Exported, Finished, Previewed, Saved, Started, Stopped
-from scene_experts.training.loop import Run
+from scene_experts.training.loop import Job
+from scene_experts.training.options import TrainOptions
+from support.captures import load
 from support.messages import naming
 from support.synthetic import make_capture
 
@@ -26,9 +28,9 @@ def capture(tmp_path_factory) -> Capture:
     return load(make_capture(tmp_path_factory.mktemp("capture"), views=9, size=(32, 24), points=200).folder)
 
 
-def run_in(out: Path | None, capture: Capture, **settings) -> Run:
+def run_in(out: Path | None, capture: Capture, **settings) -> Job:
     cfg = replace(RECIPES["scaffold-gs"][1], iterations=4)
-    return Run(RunConfig(cfg, Data(capture.root)), out, preview_every=2, **settings)
+    return Job(RunConfig(cfg, Data(capture.root)), out, options=TrainOptions(preview_every=2, **settings))
 
 
 def test_the_folder_is_complete_when_the_training_has_finished(tmp_path, capture):
@@ -92,7 +94,7 @@ def test_a_run_that_is_resumed_before_its_first_checkpoint_starts_from_the_scene
     longer = replace(RECIPES["scaffold-gs"][1], iterations=8)
     begun = RunConfig(longer, Data(capture.root), init_from=tmp_path / "first")
     run_folder.prepare(tmp_path / "second", begun, resume=False)  # and killed
-    resumed = Run(replace(begun, init_from=None), tmp_path / "second", resume=True)
+    resumed = Job(replace(begun, init_from=None), tmp_path / "second", options=TrainOptions(resume=True))
     events = list(recording.train(resumed, capture, CPU))
     assert isinstance(events[0], Started) and events[0].step == 4
     assert run_folder.read_config(tmp_path / "second") == replace(begun, data=Data(capture.root.absolute()))
@@ -103,5 +105,5 @@ def test_a_stop_before_the_start_of_init_from_is_refused(tmp_path, capture):
     longer = replace(RECIPES["scaffold-gs"][1], iterations=8)
     begun = RunConfig(longer, Data(capture.root), stop_at=4, init_from=tmp_path / "first")
     with pytest.raises(InputError, match=naming("--stop-at", 4)):
-        list(recording.train(Run(begun, tmp_path / "second"), capture, CPU))
+        list(recording.train(Job(begun, tmp_path / "second"), capture, CPU))
     assert not (tmp_path / "second").exists()

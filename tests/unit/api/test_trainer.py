@@ -1,5 +1,7 @@
 """Scripted trainings: events, pauses, stops, and the same bits as the command."""
 
+import dataclasses
+import inspect
 import os
 import signal
 from dataclasses import replace
@@ -13,6 +15,8 @@ import scene_experts as se
 from scene_experts.api.trainer import Settings
 from scene_experts.cli import main
 from scene_experts.core import checkpoint
+from scene_experts.data.settings import Data
+from scene_experts.training.options import TrainOptions
 from scene_experts.training.run_folder import read_config
 
 FLAGS = ["--iterations", "6", "--scene.voxel-size", "0.2", "--deterministic", "--device", "cpu", "--save-every", "3"]
@@ -136,7 +140,7 @@ def test_ctrl_c_saves_and_is_raised(capture, tmp_path, monkeypatch):
         ({"stop_at": 0}, "stop_at"),
         ({"stop_at": 4.0}, "stop_at.*4.0"),
         ({"deterministic": 1}, "deterministic"),
-        ({"max_memory": -1.0}, "max-memory"),
+        ({"max_memory": -1.0}, "max_memory"),
         ({"device": "gpu"}, "'gpu'"),
         ({"rasterizer": "opengl"}, "opengl"),
     ],
@@ -163,8 +167,12 @@ def test_an_earlier_run_is_not_lost_by_accident(run, capture, small, folder):
         se.Trainer("moe-gs", folder / "absent")
 
 
-def test_train_takes_every_setting_of_the_trainer():
-    import inspect
-
-    settings = {name: p for name, p in inspect.signature(se.Trainer).parameters.items() if p.kind is p.KEYWORD_ONLY}
-    assert settings.keys() == Settings.__annotations__.keys()
+def test_the_arguments_are_those_of_the_options():
+    """Signatures are written out for readers and editors; names and defaults are those of the dataclasses."""
+    for function, kind, own in ((se.Trainer, TrainOptions, set()), (se.load_capture, Data, {"seed", "path", "views"})):
+        found = {name: p for name, p in inspect.signature(function).parameters.items() if p.kind is p.KEYWORD_ONLY}
+        fields = {f.name: f.default for f in dataclasses.fields(kind)}
+        assert found.keys() - own == fields.keys() - own
+        differ = {name for name in found.keys() - own if found[name].default != fields[name]}
+        assert differ <= {"normalise"}  # None: that of the scene of the catalog, or the default of `Data`
+    assert TrainOptions.__dataclass_fields__.keys() == Settings.__annotations__.keys()

@@ -6,9 +6,9 @@ import pytest
 
 from scene_experts import cli
 from scene_experts.commands.train import parse_train
-from scene_experts.data.capture import load
 from scene_experts.scene.anchors.few_views import find_weight
 from scene_experts.training.config import check
+from support.captures import load
 from support.synthetic import make_capture
 
 
@@ -31,7 +31,7 @@ def test_the_commands_of_a_plan_are_commands_of_train(capture, tmp_path, capsys)
     words = [shlex.split(line) for line in lines]
     trains = [parse_train(line[2:]) for line in words if line[1] == "train"]
     assert [train.init_from for train in trains] == [None, *[out / "coarse"] * 3, out / "merged"]
-    assert [train.cfg.iterations for train in trains] == [900, 900, 900, 900, 990] and trains[0].stop_at == 300
+    assert [train.cfg.iterations for train in trains] == [900, 900, 900, 900, 990] and trains[0].options.stop_at == 300
     assert all(train.cfg.seed == 3 for train in trains)
     assert [train.cfg.max_anchors for train in trains[:2]] == [500, 0] and [t.max_memory for t in trains] == [4, 4, 4, 4, 0]
     assert all(train.data.background == (1, 1, 0.5) and train.data.ignore_principal_point for train in trains)
@@ -56,7 +56,7 @@ def test_the_coarse_training_outlasts_the_warm_up(capture, tmp_path, warmup, unt
     given = ["--blocks", "2", "--recipe", "scene-experts", "--iterations", "900", f"--train=--scene.decoder.warmup={warmup}"]
     assert cli.main(["blocks", "plan", str(capture), "--out", str(tmp_path / "plan"), *given]) == 0
     coarse = shlex.split((tmp_path / "plan/commands.sh").read_text().splitlines()[2])
-    assert parse_train(coarse[2:]).stop_at == until
+    assert parse_train(coarse[2:]).options.stop_at == until
 
 
 @pytest.mark.parametrize("options", ["scaffold-gs-bank", "moe-gs-balance", "scaffold-gs --train=--scene.appearance=8"])
@@ -90,7 +90,7 @@ def test_words_that_do_not_fit(capture, tmp_path, capsys):
         (["blocks", "plan", str(capture), *out, "--blocks", "0"], "--blocks"),
         (["blocks", "plan", str(capture), *out, "--views", "x.json"], "--views"),
         (["blocks", "plan", str(capture), *out, "--train=--seeed 3"], "seeed"),
-        (["blocks", "plan", str(capture), *out, "--train=--seed -1"], "--seed of at least 0"),
+        (["blocks", "plan", str(capture), *out, "--train=--seed -1"], "--seed from 0"),
         (["blocks", "plan", str(capture), *out, "--iterations", "100", "--train=--batch 8"], "--batch 8 divides"),
         (["blocks", "plan", str(capture), *out, "--blocks", "300"], "same coordinate; give smaller --blocks"),
         (["blocks", "plan", str(capture), *out, "--train=--seed '3"], "--train"),

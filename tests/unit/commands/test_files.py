@@ -8,6 +8,7 @@ import pytest
 from scene_experts.arguments.parse import HelpAsked
 from scene_experts.commands.files import export, import_
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.files import registry
 from scene_experts.files.export import write_result_folder
@@ -49,8 +50,8 @@ def test_flags_reach_the_bake(tmp_path, capsys):
     folder = make_capture(tmp_path / "capture", views=9, size=(48, 32), points=250).folder
     config = RunConfig(replace(RECIPES["scaffold-gs"][1], iterations=300), Data(folder), stop_at=10)
     run_folder.prepare(tmp_path / "run", config, resume=False)
-    capture = run_folder.load_capture(config.data)
-    list(train.train(config.train, train.Run(config, tmp_path / "run"), capture, choose("auto", "cpu")))
+    capture = captures.load(config.data)
+    list(train.train(config.train, train.Job(config, tmp_path / "run"), capture, choose("auto", "cpu")))
     capture.images.close()
     flags = ["--sh-degree", "1", "--max-gaussians", "90", "--prune", "0.01", "--refine", "3", "--frame", "trained"]
     assert export([str(tmp_path / "run"), "--format", "spz", *flags]) == 0
@@ -70,8 +71,8 @@ def run(tmp_path_factory):
     folder = make_capture(root / "capture", views=9, size=(48, 32), points=250).folder
     config = RunConfig(replace(RECIPES["scaffold-gs"][1], iterations=300), Data(folder), stop_at=2)
     run_folder.prepare(root / "run", config, resume=False)
-    capture = run_folder.load_capture(config.data)
-    list(train.train(config.train, train.Run(config, root / "run"), capture, choose("auto", "cpu")))
+    capture = captures.load(config.data)
+    list(train.train(config.train, train.Job(config, root / "run"), capture, choose("auto", "cpu")))
     write_result_folder(run_folder.open_run(root / "run"), capture)
     capture.images.close()
     return root / "run"

@@ -67,7 +67,7 @@ def test_a_restarted_process_continues_a_run_that_had_begun(tmp_path):
     assert after_restart(command, group) == command
     (tmp_path / "config.json").touch()
     continued = after_restart(command, group)
-    assert continued.resume and not continued.overwrite
+    assert continued.options.resume and not continued.options.overwrite
 
 
 def test_a_memory_cap_needs_a_system_that_tells(monkeypatch):

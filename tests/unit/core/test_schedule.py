@@ -2,6 +2,7 @@ import math
 
 import pytest
 
+from scene_experts.core.fields import scale
 from scene_experts.core.schedule import Every, Rate, passes
 
 
@@ -14,7 +15,7 @@ def test_a_shorter_training_scales_the_window_and_keeps_the_interval():
     for every in (Every(1500, 15_000, 100), Every(350, 3500, 100), Every(0, 10, 3)):
         for last in (0, 9, 10, 1600, 3000, 30_000):
             assert every.count(last) == sum(every.due(i) for i in range(1, last + 1))
-    assert Every(1500, 15_000, 100).scaled(0.1) == Every(150, 1500, 100)
+    assert scale(Every(1500, 15_000, 100), 0.1) == Every(150, 1500, 100)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.blocks import FAR, Block, make_blocks, read_plan, read_view_names, split_box, visible, write_plan
-from scene_experts.data.capture import load
+from support.captures import load
 from support.synthetic import make_capture
 
 

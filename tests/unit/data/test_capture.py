@@ -13,10 +13,10 @@ import torch
 from PIL import Image
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap_model import read_model, write_model
 from scene_experts.data.summary import neighbour_distance, summarise
+from support.captures import load
 from support.lenses import LENSES
 from support.messages import naming
 from support.synthetic import Synthetic, make_capture, picture

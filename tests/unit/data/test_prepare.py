@@ -11,7 +11,8 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Points
 from scene_experts.data import prepare
-from scene_experts.data.capture import Capture, load
+from scene_experts.data.capture import Capture
+from support.captures import load
 from support.synthetic import make_capture
 
 
@@ -39,7 +40,9 @@ def test_splits(capture: Capture) -> None:
     assert prepare.hold_out(capture, "mod:5").split == "mod5"
 
 
-@pytest.mark.parametrize("split", ["mod1", "modx", "first:0", "fold:0/5", "fold:6/5", "fold:1/1", "half", "files", "first:10", "", "mod²", "first:²"])
+@pytest.mark.parametrize(
+    "split", ["mod1", "modx", "first:0", "fold:0/5", "fold:6/5", "fold:1/1", "half", "files", "first:10", "", "mod²", "first:²"]
+)
 def test_bad_splits(capture: Capture, split: str) -> None:
     with pytest.raises(InputError, match="--split"):
         prepare.hold_out(capture, split)

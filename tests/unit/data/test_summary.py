@@ -8,8 +8,8 @@ import pytest
 import torch
 from rich.console import Console
 
-from scene_experts.data.capture import load
 from scene_experts.data.summary import format_value, neighbour_distance, print_summary, summarise
+from support.captures import load
 from support.synthetic import make_capture, make_nerfstudio
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from scene_experts.core.types import Camera
-from scene_experts.data.capture import load
 from scene_experts.data.views import World, same_poses
+from support.captures import load
 from support.synthetic import look_at, make_capture
 
 WORLD = World(3.5, (10.0, -20.0, 0.5))

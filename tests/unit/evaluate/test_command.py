@@ -49,7 +49,7 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return {"psnr": 1.0}
 
     monkeypatch.setattr(command.run_folder, "open_run", lambda run, device, step: opened)
-    monkeypatch.setattr(command.run_folder, "load_capture", load)
+    monkeypatch.setattr(command.run_folder.captures, "load", load)
     monkeypatch.setattr(command, "evaluate", evaluate)
     result = command.evaluate_run(tmp_path, "cpu", Raster(), EvalOptions("train", lpips=False), data=Path("new"))  # type: ignore[arg-type]
     assert result == {"psnr": 1.0} and closed == [True]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import load
 from scene_experts.evaluate.metrics import Perceptual
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.results import (
@@ -18,6 +17,7 @@ from scene_experts.evaluate.results import (
     find_failed,
     find_outdated,
 )
+from support.captures import load
 from support.messages import naming
 from support.scenes import start_scene
 from support.synthetic import make_blender, make_capture

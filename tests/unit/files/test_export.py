@@ -11,6 +11,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
+from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.evaluate.metrics import psnr
@@ -29,7 +30,7 @@ from scene_experts.render import choose
 from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig, Train
-from scene_experts.training.loop import Run, train
+from scene_experts.training.loop import Job, train
 from scene_experts.training.state import Training
 from support.files import export_run
 from support.messages import naming
@@ -51,10 +52,10 @@ def trained(recipe: str, folder: Path, out: Path) -> run_folder.OpenRun:
     cfg = replace(base, iterations=300, scene=replace(base.scene, add_dist=("color", "cov")))
     config = RunConfig(cfg, Data(folder), stop_at=STEPS)
     run_folder.prepare(out, config, resume=False)
-    capture = run_folder.load_capture(config.data)
+    capture = captures.load(config.data)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Training, "start", partial(start_changed, change=1e-3))
-        list(train(cfg, Run(config, out=out), capture, choose("auto", "cpu")))
+        list(train(cfg, Job(config, out=out), capture, choose("auto", "cpu")))
     opened = run_folder.open_run(out)
     write_result_folder(opened, capture)
     capture.images.close()
@@ -81,7 +82,7 @@ def picture(run, capture):
 
 
 def test_the_layout_is_in_the_input_frame(run, folder):
-    capture = run_folder.load_capture(run.config.data)
+    capture = captures.load(run.config.data)
     world = capture.world
     assert not world.identity and world_of(run) == world
     layout = run.path / "point_cloud" / f"iteration_{STEPS}"
@@ -138,7 +139,7 @@ def test_written_and_read_back_it_draws_the_same_picture(run, tmp_path, form):
     assert again.config.train == run.config.train and again.step == run.step and again.scene.voxel == run.scene.voxel
     rows = lambda s: sorted(map(tuple, s.table.facts["xyz"].tolist()))  # noqa: E731
     assert rows(again.scene) == rows(run.scene), "positions bit for bit"
-    capture = run_folder.load_capture(again.config.data)
+    capture = captures.load(again.config.data)
     a, b = picture(run, capture), picture(again, capture)
     torch.testing.assert_close(b, a, rtol=0, atol=1e-4 if form == "anchors" else 0.02)
     assert (a - b).abs().mean() < (1e-6 if form == "anchors" else 1e-3)
@@ -157,7 +158,7 @@ def test_the_cost_of_the_compact_file_is_measured_and_small(run, tmp_path):
     (written,) = export_run(run.path, "compact", tmp_path / "file.compact", measure=True)
     before, after = written.psnr["run"], written.psnr["file"]
     assert abs(after - before) < 0.05 and f"{before:.3f} dB" in written.lines[-1] and f"{after:.3f} dB" in written.lines[-1]
-    capture, total = run_folder.load_capture(run.config.data), 0.0
+    capture, total = captures.load(run.config.data), 0.0
     for index in capture.test:
         painter = Painter.of(run.scene, run.step, choose("auto", "cpu"))
         with torch.no_grad():
@@ -235,8 +236,8 @@ def short_run(recipe: str, root: Path) -> Path:
     folder = make_capture(root / "capture", views=9, size=(48, 32), points=250, scale=3.0).folder
     config = RunConfig(replace(RECIPES[recipe][1], iterations=300), Data(folder), stop_at=20)
     run_folder.prepare(root / "run", config, resume=False)
-    capture = run_folder.load_capture(config.data)
-    list(train(config.train, Run(config, root / "run"), capture, choose("auto", "cpu")))
+    capture = captures.load(config.data)
+    list(train(config.train, Job(config, root / "run"), capture, choose("auto", "cpu")))
     capture.images.close()
     return root / "run"
 
@@ -249,7 +250,7 @@ def short(request, tmp_path_factory) -> Path:
 def measured(short: Path, file: Path, world: World | None = None) -> float:
     """PSNR of the held-out views as our own renderer draws the file."""
     opened = run_folder.open_run(short)
-    capture, draw, total = run_folder.load_capture(opened.config.data), choose("auto", "cpu"), 0.0
+    capture, draw, total = captures.load(opened.config.data), choose("auto", "cpu"), 0.0
     scene = scene_of(table_columns(registry.read(file), world or capture.world), capture.extent)
     painter = Painter.of(scene, DRAWN_AT, draw)
     with torch.no_grad():
@@ -300,7 +301,7 @@ def test_frames_and_folders(short, tmp_path):
     (written,) = export_run(short, "ply", tmp_path / "world.ply", refine=0, frame="trained")
     assert len(written.lines) == 2 and written.psnr == {}
     opened = run_folder.open_run(short)
-    capture = run_folder.load_capture(opened.config.data)
+    capture = captures.load(opened.config.data)
     capture.images.close()
     own, world = registry.read(tmp_path / "scene.ply"), registry.read(tmp_path / "world.ply")
     assert capture.world.scale != 1 and own.degree == 3
@@ -401,7 +402,7 @@ def test_a_capture_that_moved_is_found_by_its_flag(short, tmp_path):
 @pytest.mark.parametrize("short", ["3dgs"], indirect=True)
 def test_plain_gaussians_need_no_capture(short, tmp_path):
     opened = run_folder.open_run(short)
-    capture = run_folder.load_capture(opened.config.data)
+    capture = captures.load(opened.config.data)
     capture.images.close()
     write_result_folder(opened, capture)
     (written,) = export_run(short, "ply", tmp_path / "x.ply", data=tmp_path / "gone", measure=True)

@@ -11,6 +11,7 @@ from PIL import Image
 
 from scene_experts.commands.files import export
 from scene_experts.core.errors import InputError
+from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.files import hub
 from scene_experts.files.export import Written
@@ -100,8 +101,8 @@ def test_the_command_writes_a_folder(tmp_path, capsys):
     (folder / "LICENSE").write_text("MIT")
     config = RunConfig(replace(RECIPES["moe-gs"][1], iterations=300), Data(folder), stop_at=10)
     run_folder.prepare(tmp_path / "run", config, resume=False)
-    capture = run_folder.load_capture(config.data)
-    list(loop.train(config.train, loop.Run(config, tmp_path / "run"), capture, choose("auto", "cpu")))
+    capture = captures.load(config.data)
+    list(loop.train(config.train, loop.Job(config, tmp_path / "run"), capture, choose("auto", "cpu")))
     capture.images.close()
     out = tmp_path / "hub"
     assert export([str(tmp_path / "run"), "--hub", str(out), "--refine", "2", "--no-measure", "--licence", "mit"]) == 0

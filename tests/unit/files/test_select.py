@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import load
 from scene_experts.data.views import World
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.gaussians.read import DRAWN_AT, scene_of
 from scene_experts.files.measure import Painter
 from scene_experts.files.select import Crop, crop, find_floaters, find_subject, parse_crop
+from support.captures import load
 from support.messages import naming
 from support.synthetic import make_capture
 

@@ -8,7 +8,6 @@ import pytest
 
 from scene_experts.commands.train import parse_train
 from scene_experts.core.errors import InputError
-from scene_experts.core.plain import to_json
 from scene_experts.data.fetch import catalog
 from scene_experts.data.images import check_policy, target_size
 from scene_experts.data.settings import Data
@@ -16,7 +15,6 @@ from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS
 from scene_experts.reproduce.plan import (
     COLLECTIONS,
-    NEWER,
     OWN,
     Scale,
     Scene,
@@ -27,8 +25,8 @@ from scene_experts.reproduce.plan import (
     identity,
     list_runs,
     shrink,
-    without_newer,
 )
+from scene_experts.scene.anchors.routers import Linear, Margin
 from scene_experts.training.config import flags_of
 
 FOX = Scene("fox", OWN, Path("captures/fox"))
@@ -66,16 +64,19 @@ def test_what_changes_numbers_changes_the_key_and_the_place_does_not():
     assert replace(spec, scene=replace(FOX, path=Path("/elsewhere/fox"))).key == spec.key
 
 
-def test_every_newer_setting_is_left_out_at_its_default_and_counts_otherwise():
+def test_a_setting_counts_where_it_differs_from_its_default_and_a_part_where_it_changed(monkeypatch):
     cfg = Spec(FOX, "moe-gs", 0, Scale()).train
-    text = str(without_newer(to_json(cfg), cfg))
-    assert not any(f"'{name.rpartition('.')[2]}'" in text for name in NEWER)
+    name = identity("fox", cfg, Data(FOX.path))
     for changed in (
         replace(cfg, average=replace(cfg.average, span=0.25)),
         replace(cfg, growth=replace(cfg.growth, gradient="absolute")),
-        replace(cfg, scene=replace(cfg.scene, decoder=replace(cfg.scene.decoder, shared=True))),
+        replace(cfg, scene=replace(cfg.scene, decoder=replace(cfg.scene.decoder, router=Margin()))),
     ):
-        assert identity("fox", changed, Data(FOX.path)) != identity("fox", cfg, Data(FOX.path))
+        assert identity("fox", changed, Data(FOX.path)) != name
+    monkeypatch.setattr(Linear, "changes", ("The logits are divided by two.",))
+    assert identity("fox", cfg, Data(FOX.path)) != name
+    plain = Spec(FOX, "scaffold-gs", 0, Scale()).train  # has no router
+    assert identity("fox", plain, Data(FOX.path)) == Spec(FOX, "scaffold-gs", 0, Scale()).key
 
 
 def test_scale():

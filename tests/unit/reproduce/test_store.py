@@ -1,6 +1,8 @@
 """Records: written, found again, refused when changed by hand."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,9 +11,11 @@ import pytest
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
 from scene_experts.core.plain import to_json
+from scene_experts.data import capture as captures
+from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec, drop_repeated
-from scene_experts.reproduce.store import POINTS, check_captures, find, find_all, load, read, read_curves, read_run, unpack, write
-from scene_experts.training.run_folder import load_capture
+from scene_experts.reproduce.store import POINTS, SAMPLES, check_captures, find, find_all, load, read, read_curves, read_run, write
+from scene_experts.strategy.grow import GrowAnchors
 from support.messages import naming
 from support.records import record
 from support.synthetic import make_capture
@@ -22,22 +26,23 @@ def test_a_record_comes_back_as_it_was_without_the_place_of_the_capture(tmp_path
     made = replace(made, config=replace(made.config, data=replace(made.config.data, path=Path("/home/someone/fox")), command="secret"))
     path = write(tmp_path, made)
     assert "someone" not in path.read_text() and "secret" not in path.read_text()
-    back = read(path)
-    assert (back.key, back.results, back.per_view, back.curves) == (made.key, made.results, made.per_view, made.curves)
+    (back,) = read(path)
+    assert (back.key, back.results, back.per_view) == (made.key, made.results, made.per_view)
+    assert [point["psnr"] for point in back.curves] == [20.0] * 3 and back.fit == made.fit
     assert [r.key for r in load(tmp_path)] == [made.key]
 
 
 def test_a_record_names_the_run_that_it_started_from_if_there_is_one(tmp_path):
     made = record()
-    assert "init_from" not in unpack(json.loads(write(tmp_path, made).read_text()))["config"]
+    assert "init_from" not in json.loads(write(tmp_path, made).read_text())["runs"][0]["config"]
     begun = replace(made, config=replace(made.config, init_from=Path("/home/someone/coarse")))
-    assert read(write(tmp_path, begun)).config.init_from == Path("coarse")
+    assert {record.config.init_from for record in read(write(tmp_path, begun))} == {None, Path("coarse")}
 
 
 def test_a_run_that_started_from_another_one_is_not_taken_for_the_run_of_its_recipe(tmp_path):
     spec = Spec(Scene("fox", OWN, Path("fox")), "moe-gs", 0, Scale(iterations=3000))
     begun = replace(record(psnr=20.0), config=replace(record().config, init_from=Path("/home/someone/coarse")))
-    back = read(write(tmp_path, begun))
+    (back,) = read(write(tmp_path, begun))
     assert back.key == begun.key and find(load(tmp_path), spec) is None
     write(tmp_path, record(psnr=30.0))
     found = find(load(tmp_path), spec)
@@ -56,23 +61,60 @@ def test_a_run_that_started_from_another_one_is_not_taken_for_the_run_of_its_rec
 def test_a_record_does_not_say_where_the_weights_of_lpips_were(tmp_path, place, kept):
     made = record()
     path = write(tmp_path, replace(made, results={**made.results, "lpips_weights": {"vgg": place}}))
-    assert read(path).results == {**made.results, "lpips_weights": {"vgg": kept}} and "some" not in path.read_text()
+    assert read(path)[0].results == {**made.results, "lpips_weights": {"vgg": kept}} and "some" not in path.read_text()
 
 
 def test_a_record_keeps_the_code_that_it_was_trained_with(tmp_path):
     made = replace(record(), code="0123456789ab")
-    back = read(write(tmp_path, made))
+    (back,) = read(write(tmp_path, made))
     assert (back.code, back.key) == (made.code, made.key) and made.key != record().key
-    assert "code" not in json.loads(write(tmp_path, record()).read_text())
+    assert ["code" in run for run in json.loads(write(tmp_path, record()).read_text())["runs"]].count(True) == 1
 
 
-def test_a_record_of_the_first_format_opens(tmp_path):
+def test_a_record_is_small_and_states_what_differs_from_the_defaults(tmp_path):
+    many = {f"DSC_{i:04}.jpg": {"psnr": 30 + i / 7, "ssim": 0.9 + i / 1e4, "lpips": i / 300, "lpips_3dgs": i / 301} for i in range(32)}
+    shares = {a: [i / 11 for i in range(5)] for a in ("opacity", "cov", "color")}
+    curves = [{"step": 10 * i, "seconds": i / 3, "psnr": 20 + i / 7, "anchors": 150_000, "scene_routing": shares} for i in range(200)]
+    psnr = sum(view["psnr"] for view in many.values()) / 32
+    means = {name: sum(view[name] for view in many.values()) / 32 for name in ("ssim", "lpips", "lpips_3dgs")}
     made = record()
+    made = replace(made, per_view=many, results={**made.results, **means, "psnr": psnr}, curves=store.thin(curves))
     path = write(tmp_path, made)
-    value = unpack(json.loads(path.read_text()))
-    assert value["curves"] == made.curves and value["per_view"] == made.per_view
-    path.write_text(json.dumps({**value, "format": 1}, indent=2))
-    assert read(path) == made
+    assert len(path.read_bytes()) < 8000 and len(read(path)[0].curves) == POINTS
+    assert json.loads(path.read_text())["runs"][0]["config"]["train"] == {
+        "type": "Train",
+        "recipe": "moe-gs",
+        "scene": {"type": "Anchors", "decoder": {"type": "Experts"}},
+        "loss": {"type": "Weights", "opacity": 0.01, "load": 0.01},
+        "iterations": 3000,
+    }
+
+
+def test_a_record_of_a_part_that_changed_counts_as_no_run(tmp_path, monkeypatch):
+    spec = Spec(Scene("fox", OWN, Path("fox")), "moe-gs", 0, Scale(iterations=3000))
+    write(tmp_path, record())
+    assert find(load(tmp_path), spec) is not None
+    monkeypatch.setattr(GrowAnchors, "changes", ("Candidates are counted twice.",))
+    assert load(tmp_path) == [] and find(load(tmp_path), spec) is None
+    write(tmp_path, record())
+    assert find(load(tmp_path), spec) is not None
+    monkeypatch.setattr(GrowAnchors, "changes", ())
+    assert len(load(tmp_path)) == 1
+
+
+def test_a_record_takes_the_place_of_one_of_the_same_run(tmp_path):
+    for psnr in (30.0, 31.0):
+        write(tmp_path, record(psnr=psnr))
+    write(tmp_path, record(seed=1))
+    assert [(r.seed, r.results["psnr"]) for r in load(tmp_path)] == [(0, 32.5), (1, 31.5)]
+
+
+def test_several_processes_write_one_file(tmp_path):
+    code = "import sys; from pathlib import Path; from support.records import record; from scene_experts.reproduce.store import write; "
+    code += "[write(Path(sys.argv[1]), record(seed=int(sys.argv[2]) + i)) for i in range(5)]"
+    start = lambda seed: subprocess.Popen([sys.executable, "-c", code, str(tmp_path), str(seed)], cwd=Path(__file__).parents[2])  # noqa: E731
+    assert [process.wait() for process in [start(0), start(10)]] == [0, 0]
+    assert len(load(tmp_path)) == 10
 
 
 def test_a_run_is_found_by_its_spec(tmp_path):
@@ -84,7 +126,7 @@ def test_a_run_is_found_by_its_spec(tmp_path):
 def test_records_of_another_capture_of_the_same_name_are_refused(tmp_path):
     box = make_capture(tmp_path / "box", views=9)
     spec = Spec(Scene("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
-    capture = load_capture(spec.data)
+    capture = captures.load(spec.data)
     own = replace(record(scene="box"), per_view={capture.views[i].name: {"psnr": 30.0} for i in capture.test})
     check_captures([own], [spec])
     check_captures([record(scene="box", seed=1)], [spec])  # counts as no run that is asked for
@@ -96,7 +138,7 @@ def test_records_of_another_capture_of_the_same_name_are_refused(tmp_path):
 def test_records_of_other_poses_of_the_same_photographs_are_refused(tmp_path):
     box = make_capture(tmp_path / "box", views=9, points=700)
     specs = [Spec(Scene("box", OWN, box.folder), recipe, 0, Scale(iterations=3000)) for recipe in ("scaffold-gs", "moe-gs")]
-    capture = load_capture(specs[0].data)
+    capture = captures.load(specs[0].data)
     views = {capture.views[i].name: {"psnr": 30.0} for i in capture.test}
     found = [replace(record(s.recipe, scene="box", psnr=30.0, views=1, points=n), per_view=views) for s, n in zip(specs, (651, 700))]
     check_captures([replace(r, results={**r.results, "points": len(capture.points.xyz)}) for r in found], specs)
@@ -107,7 +149,7 @@ def test_records_of_other_poses_of_the_same_photographs_are_refused(tmp_path):
 def test_records_of_other_cameras_with_the_same_points_are_refused(tmp_path):
     box, moved = make_capture(tmp_path / "box", views=9), make_capture(tmp_path / "other" / "box", views=9, scale=2.0)
     spec = Spec(Scene("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
-    capture, other = load_capture(spec.data), load_capture(replace(spec.data, path=moved.folder))
+    capture, other = captures.load(spec.data), captures.load(replace(spec.data, path=moved.folder))
     own = replace(record(scene="box"), per_view={capture.views[i].name: {"psnr": 30.0} for i in capture.test})
     check_captures([replace(own, results={**own.results, "poses": capture.poses()})], [spec])
     with pytest.raises(InputError, match=naming("camera poses", "--records")):
@@ -126,19 +168,21 @@ def test_a_run_that_memory_may_have_limited_is_no_record(tmp_path):
 def test_changed_figures_are_refused(tmp_path):
     path = write(tmp_path, record())
     value = json.loads(path.read_text())
-    value["results"]["psnr"] = 99.0
+    value["runs"][0]["results"]["psnr"] = 99.0
     path.write_text(json.dumps(value))
     with pytest.raises(InputError, match=naming(tmp_path)):
         read(path)
     path = write(tmp_path, record())
     value = json.loads(path.read_text())
-    del value["per_view"]["scores"]["psnr"][1:]
+    del value["runs"][0]["per_view"]["scores"]["psnr"][1:]
+    resealed(value)
     path.write_text(json.dumps(value))
     with pytest.raises(InputError, match=naming(tmp_path)):
         read(path)
     path = write(tmp_path, record())
     value = json.loads(path.read_text())
-    value["per_view"]["scores"]["psnr"][0] += 1.0
+    value["runs"][0]["per_view"]["scores"]["psnr"][0] += 1.0
+    resealed(value)
     path.write_text(json.dumps(value))
     with pytest.raises(InputError, match=naming(tmp_path, "psnr")):
         read(path)
@@ -146,6 +190,12 @@ def test_changed_figures_are_refused(tmp_path):
         path.write_text(other)
         with pytest.raises(InputError, match=naming(tmp_path)):
             read(path)
+
+
+def resealed(value):
+    """Give an edited record its checksum."""
+    (run,) = value["runs"]
+    run["sha256"] = store.digest({name: each for name, each in run.items() if name != "sha256"})
 
 
 def test_scores_by_view_of_another_evaluation_are_refused(tmp_path):
@@ -184,7 +234,11 @@ def test_curves_keep_the_ends_and_skip_torn_lines(tmp_path):
     ]
     path.write_bytes("\n".join(lines).encode() + b"\n\xff\xfe")
     found = read_curves(path)
-    assert len(found) == POINTS and (found[0]["step"], found[-1]["step"]) == (1, 1000) and "terms" not in found[0]
+    assert len(found) == SAMPLES and (found[0]["step"], found[-1]["step"]) == (1, 1000) and "terms" not in found[0]
+    thinned = store.thin(found)
+    assert len(thinned) == POINTS and (thinned[0]["step"], thinned[-1]["step"]) == (1, 1000)
+    late = [line for line in found if line["step"] > 500]
+    assert store.fit_of([{**line, "psnr": float(line["step"])} for line in found], 1000) == sum(line["step"] for line in late) / len(late)
     assert read_curves(tmp_path / "none") == []
 
 

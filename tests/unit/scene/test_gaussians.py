@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.geometry.sh import sh_to_rgb
@@ -124,4 +125,4 @@ def test_file_sizes_and_impossible_settings():
     assert make(1).file_values == 62 and make(1, config=Explicit(sh_degree=0)).file_values == 17
     for config, flag in ((Explicit(sh_degree=4), "sh-degree"), (Explicit(opacity=1.0), "opacity"), (replace(Explicit(), size=0.0), "size")):
         with pytest.raises(InputError, match=flag):
-            config.check()
+            check_fields(config, "scene")

@@ -5,6 +5,7 @@ from dataclasses import fields, is_dataclass
 import pytest
 import torch
 
+from scene_experts.core.fields import check_fields
 from scene_experts.core.table import Table
 from scene_experts.core.types import Mode
 from scene_experts.recipes import RECIPES
@@ -39,7 +40,7 @@ def test_every_learned_tensor_has_a_rate(recipe):
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_every_recipe_is_made_of_frozen_parts_that_scale_and_are_possible(recipe):
     cfg = RECIPES[recipe][1]
-    cfg.scene.check()
+    check_fields(cfg.scene, "scene")
     for part in (cfg.scene, cfg.growth):
         assert is_dataclass(part) and type(part).__dataclass_params__.frozen and fields(part)  # type: ignore[attr-defined]
         assert part.scaled(1.0) == part
@@ -67,10 +68,10 @@ def test_a_scene_says_what_it_is_and_can_do(recipe):
 
 def test_stating_traits_changes_nothing():
     scene = start_scene("moe-gs-balance")
-    state, before = torch.random.get_rng_state(), [h.router_balance.clone() for h in scene.heads.values()]
+    state, before = torch.random.get_rng_state(), [h.router.balance.clone() for h in scene.heads.values()]
     assert scene.traits.experts == 5
     assert torch.equal(torch.random.get_rng_state(), state)
-    assert all(torch.equal(h.router_balance, b) for h, b in zip(scene.heads.values(), before))
+    assert all(torch.equal(h.router.balance, b) for h, b in zip(scene.heads.values(), before))
 
 
 @pytest.mark.parametrize("recipe", ["octree-gs", "3dgs"])
@@ -95,7 +96,6 @@ def test_a_drawing_with_gradients_changes_nothing_and_torchs_own_mode_has_no_eff
     decoded = scene(CAMERA, 2000, Mode.DRAW, draw.visible)
     assert decoded.gaussians.means.requires_grad or decoded.gaussians.colors.requires_grad
     scene.routing(2000)
-    scene.scene_opacity(CAMERA, 2000)
     assert torch.equal(torch.random.get_rng_state(), random)
     assert all(torch.equal(v, before[k]) for k, v in {**scene.table.columns(), **scene.network_tensors()}.items())
 
@@ -104,7 +104,8 @@ def test_training_moves_the_biases_of_the_router_even_without_gradients():
     scene, draw = start_scene("moe-gs-balance"), choose("auto", "cpu")
     with torch.no_grad():
         scene(CAMERA, 2000, Mode.TRAIN, draw.visible)
-    assert all(head.router_balance.any() for head in scene.heads.values())
+    scene.end_batch(1)
+    assert all(head.router.balance.any() for head in scene.heads.values())
 
 
 def tensors_of(value, path="scene", found=None, visited=None) -> dict[str, torch.Tensor]:

@@ -13,11 +13,11 @@ import torch
 from PIL import Image
 
 from scene_experts.core.errors import InputError, RunError
-from scene_experts.data.capture import load
 from scene_experts.sfm import reconstruct as run
 from scene_experts.sfm.options import Options
 from scene_experts.sfm.reconstruct import LOG, NOTE
 from scene_experts.sfm.work import NAME, PLACES
+from support.captures import load
 from support.messages import naming
 from support.photos import fake_worker, write_black, write_photo
 from support.places import DEMO

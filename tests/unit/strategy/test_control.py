@@ -1,12 +1,12 @@
 """Density control that all anchor methods share. The growth rules have their own files."""
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.core.schedule import Every
 from scene_experts.strategy import observe
 from scene_experts.strategy.control import AnchorControl
@@ -36,16 +36,6 @@ def test_faint_anchors_that_were_seen_often_go(recipe):
     assert float(scene.table.params["log_scaling"].detach()[:, 3:].max()) <= 0.05 + 1e-6
 
 
-def test_sizes_are_clamped_in_the_unit_asked_for():
-    for clamp, bound in (("log0.05", 0.05), ("linear0.05", math.log(0.05)), ("off", 2.0)):
-        scene = start_scene("scaffold-gs")
-        observe.start(scene.table, scene.K)
-        scene.table.params["log_scaling"].data.fill_(2.0)
-        AnchorControl(scale_clamp=clamp).prune(scene)  # type: ignore[arg-type]
-        assert float(scene.table.params["log_scaling"].detach()[:, 3:].max()) == pytest.approx(bound)
-        assert float(scene.table.params["log_scaling"].detach()[:, :3].min()) == 2.0
-
-
 def test_adjustments_are_due_inside_the_window_and_spare_the_anchors_one_step():
     scene, rule = start_scene("scaffold-gs"), Still(adjust=Every(1500, 15_000, 100))
     assert rule.update(scene, 1600, torch.Generator()) is None  # nothing counted yet
@@ -63,8 +53,8 @@ def test_adjustments_are_due_inside_the_window_and_spare_the_anchors_one_step():
 def test_windows_scale_and_gates_stay():
     half = AnchorControl().scaled(0.5)
     assert (half.start_stat, half.adjust) == (250, Every(750, 7500, 100)) and half.gate() == AnchorControl().gate() == 40
-    assert replace(half, start_stat=500, adjust=Every(1500, 15_000, 100)) == AnchorControl()
+    assert replace(half, start_stat=500, adjust=Every(1500, 15_000, 100), mask_at=(20_000, 30_000)) == AnchorControl()
     with pytest.raises(InputError, match=r"--growth\.adjust\.interval"):
-        AnchorControl(adjust=Every(1, 2, 0)).check()
+        check_fields(AnchorControl(adjust=Every(1, 2, 0)), "growth")
     with pytest.raises(NotImplementedError):
         AnchorControl().grow(None, torch.Generator())  # type: ignore[arg-type]

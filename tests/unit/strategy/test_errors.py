@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.core.schedule import Every
 from scene_experts.core.types import Mode
 from scene_experts.render import choose
@@ -124,8 +125,8 @@ def test_masks_in_every_decode_and_in_training():
 
 def test_settings():
     used = AnchorControl(mask_contribution=0.1, mask_at=(20_000,)).scaled(0.1)
-    assert used.mask_at == (2000,) and AnchorControl().scaled(0.1).mask_at == AnchorControl().mask_at
+    assert used.mask_at == (2000,)
     for bad in ({"error_quantile": 1.0}, {"least_contribution": 1.0}, {"mask_contribution": -1.0}, {"error_views": -1}):
         with pytest.raises(InputError, match="--growth"):
-            AnchorControl(**bad).check()
+            check_fields(AnchorControl(**bad), "growth")
     assert not AnchorControl(adjust=Every(0, 10, 1)).grows_at(start_scene("scaffold-gs"), 5)

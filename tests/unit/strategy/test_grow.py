@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.core.schedule import Every
 from scene_experts.core.table import Table
 from scene_experts.geometry.voxel import coarsen
@@ -68,7 +69,7 @@ def test_growth_within_bounds_keeps_the_candidates_inside():
     }
     assert 5 < len(cells(bound) - start) < len(cells(free) - start)
     with pytest.raises(InputError, match=r"--growth\.bounds"):
-        GrowAnchors(bounds=(0.0, 0.0, 0.0, 1.0, 1.0, -1.0)).check()
+        check_fields(GrowAnchors(bounds=(0.0, 0.0, 0.0, 1.0, 1.0, -1.0)), "growth")
 
 
 def test_growth_founds_the_cells_of_the_slow_rule():
@@ -115,23 +116,10 @@ def make_like(scene: AnchorScene) -> AnchorScene:
     return copy
 
 
-def test_parity_quirk_skips_finer_levels_when_the_coarsest_added_nothing():
-    for skip, cells in ((True, []), (False, [4, 8, 2, 6])):
-        scene = make()
-        scene.table.keep(torch.arange(len(scene.table)) == 0)
-        scene.table.facts = {"cell": torch.zeros(1, 3, dtype=torch.int64), "xyz": torch.zeros(1, 3)}
-        scene.table.stats["count"].fill_(50)
-        scene.table.stats["grad"].fill_(50 * 1e-2)
-        steps = torch.tensor([[2.0, 0, 0], [6, 0, 0], [0, 0, 0], [0, 0, 0]])  # fine cells from its own, in its coarse cell all of them
-        scene.table.params["offsets"].data[0] = steps * VOXEL / 0.4
-        assert GrowAnchors(elimination=False, parity_level_skip=skip).grow(scene, torch.Generator())[0] == len(cells)
-        assert scene.table.facts["cell"][:, 0].tolist() == [0, *cells]
-
-
 def test_impossible_numbers_are_refused():
     for wrong, flag in (({"hierarchy_factor": 1}, "hierarchy-factor"), ({"init_factor": 0}, "init-factor"), ({"levels": 0}, "levels")):
         with pytest.raises(InputError, match=rf"--growth\.{flag}"):
-            GrowAnchors(**wrong).check()
+            check_fields(GrowAnchors(**wrong), "growth")
 
 
 def test_cap_holds_and_prefers_large_gradients():
@@ -164,13 +152,12 @@ def test_prune_removes_faint_well_seen_anchors_and_restarts_their_count():
     assert scene.table.stats["visits"][3] == 80 and scene.table.stats["visits"][0] == 0
 
 
-@pytest.mark.parametrize(("clamp", "limit"), [("log0.05", 0.05), ("linear0.05", math.log(0.05)), ("off", 9.0)])
-def test_scale_clamp(clamp, limit):
+def test_sizes_are_clamped_in_log_units():
     scene = make()
     scene.table.params["log_scaling"].data.fill_(9.0)
-    GrowAnchors(scale_clamp=clamp).prune(scene)
+    GrowAnchors().prune(scene)
     values = scene.table.params["log_scaling"].detach()
-    assert values[:, :3].min() == 9.0 and values[:, 3:].max() == pytest.approx(limit)
+    assert values[:, :3].min() == 9.0 and values[:, 3:].max() == pytest.approx(0.05)
 
 
 def test_update_is_due_from_1600_and_frees_its_memory_at_the_end():

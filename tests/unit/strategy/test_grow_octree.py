@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.core.table import Table
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.levels import Levels
@@ -110,27 +111,22 @@ def test_statistics_of_eligible_slots_begin_anew():
 
 def test_anchors_of_large_mean_gradient_ask_for_finer_levels():
     scene, n = make(), len(make().table)
-    stats, expected, repeated = scene.table.stats, [], []
+    stats, expected = scene.table.stats, []
     for a in range(n):
         slots = [float(stats["grad"][a, k] / stats["count"][a, k]) for k in range(K) if float(stats["count"][a, k]) > 40]
         mean, level = sum(slots) / (len(slots) + 1e-6), int(scene.table.facts["level"][a])
         passed = [mean >= 0.25 * 2e-4 * 2 ** (0.2 * j) for j in range(COUNT)]
         expected.append(0.01 * passed[level])
-        repeated.append(0.01 * sum(passed))
-    parity = make()
     GrowOctree().grow(scene, torch.Generator(), LATE)
-    GrowOctree(parity_extra_level=True).grow(parity, torch.Generator(), LATE)
     assert 0 < sum(expected) < 0.01 * n
     torch.testing.assert_close(scene.table.facts["extra_level"][:n], torch.tensor(expected))
-    torch.testing.assert_close(parity.table.facts["extra_level"][:n], torch.tensor(repeated))
 
 
-def test_finer_levels_wait_for_the_coarse_phase_unless_the_bug_is_asked_for():
-    calm, hasty = make(), make()
+def test_finer_levels_wait_for_the_coarse_phase():
+    calm, late = make(), make()
     GrowOctree().grow(calm, torch.Generator(), 1600)
-    GrowOctree(parity_coarse_gate=True).grow(hasty, torch.Generator(), 1600)
-    assert not calm.table.facts["extra_level"].any() and hasty.table.facts["extra_level"].any()
-    assert len(hasty.table) - len(make().table) == len(slow_growth(make()))
+    GrowOctree().grow(late, torch.Generator(), LATE)
+    assert not calm.table.facts["extra_level"].any() and late.table.facts["extra_level"].any()
 
 
 def test_the_cap_takes_the_strongest():
@@ -147,7 +143,7 @@ def test_levels_and_growth_by_level_belong_together():
         with pytest.raises(InputError, match="levels"):
             check(cfg)
     with pytest.raises(InputError, match="update-ratio"):
-        GrowOctree(update_ratio=-1.0).check()
+        check_fields(GrowOctree(update_ratio=-1.0), "growth")
 
 
 def test_the_published_schedule():

@@ -65,5 +65,5 @@ def test_parts_of_another_method_are_refused():
 
 def test_numbers_of_sags():
     growth = RECIPES["sags"][1].growth
-    assert growth.cell_factors() == [16, 4, 1] and growth.gate() == 30 and growth.scale_clamp == "off"
+    assert growth.cell_factors() == [16, 4, 1] and growth.gate() == 30 and growth.largest_log_size is None
     assert (growth.start_stat, growth.adjust, growth.min_opacity) == (500, Every(1500, 15_000, 100), 0.005)

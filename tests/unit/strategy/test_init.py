@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.recipes import RECIPES
 from scene_experts.strategy import Edit
 from support.scenes import METHODS, start_scene
@@ -23,9 +24,9 @@ def test_nothing_is_due_at_the_first_iteration(recipe):
 @pytest.mark.parametrize("recipe", METHODS)
 def test_impossible_numbers_are_refused(recipe):
     strategy = RECIPES[recipe][1].growth
-    strategy.check()
+    check_fields(strategy, "growth")
     with pytest.raises(InputError, match="max-anchors"):
-        replace(strategy, max_anchors=-1).check()
+        check_fields(replace(strategy, max_anchors=-1), "growth")
 
 
 @pytest.mark.parametrize("recipe", METHODS)

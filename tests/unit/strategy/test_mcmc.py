@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.geometry.rotation import covariance
 from scene_experts.native import library as native
 from scene_experts.strategy import mcmc
@@ -145,4 +146,4 @@ def test_native_noise_is_that_of_torch(level, n, monkeypatch):
 def test_impossible_numbers_are_refused():
     for rule, flag in ((MCMC(growth=0.9), r"growth\.growth"), (MCMC(noise=-1.0), r"growth\.noise")):
         with pytest.raises(InputError, match=flag):
-            rule.check()
+            check_fields(rule, "growth")

@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import load
+from scene_experts.core.fields import check_fields
 from scene_experts.recipes import RECIPES
 from scene_experts.scene import restore_scene
 from scene_experts.training.average import Average, Averages
 from scene_experts.training.state import Training
+from support.captures import load
 from support.messages import naming
 from support.synthetic import make_capture
 
@@ -138,4 +139,4 @@ def test_averages_move_with_the_scene(capture):
 @pytest.mark.parametrize(("change", "words"), [({"span": 1.5}, "--average.span"), ({"interval": 0}, "--average.interval")])
 def test_invalid_settings(change, words):
     with pytest.raises(InputError, match=naming(words)):
-        Average(**change).check()
+        check_fields(Average(**change), "average")

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError, RunError
-from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
 from scene_experts.render import choose
 from scene_experts.training.average import Average
@@ -18,8 +17,9 @@ from scene_experts.training.batch import check_batch
 from scene_experts.training.config import RunConfig
 from scene_experts.training.config import check as check_train
 from scene_experts.training.events import Densified, Previewed, Started, Stepped, Stopped
-from scene_experts.training.loop import Run, iterate
+from scene_experts.training.loop import Job, iterate
 from scene_experts.training.state import Training
+from support.captures import load
 from support.groups import run_group
 from support.lanes import slow_except
 from support.synthetic import make_capture
@@ -150,7 +150,7 @@ def test_a_batch_has_the_mean_gradient_and_the_rates_of_its_size(folder, power, 
     single = Training.start(replace(cfg, batch=1).scaled(), capture, "cpu")
     training.optimizer.step = single.optimizer.step = lambda *_, **__: 0.0  # type: ignore[method-assign]
     training.optimizer.zero_grad = single.optimizer.zero_grad = lambda *_, **__: None  # type: ignore[method-assign]
-    run = Run(RunConfig(cfg, Data(folder)))
+    run = Job(RunConfig(cfg, Data(folder)))
     iterate(training, run, capture, rasterize)
     for _ in range(4):
         iterate(single, run, capture, rasterize)

@@ -9,10 +9,10 @@ import torch
 
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError, RunError
-from scene_experts.data.capture import load
 from scene_experts.training import guard, state
 from scene_experts.training.events import Saved
 from scene_experts.training.optim import FusedAdam
+from support.captures import load
 from support.messages import naming
 from support.synthetic import make_capture
 from support.trainings import config, events

@@ -104,33 +104,23 @@ def test_terms_are_named_weighted_and_absent_at_weight_zero():
     assert list(terms(decoded, render, target, Weights(dssim=0.0, scale=0.0))) == ["l1"]
 
 
-def test_the_switches_of_the_load_balance():
+def test_the_load_balance_is_the_sum_over_the_attributes_of_the_phase_s_loss():
     sparse, dense = Routing(*routed(5, 2, True)), Routing(routed(3, 2, True)[0], None)
     s, d = float(load_sparse(sparse.gates, sparse.chosen)), float(load_dense(dense.gates))
-    both = s + float(load_dense(sparse.gates))
-    value = lambda **w: float(terms(*scene({"color": sparse, "cov": dense}), Weights(load=0.5, **w))["load"])  # noqa: E731
-    assert value() == pytest.approx(0.5 * (s + d))
-    assert value(load_reduce="mean") == pytest.approx(0.25 * (s + d))
-    assert value(load_phase="both") == pytest.approx(0.5 * (both + d))
-    assert value(load_normalise_by_k=True) == pytest.approx(0.5 * (s / 2 + d))
+    assert float(terms(*scene({"color": sparse, "cov": dense}), Weights(load=0.5))["load"]) == pytest.approx(0.5 * (s + d))
+
+
+def test_the_hinge_is_over_all_slots_of_the_visible_anchors():
+    decoded, render, target = scene()
+    raw = torch.tensor([[-1.0, 0.5], [-0.5, -0.5], [0.1, 0.2]])
+    found = terms(replace(decoded, raw_opacity=raw), render, target, Weights(opacity=1.0))
+    assert float(found["opacity"]) == pytest.approx(2.0 / 6)
 
 
 def test_the_window_of_the_opacity_hinge():
     w = Weights(opacity=0.1, opacity_from=10, opacity_until=20)
     on = [step for step in (9, 10, 20, 21) if "opacity" in terms(*scene(), w, step)]
     assert on == [10, 20] and "opacity" in terms(*scene(), w)
-
-
-def test_hinge_scopes():
-    raw = torch.tensor([[-1.0, 0.5], [-0.5, -0.5], [0.1, 0.2]])
-    g = Gaussians(torch.zeros(3, 3), torch.zeros(3, 4), torch.zeros(3, 3), torch.zeros(3), torch.zeros(3, 3), torch.tensor([9, 14, 15]))
-    radii = torch.tensor([3, 0, 2], dtype=torch.int32)
-    render = Render(torch.zeros(4, 4, 3), torch.zeros(4, 4), torch.zeros(4, 4), radii, torch.zeros(3, 2))
-    decoded = Decoded(g, torch.tensor([4, 6, 7]), raw, {}, scene_opacity=torch.full((8, 2), -0.25))
-    value = lambda scope: float(terms(decoded, render, torch.zeros(4, 4, 3), Weights(opacity=1.0, opacity_scope=scope))["opacity"])  # noqa: E731
-    assert value("visible") == pytest.approx(2.0 / 6)
-    assert value("rendered_anchors") == pytest.approx(1.0 / 4)  # anchors 4 and 7 have a slot with radius > 0
-    assert value("all") == pytest.approx(0.25)
 
 
 def test_mean_opacity_and_size_are_over_every_gaussian():

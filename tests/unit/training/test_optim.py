@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.native import library as native
 from scene_experts.training.optim import Adam, FusedAdam, _by_torch
 
@@ -119,7 +120,7 @@ def test_the_part_builds_it_with_its_numbers():
     assert Adam().scaled(0.5) == Adam()
     for wrong in (Adam(betas=(1.0, 0.9)), Adam(eps=-1.0)):
         with pytest.raises(InputError, match="--optimizer"):
-            wrong.check()
+            check_fields(wrong, "optimizer")
 
 
 @pytest.mark.skipif(native.load() is None, reason="no compiled library")

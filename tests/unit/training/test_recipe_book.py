@@ -14,16 +14,17 @@ from scene_experts.commands.train import parse_train
 from scene_experts.core.errors import InputError
 from scene_experts.core.schedule import Every
 from scene_experts.core.types import Mode
-from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES, moe_gs
 from scene_experts.render import choose
 from scene_experts.training import recipe_book, run_folder
 from scene_experts.training.config import RunConfig, check
 from scene_experts.training.events import Densified, Finished, Stepped
-from scene_experts.training.loop import Run, train
+from scene_experts.training.loop import Job, train
+from scene_experts.training.options import TrainOptions
 from scene_experts.training.recipe_book import GROUP, RecipeBook
 from support import outside
+from support.captures import load
 from support.synthetic import make_capture
 
 
@@ -91,15 +92,15 @@ def test_it_trains_resumes_and_opens(monkeypatch, tmp_path):
     cfg = replace(outside.dots, iterations=12, schedule=12, growth=outside.Halve(adjust=Every(0, 12, 5)))
     capture, draw, config = load(folder), choose("auto", "cpu"), RunConfig(cfg, Data(folder))
     run_folder.prepare(out, config, False)
-    first = list(train(cfg, Run(replace(config, stop_at=6), out=out, log_every=1), capture, draw))
-    events = first + list(train(cfg, Run(config, out=out, resume=True, log_every=1), capture, draw))
+    first = list(train(cfg, Job(replace(config, stop_at=6), out=out, options=TrainOptions(log_every=1, preview_every=0)), capture, draw))
+    events = first + list(train(cfg, Job(config, out=out, options=TrainOptions(resume=True, log_every=1, preview_every=0)), capture, draw))
     steps = [e for e in events if isinstance(e, Stepped)]
     assert [e.step for e in steps] == list(range(1, 13)) and set(steps[0].terms) == {"l1", "dssim", "size"}
     assert [e.edit.grown - e.edit.pruned < 0 for e in events if isinstance(e, Densified)] == [True, True]
     assert isinstance(events[-1], Finished)
     opened = run_folder.open_run(out)
     assert opened.scene.traits.family == "dots" and opened.config.train == cfg
-    whole = list(train(cfg, Run(config, out=tmp_path / "whole"), capture, draw))
+    whole = list(train(cfg, Job(config, out=tmp_path / "whole"), capture, draw))
     assert isinstance(whole[-1], Finished)
     other = run_folder.checkpoint.newest(tmp_path / "whole" / "checkpoints")[0]
     again = run_folder.checkpoint.newest(out / "checkpoints")[0]

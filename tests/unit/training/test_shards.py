@@ -86,10 +86,5 @@ def test_recipes_that_need_the_whole_table_are_refused(recipe):
 def test_settings_that_need_the_whole_table_are_refused():
     cfg: Any = RECIPES["moe-gs"][1]
     check_shard(cfg, 0.0, False)
-    for changed, flag in (
-        (replace(cfg, growth=replace(cfg.growth, error_views=3)), "--growth.error-views"),
-        (replace(cfg, loss=replace(cfg.loss, opacity_scope="all")), "--loss.opacity-scope"),
-        (replace(cfg, scene=replace(cfg.scene, decoder=replace(cfg.scene.decoder, load_scope="all"))), "--scene.decoder.load-scope"),
-    ):
-        with pytest.raises(InputError, match=flag):
-            check_shard(changed, 0.0, False)
+    with pytest.raises(InputError, match=r"--growth\.error-views"):
+        check_shard(replace(cfg, growth=replace(cfg.growth, error_views=3)), 0.0, False)

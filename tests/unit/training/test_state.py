@@ -7,15 +7,15 @@ import torch
 
 from scene_experts import cli
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import load
+from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.recipes import RECIPES
 from scene_experts.scene import restore_scene
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
-from scene_experts.training.old_hash import old_hash
 from scene_experts.training.run_folder import open_run
 from scene_experts.training.state import Training, resume, save
+from support.captures import load
 from support.messages import naming
 from support.synthetic import make_capture
 
@@ -88,21 +88,6 @@ def test_saved_is_found_again_and_none_is_none(capture, tmp_path):
         resume(training.cfg, tmp_path, "cpu")
 
 
-def test_checkpoints_that_hold_a_hash_alone_still_fit(capture):
-    training = started(capture)
-    meta = {k: v for k, v in training.meta().items() if k != "train"} | {"config": old_hash(training.cfg)}
-    assert Training.restore(training.cfg, training.tensors(), meta, "cpu").step == 7
-    with pytest.raises(InputError, match="--out"):
-        Training.restore(replace(training.cfg, sparse_adam=True), training.tensors(), meta, "cpu")
-
-
-def test_a_setting_that_is_newer_than_a_checkpoint_counts_as_its_default(capture):
-    training = started(capture)
-    meta = training.meta()
-    del meta["train"]["optimizer"], meta["train"]["scene"]["mix"]
-    assert Training.restore(training.cfg, training.tensors(), meta, "cpu").step == 7
-
-
 def test_a_checkpoint_without_a_cpu_time_opens_and_it_stays_unknown(capture):
     training = started(capture)
     meta = {k: v for k, v in training.meta().items() if k not in ("cpu_seconds", "load")}
@@ -141,7 +126,7 @@ def test_a_start_in_another_world_or_from_other_views_or_networks_names_the_flag
 
     def start(data, **scene):
         now = replace(cfg, scene=replace(cfg.scene, **scene))
-        capture = run_folder.load_capture(data)
+        capture = captures.load(data)
         capture.images.close()
         return Training.start_from(now.scaled(), tmp_path / "run", capture, "cpu", RunConfig(now, data))
 

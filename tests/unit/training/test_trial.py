@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.types import Mode
-from scene_experts.data.capture import load
 from scene_experts.recipes import RECIPES
 from scene_experts.training.state import Training
 from scene_experts.training.trial import fit_memory, unchanged
+from support.captures import load
 from support.synthetic import make_capture
 from support.trainings import config, events
 
@@ -42,15 +41,6 @@ def test_generators_and_networks_are_put_back(folder):
         for tensor in scene.network_tensors().values():
             tensor.data.add_(1.0)
     assert all(torch.equal(v, before[k]) for k, v in scene.network_tensors().items()) and torch.equal(torch.get_rng_state(), generator)
-
-
-def test_counts_of_a_batch_are_put_back(folder):
-    scene = Training.start(config("moe-gs-balance", batch=2).scaled(), load(folder), "cpu").scene
-    with unchanged(scene):
-        for number, head in enumerate(scene.heads.values()):
-            head.route(torch.randn(6, 32), 2000 + number, None, Mode.TRAIN)
-        assert all(count.any() for count in scene.counts())
-    assert not any(count.any() for count in scene.counts())
 
 
 @pytest.mark.slow

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import load
 from scene_experts.geometry.poses import look_at
 from scene_experts.view import paths
 from scene_experts.view.paths import CameraRig, choose_best_view, make_path, orbit, spiral
+from support.captures import load
 from support.places import DEMO
 from support.scenes import CAMERA
 from support.synthetic import make_capture

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from scene_experts.data.capture import load
 from scene_experts.evaluate.pictures import to_8bit
 from scene_experts.recipes import RECIPES
 from scene_experts.view.paint import paint
 from scene_experts.view.paths import choose_best_view
+from support.captures import load
 
 pytest.importorskip("viser")
 from scene_experts.view.server import Client, Viewer, check_host

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import FARTHEST, LARGEST, LARGEST_LOG, expect_range
+from scene_experts.scene.anchors.mlp import Attribute
 
 Network = dict[str, Tensor]
 """One decoder network by our short names: w1 [E, H, D], b1 [E, H], w2 [E, out, H], b2 [E, out] of E
@@ -41,7 +42,7 @@ class AnchorData:
     """Edge of a cell; 0: unknown."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of cell (0, 0, 0)."""
-    add_dist: tuple[str, ...] = ()
+    add_dist: tuple[Attribute, ...] = ()
     """Attributes whose network sees the distance."""
     step: int = 0
     """Iterations trained; 0: unknown."""

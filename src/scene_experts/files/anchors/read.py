@@ -20,6 +20,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.plain import from_json
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import guarding
+from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.files import result_folder
@@ -33,9 +34,9 @@ from scene_experts.files.registry import read as read_file
 from scene_experts.files.result_folder import expect_world, world_in
 from scene_experts.scene import Scene, restore_scene
 from scene_experts.scene.anchors.levels import Levels
-from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, Attribute
 from scene_experts.training.config import Train
-from scene_experts.training.run_folder import OpenRun, load_capture
+from scene_experts.training.run_folder import OpenRun
 
 MOST_LEVELS = 64  # of detail
 
@@ -63,7 +64,7 @@ def _read(source: Path, data: Data) -> Imported:
     check_networks(networks, str(source))
     about = found.about
     data = data if about is not None else replace(data, normalise="none")
-    capture = load_capture(data)
+    capture = captures.load(data)
     capture.images.close()
     if about is None:
         meta, voxel, cfg = meta_of(found, capture), found.voxel, recipe_of(found)
@@ -119,7 +120,7 @@ def tensors_of(
     return out | {f"network.{a}.{name}": value for a, n in trained.items() for name, value in n.items()}
 
 
-def for_trained_unit(networks: dict[str, Network], add_dist: tuple[str, ...], features: int, scale: float) -> dict[str, Network]:
+def for_trained_unit(networks: dict[str, Network], add_dist: tuple[Attribute, ...], features: int, scale: float) -> dict[str, Network]:
     """Networks that see distances in trained units, by the names of a scene's parts: the inverse of
     `write.networks`, up to rounding.
 
@@ -224,7 +225,7 @@ def read_anchors(path: Path) -> dict[str, Tensor]:
     return out
 
 
-def distance_inputs(networks: dict[str, Network], columns: dict[str, Tensor], by_level: bool, where: str) -> tuple[str, ...]:
+def distance_inputs(networks: dict[str, Network], columns: dict[str, Tensor], by_level: bool, where: str) -> tuple[Attribute, ...]:
     """The attributes whose network sees the distance: it has one input more than feature, direction
     and appearance code.
 

@@ -17,6 +17,7 @@ from scene_experts.core.plain import from_json
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import guarding
 from scene_experts.core.table import Table
+from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.files import result_folder
@@ -29,7 +30,7 @@ from scene_experts.recipes import gs_3d
 from scene_experts.scene import Scene
 from scene_experts.scene.gaussians import Explicit, GaussianScene
 from scene_experts.training.config import Train
-from scene_experts.training.run_folder import OpenRun, load_capture
+from scene_experts.training.run_folder import OpenRun
 
 log: logging.Logger = logging.getLogger(__name__)
 DRAWN_AT = 3  # the step to draw scenes of `scene_of` at: all their harmonics are in use from this step on
@@ -50,7 +51,7 @@ def read(source: Path, data: Data, iteration: int | None) -> Imported:
     """
     antialias = is_antialiased(source)
     about = result_folder.read_description(source.parent) or {}
-    capture = load_capture(data)
+    capture = captures.load(data)
     capture.images.close()
     made_on = beside(source).get("capture")
     if made_on not in (None, "", capture.fingerprint()):

@@ -20,6 +20,7 @@ from scene_experts.core.plain import from_json
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.numbers import FARTHEST, LARGEST, LARGEST_LOG, expect_finite_tensors, expect_range, number
 from scene_experts.core.reading.source import guarding
+from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.files import result_folder
@@ -30,7 +31,6 @@ from scene_experts.files.result_folder import expect_world, world_in
 from scene_experts.geometry.voxel import coarsen
 from scene_experts.scene.graph.scene import CHANNELS, HALF
 from scene_experts.training.config import Train
-from scene_experts.training.run_folder import load_capture
 
 
 def find(source: Path, iteration: int | None) -> Path | None:
@@ -60,7 +60,7 @@ def _read(source: Path, data: Data) -> Imported:
     if absent := {"grid", "extent", "step", "train"} - about.keys():
         raise InputError(f"expected {', '.join(sorted(absent))} in {source / result_folder.DESCRIPTION}, found none; copy the whole folder")
     world, cfg = world_in(about), from_json(Train, about.get("train"), "train")
-    capture = load_capture(data)
+    capture = captures.load(data)
     capture.images.close()
     expect_world(world, capture.world)
     voxel = float(about["voxel_size"]["trained"])

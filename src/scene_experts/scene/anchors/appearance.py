@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Literal, Self
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -16,24 +16,21 @@ from torch import Tensor, nn
 from scene_experts.core.types import Camera, Mode
 from scene_experts.scene.anchors.mlp import HeadWeights
 
-TestRule = Literal["mean", "index"]
-
 
 class Codes(nn.Module):
     """One code per training view, initialized from a standard normal distribution (Scaffold-GS).
 
-    views: the training cameras' ids. rule: the code of any other camera: the mean of all codes, or (what Scaffold-GS does) that of the
-    training view with the test view's number among the test views. `fitted` holds codes of other cameras, by id, that an evaluation
-    found; they are no part of the scene.
+    views: the training cameras' ids. Any other camera has the mean of all codes. `fitted` holds codes of other cameras, by id, that an
+    evaluation found; they are no part of the scene.
     """
 
     views: tuple[int, ...]
     row: dict[int, int]
     table: nn.Parameter
 
-    def __init__(self, dim: int, views: Sequence[int], rule: TestRule = "mean") -> None:
+    def __init__(self, dim: int, views: Sequence[int]) -> None:
         super().__init__()
-        self.views, self.rule = tuple(views), rule
+        self.views = tuple(views)
         self.row = {view: i for i, view in enumerate(self.views)}
         self.table = nn.Parameter(torch.randn(len(self.views), dim))
         self.fitted: dict[int, Tensor] = {}
@@ -48,8 +45,6 @@ class Codes(nn.Module):
         if mode is Mode.DRAW and camera.id in self.fitted:
             return self.fitted[camera.id]
         row = self.row.get(camera.id)
-        if row is None and self.rule == "index" and camera.id >= 0:  # below 0: a free camera that belongs to no view
-            row = (camera.id - sum(view < camera.id for view in self.views)) % len(self.views)  # its number among the other views
         return self.table.mean(dim=0) if row is None else self.table[row]
 
 

@@ -1,6 +1,6 @@
-"""The mixture of experts of the paper (section 3.2): router, dense mixture, Top-k mixture, curriculum.
+"""The mixture of experts of the paper (section 3.2): dense mixture, Top-k mixture, curriculum. `routers.py` has the routers.
 
-Symbols: A anchors, F feature size, D input size, E experts, k chosen experts. g = softmax(R(f)) (eq. 3) depends only on the feature.
+Symbols: A anchors, F feature size, D input size, E experts, k chosen experts. g are the gates, which depend only on the anchor.
     dense  (eq. 4)  y = sum_i g_i E_i(z)                          for the first `warmup` iterations
     sparse (eq. 5)  y = sum_{i in Top-k} w_i E_i(z),  w_i = g_i / sum_{j in Top-k} g_j, the softmax over the k chosen logits
 The load-balancing losses L_load^S and L_load^D (eq. 6, 7) are in `losses.py`.
@@ -11,75 +11,44 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, Self
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import CHOSEN, SCALES, Count, Flag, Needs, Range
 from scene_experts.core.parts import register
 from scene_experts.core.types import Mode, Routing
-from scene_experts.scene.anchors.mlp import ACTIVATIONS, ATTRIBUTES, LEAST_MARGIN, MLP, Decoder, HeadWeights, linear_init
+from scene_experts.scene import ROUTERS
+from scene_experts.scene.anchors.mlp import ACTIVATIONS, ATTRIBUTES, MLP, Attribute, Decoder, HeadWeights, linear_init
+from scene_experts.scene.anchors.routers import Companions, Linear, Router, RouterModule
 
 log: logging.Logger = logging.getLogger(__name__)
-MOST_MARGINS = 64  # experts of a head with margin weights in the compiled library
-
-
-@dataclass(frozen=True)
-class Router:
-    """The router, which computes the gates.
-
-    The defaults are the paper's "simple linear layer"; the other values cover what it leaves open.
-    """
-
-    bias: bool = True
-    """Give the linear layer a bias."""
-    init: Literal["default", "zeros"] = "default"
-    """Initialisation of the weights: PyTorch's default, or zeros."""
-    renormalise: bool = True
-    """Scale the weights of the chosen experts to sum to 1 (eq. 5). With k = 1 the router then gets gradients from L_load only."""
-    noise_std: float = 0.0
-    """Standard deviation of the Gaussian noise on the logits during training."""
-    weights: Literal["softmax", "margin"] = "softmax"
-    """Weights of the chosen experts. softmax: eq. 5. margin: proportional to a gate minus the largest gate that is not chosen, so that no
-    weight jumps where two experts change ranks."""
-    detach_feature: bool = False
-    """Stop gradients from the gates to the anchor features."""
-    input_pos: bool = False
-    """Append the anchor's position, divided by the scene's extent, to the router's input (the paper's appendix)."""
+Init = Literal["independent", "clone_jitter", "variance"]
 
 
 @register
 @dataclass(frozen=True)
 class Experts(Decoder):
-    """A mixture of experts for each attribute, with a linear router."""
+    """A mixture of experts for each attribute."""
 
-    num: int = 5
+    num: Count = 5
     """Number of experts per attribute."""
-    top_k: int | None = 2
+    top_k: Annotated[int | None, Range(1)] = 2
     """Number of experts per anchor after the warm-up; none keeps the dense mixture."""
-    warmup: int = 1500
+    warmup: Annotated[int, Range(0), SCALES] = 1500
     """Iterations with the dense mixture before Top-k. --iterations rescales it."""
-    attributes: tuple[str, ...] = ATTRIBUTES
-    """Attributes that have experts: opacity, cov, color. The others have one network."""
-    mix: Literal["post_activation", "pre_activation"] = "post_activation"
-    """Mix the outputs of the experts after or before the activation function."""
-    expert_init: Literal["independent", "clone_jitter", "variance"] = "independent"
-    """independent: initialise each expert on its own. clone_jitter: copies of one network with small noise. variance: independent, with
-    the last layers times sqrt(num), so that the outputs of the dense mixture vary as much as those of one network."""
-    load_scope: Literal["visible", "all"] = "visible"
-    """Anchors over which L_load balances the experts: the visible ones, or all."""
-    shared: bool = False
-    """Add an expert that decodes every anchor beside the chosen ones. The router weighs it against them; L_load ignores it."""
-    form: Literal["fast", "masked"] = "fast"
-    """How PyTorch computes Top-k. fast: gather the anchors of each expert. masked: run all experts and zero the weights of the others (slow
-    reference)."""
-    router: Router = Router()
-
-    learns_routing: ClassVar[bool] = True
-    """Whether losses train the routers."""
+    attributes: tuple[Attribute, ...] = ATTRIBUTES
+    """Attributes that have experts. The others have one network."""
+    expert_init: Annotated[Init, Needs(ROUTERS)] = "independent"
+    """independent: initialise each expert on its own. clone_jitter: copies of one network with small noise. variance:
+    independent, with the last layers times sqrt(num), so that the outputs of the dense mixture vary as much as those of one
+    network."""
+    router: Annotated[Router, CHOSEN] = Linear()
+    """How experts are chosen and weighed."""
 
     @property
     def with_experts(self) -> tuple[str, ...]:
@@ -90,210 +59,119 @@ class Experts(Decoder):
         return self.warmup
 
     @property
-    def balances_all(self) -> bool:
-        return self.load_scope == "all"
+    def has(self) -> frozenset[str]:
+        return frozenset({ROUTERS}) if self.router.learns else frozenset()
 
-    def scaled(self, factor: float) -> Self:
-        """Return the settings for a training run that is `factor` times as long. The dense warm-up scales with it."""
-        return replace(self, warmup=round(self.warmup * factor))
-
-    def check(self) -> None:
-        """Raises InputError, naming the flag, for invalid settings."""
-        expect_at_least([("--scene.decoder.num", self.num, 1), ("--scene.decoder.warmup", self.warmup, 0)])
-        expect_at_least([("--scene.decoder.router.noise-std", self.router.noise_std, 0)])
-        if self.top_k is not None and not 1 <= self.top_k <= self.num:
+    def check(self, flag: Flag) -> None:
+        if self.top_k is not None and self.top_k > self.num:
             raise InputError(
-                f"expected --scene.decoder.top-k between 1 and the number of experts ({self.num}), found {self.top_k}; "
-                "change it or --scene.decoder.num"
+                f"expected {flag('top_k')} of at most the number of experts ({self.num}), found {self.top_k}; change it or {flag('num')}"
             )
 
-    def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> MixtureHead | MLP:
-        """Build the head of an attribute: [A, inputs] and features [A, feature] to [A, outputs]. Raises InputError as `check` does."""
-        self.check()
+    def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> Mixture | MLP:
+        """Build the head of an attribute: [A, inputs] and features [A, feature] to [A, outputs]."""
         if self.num == 1 or attribute not in self.attributes:
             return MLP(attribute, inputs, hidden, outputs)
-        if self.learns_routing and self.top_k == 1 and self.router.renormalise and attribute == self.attributes[0]:
+        if self.router.learns and self.router.sums_to_one and self.top_k == 1 and attribute == self.attributes[0]:
             log.warning("with top_k 1 and renormalised weights the picture does not train the routers; only L_load does")
-        return self.head()(self, attribute, inputs, hidden, outputs, feature)
-
-    def head(self) -> type[MixtureHead]:
-        """Return the class of the head for attributes with experts. Routing variants override it."""
-        return MixtureHead
+        return Mixture(self, attribute, inputs, hidden, outputs, feature)
 
 
-def top_k(logits: Tensor, k: int) -> Tensor:
-    """Return indices [A, k] of the k largest logits [A, E], largest first. Ties go to the lowest index on every device."""
-    remaining, chosen = logits.detach(), []
-    for _ in range(k):
-        best = remaining.argmax(dim=1, keepdim=True)  # the first of equal maxima
-        chosen.append(best)
-        remaining = remaining.scatter(1, best, -torch.inf)
-    return torch.cat(chosen, dim=1)
+class Networks(nn.Module):
+    """E two-layer networks of one attribute: w1 [E, H, D], b1 [E, H], w2 [E, out, H], b2 [E, out]."""
 
-
-class MixtureHead(nn.Module):
-    """A sparsely gated mixture of E two-layer networks for one attribute."""
-
-    config: Experts
-    attribute: str
-    experts: int
-    batch: int = 1  # views per optimiser step
     w1: nn.Parameter
     b1: nn.Parameter
     w2: nn.Parameter
     b2: nn.Parameter
-    router_w: nn.Parameter
-    router_b: nn.Parameter | None
+
+    def __init__(self, attribute: str, count: int, inputs: int, hidden: int, outputs: int, init: Init = "independent") -> None:
+        super().__init__()
+        self.attribute, self.count = attribute, count
+        stacked = lambda shape, fan_in: nn.Parameter(torch.cat([linear_init((1, *shape), fan_in).data for _ in range(count)]))  # noqa: E731
+        self.w1, self.b1 = stacked((hidden, inputs), inputs), stacked((hidden,), inputs)
+        self.w2, self.b2 = stacked((outputs, hidden), hidden), stacked((outputs,), hidden)
+        if init == "clone_jitter":
+            for p in self.parameters():
+                p.data[1:] = p.data[:1] * (1.0 + 0.01 * torch.randn_like(p.data[1:]))
+        if init == "variance":  # a mean of E independent outputs has 1 / E of their variance
+            self.w2.data.mul_(math.sqrt(count))
+            self.b2.data.mul_(math.sqrt(count))
+
+    def one(self, i: int, x: Tensor) -> Tensor:
+        """Return the activated outputs [A, out] of expert i for x [A, D]."""
+        hidden = functional.relu(functional.linear(x, self.w1[i], self.b1[i]))
+        return ACTIVATIONS[self.attribute](functional.linear(hidden, self.w2[i], self.b2[i]))
+
+    def all(self, x: Tensor, w: Tensor) -> Tensor:
+        """Compute all experts and return sum_i w_i E_i(x). w [A, E]."""
+        return sum((w[:, i : i + 1] * self.one(i, x) for i in range(self.count)), start=x.new_zeros(()))  # type: ignore[return-value]
+
+    def chosen(self, x: Tensor, chosen: Tensor, w: Tensor) -> Tensor:
+        """Return the same sum over the chosen experts [A, k]: each is computed only for the anchors that chose it."""
+        A, k = chosen.shape
+        order = chosen.reshape(-1).argsort(stable=True)
+        counts = torch.bincount(chosen.reshape(-1), minlength=self.count).tolist()
+        rows = torch.div(order, k, rounding_mode="floor")
+        parts = [self.one(i, part) for i, part in enumerate(x.index_select(0, rows).split(counts)) if len(part)]
+        if not parts:
+            return x.new_zeros(A, self.w2.shape[1])
+        y = torch.cat(parts) * w.reshape(-1, 1).index_select(0, order)
+        return torch.zeros(A, y.shape[1], dtype=y.dtype, device=y.device).index_add(0, rows, y)
+
+
+class Mixture(nn.Module):
+    """A sparsely gated mixture for one attribute: networks and a router."""
+
+    networks: Networks
+    router: RouterModule
 
     def __init__(self, config: Experts, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> None:
         super().__init__()
-        self.config, self.attribute = config, attribute
-        self.experts = config.num
-        E = config.num + config.shared  # the shared expert is the last
-        self.w1 = nn.Parameter(torch.cat([linear_init((1, hidden, inputs), inputs).data for _ in range(E)]))
-        self.b1 = nn.Parameter(torch.cat([linear_init((1, hidden), inputs).data for _ in range(E)]))
-        self.w2 = nn.Parameter(torch.cat([linear_init((1, outputs, hidden), hidden).data for _ in range(E)]))
-        self.b2 = nn.Parameter(torch.cat([linear_init((1, outputs), hidden).data for _ in range(E)]))
-        if config.expert_init == "clone_jitter":
-            for p in (self.w1, self.b1, self.w2, self.b2):
-                p.data[1:] = p.data[:1] * (1.0 + 0.01 * torch.randn_like(p.data[1:]))
-        if config.expert_init == "variance":  # a mean of E independent outputs has 1 / E of their variance
-            self.w2.data.mul_(math.sqrt(E))
-            self.b2.data.mul_(math.sqrt(E))
-        router_inputs = feature + (3 if config.router.input_pos else 0)
-        self.router_w = linear_init((E, router_inputs), router_inputs)
-        self.router_b = linear_init((E,), router_inputs) if config.router.bias else None
-        if config.router.init == "zeros":
-            nn.init.zeros_(self.router_w)
-            if self.router_b is not None:
-                nn.init.zeros_(self.router_b)
-
-    def begin(self, before: int, step: int, positions: Callable[[], Tensor], companions: Callable[[Tensor], list[Tensor]]) -> None:
-        """Prepare for training iteration `step`. The default does nothing. See `Scene.begin_iteration`."""
+        self.config, self.experts = config, config.num
+        init = config.expert_init if config.router.learns else "independent"  # otherwise one network begins alone
+        self.networks = Networks(attribute, config.num, inputs, hidden, outputs, init)
+        self.router = config.router.build(config.num, feature)
 
     def k(self, step: int) -> int | None:
         """Return the number of experts per anchor at `step`, or None if dense. Iterations 1 .. warmup are dense."""
         return None if self.config.top_k is None or step <= self.config.warmup else self.config.top_k
 
-    def logits(self, feature: Tensor, position: Tensor | None, mode: Mode = Mode.DRAW) -> Tensor:
-        """Return the router's logits [A, E]. Noise is added in training."""
-        router = self.config.router
-        x = feature.detach() if router.detach_feature else feature
-        if router.input_pos:
-            if position is None:
-                raise ValueError("expected anchor positions for a router with input_pos, found none")
-            x = torch.cat([x, position], dim=1)
-        y = functional.linear(x, self.router_w, self.router_b)
-        if router.noise_std > 0 and mode is Mode.TRAIN:
-            y = y + router.noise_std * torch.randn_like(y)
-        return y
+    def begin(self, before: int, step: int, positions: Callable[[], Tensor], companions: Companions) -> None:
+        self.router.begin(self.networks, before, step, self.config.warmup, positions, companions)
 
-    def route(self, feature: Tensor, step: int, position: Tensor | None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor]:
+    def end_batch(self, views: int) -> None:
+        self.router.end_batch(views)
+
+    def route(self, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor]:
         """Return the routing and the mixture weights: [A, E] if dense, [A, k] otherwise."""
-        every = self.logits(feature, position, mode)
-        logits, k = every[:, : self.experts], self.k(step)
-        gates = logits.softmax(dim=1)  # eq. 3
-        if k is None:
-            return Routing(gates, None), every.softmax(dim=1) if self.config.shared else gates
-        chosen = self.choose(logits, k)
-        return Routing(gates, chosen), self.weigh(every, gates, chosen)
-
-    def weigh(self, logits: Tensor, gates: Tensor, chosen: Tensor) -> Tensor:
-        """Return the weights of the chosen experts [A, k], or [A, k + 1] with the shared expert last. logits [A, E], gates [A, num]."""
-        shared = logits[:, self.experts :]  # [A, 1], or [A, 0]
-        if self.config.router.weights == "margin":
-            rest = gates.scatter(1, chosen, 0.0).amax(dim=1, keepdim=True)
-            margin = gates.gather(1, chosen) - rest + LEAST_MARGIN
-            weights = margin / margin.sum(dim=1, keepdim=True)
-            part = shared.sigmoid()
-            return torch.cat([weights * (1.0 - part), part], dim=1) if self.config.shared else weights
-        if self.config.router.renormalise:
-            return torch.cat([logits.gather(1, chosen), shared], dim=1).softmax(dim=1)  # eq. 5
-        return logits.softmax(dim=1).gather(1, self.with_shared(chosen))
-
-    def counts(self) -> list[Tensor]:
-        """Return what the head has counted in a batch, as `Scene.counts`. A plain mixture counts nothing."""
-        return []
-
-    def settle(self) -> None:
-        """Use the counts of a batch, as `Scene.settle`. A plain mixture has none."""
-
-    def with_shared(self, chosen: Tensor) -> Tensor:
-        """Append the index of the shared expert, if there is one, to chosen [A, k]."""
-        return functional.pad(chosen, (0, 1), value=self.experts) if self.config.shared else chosen
-
-    def choose(self, logits: Tensor, k: int) -> Tensor:
-        """Return indices [A, k] of the experts that decode each anchor, given logits [A, E]."""
-        return top_k(logits, k)
-
-    def routing(self, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW) -> Routing:
-        return self.route(feature, step, position, mode)[0]
+        return self.router(feature, position, self.k(step), mode)
 
     def forward(
         self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW
     ) -> tuple[Tensor, Routing | None]:
         """x [A, D], feature [A, F] -> activated mixture [A, out], routing."""
         routing, w = self.route(feature, step, position, mode)
-        if routing.chosen is None:
-            y = self.all_experts(x, w)
-        elif self.config.form == "masked":
-            y = self.all_experts(x, self.spread(routing.chosen, w))
-        else:
-            y = self.chosen_experts(x, self.with_shared(routing.chosen), w)
-        return (ACTIVATIONS[self.attribute](y) if self.config.mix == "pre_activation" else y), routing
+        alone = self.router.alone(self.k(step))
+        if alone is not None:
+            return self.networks.one(alone, x), routing
+        return self.networks.all(x, w) if routing.chosen is None else self.networks.chosen(x, routing.chosen, w), routing
 
-    def spread(self, chosen: Tensor, w: Tensor) -> Tensor:
-        """Return weights [A, E] of all experts, 0 for those that are not chosen. chosen [A, k], w [A, k], or [A, k + 1] if shared."""
-        return w.new_zeros(len(w), len(self.w1)).scatter(1, self.with_shared(chosen), w)
+    def weights(self, step: int) -> HeadWeights:
+        k, own = self.k(step), self.networks
+        alone = self.router.alone(k)
+        if alone is not None:
+            only = slice(alone, alone + 1)
+            return HeadWeights(None, None, own.w1[only], own.b1[only], own.w2[only], own.b2[only], None)
+        w, b, position = self.router.fused() or (None, None, False)
+        return HeadWeights(w, b, own.w1, own.b1, own.w2, own.b2, k, position=position)
 
-    def expert(self, i: int, x: Tensor) -> Tensor:
-        """Return one expert's outputs. They are activated unless outputs are mixed before the activation."""
-        y = functional.linear(functional.relu(functional.linear(x, self.w1[i], self.b1[i])), self.w2[i], self.b2[i])
-        return ACTIVATIONS[self.attribute](y) if self.config.mix == "post_activation" else y
+    def network_parameters(self) -> list[nn.Parameter]:
+        return list(self.networks.parameters())
 
-    def all_experts(self, x: Tensor, w: Tensor) -> Tensor:
-        """Compute all experts and return sum_i w_i E_i(x). w [A, E]."""
-        return sum((w[:, i : i + 1] * self.expert(i, x) for i in range(len(self.w1))), start=x.new_zeros(()))  # type: ignore[return-value]
+    def router_parameters(self) -> list[nn.Parameter]:
+        return list(self.router.parameters())
 
-    def chosen_experts(self, x: Tensor, chosen: Tensor, w: Tensor) -> Tensor:
-        """Return the same sum, but compute each expert only for the anchors that chose it, sorted by expert."""
-        A, k = chosen.shape
-        order = chosen.reshape(-1).argsort(stable=True)
-        counts = torch.bincount(chosen.reshape(-1), minlength=len(self.w1)).tolist()
-        rows = torch.div(order, k, rounding_mode="floor")
-        parts = [self.expert(i, part) for i, part in enumerate(x.index_select(0, rows).split(counts)) if len(part)]
-        if not parts:
-            return x.new_zeros(A, self.w2.shape[1])
-        y = torch.cat(parts) * w.reshape(-1, 1).index_select(0, order)
-        return torch.zeros(A, y.shape[1], dtype=y.dtype, device=y.device).index_add(0, rows, y)
-
-    def aligned(
-        self, x: Tensor, feature: Tensor, step: int, position: Tensor | None, K: int, mode: Mode = Mode.DRAW
-    ) -> tuple[Tensor, Routing]:
-        """Return mixed covariance outputs [A, K * 7]. Quaternions are first flipped to the hemisphere of the anchor's first expert."""
-        routing, w = self.route(feature, step, position, mode)
-        if routing.chosen is not None:
-            w = self.spread(routing.chosen, w)
-        y = torch.stack([self.expert(i, x) for i in range(len(self.w1))], dim=1).reshape(len(x), len(self.w1), K, 7)
-        first = routing.gates.argmax(dim=1)[:, None, None, None].expand(-1, 1, K, 4)
-        reference = y[..., 3:].gather(1, first)
-        sign = torch.where((y[..., 3:] * reference).sum(-1, keepdim=True) < 0, -1.0, 1.0)
-        y = torch.cat([y[..., :3], y[..., 3:] * sign.detach()], dim=-1)
-        return (w[:, :, None, None] * y).sum(1).reshape(len(x), K * 7), routing
-
-    def weights(self, step: int) -> HeadWeights | None:
-        config, router = self.config, self.config.router
-        margin, k = router.weights == "margin", self.k(step)
-        if router.noise_std > 0 or router.detach_feature or not (router.renormalise or margin):
-            return None
-        if margin and (config.shared or self.experts > MOST_MARGINS):
-            return None
-        tensors = (self.router_w, self.router_b, self.w1, self.b1, self.w2, self.b2)
-        return HeadWeights(
-            *tensors,
-            None if k is None else k + config.shared,
-            position=router.input_pos,
-            linear=config.mix == "pre_activation",
-            shared=config.shared,
-            margin=margin,
-        )
+    def tensors(self) -> dict[str, nn.Parameter]:
+        networks, router = self.networks.named_parameters(), self.router.named_parameters()
+        return dict(networks) | {f"router_{name}": parameter for name, parameter in router}

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import Count
 from scene_experts.core.parts import Part, register
 from scene_experts.core.table import Table
 from scene_experts.scene.anchors.mlp import linear_init
@@ -63,7 +64,7 @@ class FeatureBank(FeatureMix):
     It blends every fourth, every second and all channels of the feature with camera-dependent weights.
     """
 
-    hidden: int = 32
+    hidden: Count = 32
     """Width of the network that predicts the blending weights."""
 
     def width(self, F: int) -> int:
@@ -74,7 +75,6 @@ class FeatureBank(FeatureMix):
 
     def check_size(self, F: int) -> None:
         """Raises InputError for a feature size that is not a multiple of 4."""
-        expect_at_least([("--scene.mix.hidden", self.hidden, 1)])
         if F % 4:
             raise InputError(f"expected --scene.F as a multiple of 4 for the feature bank, found {F}; give another size")
 

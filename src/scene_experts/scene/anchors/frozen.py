@@ -108,13 +108,18 @@ class Frozen:
         heads, N, nowhere = self._routers(), len(self.xyz), torch.zeros(3)
         call, alive = self._call(torch.arange(N), nowhere, heads)
         routed = [h.router_w is not None for h in heads.values()]
+        outside = self.scene.route_outside(heads, torch.arange(N), self.step)
         gates = [torch.empty(N, head.E) if r else None for r, head in zip(routed, call.heads)]
         chosen = [torch.empty(N, head.k, dtype=torch.int64) if r and head.k else None for r, head in zip(routed, call.heads)]
         chosen_weight = [torch.empty(N, head.k) if r and head.k else None for r, head in zip(routed, call.heads)]
         native_decode.set_routing(call, gates, chosen, chosen_weight)
         native_decode.route(call)
         del alive
-        return tuple(Kept(None if c is not None else g, c, m) for g, c, m in zip(gates, chosen, chosen_weight))
+        kept = {a: Kept(None if c is not None else g, c, m) for a, g, c, m in zip(ATTRIBUTES, gates, chosen, chosen_weight)}
+        for a, (routing, weight) in outside.items():
+            chosen = routing.chosen
+            kept[a] = Kept(weight, None, None) if chosen is None else Kept(None, chosen.contiguous(), weight.contiguous())
+        return tuple(kept.values())
 
 
 def _detach(w: HeadWeights) -> HeadWeights:
@@ -137,4 +142,6 @@ class FrozenCuda(Frozen):
         return Decoded(gaussians, rows, raw, {})
 
     def _keep(self) -> triton_decode.Routes:  # type: ignore[override]
-        return triton_decode.Routes(self.xyz, self.columns, self._routers(), self.with_dist, self.scene.extent)
+        heads = self._routers()
+        outside = self.scene.route_outside(heads, torch.arange(len(self.xyz), device=self.xyz.device), self.step)
+        return triton_decode.Routes(self.xyz, self.columns, heads, self.with_dist, self.scene.extent, outside)

@@ -120,14 +120,10 @@ def level_count(far: float, near: float, fork: int) -> int:
     return max(1, round(math.log(far / near, fork)) + 1) if near > 0 else 1
 
 
-def cube(points: Tensor, extend: float, parity: bool = False) -> tuple[float, float]:
-    """Return (low corner, edge) of the bounding cube of points [P, 3], scaled by `extend`. The values hold for all axes.
-
-    parity: scale the ends about the origin, as Octree-GS does. This displaces a cube that is not centred on the origin.
-    """
+def cube(points: Tensor, extend: float) -> tuple[float, float]:
+    """Return (low corner, edge) of the bounding cube of points [P, 3], scaled by `extend` about its centre. The values hold for all
+    axes."""
     low, high = float(points.min()), float(points.max())
-    if parity:
-        return extend * low, extend * (high - low)
     edge = extend * max(high - low, 1e-9)
     return 0.5 * (low + high - edge), edge
 

@@ -6,20 +6,20 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Literal, Protocol
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.fields import Range
 from scene_experts.core.parts import Part, register
 from scene_experts.core.types import Mode, Routing
 
-ATTRIBUTES = ("opacity", "cov", "color")  # decoded attributes, in the compiled library's order
+Attribute = Literal["opacity", "cov", "color"]
+ATTRIBUTES: tuple[Attribute, ...] = ("opacity", "cov", "color")  # decoded attributes, in the compiled library's order
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"opacity": torch.tanh, "cov": lambda y: y, "color": torch.sigmoid}
 """Activation of the last layer of each attribute."""
-LEAST_MARGIN = 1e-4  # added to margin weights (`Router.weights`), which stay finite where all gates are equal
 CHANNELS = {"opacity": 1, "cov": 7, "color": 3}  # values per Gaussian: opacity; 3 scale + 4 rotation; RGB
 
 
@@ -27,8 +27,8 @@ CHANNELS = {"opacity": 1, "cov": 7, "color": 3}  # values per Gaussian: opacity;
 class HeadWeights:
     """The tensors of a head, for kernels and files. A plain network has E = 1 and no router.
 
-    E counts the shared expert, which is the last.
-    k: number of experts that decode an anchor, the shared one included. None means dense: all, weighted by their gates.
+    k: number of experts that decode an anchor. None means dense: all, weighted by their gates. A head with several experts and no
+    `router_w` is routed outside the kernels, which take the mixture weights as an input.
     """
 
     router_w: Tensor | None  # [E, F], or [E, F + 3] if the router receives the anchor's position
@@ -41,9 +41,11 @@ class HeadWeights:
     middle_w: Tensor | None = None  # [E, L, H, H]: L hidden layers between the first and the last
     middle_b: Tensor | None = None  # [E, L, H]
     position: bool = False  # the router receives the anchor's position, divided by the scene's extent
-    linear: bool = False  # the experts' outputs are mixed before the activation
-    shared: bool = False  # the last expert decodes every anchor
-    margin: bool = False  # the weights of the chosen experts are margins, see `Router.weights`
+
+    @property
+    def routed_outside(self) -> bool:
+        """Whether the kernels need the mixture weights of each anchor."""
+        return self.router_w is None and len(self.w1) > 1
 
 
 class Head(Protocol):
@@ -61,12 +63,28 @@ class Head(Protocol):
         """Prepare for training iteration `step`, see `Scene.begin_iteration`. positions() are [N, 3], over the scene's extent."""
         ...
 
-    def weights(self, step: int) -> HeadWeights | None:
-        """Return the tensors used at `step`, or None if they do not describe the head completely."""
+    def weights(self, step: int) -> HeadWeights:
+        """Return the tensors used at `step`."""
         ...
 
-    def routing(self, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW) -> Routing | None:
-        """Return the routing, or None without experts. It depends only on the anchor's feature, never on the view."""
+    def route(self, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor] | None:
+        """Return the routing and the mixture weights [A, k], or [A, E] while dense; None without experts. They never depend on the view."""
+        ...
+
+    def end_batch(self, views: int) -> None:
+        """Learn what no gradient teaches, see `Scene.end_batch`."""
+        ...
+
+    def network_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters of the networks."""
+        ...
+
+    def router_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters of the router; empty without one."""
+        ...
+
+    def tensors(self) -> dict[str, nn.Parameter]:
+        """Return the parameters by their names in files: those of the networks, then those of a router (`router_...`)."""
         ...
 
 
@@ -91,14 +109,9 @@ class Decoder(Part, ABC):
         return 0
 
     @property
-    def balances_all(self) -> bool:
-        """Whether the experts' load is balanced over all anchors instead of the visible ones."""
-        return False
-
-    @property
-    def unused(self) -> tuple[str, ...]:
-        """Settings without an effect on these networks, as `SceneConfig.unused`."""
-        return ()
+    def has(self) -> frozenset[str]:
+        """What the networks add to `SceneConfig.has`."""
+        return frozenset()
 
     @abstractmethod
     def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> nn.Module:
@@ -110,16 +123,8 @@ class Decoder(Part, ABC):
 class Plain(Decoder):
     """One network per attribute, as in Scaffold-GS. `depth` counts linear layers (the paper's Figure 7 goes to 6)."""
 
-    depth: int = 2
+    depth: Annotated[int, Range(2)] = 2
     """Number of linear layers per network."""
-
-    @property
-    def unused(self) -> tuple[str, ...]:
-        return ("loss.load", "rates.router_scale", "scene.quat_align")
-
-    def check(self) -> None:
-        """Raises InputError for a network without a hidden layer."""
-        expect_at_least([("--scene.decoder.depth", self.depth, 2)])
 
     def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> MLP:
         return MLP(attribute, inputs, hidden, outputs, self.depth)
@@ -137,8 +142,6 @@ class MLP(nn.Module):
     def __init__(self, attribute: str, inputs: int, hidden: int, outputs: int, depth: int = 2) -> None:
         super().__init__()
         self.experts = 0
-        if depth < 2:
-            raise InputError(f"expected a depth of at least 2 linear layers, found {depth}; give a larger number")
         self.attribute = attribute
         self.w1 = linear_init((1, hidden, inputs), inputs)
         self.b1 = linear_init((1, hidden), inputs)
@@ -158,12 +161,24 @@ class MLP(nn.Module):
     def begin(self, before: int, step: int, positions: Callable[[], Tensor], companions: Callable[[Tensor], list[Tensor]]) -> None:
         """Do nothing: a plain network is the same at every iteration."""
 
-    def weights(self, step: int) -> HeadWeights | None:
+    def end_batch(self, views: int) -> None:
+        """Do nothing: gradients teach a plain network everything."""
+
+    def network_parameters(self) -> list[nn.Parameter]:
+        return list(self.parameters())
+
+    def router_parameters(self) -> list[nn.Parameter]:
+        return []
+
+    def tensors(self) -> dict[str, nn.Parameter]:
+        return dict(self.named_parameters())
+
+    def weights(self, step: int) -> HeadWeights:
         if not self.middle:
             return HeadWeights(None, None, self.w1, self.b1, self.w2, self.b2, None)
         middle_w = torch.stack([layer.weight for layer in self.middle])[None]  # type: ignore[misc]
         middle_b = torch.stack([layer.bias for layer in self.middle])[None]  # type: ignore[misc]
         return HeadWeights(None, None, self.w1, self.b1, self.w2, self.b2, None, middle_w, middle_b)
 
-    def routing(self, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW) -> Routing | None:
+    def route(self, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW) -> None:
         return None

@@ -8,7 +8,9 @@ number of threads. Symbols as in `types.py`. A head has D inputs, H hidden units
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -23,6 +25,7 @@ from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, HeadWeights
 WHAT = "the decode"
 TENSORS = api.HEAD_TENSORS
 T = len(TENSORS)
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -35,11 +38,10 @@ class Plan:
     k: tuple[int, int, int]  # 0: dense
     distance: tuple[int, int, int]
     position: tuple[int, int, int]  # whether the router receives the position
-    linear: tuple[int, int, int]  # whether outputs are mixed before the activation
-    shared: tuple[int, int, int]  # whether the last expert decodes every anchor
-    margin: tuple[int, int, int]  # whether the weights are margins
     extent: float
     ascending: bool
+    outside: tuple[bool, bool, bool] = (False, False, False)  # whether the mixture weights are given
+    chosen: tuple[Tensor | None, ...] = (None, None, None)  # [A, k] int64, the experts of heads that are routed outside
 
 
 def decode(
@@ -52,11 +54,12 @@ def decode(
     heads: dict[str, HeadWeights],
     with_dist: dict[str, bool],
     extent: float = 1.0,
+    outside: Mapping[str, tuple[Routing, Tensor]] = NOTHING,
 ) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
     """Decode anchors into Gaussians.
 
-    Differentiable with respect to feature, log_scaling, offsets and the tensors of the heads, but not xyz and the camera. All tensors are
-    float32 on the CPU unless noted.
+    Differentiable with respect to feature, log_scaling, offsets, the tensors of the heads and the weights in `outside`, but not xyz and
+    the camera. All tensors are float32 on the CPU unless noted.
 
     Args:
         rows: [A] int64, without duplicates.
@@ -68,17 +71,19 @@ def decode(
         heads: Tensors of the networks by attribute ("opacity", "cov", "color").
         with_dist: Whether the network of an attribute receives the distance to the camera.
         extent: Routers that receive positions receive xyz / extent.
+        outside: Routing and mixture weights ([A, k], or [A, E] while dense) of the heads that are `HeadWeights.routed_outside`.
 
     Returns:
-        The Gaussians of positive opacity, ordered by (row, slot); the raw opacities [A, K]; the routing of the heads that have a router.
+        The Gaussians of positive opacity, ordered by (row, slot); the raw opacities [A, K]; the routing of the heads with experts.
 
     Raises:
         ValueError: The shapes do not match.
-        IndexError: A row is outside the table.
+        IndexError: A row is outside the table, or a chosen expert does not exist.
     """
     found = [heads[a] for a in ATTRIBUTES]
     distance = tuple(int(with_dist[a]) for a in ATTRIBUTES)
     _check(xyz, feature, log_scaling, offsets, found, distance)
+    check_outside(heads, outside, len(rows))
     rows = rows.contiguous()
     ascending = len(rows) > 0 and bool((rows[1:] > rows[:-1]).all())
     if len(rows):
@@ -86,21 +91,31 @@ def decode(
         if low < 0 or high >= len(xyz):
             raise IndexError(f"expected rows from 0 to {len(xyz) - 1}, found {low} to {high}")
     plan = make_plan(rows, xyz, camera_position, heads, with_dist, extent, ascending)
+    chosen = tuple(outside[a][0].chosen if a in outside else None for a in ATTRIBUTES)
+    plan = replace(
+        plan, outside=tuple(a in outside for a in ATTRIBUTES), chosen=tuple(None if c is None else c.contiguous() for c in chosen)
+    )
     weights = [getattr(h, name) for h in found for name in TENSORS]
-    out = _DecodeFunction.apply(plan, feature, log_scaling, offsets, *weights)
+    mixed = [outside[a][1] if a in outside else None for a in ATTRIBUTES]
+    out = _DecodeFunction.apply(plan, feature, log_scaling, offsets, *weights, *mixed)
     means, quats, scales, opacities, colors, source, raw = out[:7]
-    routing = {
-        a: drop_shared(gates, chosen) if heads[a].shared else Routing(gates, chosen)
-        for a, gates, chosen in zip(ATTRIBUTES, out[7:10], out[10:13])
-        if gates is not None
-    }
+    found_routing = {a: Routing(gates, picked) for a, gates, picked in zip(ATTRIBUTES, out[7:10], out[10:13]) if gates is not None}
+    routing = {a: outside[a][0] if a in outside else found_routing[a] for a in ATTRIBUTES if a in outside or a in found_routing}
     return Gaussians(means, quats, scales, opacities, colors, source), raw, routing
 
 
-def drop_shared(gates: Tensor, chosen: Tensor | None) -> Routing:
-    """Return the routing among the other experts, given the gates [A, E] and the experts [A, k] with the shared expert last."""
-    routed = gates[:, :-1]
-    return Routing(routed / routed.sum(dim=1, keepdim=True), None if chosen is None else chosen[:, :-1])
+def check_outside(heads: Mapping[str, HeadWeights], outside: Mapping[str, tuple[Routing, Tensor]], A: int) -> None:
+    """Raise ValueError unless `outside` has weights of the right shape for each head that is routed outside, IndexError for experts that do
+    not exist."""
+    for a, h in heads.items():
+        if h.routed_outside != (a in outside):
+            raise ValueError(f"expected mixture weights for the heads that are routed outside, found other ones for {a}")
+        if a in outside:
+            (routing, weight), E = outside[a], len(h.w1)
+            if tuple(weight.shape) != (A, h.k or E) or (routing.chosen is None) != (h.k is None):
+                raise ValueError(f"expected mixture weights [{A}, {h.k or E}] for {a}, found {tuple(weight.shape)}")
+            if routing.chosen is not None and A and not 0 <= int(routing.chosen.min()) <= int(routing.chosen.max()) < E:
+                raise IndexError(f"expected experts from 0 to {E - 1} for {a}, found others")
 
 
 def make_plan(
@@ -108,11 +123,11 @@ def make_plan(
 ) -> Plan:
     """Collect the inputs that are not differentiated. The arguments are those of `decode`; ascending: whether `rows` are sorted."""
     found = [heads[a] for a in ATTRIBUTES]
-    k = tuple(h.k or 0 if h.router_w is not None else 0 for h in found)
+    k = tuple(h.k or 0 for h in found)
     distance = tuple(int(with_dist[a]) for a in ATTRIBUTES)
-    flags = [tuple(int(getattr(h, name)) for h in found) for name in ("position", "linear", "shared", "margin")]
+    position = tuple(int(h.position) for h in found)
     camera = camera.detach().to(torch.float32).contiguous()
-    return Plan(rows.contiguous(), xyz.detach().contiguous(), camera, k, distance, *flags, extent=extent, ascending=ascending)  # type: ignore[arg-type]
+    return Plan(rows.contiguous(), xyz.detach().contiguous(), camera, k, distance, position, extent, ascending)  # type: ignore[arg-type]
 
 
 def _check(xyz: Tensor, feature: Tensor, log_scaling: Tensor, offsets: Tensor, heads: list[HeadWeights], distance: tuple[int, ...]) -> None:
@@ -125,15 +140,11 @@ def _check(xyz: Tensor, feature: Tensor, log_scaling: Tensor, offsets: Tensor, h
         if h.middle_w is not None and h.middle_b is not None:
             L = h.middle_w.shape[1]
             wanted += [(f"{a}.middle_w", h.middle_w, (E, L, H, H)), (f"{a}.middle_b", h.middle_b, (E, L, H))]
-        if h.router_w is None:
-            if E != 1:
-                raise ValueError(f"expected one expert for {a} without a router, found {E}")
-            continue
-        if h.k is not None and not 1 + h.shared <= h.k <= E:
+        if h.k is not None and not 1 <= h.k <= E:
             raise ValueError(f"expected k between 1 and {E} for {a}, found {h.k}")
-        wanted += [(f"{a}.router_w", h.router_w, (E, F + 3 * h.position))] + (
-            [] if h.router_b is None else [(f"{a}.router_b", h.router_b, (E,))]
-        )
+        if h.router_w is not None:
+            wanted += [(f"{a}.router_w", h.router_w, (E, F + 3 * h.position))]
+            wanted += [] if h.router_b is None else [(f"{a}.router_b", h.router_b, (E,))]
     for name, tensor, shape in wanted:
         if tuple(tensor.shape) != shape or tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise ValueError(
@@ -169,22 +180,24 @@ class _DecodeFunction(torch.autograd.Function):
     def forward(ctx: Any, plan: Plan, feature: Tensor, log_scaling: Tensor, offsets: Tensor, *weights: Tensor | None) -> tuple:
         columns = [t.detach().contiguous() for t in (feature, log_scaling, offsets)]
         weights = tuple(None if t is None else t.detach().contiguous() for t in weights)
+        weights, given = weights[: 3 * T], weights[3 * T :]
         A = len(plan.rows)
         call = make_call(plan, columns, weights)
         gates, chosen, chosen_weight = [], [], []
         for i, k in enumerate(plan.k):
             routed, E = weights[T * i] is not None, call.heads[i].E
-            gates.append(torch.empty(A, E) if routed else None)
-            chosen.append(torch.empty(A, k, dtype=torch.int64) if routed and k else None)
-            chosen_weight.append(torch.empty(A, k) if routed and k else None)
+            gates.append(torch.empty(A, E) if routed else None if k else given[i])
+            chosen.append(torch.empty(A, k, dtype=torch.int64) if routed and k else plan.chosen[i])
+            chosen_weight.append(torch.empty(A, k) if routed and k else given[i] if k else None)
         set_routing(call, gates, chosen, chosen_weight)
         (means, quats, scales, opacities, colors, source), raw, starts, per_length = run(call)
         made = (means, quats, scales, opacities, colors)
         ctx.plan = plan
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(source, *(c for c in chosen if c is not None))
         ctx.save_for_backward(*columns, *weights, raw, starts, *made, per_length, *gates, *chosen, *chosen_weight)
-        return means, quats, scales, opacities, colors, source, raw, *gates, *chosen
+        shown = [[None if out else t for out, t in zip(plan.outside, found)] for found in (gates, chosen)]
+        ctx.mark_non_differentiable(source, *(c for c in shown[1] if c is not None))
+        return means, quats, scales, opacities, colors, source, raw, *shown[0], *shown[1]
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple:
@@ -205,9 +218,12 @@ class _DecodeFunction(torch.autograd.Function):
         set_pointers(call, d_feature=d_columns[0], d_log_scaling=d_columns[1], d_offsets=d_columns[2])
         for i, head in enumerate(call.heads):
             set_pointers(head, d_gates=given[7 + i], **{f"d_{name}": d_weights[T * i + j] for j, name in enumerate(TENSORS)})
+        mixed = [raw.new_empty(len(raw), h.k or h.E) if out else None for out, h in zip(plan.outside, call.heads)]
+        for head, d_weight in zip(call.heads, mixed):
+            set_pointers(head, d_weight=d_weight)
         native.check(native.require().se_decode_backward(ctypes.byref(call)), "the backward pass of the decode")
         wanted = ctx.needs_input_grad[1:]
-        return None, *(g if want else None for g, want in zip([*d_columns, *d_weights], wanted))
+        return None, *(g if want else None for g, want in zip([*d_columns, *d_weights, *mixed], wanted))
 
 
 def make_call(plan: Plan, columns: Any, weights: Any) -> SeDecode:
@@ -224,7 +240,6 @@ def make_call(plan: Plan, columns: Any, weights: Any) -> SeDecode:
         head.E, head.H, head.out = own["w1"].shape[0], own["w1"].shape[1], own["w2"].shape[1]
         head.L = 0 if own["middle_w"] is None else own["middle_w"].shape[1]
         head.k, head.distance, head.position = plan.k[i], plan.distance[i], plan.position[i]
-        head.linear, head.shared, head.margin = plan.linear[i], plan.shared[i], plan.margin[i]
     return call
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.fields import Needs, NotNegative, Range
 from scene_experts.core.parts import register
 from scene_experts.core.schedule import Rate
-from scene_experts.scene import LearningRates
+from scene_experts.scene import ROUTERS, LearningRates
 from scene_experts.scene.anchors.mlp import ATTRIBUTES
 
 SHARED = ("mix", "appearance")  # beside the decoder networks, what all anchors share
@@ -36,24 +37,15 @@ class Rates(LearningRates):
     """Learning rate of the network of the feature bank."""
     appearance: Rate = Rate(0.05, 0.0005)
     """Learning rate of the appearance codes."""
-    router_scale: float = 1.0
+    router_scale: Annotated[NotNegative, Needs(ROUTERS)] = 1.0
     """Factor of a router's learning rate over that of its attribute."""
-    networks: float = 1.0
+    networks: NotNegative = 1.0
     """Factor of the learning rates of the decoder networks and their routers. 0 also keeps the feature bank and the appearance codes."""
-    anneal: float = 1.0
+    anneal: Annotated[float, Range(above=0, high=1)] = 1.0
     """Final value of the learning rates that are constant otherwise (feature, log_scaling, cov), relative to their first; 1 leaves them
     constant."""
-    anneal_from: float = 2 / 3
+    anneal_from: Annotated[float, Range(0, below=1)] = 2 / 3
     """Share of the training after which these rates fall, log-linearly."""
-
-    def check(self) -> None:
-        """Check the rates. Raises InputError, which names the flag, if a factor is invalid."""
-        super().check()
-        expect_at_least([("--rates.networks", self.networks, 0), ("--rates.router-scale", self.router_scale, 0)])
-        if not 0 < self.anneal <= 1:
-            raise InputError(f"expected --rates.anneal above 0 and at most 1, found {self.anneal}; 1 leaves the rates constant")
-        if not 0 <= self.anneal_from < 1:
-            raise InputError(f"expected --rates.anneal-from from 0 to below 1, found {self.anneal_from}; it is a share of the training")
 
     def at(self, group: str, step: int, total: int, extent: float) -> float:
         """Return the learning rate of a group of `rate_groups` at `step` of `total`."""

@@ -13,13 +13,14 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import Count, CountOrNone, Flag, NotNegative, Range, Scales
 from scene_experts.core.parts import register
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points, Routing
@@ -27,14 +28,13 @@ from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.voxel import VoxelChoice, choose_voxel_size
 from scene_experts.native import library as native
 from scene_experts.native import triton
-from scene_experts.scene import Cull, Draws, LatticeScene, SceneConfig, Traits
+from scene_experts.scene import OPACITY, Cull, Draws, LatticeScene, SceneConfig, Traits
 from scene_experts.scene.anchors import native_decode, triton_decode
-from scene_experts.scene.anchors.appearance import Codes, TestRule, fold
-from scene_experts.scene.anchors.experts import MixtureHead
+from scene_experts.scene.anchors.appearance import Codes, fold
 from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
 from scene_experts.scene.anchors.few_views import displace, drop_anchors, find_spacings, find_weight
 from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
-from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, MLP, Decoder, HeadWeights, Plain
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, Attribute, Decoder, Head, HeadWeights, Plain
 from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, drop_masked, fade_opacities, visible_rows
 from scene_experts.scene.anchors.smoothing import find_intervals, smooth
 
@@ -50,21 +50,19 @@ class Anchors(SceneConfig):
 
     family = "anchors"
 
-    K: int = 10
+    K: Count = 10
     """Number of Gaussians per anchor."""
-    F: int = 32
+    F: Count = 32
     """Number of feature channels per anchor."""
-    hidden: int = 32
+    hidden: Count = 32
     """Width of the decoder networks."""
-    add_dist: tuple[str, ...] = ()
-    """Attributes whose networks also receive the distance to the camera: opacity, cov, color."""
-    voxel_size: float = 0.0
+    add_dist: tuple[Attribute, ...] = ()
+    """Attributes whose networks also receive the distance to the camera."""
+    voxel_size: NotNegative = 0.0
     """Edge of the finest voxels in trained units; 0 lets voxel_rule choose it."""
     voxel_rule: VoxelChoice = "neighbours"
     """neighbours: a quarter of the median distance to the nearest neighbours. squared_median and median_nn: the rule of Scaffold-GS as
     implemented and as documented."""
-    quat_align: bool = False
-    """Flip each expert's quaternion to the hemisphere of the first expert of the anchor before mixing (composed decoding only)."""
     decode: Literal["auto", "composed", "native"] = "auto"
     """Implementation that decodes anchors: native (fused), composed (PyTorch), or auto (native if it supports the scene)."""
     decoder: Decoder = Plain()
@@ -73,25 +71,22 @@ class Anchors(SceneConfig):
     """Which anchors a camera uses."""
     mix: FeatureMix = OwnFeature()
     """What the decoders see of an anchor's feature."""
-    appearance: int = 0
+    appearance: CountOrNone = 0
     """Size of the appearance code per training view; 0 means no codes."""
-    dropout: float = 0.0
+    dropout: Annotated[float, Range(0, below=1)] = 0.0
     """Share of the anchors that a training view leaves out from iteration `dropout_full` on; it rises linearly from 0. Meant for few
     photographs (after DropGaussian, Park et al. 2025)."""
-    dropout_full: int = 30_000
+    dropout_full: Annotated[int, Range(1), Scales(least=1)] = 30_000
     """Iteration at which the share of dropped anchors is reached. --iterations rescales it."""
-    view_jitter: float = 0.0
+    view_jitter: NotNegative = 0.0
     """Training views are decoded as seen from a random position around their camera. Its root mean square distance from the camera, as a
     share of the distance to the nearest other training cameras; 0 means no displacement."""
-    few_views: int = 0
+    few_views: CountOrNone = 0
     """Number of training views up to which dropout and view_jitter have their whole value. Both fall linearly to 0 at twice as many
     views; 0: the same values for any number of views."""
-    smoothing: float = 0.0
+    smoothing: NotNegative = 0.0
     """Variance of the 3D smoothing filter in squared pixels of the closest training view (0.2 in Mip-Splatting); 0 means no filter. It
     helps cameras that come closer than the training views."""
-    test_appearance: TestRule = "mean"
-    """Appearance code of a held-out view. mean: the mean of all codes. index: the code of the training view with the same index, as in
-    Scaffold-GS."""
 
     @property
     def grown_as(self) -> str:
@@ -102,16 +97,14 @@ class Anchors(SceneConfig):
         return self.decoder.dense_until
 
     @property
-    def unused(self) -> tuple[str, ...]:
-        return ("loss.mean_opacity", "loss.mean_size", *self.decoder.unused)
+    def has(self) -> frozenset[str]:
+        return self.decoder.has | {OPACITY}
 
     def phases(self) -> dict[str, int]:
-        return {"--scene.decoder.warmup": self.dense_until, **self.select.phases()}
+        return {"decoder.warmup": self.dense_until, **{f"select.{name}": last for name, last in self.select.phases().items()}}
 
     def needs_whole_table(self) -> str:
-        if self.select.has_levels:
-            return "anchors on levels"
-        return "--scene.decoder.load-scope all" if self.decoder.balances_all else ""
+        return "anchors on levels" if self.select.has_levels else ""
 
     def of_views(self, views: int) -> Self:
         weight = find_weight(self.few_views, views)
@@ -131,26 +124,8 @@ class Anchors(SceneConfig):
         """Create the scene of a checkpoint with newly initialized networks."""
         return AnchorScene(self, table, float(meta["voxel"]), float(meta["extent"]), self.select.restore(meta), meta.get("views", ()))
 
-    def scaled(self, factor: float) -> Self:
-        """Return the settings for a training run that is `factor` times as long."""
-        full = max(1, round(self.dropout_full * factor)) if self.dropout else self.dropout_full
-        return replace(self, decoder=self.decoder.scaled(factor), select=self.select.scaled(factor), dropout_full=full)
-
-    def check(self) -> None:
-        """Raises InputError, naming the flag, for invalid settings."""
-        expect_at_least([(f"--scene.{name}", getattr(self, name), 1) for name in ("K", "F", "hidden")])
-        expect_at_least([("--scene.voxel-size", self.voxel_size, 0), ("--scene.appearance", self.appearance, 0)])
-        expect_at_least([("--scene.dropout", self.dropout, 0), ("--scene.dropout-full", self.dropout_full, 1)])
-        expect_at_least([("--scene.few-views", self.few_views, 0), ("--scene.view-jitter", self.view_jitter, 0)])
-        expect_at_least([("--scene.smoothing", self.smoothing, 0)])
-        if self.dropout >= 1:
-            raise InputError(f"expected --scene.dropout below 1, found {self.dropout}; it is a share of the anchors")
-        self.decoder.check()
-        self.select.check()
+    def check(self, flag: Flag) -> None:
         self.mix.check_size(self.F)
-        unknown = {*self.add_dist, *self.decoder.with_experts} - set(ATTRIBUTES)
-        if unknown:
-            raise InputError(f"expected attributes among {', '.join(ATTRIBUTES)}, found {', '.join(sorted(unknown))}; correct the flag")
 
 
 class AnchorScene(LatticeScene):
@@ -175,9 +150,9 @@ class AnchorScene(LatticeScene):
         for attribute in ATTRIBUTES:
             inputs = config.mix.width(config.F) + 3 + (attribute in config.add_dist) + (config.appearance if attribute == "color" else 0)
             heads[attribute] = config.decoder.build(attribute, inputs, config.hidden, config.K * CHANNELS[attribute], config.F)
-        self.heads: Mapping[str, MLP | MixtureHead] = nn.ModuleDict(heads)  # type: ignore[assignment]
+        self.heads: Mapping[str, Head] = nn.ModuleDict(heads)  # type: ignore[assignment]
         self.bank = config.mix.build(config.F)
-        self.codes = Codes(config.appearance, views, config.test_appearance) if config.appearance else None
+        self.codes = Codes(config.appearance, views) if config.appearance else None
         self.cameras: tuple[Camera, ...] = ()  # of the training views, for the smoothing filter of new anchors
         self.few_weight = 1.0  # factor of dropout and jitter, see `find_weight`
         self.spacings: dict[int, float] = {}  # by camera id, see `find_spacings`; empty without view_jitter
@@ -278,8 +253,7 @@ class AnchorScene(LatticeScene):
         decoded = self.decode(rows, seen_from, step, mode)
         decoded = fade_opacities(decoded, self.select.fade(table, rows, camera, step, mode), len(table), self.K)
         decoded = drop_masked(decoded, table.facts.get("slots"))
-        decoded = smooth(decoded, table.facts.get("interval"), self.config.smoothing, self.K)
-        return self.with_global_routing(decoded, step) if mode is Mode.TRAIN else decoded
+        return smooth(decoded, table.facts.get("interval"), self.config.smoothing, self.K)
 
     def visible(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Tensor:
         """Return the rows [A] that `camera` sees at `step`."""
@@ -295,7 +269,7 @@ class AnchorScene(LatticeScene):
 
     def decode(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:
         """Decode the given anchors [A]. Uses the device's fused kernels if they support the scene, otherwise PyTorch."""
-        weights = self.native_weights(step)
+        weights = self.fused_weights(step)
         if weights is None:
             return self.decode_composed(rows, camera, step, mode)
         if self.codes is not None:
@@ -303,28 +277,53 @@ class AnchorScene(LatticeScene):
         p = self.table.params
         with_dist = {a: a in self.config.add_dist for a in ATTRIBUTES}
         xyz, columns = self.table.facts["xyz"], (p["feature"], p["log_scaling"], p["offsets"])
+        outside = self.route_outside(weights, rows, step, mode)
         fused = native_decode if rows.device.type == "cpu" else triton_decode
-        made = fused.decode(rows, xyz, *columns, camera.position, weights, with_dist, self.extent)
+        made = fused.decode(rows, xyz, *columns, camera.position, weights, with_dist, self.extent, outside)
         return Decoded(made[0], rows, made[1], made[2])
 
-    def native_weights(self, step: int) -> dict[str, HeadWeights] | None:
-        """Return the heads' tensors for the fused decode (compiled on the CPU, Triton on CUDA), or None if it does not apply."""
-        feature = self.table.params["feature"]
-        why = no_kernels(feature.device)
-        why = why or ("--scene.quat-align" if self.config.quat_align else "a feature bank" if self.bank is not None else None)
-        why = why or (f"tensors of {feature.dtype}" if feature.dtype != torch.float32 else None)
-        if self.config.decode == "composed" or why:
-            if self.config.decode == "native":
-                raise InputError(f"expected a scene that the native decode covers, found {why}; use --scene.decode auto")
-            return None
+    def route_outside(
+        self, weights: dict[str, HeadWeights], rows: Tensor, step: int, mode: Mode = Mode.DRAW
+    ) -> dict[str, tuple[Routing, Tensor]]:
+        """Return the routing and the mixture weights of rows [A] by attribute, where the fused decode has no code for the router."""
+        heads = {a: self.heads[a] for a, w in weights.items() if w.routed_outside}
+        if not heads:
+            return {}
+        feature, position = self.table.params["feature"].index_select(0, rows), self.table.facts["xyz"].index_select(0, rows) / self.extent
+        return {a: head.route(feature, step, position, mode) for a, head in heads.items()}  # type: ignore[misc]
+
+    def fused_weights(self, step: int) -> dict[str, HeadWeights] | None:
+        """Return the heads' tensors for the fused decode (compiled on the CPU, Triton on CUDA), or None if it does not apply.
+
+        Raises InputError with `decode = native` where it does not apply.
+        """
         weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
-        wide = lambda a, w: feature.is_cuda and not triton_decode.covers(a, w, self.config.F, self.K)  # noqa: E731
-        without = next((a for a, w in weights.items() if w is None or wide(a, w)), None)
-        if without and self.config.decode == "native":
-            raise InputError(
-                f"expected a {without} head that the native decode covers, found switches it has no code for; use --scene.decode auto"
-            )
-        return None if without else weights  # type: ignore[return-value]
+        why = self.why_composed(weights)
+        if why and self.config.decode == "native":
+            raise InputError(f"expected a scene that the native decode covers, found {why}; use --scene.decode auto")
+        return None if why or self.config.decode == "composed" else weights
+
+    def why_composed(self, weights: dict[str, HeadWeights]) -> str:
+        """Return why plain PyTorch decodes, or "" where the fused decode supports the scene."""
+        feature = self.table.params["feature"]
+        if missing := no_kernels(feature.device):
+            return missing
+        if self.bank is not None:
+            return "a feature bank"
+        if feature.dtype != torch.float32:
+            return f"tensors of {feature.dtype}"
+        wide = [a for a, w in weights.items() if feature.is_cuda and not triton_decode.covers(a, w, self.config.F, self.K)]
+        return f"networks of {wide[0]} that are too deep or too wide for the kernels" if wide else ""
+
+    def describe_decode(self, step: int) -> str:
+        """Say which decode runs at `step`, and why not the fused one, as `Scene.describe_decode`."""
+        weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
+        why = self.why_composed(weights) or ("--scene.decode composed" if self.config.decode == "composed" else "")
+        if why:
+            return f"composed, in plain torch ({why})"
+        outside = [a for a, w in weights.items() if w.routed_outside]
+        kernels = "compiled" if self.table.device.type == "cpu" else "Triton"
+        return f"fused ({kernels})" + (f", routed in torch ({', '.join(outside)}: a router without a kernel)" if outside else "")
 
     def inputs(self, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
         """Return features [A, F], unit directions from camera to anchor [A, 3] and distances [A, 1]."""
@@ -345,10 +344,7 @@ class AnchorScene(LatticeScene):
             x = torch.cat([seen, direction] + ([distance] if attribute in self.config.add_dist else []), dim=1)
             if attribute == "color" and self.codes is not None:
                 x = torch.cat([x, self.codes(camera, mode).expand(len(x), -1)], dim=1)
-            if attribute == "cov" and self.config.quat_align and isinstance(head, MixtureHead):
-                out[attribute], found = head.aligned(x, feature, step, position, K, mode)
-            else:
-                out[attribute], found = head(x, feature, step, position, mode)
+            out[attribute], found = head(x, feature, step, position, mode)
             if found is not None:
                 routing[attribute] = found
         raw = out["opacity"]  # [A, K]
@@ -369,34 +365,16 @@ class AnchorScene(LatticeScene):
         )
         return Decoded(gaussians, rows, raw, routing)
 
-    def scene_opacity(self, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Tensor:
-        """Return the raw opacities [N, K] of all anchors for `camera`, including anchors that are not visible."""
-        everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
-        feature, direction, distance = self.inputs(everyone, camera)
-        seen = feature if self.bank is None else self.bank(self.table, everyone, direction, distance)
-        x = torch.cat([seen, direction] + ([distance] if "opacity" in self.config.add_dist else []), dim=1)
-        return self.heads["opacity"](x, feature, step, self.table.facts["xyz"] / self.extent, mode)[0]
-
     def routing(self, step: int, most: int | None = None, mode: Mode = Mode.DRAW) -> dict[str, Routing]:
         """Return the routing by attribute for all anchors, or for at most `most` evenly spaced ones. It is independent of the camera."""
         every = max(1, -(-len(self.table) // most)) if most else 1
         feature, position = self.table.params["feature"][::every], self.table.facts["xyz"][::every] / self.extent
-        found = {a: self.heads[a].routing(feature, step, position, mode) for a in ATTRIBUTES}
-        return {a: r for a, r in found.items() if r is not None}
+        found = {a: self.heads[a].route(feature, step, position, mode) for a in ATTRIBUTES}
+        return {a: r[0] for a, r in found.items() if r is not None}
 
-    def set_batch(self, views: int) -> None:
-        for head in self._mixtures():
-            head.batch = views
-
-    def counts(self) -> list[Tensor]:
-        return [count for head in self._mixtures() for count in head.counts()]
-
-    def settle(self) -> None:
-        for head in self._mixtures():
-            head.settle()
-
-    def _mixtures(self) -> list[MixtureHead]:
-        return [head for head in self.heads.values() if isinstance(head, MixtureHead)]
+    def end_batch(self, views: int) -> None:
+        for head in self.heads.values():
+            head.end_batch(views)
 
     def rows_by_level(self) -> list[int]:
         """Return the number of anchors per level of detail, coarse to fine. Empty without levels."""
@@ -414,26 +392,18 @@ class AnchorScene(LatticeScene):
 
     def frozen(self, step: int) -> Draws:
         """Return the scene with precomputed routing if the native decode supports it, otherwise the scene itself."""
-        weights = self.native_weights(step) if len(self.table) else None
+        weights = self.fused_weights(step) if len(self.table) else None
         if weights is None:
             return self
         return (Frozen if self.table.device.type == "cpu" else FrozenCuda)(self, weights, step)
-
-    def with_global_routing(self, decoded: Decoded, step: int) -> Decoded:
-        """With `load_scope = all`, replace the routing by that of all anchors, so that L_load balances the whole scene."""
-        if self.config.decoder.balances_all and decoded.routing:
-            return replace(decoded, routing=self.routing(step, mode=Mode.TRAIN))
-        return decoded
 
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return the parameters by learning rate name: one group per column, head and router."""
         groups = {name: [self.table.params[name]] for name in ("feature", "offsets", "log_scaling")}
         for attribute in ATTRIBUTES:
             head = self.heads[attribute]
-            named = dict(head.named_parameters())  # type: ignore[attr-defined]
-            groups[attribute] = [p for name, p in named.items() if not name.startswith("router")]
-            routers = [p for name, p in named.items() if name.startswith("router")]
-            if routers:
+            groups[attribute] = head.network_parameters()
+            if routers := head.router_parameters():
                 groups[f"{attribute}.router"] = routers
         if self.bank is not None:
             groups["mix"] = list(self.bank.parameters())
@@ -443,8 +413,9 @@ class AnchorScene(LatticeScene):
 
     def network_tensors(self) -> dict[str, Tensor]:
         """Return all tensors of the decoder by name (`opacity.w1`, ...), for files."""
-        parts: dict[str, Any] = {**self.heads, "mix": self.bank, "appearance": self.codes}
-        return {f"{part}.{name}": p for part, module in parts.items() if module is not None for name, p in module.named_parameters()}
+        parts = {attribute: head.tensors() for attribute, head in self.heads.items()}
+        parts |= {name: dict(m.named_parameters()) for name, m in (("mix", self.bank), ("appearance", self.codes)) if m is not None}
+        return {f"{part}.{name}": p for part, found in parts.items() for name, p in found.items()}
 
 
 def no_kernels(device: torch.device) -> str | None:

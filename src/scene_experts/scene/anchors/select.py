@@ -7,12 +7,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Any, ClassVar, Protocol, Self
+from typing import Annotated, Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import SCALES, Positive, Range
 from scene_experts.core.parts import Part, register
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode
@@ -68,7 +69,7 @@ class Selection(Part, ABC):
     """Whether anchors lie on levels of detail."""
 
     def phases(self) -> dict[str, int]:
-        """Return the last iterations of its phases, as `SceneConfig.phases`."""
+        """Return the last iterations of its phases by the names of their fields, as `SceneConfig.phases`."""
         return {}
 
     @abstractmethod
@@ -127,32 +128,29 @@ class Octree(Selection):
 
     has_levels = True
 
-    fork: int = 2
+    fork: Annotated[int, Range(2, lattices.MOST_FORK)] = 2
     """Subdivision factor between levels."""
-    count: int = 0
+    count: Annotated[int, Range(0, lattices.MOST_LEVELS)] = 0
     """Number of levels; 0 derives it from the distances between training cameras and points."""
-    first: int = -1
+    first: Annotated[int, Range(-1)] = -1
     """Finest level at the start of coarse-to-fine training; -1 means half of the levels."""
     base_layer: int = -1
     """Level 0 divides the scene's cube into fork^base_layer cells per axis; -1 derives it from coarseness."""
-    coarseness: float = 4.0
+    coarseness: Positive = 4.0
     """Cell size of the middle level in voxels, if base_layer is -1."""
-    dist_ratio: float = 0.999
+    dist_ratio: Annotated[float, Range(above=0.5, high=1)] = 0.999
     """Quantile of the camera distances that is used as the largest distance; one minus it gives the smallest."""
-    visible_threshold: float = -1.0
+    visible_threshold: Annotated[float, Range(below=1)] = -1.0
     """Remove anchors that are selected by no larger share of the training cameras; a negative value means the mean share."""
     rule: LevelRule = "round"
     """How the level of detail is rounded to an integer. blend fades in the opacity of the finest level."""
-    coarse_to_fine: bool = True
-    """Start with the coarser half of the levels and add the finer levels one by one."""
-    coarse_until: int = 10_000
-    """Iteration from which all levels are used. --iterations rescales it."""
-    coarse_factor: float = 1.5
+    coarse_until: Annotated[int, Range(0), SCALES] = 10_000
+    """Training starts with the coarser half of the levels and adds the finer ones one by one until this iteration; 0 starts with all.
+    --iterations rescales it."""
+    coarse_factor: Positive = 1.5
     """Ratio of the waiting times of successive levels in coarse-to-fine training."""
-    extend: float = 1.1
+    extend: Annotated[float, Range(1)] = 1.1
     """Edge of the scene's cube, in edges of the bounding cube of the points."""
-    parity_cube: bool = False
-    """Reproduce a quirk of Octree-GS: scale the cube about the origin instead of its centre."""
 
     def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
         """Create anchors in the occupied cells of every level and remove those that too few cameras select.
@@ -177,7 +175,7 @@ class Octree(Selection):
             raise InputError("expected training cameras to choose levels of detail from, found none; choose another --split")
         far, near = lattices.distances(points, cameras, self.dist_ratio)
         count = self.count or lattices.level_count(far, near, self.fork)
-        low, cube = lattices.cube(points, self.extend, self.parity_cube)
+        low, cube = lattices.cube(points, self.extend)
         layer = self.base_layer
         if layer < 0:
             layer = round(math.log(cube / (self.coarseness * voxel), self.fork)) - count // 2 + 1
@@ -196,11 +194,8 @@ class Octree(Selection):
     def restore(self, meta: dict[str, Any]) -> Selector:
         return LevelSelector(self, Levels.from_meta(meta["levels"]))
 
-    def scaled(self, factor: float) -> Self:
-        return replace(self, coarse_until=round(self.coarse_until * factor))
-
     def phases(self) -> dict[str, int]:
-        return {"--scene.select.coarse-until": self.coarse_until} if self.coarse_to_fine else {}
+        return {"coarse_until": self.coarse_until}
 
     def turns(self, levels: Levels) -> list[float]:
         """Iterations after which one more level is used. Intervals shrink by `coarse_factor`; the last ends at `coarse_until`."""
@@ -208,24 +203,6 @@ class Octree(Selection):
         if m < 1:
             return []
         return list(accumulate(q**i / sum(q**j for j in range(m)) * self.coarse_until for i in range(m)))
-
-    def check(self) -> None:
-        """Raises InputError, naming the flag, for invalid settings."""
-        expect_at_least(
-            [("--scene.select.fork", self.fork, 2), ("--scene.select.count", self.count, 0), ("--scene.select.first", self.first, -1)]
-        )
-        expect_at_least([("--scene.select.coarse-until", self.coarse_until, 0), ("--scene.select.extend", self.extend, 1)])
-        bounds = [
-            ("fork", self.fork, self.fork <= lattices.MOST_FORK, f"of at most {lattices.MOST_FORK:,}"),
-            ("count", self.count, self.count <= lattices.MOST_LEVELS, f"of at most {lattices.MOST_LEVELS}"),
-            ("dist-ratio", self.dist_ratio, 0.5 < self.dist_ratio <= 1, "above 0.5 and at most 1"),
-            ("visible-threshold", self.visible_threshold, self.visible_threshold < 1, "below 1"),
-            ("coarseness", self.coarseness, self.coarseness > 0, "above 0"),
-            ("coarse-factor", self.coarse_factor, self.coarse_factor > 0, "above 0"),
-        ]
-        for name, value, possible, wanted in bounds:
-            if not possible:
-                raise InputError(f"expected --scene.select.{name} {wanted}, found {value}; correct it or leave it out")
 
 
 @dataclass(frozen=True)
@@ -255,7 +232,7 @@ class LevelSelector:
     def top(self, step: int, mode: Mode) -> int:
         """Return the number of levels in use. During coarse-to-fine training, these are the levels added before `step`."""
         count = self.lattices.count
-        if mode is Mode.TRAIN and self.config.coarse_to_fine:
+        if mode is Mode.TRAIN:
             count = self.lattices.first + 1 + sum(turn < step for turn in self.config.turns(self.lattices))
         return min(count, self.lattices.count if self.cap is None else max(self.cap, 0) + 1)
 
@@ -269,7 +246,7 @@ class LevelSelector:
 
     def coarse(self, step: int) -> bool:
         """Whether coarse-to-fine training still adds levels at `step`."""
-        turns = self.config.turns(self.lattices) if self.config.coarse_to_fine else []
+        turns = self.config.turns(self.lattices)
         return bool(turns) and step <= turns[-1]
 
     def places(self, cells: Tensor, voxel: float, level: int) -> dict[str, Tensor]:

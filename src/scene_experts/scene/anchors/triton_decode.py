@@ -9,8 +9,9 @@ inputs give the same bits. Symbols as in `types.py`.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from scene_experts.core.types import Gaussians, Routing
 from scene_experts.native import triton
-from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, LEAST_MARGIN, HeadWeights
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, HeadWeights
 
 ACTIVATION = {"opacity": 0, "cov": 1, "color": 2}  # TANH, NONE, SIGMOID of triton_kernels.py
 TENSORS = ("router_w", "router_b", "w1", "b1", "w2", "b2")
@@ -26,6 +27,7 @@ PRECISION = "ieee"  # of matrix products: "ieee" is float32, "tf32x3" is nearly 
 BLOCK = 32  # anchors per program; with the paper's sizes, the largest block whose tiles fit in registers
 BLOCK_WEIGHTS = 16  # anchors per step of `weight_backward`, which also keeps the gradient of a network in registers
 MOST_EXPERTS = 30  # a set of experts is stored as the bits of an int32
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 WIDEST = 256  # largest padded number of outputs
 
 
@@ -33,7 +35,7 @@ def covers(attribute: str, h: HeadWeights, F: int, K: int) -> bool:
     """Whether the kernels support a network (two layers, held in registers) and its number of experts."""
     E, H = h.w1.shape[:2]
     fits = pad(F + 5) <= 64 and pad(H) <= 64 and pad(K * CHANNELS[attribute]) <= WIDEST
-    return h.middle_w is None and fits and E <= MOST_EXPERTS and not (h.linear or h.shared)
+    return h.middle_w is None and fits and E <= MOST_EXPERTS
 
 
 def pad(n: int, least: int = 16) -> int:
@@ -48,10 +50,10 @@ class _Head:
     attribute: str
     E: int
     k: int  # 0: dense, or no router
-    routed: bool
+    routed: bool  # a mixture, whoever computes its weights
+    outside: bool  # the mixture weights are given
     distance: bool
     position: bool  # whether the router receives the position
-    margin: bool  # whether the weights are margins
     sizes: dict[str, Any]  # the compile-time constants of its three kernels
 
 
@@ -80,11 +82,12 @@ def decode(
     heads: dict[str, HeadWeights],
     with_dist: dict[str, bool],
     extent: float = 1.0,
+    outside: Mapping[str, tuple[Routing, Tensor]] = NOTHING,
 ) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
     """Decode anchors into Gaussians.
 
-    Differentiable with respect to feature, log_scaling, offsets and the tensors of the heads, but not xyz and the camera. All tensors are
-    float32 on one device unless noted.
+    Differentiable with respect to feature, log_scaling, offsets, the tensors of the heads and the weights in `outside`, but not xyz and
+    the camera. All tensors are float32 on one device unless noted.
 
     Args:
         rows: [A] int64, without duplicates and inside the table. This is not checked, because the check would wait for the device.
@@ -96,9 +99,11 @@ def decode(
         heads: Tensors of the networks by attribute ("opacity", "cov", "color").
         with_dist: Whether the network of an attribute receives the distance to the camera.
         extent: Routers that receive positions receive xyz / extent.
+        outside: Routing and mixture weights ([A, k], or [A, E] while dense) of the heads that are `HeadWeights.routed_outside`. The
+            experts are not checked.
 
     Returns:
-        The Gaussians of positive opacity, ordered by (row, slot); the raw opacities [A, K]; the routing of the heads that have a router.
+        The Gaussians of positive opacity, ordered by (row, slot); the raw opacities [A, K]; the routing of the heads with experts.
 
     Raises:
         ValueError: The shapes do not match, or the kernels do not support a network.
@@ -107,9 +112,24 @@ def decode(
     made = tuple(_head(a, heads[a], with_dist[a], F, K) for a in ATTRIBUTES)
     plan = _Plan(rows.contiguous(), xyz.detach().contiguous(), camera_position.detach().to(xyz).contiguous(), made, extent)  # type: ignore[arg-type]
     weights = [getattr(heads[a], name) for a in ATTRIBUTES for name in TENSORS]
-    means, quats, scales, opacities, colors, source, raw, *routing = _Decode.apply(plan, feature, log_scaling, offsets, *weights)
-    found = {a: Routing(routing[i], routing[3 + i]) for i, a in enumerate(ATTRIBUTES) if routing[i] is not None}
+    mixed, keys = zip(*(_spread(outside[a], len(heads[a].w1)) if a in outside else (None, None) for a in ATTRIBUTES))
+    means, quats, scales, opacities, colors, source, raw, *routing = _Decode.apply(
+        plan, keys, feature, log_scaling, offsets, *weights, *mixed
+    )
+    found = {
+        a: outside[a][0] if a in outside else Routing(routing[i], routing[3 + i])
+        for i, a in enumerate(ATTRIBUTES)
+        if a in outside or routing[i] is not None
+    }
     return Gaussians(means, quats, scales, opacities, colors, source), raw, found
+
+
+def _spread(outside: tuple[Routing, Tensor], E: int) -> tuple[Tensor, Tensor | None]:
+    """Return the weights of all experts [A, E], 0 for those that are not chosen, and the set of chosen experts as bits [A] int32."""
+    chosen, w = outside[0].chosen, outside[1]
+    if chosen is None:
+        return w.contiguous(), None
+    return w.new_zeros(len(w), E).scatter(1, chosen, w), (1 << chosen).sum(1).to(torch.int32)
 
 
 def _head(attribute: str, h: HeadWeights, distance: bool, F: int, K: int) -> _Head:
@@ -120,9 +140,7 @@ def _head(attribute: str, h: HeadWeights, distance: bool, F: int, K: int) -> _He
         raise ValueError(f"expected {expected}, found {tuple(h.w1.shape)} and {tuple(h.w2.shape)}")
     if h.middle_w is not None:
         raise ValueError(f"expected networks of two layers, found {2 + h.middle_w.shape[1]} for {attribute}")
-    routed = h.router_w is not None
-    if not routed and E != 1:
-        raise ValueError(f"expected one expert for {attribute} without a router, found {E}")
+    routed = E > 1 or h.router_w is not None
     if h.router_w is not None and h.router_w.shape[1] != F + 3 * h.position:
         raise ValueError(f"expected {attribute} router weights [{E}, {F + 3 * h.position}], found {tuple(h.router_w.shape)}")
     if routed and h.k is not None and not 1 <= h.k <= E:
@@ -130,7 +148,7 @@ def _head(attribute: str, h: HeadWeights, distance: bool, F: int, K: int) -> _He
     sizes: dict[str, Any] = {"E": E, "F": F, "H": H, "K": K, "C": C, "DISTANCE": int(distance), "ROUTED": routed}
     sizes |= {"SPARSE": routed and h.k is not None, "ACT": ACTIVATION[attribute], "COMPACT": attribute != "opacity"}
     sizes |= {"XP": pad(D + 1), "HP": pad(H), "COLS": pad(K * C), "PRECISION": PRECISION}
-    return _Head(attribute, E, (h.k or 0) if routed else 0, routed, distance, h.position, h.margin, sizes)
+    return _Head(attribute, E, (h.k or 0) if routed else 0, routed, h.routed_outside, distance, h.position, sizes)
 
 
 def _kernels() -> ModuleType:
@@ -145,10 +163,14 @@ def _parts(device: torch.device, experts: int, blocks: int) -> int:
 
 class _Decode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, plan: _Plan, feature: Tensor, log_scaling: Tensor, offsets: Tensor, *weights: Tensor | None) -> tuple:
+    def forward(ctx: Any, plan: _Plan, keys: Any, feature: Tensor, log_scaling: Tensor, offsets: Tensor, *weights: Tensor | None) -> tuple:
         columns = [t.detach().contiguous() for t in (feature, log_scaling, offsets)]
         weights = tuple(None if t is None else t.detach().contiguous() for t in weights)
-        routes = [_route(plan, head, columns[0], weights[6 * i : 6 * i + 6]) for i, head in enumerate(plan.heads)]
+        weights, mixed = weights[:18], weights[18:]
+        routes = [
+            _given(plan, mixed[i], keys[i]) if head.outside else _route(plan, head, columns[0], weights[6 * i : 6 * i + 6])
+            for i, head in enumerate(plan.heads)
+        ]
         (means, quats, scales, opacities, colors, source, raw), dst, cov = _draw(plan, columns, weights, routes)
         gates, chosen = [r[0] for r in routes], [r[2] for r in routes]
         ctx.plan = plan
@@ -172,10 +194,12 @@ class _Decode(torch.autograd.Function):
             grid = (-(-A // BLOCK),)
             triton.launch(_kernels().place_backward, grid, *given, d_offsets, d_log_scaling, d_cov, d_all, A, K=K, B=BLOCK, KP=pad(K, 1))
         d_weights: list[Tensor | None] = []
+        d_mixed: list[Tensor | None] = []
         for i, d_out in enumerate((d_all, d_cov, d_colors)):
-            d_weights += _backward(plan, i, routes[i], columns[0], weights, dst, d_out, d_gates[i], d_feature)
-        wanted = ctx.needs_input_grad[1:]
-        return None, *(g if want else None for g, want in zip([d_feature, d_log_scaling, d_offsets, *d_weights], wanted))
+            own, mixed = _backward(plan, i, routes[i], columns[0], weights, dst, d_out, d_gates[i], d_feature)
+            d_weights, d_mixed = d_weights + own, [*d_mixed, mixed]
+        wanted = ctx.needs_input_grad[2:]
+        return None, None, *(g if want else None for g, want in zip([d_feature, d_log_scaling, d_offsets, *d_weights, *d_mixed], wanted))
 
 
 def _draw(plan: _Plan, columns: list[Tensor], weights: Any, routes: Any) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
@@ -202,14 +226,24 @@ class Routes:
 
     @torch.no_grad()
     def __init__(
-        self, xyz: Tensor, columns: list[Tensor], heads: dict[str, HeadWeights], with_dist: dict[str, bool], extent: float
+        self,
+        xyz: Tensor,
+        columns: list[Tensor],
+        heads: dict[str, HeadWeights],
+        with_dist: dict[str, bool],
+        extent: float,
+        outside: Mapping[str, tuple[Routing, Tensor]] = NOTHING,
     ) -> None:
         """xyz [N, 3]; columns: feature [N, F], log_scaling [N, 6], offsets [N, K, 3], all contiguous. Other arguments: see `decode`."""
         F, K = columns[0].shape[1], columns[2].shape[1]
         self.columns, self.heads = columns, tuple(_head(a, heads[a], with_dist[a], F, K) for a in ATTRIBUTES)
         everyone = torch.arange(len(xyz), device=xyz.device)
         self.plan = _Plan(everyone, xyz, xyz.new_zeros(3), self.heads, extent)  # type: ignore[arg-type]
-        routes = [_route(self.plan, h, columns[0], [heads[a].router_w, heads[a].router_b]) for a, h in zip(ATTRIBUTES, self.heads)]
+        given = {a: _spread(found, len(heads[a].w1)) for a, found in outside.items()}
+        routes = [
+            _given(self.plan, *given[a]) if a in given else _route(self.plan, h, columns[0], [heads[a].router_w, heads[a].router_b])
+            for a, h in zip(ATTRIBUTES, self.heads)
+        ]
         self.weights, self.keys = _stack([r[1] for r in routes]), _stack([r[3] for r in routes])
 
     @property
@@ -254,12 +288,16 @@ def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Ten
     if A:
         bias = weights[1]
         sizes = {"F": feature.shape[1], "E": head.E, "TOP": head.k, "BIAS": bias is not None, "POSITION": head.position}
-        sizes |= {"MARGIN": head.margin, "LEAST": LEAST_MARGIN}
         sizes |= {"FP": pad(feature.shape[1]), "EP": pad(head.E), "B": BLOCK, "PRECISION": PRECISION}
         unused = plan.rows  # placeholder for arrays that the kernel does not access
         arguments = [plan.rows, plan.xyz, feature, weights[0], bias, gates, weight, chosen, keys]
         triton.launch(_kernels().route, (-(-A // BLOCK),), *(unused if t is None else t for t in arguments), A, plan.extent, **sizes)
     return gates, weight, chosen, keys, None if keys is None else plan.order(keys)
+
+
+def _given(plan: _Plan, weight: Tensor | None, keys: Tensor | None) -> tuple[Tensor | None, ...]:
+    """Return the same as `_route` for given weights [A, E] and sets of chosen experts [A]: without gates and indices."""
+    return None, weight, None, keys, None if keys is None else plan.order(keys)
 
 
 def _forward(plan: _Plan, i: int, routes: Any, feature: Tensor, weights: Any, dst: Tensor, out: Tensor) -> None:
@@ -275,13 +313,13 @@ def _forward(plan: _Plan, i: int, routes: Any, feature: Tensor, weights: Any, ds
 
 def _backward(
     plan: _Plan, i: int, route: Any, feature: Tensor, weights: Any, dst: Tensor, d_out: Tensor, d_gates: Tensor | None, d_feature: Tensor
-) -> list[Tensor | None]:
-    """Return the gradients of the six tensors of attribute i, and add its part to `d_feature`."""
+) -> tuple[list[Tensor | None], Tensor | None]:
+    """Return the gradients of the six tensors of attribute i and of given mixture weights, and add its part to `d_feature`."""
     head, own, A = plan.heads[i], weights[6 * i : 6 * i + 6], len(plan.rows)
     gates, weight, _, keys, order = route
     if not A:
-        return [None if t is None else torch.zeros_like(t) for t in own]
-    d_logits = None if gates is None else torch.empty_like(gates)
+        return [None if t is None else torch.zeros_like(t) for t in own], torch.zeros_like(weight) if head.outside else None
+    d_logits = torch.empty_like(weight) if head.routed else None  # of the given weights, where they are given
     shared = [plan.rows, order, keys, weight]
     arguments = [*shared, gates, plan.xyz, feature, plan.camera, own[0], *own[2:], dst, d_out, d_gates, d_logits, d_feature]
     grid = (-(-A // BLOCK),)
@@ -294,8 +332,7 @@ def _backward(
         B=BLOCK,
         EP=pad(head.E),
         POSITION=head.position,
-        MARGIN=head.margin and head.k > 0,
-        LEAST=LEAST_MARGIN,
+        OUTSIDE=head.outside,
     )
     blocks = -(-A // BLOCK_WEIGHTS)
     parts = [t.new_empty(_parts(t.device, head.E, blocks), *t.shape) for t in own[2:]]
@@ -303,10 +340,10 @@ def _backward(
     given = (plan.rows if t is None else t for t in arguments)
     triton.launch(_kernels().weight_backward, (head.E, len(parts[0])), *given, A, blocks, **head.sizes, B=BLOCK_WEIGHTS)
     found: list[Tensor | None] = [None, None]
-    if d_logits is not None:
+    if d_logits is not None and not head.outside:
         seen = feature.index_select(0, plan.rows)
         if head.position:
             seen = torch.cat([seen, plan.xyz.index_select(0, plan.rows) / plan.extent], dim=1)
         found[0] = d_logits.T @ seen
         found[1] = None if own[1] is None else d_logits.sum(0)
-    return [*found, *(part.sum(0) for part in parts)]
+    return [*found, *(part.sum(0) for part in parts)], d_logits if head.outside else None

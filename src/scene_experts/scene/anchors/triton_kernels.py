@@ -121,13 +121,12 @@ def outputs(dst, anchor, inside, K: tl.constexpr, C: tl.constexpr, COLS: tl.cons
 @triton.jit(do_not_specialize=["A"])
 def route(
     rows, xyz, feature, router_w, router_b, gates, weight, chosen, keys, A, extent,
-    F: tl.constexpr, E: tl.constexpr, TOP: tl.constexpr, BIAS: tl.constexpr, POSITION: tl.constexpr, MARGIN: tl.constexpr,
-    LEAST: tl.constexpr, B: tl.constexpr, FP: tl.constexpr, EP: tl.constexpr, PRECISION: tl.constexpr,
+    F: tl.constexpr, E: tl.constexpr, TOP: tl.constexpr, BIAS: tl.constexpr, POSITION: tl.constexpr,
+    B: tl.constexpr, FP: tl.constexpr, EP: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Compute the gates [A, E] (eq. 3). If TOP > 0, also the chosen experts [A, TOP], their weights [A, E] (eq. 5) and the keys [A].
 
-    Ties go to the lowest index. POSITION: the router also receives xyz / extent. MARGIN: the weights are proportional to a gate minus the
-    largest gate that is not chosen, plus LEAST.
+    Ties go to the lowest index. POSITION: the router also receives xyz / extent.
     """
     anchor = tl.program_id(0) * B + tl.arange(0, B)
     inside = anchor < A
@@ -156,9 +155,6 @@ def route(
             key = key | (1 << best)
             logits = tl.where(expert == best[:, None], -float("inf"), logits)
         mine = ((key[:, None] >> expert) & 1) == 1
-        if MARGIN:
-            p = p / tl.sum(p, axis=1)[:, None]
-            p = p - tl.max(tl.where(mine, 0.0, p), axis=1)[:, None] + LEAST
         p = tl.where(mine, p, 0.0)
         tl.store(weight + anchor[:, None] * E + expert, p / tl.sum(p, axis=1)[:, None], mask=there)
         tl.store(keys + anchor, key, mask=inside)
@@ -194,9 +190,12 @@ def head_backward(
     E: tl.constexpr, F: tl.constexpr, H: tl.constexpr, K: tl.constexpr, C: tl.constexpr,
     DISTANCE: tl.constexpr, ROUTED: tl.constexpr, SPARSE: tl.constexpr, ACT: tl.constexpr, COMPACT: tl.constexpr,
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, EP: tl.constexpr, POSITION: tl.constexpr,
-    MARGIN: tl.constexpr, LEAST: tl.constexpr, PRECISION: tl.constexpr,
+    OUTSIDE: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Add the gradient of one attribute, through networks and router, to `d_feature`. Write the gradient of the logits [A, E]."""
+    """Add the gradient of one attribute, through networks and router, to `d_feature`. Write the gradient of the logits [A, E].
+
+    OUTSIDE: the mixture weights are given. Their gradient [A, E] takes the place of that of the logits, and there is no router.
+    """
     anchor, row, key, inside = block_of(order, keys, rows, tl.program_id(0), A, B, SPARSE)
     x = inputs(feature, xyz, camera, row, inside, F, DISTANCE, XP)
     at, there = outputs(dst, anchor, inside, K, C, COLS, COMPACT)
@@ -216,23 +215,15 @@ def head_backward(
                 back = back * tl.load(weight + anchor * E + e, mask=mine, other=0.0)[:, None]
             dh = tl.dot(back * slope(a, ACT), tl.trans(w), input_precision=PRECISION)
             dx += tl.dot(tl.where(h > 0, dh, 0.0), tl.trans(first), input_precision=PRECISION)
-    if ROUTED:
-        real = inside[:, None] & (expert < E)
+    real = inside[:, None] & (expert < E)
+    if OUTSIDE:
+        tl.store(d_logits + anchor[:, None] * E + expert, d_weight, mask=real)
+    elif ROUTED:
         g = tl.load(gates + anchor[:, None] * E + expert, mask=real, other=0.0)
         m = tl.load(weight + anchor[:, None] * E + expert, mask=real, other=0.0)
         d_g = tl.load(d_gates + anchor[:, None] * E + expert, mask=real, other=0.0)
         spread = d_weight - tl.sum(m * d_weight, axis=1)[:, None]
-        if MARGIN:
-            mine = m > 0
-            others = tl.where(real & (m == 0), g, -1.0)
-            rest = tl.maximum(tl.max(others, axis=1), 0.0)
-            total = tl.sum(tl.where(mine, g - rest[:, None] + LEAST, 0.0), axis=1)
-            d_margin = tl.where(mine, spread / tl.where(inside, total, 1.0)[:, None], 0.0)
-            left = expert == tl.argmax(others, axis=1)[:, None]  # the largest gate that is not chosen, if there is one
-            d_g += d_margin - tl.where(left & (others >= 0), tl.sum(d_margin, axis=1)[:, None], 0.0)
-            d_logit = g * (d_g - tl.sum(g * d_g, axis=1)[:, None])
-        else:
-            d_logit = m * spread + g * (d_g - tl.sum(g * d_g, axis=1)[:, None])  # two softmaxes
+        d_logit = m * spread + g * (d_g - tl.sum(g * d_g, axis=1)[:, None])  # two softmaxes
         tl.store(d_logits + anchor[:, None] * E + expert, d_logit, mask=real)
         expert_down = tl.arange(0, EP)[:, None]
         r = tl.load(router_w + expert_down * (F + 3 * POSITION) + column, mask=(expert_down < E) & (column < F), other=0.0)

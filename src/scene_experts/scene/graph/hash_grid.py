@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor, nn
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import Count, Flag, Range
 from scene_experts.core.transfer import upload
 from scene_experts.native import library as native
 
@@ -29,36 +30,27 @@ FINEST = 53  # 2^53 cells per axis: their numbers are exact, and their corners h
 class HashGrid:
     """Size of the hash grid."""
 
-    levels: int = 16
+    levels: Annotated[int, Range(1, MOST_LEVELS)] = 16
     """Number of levels."""
-    features: int = 2
+    features: Count = 2
     """Number of features per level."""
-    log2_table: int = 15
+    log2_table: Annotated[int, Range(1, LARGEST)] = 15
     """Base-2 logarithm of the largest table of a level."""
-    base: int = 16
+    base: Count = 16
     """Cells per axis at the coarsest level."""
-    growth: float = 1.447
+    growth: Annotated[float, Range(1)] = 1.447
     """Ratio of the cells per axis of two successive levels."""
-    coordinates: Literal["box", "world"] = "box"
-    """box: positions relative to the cube around the initial points. world: unscaled positions, as in SAGS's code."""
 
     @property
     def width(self) -> int:
         """Number of features per position."""
         return self.levels * self.features
 
-    def check(self) -> None:
-        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
-        names = ("levels", "features", "log2_table", "base", "growth")
-        expect_at_least([(f"--scene.grid.{name.replace('_', '-')}", getattr(self, name), 1) for name in names])
-        if self.levels > MOST_LEVELS:
-            raise InputError(f"expected --scene.grid.levels of at most {MOST_LEVELS}, found {self.levels}; give a smaller number")
-        if self.log2_table > LARGEST:
-            raise InputError(f"expected --scene.grid.log2-table of at most {LARGEST}, found {self.log2_table}; give a smaller number")
+    def check(self, flag: Flag) -> None:
         if math.log2(self.base) + (self.levels - 1) * math.log2(self.growth) > FINEST:
             raise InputError(
                 f"expected at most 2^{FINEST} cells per axis at the finest level, found {self.base} x {self.growth:g}^{self.levels - 1}; "
-                "lower --scene.grid.levels, --scene.grid.growth or --scene.grid.base"
+                f"lower {flag('levels')}, {flag('growth')} or {flag('base')}"
             )
 
     def resolutions(self) -> list[int]:
@@ -87,9 +79,7 @@ class Grid(nn.Module):
         self.table = nn.Parameter(torch.empty(sum(config.rows()), config.features).uniform_(-INITIAL, INITIAL))
 
     def unit(self, xyz: Tensor) -> Tensor:
-        """Convert world positions [A, 3] to grid coordinates, clamped to [0, 1]; unchanged if `coordinates` is "world"."""
-        if self.config.coordinates == "world":
-            return xyz
+        """Convert world positions [A, 3] to grid coordinates: those in the cube around the initial points, clamped to [0, 1]."""
         return ((xyz - upload(torch.tensor(self.low, dtype=xyz.dtype), xyz.device)) / self.edge).clamp(0, 1)
 
     def forward(self, xyz: Tensor) -> Tensor:

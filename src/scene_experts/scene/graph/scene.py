@@ -17,7 +17,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import Count, CountOrNone, NotNegative
 from scene_experts.core.parts import register
 from scene_experts.core.schedule import Rate
 from scene_experts.core.table import Table
@@ -25,7 +26,7 @@ from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.geometry.curvature import curvature, find_flat, find_midpoint_pairs
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.voxel import VoxelChoice, choose_voxel_size, coarsen, find_unique_cells, to_lattice
-from scene_experts.scene import Cull, LatticeScene, LearningRates, SceneConfig, Traits
+from scene_experts.scene import OPACITY, Cull, LatticeScene, LearningRates, SceneConfig, Traits
 from scene_experts.scene.anchors.mlp import CHANNELS
 from scene_experts.scene.anchors.scene import EPS
 from scene_experts.scene.anchors.select import visible_rows
@@ -43,23 +44,23 @@ class GraphPoints(SceneConfig):
 
     family = "graph"
 
-    F: int = 32
+    F: Count = 32
     """Number of feature channels per point."""
-    hidden: int = 32
+    hidden: Count = 32
     """Width of the networks of opacity, colour and covariance (two hidden layers)."""
-    offset_hidden: int = 64
+    offset_hidden: Count = 64
     """Width of the offset network (one hidden layer, no activation)."""
-    neighbours: int = 10
+    neighbours: Count = 10
     """Number of points in a neighbourhood, including the point itself, for the graph and the curvature."""
     blend: float = 0.5
     """Weight of the neighbours in the feature of a point."""
-    low: int = 10
+    low: Count = 10
     """Flat regions: number of nearest points, including the point itself, to which midpoints are added."""
-    high: int = 5
+    high: CountOrNone = 5
     """Other regions: number of nearest points to which midpoints are added (SAGS's scripts use 2 to 8)."""
     flat_sigmas: float = 1.0
     """A point is in a flat region if its curvature is this many standard deviations below the mean."""
-    voxel_size: float = 0.0
+    voxel_size: NotNegative = 0.0
     """Edge of the finest voxels in trained units; 0 lets voxel_rule choose it."""
     voxel_rule: VoxelChoice = "neighbours"
     """neighbours: a quarter of the median distance to the nearest neighbours. squared_median and median_nn: the rule of Scaffold-GS as
@@ -71,8 +72,8 @@ class GraphPoints(SceneConfig):
         return "graph points"
 
     @property
-    def unused(self) -> tuple[str, ...]:
-        return ("loss.load", "loss.mean_opacity", "loss.mean_size")
+    def has(self) -> frozenset[str]:
+        return frozenset({OPACITY})
 
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> GraphScene:
         """Create points at the occupied voxels of the cloud and midpoints between them. Raises InputError if the cloud is empty."""
@@ -99,13 +100,6 @@ class GraphPoints(SceneConfig):
         """Build the scene of a checkpoint, with newly initialised networks."""
         corner, edge = tuple(float(v) for v in meta["grid_low"]), float(meta["grid_edge"])
         return GraphScene(self, table, float(meta["voxel"]), float(meta["extent"]), corner, edge)
-
-    def check(self) -> None:
-        """Validate the settings. Raises InputError with the name of the flag for invalid settings."""
-        names = ("F", "hidden", "offset_hidden", "neighbours", "low")
-        expect_at_least([(f"--scene.{name.replace('_', '-')}", getattr(self, name), 1) for name in names])
-        expect_at_least([(f"--scene.{name.replace('_', '-')}", getattr(self, name), 0) for name in ("high", "voxel_size")])
-        self.grid.check()
 
 
 class Unbiased(nn.Module):
@@ -278,12 +272,6 @@ class GraphScene(LatticeScene):
         everyone = torch.arange(len(self.table), device=rows.device)
         offset = self.offset(*self.encode(everyone, rows)) * self.table.params["log_scaling"].index_select(0, rows)[:, :3].exp()
         return self.table.facts["xyz"].index_select(0, rows).double() + offset.double()
-
-    def scene_opacity(self, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Tensor:
-        """Raw opacities [N, 1] of all points for `camera`, visible or not."""
-        everyone = torch.arange(len(self.table), device=self.table.facts["xyz"].device)
-        own, strongest = self.encode(everyone)
-        return self.opacity(torch.cat([own, self.view(everyone, camera)], dim=1), strongest)
 
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:
         """All parameters, grouped by the name of their learning rate."""

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
+from support.captures import load
 from support.synthetic import make_blender, picture
 
 

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import load
 from scene_experts.data.readers.colmap import READER
 from scene_experts.data.readers.colmap_model import read_model, write_model
 from scene_experts.data.readers.reader import ReadOptions
+from support.captures import load
 from support.messages import naming
 from support.synthetic import Synthetic, make_capture
 

@@ -16,7 +16,6 @@ import scene_experts
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Points
 from scene_experts.data import readers
-from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers import PosedImage, RawCapture, ReadOptions
 from scene_experts.data.settings import Data
@@ -24,7 +23,8 @@ from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Finished
-from scene_experts.training.loop import Run, train
+from scene_experts.training.loop import Job, train
+from support.captures import load
 from support.synthetic import make_capture
 
 
@@ -91,7 +91,7 @@ def test_what_a_reader_states_decides_how_its_capture_is_loaded(folder: Path) ->
 @pytest.mark.usefixtures("registered")
 def test_a_training_runs_on_a_capture_of_a_registered_kind(folder: Path) -> None:
     cfg = replace(RECIPES["scaffold-gs"][1], iterations=3)
-    events = list(train(cfg, Run(RunConfig(cfg, Data(folder))), load(folder), choose("auto", "cpu")))
+    events = list(train(cfg, Job(RunConfig(cfg, Data(folder))), load(folder), choose("auto", "cpu")))
     assert isinstance(events[-1], Finished) and events[-1].step == 3
 
 

@@ -11,10 +11,10 @@ import torch
 from PIL import Image
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap_model import write_model
 from scene_experts.data.summary import summarise
+from support.captures import load
 from support.lenses import LENSES
 from support.synthetic import make_capture, make_nerfstudio, picture
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import load
+from support.captures import load
 from support.synthetic import make_nerfstudio
 
 

@@ -12,6 +12,7 @@ from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.core.types import Mode
+from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.files.anchors import torchscript
 from scene_experts.files.anchors.data import by_attribute
@@ -76,7 +77,7 @@ def test_a_published_result_draws_as_it_is(tmp_path, folder, cfg, depth):
     out = import_files(tmp_path / "result", Data(folder), tmp_path / "run")
     opened = run_folder.open_run(out)
     assert opened.config.data.normalise == "none" and opened.step == 30_000 and opened.config.train.recipe == "scaffold-gs"
-    capture = run_folder.load_capture(opened.config.data)
+    capture = captures.load(opened.config.data)
     wanted, found = picture(scene, capture, 30_000), picture(opened.scene, capture, 30_000)
     assert wanted.std() > 0.05, "the picture shows something"
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-4)
@@ -139,7 +140,7 @@ def test_what_cannot_be_drawn_is_refused(tmp_path, folder):
 
 def test_a_published_feature_bank_and_codes_are_drawn(tmp_path, folder):
     torch.manual_seed(1)
-    capture = run_folder.load_capture(Data(folder, normalise="none"))
+    capture = captures.load(Data(folder, normalise="none"))
     wanted = published(tmp_path / "result")
     iteration = tmp_path / "result" / "point_cloud" / "iteration_30000"
     config = replace(wanted.config, mix=FeatureBank(), appearance=4)
@@ -173,7 +174,7 @@ def test_a_published_octree_draws_the_levels_its_distances_ask_for(tmp_path, fol
     columns = {"level": level, "extra_level": extra, "info": info}
     write_anchor_ply(path, xyz, torch.randn(n, 10, 3), torch.randn(n, 32), torch.randn(n, 6) * 0.3 - 3, columns)
     opened = run_folder.open_run(import_files(tmp_path / "result", Data(folder), tmp_path / "run"))
-    table, camera = opened.scene.table, run_folder.load_capture(opened.config.data).views[0].camera
+    table, camera = opened.scene.table, captures.load(opened.config.data).views[0].camera
     for j in range(3):  # the same lattice, counted from an anchor of level 0
         off = table.facts["cell"][level == j] - cell[level == j]
         assert (off == off[0]).all()

@@ -7,12 +7,12 @@ import torch
 
 from scene_experts import render
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import load
 from scene_experts.files.bake.bake import DRAWN_AT, LEAST_ALPHA, Bake, Refine, bake, choose, closed_form, without_faint
 from scene_experts.files.bake.observe import Sums
 from scene_experts.files.gaussians.read import scene_of
 from scene_experts.files.measure import Painter, scores
 from scene_experts.recipes import RECIPES
+from support.captures import load
 from support.files import run_in_memory
 from support.synthetic import make_capture
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.capture import load
 from scene_experts.files.bake import views as bake_views
 from scene_experts.files.bake.views import NEIGHBOURS, Views, neighbours
 from scene_experts.geometry.poses import FREE
+from support.captures import load
 from support.synthetic import make_capture
 
 

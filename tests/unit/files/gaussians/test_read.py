@@ -9,7 +9,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
-from scene_experts.data.capture import load
+from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.files import registry
 from scene_experts.files.export import export, write_result_folder
@@ -23,6 +23,7 @@ from scene_experts.render import choose
 from scene_experts.training import loop as train
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
+from support.captures import load
 from support.files import export_run
 from support.messages import naming
 from support.synthetic import make_capture
@@ -37,7 +38,7 @@ def made(tmp_path_factory):
     config = RunConfig(cfg, Data(folder))
     run_folder.prepare(root / "run", config, resume=False)
     capture = load(folder)
-    list(train.train(cfg, train.Run(config, root / "run"), capture, choose("auto", "cpu")))
+    list(train.train(cfg, train.Job(config, root / "run"), capture, choose("auto", "cpu")))
     capture.images.close()
     return root / "run", folder
 
@@ -48,7 +49,7 @@ def to_ply(run, path):
 
 def drawn(run, index=0):
     opened = run_folder.open_run(run)
-    capture = run_folder.load_capture(opened.config.data)
+    capture = captures.load(opened.config.data)
     draw, camera = choose("auto", "cpu"), capture.views[capture.test[index]].camera
     capture.images.close()
     with torch.no_grad():
@@ -63,7 +64,7 @@ def test_the_file_has_the_layout_of_3dgs_in_the_frame_of_the_capture(made, tmp_p
     assert list(columns) == [*names, *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     assert "Gaussians" in written.lines[1] and all(c.dtype == np.float32 for c in columns.values())
     scene = run_folder.open_run(run).scene
-    world = run_folder.load_capture(Data(folder)).world
+    world = captures.load(Data(folder)).world
     assert world.scale != 1
     xyz = torch.from_numpy(np.stack([columns[a] for a in "xyz"], 1))
     p = scene.table.params
@@ -87,7 +88,7 @@ def test_a_file_comes_back_as_a_run_that_draws_the_same_picture(made, tmp_path):
 
 def test_our_own_folder_keeps_recipe_and_step(made, tmp_path):
     run, folder = made
-    layout = write_result_folder(run_folder.open_run(run), run_folder.load_capture(Data(folder)), tmp_path / "result")
+    layout = write_result_folder(run_folder.open_run(run), captures.load(Data(folder)), tmp_path / "result")
     settings = read_settings(layout)
     assert layout.name == "iteration_90" and settings["sh_degree"] == 3 and settings["source_path"] == str(folder)
     out = import_files(tmp_path / "result", Data(folder), tmp_path / "again")
@@ -115,7 +116,7 @@ def test_every_standard_file_comes_back_as_a_run(made, tmp_path, format):
     file = tmp_path / f"scene{registry.format_named(format).suffix}"
     export_run(run, format, file)
     out = import_files(file, Data(folder), tmp_path / "again")
-    opened, there, world = run_folder.open_run(out), registry.read(file), run_folder.load_capture(Data(folder)).world
+    opened, there, world = run_folder.open_run(out), registry.read(file), captures.load(Data(folder)).world
     assert opened.config.train.recipe == "3dgs" and opened.scene.config.sh_degree == there.degree == (0 if format == "splat" else 3)
     torch.testing.assert_close(
         world.to_input(opened.scene.table.params["means"].detach().double()).float(), there.means, atol=1e-4, rtol=1e-5
@@ -131,7 +132,7 @@ def test_every_standard_file_comes_back_as_a_run(made, tmp_path, format):
 
 def test_beside_a_description_of_more_harmonics_the_file_says_the_degree(made, tmp_path):
     run, folder = made
-    layout = write_result_folder(run_folder.open_run(run), run_folder.load_capture(Data(folder)), tmp_path / "result")
+    layout = write_result_folder(run_folder.open_run(run), captures.load(Data(folder)), tmp_path / "result")
     splat.write(layout / "scene.splat", ply.read(layout / "point_cloud.ply"), {})
     opened = run_folder.open_run(import_files(layout / "scene.splat", Data(folder), tmp_path / "again"))
     assert opened.step == 90 and opened.scene.config.sh_degree == 0

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 
-from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
 from scene_experts.files.export import write_result_folder
 from scene_experts.recipes import RECIPES
@@ -12,6 +11,7 @@ from scene_experts.render import choose
 from scene_experts.training import loop as train
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
+from support.captures import load
 from support.synthetic import make_capture
 
 
@@ -24,7 +24,7 @@ def made(tmp_path_factory):
     config = RunConfig(cfg, Data(folder))
     run_folder.prepare(root / "run", config, resume=False)
     capture = load(folder)
-    list(train.train(cfg, train.Run(config, root / "run"), capture, choose("auto", "cpu")))
+    list(train.train(cfg, train.Job(config, root / "run"), capture, choose("auto", "cpu")))
     written = write_result_folder(run_folder.open_run(root / "run"), capture)
     capture.images.close()
     return root / "run", written, capture

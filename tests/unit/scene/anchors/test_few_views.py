@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.scene.anchors.few_views import displace, find_spacings, find_weight
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
@@ -117,4 +118,4 @@ def test_more_views_mean_less_dropout_and_less_displacement():
 @pytest.mark.parametrize("changes", [{"view_jitter": -0.1}, {"few_views": -1}])
 def test_refused(changes):
     with pytest.raises(InputError, match=naming("--scene." + next(iter(changes)).replace("_", "-"))):
-        Anchors(**changes).check()
+        check_fields(Anchors(**changes), "scene")

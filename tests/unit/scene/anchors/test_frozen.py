@@ -10,8 +10,11 @@ from scene_experts.native import library as native
 from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors import scene as anchors
-from scene_experts.scene.anchors.experts import Experts, Router
+from scene_experts.scene.anchors.balance import Balanced
+from scene_experts.scene.anchors.experts import Experts
+from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
+from scene_experts.scene.anchors.routers import Linear, Margin
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 from support.interpret import DEVICE, kernels
 from support.messages import naming
@@ -53,7 +56,7 @@ def same(found, expected):
 def test_every_recipe_draws_the_same_bits(recipe):
     scene = trained(RECIPES[recipe][1].scene)
     frozen = scene.frozen(DONE)
-    if scene.native_weights(DONE) is None:
+    if scene.fused_weights(DONE) is None:
         assert frozen is scene
         return
     assert isinstance(frozen, Frozen)
@@ -70,13 +73,13 @@ def test_every_recipe_draws_the_same_bits(recipe):
     [
         Anchors(add_dist=("color",), decoder=Experts(num=7, top_k=3), hidden=24, F=20, K=3),
         Anchors(decoder=Experts(num=4, top_k=1, attributes=("cov",))),
-        Anchors(decoder=Experts(num=16, top_k=5, router=Router(input_pos=True, bias=False))),
+        Anchors(decoder=Experts(num=16, top_k=5, router=Linear(input_pos=True))),
         Anchors(appearance=6),
         Anchors(appearance=6, decoder=Experts(top_k=None)),
-        Anchors(decoder=Experts(router=Router(weights="margin"), mix="pre_activation")),
-        Anchors(decoder=Experts(shared=True, top_k=1)),
+        Anchors(decoder=Experts(router=Margin())),
+        Anchors(decoder=Experts(router=Balanced(), top_k=1)),
     ],
-    ids=["odd sizes", "top-1 of one attribute", "positions", "appearance", "appearance, dense", "margins", "shared"],
+    ids=["odd sizes", "top-1 of one attribute", "positions", "appearance", "appearance, dense", "margins", "balanced"],
 )
 def test_other_heads_draw_the_same_bits(config):
     scene = trained(config)
@@ -112,7 +115,7 @@ def test_on_cuda_the_same_bits_are_drawn(config, monkeypatch):
     view = camera(1).to(DEVICE)
     seen = lambda means, scales, camera: torch.arange(len(means), device=means.device) % 3 != 1  # noqa: E731
     for step in (1, DONE):
-        weights = scene.native_weights(step)
+        weights = scene.fused_weights(step)
         assert weights is not None
         with torch.no_grad():
             expected = scene(view, step, Mode.DRAW, seen)
@@ -147,6 +150,6 @@ def test_another_step_and_training_are_refused():
 
 
 def test_what_the_native_decode_does_not_cover_stays_itself():
-    for config in (Anchors(decode="composed"), Anchors(quat_align=True), Anchors(decoder=Experts(router=Router(noise_std=0.1)))):
+    for config in (Anchors(decode="composed"), Anchors(mix=FeatureBank())):
         scene = trained(config, n=20)
         assert scene.frozen(7) is scene

@@ -49,11 +49,10 @@ def test_how_many_levels():
     assert (inner, outer) == pytest.approx((1.5 + 0.75 * 1.5, 1.5 + 0.25 * 1.5))
 
 
-def test_the_cube_grows_about_its_centre_unless_told_otherwise():
+def test_the_cube_grows_about_its_centre():
     points = torch.tensor([[10.0, 11, 12], [20, 13, 14]])
     low, edge = cube(points, 1.1)
     assert edge == pytest.approx(11) and low == pytest.approx(9.5)
-    assert cube(points, 1.1, parity=True) == (pytest.approx(11), pytest.approx(11))  # the quirk: 11 .. 22 leaves 10 out
 
 
 def test_cells_and_positions_of_every_level():

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.scene.anchors.mlp import ACTIVATIONS, MLP, Plain, linear_init
 from support.messages import naming
 
@@ -16,7 +17,7 @@ def test_equals_a_torch_sequential(attribute):
     x = torch.randn(7, 35)
     y, routing = mlp(x, x[:, :32], 1)
     torch.testing.assert_close(y, ACTIVATIONS[attribute](layers(x)))
-    assert routing is None and mlp.routing(x[:, :32], 1) is None
+    assert routing is None and mlp.route(x[:, :32], 1) is None
 
 
 def test_depth_adds_square_layers():
@@ -25,8 +26,8 @@ def test_depth_adds_square_layers():
     assert sum(p.numel() for p in deep.parameters()) == 2142 + 3 * (32 * 32 + 32)
     assert deep(torch.randn(4, 35), torch.randn(4, 32), 1)[0].shape == (4, 30)
     assert Plain().build("color", 35, 32, 30, 32).weights(1).k is None
-    with pytest.raises(InputError, match=naming(2, 1)):
-        Plain(depth=1).build("color", 35, 32, 30, 32)
+    with pytest.raises(InputError, match=naming("--scene.decoder.depth", 2, 1)):
+        check_fields(Plain(depth=1), "scene.decoder")
 
 
 def test_initial_values_are_uniform_within_the_fan_in_bound():

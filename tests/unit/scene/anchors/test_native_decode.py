@@ -5,21 +5,21 @@ from dataclasses import replace
 import pytest
 import torch
 
+from scene_experts.core.types import Routing
 from scene_experts.native import library as native
 from scene_experts.scene.anchors import native_decode
-from support.decoding import CASES, EXTENT, compare, leaves, objective, oracle, problem, single_precision
+from support.decoding import CASES, EXTENT, OUTSIDE, compare, leaves, objective, oracle, problem, single_precision, without_routers
 from support.messages import naming
 
 pytestmark = pytest.mark.skipif(native.load() is None, reason="no compiled library")
 LEVELS = [level for level in native.list_levels() if native.find(level)]
 
 
-def run_native(rows, columns, camera, heads, with_dist, seed=5):
+def run_native(rows, columns, camera, heads, with_dist, seed=5, outside=native_decode.NOTHING):
     columns, heads, named = leaves(*single_precision(columns, heads))
-    gaussians, raw, routing = native_decode.decode(
-        rows, columns["xyz"], columns["feature"], columns["log_scaling"], columns["offsets"], camera.float(), heads, with_dist, EXTENT
-    )
-    objective(gaussians, raw, {a: r.gates for a, r in routing.items()}, seed).backward()
+    given = [columns[name] for name in ("xyz", "feature", "log_scaling", "offsets")]
+    gaussians, raw, routing = native_decode.decode(rows, *given, camera.float(), heads, with_dist, EXTENT, outside)
+    objective(gaussians, raw, {a: r.gates for a, r in routing.items() if a not in outside}, seed).backward()
     return gaussians, raw, routing, {n: v.grad for n, v in named.items()}
 
 
@@ -41,6 +41,44 @@ def test_value_and_gradient_are_the_equations(case):
         assert r.chosen is None or torch.equal(r.chosen, chosen[a])
     for name, leaf in named.items():
         compare(gradients[name], torch.zeros_like(leaf) if leaf.grad is None else leaf.grad, 1e-5, f"gradient of {name}")
+
+
+@pytest.mark.parametrize("case", OUTSIDE)
+def test_weights_from_outside_take_the_place_of_a_router(case):
+    (sizes, attributes) = OUTSIDE[case]
+    rows, columns, camera, heads, with_dist = problem(**sizes)
+    heads, outside = without_routers(heads, len(rows), attributes)
+    exact_columns, exact_heads, named = leaves(columns, heads)
+    exact = {a: (r, w.clone().requires_grad_()) for a, (r, w) in outside.items()}
+    expected, raw, gates, _ = oracle(rows, exact_columns, camera, exact_heads, with_dist, exact)
+    objective(expected, raw, gates).backward()
+    given = {a: (r, w.float().requires_grad_()) for a, (r, w) in outside.items()}
+    found, found_raw, routing, gradients = run_native(rows, columns, camera, heads, with_dist, outside=given)
+    assert torch.equal(found.source, expected.source) and all(routing[a] is given[a][0] for a in given)
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        compare(getattr(found, name), getattr(expected, name), name=name)
+    compare(found_raw, raw, name="raw opacity")
+    for a, (_, w) in given.items():
+        compare(w.grad, exact[a][1].grad, 5e-5, f"gradient of the weights of {a}")
+    for name, leaf in named.items():
+        compare(gradients[name], torch.zeros_like(leaf) if leaf.grad is None else leaf.grad, 1e-5, f"gradient of {name}")
+
+
+def test_weights_that_do_not_fit_are_refused():
+    rows, columns, camera, heads, with_dist = problem()
+    bare, outside = without_routers(heads, len(rows))
+    floats = {a: (r, w.float()) for a, (r, w) in outside.items()}
+    routing, weight = floats["cov"]
+    for wrong, error in (
+        ({}, ValueError),
+        ({**floats, "cov": (routing, weight[:, :1])}, ValueError),
+        ({**floats, "cov": (Routing(routing.gates, None), weight)}, ValueError),
+        ({**floats, "cov": (Routing(routing.gates, routing.chosen + 3), weight)}, IndexError),
+    ):
+        with pytest.raises(error, match=r"cov|opacity"):
+            run_native(rows, columns, camera, bare, with_dist, outside=wrong)
+    with pytest.raises(ValueError, match="outside"):
+        run_native(rows, columns, camera, heads, with_dist, outside=floats)
 
 
 @pytest.mark.parametrize("case", ["top-2", "dense", "plain", "paper's sizes, several chunks", "odd sizes"])

@@ -3,6 +3,7 @@
 import pytest
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.scene.anchors.rates import Rates
 from support.messages import naming
 
@@ -29,4 +30,4 @@ def test_rates_of_the_networks():
 @pytest.mark.parametrize("change", [{"anneal": 0.0}, {"anneal": 2.0}, {"anneal_from": 1.0}, {"networks": -1.0}])
 def test_invalid_rates(change):
     with pytest.raises(InputError, match=naming(f"--rates.{next(iter(change)).replace('_', '-')}")):
-        Rates(**change).check()
+        check_fields(Rates(**change), "rates")

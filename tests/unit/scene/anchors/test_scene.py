@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
 from scene_experts.recipes import RECIPES
-from scene_experts.scene.anchors.experts import Experts, Router
 from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.scene.anchors.rates import Rates
 from scene_experts.scene.anchors.scene import ATTRIBUTES, Anchors, AnchorScene
@@ -114,14 +114,6 @@ def test_native_and_composed_decode_agree_in_value_and_gradient(name, step):
         )
 
 
-def test_load_scope_all_balances_every_anchor():
-    made = scene(Anchors(decoder=Experts(load_scope="all"), decode="composed"))
-    half = lambda means, scales, cam: torch.arange(len(means)) % 2 == 0  # noqa: E731
-    decoded = made(camera(), 1, Mode.TRAIN, half)
-    assert len(decoded.rows) == 100 and all(len(r.gates) == 200 for r in decoded.routing.values())
-    assert all(len(r.gates) == 100 for r in made(camera(), 1, Mode.DRAW, half).routing.values())
-
-
 def test_nothing_in_view_and_nothing_positive():
     made = scene(Anchors(decode="composed"))
     none = made(camera(), 1, True, lambda m, s, c: torch.zeros(len(m), dtype=torch.bool))
@@ -152,34 +144,20 @@ def test_rates_by_group():
     assert rates.at("feature", 1, 30_000, 5.0) == 0.0075
 
 
-def test_switches_the_native_decode_does_not_cover_fall_back_or_are_refused():
-    odd = Anchors(decoder=Experts(router=Router(detach_feature=True)))
-    assert scene(odd, n=4).native_weights(1) is None
+def test_what_the_native_decode_does_not_cover_falls_back_or_is_refused():
+    assert scene(Anchors(mix=FeatureBank()), n=4).fused_weights(1) is None
     if native.load() is None:
         pytest.skip("no compiled library")
-    for uncovered, named in (
-        (Anchors(quat_align=True), "quat-align"),
-        (Anchors(mix=FeatureBank()), "feature bank"),
-        (odd, "opacity"),
-    ):
-        with pytest.raises(InputError, match=naming(named, "--scene.decode auto")):
-            scene(replace(uncovered, decode="native"), n=4).native_weights(1)
+    with pytest.raises(InputError, match=naming("feature bank", "--scene.decode auto")):
+        scene(Anchors(mix=FeatureBank(), decode="native"), n=4).fused_weights(1)
     with pytest.raises(InputError, match=r"torch\.float64"):
-        scene(Anchors(decode="native"), n=4).double().native_weights(1)
+        scene(Anchors(decode="native"), n=4).double().fused_weights(1)
 
 
 def test_new_rows_have_the_columns_of_the_table():
     made = scene(Anchors(), n=5)
     made.table.append(made.new_rows(torch.tensor([[16, 0, -16]]), 0.16, torch.ones(1, 32)))
     assert len(made.table) == 6 and float(made.table.params["log_scaling"][5, 0].detach()) == pytest.approx(math.log(0.16))
-
-
-def test_the_native_decode_refuses_heads_it_has_no_code_for():
-    if native.load() is None:
-        pytest.skip("no compiled library")
-    wanted = Anchors(decode="native", decoder=Experts(router=Router(noise_std=0.1)))
-    with pytest.raises(InputError, match=r"--scene\.decode auto"):
-        scene(wanted)(camera(), 1, Mode.TRAIN, EVERYTHING)
 
 
 def test_dropped_anchors():
@@ -189,4 +167,4 @@ def test_dropped_anchors():
     assert shares == pytest.approx([0.004, 0.2, 0.4, 0.4], abs=0.04)
     assert len(made(camera(), 1000, Mode.DRAW, EVERYTHING).rows) == len(made.table)
     with pytest.raises(InputError, match=naming("--scene.dropout")):
-        Anchors(dropout=1.0).check()
+        check_fields(Anchors(dropout=1.0), "scene")

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.recipes import RECIPES
@@ -61,8 +62,8 @@ def test_levels_are_let_in_one_by_one():
     assert Octree(first=3).turns(replace(LEVELS, first=3)) == []
     select = LevelSelector(Octree(), LEVELS)
     assert select.coarse(10_000) and not select.coarse(10_001)
-    assert not LevelSelector(Octree(coarse_to_fine=False), LEVELS).coarse(1)
-    assert LevelSelector(Octree(coarse_to_fine=False), LEVELS).top(1, Mode.TRAIN) == 4
+    assert not LevelSelector(Octree(coarse_until=0), LEVELS).coarse(1)
+    assert LevelSelector(Octree(coarse_until=0), LEVELS).top(1, Mode.TRAIN) == 4
     assert Octree().scaled(0.1).coarse_until == 1000
 
 
@@ -152,7 +153,7 @@ def test_newborn_anchors_have_the_facts_and_checkpoints_the_levels():
 
 
 def test_impossible_numbers_are_refused():
-    Octree().check()
+    check_fields(Octree(), "scene.select")
     impossible = {
         "fork": 1,
         "count": -1,
@@ -164,11 +165,11 @@ def test_impossible_numbers_are_refused():
     }
     for name, value in impossible.items():
         with pytest.raises(InputError, match=naming(f"--scene.select.{name.replace('_', '-')}", value)):
-            Octree(**{name: value}).check()
-    Octree(fork=MOST_FORK, count=MOST_LEVELS).check()
+            check_fields(Octree(**{name: value}), "scene.select")
+    check_fields(Octree(fork=MOST_FORK, count=MOST_LEVELS), "scene.select")
     for name, most in (("fork", MOST_FORK), ("count", MOST_LEVELS)):  # more of them could be trained, but no checkpoint of it could be read
         with pytest.raises(InputError, match=naming(f"--scene.select.{name}", f"{most:,}", most + 1)):
-            Octree(**{name: most + 1}).check()
+            check_fields(Octree(**{name: most + 1}), "scene.select")
     assert start(base_layer=19)[2].lattices.count == 1
     for layer in (20, 1000):
         with pytest.raises(InputError, match=naming(f"2^{layer}", "--scene.select.base-layer")):

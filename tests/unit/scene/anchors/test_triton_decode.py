@@ -6,14 +6,15 @@ import pytest
 import torch
 
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Gaussians
+from scene_experts.core.types import Camera, Gaussians, Routing
 from scene_experts.native.triton import explain_missing
 from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors import scene as anchors
-from scene_experts.scene.anchors.experts import Experts, Router
+from scene_experts.scene.anchors.experts import Experts
 from scene_experts.scene.anchors.mlp import HeadWeights, Plain
+from scene_experts.scene.anchors.routers import Linear
 from scene_experts.scene.anchors.scene import ATTRIBUTES, Anchors, AnchorScene
-from support.decoding import CASES, EXTENT, compare, leaves, objective, oracle, problem, single_precision
+from support.decoding import CASES, EXTENT, OUTSIDE, compare, leaves, objective, oracle, problem, single_precision, without_routers
 from support.interpret import DEVICE, kernels
 from support.messages import naming
 
@@ -40,22 +41,22 @@ def moved(columns, heads, device=DEVICE):
     return {n: v.to(device) for n, v in columns.items()}, {a: replace(h, **tensors(h)) for a, h in heads.items()}
 
 
-def call(rows, columns, camera, heads, with_dist):
+def call(rows, columns, camera, heads, with_dist, outside=triton_decode.NOTHING):
     c = [columns[n] for n in ("xyz", "feature", "log_scaling", "offsets")]
-    return triton_decode.decode(rows.to(DEVICE), *c, camera.float().to(DEVICE), heads, with_dist, EXTENT)
+    return triton_decode.decode(rows.to(DEVICE), *c, camera.float().to(DEVICE), heads, with_dist, EXTENT, outside)
 
 
-def run(rows, columns, camera, heads, with_dist):
+def run(rows, columns, camera, heads, with_dist, outside=triton_decode.NOTHING):
     """Outputs and gradients, on the CPU."""
     columns, heads, named = leaves(*moved(columns, heads))
-    gaussians, raw, routing = call(rows, columns, camera, heads, with_dist)
+    gaussians, raw, routing = call(rows, columns, camera, heads, with_dist, outside)
     g = Gaussians(**{n: getattr(gaussians, n).cpu() for n in (*PARTS, "source")})
-    objective(g, raw.cpu(), {a: r.gates.cpu() for a, r in routing.items()}).backward()
+    objective(g, raw.cpu(), {a: r.gates.cpu() for a, r in routing.items() if a not in outside}).backward()
     return g, raw.cpu(), routing, {n: v.grad.cpu() for n, v in named.items()}
 
 
 @pytest.mark.usefixtures("triton")
-@pytest.mark.parametrize("case", [name for name, case in CASES.items() if not {"depth", "linear", "shared"} & case.keys()])
+@pytest.mark.parametrize("case", [name for name, case in CASES.items() if "depth" not in case])
 def test_value_and_gradient_are_the_equations(case):
     rows, columns, camera, heads, with_dist = problem(**{**CASES[case], **SMALL.get(case, {"A": 40, "N": 50})})
     exact_columns, exact_heads, named = leaves(columns, heads)
@@ -71,6 +72,29 @@ def test_value_and_gradient_are_the_equations(case):
         compare(r.gates.cpu(), gates[a], name=f"{a} gates")
         assert (r.chosen is None) == (heads[a].k is None)
         assert r.chosen is None or torch.equal(r.chosen.cpu(), chosen[a])
+    for name, leaf in named.items():
+        compare(gradients[name], torch.zeros_like(leaf) if leaf.grad is None else leaf.grad, 1e-5, f"gradient of {name}")
+
+
+@pytest.mark.usefixtures("triton")
+@pytest.mark.parametrize("case", OUTSIDE)
+def test_weights_from_outside_take_the_place_of_a_router(case):
+    (sizes, attributes) = OUTSIDE[case]
+    rows, columns, camera, heads, with_dist = problem(**{**sizes, "A": 34, "N": 40})
+    heads, outside = without_routers(heads, len(rows), attributes)
+    exact_columns, exact_heads, named = leaves(columns, heads)
+    exact = {a: (r, w.clone().requires_grad_()) for a, (r, w) in outside.items()}
+    expected, raw, gates, _ = oracle(rows, exact_columns, camera, exact_heads, with_dist, exact)
+    objective(expected, raw, gates).backward()
+    on = lambda r: Routing(r.gates.to(DEVICE), None if r.chosen is None else r.chosen.to(DEVICE))  # noqa: E731
+    given = {a: (on(r), w.float().to(DEVICE).requires_grad_()) for a, (r, w) in outside.items()}
+    found, found_raw, _, gradients = run(rows, columns, camera, heads, with_dist, given)
+    assert torch.equal(found.source, expected.source)
+    for name in PARTS:
+        compare(getattr(found, name), getattr(expected, name), name=name)
+    compare(found_raw, raw, name="raw opacity")
+    for a, (_, w) in given.items():
+        compare(w.grad.cpu(), exact[a][1].grad, 5e-5, f"gradient of the weights of {a}")
     for name, leaf in named.items():
         compare(gradients[name], torch.zeros_like(leaf) if leaf.grad is None else leaf.grad, 1e-5, f"gradient of {name}")
 
@@ -206,7 +230,7 @@ SCENES = {
     "scaffold": Anchors(decoder=Plain()),
     "top-2": Anchors(decoder=Experts(warmup=0)),
     "dense": Anchors(decoder=Experts(top_k=None)),
-    "positions": Anchors(decoder=Experts(warmup=0, router=Router(input_pos=True))),
+    "positions": Anchors(decoder=Experts(warmup=0, router=Linear(input_pos=True))),
 }
 
 
@@ -238,7 +262,7 @@ def test_a_scene_s_two_decodes_agree(name, monkeypatch):
 def test_on_cuda_a_scene_decodes_with_triton(triton):
     made = scene(SCENES["top-2"], 50_000).to("cuda")
     rows, camera = torch.arange(0, 50_000, 2, device="cuda"), CAMERA.to("cuda")
-    assert explain_missing() is None and made.native_weights(5) is not None
+    assert explain_missing() is None and made.fused_weights(5) is not None
     ours, exact = made.decode(rows, camera, 5), made.decode_composed(rows, camera, 5)
     agree = torch.isin(ours.gaussians.source, exact.gaussians.source)
     assert agree.float().mean() > 0.9999  # except where rounding changes the sign of an opacity or the order of two logits

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.native import library as native
 from scene_experts.scene.graph.hash_grid import PRIMES, Grid, HashGrid, encode
 from support.messages import naming
@@ -52,9 +53,8 @@ def slow(grid: Grid, xyz: torch.Tensor) -> torch.Tensor:
     return torch.stack(out)
 
 
-@pytest.mark.parametrize("coordinates", ["box", "world"])
-def test_features_are_those_of_the_formula(coordinates):
-    grid = built(HashGrid(levels=5, features=3, log2_table=7, base=2, growth=1.6, coordinates=coordinates))
+def test_features_are_those_of_the_formula():
+    grid = built(HashGrid(levels=5, features=3, log2_table=7, base=2, growth=1.6))
     torch.testing.assert_close(grid(places()), slow(grid, places()))
     torch.testing.assert_close(copy.deepcopy(grid).float()(places().float()), slow(grid, places()).float(), rtol=1e-4, atol=1e-4)
 
@@ -90,23 +90,21 @@ def test_gradient_of_the_table_by_finite_differences():
 
 def test_no_places_and_sizes_that_cannot_be():
     assert built()(places(0)).shape == (0, 15)
-    HashGrid().check()
+    check_fields(HashGrid(), "scene.grid")
     for wrong, flag in (({"levels": 0}, "levels"), ({"log2_table": 0}, "log2-table"), ({"log2_table": 60}, "log2-table")):
         with pytest.raises(InputError, match=naming(f"--scene.grid.{flag}")):
-            HashGrid(**wrong).check()
+            check_fields(HashGrid(**wrong), "scene.grid")
 
 
 def test_cells_too_fine_to_number_are_refused():
-    HashGrid(levels=64).check()
+    check_fields(HashGrid(levels=64), "scene.grid")
     for wrong in ({"levels": 64, "growth": 2.0}, {"levels": 64, "growth": 1e6}, {"growth": float("inf")}):
         with pytest.raises(InputError, match=naming("--scene.grid.levels", "--scene.grid.growth")):
-            HashGrid(**wrong).check()
+            check_fields(HashGrid(**wrong), "scene.grid")
 
 
 @pytest.mark.skipif(native.load() is None, reason="needs the compiled library")
-@pytest.mark.parametrize(
-    "config", [HashGrid(), SMALL, HashGrid(levels=3, features=1, coordinates="world"), HashGrid(levels=2, base=2**21 - 1, growth=1.5)]
-)
+@pytest.mark.parametrize("config", [HashGrid(), SMALL, HashGrid(levels=3, features=1), HashGrid(levels=2, base=2**21 - 1, growth=1.5)])
 def test_the_compiled_form_is_the_plain_one(config, monkeypatch):
     grid = built(config, torch.float32)
     for n in (0, 1, 1500):
