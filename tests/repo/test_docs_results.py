@@ -275,7 +275,7 @@ def test_pages_are_what_their_commands_write(folder, tmp_path, monkeypatch):
 
     def no_picture(figure, path: Path) -> list[Path]:
         figures.discard(figure)
-        return [path.with_suffix(".png"), path.with_suffix(".svg")]
+        return [path.with_suffix(".png")]
 
     monkeypatch.setattr(figures, "save", no_picture)
     monkeypatch.setattr(store, "load", lambda place: records(RECORDS))
