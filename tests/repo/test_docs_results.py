@@ -330,3 +330,10 @@ def test_when_experts_pay():
     sys.modules["experts_pay"] = script  # dataclasses look their module up
     spec.loader.exec_module(script)  # type: ignore[union-attr]
     assert "\n".join(script.table(script.read_scores(RECORDS))) in (ROOT / "results" / "experts-pay.md").read_text()
+
+
+def test_every_figure_of_the_summary_stands_with_its_evidence():
+    number = re.compile(r"(?<![\w.])\d+\.\d+")
+    evidence = {figure for page in (ROOT / "results").rglob("*.md") for figure in number.findall(page.read_text())}
+    figures_of_the_summary = set(number.findall((ROOT / SUMMARY).read_text()))
+    assert len(figures_of_the_summary) > 80 and not figures_of_the_summary - evidence
