@@ -197,7 +197,7 @@ def test_the_gains_of_scene_experts_are_those_of_its_page(recipe):
 
 def test_ssim_and_lpips_over_scaffold_gs_are_those_of_the_page():
     page, doc = (ROOT / "results/confirmation/README.md").read_text(), prose(SUMMARY)
-    for score, start in (("SSIM", "SSIM gains "), ("LPIPS (3DGS)", "LPIPS (3DGS) ")):
+    for score, start in (("SSIM", "SSIM changes by "), ("LPIPS (3DGS)", "LPIPS (3DGS) by ")):
         section = page[page.index(f"### captures: {score} minus that of scaffold-gs\n") :]
         cells = next(line for line in section.splitlines() if line.startswith("| scene-experts |")).split("|")
         assert re.search(rf"{re.escape(start + cells[-4].strip())} \((over captures )?{re.escape(cells[-2].strip())}\)", doc), score
