@@ -2,7 +2,7 @@
 
     python benchmarks/experts_pay.py results/records --figure docs/figures/experts_pay.png
 
-Reads the records of runs (results/README.md has the command of the trainings) and prints the table of docs/results.md.
+Reads the records of runs (results/README.md has the command of the trainings) and prints the table of results/experts-pay.md.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ def list_arrows(diagram: str) -> str:
         if arrow:
             names = [re.sub(r'^\w+\["(.*)"\]$', r"\1", name.strip()) for name in (left, *right.split("&"))]
             rows.append(f"| {names[0]} | {', '.join(names[1:])} |")
-    return "\n".join(["| room | imports |", "|---|---|", *rows])
+    return "\n".join(["| package | imports |", "|---|---|", *rows])
 
 
 def find(path: str, files: Files) -> str | None:

@@ -131,9 +131,41 @@ def test_every_open_question_has_a_decision():
     assert len(departures) > 40 and all(len(cells) == 3 and all(cells) for cells in departures)
 
 
-def test_the_front_page_is_short_and_the_shipped_captures_are_small():
-    lines = (ROOT / "README.md").read_text().splitlines()
-    assert len(lines) <= 90 and max(map(len, lines)) <= 200
+def prose(text: str) -> list[str]:
+    """The lines of a page without code, tables and pictures. Of a link, only its text counts."""
+    plain = re.sub(r"^ *```.*?^ *```", "", text, flags=re.MULTILINE | re.DOTALL)
+    return [re.sub(r"\]\([^)]*\)", "]", line) for line in plain.splitlines() if not line.lstrip().startswith(("|", "!["))]
+
+
+WRITTEN = sorted(p for place in (".", "docs", "docs/reference", "results", "results/tuning") for p in ROOT.glob(f"{place}/*.md"))
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda p: str(p.relative_to(ROOT)))
+def test_prose_wraps_at_100_characters(page):
+    assert [line for line in prose(page.read_text()) if len(line) > 100] == []
+
+
+def test_the_front_page_is_short():
+    text = (ROOT / "README.md").read_text()
+    code = [line for block in re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL) for line in block.splitlines()]
+    assert len(text.splitlines()) <= 70 and code and max(map(len, code)) <= 100
+    assert {"make demo", "make test"} <= {" ".join(line.partition("#")[0].split()) for line in code}
+
+
+def test_each_claim_of_the_front_page_has_one_link_to_its_figures():
+    section = (ROOT / "README.md").read_text().partition("## What it is good at\n")[2].partition("\n## ")[0]
+    claims = [" ".join(claim.split()) for claim in section.strip().removeprefix("* ").split("\n* ")]
+    assert len(claims) >= 5
+    for claim in claims:
+        ((name, anchor),) = re.findall(r"\]\(([\w./-]+\.md)(?:#([\w-]+))?\)", claim)
+        figures = re.findall(r"\d[\d.,]*\d", re.sub(r"\[.*?\]\([^)]*\)|3DGS", "", claim))
+        if figures:
+            parts = re.split(r"^(?=## )", (ROOT / name).read_text(), flags=re.MULTILINE)
+            part = next(text for text in parts if slug(text.splitlines()[0]) == anchor)
+            assert not [figure for figure in figures if not re.search(rf"(?<![\d.]){re.escape(figure)}(?![\d.]*\d)", part)], claim
+
+
+def test_the_shipped_captures_are_small():
     size = {folder.name: sum(path.stat().st_size for path in folder.rglob("*")) for folder in (ROOT / "demo").iterdir()}
     assert size["banana"] <= 8_000_000
     assert all((ROOT / "demo" / name / "ATTRIBUTION.txt").is_file() for name in size)

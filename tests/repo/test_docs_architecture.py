@@ -12,8 +12,8 @@ PICTURE = PAGE.partition("```mermaid")[2].partition("```")[0]
 SOURCE = ROOT / "src" / "scene_experts"
 
 
-def rooms() -> dict[str, str]:
-    """The room of every package and module: a room is a node, and the modules that its label names."""
+def nodes() -> dict[str, str]:
+    """The node of every package and module. A node stands for its package and for the modules that its label names."""
     found = {}
     for name, label in re.findall(r"(\w+)\[\"([^\"]+)\"\]", PICTURE):
         found |= {part.strip().removesuffix(".py"): name for part in label.split(",")}
@@ -32,11 +32,11 @@ def arrows() -> dict[str, set[str]]:
 
 
 def imports() -> dict[str, set[str]]:
-    """The imports between rooms, at the top of a file or inside a function. The package itself only names its API."""
-    found, room = defaultdict(set), rooms() | {"__main__": rooms()["cli"]}
+    """The imports between nodes, at the top of a file or inside a function. The package itself only names its API."""
+    found, node_of = defaultdict(set), nodes() | {"__main__": nodes()["cli"]}
     for path in SOURCE.rglob("*.py"):
         relative = path.relative_to(SOURCE)
-        here = room.get(relative.parts[0] if len(relative.parts) > 1 else path.stem)
+        here = node_of.get(relative.parts[0] if len(relative.parts) > 1 else path.stem)
         for node in ast.walk(ast.parse(path.read_text())):
             modules = []
             if isinstance(node, ast.ImportFrom) and node.module:
@@ -44,7 +44,7 @@ def imports() -> dict[str, set[str]]:
             elif isinstance(node, ast.Import):
                 modules = [alias.name for alias in node.names]
             for module in modules:
-                there = room.get(module.split(".")[1]) if module.startswith("scene_experts.") else None
+                there = node_of.get(module.split(".")[1]) if module.startswith("scene_experts.") else None
                 if here and there and there != here:
                     found[here].add(there)
     return found
@@ -59,12 +59,12 @@ def reachable(graph: dict[str, set[str]], start: str) -> set[str]:
     return seen
 
 
-def test_the_rooms_are_the_packages():
+def test_the_nodes_are_the_packages():
     packages = {p.name for p in SOURCE.iterdir() if (p / "__init__.py").is_file()}
     modules = {p.stem for p in SOURCE.glob("*.py")} - {"__init__", "__main__"}
-    assert rooms().keys() == packages | modules
+    assert nodes().keys() == packages | modules
     described = set(re.findall(r"^\*\*(\w+)\*\*", PAGE, re.MULTILINE))
-    assert described == set(rooms().values())
+    assert described == set(nodes().values())
 
 
 def test_the_arrows_are_the_imports():

@@ -10,14 +10,14 @@ import pytest
 import scene_experts
 
 SOURCE = Path(scene_experts.__file__).parent
-OWNERS = ("scene", "strategy")  # the rooms whose classes nobody else asks for
+OWNERS = ("scene", "strategy")  # the packages whose classes nobody else asks for
 PART = re.compile(r"\b(scene|growth|strategy|decoder|select|heads?|rates|optimizer)(\]|\b)[^.(]*$")  # what an expression ends with
 
 
 @functools.cache
 def classes() -> set[str]:
-    """Names of the classes in the rooms that own them."""
-    trees = [ast.parse(path.read_text()) for room in OWNERS for path in (SOURCE / room).rglob("*.py")]
+    """Names of the classes in the packages that own them."""
+    trees = [ast.parse(path.read_text()) for owner in OWNERS for path in (SOURCE / owner).rglob("*.py")]
     return {node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
 
 

@@ -8,7 +8,7 @@ import pytest
 import scene_experts
 
 SOURCE = Path(scene_experts.__file__).parent
-ROOM = SOURCE / "core" / "reading"
+READING = SOURCE / "core" / "reading"
 NAMES = {  # functions that open or decode what a file holds
     "open", "read_bytes", "read_text", "fromfile", "memmap", "load", "loads", "safe_open", "load_file", "ZipFile", "is_zipfile",
     "Unpickler", "decompress", "GzipFile", "genfromtxt", "loadtxt",
@@ -61,9 +61,9 @@ def opened(path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("path", sorted(SOURCE.rglob("*.py")), ids=lambda p: str(p.relative_to(SOURCE)))
-def test_files_are_opened_in_one_room(path):
+def test_files_are_opened_in_one_package(path):
     relative = path.relative_to(SOURCE).as_posix()
-    if not path.is_relative_to(ROOM) and relative not in ALLOWED:
+    if not path.is_relative_to(READING) and relative not in ALLOWED:
         assert not opened(path), f"{relative} reads a file by itself: use core/reading (opening, read_json, opening_picture, ...)"
 
 

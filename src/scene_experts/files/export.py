@@ -1,7 +1,5 @@
 """Runs to files: the only entry is `export`. `write_result_folder` writes what a training leaves
 for other tools.
-
-It stays one module: an export visits at most 12 modules (tests/system/test_rooms.py), and each part of this one is on the way.
 """
 
 from __future__ import annotations

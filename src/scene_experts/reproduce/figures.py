@@ -1,8 +1,7 @@
-"""Figures 1(b), 3, 6 and 7 of the paper from our records, as PNG and SVG."""
+"""Figures 1(b), 3, 6 and 7 of the paper from our records, as PNG."""
 
 from __future__ import annotations
 
-import base64
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,29 +33,17 @@ def canvas(columns: int = 1, width: float = 6.4, height: float = 3.8) -> tuple[A
 
 
 def save(figure: Any, path: Path) -> list[Path]:
-    """Write PNG and SVG files, each whole or not at all. The same figure gives the same bytes."""
-    from matplotlib import pyplot, rcParams
+    """Write a PNG file of 256 colours, whole or not at all. The same figure gives the same bytes."""
+    from matplotlib import pyplot
 
-    rcParams["svg.hashsalt"] = "scene-experts"  # makes the ids in the file deterministic
-    out = []
-    for ending in ("png", "svg"):
-        stream = io.BytesIO()
-        figure.savefig(stream, format=ending, dpi=160, metadata={"Date": None} if ending == "svg" else None)
-        write_bytes(path.with_suffix(f".{ending}"), stream.getvalue())
-        out.append(path.with_suffix(f".{ending}"))
+    drawn, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=160)
     pyplot.close(figure)
-    return out
-
-
-def wrap_in_svg(picture: Path) -> Path:
-    """Write an SVG of the same size beside a PNG, which it embeds."""
-    with Image.open(picture) as image:
-        width, height = image.size
-    data = base64.b64encode(picture.read_bytes()).decode()
-    address = f'xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" viewBox="0 0 {width} {height}"'
-    held = f'<image width="{width}" height="{height}" href="data:image/png;base64,{data}"/>'
-    write_bytes(picture.with_suffix(".svg"), f"<svg {address}>{held}</svg>\n".encode())
-    return picture.with_suffix(".svg")
+    with Image.open(drawn) as image:
+        image.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)  # a third of the bytes
+    out = path.with_suffix(".png")
+    write_bytes(out, small.getvalue())
+    return [out]
 
 
 def relative_psnr(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str], path: Path) -> list[Path]:

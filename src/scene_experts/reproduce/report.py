@@ -40,7 +40,7 @@ def write(
     for experiment in experiments:
         made = [*write_tables(out, experiment, scenes, records), *write_figures(out, experiment, scenes, records)]
         if experiment.name == "fig5":
-            made += [p for s in scenes for p in (strip_path(out, s.name), strip_path(out, s.name).with_suffix(".svg")) if p.is_file()]
+            made += [p for s in scenes if (p := strip_path(out, s.name)).is_file()]
         written += made
         page += [f"## {experiment.title}", "", ", ".join(f"[{p.name}]({p.name})" for p in made) or "No run is finished yet.", ""]
         page += [f"![{p.stem}]({p.name})\n" for p in made if p.suffix == ".png"]
@@ -153,7 +153,6 @@ def draw_experts(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
         capture.images.close()
     path = strip_path(out, spec.scene.name)
     pictures.write_picture(path, sheet)
-    figures.wrap_in_svg(path)
     return path
 
 

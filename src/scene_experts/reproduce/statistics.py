@@ -14,7 +14,7 @@ from scene_experts.reproduce.store import Record
 
 SEED_SD = {"psnr": 0.28, "ssim": 0.005, "lpips_3dgs": 0.005}
 """Assumed standard deviation over seeds of the difference of two runs on one capture, PSNR in dB: that of the ten pairs of five recipes
-with three seeds on seven captures at 7,000 iterations, pooled (docs/results.md). Single pairs have 0.15 to 0.39 dB, 0.003 to 0.007 and
+with three seeds on seven captures at 7,000 iterations, pooled (results/moe-gs.md). Single pairs have 0.15 to 0.39 dB, 0.003 to 0.007 and
 0.003 to 0.006."""
 VIEW_SD = {"psnr": 0.4, "ssim": 0.003, "lpips_3dgs": 0.004}
 """The same over the views of a capture. Used for captures with a single view."""

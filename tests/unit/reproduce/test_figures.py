@@ -1,7 +1,5 @@
 """Charts: drawn where runs are done, nothing where none is."""
 
-import base64
-
 import pytest
 from PIL import Image
 
@@ -13,8 +11,8 @@ pytest.importorskip("matplotlib")
 
 
 def whole(paths):
-    assert {p.suffix for p in paths} == {".png", ".svg"}
-    assert min(Image.open(next(p for p in paths if p.suffix == ".png")).size) > 300
+    assert [p.suffix for p in paths] == [".png"]
+    assert min(Image.open(paths[0]).size) > 300
     return True
 
 
@@ -68,10 +66,3 @@ def test_figures_compare_the_same_seeds(tmp_path, monkeypatch):
     ]
     figures.cost(EXPERIMENTS["fig6"], timed, tmp_path / "fig6")
     assert list(drawn[2].axes[0].lines[0].get_ydata()) == [30.0, 30.0]
-
-
-def test_a_picture_in_an_svg_is_the_picture(tmp_path):
-    Image.new("RGB", (30, 20), (255, 0, 0)).save(tmp_path / "fig5_fox.png")
-    text = figures.wrap_in_svg(tmp_path / "fig5_fox.png").read_text()
-    held = base64.b64decode(text.partition("base64,")[2].partition('"')[0])
-    assert 'viewBox="0 0 30 20"' in text and held == (tmp_path / "fig5_fox.png").read_bytes()
