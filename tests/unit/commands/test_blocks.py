@@ -33,7 +33,7 @@ def test_the_commands_of_a_plan_are_commands_of_train(capture, tmp_path, capsys)
     assert [train.init_from for train in trains] == [None, *[out / "coarse"] * 3, out / "merged"]
     assert [train.cfg.iterations for train in trains] == [900, 900, 900, 900, 990] and trains[0].options.stop_at == 300
     assert all(train.cfg.seed == 3 for train in trains)
-    assert [train.cfg.max_anchors for train in trains[:2]] == [500, 0] and [t.max_memory for t in trains] == [4, 4, 4, 4, 0]
+    assert [train.cfg.max_anchors for train in trains[:2]] == [500, 0] and [t.options.max_memory for t in trains] == [4, 4, 4, 4, 0]
     assert all(train.data.background == (1, 1, 0.5) and train.data.ignore_principal_point for train in trains)
     assert [train.data.views for train in trains[1:4]] == [out / f"block{number}.json" for number in range(3)]
     assert words[4][1:3] == ["blocks", "merge"]
