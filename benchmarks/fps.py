@@ -19,8 +19,8 @@ from scene_experts.bench.measure import Clock, Subject, choose_clock, measure_mi
 from scene_experts.bench.step import AT, make_work
 from scene_experts.core.types import Mode
 from scene_experts.evaluate import timing
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.run_folder import load_capture, open_run
 
 KINDS = (

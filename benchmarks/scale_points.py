@@ -188,7 +188,7 @@ def measure_views(count: int) -> list[Row]:
 
 
 def _small(capture: object) -> tuple:
-    from scene_experts.recipes import RECIPES
+    from scene_experts.training.recipes import RECIPES
 
     cfg = RECIPES[step.MIXTURE][1].scaled()
     return cfg, cfg.scene.start(capture.points, capture.extent)  # type: ignore[attr-defined]

@@ -3,8 +3,8 @@
 import torch
 
 from scene_experts.core.types import Camera, Points
-from scene_experts.recipes import RECIPES
 from scene_experts.scene import Scene
+from scene_experts.training.recipes import RECIPES
 
 # one recipe of every scene family and of every kind of mixture
 METHODS = (

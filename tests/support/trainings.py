@@ -8,10 +8,10 @@ import torch
 from scene_experts.core import checkpoint
 from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig
 from scene_experts.training.loop import Run, train
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 
 CHANGE = 0.01  # standard deviation, of each parameter before the first step

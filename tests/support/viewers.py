@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from scene_experts.data.capture import load
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
+from scene_experts.training.recipes import RECIPES
 from support.synthetic import make_capture
 
 DRAW = choose("auto", "cpu")

@@ -16,7 +16,7 @@ import pytest
 from scene_experts import cli
 from scene_experts.commands import COMMANDS
 from scene_experts.commands.train import parse_train
-from scene_experts.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES
 from support.golden import recorded, recorded_text
 from support.synthetic import make_capture
 

@@ -12,11 +12,11 @@ from scene_experts.core.types import Points
 from scene_experts.data.capture import Capture, load
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.score import evaluate
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene import restore_scene
 from scene_experts.training.config import Train
 from scene_experts.training.events import Densified, Finished, Started
+from scene_experts.training.recipes import RECIPES
 from support.lanes import slow_except
 from support.places import DEMO
 from support.trainings import assert_same, events, last_tensors

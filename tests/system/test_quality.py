@@ -14,10 +14,10 @@ from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
 from scene_experts.evaluate.metrics import psnr
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig
 from scene_experts.training.loop import Run, train
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 from support.golden import recorded
 from support.places import DEMO, GOLDEN

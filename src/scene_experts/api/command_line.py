@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.training.config import Train, flag
+from scene_experts.training.recipes import RECIPES
 
 
 def command_of(cfg: Train, data: Data, out: Path | None, deterministic: bool, stop_at: int | None, max_memory: float = 0.0) -> str:

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-import scene_experts
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import check_writable, read_json, write_bytes, write_json
 from scene_experts.core.plain import to_json
+from scene_experts.core.version import __version__
 from scene_experts.data.settings import Data
 from scene_experts.data.views import Capture, World
 from scene_experts.files.cameras import write_cameras
@@ -453,7 +453,7 @@ def _describe(work: _Work, contents: Any, level: int | None) -> dict[str, Any]:
     run = work.run
     return {
         "format": NOTE_FORMAT,
-        "made_by": f"scene-experts {scene_experts.__version__}",
+        "made_by": f"scene-experts {__version__}",
         "command": work.command,
         "recipe": run.config.train.recipe,
         "step": run.step,

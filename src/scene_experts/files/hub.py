@@ -16,11 +16,11 @@ from typing import Any
 import torch
 import yaml
 
-import scene_experts
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import check_writable, write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import opening
+from scene_experts.core.version import __version__
 from scene_experts.data.capture import Capture
 from scene_experts.evaluate.pictures import to_8bit, write_picture
 from scene_experts.evaluate.results import load_results
@@ -138,7 +138,7 @@ def make_card(
         result = {"task": task, "dataset": {"type": scene, "name": f"held-out views of {scene}"}, "metrics": metrics}
         head["model-index"] = [{"name": f"{scene}, {recipe}", "results": [result]}]
     lines = ["---", yaml.safe_dump(head, sort_keys=False, allow_unicode=True).strip(), "---", "", f"# {scene}", ""]
-    maker = f"scene-experts {scene_experts.__version__}"
+    maker = f"scene-experts {__version__}"
     lines += [f"![{scene}]({PREVIEW})", "", f"A 3D scene of Gaussians, trained from photographs by {maker} with"]
     lines += [f"the recipe `{recipe}` for {run.step:,} iterations.", "", "| file | content |", "|---|---|"]
     for file in files:

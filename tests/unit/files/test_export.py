@@ -24,12 +24,12 @@ from scene_experts.files.importing import import_files
 from scene_experts.files.measure import Painter
 from scene_experts.files.registry import GAUSSIANS, format_named, formats_of
 from scene_experts.files.result_folder import read_settings
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.loop import Run, train
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 from support.files import export_run
 from support.messages import naming

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-import scene_experts
 from scene_experts.core.errors import InputError
 from scene_experts.native import api
 from scene_experts.native import library as native
@@ -18,7 +17,7 @@ from scene_experts.native import library as native
 def elsewhere(tmp_path, monkeypatch):
     """A package folder without libraries."""
     native.load.cache_clear()
-    monkeypatch.setattr(scene_experts, "__path__", [str(tmp_path)])
+    monkeypatch.setattr(native, "package_folders", lambda: [tmp_path])
     yield tmp_path
     native.load.cache_clear()
 

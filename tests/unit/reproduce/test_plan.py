@@ -12,7 +12,6 @@ from scene_experts.core.plain import to_json
 from scene_experts.data.fetch import catalog
 from scene_experts.data.images import check_policy, target_size
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS
 from scene_experts.reproduce.plan import (
     COLLECTIONS,
@@ -30,6 +29,7 @@ from scene_experts.reproduce.plan import (
     without_newer,
 )
 from scene_experts.training.config import flags_of
+from scene_experts.training.recipes import RECIPES
 
 FOX = Scene("fox", OWN, Path("captures/fox"))
 

@@ -12,7 +12,6 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.schedule import Every
 from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.anchors.experts import Experts
 from scene_experts.scene.anchors.scene import Anchors
@@ -22,6 +21,7 @@ from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Densified, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.loop import Run, iterate, measure_step, without_graph
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 from support.golden import recorded_text
 from support.lanes import slow_except

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 
 from scene_experts.core.schedule import Every
-from scene_experts.recipes import RECIPES
 from scene_experts.training.old_hash import old_hash
 from scene_experts.training.optim import Adam
+from scene_experts.training.recipes import RECIPES
 
 FIRST = {"scaffold-gs": "f304f3c44732921f", "moe-gs": "536629188212acee"}  # of 30,000 iterations
 SHORT = {  # of 40 iterations, densification every 4

@@ -16,13 +16,13 @@ from scene_experts.core.schedule import Every
 from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES, moe_gs
 from scene_experts.render import choose
 from scene_experts.training import recipe_book, run_folder
 from scene_experts.training.config import RunConfig, check
 from scene_experts.training.events import Densified, Finished, Stepped
 from scene_experts.training.loop import Run, train
 from scene_experts.training.recipe_book import GROUP, RecipeBook
+from scene_experts.training.recipes import RECIPES, moe_gs
 from support import outside
 from support.synthetic import make_capture
 

@@ -9,7 +9,7 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
 from scene_experts.data.capture import load
-from scene_experts.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 from scene_experts.training.trial import fit_memory, unchanged
 from support.synthetic import make_capture

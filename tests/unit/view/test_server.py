@@ -11,7 +11,7 @@ import torch
 
 from scene_experts.data.capture import load
 from scene_experts.evaluate.pictures import to_8bit
-from scene_experts.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES
 from scene_experts.view.paint import paint
 from scene_experts.view.paths import choose_best_view
 

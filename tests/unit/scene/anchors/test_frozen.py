@@ -7,12 +7,12 @@ import torch
 
 from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors import scene as anchors
 from scene_experts.scene.anchors.experts import Experts, Router
 from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
+from scene_experts.training.recipes import RECIPES
 from support.interpret import DEVICE, kernels
 from support.messages import naming
 

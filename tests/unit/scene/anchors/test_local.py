@@ -7,11 +7,11 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.experts import Router
 from scene_experts.scene.anchors.local import LocalExperts, LocalHead, find_centres
 from scene_experts.scene.anchors.scene import ATTRIBUTES
 from scene_experts.training.config import check
+from scene_experts.training.recipes import RECIPES
 from support.scenes import CAMERA, start_scene
 
 WARM = 10_000  # the last iteration of one network

@@ -9,11 +9,11 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.experts import Experts, Router
 from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.scene.anchors.rates import Rates
 from scene_experts.scene.anchors.scene import ATTRIBUTES, Anchors, AnchorScene
+from scene_experts.training.recipes import RECIPES
 from support.messages import naming
 
 EVERYTHING = lambda means, scales, camera: torch.ones(len(means), dtype=torch.bool)  # noqa: E731
