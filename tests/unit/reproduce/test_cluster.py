@@ -19,7 +19,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.reproduce import cluster as module
 from scene_experts.reproduce import store
 from scene_experts.reproduce.cluster import ClusterRunner, Job, make_task, threads, work
-from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec
+from scene_experts.reproduce.plan import OWN, CaptureSpec, Scale, Spec
 from support.synthetic import make_capture
 from support.trainings import assert_same, last_tensors
 
@@ -33,7 +33,7 @@ def job(tmp_path, monkeypatch):
         (tmp_path / name).mkdir()
     for name in ("runs", "records"):
         (tmp_path / name / ".token").touch()
-    spec = Spec(Scene("box", OWN, tmp_path / "box"), "moe-gs", 0, Scale(iterations=10))
+    spec = Spec(CaptureSpec("box", OWN, tmp_path / "box"), "moe-gs", 0, Scale(iterations=10))
     return Job(spec, tmp_path / "runs", tmp_path / "records", ".token", "[1/1]", {})
 
 
@@ -62,7 +62,7 @@ def test_an_address_that_does_not_answer(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "CONNECT", 1.0)
     for address in ("tcp://127.0.0.1:9", "nonsense://x"):
         runner = ClusterRunner(tmp_path / "runs", tmp_path / "records", say=lambda _: None, address=address)
-        spec = Spec(Scene("box", OWN, tmp_path), "moe-gs", 0, Scale(iterations=10))
+        spec = Spec(CaptureSpec("box", OWN, tmp_path), "moe-gs", 0, Scale(iterations=10))
         with pytest.raises(InputError, match=address):
             runner.run_all([spec])
 
@@ -97,7 +97,7 @@ def test_threads_of_a_run():
 
 
 def specs_of(capture: Path) -> list[Spec]:
-    scene = Scene("box", OWN, capture)
+    scene = CaptureSpec("box", OWN, capture)
     return [Spec(scene, recipe, 0, Scale(iterations=400)) for recipe in ("moe-gs", "scaffold-gs", "3dgs")]
 
 

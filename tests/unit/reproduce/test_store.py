@@ -9,7 +9,7 @@ import pytest
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
 from scene_experts.core.plain import to_json
-from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec, drop_repeated
+from scene_experts.reproduce.plan import OWN, CaptureSpec, Scale, Spec, drop_repeated
 from scene_experts.reproduce.store import POINTS, check_captures, find, find_all, load, read, read_curves, read_run, unpack, write
 from scene_experts.training.run_folder import load_capture
 from support.messages import naming
@@ -35,7 +35,7 @@ def test_a_record_names_the_run_that_it_started_from_if_there_is_one(tmp_path):
 
 
 def test_a_run_that_started_from_another_one_is_not_taken_for_the_run_of_its_recipe(tmp_path):
-    spec = Spec(Scene("fox", OWN, Path("fox")), "moe-gs", 0, Scale(iterations=3000))
+    spec = Spec(CaptureSpec("fox", OWN, Path("fox")), "moe-gs", 0, Scale(iterations=3000))
     begun = replace(record(psnr=20.0), config=replace(record().config, init_from=Path("/home/someone/coarse")))
     back = read(write(tmp_path, begun))
     assert back.key == begun.key and find(load(tmp_path), spec) is None
@@ -76,14 +76,14 @@ def test_a_record_of_the_first_format_opens(tmp_path):
 
 
 def test_a_run_is_found_by_its_spec(tmp_path):
-    spec = Spec(Scene("fox", OWN, Path("anywhere/fox")), "moe-gs", 0, Scale(iterations=3000))
+    spec = Spec(CaptureSpec("fox", OWN, Path("anywhere/fox")), "moe-gs", 0, Scale(iterations=3000))
     assert find([record(seed=1), record()], spec) is not None
     assert find([record(seed=1), record(iterations=7000)], spec) is None
 
 
 def test_records_of_another_capture_of_the_same_name_are_refused(tmp_path):
     box = make_capture(tmp_path / "box", views=9)
-    spec = Spec(Scene("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
+    spec = Spec(CaptureSpec("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
     capture = load_capture(spec.data)
     own = replace(record(scene="box"), per_view={capture.views[i].name: {"psnr": 30.0} for i in capture.test})
     check_captures([own], [spec])
@@ -95,7 +95,7 @@ def test_records_of_another_capture_of_the_same_name_are_refused(tmp_path):
 
 def test_records_of_other_poses_of_the_same_photographs_are_refused(tmp_path):
     box = make_capture(tmp_path / "box", views=9, points=700)
-    specs = [Spec(Scene("box", OWN, box.folder), recipe, 0, Scale(iterations=3000)) for recipe in ("scaffold-gs", "moe-gs")]
+    specs = [Spec(CaptureSpec("box", OWN, box.folder), recipe, 0, Scale(iterations=3000)) for recipe in ("scaffold-gs", "moe-gs")]
     capture = load_capture(specs[0].data)
     views = {capture.views[i].name: {"psnr": 30.0} for i in capture.test}
     found = [replace(record(s.recipe, scene="box", psnr=30.0, views=1, points=n), per_view=views) for s, n in zip(specs, (651, 700))]
@@ -106,7 +106,7 @@ def test_records_of_other_poses_of_the_same_photographs_are_refused(tmp_path):
 
 def test_records_of_other_cameras_with_the_same_points_are_refused(tmp_path):
     box, moved = make_capture(tmp_path / "box", views=9), make_capture(tmp_path / "other" / "box", views=9, scale=2.0)
-    spec = Spec(Scene("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
+    spec = Spec(CaptureSpec("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
     capture, other = load_capture(spec.data), load_capture(replace(spec.data, path=moved.folder))
     own = replace(record(scene="box"), per_view={capture.views[i].name: {"psnr": 30.0} for i in capture.test})
     check_captures([replace(own, results={**own.results, "poses": capture.poses()})], [spec])
@@ -196,7 +196,7 @@ def test_columns():
 
 def test_a_run_counts_for_every_recipe_of_the_same_numbers(tmp_path):
     """Five experts with Top-2 in Figure 6 are the main recipe, two layers in Figure 7 are Scaffold-GS."""
-    scene = Scene("fox", OWN, tmp_path)
+    scene = CaptureSpec("fox", OWN, tmp_path)
     pair = [Spec(scene, recipe, 0, Scale(iterations=3000)) for recipe in ("moe-gs", "moe-gs-e5-top2")]
     assert drop_repeated([*pair, Spec(scene, "moe-gs-e4-top2", 0, Scale(iterations=3000))]) == [
         pair[0],
