@@ -15,9 +15,9 @@ from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.files import registry
+from scene_experts.files.anchors import compact
 from scene_experts.files.anchors.read import read_anchors, read_folder
 from scene_experts.files.export import Options, export, export_several, file_path, result_warnings, world_of, write_result_folder
-from scene_experts.files.formats import compact
 from scene_experts.files.gaussians.read import DRAWN_AT, scene_of, table_columns
 from scene_experts.files.gaussians.write import splats_of
 from scene_experts.files.importing import import_files
