@@ -24,10 +24,11 @@ from scene_experts.core.version import __version__
 from scene_experts.data.capture import Capture
 from scene_experts.evaluate.pictures import to_8bit, write_picture
 from scene_experts.evaluate.results import load_results
-from scene_experts.files.export import Written, export_several
+from scene_experts.files.export import export_several
 from scene_experts.files.measure import Painter, Tell, capture_if_there
 from scene_experts.files.options import DEFAULT, Options
 from scene_experts.files.registry import GAUSSIANS, format_named, formats_of
+from scene_experts.files.standard import Written
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.view.paths import choose_best_view
 

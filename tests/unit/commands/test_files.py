@@ -10,7 +10,7 @@ from scene_experts.commands.files import export, import_
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.data.settings import Data
 from scene_experts.files import registry
-from scene_experts.files.export import write_result_folder
+from scene_experts.files.scene_folder import write_result_folder
 from scene_experts.render import choose
 from scene_experts.scene.anchors.mlp import MLP
 from scene_experts.training import loop as train

@@ -89,7 +89,7 @@ def test_what_can_be_shown_follows_the_traits_of_a_scene():
 
 
 def test_depth_is_shown_where_half_of_the_light_is_stopped():
-    """Near is light: equal steps of disparity between the nearest and the farthest pixel seen. Fainter pixels do not count and are black."""
+    """Near is light: equal steps of disparity between the nearest and the farthest pixel seen. Fainter pixels are black."""
     alpha = torch.tensor([[0.51, 0.8, 1.0, 0.49, 0.2, 0.0]])
     depth = torch.tensor([[2.0, 3.0, 6.0, 1.0, 50.0, 0.0]])
 

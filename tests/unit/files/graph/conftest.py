@@ -6,7 +6,7 @@ import pytest
 
 from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
-from scene_experts.files.export import write_result_folder
+from scene_experts.files.scene_folder import write_result_folder
 from scene_experts.render import choose
 from scene_experts.training import loop as train
 from scene_experts.training import run_folder
