@@ -107,7 +107,7 @@ def write_compact(path: Path, size: int, allowance: int) -> None:
     import torch
 
     from scene_experts.core.checkpoint import write_tensors
-    from scene_experts.files.formats import compact
+    from scene_experts.files.anchors import compact
 
     K, F = 10, 32
     count = allowance // (8 * (3 * K + F + 6 + 12))
@@ -200,8 +200,9 @@ def formats() -> dict[str, tuple[Any, Callable[[Path, int, int], None], Callable
     """Return the budget, the writer and the reader of each format."""
     from scene_experts.core.reading import budget
     from scene_experts.core.reading.plain import read_json
+    from scene_experts.files.anchors import compact
     from scene_experts.files.archive.torch_archive import read_tensors
-    from scene_experts.files.formats import compact, glb, sog, spz
+    from scene_experts.files.formats import glb, sog, spz
 
     return {
         "spz": (budget.SPZ, write_spz, spz.read),

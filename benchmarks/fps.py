@@ -20,8 +20,8 @@ from scene_experts.bench.step import AT, make_work
 from scene_experts.core.types import Mode
 from scene_experts.data import capture as captures
 from scene_experts.evaluate import timing
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.run_folder import open_run
 
 KINDS = (

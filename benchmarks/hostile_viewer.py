@@ -105,11 +105,11 @@ def measure(capture_path: Path, recipe: str, spell: int, most: int) -> tuple[flo
     """Return the seconds of an iteration without and with the client, the growth of memory in bytes, and the client's counts."""
     from scene_experts.data import capture as captures
     from scene_experts.data.settings import Data
-    from scene_experts.recipes import RECIPES
     from scene_experts.render import choose
     from scene_experts.training import loop
     from scene_experts.training.config import RunConfig
     from scene_experts.training.options import TrainOptions
+    from scene_experts.training.recipes import RECIPES
     from scene_experts.view.live import Live
 
     capture = captures.load(Data(capture_path, resolution="factor:4"))

@@ -32,8 +32,8 @@ def make_ply(folder: Path, share: float) -> Callable[[], Any]:
 
 def make_compact(folder: Path, share: float) -> Callable[[], Any]:
     """A compact file of 2 million anchors."""
+    from scene_experts.files.anchors import compact
     from scene_experts.files.anchors.data import AnchorData
-    from scene_experts.files.formats import compact
 
     n = int(2_000_000 * share)
     cells = torch.randint(0, 4000, (n, 3))

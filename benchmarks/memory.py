@@ -22,13 +22,13 @@ from scene_experts.core.schedule import Every
 from scene_experts.core.types import Camera, Gaussians, Points, Render
 from scene_experts.data.capture import Capture, load
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training import memory
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Densified
 from scene_experts.training.loop import Job, iterate, train
 from scene_experts.training.options import TrainOptions
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 
 

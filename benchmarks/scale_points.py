@@ -28,8 +28,7 @@ from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap_model import ColmapImage, Model, write_model
 from scene_experts.data.settings import Data
 from scene_experts.data.views import World
-from scene_experts.files.anchors import FAMILY
-from scene_experts.files.formats import compact
+from scene_experts.files.anchors import FAMILY, compact
 from scene_experts.render import choose
 from scene_experts.strategy import observe
 from scene_experts.training.config import RunConfig
@@ -188,7 +187,7 @@ def measure_views(count: int) -> list[Row]:
 
 
 def _small(capture: object) -> tuple:
-    from scene_experts.recipes import RECIPES
+    from scene_experts.training.recipes import RECIPES
 
     cfg = RECIPES[step.MIXTURE][1].scaled()
     return cfg, cfg.scene.start(capture.points, capture.extent)  # type: ignore[attr-defined]

@@ -27,13 +27,13 @@ from scene_experts.core.group import join
 from scene_experts.core.types import Points
 from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.events import Densified
 from scene_experts.training.loop import Job, train
 from scene_experts.training.memory import reuse_freed
 from scene_experts.training.options import TrainOptions
+from scene_experts.training.recipes import RECIPES
 
 
 def settings(recipe: str, args: argparse.Namespace) -> Train:

@@ -33,7 +33,6 @@ from scene_experts.core.group import join
 from scene_experts.core.table import Table
 from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training import shards
 from scene_experts.training.config import RunConfig
@@ -41,6 +40,7 @@ from scene_experts.training.events import Densified
 from scene_experts.training.loop import Job, train
 from scene_experts.training.memory import forget_peak, peak_bytes, reuse_freed, used_bytes
 from scene_experts.training.options import TrainOptions
+from scene_experts.training.recipes import RECIPES
 
 
 def size_of(tensors: list[Tensor]) -> int:

@@ -19,11 +19,11 @@ import torch
 
 from scene_experts.data.capture import Capture, load
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Event, Stepped
 from scene_experts.training.loop import Job, train
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 
 

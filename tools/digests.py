@@ -162,7 +162,7 @@ def imported(files: Path, out: Path) -> dict[str, object]:
 
 def recipes() -> dict[str, tuple[str, ...]]:
     """What is trained: the words after `train`, by name."""
-    from scene_experts.recipes import RECIPES
+    from scene_experts.training.recipes import RECIPES
 
     found: dict[str, tuple[str, ...]] = {recipe: (recipe,) for recipe in RECIPES}
     found["appearance"] = APPEARANCE

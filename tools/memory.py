@@ -65,7 +65,7 @@ def train(recipe: str, limit: float, capture: Path, iterations: int, seconds: fl
 
 
 def main() -> int:
-    from scene_experts.recipes import RECIPES
+    from scene_experts.training.recipes import RECIPES
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recipes", nargs="*", default=list(RECIPES), help="recipes (default: all)")

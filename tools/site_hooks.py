@@ -113,7 +113,8 @@ def commands() -> str:
 def recipes() -> str:
     """Return all recipes in Markdown, in the groups of `train --help`, each with its description."""
     code = (
-        "import json, re; from scene_experts.commands.train import GROUPS; from scene_experts.recipes import RECIPES; left = dict(RECIPES);"
+        "import json, re; from scene_experts.commands.train import GROUPS; from scene_experts.training.recipes import RECIPES; "
+        "left = dict(RECIPES);"
         "print(json.dumps({t: [(n, left.pop(n)[0]) for n in list(left) if re.fullmatch(p, n)] for t, p in GROUPS.items()}))"
     )
     done = run([sys.executable, "-c", code])

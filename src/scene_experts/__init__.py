@@ -15,6 +15,8 @@ import importlib
 import os
 from typing import TYPE_CHECKING
 
+from scene_experts.core.version import __version__
+
 # OpenMP's threads sleep between torch's operations instead of spinning, where torch is not loaded yet: spinning, they take the cores from
 # the native library's own threads (4.7x slower training on two cores, ten times on a busy machine). It changes no number.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -45,8 +47,6 @@ if TYPE_CHECKING:
     from scene_experts.training.events import Started as Started
     from scene_experts.training.events import Stepped as Stepped
     from scene_experts.training.events import Stopped as Stopped
-
-__version__ = "0.1.0"
 
 __all__ = [
     "Camera",

@@ -39,7 +39,7 @@ def dispatch(args: list[str]) -> int:
         print(usage())
         return 0 if args else 2
     if args[0] in ("-V", "--version", "version"):
-        from scene_experts import __version__
+        from scene_experts.core.version import __version__
 
         print(f"{PROG} {__version__}")
         return 0

@@ -27,11 +27,10 @@ from scene_experts.evaluate import results
 from scene_experts.evaluate.lpips import tensor_shapes
 from scene_experts.evaluate.weights import _hash_tensors, _read_cache
 from scene_experts.files import registry, result_folder
-from scene_experts.files.anchors import torchscript
+from scene_experts.files.anchors import compact, torchscript
 from scene_experts.files.anchors.read import read_folder
 from scene_experts.files.anchors.write import contents, describe
 from scene_experts.files.archive.torch_archive import read_tensors
-from scene_experts.files.formats import compact
 from scene_experts.report import page
 from scene_experts.reproduce import store
 from scene_experts.scene.fit import restore_foreign

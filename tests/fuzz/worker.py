@@ -1,7 +1,7 @@
-"""Runs mutated inputs of one target: `python -m fuzz.worker TARGET SEED COUNT OUT`, from the folder tests.
+"""Runs mutated inputs of one or several targets: `python -m fuzz.worker TARGET,TARGET SEED COUNT OUT`, from the folder tests.
 
 Each input is written to OUT/current before it is read, so that the input that ends the process is known. A line of JSON on stdout
-says what each finding was; the last line counts the inputs.
+says what each finding was; a last line for each target counts its inputs.
 """
 
 from __future__ import annotations
@@ -64,24 +64,30 @@ def try_input(read, files, folder: Path, start: int) -> str:
 
 
 def main() -> None:
-    name, seed, count, out = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
+    names, seed, count, out = sys.argv[1].split(","), int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     logging.disable(logging.CRITICAL)
     warnings.simplefilter("ignore")
     import torch
 
+    torch.set_num_threads(1)
+    for name in names:
+        read_inputs(name, range(seed, seed + count), out)
+
+
+def read_inputs(name: str, numbers: range, out: Path) -> None:
+    """Read the inputs of one target and print what was wrong."""
     from fuzz.targets import STRUCTURED, TARGETS, make_seed, mutate_files
 
-    torch.set_num_threads(1)
-    target = TARGETS[name]
+    target, most = TARGETS[name], resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
     with tempfile.TemporaryDirectory() as scratch:
         files = make_seed(target, Path(scratch) / "valid")
         assert not (wrong := try_input(target.read, files, Path(scratch) / "valid", peak())), wrong
         start = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-        limit = resource.getrlimit(resource.RLIMIT_AS)[1]
         size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MEMORY, limit))  # a bomb fails here before it takes the machine
-        for number in range(seed, seed + count):
+        resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MEMORY, most))  # a bomb fails here before it takes the machine
+        for number in numbers:
             rng = random.Random(f"{name} {number}")
             changed = mutate_files(files, target, rng, number >= STRUCTURED)
             if rng.random() < 0.3:
@@ -91,7 +97,7 @@ def main() -> None:
             wrong = try_input(target.read, changed, out / "input", start)
             if wrong:
                 print(json.dumps({"target": name, "number": number, "wrong": wrong}), flush=True)
-    print(json.dumps({"target": name, "done": count}), flush=True)
+    print(json.dumps({"target": name, "done": len(numbers)}), flush=True)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,8 @@ from scene_experts.arguments.table import rows as rows_of
 from scene_experts.commands.evaluate import EvalCommand
 from scene_experts.commands.render import RenderCommand
 from scene_experts.commands.train import TrainCommand
-from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.options import ReproduceOptions
+from scene_experts.training.recipes import RECIPES
 from support.places import ROOT
 
 PLACES = (ROOT / "src" / "scene_experts", ROOT / "csrc", ROOT / "tests", ROOT)

@@ -12,7 +12,7 @@ import pytest
 
 import scene_experts
 from scene_experts.commands import COMMANDS
-from scene_experts.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -13,11 +13,12 @@ from scene_experts.data.settings import Data
 from scene_experts.files import export as exporting
 from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.anchors.write import vertices
-from scene_experts.files.export import Options, Written
 from scene_experts.files.formats.ply import write_vertices
-from scene_experts.recipes import RECIPES
+from scene_experts.files.options import Options
+from scene_experts.files.standard import Written
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.run_folder import OpenRun, open_run, with_capture
 from support.scenes import start_scene
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.store import Record
 from scene_experts.training.config import RunConfig
+from scene_experts.training.recipes import RECIPES
 
 
 def record(

@@ -3,9 +3,9 @@
 import torch
 
 from scene_experts.core.types import Camera, Points
-from scene_experts.recipes import RECIPES
 from scene_experts.scene import Scene
 from scene_experts.training.config import Train
+from scene_experts.training.recipes import RECIPES
 
 # one recipe of every scene family and of every kind of mixture
 METHODS = (

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
+from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.synthetic import make_capture
 

@@ -16,8 +16,8 @@ import pytest
 from scene_experts import cli
 from scene_experts.commands import COMMANDS
 from scene_experts.commands.train import parse_train
-from scene_experts.recipes import RECIPES
-from support.golden import recorded, recorded_text
+from scene_experts.training.recipes import RECIPES
+from support.golden import recorded_text
 from support.synthetic import make_capture
 
 
@@ -42,25 +42,20 @@ def fails(capsys, *args: str) -> str:
 
 def test_help_is_what_was_reviewed(capsys):
     code, out, _ = run(capsys, "--help")
-    assert code == 0 and out == recorded_text("help.txt", out)
+    assert code == 0 and out == recorded_text("help.txt", out), "look at the change, then run `make record-flags`"
 
 
-RECIPES_SHOWN = ("moe-gs", "scaffold-gs", "3dgs", "3dgs-mcmc", "octree-gs", "sags", "moe-gs-balance")
-HELP = [
-    *(name for name in COMMANDS if name not in ("train", "blocks")),
-    "blocks plan",
-    "blocks merge",
-    *(f"train {name}" for name in RECIPES_SHOWN),
-]
-
-
-@pytest.mark.parametrize("command", HELP)
-def test_the_flags_of_every_command_are_what_was_reviewed(command, capsys):
-    """The names alone, sorted. `make record-flags` records them."""
-    code, out, _ = run(capsys, *command.split(), "--help-all")
-    names = [line[2:].split("  ")[0] for line in out.splitlines() if line.startswith("  -")]
-    found = sorted({flag for name in names for flag in re.findall(r"--[\w.-]+", name)})
-    assert code == 0 and found == recorded("flags.json", command, lambda: found)
+def test_the_flags_are_what_was_reviewed(capsys):
+    """Every flag of a command or a recipe once."""
+    found: set[str] = set()
+    commands = [*(name for name in COMMANDS if name not in ("train", "blocks")), "blocks plan", "blocks merge"]
+    for words in [*commands, *(f"train {name}" for name in RECIPES)]:
+        code, out, _ = run(capsys, *words.split(), "--help-all")
+        names = [line[2:].split("  ")[0] for line in out.splitlines() if line.startswith("  -")]
+        found |= {flag for name in names for flag in re.findall(r"--[\w.-]+", name)}
+        assert code == 0, words
+    listed = "".join(f"{flag}\n" for flag in sorted(found))
+    assert listed == recorded_text("flags.txt", listed), "look at the flags that came or went, then run `make record-flags`"
 
 
 def test_help_and_version_do_not_load_torch():
@@ -201,9 +196,8 @@ def test_bad_captures(capsys, capture, tmp_path):
     assert "--iterations" in fails(capsys, "train", "moe-gs", "--data", str(capture), "--out", str(tmp_path / "r"), "--iterations", "0")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.slow
-def test_a_signal_saves_and_ends_cleanly(number, capture, tmp_path):
+def test_a_signal_saves_and_ends_cleanly(capture, tmp_path):
     args = [
         sys.executable,
         "-m",
@@ -217,14 +211,17 @@ def test_a_signal_saves_and_ends_cleanly(number, capture, tmp_path):
         "--iterations",
         "20000",
     ]
-    process = subprocess.Popen(args, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    while process.poll() is None and not ((tmp_path / "metrics.jsonl").exists() and (tmp_path / "metrics.jsonl").stat().st_size):
-        time.sleep(0.1)
-    process.send_signal(number)
-    out, _ = process.communicate(timeout=400)
-    assert process.returncode == 128 + number and "--resume" in out and "Traceback" not in out, out
-    step = int(re.search(r"iteration ([\d,]+)[^\n]*--resume", out)[1].replace(",", ""))
-    assert (tmp_path / "checkpoints" / f"ckpt_{step:06d}.safetensors").is_file()
+    metrics = tmp_path / "metrics.jsonl"
+    for number, flags in ((signal.SIGINT, []), (signal.SIGTERM, ["--resume"])):
+        before = metrics.stat().st_size if metrics.exists() else 0
+        process = subprocess.Popen([*args, *flags], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        while process.poll() is None and not (metrics.exists() and metrics.stat().st_size > before):
+            time.sleep(0.1)
+        process.send_signal(number)
+        out, _ = process.communicate(timeout=400)
+        assert process.returncode == 128 + number and "--resume" in out and "Traceback" not in out, out
+        step = int(re.search(r"iteration ([\d,]+)[^\n]*--resume", out)[1].replace(",", ""))
+        assert (tmp_path / "checkpoints" / f"ckpt_{step:06d}.safetensors").is_file()
     again = [*args, "--resume", "--stop-at", str(step + 5)]
     done = subprocess.run(again, capture_output=True, text=True, check=False, timeout=400)
     assert done.returncode == 0 and f"iteration {step:,}" in done.stdout, done.stdout + done.stderr

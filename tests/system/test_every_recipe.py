@@ -1,4 +1,4 @@
-"""Every recipe on a shipped capture in thumbnails: trains, changes its rows, resumes to the bit, and is scored on held-out views."""
+"""Recipes of every composition on a shipped capture in thumbnails: train, change rows, resume to the bit, are scored."""
 
 import json
 import math
@@ -12,11 +12,11 @@ from scene_experts.core.types import Points
 from scene_experts.data.capture import Capture
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.score import evaluate
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene import restore_scene
 from scene_experts.training.config import Train
 from scene_experts.training.events import Densified, Finished, Started
+from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.lanes import slow_except
 from support.places import DEMO
@@ -47,7 +47,20 @@ def rows(cfg: Train, capture: Capture, out: Path, **run) -> tuple[list[int], lis
     return [seen[0].anchors, *(e.edit.anchors for e in seen if isinstance(e, Densified))], [seen[0].step, seen[-1].step]
 
 
-@pytest.mark.parametrize("recipe", slow_except(RECIPES, "moe-gs", "3dgs", "octree-gs", "sags"))
+FAMILIES = ("moe-gs", "3dgs", "octree-gs", "sags")
+PARTS = (
+    "scene-experts-wide",
+    "scaffold-gs-dist",
+    "scaffold-gs-depth3",
+    "moe-gs-posrouter",
+    "moe-gs-no-cl",
+    "moe-gs-e4-dense",
+    "moe-gs-e3-top1",
+)
+"""Compositions that no other training of the tests has; those of `support.scenes.METHODS` are resumed in unit/training/test_loop.py."""
+
+
+@pytest.mark.parametrize("recipe", slow_except((*FAMILIES, *PARTS), *FAMILIES))
 def test_it_trains_grows_resumes_to_the_bit_and_is_scored(recipe, buddha, tmp_path):
     cfg = short(recipe)
     whole, parts = tmp_path / "whole", tmp_path / "parts"

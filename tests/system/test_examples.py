@@ -98,5 +98,6 @@ def test_new_recipe(tmp_path, folder, recipe, option):
 
     size = ("--resolution", "longest:48", "--max-views", 16, "--iterations", 3, "--scene.voxel-size", 0.2)
     call("train", recipe, "--data", DEMO / "buddha", "--out", "run", *size, *option)
-    call("eval", "run", "--no-lpips")
+    if folder == "new_recipe":
+        call("eval", "run", "--no-lpips")
     assert recipe in (tmp_path / "run" / "config.json").read_text()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from scene_experts.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES
 from support.places import ROOT
 from support.pretend.start import explain_missing
 from support.synthetic import make_capture

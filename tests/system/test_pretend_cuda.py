@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import pytest
 
-from scene_experts.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES
 from support.pretend.start import run
 
 

@@ -3,7 +3,6 @@
 Record the seeds anew: SCENE_EXPERTS_RECORD=1 python -m pytest tests/system/test_quality.py
 """
 
-import json
 import statistics
 from dataclasses import replace
 
@@ -13,14 +12,14 @@ import torch
 from scene_experts.core.types import Mode
 from scene_experts.data.settings import Data
 from scene_experts.evaluate.metrics import psnr
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig
 from scene_experts.training.loop import Job, train
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 from support.captures import load
 from support.golden import recorded
-from support.places import DEMO, GOLDEN
+from support.places import DEMO
 from support.synthetic import make_capture
 
 BRIGHTON = DEMO / "brighton"
@@ -74,10 +73,7 @@ def held_out(captures):
     return score
 
 
-BOTH = [(recipe, name) for recipe in ("scaffold-gs", "moe-gs") for name in ("brighton", "coloured")]
-
-
-@pytest.mark.parametrize(("recipe", "name"), [*BOTH, ("3dgs", "coloured")])
+@pytest.mark.parametrize(("recipe", "name"), [("moe-gs", "brighton"), ("scaffold-gs", "coloured"), ("3dgs", "coloured")])
 @pytest.mark.slow
 def test_held_out_psnr_stays_within_three_sigma_of_the_recorded_seeds(name, recipe, held_out):
     key = f"{recipe} on {name}"
@@ -98,8 +94,8 @@ def test_growth_pays(held_out):
 
 @pytest.mark.slow
 def test_levels_of_detail_cost_less_than_a_decibel(held_out):
-    seeds = json.loads((GOLDEN / "quality.json").read_text())["scaffold-gs on brighton"]
-    assert held_out("brighton", "octree-moe-gs") > statistics.mean(seeds) - 1.0
+    octree, scaffold = (held_out("brighton", recipe, steps=300) for recipe in ("octree-moe-gs", "scaffold-gs"))
+    assert octree > scaffold - 1.0
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ Linear(in, 32) - ReLU - Linear(32, out) has 33 out + 32 (in + 1) parameters: wit
 import pytest
 
 from scene_experts.evaluate.results import describe_size
-from scene_experts.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES
 from support.scenes import start_scene
 
 PLAIN, LAYER, EXPERT = 7086, 3 * (32 * 32 + 32), 7185

@@ -17,7 +17,7 @@ LIMIT = 400  # seconds
 
 def command(folder: Path, out: Path) -> list[str]:
     words = ["-m", "scene_experts", "train", "scaffold-gs", "--data", str(folder), "--out", str(out), "--device", "cpu", "--deterministic"]
-    numbers = {"iterations": 600, "batch": 2, "stop-at": 200, "save-every": 40, "preview-every": 0, "growth.adjust.interval": 20}
+    numbers = {"iterations": 600, "batch": 2, "stop-at": 60, "save-every": 20, "preview-every": 0, "growth.adjust.interval": 20}
     return words + [word for name, value in numbers.items() for word in (f"--{name}", str(value))]
 
 

@@ -9,9 +9,9 @@ from typing import Any
 
 from scene_experts.core.fields import flag_of
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.training.config import Train
 from scene_experts.training.options import TrainOptions
+from scene_experts.training.recipes import RECIPES
 
 RECORDED = ("deterministic", "stop_at", "max_memory")
 """Options of a training that its results depend on."""

@@ -11,8 +11,8 @@ import numpy as np
 
 from scene_experts.core.errors import InputError, nearest
 from scene_experts.core.plain import from_json, to_json
-from scene_experts.recipes import RECIPES
 from scene_experts.training.config import Train, check
+from scene_experts.training.recipes import RECIPES
 
 Recipe = Train
 

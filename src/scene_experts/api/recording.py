@@ -13,9 +13,9 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.fields import check_fields
 from scene_experts.data.capture import Capture
-from scene_experts.files.export import result_warnings, write_result_folder
 from scene_experts.files.registry import exported_files
 from scene_experts.files.result_folder import DESCRIPTION
+from scene_experts.files.scene_folder import result_warnings, write_result_folder
 from scene_experts.render import Rasterizer
 from scene_experts.training import loop, run_folder
 from scene_experts.training.config import check

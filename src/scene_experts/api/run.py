@@ -163,7 +163,7 @@ class Run:
         """
         expect_among("show", show, SHOWS)
         view, background = self._view(camera)
-        return numpy(paint(self.scene, view, self.step, self._rasterize, background, Look(show, attribute), self._frozen()))
+        return numpy(paint(self.scene, view, self.step, self._rasterize, background, Look(show=show, attribute=attribute), self._frozen()))
 
     @torch.no_grad()
     def render_layers(self, camera: Camera) -> Layers:

@@ -15,11 +15,11 @@ from scene_experts.bench import raster
 from scene_experts.bench.machine import Machine, measure_multiply_adds
 from scene_experts.bench.measure import Clock, Figure, Missing, Result, Subject, choose_clock, measure_minima
 from scene_experts.core.types import Camera, Mode, Points
-from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer, choose
 from scene_experts.render.cpu import CpuRasterizer
 from scene_experts.training.config import with_numbers
 from scene_experts.training.losses import Sample, compute_terms
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 
 MIXTURE, BASELINE = "moe-gs", "scaffold-gs"

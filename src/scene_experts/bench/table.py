@@ -12,12 +12,12 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from scene_experts import __version__
 from scene_experts.bench import parts, raster, step
 from scene_experts.bench.machine import Machine, describe, measure_clock, measure_copy, measure_multiply_adds
 from scene_experts.bench.measure import Figure, Missing, Result
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import check_writable, write_json
+from scene_experts.core.version import __version__
 from scene_experts.native import library as native
 
 

@@ -85,8 +85,8 @@ def plan(args: list[str]) -> int:
     from scene_experts.core.io import write_bytes
     from scene_experts.data import capture as captures
     from scene_experts.data.blocks import make_blocks, write_plan
-    from scene_experts.recipes import RECIPES
     from scene_experts.training import run_folder
+    from scene_experts.training.recipes import RECIPES
 
     if command.data.views is not None:
         raise InputError(f"expected a plan of all training views, found --views {command.data.views}; leave it out")

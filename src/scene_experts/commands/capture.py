@@ -11,7 +11,7 @@ from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
 from scene_experts.core.errors import few
 from scene_experts.core.signals import handled
-from scene_experts.sfm.options import Options
+from scene_experts.sfm.options import SfmOptions
 
 MOST_REASONS = 8  # lines about photographs without a pose
 FEW = 0.9  # a smaller share of photographs with a pose gets a warning
@@ -29,7 +29,7 @@ class CaptureCommand:
     """Folder of photographs (JPEG, PNG and others, also in subfolders), or a video. CAPTURE/images is used in place."""
     out: Annotated[Path, Option(value="CAPTURE")]
     """Folder of the capture to write: images/, sparse/0/ and capture.json."""
-    options: Annotated[Options, Option(name="")] = Options()
+    options: Annotated[SfmOptions, Option(name="")] = SfmOptions()
     overwrite: bool = False
     """Replace existing poses and copied photographs once the new reconstruction is complete."""
 

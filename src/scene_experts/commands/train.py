@@ -26,7 +26,6 @@ from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.catalog import defaults_in
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.render import Rasterizer
 from scene_experts.training import run_folder
 from scene_experts.training.batch import check_batch
@@ -36,6 +35,7 @@ from scene_experts.training.loop import Job
 from scene_experts.training.memory import reuse_freed
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.progress import TrainingProgress
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.shards import check_shard
 from scene_experts.view.live import Live
 from scene_experts.view.server import check_port, import_viser

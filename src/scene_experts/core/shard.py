@@ -21,46 +21,51 @@ NUMBER = "number"  # fact [n] int64 of a divided table; checkpoints do not have 
 BLOCK = 1 << 16  # rows for which random numbers are drawn at once
 
 
-class Shard:
+class ShardedTable(Table):
     """The part of a table that this process holds. Every process must call the methods that exchange data in the same order."""
 
-    total: int
-    """Number of rows in all processes."""
+    def __init__(self, whole: Table, group: Alone) -> None:
+        """Take over the columns and moments of `whole`, which is equal in all processes of `group`, and keep the rows of this process."""
+        numbers = torch.arange(len(whole), device=whole.device)
+        super().__init__({}, {**whole.facts, NUMBER: numbers}, whole.stats)
+        self.params, self.averages, self._optimizer = whole.params, whole.averages, whole._optimizer
+        self.group, self._total = group, len(numbers)
+        self.keep(self.owned(numbers))
 
-    def __init__(self, table: Table, group: Alone) -> None:
-        """Keep the rows of this process in `table`, which is whole and equal in all processes of `group`."""
-        self.group, self.total = group, len(table)
-        numbers = torch.arange(self.total, device=table.device)
-        table.facts[NUMBER] = numbers
-        table.keep(self.owned(numbers))
-        table.shard = self
+    @property
+    def total(self) -> int:
+        return self._total
+
+    def append(self, new: dict[str, Tensor]) -> None:
+        super().append(new)
+        count = torch.tensor(len(new[NUMBER]), device=self.device)
+        self.group.sum(count)
+        self._total += int(count)
+
+    def drop(self, mask: Tensor) -> int:
+        """Remove the rows where `mask` [n] is true, and number the others anew. Returns how many were removed in all processes."""
+        numbers = self.facts[NUMBER]
+        gone = torch.cat(self.share(numbers[mask])).sort().values
+        if len(gone):
+            self.facts[NUMBER] = numbers - torch.searchsorted(gone, numbers)
+            self.keep(~mask)
+            self._total -= len(gone)
+        return len(gone)
+
+    def whole_fact(self, name: str) -> Tensor:
+        return torch.cat(self.share(self.facts[name]))[torch.cat(self.share(self.facts[NUMBER])).argsort()]
 
     def owned(self, numbers: Tensor) -> Tensor:
         """Return which of the new rows with these `numbers` [n] this process gets, [n] bool."""
         return numbers % self.group.size == self.group.rank
 
-    def drop(self, table: Table, mask: Tensor) -> int:
-        """Remove the rows where `mask` [n] is true in all processes, and number the others anew. Returns how many were removed in all."""
-        gone = torch.cat(self.share(table.facts[NUMBER][mask])).sort().values
-        if len(gone):
-            table.keep(~mask)
-            table.facts[NUMBER] = table.facts[NUMBER] - torch.searchsorted(gone, table.facts[NUMBER])
-            self.total -= len(gone)
-        return len(gone)
-
     def share(self, rows: Tensor) -> list[Tensor]:
         """Return the rows [n, ...] of every process, in the order of the processes; n may differ."""
         return self.group.exchange([rows] * self.group.size)
 
-    def whole(self, numbers: Tensor, column: Tensor) -> Tensor:
-        """Return the column of the whole table in every process, [total, ...]. numbers [n], column [n, ...]: those of this process."""
-        return torch.cat(self.share(column))[torch.cat(self.share(numbers)).argsort()]
-
-    def collect(self, numbers: Tensor, column: Tensor) -> Tensor:
-        """Return the whole column in process 0, [total, ...] on the CPU, and an empty one in the others.
-
-        numbers [n], column [n, ...]: those of this process.
-        """
+    def collect(self, column: Tensor) -> Tensor:
+        """Return the column [n, ...] of this process whole in process 0, [total, ...] on the CPU, and empty in the others."""
+        numbers = self.facts[NUMBER]
         rest = [column[:0]] * (self.group.size - 1)
         parts = self.group.exchange([column, *rest])
         places = self.group.exchange([numbers, *([numbers[:0]] * (self.group.size - 1))])
@@ -69,13 +74,13 @@ class Shard:
             out[place.cpu()] = part.detach().cpu()
         return out
 
-    def draw(self, generator: torch.Generator, numbers: Tensor, slots: Tensor, K: int) -> Tensor:
+    def draw(self, generator: torch.Generator, slots: Tensor, K: int) -> Tensor:
         """Return the random numbers in [0, 1) of some slots, [s]. On the CPU they are those of `torch.rand(total, K)`.
 
-        generator: the same in all processes.  numbers [n]: of the rows of this process.  slots [s]: row * K + slot, ascending.
+        generator: the same in all processes.  slots [s]: row * K + slot, ascending.
         """
         own = generator_on(slots.device, generator)
-        wanted = numbers[torch.div(slots, K, rounding_mode="floor")] * K + slots % K
+        wanted = self.facts[NUMBER][torch.div(slots, K, rounding_mode="floor")] * K + slots % K
         out = torch.empty(len(slots), device=slots.device)
         ends = torch.searchsorted(wanted, torch.arange(0, self.total + BLOCK, BLOCK, device=slots.device) * K).tolist()
         for block, (first, last) in enumerate(pairwise(ends)):

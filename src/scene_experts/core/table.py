@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import torch
 from torch import Tensor, nn
-
-if TYPE_CHECKING:
-    from scene_experts.core.shard import Shard
 
 
 class Table(nn.Module):
@@ -24,8 +21,6 @@ class Table(nn.Module):
     facts: dict[str, Tensor]
     stats: dict[str, Tensor]
     averages: dict[str, Tensor]
-    shard: Shard | None
-    """How the rows are divided among several processes; None: this process holds all rows."""
 
     def __init__(self, params: dict[str, Tensor], facts: dict[str, Tensor], stats: dict[str, Tensor] | None = None) -> None:
         super().__init__()
@@ -33,7 +28,6 @@ class Table(nn.Module):
         self.facts = dict(facts)
         self.stats = dict(stats or {})
         self.averages = {}
-        self.shard = None
         self._optimizer: torch.optim.Optimizer | None = None
         lengths = {name: value.shape[0] for name, value in self.columns().items()}
         if len(set(lengths.values())) > 1:
@@ -45,7 +39,7 @@ class Table(nn.Module):
     @property
     def total(self) -> int:
         """Number of rows in all processes."""
-        return len(self) if self.shard is None else self.shard.total
+        return len(self)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Apply `.to(...)` and similar methods to parameters, facts and statistics. Integer columns keep their dtype."""
@@ -108,12 +102,10 @@ class Table(nn.Module):
 
     def whole_fact(self, name: str) -> Tensor:
         """Return a fact of the rows of all processes, [total, ...]. Every process must call this."""
-        return self.facts[name] if self.shard is None else self.shard.whole(self.facts["number"], self.facts[name])
+        return self.facts[name]
 
     def drop(self, mask: Tensor) -> int:
         """Remove the rows where `mask` [N] (bool) is true. Returns how many were removed in all processes."""
-        if self.shard is not None:
-            return self.shard.drop(self, mask)
         gone = int(mask.sum())
         if gone:
             self.keep(~mask)

@@ -100,7 +100,7 @@ class Perceptual:
             try:
                 tensors, sources[net] = weights.load(net, explicit)
                 networks[net] = Lpips(net, tensors).to(device)
-            except weights.Missing as error:
+            except weights.MissingWeights as error:
                 absent |= {metric: str(error) for metric, backbone in NETWORKS.items() if backbone == net}
         return cls(networks, sources, absent)
 

@@ -61,14 +61,14 @@ class WeightSource:
     cached: bool = False  # whether it is the cache of this package
 
 
-class Missing(Exception):
+class MissingWeights(Exception):
     """There are no weights of a network on this machine. The message says what was found and what to do."""
 
 
 def load(net: str, explicit: Path | None = None) -> tuple[dict[str, Tensor], str]:
     """Return the tensors of `net` ("vgg" or "alex"), named as in `lpips.tensor_shapes`, and a description of their source.
 
-    A damaged or unknown file is skipped. Raises Missing if there are no weights, InputError if `explicit` (or the environment
+    A damaged or unknown file is skipped. Raises MissingWeights if there are no weights, InputError if `explicit` (or the environment
     variable) names nothing that could be weights.
     """
     notes: list[str] = []
@@ -92,7 +92,7 @@ def load(net: str, explicit: Path | None = None) -> tuple[dict[str, Tensor], str
             _write_cache(net, tensors, source.what)
         return tensors, source.what
     found = f" ({'; '.join(notes)})" if notes else ""
-    raise Missing(f"no weights of LPIPS ({net}) on this machine{found}: {HOW}")
+    raise MissingWeights(f"no weights of LPIPS ({net}) on this machine{found}: {HOW}")
 
 
 def download(net: str, *, backbones: str = TORCHVISION, linears: str = LPIPS, progress: ByteProgress | None = None) -> str:

@@ -16,18 +16,19 @@ from typing import Any
 import torch
 import yaml
 
-import scene_experts
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import check_writable, write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import opening
+from scene_experts.core.version import __version__
 from scene_experts.data.capture import Capture
 from scene_experts.evaluate.pictures import to_8bit, write_picture
 from scene_experts.evaluate.results import load_results
-from scene_experts.files.export import Written, export_several
+from scene_experts.files.export import export_several
 from scene_experts.files.measure import Painter, Tell, capture_if_there
 from scene_experts.files.options import DEFAULT, Options
 from scene_experts.files.registry import GAUSSIANS, format_named, formats_of
+from scene_experts.files.standard import Written
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.view.paths import choose_best_view
 
@@ -138,7 +139,7 @@ def make_card(
         result = {"task": task, "dataset": {"type": scene, "name": f"held-out views of {scene}"}, "metrics": metrics}
         head["model-index"] = [{"name": f"{scene}, {recipe}", "results": [result]}]
     lines = ["---", yaml.safe_dump(head, sort_keys=False, allow_unicode=True).strip(), "---", "", f"# {scene}", ""]
-    maker = f"scene-experts {scene_experts.__version__}"
+    maker = f"scene-experts {__version__}"
     lines += [f"![{scene}]({PREVIEW})", "", f"A 3D scene of Gaussians, trained from photographs by {maker} with"]
     lines += [f"the recipe `{recipe}` for {run.step:,} iterations.", "", "| file | content |", "|---|---|"]
     for file in files:

@@ -9,10 +9,10 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import guarding
 from scene_experts.data.settings import Data
-from scene_experts.files.export import write_result_folder
 from scene_experts.files.formats.ply import read_vertices
 from scene_experts.files.registry import FAMILIES, Family, family_named, recognise
 from scene_experts.files.result_folder import is_result, iteration_folder
+from scene_experts.files.scene_folder import write_result_folder
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig

@@ -16,7 +16,7 @@ from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.data.blocks import Block, read_plan
 from scene_experts.data.views import same_poses
-from scene_experts.files.export import write_result_folder
+from scene_experts.files.scene_folder import write_result_folder
 from scene_experts.scene import Scene
 from scene_experts.training import run_folder
 from scene_experts.training.run_folder import OpenRun

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 FORMATS = {
     "anchors": "scene_experts.files.anchors",
-    "compact": "scene_experts.files.formats.compact",
+    "compact": "scene_experts.files.anchors.compact",
     "ply": "scene_experts.files.formats.ply",
     "compressed-ply": "scene_experts.files.formats.compressed_ply",
     "splat": "scene_experts.files.formats.splat",

@@ -1,7 +1,7 @@
 """Load the compiled library built for this processor (sources in csrc/), or explain why there is none.
 
 `scene_experts/_native` holds one shared library per instruction set; `load` takes the best one that this processor runs and binds it to
-the interface of `api.py`. Of the package this module imports only the errors, so every layer may use it.
+the interface of `api.py`. Of the package this module imports only two modules of `core`, so every layer may use it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-import scene_experts
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.version import package_folders
 from scene_experts.native import api
 
 LEVELS = ("avx512", "avx2", "portable")  # best first
@@ -39,8 +39,8 @@ def list_levels() -> tuple[str, ...]:
 
 def find(level: str) -> Path | None:
     """The path of the installed library for `level`, or None."""
-    for root in scene_experts.__path__:
-        candidate = Path(root) / "_native" / f"se_{level}{_SUFFIX}"
+    for folder in package_folders():
+        candidate = folder / "_native" / f"se_{level}{_SUFFIX}"
         if candidate.is_file():
             return candidate
     return None

@@ -20,7 +20,7 @@ from scene_experts.evaluate.results import describe_failed, find_difference, fin
 from scene_experts.evaluate.tables import ResultTable, explain, make_table
 from scene_experts.report import chart
 from scene_experts.report.chart import Line
-from scene_experts.report.source import Source, group_by_capture, read_run, tell_apart
+from scene_experts.report.source import ShownRun, group_by_capture, read_run, tell_apart
 from scene_experts.report.views import encode_picture, show_captures
 
 NAME = "report.html"
@@ -53,7 +53,7 @@ def write(runs: Sequence[Path], out: Path | None = None) -> Path:
     return path
 
 
-def build_page(sources: Sequence[Source]) -> str:
+def build_page(sources: Sequence[ShownRun]) -> str:
     """Return the page as HTML."""
     names, results = [s.name for s in sources], [s.results for s in sources]
     title = f"{', '.join(names)} on {', '.join(dict.fromkeys(str(r.get('capture', '?')) for r in results))}"
@@ -95,7 +95,7 @@ def describe_scores(r: dict[str, Any]) -> str:
     return f"{r.get('view_count')} {views} views ({r.get('split')}), {r.get('resolution')}{steps}"
 
 
-def find_failures(sources: Sequence[Source]) -> list[str]:
+def find_failures(sources: Sequence[ShownRun]) -> list[str]:
     """Return a sentence for each run about the views that fail."""
     found = [(s.name, describe_failed(s.per_view)) for s in sources]
     return [text if len(sources) == 1 else f"{name}: {text}" for name, text in found if text]
@@ -127,7 +127,7 @@ def format_table(found: ResultTable) -> str:
     return f"<div class='wide' tabindex=0><table><tr>{head}</tr>{rows}</table></div>{notes}<dl class=terms>{items}</dl>"
 
 
-def explain_curves(sources: Sequence[Source]) -> str:
+def explain_curves(sources: Sequence[ShownRun]) -> str:
     """Return what the curves of the training show, as HTML."""
     terms = sorted({t for s in sources for m in s.metrics for t in m.get("terms", {})})
     named = "; ".join(LOSSES.get(term, f"{term}: a term of the recipe") for term in terms)
@@ -135,7 +135,7 @@ def explain_curves(sources: Sequence[Source]) -> str:
     return f"<p class='soft'>{text}{f' Losses: {escape(named)}.' if named else ''}</p>"
 
 
-def draw_curves(sources: Sequence[Source]) -> str:
+def draw_curves(sources: Sequence[ShownRun]) -> str:
     """Draw charts over the iterations: PSNR, losses, anchors, Gaussians, active share, wall time."""
 
     def series(key: str, factor: float = 1.0, smooth: bool = True, anchored: bool = False) -> list[Line]:
@@ -163,7 +163,7 @@ def draw_curves(sources: Sequence[Source]) -> str:
     return "".join(parts)
 
 
-def show_experts(sources: Sequence[Source]) -> str:
+def show_experts(sources: Sequence[ShownRun]) -> str:
     """Show the experts' shares at the end, one view by the anchors of each expert, and curves of shares and gate entropy.
 
     Empty without experts.
@@ -189,7 +189,7 @@ def show_experts(sources: Sequence[Source]) -> str:
     return f"<h2>Experts</h2>{note}{''.join(bars)}{alone}<div class='charts'>{''.join(charts)}</div>"
 
 
-def show_strips(s: Source) -> str:
+def show_strips(s: ShownRun) -> str:
     """Show one held-out view by the anchors of each expert: colour open, other attributes folded. Empty without such pictures."""
     folder = s.path / "test" / "experts"
     found = {a: inside(folder, f"{a}.png") for a in s.results.get("experts") or {}}
@@ -209,7 +209,7 @@ def show_strips(s: Source) -> str:
     return f"<p><b>{escape(s.name)}</b>, {view}: <span class='soft'>{escape(how)}.</span></p>{images[0]}{folded}"
 
 
-def format_scores(sources: Sequence[Source]) -> str:
+def format_scores(sources: Sequence[ShownRun]) -> str:
     """Return the table of scores by view as HTML."""
     rows = []
     failed = {name for s in sources for name in find_failed(s.per_view)}
@@ -226,7 +226,7 @@ def format_scores(sources: Sequence[Source]) -> str:
     return f"<div class='wide' tabindex=0><table><tr><th>view</th>{head}</tr>{''.join(rows)}</table></div>"
 
 
-def show_command(s: Source) -> str:
+def show_command(s: ShownRun) -> str:
     """Show the command that repeats a run, and its configuration."""
     line = s.config.command or "This run was trained by another program."
     config = json.dumps(to_json(s.config), indent=1)

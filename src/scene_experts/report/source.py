@@ -20,7 +20,7 @@ from scene_experts.training.config import RunConfig
 
 
 @dataclass(frozen=True)
-class Source:
+class ShownRun:
     """What the page shows of one run. `metrics`: lines of metrics.jsonl; `per_view`: scores by the name of a view."""
 
     name: str
@@ -31,7 +31,7 @@ class Source:
     metrics: list[dict[str, Any]]
 
 
-def read_run(run: Path) -> Source:
+def read_run(run: Path) -> ShownRun:
     """Read a run folder. Raises InputError if it is not evaluated or its scores by view are invalid."""
     config, results = run_folder.read_config(run), load_results(run)
     path = run / "per_view.json"
@@ -41,10 +41,10 @@ def read_run(run: Path) -> Source:
     with guarding(path, RUN, "file of scores by view"):
         for facts in per_view.values():
             inside(run / "test" / "gt", facts["file"])
-    return Source(config.train.recipe, run, config, results, per_view, read_metrics(run / "metrics.jsonl"))
+    return ShownRun(config.train.recipe, run, config, results, per_view, read_metrics(run / "metrics.jsonl"))
 
 
-def tell_apart(sources: list[Source]) -> list[Source]:
+def tell_apart(sources: list[ShownRun]) -> list[ShownRun]:
     """Give runs of the same recipe different names."""
     names = distinguish_runs([s.path for s in sources], [s.name for s in sources])
     return [replace(s, name=name) for s, name in zip(sources, names)]
@@ -55,12 +55,12 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     return [line for line in read_json_lines(path) if isinstance(line.get("step"), (int, float))] if path.is_file() else []
 
 
-def group_by_capture(sources: Sequence[Source]) -> dict[str, list[Source]]:
+def group_by_capture(sources: Sequence[ShownRun]) -> dict[str, list[ShownRun]]:
     """Group runs by the name and the camera poses of their capture: only these can have views in common.
 
     The keys are the names, with a number where captures of one name have other poses.
     """
-    groups: dict[str, list[Source]] = {}
+    groups: dict[str, list[ShownRun]] = {}
     for s in sources:
         name, number = str(s.results.get("capture", "?")), 1
         key = name
@@ -71,6 +71,6 @@ def group_by_capture(sources: Sequence[Source]) -> dict[str, list[Source]]:
     return groups
 
 
-def find_common_views(sources: Sequence[Source]) -> list[str]:
+def find_common_views(sources: Sequence[ShownRun]) -> list[str]:
     """Return the names of the views that every run was scored on."""
     return [name for name in sources[0].per_view if all(name in s.per_view for s in sources)]

@@ -12,14 +12,14 @@ from statistics import fmean
 from PIL import Image
 
 from scene_experts.evaluate.pictures import read_picture
-from scene_experts.report.source import Source, find_common_views
+from scene_experts.report.source import ShownRun, find_common_views
 
 MOST_VIEWS = 8  # of a capture; pictures are most of a page's bytes
 LONGEST = 960  # px; larger pictures are scaled down
 QUALITY = 88  # of the JPEGs
 
 
-def show_captures(groups: dict[str, list[Source]]) -> tuple[str, dict[str, str]]:
+def show_captures(groups: dict[str, list[ShownRun]]) -> tuple[str, dict[str, str]]:
     """Return the held-out views of each capture as HTML, and their pictures as data URLs by key."""
     pictures: dict[str, str] = {}
     parts = []
@@ -33,7 +33,7 @@ def show_captures(groups: dict[str, list[Source]]) -> tuple[str, dict[str, str]]
     return "\n".join(parts), pictures
 
 
-def show_views(sources: Sequence[Source], prefix: str) -> tuple[str, dict[str, str]]:
+def show_views(sources: Sequence[ShownRun], prefix: str) -> tuple[str, dict[str, str]]:
     """Return up to MOST_VIEWS views with their sliders as HTML, and their pictures as data URLs by key. Keys start with `prefix`."""
     pictures: dict[str, str] = {}
     blocks = []
@@ -75,7 +75,7 @@ def encode_picture(path: Path, longest: int = LONGEST) -> str:
     return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
 
 
-def choose_shown(sources: Sequence[Source], names: Sequence[str]) -> list[tuple[str, str]]:
+def choose_shown(sources: Sequence[ShownRun], names: Sequence[str]) -> list[tuple[str, str]]:
     """Return up to MOST_VIEWS views as (name, label): the best and the worst by mean PSNR over the runs, then others in order."""
     scores = {n: [s.per_view[n]["psnr"] for s in sources if s.per_view[n].get("psnr") is not None] for n in names}
     scored = sorted((name for name in names if scores[name]), key=lambda name: fmean(scores[name]))

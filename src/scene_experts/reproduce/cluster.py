@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 from filelock import FileLock
 
-import scene_experts
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.version import __version__
 from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import Spec
 from scene_experts.reproduce.runner import Failure, Runner, build_kernels
@@ -78,7 +78,7 @@ class ClusterRunner(Runner):
             job = Job(there, self.runs, self.records, token, f"[{number + 1}/{len(todo)}]", self.resources)
             future = client.submit(
                 task,
-                scene_experts.__version__,
+                __version__,
                 pickle.dumps(job),
                 key=f"scene-experts-{spec.key}-{token[1:]}",
                 resources=self.resources or None,
@@ -197,12 +197,11 @@ def make_task() -> Callable[[str, bytes], tuple[str, str]]:
 
         where = get_worker().address
         try:
-            import scene_experts
+            from scene_experts.core.version import __version__ as found
             from scene_experts.reproduce.cluster import work
         except ImportError as error:
             return "input", f"expected scene-experts {version} on the worker {where}, found none ({error}); install it there"
-        if scene_experts.__version__ != version:
-            found = scene_experts.__version__
+        if found != version:
             return "input", f"expected scene-experts {version} on the worker {where}, found version {found}; install the same version there"
         return work(job)
 

@@ -29,7 +29,7 @@ OWN = "captures"  # the data set of the user's own captures
 
 
 @dataclass(frozen=True)
-class Scene:
+class CaptureSpec:
     """A capture to train on. Its protocol sets `options` of Data (resolution, split, normalise, ...) and `numbers` of Train."""
 
     name: str
@@ -78,7 +78,7 @@ def shrink(policy: str, share: float) -> str:
 class Spec:
     """One run: a recipe on a scene with a seed. The recipe may have flags: "moe-gs --scene.hidden 8"."""
 
-    scene: Scene
+    scene: CaptureSpec
     recipe: str
     seed: int
     scale: Scale
@@ -172,9 +172,9 @@ def parts_of(value: Any) -> Iterator[Any]:
             yield from parts_of(entry)
 
 
-def find_own_scenes(captures: Sequence[Path]) -> list[Scene]:
+def find_own_scenes(captures: Sequence[Path]) -> list[CaptureSpec]:
     """Return the user's captures as scenes of one data set. Raises InputError where a folder is missing or two have the same name."""
-    scenes = [Scene(path.resolve().name, OWN, path) for path in captures]
+    scenes = [CaptureSpec(path.resolve().name, OWN, path) for path in captures]
     for scene in scenes:
         if not scene.path.is_dir():
             raise InputError(f"expected a capture folder at {scene.path}, found none; correct --captures")
@@ -183,24 +183,24 @@ def find_own_scenes(captures: Sequence[Path]) -> list[Scene]:
     return scenes
 
 
-def check_folders(scenes: Sequence[Scene]) -> None:
+def check_folders(scenes: Sequence[CaptureSpec]) -> None:
     """Raise InputError for a scene whose folder is not a capture: all its runs would fail."""
     for scene in scenes:
         if not is_capture(scene.path):
             raise unrecognised_error(scene.path)
 
 
-def find_paper_scenes(root: Path) -> list[Scene]:
+def find_paper_scenes(root: Path) -> list[CaptureSpec]:
     """Find the paper's scenes below `root`, each with the paper's protocol. As in the paper's code, they keep their own units."""
     found = []
     for scene in catalog.SCENES:
         if is_present(root, scene):
             options = {"resolution": scene.resolution, "split": scene.split, "normalise": "none"}
-            found.append(Scene(scene.name, COLLECTIONS[scene.collection.key], root / scene.path, options, scene.collection.numbers))
+            found.append(CaptureSpec(scene.name, COLLECTIONS[scene.collection.key], root / scene.path, options, scene.collection.numbers))
     return found
 
 
-def list_runs(experiments: Iterable[Experiment], scenes: Sequence[Scene], seeds: Sequence[int], scale: Scale) -> list[Spec]:
+def list_runs(experiments: Iterable[Experiment], scenes: Sequence[CaptureSpec], seeds: Sequence[int], scale: Scale) -> list[Spec]:
     """List the runs that experiments need, each once. All runs of a seed come before the next seed, so a table is complete early.
 
     The user's own captures are used in place of every data set. The paper's scenes are used in the experiments that name them.

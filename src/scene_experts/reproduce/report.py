@@ -17,7 +17,7 @@ from scene_experts.render import choose
 from scene_experts.reproduce import claims, figures, store, tables
 from scene_experts.reproduce.compare import COMPARE, make_difference_tables
 from scene_experts.reproduce.experiments import Experiment
-from scene_experts.reproduce.plan import OWN, Scene, Spec, code_of
+from scene_experts.reproduce.plan import OWN, CaptureSpec, Spec, code_of
 from scene_experts.reproduce.statistics import SEED_SD, SEED_WEIGHT, on_common_scenes
 from scene_experts.reproduce.store import Record
 from scene_experts.training import run_folder
@@ -28,7 +28,7 @@ DISJOINT = "No scene has runs of every row: each mean is over the scenes of its 
 
 
 def write(
-    out: Path, experiments: Sequence[Experiment], scenes: Sequence[Scene], records: Sequence[Record], command: str = ""
+    out: Path, experiments: Sequence[Experiment], scenes: Sequence[CaptureSpec], records: Sequence[Record], command: str = ""
 ) -> list[Path]:
     """Write the files of experiments below `out` and return their paths. Ignores records of other scenes. The page quotes `command`."""
     wanted = {scene.name for scene in scenes}
@@ -87,7 +87,7 @@ def caveat(records: Sequence[Record]) -> list[str]:
     return [f"The verdicts are from trainings of {size}. {meaning}", ""]
 
 
-def write_tables(out: Path, experiment: Experiment, scenes: Sequence[Scene], records: Sequence[Record]) -> list[Path]:
+def write_tables(out: Path, experiment: Experiment, scenes: Sequence[CaptureSpec], records: Sequence[Record]) -> list[Path]:
     """Write an experiment's tables: means for each data set, and the first column scene by scene."""
     made: dict[str, ResultTable] = {}
     datasets = list(dict.fromkeys(s.dataset for s in scenes if s.dataset == OWN or s.dataset in experiment.datasets))
@@ -119,7 +119,7 @@ def write_tables(out: Path, experiment: Experiment, scenes: Sequence[Scene], rec
     return out_paths
 
 
-def write_figures(out: Path, experiment: Experiment, scenes: Sequence[Scene], records: Sequence[Record]) -> list[Path]:
+def write_figures(out: Path, experiment: Experiment, scenes: Sequence[CaptureSpec], records: Sequence[Record]) -> list[Path]:
     """Write the charts of a figure; nothing for a table, or where no run is finished."""
     names = [s.name for s in scenes]
     if experiment.name == "fig1b":

@@ -12,17 +12,26 @@ from scene_experts.data.fetch.obtain import captures_dir
 from scene_experts.reproduce.compare import COMPARE, make_comparison
 from scene_experts.reproduce.experiments import EXPERIMENTS, OURS, Experiment
 from scene_experts.reproduce.options import ReproduceOptions
-from scene_experts.reproduce.plan import Scale, Scene, Spec, check_folders, drop_repeated, find_own_scenes, find_paper_scenes, list_runs
+from scene_experts.reproduce.plan import (
+    CaptureSpec,
+    Scale,
+    Spec,
+    check_folders,
+    drop_repeated,
+    find_own_scenes,
+    find_paper_scenes,
+    list_runs,
+)
 from scene_experts.reproduce.variants import split_name
 from scene_experts.training.config import check
 
 
 @dataclass(frozen=True)
-class Plan:
+class StudyPlan:
     """The runs that the options request."""
 
     experiments: list[Experiment]
-    scenes: list[Scene]
+    scenes: list[CaptureSpec]
     shown: list[Spec]
     """The runs of the tables."""
     wanted: list[Spec]
@@ -31,7 +40,7 @@ class Plan:
     runs: Path
 
 
-def make_plan(options: ReproduceOptions) -> Plan:
+def make_plan(options: ReproduceOptions) -> StudyPlan:
     """The plan of the options.
 
     Raises InputError for unknown experiments, scenes and recipes, for settings that `train` refuses, and for folders that are files.
@@ -48,7 +57,7 @@ def make_plan(options: ReproduceOptions) -> Plan:
     for spec in shown:
         check(spec.train)
     records, runs = options.records or options.out / "records", options.runs or options.out / "runs"
-    return Plan(chosen, scenes, shown, drop_repeated(shown), records, runs)
+    return StudyPlan(chosen, scenes, shown, drop_repeated(shown), records, runs)
 
 
 def choose_rows(experiments: list[Experiment], recipes: tuple[str, ...]) -> list[Experiment]:
@@ -77,7 +86,7 @@ def choose_experiments(options: ReproduceOptions) -> list[Experiment]:
     return [make_comparison(options) if name == COMPARE else EXPERIMENTS[name] for name in names]
 
 
-def choose_scenes(options: ReproduceOptions) -> list[Scene]:
+def choose_scenes(options: ReproduceOptions) -> list[CaptureSpec]:
     """The captures of the options: the user's own, or the paper's scenes on this machine. Raises InputError for unknown scenes."""
     root = options.data or captures_dir()
     scenes = find_own_scenes(options.captures) if options.captures else find_paper_scenes(root)
@@ -94,7 +103,7 @@ def choose_scenes(options: ReproduceOptions) -> list[Scene]:
     return [s for s in scenes if not options.scenes or s.name in options.scenes]
 
 
-def written_command(options: ReproduceOptions, scenes: list[Scene]) -> str:
+def written_command(options: ReproduceOptions, scenes: list[CaptureSpec]) -> str:
     """The command that makes these tables and figures, without paths of this machine."""
     words = ["scene-experts", "reproduce", *options.experiments]
     if options.captures:

@@ -12,7 +12,7 @@ from scene_experts.reproduce.cluster import ClusterRunner
 from scene_experts.reproduce.experiments import EXPERIMENTS
 from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.plan import Spec
-from scene_experts.reproduce.request import Plan, make_plan, written_command
+from scene_experts.reproduce.request import StudyPlan, make_plan, written_command
 from scene_experts.reproduce.runner import Failure, Runner, Say
 
 
@@ -46,7 +46,7 @@ def reproduce(options: ReproduceOptions, say: Say) -> bool:
     return True
 
 
-def make_runner(options: ReproduceOptions, plan: Plan, say: Say, draw: Callable[[Spec, Path], None]) -> Runner:
+def make_runner(options: ReproduceOptions, plan: StudyPlan, say: Say, draw: Callable[[Spec, Path], None]) -> Runner:
     """The runner of the options: the workers of a cluster (--cluster), or processes of this machine."""
     if options.cluster is not None:
         cluster = {"address": options.cluster, "resources": options.needs()}
@@ -54,7 +54,7 @@ def make_runner(options: ReproduceOptions, plan: Plan, say: Say, draw: Callable[
     return Runner(plan.runs, plan.records, options.worker_count, options.devices, options.discard, say, draw)
 
 
-def list_plan(plan: Plan, say: Say) -> None:
+def list_plan(plan: StudyPlan, say: Say) -> None:
     """List which runs are done and which are not."""
     there = store.load(plan.records)
     done = [store.find(there, spec) is not None for spec in plan.wanted]
@@ -63,7 +63,7 @@ def list_plan(plan: Plan, say: Say) -> None:
     say(f"{len(plan.wanted)} runs, {sum(done)} of them done")
 
 
-def figure_drawer(options: ReproduceOptions, plan: Plan) -> Callable[[Spec, Path], None]:
+def figure_drawer(options: ReproduceOptions, plan: StudyPlan) -> Callable[[Spec, Path], None]:
     """A function that draws Figure 5 from a run folder, if the figure is requested and the run belongs to it and has the first seed."""
     figure5 = set(EXPERIMENTS["fig5"].rows.values()) if any(e.name == "fig5" for e in plan.experiments) else set()
 
@@ -74,7 +74,7 @@ def figure_drawer(options: ReproduceOptions, plan: Plan) -> Callable[[Spec, Path
     return draw
 
 
-def run_plan(runner: Runner, plan: Plan, out: Path) -> list[Failure]:
+def run_plan(runner: Runner, plan: StudyPlan, out: Path) -> list[Failure]:
     """Train the missing runs and draw missing pictures of the finished ones into `out`; returns the runs that failed."""
     with handled(lambda *_: runner.end()):
         failures = runner.run_all(plan.wanted)

@@ -11,8 +11,8 @@ from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, HelpAsked, parse
 from scene_experts.core.errors import InputError, nearest
 from scene_experts.data.fetch.catalog import Numbers
-from scene_experts.recipes import RECIPES
 from scene_experts.training.config import Train, with_numbers
+from scene_experts.training.recipes import RECIPES
 
 SET_HERE = ("--iterations", "--seed")
 """Flags that `reproduce` sets itself."""

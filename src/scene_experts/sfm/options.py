@@ -17,7 +17,7 @@ Matching = Literal["auto", "exhaustive", "sequential"]
 
 
 @dataclass(frozen=True)
-class Options:
+class SfmOptions:
     """Settings of the reconstruction."""
 
     frames: int = 150

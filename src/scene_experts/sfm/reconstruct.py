@@ -25,7 +25,7 @@ from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
 from scene_experts.sfm import frames, photos, work, worker
 from scene_experts.sfm.masks import write_masks
-from scene_experts.sfm.options import Matching, Options
+from scene_experts.sfm.options import Matching, SfmOptions
 from scene_experts.sfm.photos import Photo
 
 LOG, NOTE, VIDEO = "colmap.log", "capture.json", "video.txt"
@@ -37,7 +37,7 @@ Say = Callable[[str], None]
 
 
 def reconstruct(
-    source: Path, out: Path, options: Options, *, overwrite: bool = False, say: Say = print, progress: Progress = lambda *_: None
+    source: Path, out: Path, options: SfmOptions, *, overwrite: bool = False, say: Say = print, progress: Progress = lambda *_: None
 ) -> dict[str, Any]:
     """Make the capture `out` from the photographs in the folder `source`, or from the frames of the video `source`.
 
@@ -131,7 +131,7 @@ def check_request(source: Path, out: Path, overwrite: bool) -> None:
         raise InputError(f"{out / 'images'} holds images that `capture` did not copy there; choose another --out")
 
 
-def extract_photos(video: Path, images: Path, options: Options, progress: Progress) -> list[Photo]:
+def extract_photos(video: Path, images: Path, options: SfmOptions, progress: Progress) -> list[Photo]:
     """Extract the frames of a video into `images` and return them. Frames of an earlier call with the same video are reused."""
     note, mark = images.with_name(VIDEO), f"{video.name} {video.stat().st_size} {video.stat().st_mtime_ns} {options.frames}"
     if not note.is_file() or note.read_text() != mark:
@@ -158,7 +158,7 @@ def choose_pairs(count: int, matching: Matching = "auto", neighbours: int = NEIG
     return [(i, i + step) for i in range(count) for step in steps if i + step < count]
 
 
-def prepare_folder(folder: Path, found: list[Photo], options: Options, masks: list[str]) -> None:
+def prepare_folder(folder: Path, found: list[Photo], options: SfmOptions, masks: list[str]) -> None:
     """Empty the work folder for this request. The database is kept if it holds features of the same photographs and masks.
 
     masks: Checksums of the masks.
@@ -236,7 +236,7 @@ def last_log_line(log: Path) -> str:
 
 
 def describe_result(
-    result: dict[str, Any], found: list[Photo], options: Options, seconds: float, *, copied: bool, exhaustive: bool
+    result: dict[str, Any], found: list[Photo], options: SfmOptions, seconds: float, *, copied: bool, exhaustive: bool
 ) -> dict[str, Any]:
     """Return the content of capture.json.
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from scene_experts.core.fields import Count, Range, flag_of
 from scene_experts.core.parts import register
 from scene_experts.core.random import generator_on
-from scene_experts.core.shard import NUMBER
+from scene_experts.core.shard import NUMBER, ShardedTable
 from scene_experts.geometry.voxel import AXIS_LIMIT, coarsen, in_set, pack, scatter_max
 from scene_experts.strategy.control import AnchorControl, L
 from scene_experts.strategy.errors import find_wrong
@@ -52,12 +52,12 @@ class GrowAnchors(AnchorControl[L]):
 
         Returns the number of new anchors and whether the limit rejected candidates.
         """
-        search = self.search if scene.table.shard is None else self.search_shards
-        rows, born, capped = search(scene, generator, cap)  # `search` frees its buffers before the columns are copied
+        table = scene.table  # `search` frees its buffers before the columns are copied
+        rows, born, capped = (
+            self.search_shards(scene, table, generator, cap) if isinstance(table, ShardedTable) else self.search(scene, generator, cap)
+        )
         if rows:
-            scene.table.append({name: torch.cat([row[name] for row in rows]) for name in rows[0]})
-        if scene.table.shard is not None:
-            scene.table.shard.total += born
+            table.append({name: torch.cat([row[name] for row in rows]) for name in rows[0]})
         return born, capped
 
     def needs_whole_table(self) -> str:
@@ -113,21 +113,22 @@ class GrowAnchors(AnchorControl[L]):
             slots, g, parents, points = (part.index_select(0, here) for part in (slots, g, parents, points))
         return eligible, slots, g, parents, points / scene.voxel
 
-    def search_shards(self, scene: L, generator: torch.Generator, cap: int = 0) -> tuple[list[dict[str, Tensor]], int, bool]:
+    def search_shards(
+        self, scene: L, table: ShardedTable, generator: torch.Generator, cap: int = 0
+    ) -> tuple[list[dict[str, Tensor]], int, bool]:
         """Do the same as `search` for a table that is divided among several processes. Returns the new rows of this process."""
-        table, stats, shard = scene.table, scene.table.stats, scene.table.shard
-        assert shard is not None
+        stats = table.stats
         eligible, slots, g, parents, fine = self.candidates(scene)
         cells, rows, born, capped = table.facts["cell"], [], 0, False
         for level, factor in enumerate(self.cell_factors()):
             chosen = g >= self.grad_threshold * (self.hierarchy_factor // 2) ** level
             if self.elimination:
-                chosen &= shard.draw(generator, table.facts[NUMBER], slots, scene.K) > 0.5 ** (level + 1)
-            found = Candidates(shard, table.params["feature"], cells, fine[chosen], parents[chosen], g[chosen], factor)
-            best = strongest(found.strength, cap, shard.total + born)
+                chosen &= table.draw(generator, slots, scene.K) > 0.5 ** (level + 1)
+            found = Candidates(table, table.params["feature"], cells, fine[chosen], parents[chosen], g[chosen], factor)
+            best = strongest(found.strength, cap, table.total + born)
             capped |= len(best) < len(found.cells)
-            numbers = shard.total + born + torch.arange(len(best), device=best.device)
-            own, feature = shard.owned(numbers), found.features_of(best, numbers % shard.group.size)
+            numbers = table.total + born + torch.arange(len(best), device=best.device)
+            own, feature = table.owned(numbers), found.features_of(best, numbers % table.group.size)
             new = found.cells[best[own]]
             rows.append({**scene.new_rows(new * factor, scene.voxel * factor, feature), NUMBER: numbers[own]})
             cells, born = torch.cat([cells, rows[-1]["cell"]]), born + len(best)

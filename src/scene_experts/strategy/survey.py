@@ -26,7 +26,7 @@ class Draw(Protocol):
 
 
 @dataclass(frozen=True)
-class Photo:
+class TrainingPhoto:
     """A training view."""
 
     camera: Camera
@@ -39,7 +39,7 @@ class Survey:
     """The training views and the means to draw them."""
 
     views: Sequence[int]
-    photo: Callable[[int], Photo]
+    photo: Callable[[int], TrainingPhoto]
     draw: Draw
     background: Tensor  # [3]
 
@@ -49,7 +49,7 @@ class Survey:
         return [self.views[i] for i in order[: count or len(order)]]
 
     @torch.no_grad()
-    def see(self, scene: Scene, view: int, step: int, weigh: Callable[[Tensor, Photo], Tensor]) -> tuple[Decoded, Tensor]:
+    def see(self, scene: Scene, view: int, step: int, weigh: Callable[[Tensor, TrainingPhoto], Tensor]) -> tuple[Decoded, Tensor]:
         """Draw a view. Returns the decoded scene and the sums [M, 3] over pixels of T alpha times `weigh(image, photo)` [H, W, 3]."""
         photo = self.photo(view)
         decoded = scene(photo.camera, step, Mode.DRAW, self.draw.visible)
@@ -60,12 +60,12 @@ class Survey:
         return decoded, sums.clamp_min_(0)
 
 
-def weigh_all(image: Tensor, photo: Photo) -> Tensor:
+def weigh_all(image: Tensor, photo: TrainingPhoto) -> Tensor:
     """Weights of 1, so that all three sums are the contribution."""
     return torch.ones_like(image)
 
 
-def weigh_errors(image: Tensor, photo: Photo, quantile: float) -> Tensor:
+def weigh_errors(image: Tensor, photo: TrainingPhoto, quantile: float) -> Tensor:
     """Weights [H, W, 3]: 1, then 1 at pixels whose error is above the quantile of the picture, then the error.
 
     The error of a pixel is the mean over the channels of |image - photograph|. The weights of masked pixels are 0.

@@ -21,7 +21,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.render import Rasterizer, for_growth
 from scene_experts.scene import Scene
 from scene_experts.strategy import Edit
-from scene_experts.strategy.survey import Photo, Survey
+from scene_experts.strategy.survey import Survey, TrainingPhoto
 from scene_experts.training.batch import Direct, check_batch, make_exchange
 from scene_experts.training.config import RunConfig, Train, find_unused
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
@@ -264,11 +264,11 @@ def see_view(
 def survey_of(training: Training, run: Job, capture: Capture, rasterize: Rasterizer) -> Survey:
     """Return the training views as densification can look at them."""
 
-    def photo(index: int) -> Photo:
+    def photo(index: int) -> TrainingPhoto:
         frame = capture.frame(index)
         mask = None if frame.mask is None else upload(frame.mask, run.device, run.dtype)
         image = upload(frame.rgb, run.device, run.dtype).div_(255.0)
-        return Photo(capture.views[index].camera.to(run.device, run.dtype), image, mask)
+        return TrainingPhoto(capture.views[index].camera.to(run.device, run.dtype), image, mask)
 
     return Survey(capture.train, photo, rasterize, torch.tensor(capture.background))
 

@@ -22,23 +22,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import scene_experts
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError, few
 from scene_experts.core.io import locked, read_json, write_json
 from scene_experts.core.plain import MOST_DIFFERENCES, UnknownPart, differences, from_json, to_json
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding
+from scene_experts.core.version import __version__
 from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.scene import Scene
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.training import capture_place
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig
+from scene_experts.training.recipes import RECIPES
 
 FORMAT = 1
 PICTURES = ("renders", "gt", "errors", "side_by_side", "masks", "experts")  # folders with the images of an evaluation
@@ -60,7 +60,7 @@ class OpenRun:
 def versions() -> dict[str, str]:
     """Return the versions of the software and the machine type that a run records."""
     return {
-        "scene-experts": scene_experts.__version__,
+        "scene-experts": __version__,
         "torch": torch.__version__,
         "python": platform.python_version(),
         "machine": platform.machine(),

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.group import Alone
-from scene_experts.core.shard import NUMBER, Shard, pack_rows, unpack_rows
+from scene_experts.core.shard import NUMBER, ShardedTable, pack_rows, unpack_rows
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Mode, Render
 from scene_experts.scene import Cull
@@ -33,7 +33,7 @@ class Sharded(Reduced):
 
     scene: AnchorScene
     view: AnchorScene | None  # the rows of the view that this process draws
-    shard: Shard
+    table: ShardedTable
 
     def __init__(self, training: Training, group: Alone, stop: list[str], ordered: bool) -> None:
         """ordered: add the gradients of the networks in the order of the views too."""
@@ -46,7 +46,7 @@ class Sharded(Reduced):
     def start(self) -> None:
         """Make the scenes of all processes equal, and keep the rows of this process."""
         super().start()
-        self.shard = Shard(self.scene.table, self.group)
+        self.scene.table = self.table = ShardedTable(self.scene.table, self.group)
 
     def scene_of(self, cameras: Sequence[Camera | None], step: int, mode: Mode, cull: Cull) -> AnchorScene:
         """Return the rows that the camera of this process sees, as a scene. Every process must call this.
@@ -132,12 +132,12 @@ class Sharded(Reduced):
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the state as `Training.tensors` of one process has it: whole in process 0, on the CPU. Every process must call this."""
-        table, out = self.scene.table, {}
+        table, out = self.table, {}
         prefixes = ("params.", "facts.", "stats.", "average.params.", *(f"{self.training.cfg.optimizer.prefix}.{n}." for n in table.params))
         for name, value in self.training.tensors().items():
             if name != f"facts.{NUMBER}":
                 of_rows = name.startswith(prefixes) and value.dim() > 0
-                out[name] = self.shard.collect(table.facts[NUMBER], value) if of_rows else value
+                out[name] = table.collect(value) if of_rows else value
         return out
 
     def _networks(self) -> list[Tensor]:

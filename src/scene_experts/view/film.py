@@ -51,7 +51,7 @@ class Film:
     def draw_frames(self, rasterize: Rasterizer, device: str, progress: Progress) -> Iterator[np.ndarray]:
         """Yield the frames as 8-bit RGB [H, W, 3]: every run in every mode, side by side."""
         only = tuple(number - 1 for number in self.options.only) or None
-        looks = [Look(show, self.options.attribute, only) for show in self.options.show]
+        looks = [Look(show=show, attribute=self.options.attribute, only=only) for show in self.options.show]
         background = torch.tensor(self.capture.background, device=device)
         frozen = [run.scene.frozen(run.step) for run in self.runs]
         for i, camera in enumerate(self.path.cameras):

@@ -58,7 +58,7 @@ def is_local(host: str) -> bool:
 
 
 @dataclass
-class Rate:
+class RateLimit:
     """Spreads events: `wait()` returns how long the next one must wait."""
 
     per_second: float
@@ -86,7 +86,7 @@ class Gate:
     gui: Any = None  # viser's GuiApi, once there is one
     open: int = 0  # connections
     waiting: int = 0  # handshakes
-    handshakes: Rate = field(default_factory=lambda: Rate(MOST_HANDSHAKES, 2 * MOST_HANDSHAKES))
+    handshakes: RateLimit = field(default_factory=lambda: RateLimit(MOST_HANDSHAKES, 2 * MOST_HANDSHAKES))
 
     def __post_init__(self) -> None:
         if not self.token and (self.need_token or not is_local(self.host)):
@@ -245,7 +245,7 @@ class GuardedConnection:
 
     def __init__(self, connection: Any, gate: Gate) -> None:
         self._connection, self._gate = connection, gate
-        self._rate, self._refused = Rate(MOST_MESSAGES, MOST_MESSAGES), 0
+        self._rate, self._refused = RateLimit(MOST_MESSAGES, MOST_MESSAGES), 0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._connection, name)

@@ -22,7 +22,7 @@ PALETTE = (  # colours that colour-blind readers can distinguish (Okabe and Ito)
 LOW, MIDDLE, HIGH = (0.05, 0.03, 0.30), (0.75, 0.20, 0.45), (1.00, 0.90, 0.35)  # a dark-to-light ramp
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Look:
     """What a picture shows."""
 

@@ -190,7 +190,7 @@ class Panel:
         if self.crop.value:
             (x0, y0, z0), (x1, y1, z1) = self.capture.world.from_input(self.read_box()).tolist()
             box = ((x0, y0, z0), (x1, y1, z1))
-        return Look(self.show.value, attribute, only, box)
+        return Look(show=self.show.value, attribute=attribute, only=only, box=box)
 
     def read_box(self) -> torch.Tensor:
         """Return the lower and the upper corner of the crop box, [2, 3] float64, in the capture's own frame."""

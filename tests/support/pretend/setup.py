@@ -19,12 +19,12 @@ from scene_experts.data.capture import Capture
 from scene_experts.data.settings import Data
 from scene_experts.evaluate import score, timing
 from scene_experts.native import triton
-from scene_experts.recipes import RECIPES
 from scene_experts.render import gsplat
 from scene_experts.training import loop
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.optim import FusedAdam
 from scene_experts.training.options import TrainOptions
+from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.places import DEMO
 from support.pretend.tensors import Pretender, Pretending, counts

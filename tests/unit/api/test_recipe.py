@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import scene_experts as se
-from scene_experts.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES
 
 
 def test_a_recipe_without_numbers_is_the_recipe():

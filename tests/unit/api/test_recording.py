@@ -9,13 +9,13 @@ from scene_experts.api import recording
 from scene_experts.core.errors import InputError
 from scene_experts.data.capture import Capture
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Exported, Finished, Previewed, Saved, Started, Stopped
 from scene_experts.training.loop import Job
 from scene_experts.training.options import TrainOptions
+from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.messages import naming
 from support.synthetic import make_capture

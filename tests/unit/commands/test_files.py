@@ -11,13 +11,13 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.files import registry
-from scene_experts.files.export import write_result_folder
-from scene_experts.recipes import RECIPES
+from scene_experts.files.scene_folder import write_result_folder
 from scene_experts.render import choose
 from scene_experts.scene.anchors.mlp import MLP
 from scene_experts.training import loop as train
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
+from scene_experts.training.recipes import RECIPES
 from support.messages import naming
 from support.synthetic import make_capture
 

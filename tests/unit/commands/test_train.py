@@ -11,8 +11,8 @@ from scene_experts.arguments.table import rows
 from scene_experts.commands.train import FIRST, TrainCommand, after_restart, parse_train, run_of, train
 from scene_experts.core.errors import InputError
 from scene_experts.core.group import Alone
-from scene_experts.recipes import RECIPES
 from scene_experts.training import run_folder
+from scene_experts.training.recipes import RECIPES
 from support.messages import naming
 from support.synthetic import make_capture
 

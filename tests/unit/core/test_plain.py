@@ -8,8 +8,8 @@ import pytest
 from scene_experts.core.errors import InputError
 from scene_experts.core.plain import UnknownPart, differences, from_json, to_json
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.training.config import RunConfig, Train
+from scene_experts.training.recipes import RECIPES
 from support.messages import naming
 
 

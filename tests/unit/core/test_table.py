@@ -78,13 +78,18 @@ def test_a_row_trains_the_same_whether_others_come_and_go():
     assert torch.equal(alone.params["a"], mixed.params["a"]) and torch.equal(alone.params["b"], mixed.params["b"])
 
 
-def test_assign_clears_moments():
+def test_assign_clears_moments_and_begins_the_average_anew():
     table = make()
     optimizer = adam(table)
     step(table, optimizer)
+    table.averages = {name: p.detach() + 1 for name, p in table.params.items()}
+    others = table.averages["b"].clone()
     table.assign("a", torch.zeros(4, 2))
+    assert torch.equal(table.averages["a"], torch.zeros(4, 2)) and torch.equal(table.averages["b"], others)
     state = optimizer.state[table.params["a"]]
     assert not state["exp_avg"].any() and not state["exp_avg_sq"].any() and not table.params["a"].any()
+    table.params["a"].data += 1
+    assert not table.averages["a"].any()  # it is a copy
 
 
 def test_errors_name_what_differs():

@@ -13,9 +13,9 @@ from scene_experts.core.errors import InputError
 from scene_experts.data.settings import Data
 from scene_experts.evaluate import command
 from scene_experts.evaluate.options import EvalOptions
-from scene_experts.recipes import RECIPES
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig
+from scene_experts.training.recipes import RECIPES
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from scene_experts.core.types import Mode
 from scene_experts.evaluate import halves
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.score import evaluate
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
+from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.synthetic import make_capture
 

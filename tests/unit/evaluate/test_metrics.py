@@ -88,7 +88,7 @@ def test_each_variant_gets_its_own_input() -> None:
 def test_without_weights_the_reason_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(net: str, explicit: Path | None = None) -> tuple[dict[str, Tensor], str]:
         if net == "vgg":
-            raise weights.Missing("no weights of LPIPS (vgg): run this")
+            raise weights.MissingWeights("no weights of LPIPS (vgg): run this")
         return random_tensors(net), "somewhere"
 
     monkeypatch.setattr(weights, "load", load)

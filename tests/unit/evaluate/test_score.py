@@ -113,7 +113,7 @@ class FakeRasterizer:
 @pytest.fixture(autouse=True)
 def no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(net: str, explicit: Path | None = None) -> tuple[dict[str, Tensor], str]:
-        raise weights.Missing(f"no weights of LPIPS ({net}): run this")
+        raise weights.MissingWeights(f"no weights of LPIPS ({net}): run this")
 
     monkeypatch.setattr(weights, "load", load)
 

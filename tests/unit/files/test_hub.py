@@ -14,11 +14,11 @@ from scene_experts.core.errors import InputError
 from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.files import hub
-from scene_experts.files.export import Written
-from scene_experts.recipes import RECIPES
+from scene_experts.files.standard import Written
 from scene_experts.render import choose
 from scene_experts.training import loop, run_folder
 from scene_experts.training.config import RunConfig
+from scene_experts.training.recipes import RECIPES
 from support.synthetic import make_capture
 
 

@@ -10,8 +10,8 @@ from scene_experts.core.errors import InputError
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.files.gaussians.read import scene_of
 from scene_experts.files.measure import Painter, Score, capture_if_there, cost, scored_views, scores, why_no_views
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
+from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.files import run_in_memory
 from support.synthetic import make_capture

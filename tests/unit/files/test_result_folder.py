@@ -5,9 +5,7 @@ import json
 import pytest
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.settings import Data
 from scene_experts.data.views import World
-from scene_experts.files.export import capture_settings, width_in
 from scene_experts.files.result_folder import (
     expect_world,
     is_result,
@@ -72,37 +70,6 @@ def test_other_bytes(tmp_path):
         read_settings(iteration(tmp_path))
 
 
-def test_the_reading_of_a_capture_in_the_published_settings(tmp_path):
-    plain = {"images": "images", "resolution": -1, "white_background": False, "data_device": "cuda", "eval": True, "lod": 0}
-    assert capture_settings(Data(tmp_path)) == {"source_path": str(tmp_path), **plain}
-    for change, expected in (
-        ({"resolution": "as-is"}, {"resolution": 1}),
-        ({"resolution": "factor:4"}, {"resolution": 4}),
-        ({"resolution": "factor:2.5"}, {}),  # only the photographs tell the width
-        ({"resolution": "longest:400"}, {}),
-        ({"resolution": "inria:4"}, {"images": "images_4"}),
-        ({"images": "images_2"}, {"images": "images_2"}),
-        ({"split": "none"}, {"eval": False}),
-        ({"split": "first:31"}, {"lod": 30}),
-        ({"split": "first:1"}, {}),
-        ({"background": (1.0, 1.0, 1.0)}, {"white_background": True}),
-    ):
-        assert capture_settings(Data(tmp_path, **change)) == {"source_path": str(tmp_path), **plain, **expected}, change
-    for policy, expected in (
-        ("longest:400", 300),  # 300 x 400 px: the published tools take a width
-        ("factor:2.5", 300),
-        ("share:0.5", 300),
-        ("factor:4", 4),
-        ("cap1600", -1),
-        ("inria:4", -1),
-        ("as-is", 1),
-    ):
-        assert capture_settings(Data(tmp_path, resolution=policy), 300)["resolution"] == expected, policy
-    (tmp_path / "transforms_train.json").touch()
-    assert capture_settings(Data(tmp_path))["white_background"]
-    assert not capture_settings(Data(tmp_path, background=(0.0, 0.0, 0.0)))["white_background"]
-
-
 def test_no_settings(tmp_path):
     assert read_settings(iteration(tmp_path)) == {}
     assert [positive(value) for value in (2, 0.5, "2", None, float("nan"), float("inf"), -1)] == [2.0, 0.5, *[None] * 5]
@@ -154,12 +121,3 @@ def test_another_world_is_refused():
     for other in (World(2.6, world.shift), World(2.5, (1.01, -20.0, 3.0))):
         with pytest.raises(InputError, match="--normalise"):
             expect_world(world, other)
-
-
-@pytest.mark.parametrize(
-    ("text", "width"),
-    [('[{"width": 300}, {"width": 400}]', 300), ("[]", None), ("{}", None), ("[1]", None), ('[{"width": "x"}]', None), ("[", None)],
-)
-def test_the_width_of_the_first_view(tmp_path, text, width):
-    (tmp_path / "cameras.json").write_text(text)
-    assert width_in(tmp_path / "cameras.json") == width

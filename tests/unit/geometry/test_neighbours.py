@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from scene_experts.geometry import neighbours
 from scene_experts.geometry.neighbours import find_neighbours, knn_d2, median_neighbour_distance
 
 
@@ -11,6 +12,8 @@ def cloud(kind: str, n: int = 1500) -> torch.Tensor:
     points = torch.randn(n, 3, generator=generator, dtype=torch.float64)
     if kind == "duplicates":
         points[: n // 2] = points[0]
+    if kind == "pairs":
+        points[n // 2 :] = points[: n // 2]
     if kind == "outliers":
         points[:7] *= 1e6
     if kind == "flat":
@@ -21,27 +24,30 @@ def cloud(kind: str, n: int = 1500) -> torch.Tensor:
 
 
 def brute(points: torch.Tensor, k: int) -> torch.Tensor:
-    d2 = (points[:, None] - points[None]).square().sum(-1)
-    d2.fill_diagonal_(float("inf"))
-    return d2.topk(k, dim=1, largest=False).values
+    """The same sums in the same order, so that not even a bit differs."""
+    gap = (points[:, None] - points[None]).square()
+    return (gap[..., 0] + gap[..., 1] + gap[..., 2]).fill_diagonal_(float("inf")).sort(dim=1).values[:, :k]
 
 
-@pytest.mark.parametrize("kind", ["normal", "duplicates", "outliers", "flat", "lattice"])
+@pytest.mark.parametrize("kind", ["normal", "duplicates", "pairs", "outliers", "flat", "lattice"])
 @pytest.mark.parametrize("k", [1, 3, 10])
-def test_same_as_all_pairs(kind: str, k: int) -> None:
+def test_same_as_all_pairs(kind: str, k: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(neighbours, "_CHUNK", 600)
     points = cloud(kind)
     d2, index = find_neighbours(points, k)
-    torch.testing.assert_close(d2, brute(points, k), rtol=1e-12, atol=0)
+    assert torch.equal(d2, brute(points, k))
     torch.testing.assert_close((points[index] - points[:, None]).square().sum(-1), d2, rtol=1e-12, atol=0)
     assert (index != torch.arange(len(points))[:, None]).all()
-    ordered = index.sort(dim=1).values
-    assert (ordered.diff(dim=1) > 0).all()  # no neighbour twice
+    assert (index.sort(dim=1).values.diff(dim=1) > 0).all()  # no neighbour twice
+    same = d2.diff(dim=1) == 0
+    assert (index.diff(dim=1)[same] > 0).all()  # equally near ones by their indices
+    assert all(torch.equal(a, b) for a, b in zip(find_neighbours(points, k), (d2, index)))
 
 
-@pytest.mark.parametrize("n", [4, 5, 63, 64, 127, 128, 129, 257, 300])
-def test_every_size_around_the_leaf_boundaries(n: int) -> None:
-    points = cloud("normal", n)
-    torch.testing.assert_close(knn_d2(points), brute(points, 3).mean(1))
+def test_positions_that_are_not_finite_are_refused() -> None:
+    for wrong in (float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="finite"):
+            find_neighbours(torch.tensor([[0.0, 0, 0], [1, 1, 1], [wrong, 0, 0]]), 1)
 
 
 def test_few_points() -> None:

@@ -3,10 +3,10 @@
 import pytest
 
 from scene_experts.evaluate.tables import load_paper
-from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS, OURS
 from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.request import choose_experiments
+from scene_experts.training.recipes import RECIPES
 
 
 def test_all_of_the_paper_is_there():

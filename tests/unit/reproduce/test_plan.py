@@ -11,13 +11,12 @@ from scene_experts.core.errors import InputError
 from scene_experts.data.fetch import catalog
 from scene_experts.data.images import check_policy, target_size
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.experiments import DATASETS, EXPERIMENTS
 from scene_experts.reproduce.plan import (
     COLLECTIONS,
     OWN,
+    CaptureSpec,
     Scale,
-    Scene,
     Spec,
     code_of,
     find_own_scenes,
@@ -28,8 +27,9 @@ from scene_experts.reproduce.plan import (
 )
 from scene_experts.scene.anchors.routers import Linear, Margin
 from scene_experts.training.config import flags_of
+from scene_experts.training.recipes import RECIPES
 
-FOX = Scene("fox", OWN, Path("captures/fox"))
+FOX = CaptureSpec("fox", OWN, Path("captures/fox"))
 
 
 def test_a_run_that_several_tables_need_is_made_once():
@@ -39,7 +39,7 @@ def test_a_run_that_several_tables_need_is_made_once():
 
 
 def test_the_papers_scenes_serve_the_experiments_that_name_them():
-    scenes = [Scene("truck", "TanksAndTemples", Path("truck")), Scene("rome", "BungeeNeRF", Path("rome"))]
+    scenes = [CaptureSpec("truck", "TanksAndTemples", Path("truck")), CaptureSpec("rome", "BungeeNeRF", Path("rome"))]
     assert {s.scene.name for s in list_runs([EXPERIMENTS["table3"]], scenes, [0], Scale())} == {"truck"}
 
 
@@ -128,7 +128,7 @@ def test_the_papers_scenes_are_found_with_their_protocol(tmp_path):
 
 @pytest.mark.slow
 def test_the_papers_scenes_bring_the_numbers_of_their_scripts():
-    rome = Scene("rome", "BungeeNeRF", Path("rome"), {}, catalog.BUNGEENERF.numbers)
+    rome = CaptureSpec("rome", "BungeeNeRF", Path("rome"), {}, catalog.BUNGEENERF.numbers)
     octree = Spec(rome, "octree-gs", 0, Scale()).train.scene.select
     assert (octree.base_layer, octree.visible_threshold, octree.dist_ratio) == (10, 0.0, 0.99)
     moe = Spec(rome, "moe-gs", 0, Scale()).train
@@ -144,7 +144,7 @@ def test_the_papers_scenes_bring_the_numbers_of_their_scripts():
 
 @pytest.mark.parametrize("given", ["--scene.voxel-size 0.02", "--scene.voxel-size=0.02"])
 def test_flags_of_a_recipe_have_the_last_word_over_the_numbers_of_a_scene(given):
-    truck = Scene("truck", "TanksAndTemples", Path("truck"), {}, catalog.TANDT.numbers)
+    truck = CaptureSpec("truck", "TanksAndTemples", Path("truck"), {}, catalog.TANDT.numbers)
     spec = Spec(truck, f"scaffold-gs {given}", 0, Scale())
     made = parse_train(spec.arguments(Path("run"))[1:]).cfg
     assert made.scene.voxel_size == spec.train.scene.voxel_size == 0.02

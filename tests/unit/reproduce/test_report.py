@@ -6,14 +6,14 @@ from scene_experts.reproduce import report
 from scene_experts.reproduce.compare import make_comparison
 from scene_experts.reproduce.experiments import EXPERIMENTS
 from scene_experts.reproduce.options import ReproduceOptions
-from scene_experts.reproduce.plan import OWN, Scene
+from scene_experts.reproduce.plan import OWN, CaptureSpec
 from support.records import record
 
 pytest.importorskip("matplotlib")
 
 
 def test_files_and_page(tmp_path):
-    scenes = [Scene(name, OWN, tmp_path / name) for name in ("fox", "fern")]
+    scenes = [CaptureSpec(name, OWN, tmp_path / name) for name in ("fox", "fern")]
     runs = [record(recipe, scene.name, psnr=30.0 + i) for scene in scenes for i, recipe in enumerate(("scaffold-gs", "moe-gs"))]
     stray = record("moe-gs", "elsewhere", psnr=99.0)
     report.write(tmp_path, [EXPERIMENTS["table4"], EXPERIMENTS["fig7"]], scenes, [*runs, stray], "scene-experts reproduce table4 fig7")
@@ -27,7 +27,7 @@ def test_files_and_page(tmp_path):
 
 
 def test_means_are_over_the_captures_that_every_row_has(tmp_path):
-    scenes = [Scene(name, OWN, tmp_path / name) for name in ("fox", "fern")]
+    scenes = [CaptureSpec(name, OWN, tmp_path / name) for name in ("fox", "fern")]
     runs = [record("moe-gs", "fox", psnr=30.0, views=1), record("scaffold-gs-opacity", "fox", psnr=29.0, views=1)]
     report.write(tmp_path, [EXPERIMENTS["table4"]], scenes, [*runs, record("moe-gs", "fern", psnr=10.0, views=1)])
     means, by_scene = (tmp_path / "table4.md").read_text().split("scene by scene")
@@ -36,7 +36,7 @@ def test_means_are_over_the_captures_that_every_row_has(tmp_path):
 
 
 def test_rows_without_a_common_capture_are_said_not_to_compare(tmp_path):
-    scenes = [Scene(name, OWN, tmp_path / name) for name in ("fox", "fern")]
+    scenes = [CaptureSpec(name, OWN, tmp_path / name) for name in ("fox", "fern")]
     runs = [record("moe-gs", "fox", psnr=30.0), record("scaffold-gs-opacity", "fern", psnr=20.0)]
     report.write(tmp_path, [EXPERIMENTS["table4"]], scenes, runs)
     assert report.DISJOINT in (tmp_path / "table4.md").read_text()
@@ -45,7 +45,7 @@ def test_rows_without_a_common_capture_are_said_not_to_compare(tmp_path):
 
 
 def test_a_comparison_has_no_claims_and_the_differences_from_its_baseline(tmp_path):
-    scenes = [Scene(name, OWN, tmp_path / name) for name in ("fox", "fern", "box")]
+    scenes = [CaptureSpec(name, OWN, tmp_path / name) for name in ("fox", "fern", "box")]
     experiment = make_comparison(ReproduceOptions(("compare",), recipes=("moe-gs-balance", "3dgs", "scaffold-gs"), baseline=("3dgs",)))
     runs = [record(r, s.name, psnr=p) for s in scenes for r, p in (("moe-gs-balance", 30.5), ("3dgs", 30.0))]
     runs.append(record("scaffold-gs", "fox", psnr=29.0))

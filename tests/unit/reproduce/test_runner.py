@@ -14,7 +14,7 @@ from scene_experts.core.io import write_json
 from scene_experts.core.plain import to_json
 from scene_experts.reproduce import runner as module
 from scene_experts.reproduce import store
-from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec
+from scene_experts.reproduce.plan import OWN, CaptureSpec, Scale, Spec
 from scene_experts.reproduce.runner import Runner, last_line, reason, visible_device
 from scene_experts.training.config import RunConfig
 from scene_experts.training.run_folder import held
@@ -22,7 +22,7 @@ from support.records import record
 
 
 def spec(recipe="moe-gs", seed=0, scene="fox"):
-    return Spec(Scene(scene, OWN, Path("captures") / scene), recipe, seed, Scale(iterations=3000))
+    return Spec(CaptureSpec(scene, OWN, Path("captures") / scene), recipe, seed, Scale(iterations=3000))
 
 
 class Fake(Runner):

@@ -13,7 +13,7 @@ from scene_experts.core.io import write_json
 from scene_experts.core.plain import to_json
 from scene_experts.data import capture as captures
 from scene_experts.reproduce import store
-from scene_experts.reproduce.plan import OWN, Scale, Scene, Spec, drop_repeated
+from scene_experts.reproduce.plan import OWN, CaptureSpec, Scale, Spec, drop_repeated
 from scene_experts.reproduce.store import POINTS, SAMPLES, check_captures, find, find_all, load, read, read_curves, read_run, write
 from scene_experts.strategy.grow import GrowAnchors
 from support.messages import naming
@@ -40,7 +40,7 @@ def test_a_record_names_the_run_that_it_started_from_if_there_is_one(tmp_path):
 
 
 def test_a_run_that_started_from_another_one_is_not_taken_for_the_run_of_its_recipe(tmp_path):
-    spec = Spec(Scene("fox", OWN, Path("fox")), "moe-gs", 0, Scale(iterations=3000))
+    spec = Spec(CaptureSpec("fox", OWN, Path("fox")), "moe-gs", 0, Scale(iterations=3000))
     begun = replace(record(psnr=20.0), config=replace(record().config, init_from=Path("/home/someone/coarse")))
     (back,) = read(write(tmp_path, begun))
     assert back.key == begun.key and find(load(tmp_path), spec) is None
@@ -91,7 +91,7 @@ def test_a_record_is_small_and_states_what_differs_from_the_defaults(tmp_path):
 
 
 def test_a_record_of_a_part_that_changed_counts_as_no_run(tmp_path, monkeypatch):
-    spec = Spec(Scene("fox", OWN, Path("fox")), "moe-gs", 0, Scale(iterations=3000))
+    spec = Spec(CaptureSpec("fox", OWN, Path("fox")), "moe-gs", 0, Scale(iterations=3000))
     write(tmp_path, record())
     assert find(load(tmp_path), spec) is not None
     monkeypatch.setattr(GrowAnchors, "changes", ("Candidates are counted twice.",))
@@ -118,14 +118,14 @@ def test_several_processes_write_one_file(tmp_path):
 
 
 def test_a_run_is_found_by_its_spec(tmp_path):
-    spec = Spec(Scene("fox", OWN, Path("anywhere/fox")), "moe-gs", 0, Scale(iterations=3000))
+    spec = Spec(CaptureSpec("fox", OWN, Path("anywhere/fox")), "moe-gs", 0, Scale(iterations=3000))
     assert find([record(seed=1), record()], spec) is not None
     assert find([record(seed=1), record(iterations=7000)], spec) is None
 
 
 def test_records_of_another_capture_of_the_same_name_are_refused(tmp_path):
     box = make_capture(tmp_path / "box", views=9)
-    spec = Spec(Scene("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
+    spec = Spec(CaptureSpec("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
     capture = captures.load(spec.data)
     own = replace(record(scene="box"), per_view={capture.views[i].name: {"psnr": 30.0} for i in capture.test})
     check_captures([own], [spec])
@@ -137,7 +137,7 @@ def test_records_of_another_capture_of_the_same_name_are_refused(tmp_path):
 
 def test_records_of_other_poses_of_the_same_photographs_are_refused(tmp_path):
     box = make_capture(tmp_path / "box", views=9, points=700)
-    specs = [Spec(Scene("box", OWN, box.folder), recipe, 0, Scale(iterations=3000)) for recipe in ("scaffold-gs", "moe-gs")]
+    specs = [Spec(CaptureSpec("box", OWN, box.folder), recipe, 0, Scale(iterations=3000)) for recipe in ("scaffold-gs", "moe-gs")]
     capture = captures.load(specs[0].data)
     views = {capture.views[i].name: {"psnr": 30.0} for i in capture.test}
     found = [replace(record(s.recipe, scene="box", psnr=30.0, views=1, points=n), per_view=views) for s, n in zip(specs, (651, 700))]
@@ -148,7 +148,7 @@ def test_records_of_other_poses_of_the_same_photographs_are_refused(tmp_path):
 
 def test_records_of_other_cameras_with_the_same_points_are_refused(tmp_path):
     box, moved = make_capture(tmp_path / "box", views=9), make_capture(tmp_path / "other" / "box", views=9, scale=2.0)
-    spec = Spec(Scene("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
+    spec = Spec(CaptureSpec("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
     capture, other = captures.load(spec.data), captures.load(replace(spec.data, path=moved.folder))
     own = replace(record(scene="box"), per_view={capture.views[i].name: {"psnr": 30.0} for i in capture.test})
     check_captures([replace(own, results={**own.results, "poses": capture.poses()})], [spec])
@@ -250,7 +250,7 @@ def test_columns():
 
 def test_a_run_counts_for_every_recipe_of_the_same_numbers(tmp_path):
     """Five experts with Top-2 in Figure 6 are the main recipe, two layers in Figure 7 are Scaffold-GS."""
-    scene = Scene("fox", OWN, tmp_path)
+    scene = CaptureSpec("fox", OWN, tmp_path)
     pair = [Spec(scene, recipe, 0, Scale(iterations=3000)) for recipe in ("moe-gs", "moe-gs-e5-top2")]
     assert drop_repeated([*pair, Spec(scene, "moe-gs-e4-top2", 0, Scale(iterations=3000))]) == [
         pair[0],

@@ -6,16 +6,16 @@ from pathlib import Path
 import pytest
 
 from scene_experts.core.errors import InputError
-from scene_experts.recipes import RECIPES
 from scene_experts.reproduce.compare import make_comparison, make_difference_tables
 from scene_experts.reproduce.options import ReproduceOptions
-from scene_experts.reproduce.plan import Scale, Scene, Spec
+from scene_experts.reproduce.plan import CaptureSpec, Scale, Spec
 from scene_experts.reproduce.request import make_plan, written_command
 from scene_experts.reproduce.variants import read_line, split_name
+from scene_experts.training.recipes import RECIPES
 from support.records import record
 
 LINE = "moe-gs --scene.hidden 8 --rates.anneal 0.1"
-SCENE = Scene("x", "captures", Path("x"))
+SCENE = CaptureSpec("x", "captures", Path("x"))
 
 
 def test_a_recipe_without_flags_is_the_recipe():

@@ -8,10 +8,10 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.types import Points
-from scene_experts.recipes import RECIPES
 from scene_experts.scene import restore_scene
 from scene_experts.scene.fit import check_fit, restore_foreign
 from scene_experts.scene.graph.hash_grid import HashGrid
+from scene_experts.training.recipes import RECIPES
 from support.scenes import start_scene
 
 

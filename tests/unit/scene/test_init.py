@@ -8,9 +8,9 @@ import torch
 from scene_experts.core.fields import check_fields
 from scene_experts.core.table import Table
 from scene_experts.core.types import Mode
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene.anchors.appearance import Codes
+from scene_experts.training.recipes import RECIPES
 from support.scenes import CAMERA, METHODS, start_scene
 
 

@@ -3,20 +3,20 @@
 import pytest
 
 from scene_experts.core.errors import InputError
-from scene_experts.sfm.options import MOST_FRAMES, Options
+from scene_experts.sfm.options import MOST_FRAMES, SfmOptions
 
 
 @pytest.mark.parametrize(
     ("options", "flag"),
     [
-        (Options(frames=2), "--frames"),
-        (Options(frames=MOST_FRAMES + 1), "--frames"),
-        (Options(max_side=10), "--max-side"),
-        (Options(threads=-1), "--threads"),
-        (Options(seed=-1), "--seed"),
-        (Options(seed=2**31), "--seed"),
-        (Options(max_side=2**31), "--max-side"),
-        (Options(threads=2**31), "--threads"),
+        (SfmOptions(frames=2), "--frames"),
+        (SfmOptions(frames=MOST_FRAMES + 1), "--frames"),
+        (SfmOptions(max_side=10), "--max-side"),
+        (SfmOptions(threads=-1), "--threads"),
+        (SfmOptions(seed=-1), "--seed"),
+        (SfmOptions(seed=2**31), "--seed"),
+        (SfmOptions(max_side=2**31), "--max-side"),
+        (SfmOptions(threads=2**31), "--threads"),
     ],
 )
 def test_invalid_settings_name_their_option(options, flag):
@@ -25,4 +25,4 @@ def test_invalid_settings_name_their_option(options, flag):
 
 
 def test_the_defaults_are_valid():
-    Options().check()
+    SfmOptions().check()

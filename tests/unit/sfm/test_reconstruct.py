@@ -14,7 +14,7 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.sfm import reconstruct as run
-from scene_experts.sfm.options import Options
+from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.reconstruct import LOG, NOTE
 from scene_experts.sfm.work import NAME, PLACES
 from support.captures import load
@@ -55,7 +55,7 @@ def test_poses_of_photographs_equal_the_known_ones(tmp_path):
         with Image.open(source / name) as picture:
             Image.fromarray(top).resize(picture.size, Image.Resampling.NEAREST).save(source / f"{Path(name).stem}_mask.png")
     steps = []
-    note = run.reconstruct(source, out, Options(max_side=640, threads=2), say=lambda _: None, progress=lambda *a: steps.append(a))
+    note = run.reconstruct(source, out, SfmOptions(max_side=640, threads=2), say=lambda _: None, progress=lambda *a: steps.append(a))
     assert note == json.loads((out / NOTE).read_text()) and note["with_pose"] == 8 and note["error"] < 1.0
     assert not (out / NAME).exists() and {s[0] for s in steps} >= {"features", "matches", "poses (incremental)"}
     made, known = load(out, split="none", normalise="none"), load(BUDDHA, split="none", normalise="none")
@@ -65,7 +65,7 @@ def test_poses_of_photographs_equal_the_known_ones(tmp_path):
     lowest = lowest_features(out)
     assert max(lowest[name] for name in TOGETHER[:2]) < 0.75 and max(lowest.values()) > 0.9, lowest
     with pytest.raises(InputError, match="--overwrite"):
-        run.reconstruct(source, out, Options())
+        run.reconstruct(source, out, SfmOptions())
 
 
 def lowest_features(capture: Path) -> dict[str, float]:
@@ -96,7 +96,7 @@ def with_pycolmap(monkeypatch, request):
         monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: name)
 
 
-def make(source, out, options=Options(), **more):  # noqa: B008
+def make(source, out, options=SfmOptions(), **more):  # noqa: B008
     return run.reconstruct(source, out, options, say=lambda _: None, **more)
 
 
@@ -123,7 +123,7 @@ def test_frames_of_a_video_are_extracted_once(tmp_path, monkeypatch):
     video.write_bytes(b"frames")
     for count, fact in [(5, ""), (5, ""), (4, ""), (2, 3)]:
         with pytest.raises(InputError, match=naming(video, fact)):
-            make(video, tmp_path / "out", Options(frames=count))
+            make(video, tmp_path / "out", SfmOptions(frames=count))
     assert taken == [5, 4, 2]
 
 
@@ -140,7 +140,7 @@ def test_photographs_and_frames_are_not_taken_for_each_other(tmp_path, monkeypat
     video.write_bytes(b"frames")
     for asked, size in [(video, (80, 60)), (source, (64, 48)), (video, (80, 60)), (source, (64, 48))]:
         with pytest.raises(InputError, match=naming(asked)):
-            make(asked, tmp_path / "out", Options(frames=3))
+            make(asked, tmp_path / "out", SfmOptions(frames=3))
         assert {Image.open(path).size for path in images.iterdir()} == {size}
 
 
@@ -148,19 +148,19 @@ def test_only_the_same_request_reuses_its_database(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "run_worker", fake_worker())
     source, kept = write_black(tmp_path / "photos"), tmp_path / "out" / NAME / "database" / "colmap.db"
 
-    def ask(options=Options()):  # noqa: B008
+    def ask(options=SfmOptions()):  # noqa: B008
         with pytest.raises(InputError, match=naming(source)):
             make(source, tmp_path / "out", options)
 
     ask()
     kept.write_bytes(b"features")
-    ask(Options(matching="sequential"))
+    ask(SfmOptions(matching="sequential"))
     assert kept.exists()
-    ask(Options(max_side=800))
+    ask(SfmOptions(max_side=800))
     assert not kept.exists()
     kept.write_bytes(b"features")
     write_photo(source / "1.jpg", size=(64, 48), model="B")  # another photograph with the same name
-    ask(Options(max_side=800))
+    ask(SfmOptions(max_side=800))
     assert not kept.exists()
 
 

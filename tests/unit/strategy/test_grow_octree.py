@@ -9,13 +9,13 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.fields import check_fields
 from scene_experts.core.table import Table
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 from scene_experts.scene.anchors.select import LevelSelector, Octree
 from scene_experts.strategy import observe
 from scene_experts.strategy.grow_octree import GrowOctree
 from scene_experts.training.config import check
+from scene_experts.training.recipes import RECIPES
 from support.octree import slow_level
 
 K, EDGE, COUNT = 4, 0.8, 4

@@ -8,10 +8,10 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.schedule import Every
 from scene_experts.core.types import Decoded, Gaussians, Render
-from scene_experts.recipes import RECIPES
 from scene_experts.strategy.grow import GrowAnchors
 from scene_experts.strategy.grow_points import GrowPoints
 from scene_experts.training.config import check
+from scene_experts.training.recipes import RECIPES
 from support.graph_scenes import start_graph
 
 

@@ -3,7 +3,7 @@
 import torch
 
 from scene_experts.core.group import Alone
-from scene_experts.core.shard import Shard
+from scene_experts.core.shard import ShardedTable
 from scene_experts.core.table import Table
 from scene_experts.strategy.grow import empty_cells
 from scene_experts.strategy.grow_shards import Candidates
@@ -18,15 +18,15 @@ def find(group: Alone) -> None:
     fine, g = 18 * torch.rand(200, 3, generator=rng).double() - 9, torch.rand(200, generator=rng)
     expected = empty_cells(features, taken, fine, parents, g, 4)
     assert expected is not None
-    shard = Shard(Table({"feature": features}, {"cell": taken}), group)
+    table = ShardedTable(Table({"feature": features}, {"cell": taken}), group)
     own, mine = torch.arange(group.rank, 30, group.size), parents % group.size == group.rank
-    found = Candidates(shard, features[own], taken[own], fine[mine], parents[mine] // group.size, g[mine], 4)
+    found = Candidates(table, features[own], taken[own], fine[mine], parents[mine] // group.size, g[mine], 4)
     cells, feature, strength = expected
     assert torch.equal(found.cells, cells) and torch.equal(found.strength, strength)
     chosen = torch.arange(0, len(cells), 2)
     owners = torch.arange(len(chosen)) % group.size
     assert torch.equal(found.features_of(chosen, owners), feature[chosen][owners == group.rank])
-    none = Candidates(shard, features[own], taken[own], fine[:0], parents[:0], g[:0], 4)
+    none = Candidates(table, features[own], taken[own], fine[:0], parents[:0], g[:0], 4)
     assert len(none.cells) == 0 and none.features_of(chosen[:0], owners[:0]).shape == (0, 12)
 
 

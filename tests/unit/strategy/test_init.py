@@ -7,8 +7,8 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.fields import check_fields
-from scene_experts.recipes import RECIPES
 from scene_experts.strategy import Edit
+from scene_experts.training.recipes import RECIPES
 from support.scenes import METHODS, start_scene
 
 

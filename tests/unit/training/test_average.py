@@ -7,9 +7,9 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.fields import check_fields
-from scene_experts.recipes import RECIPES
 from scene_experts.scene import restore_scene
 from scene_experts.training.average import Average, Averages
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 from support.captures import load
 from support.messages import naming

@@ -5,12 +5,12 @@ import pytest
 from scene_experts.core.errors import InputError
 from scene_experts.core.fields import NotNegative, check_fields
 from scene_experts.core.schedule import Every, Rate
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.gaussians import ExplicitRates
 from scene_experts.strategy.grow_octree import GrowOctree
 from scene_experts.strategy.split_clone import SplitClone
 from scene_experts.training.config import check, find_unused
 from scene_experts.training.losses import Weights
+from scene_experts.training.recipes import RECIPES
 from support.messages import naming
 
 

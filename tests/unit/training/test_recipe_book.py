@@ -15,7 +15,6 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.schedule import Every
 from scene_experts.core.types import Mode
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES, moe_gs
 from scene_experts.render import choose
 from scene_experts.training import recipe_book, run_folder
 from scene_experts.training.config import RunConfig, check
@@ -23,6 +22,7 @@ from scene_experts.training.events import Densified, Finished, Stepped
 from scene_experts.training.loop import Job, train
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.recipe_book import GROUP, RecipeBook
+from scene_experts.training.recipes import RECIPES, moe_gs
 from support import outside
 from support.captures import load
 from support.synthetic import make_capture

@@ -11,9 +11,9 @@ from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 from support.captures import load
 from support.messages import naming

@@ -9,9 +9,9 @@ import torch
 
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
-from scene_experts.recipes import RECIPES
 from scene_experts.training.average import Average
 from scene_experts.training.events import Densified, Previewed
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.shards import check_shard
 from support.groups import run_group
 from support.synthetic import make_capture

@@ -9,10 +9,10 @@ from scene_experts import cli
 from scene_experts.core.errors import InputError
 from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.scene import restore_scene
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.run_folder import open_run
 from scene_experts.training.state import Training, resume, save
 from support.captures import load

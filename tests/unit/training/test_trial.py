@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 from scene_experts.training.trial import fit_memory, unchanged
 from support.captures import load

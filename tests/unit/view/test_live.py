@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from scene_experts.core.types import Camera, Mode
-from scene_experts.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES
 
 pytest.importorskip("viser")
 from scene_experts.view.live import Live

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from scene_experts.evaluate.pictures import to_8bit
-from scene_experts.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES
 from scene_experts.view.paint import paint
 from scene_experts.view.paths import choose_best_view
 from support.captures import load

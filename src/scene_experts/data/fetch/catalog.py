@@ -18,7 +18,7 @@ Numbers = tuple[tuple[str, float | int | str], ...]
 
 
 @dataclass(frozen=True)
-class Archive:
+class RemoteArchive:
     """A file that contains several scenes."""
 
     name: str
@@ -36,7 +36,7 @@ class Collection:
 
     key: str
     title: str
-    archive: Archive
+    archive: RemoteArchive
     licence: str  # as the owner states it
     source: str  # publication of its authors
     numbers: Numbers = ()
@@ -61,7 +61,7 @@ class CatalogScene:
         return f"{self.collection.key}/{self.name}"
 
 
-MIP360 = Archive(
+MIP360 = RemoteArchive(
     "360_v2.zip",
     (
         "https://storage.googleapis.com/gresearch/refraw360/360_v2.zip",
@@ -71,7 +71,7 @@ MIP360 = Archive(
     "12.5 GB",
     notes="the second address is a copy by a third party",
 )
-TANDT_DB = Archive(
+TANDT_DB = RemoteArchive(
     "tandt_db.zip",
     (
         "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input/tandt_db.zip",
@@ -83,7 +83,7 @@ TANDT_DB = Archive(
     "816e62f22a161abbfe841d2a6b10cdf036e297c9fa289b3bfeee9c6ec526d7e1",
     notes="COLMAP reconstructions by the authors of 3DGS; the second address is a copy by a third party",
 )
-BUNGEE = Archive(
+BUNGEE = RemoteArchive(
     "bungeenerf.tar.gz",
     ("https://drive.usercontent.google.com/download?id=1nBLcf9Jrr6sdxKa1Hbd47IArQQ_X8lww&export=download&confirm=t",),
     "https://drive.google.com/file/d/1nBLcf9Jrr6sdxKa1Hbd47IArQQ_X8lww/view",

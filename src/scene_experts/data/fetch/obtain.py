@@ -16,7 +16,7 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.io import cache_dir, read_json, write_json
 from scene_experts.core.progress import Progress
 from scene_experts.data.fetch.archive import extract
-from scene_experts.data.fetch.catalog import PREFIX, Archive, CatalogScene, one
+from scene_experts.data.fetch.catalog import PREFIX, CatalogScene, RemoteArchive, one
 from scene_experts.data.fetch.download import Say, check_web_address, fetch, sha256
 
 VARIABLE = "SCENE_EXPERTS_CAPTURES"
@@ -114,7 +114,9 @@ def _unpack(scene: CatalogScene, archive: Path, digest: str, root: Path, say: Sa
     say(f"{scene.name}: {out.files} files, {out.bytes / 1e6:,.0f} MB at {into}")
 
 
-def _fetch_archive(archive: Archive, root: Path, mirrors: Sequence[str], say: Say, progress: Progress | None) -> tuple[Path, str, str]:
+def _fetch_archive(
+    archive: RemoteArchive, root: Path, mirrors: Sequence[str], say: Say, progress: Progress | None
+) -> tuple[Path, str, str]:
     """Return the archive's file, its SHA-256 and the address that it was downloaded from. Downloads it unless it is there."""
     path = root / "archives" / archive.name
     known = _read_record(root).get(archive.name, {})
@@ -131,7 +133,7 @@ def _fetch_archive(archive: Archive, root: Path, mirrors: Sequence[str], say: Sa
     return path, got.sha256, got.url
 
 
-def _verify(archive: Archive, path: Path, known: dict, root: Path, say: Say) -> str:
+def _verify(archive: RemoteArchive, path: Path, known: dict, root: Path, say: Say) -> str:
     """Return the SHA-256 of an existing archive. Only a new or changed file is read; otherwise the recorded value is used."""
     about = path.stat()
     if known and known.get("bytes") == about.st_size and known.get("changed") == about.st_mtime_ns:
@@ -147,7 +149,7 @@ def _verify(archive: Archive, path: Path, known: dict, root: Path, say: Say) -> 
     return found
 
 
-def _manual_advice(archive: Archive, path: Path, root: Path, known: dict) -> str:
+def _manual_advice(archive: RemoteArchive, path: Path, root: Path, known: dict) -> str:
     """Return what a user can do if no address works."""
     text = f"download {archive.name} ({archive.size}) by hand from {archive.page} to {path}"
     if known and not archive.sha256:
@@ -167,7 +169,7 @@ def _read_record(root: Path) -> dict[str, dict]:
     return found
 
 
-def _write_record(root: Path, archive: Archive, digest: str, url: str) -> None:
+def _write_record(root: Path, archive: RemoteArchive, digest: str, url: str) -> None:
     about, known = (root / "archives" / archive.name).stat(), _read_record(root)
     entry = {"sha256": digest, "bytes": about.st_size, "changed": about.st_mtime_ns, "from": url}
     if {k: known.get(archive.name, {}).get(k) for k in entry} != entry:

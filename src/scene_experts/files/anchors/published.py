@@ -14,13 +14,13 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera
 from scene_experts.data.views import Capture
 from scene_experts.files.anchors.data import AnchorData
-from scene_experts.recipes import octree_gs, scaffold_gs
 from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.scene.anchors.levels import LevelRule, Levels, centres
 from scene_experts.scene.anchors.mlp import Plain
 from scene_experts.scene.anchors.scene import Anchors
 from scene_experts.scene.anchors.select import Octree
 from scene_experts.training.config import Train
+from scene_experts.training.recipes import octree_gs, scaffold_gs
 
 RULES: dict[str, LevelRule] = {"round": "round", "floor": "floor", "ceil": "ceil", "progressive": "blend"}  # dist2level
 

@@ -38,7 +38,7 @@ class Global:
 
 
 @dataclass(eq=False)
-class Record:
+class ObjectRecord:
     """An object that was not made: what to make or call, with which arguments, and what would then
     be put into it."""
 
@@ -65,7 +65,7 @@ _FIXED = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
 def decode(data: bytes) -> Any:
-    """The value of a pickle as dicts, lists, tuples, numbers and texts, with `Record`, `Global` and
+    """The value of a pickle as dicts, lists, tuples, numbers and texts, with `ObjectRecord`, `Global` and
     `Outside` for the rest.
 
     Raises NotData.
@@ -164,7 +164,7 @@ class _Machine:
             case "SETITEM" | "SETITEMS":
                 values, depth = self.since_mark() if name == "SETITEMS" else self.take(2)
                 into = self.top(depth)
-                _kind(into.items if isinstance(into, Record) else into, dict).update(_pairs(values))
+                _kind(into.items if isinstance(into, ObjectRecord) else into, dict).update(_pairs(values))
             case "PUT" | "BINPUT" | "LONG_BINPUT":
                 self.memo[argument] = (self.top(), self.deep[-1])
             case "MEMOIZE":
@@ -188,10 +188,10 @@ class _Machine:
                 self.push(Global(_kind(module, str), _kind(member, str)))
             case "NEWOBJ" | "REDUCE":
                 (what, args), depth = self.take(2)
-                self.push(Record(_kind(what, Global), _kind(args, tuple)), depth)
+                self.push(ObjectRecord(_kind(what, Global), _kind(args, tuple)), depth)
             case "BUILD":
                 (state,), depth = self.take(1)
-                _kind(self.top(depth), Record).state = state
+                _kind(self.top(depth), ObjectRecord).state = state
             case "BINPERSID":
                 (key,), depth = self.take(1)
                 self.push(Outside(key), depth)

@@ -22,7 +22,7 @@ from scene_experts.core.reading.archives import Archive, open_zip
 from scene_experts.core.reading.budget import NETWORK
 from scene_experts.core.reading.numbers import expect_finite_tensors
 from scene_experts.core.reading.source import opening, shorten
-from scene_experts.files.archive.pickle_data import Global, NotData, Outside, Record, decode
+from scene_experts.files.archive.pickle_data import Global, NotData, ObjectRecord, Outside, decode
 
 _STORAGES = {
     "FloatStorage": torch.float32, "DoubleStorage": torch.float64, "HalfStorage": torch.float16, "BFloat16Storage": torch.bfloat16,
@@ -43,7 +43,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     with opening(path, NETWORK) as source:
         try:
             with open_zip(source) as archive:
-                reader = _Reader(archive)
+                reader = _TensorReader(archive)
                 found: dict[str, Tensor] = {}
                 reader.collect(decode(reader.record("data.pkl")), "", found, 0)
                 expect_finite_tensors(found)
@@ -54,7 +54,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     return found
 
 
-class _Reader:
+class _TensorReader:
     """The records of one archive; `collect` turns the pickle's tree into tensors."""
 
     def __init__(self, archive: Archive) -> None:
@@ -80,7 +80,7 @@ class _Reader:
         self.archive.source.spend_items(1)  # a pickle of 100 bytes can name the same list 2^30 times
         if depth > NETWORK.depth:
             raise NotData("it is nested too deeply")
-        if isinstance(value, Record):
+        if isinstance(value, ObjectRecord):
             inner = self.content(value)
             if isinstance(inner, Tensor):
                 found[place] = inner
@@ -94,13 +94,13 @@ class _Reader:
         elif not isinstance(value, (int, float, str, bool, type(None))):
             raise NotData(f"it holds {shorten(str(value))}, which is no tensor")
 
-    def content(self, record: Record) -> Tensor | dict[Any, Any]:
+    def content(self, record: ObjectRecord) -> Tensor | dict[Any, Any]:
         """What an admitted record stands for: a tensor, or the named values of a module or
         dictionary. Others are refused."""
         name = str(record.what)
         if name == "torch._utils._rebuild_tensor_v2" and len(record.args) >= 4:
             return self.tensor(*record.args[:4])
-        if name == "torch._utils._rebuild_parameter" and record.args and isinstance(record.args[0], Record):
+        if name == "torch._utils._rebuild_parameter" and record.args and isinstance(record.args[0], ObjectRecord):
             return self.content(record.args[0])
         if name == "collections.OrderedDict" and not any(record.args):
             return record.items  # its state is torch's note of module versions

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.source import Source
-from scene_experts.files.formats.compact import AXIS_BITS, morton
+from scene_experts.files.formats.morton import AXIS_BITS, morton
 from scene_experts.files.formats.splats import Splats
 
 log: logging.Logger = logging.getLogger(__name__)

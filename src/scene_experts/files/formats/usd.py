@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
-import scene_experts
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.io import write_atomic
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.source import Source, opening, shorten
+from scene_experts.core.version import package_folders
 from scene_experts.files.formats.pack import (
     Floats,
     alphas,
@@ -127,7 +127,7 @@ def _prim(source: Source, data: Any, number: int) -> tuple[Floats, ...]:
 
 def _work(task: str, source: Path, target: Path, seconds: int, *limits: str) -> subprocess.CompletedProcess[str]:
     """Run the worker. Raises InputError for a usd-core that is too old, and Damaged after `seconds`."""
-    roots = [str(Path(root).parent) for root in scene_experts.__path__]
+    roots = [str(folder.parent) for folder in package_folders()]
     paths = os.pathsep.join([*roots, *filter(None, [os.environ.get("PYTHONPATH")])])
     command = [sys.executable, "-m", "scene_experts.files.formats.usd_worker", task, str(source), str(target), *limits]
     environment = os.environ | {"PYTHONPATH": paths, "PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}

@@ -26,10 +26,10 @@ from scene_experts.files.formats.splats import Splats
 from scene_experts.files.gaussians.write import KIND
 from scene_experts.files.registry import Imported, recognise
 from scene_experts.files.registry import read as read_file
-from scene_experts.recipes import gs_3d
 from scene_experts.scene import Scene
 from scene_experts.scene.gaussians import Explicit, GaussianScene
 from scene_experts.training.config import Train
+from scene_experts.training.recipes import gs_3d
 from scene_experts.training.run_folder import OpenRun
 
 log: logging.Logger = logging.getLogger(__name__)

@@ -7,21 +7,34 @@ those of the native decode, on the CPU and on CUDA. Symbols as in `types.py`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from scene_experts.core.types import Camera, Decoded, Gaussians, Mode
+from scene_experts.core.table import Table
+from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Routing
 from scene_experts.scene import Cull
 from scene_experts.scene.anchors import native_decode, triton_decode
-from scene_experts.scene.anchors.appearance import fold
+from scene_experts.scene.anchors.appearance import Codes, fold
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, HeadWeights
-from scene_experts.scene.anchors.select import drop_masked, fade_opacities, visible_rows
+from scene_experts.scene.anchors.select import Selector, drop_masked, fade_opacities, visible_rows
 from scene_experts.scene.anchors.smoothing import smooth
 
-if TYPE_CHECKING:
-    from scene_experts.scene.anchors.scene import AnchorScene
+
+class Drawn(Protocol):
+    """What is needed of the scene, an `AnchorScene`."""
+
+    table: Table
+    config: Any
+    extent: float
+    codes: Codes | None
+    select: Selector
+
+    @property
+    def K(self) -> int: ...
+
+    def route_outside(self, weights: dict[str, HeadWeights], rows: Tensor, step: int) -> dict[str, tuple[Routing, Tensor]]: ...
 
 
 @dataclass(frozen=True)
@@ -40,7 +53,7 @@ class Kept:
 class Frozen:
     """Draws a scene at one step without gradients. The result contains no routing (`AnchorScene.routing` returns it)."""
 
-    scene: AnchorScene
+    scene: Drawn
     step: int
     columns: list[Tensor]
     xyz: Tensor
@@ -50,7 +63,7 @@ class Frozen:
     kept: tuple[Kept, ...]
 
     @torch.no_grad()
-    def __init__(self, scene: AnchorScene, weights: dict[str, HeadWeights], step: int) -> None:
+    def __init__(self, scene: Drawn, weights: dict[str, HeadWeights], step: int) -> None:
         self.scene, self.step = scene, step
         p = scene.table.params
         self.columns = [p[name].detach().contiguous() for name in ("feature", "log_scaling", "offsets")]

@@ -12,7 +12,7 @@ import pytest
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.data.fetch import download, obtain
-from scene_experts.data.fetch.catalog import Archive, CatalogScene, Collection
+from scene_experts.data.fetch.catalog import CatalogScene, Collection, RemoteArchive
 from support.archives import in_folder, read_tree, write_zip
 from support.messages import naming
 from support.web import Server, serving
@@ -31,7 +31,7 @@ def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
 
 
 def scenes(server: Server, **facts: object) -> list[CatalogScene]:
-    archive = replace(Archive("both.zip", (f"{server.url}/both.zip",), "https://owner/page", "1 kB"), **facts)  # type: ignore[arg-type]
+    archive = replace(RemoteArchive("both.zip", (f"{server.url}/both.zip",), "https://owner/page", "1 kB"), **facts)  # type: ignore[arg-type]
     collection = Collection("pair", "Pair", archive, "not stated", "Somebody, 2020")
     return [CatalogScene(name, collection, (f"both/{name}",), "as-is", views=2) for name in ("truck", "train")]
 

@@ -19,11 +19,11 @@ from scene_experts.data import readers
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers import PosedImage, RawCapture, ReadOptions
 from scene_experts.data.settings import Data
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Finished
 from scene_experts.training.loop import Job, train
+from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.synthetic import make_capture
 

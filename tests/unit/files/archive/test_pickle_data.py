@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scene_experts.files.archive import pickle_data
-from scene_experts.files.archive.pickle_data import Global, NotData, Outside, Record, decode
+from scene_experts.files.archive.pickle_data import Global, NotData, ObjectRecord, Outside, decode
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -27,9 +27,9 @@ def test_plain_values_are_what_pickle_itself_reads(value, protocol):
 
 def test_an_object_becomes_a_record_of_its_name_and_arguments():
     found = decode(pickle.dumps(Decimal("1.5"), protocol=2))
-    assert isinstance(found, Record) and found.what == Global("decimal", "Decimal") and found.args == ("1.5",)
+    assert isinstance(found, ObjectRecord) and found.what == Global("decimal", "Decimal") and found.args == ("1.5",)
     found = decode(pickle.dumps(OrderedDict(a=1), protocol=2))
-    assert isinstance(found, Record) and str(found.what) == "collections.OrderedDict" and found.items == {"a": 1}
+    assert isinstance(found, ObjectRecord) and str(found.what) == "collections.OrderedDict" and found.items == {"a": 1}
     assert decode(pickle.dumps(math.sin, protocol=2)) == Global("math", "sin")
 
 

@@ -11,7 +11,7 @@ from scene_experts.files.bake.bake import DRAWN_AT, LEAST_ALPHA, Bake, Refine, b
 from scene_experts.files.bake.observe import Sums
 from scene_experts.files.gaussians.read import scene_of
 from scene_experts.files.measure import Painter, scores
-from scene_experts.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.files import run_in_memory
 from support.synthetic import make_capture

@@ -9,8 +9,8 @@ from scene_experts.files.bake.refine import Refine, refine
 from scene_experts.files.bake.views import Views
 from scene_experts.files.gaussians.read import DRAWN_AT, scene_of
 from scene_experts.files.measure import Painter
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
+from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.synthetic import make_capture
 

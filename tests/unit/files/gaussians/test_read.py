@@ -12,17 +12,18 @@ from scene_experts.core.types import Mode
 from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.files import registry
-from scene_experts.files.export import export, write_result_folder
+from scene_experts.files.export import export
 from scene_experts.files.formats import ply, splat
 from scene_experts.files.formats.ply import read_vertices, write_vertices
 from scene_experts.files.importing import import_files
 from scene_experts.files.options import Options
 from scene_experts.files.result_folder import read_settings
-from scene_experts.recipes import RECIPES
+from scene_experts.files.scene_folder import write_result_folder
 from scene_experts.render import choose
 from scene_experts.training import loop as train
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
+from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.files import export_run
 from support.messages import naming

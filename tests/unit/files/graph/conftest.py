@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 
 from scene_experts.data.settings import Data
-from scene_experts.files.export import write_result_folder
-from scene_experts.recipes import RECIPES
+from scene_experts.files.scene_folder import write_result_folder
 from scene_experts.render import choose
 from scene_experts.training import loop as train
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
+from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.synthetic import make_capture
 

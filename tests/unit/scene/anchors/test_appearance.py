@@ -7,9 +7,9 @@ import torch
 
 from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.appearance import Codes, fold
 from scene_experts.scene.anchors.mlp import HeadWeights
+from scene_experts.training.recipes import RECIPES
 
 CAMERA = Camera(torch.eye(4), torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), 48, 32, id=3)
 EVERYTHING = lambda means, scales, camera: torch.ones(len(means), dtype=torch.bool)  # noqa: E731

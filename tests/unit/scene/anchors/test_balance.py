@@ -13,10 +13,10 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
 from scene_experts.core.plain import to_json
 from scene_experts.core.types import Mode
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.balance import Balanced, BalancedModule
 from scene_experts.scene.anchors.experts import Experts, Mixture
 from scene_experts.training.config import check
+from scene_experts.training.recipes import RECIPES
 from support.scenes import start_scene
 
 SOURCE = Path(scene_experts.__file__).parent
@@ -36,7 +36,7 @@ def test_the_part_touches_its_own_file_and_the_recipes_alone():
         ("Balanced(", "BalancedModule", "moe-gs-balance", "anchors.balance", "self.balance"),
     )
     naming = {p for p in SOURCE.rglob("*.py") if any(name in p.read_text() for name in names)}
-    assert naming == {own, SOURCE / "recipes.py"}
+    assert naming == {own, SOURCE / "training" / "recipes.py"}
 
 
 def test_without_speed_it_is_the_mixture_of_the_paper_bit_for_bit():

@@ -8,8 +8,8 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Mode, Points
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.features import Bank, FeatureBank, OwnFeature
+from scene_experts.training.recipes import RECIPES
 
 CAMERA = Camera(torch.eye(4), torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), 48, 32)
 EVERYTHING = lambda means, scales, camera: torch.ones(len(means), dtype=torch.bool)  # noqa: E731

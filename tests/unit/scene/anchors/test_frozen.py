@@ -7,7 +7,6 @@ import torch
 
 from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors import scene as anchors
 from scene_experts.scene.anchors.balance import Balanced
@@ -16,6 +15,7 @@ from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
 from scene_experts.scene.anchors.routers import Linear, Margin
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
+from scene_experts.training.recipes import RECIPES
 from support.interpret import DEVICE, kernels
 from support.messages import naming
 

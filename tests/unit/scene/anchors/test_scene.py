@@ -10,10 +10,10 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.fields import check_fields
 from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.scene.anchors.rates import Rates
 from scene_experts.scene.anchors.scene import ATTRIBUTES, Anchors, AnchorScene
+from scene_experts.training.recipes import RECIPES
 from support.messages import naming
 
 EVERYTHING = lambda means, scales, camera: torch.ones(len(means), dtype=torch.bool)  # noqa: E731

@@ -8,9 +8,9 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.fields import check_fields
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.levels import MOST_FORK, MOST_LEVELS, Levels
 from scene_experts.scene.anchors.select import AllAnchors, LevelSelector, Octree, fade_opacities, visible_rows
+from scene_experts.training.recipes import RECIPES
 from support.messages import naming
 from support.octree import camera_at, slow_level
 

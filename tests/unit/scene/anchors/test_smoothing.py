@@ -8,10 +8,10 @@ import torch
 
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode
 from scene_experts.geometry.rotation import covariance
-from scene_experts.recipes import RECIPES
 from scene_experts.render import choose
 from scene_experts.scene import restore_scene
 from scene_experts.scene.anchors.smoothing import find_intervals, smooth
+from scene_experts.training.recipes import RECIPES
 from support.scenes import CAMERA, start_scene
 
 

@@ -10,10 +10,10 @@ from scene_experts.core.fields import check_fields
 from scene_experts.core.types import Mode, Points
 from scene_experts.geometry.curvature import curvature, find_flat
 from scene_experts.geometry.neighbours import knn_d2
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.graph.hash_grid import HashGrid
 from scene_experts.scene.graph.network import Graph, blend_neighbours
 from scene_experts.scene.graph.scene import GraphPoints, GraphRates, GraphScene
+from scene_experts.training.recipes import RECIPES
 from support.graph_scenes import CAMERA, cloud, everyone, start_graph
 from support.messages import naming
 

@@ -10,15 +10,14 @@ from hypothesis import strategies as st
 
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.files.anchors import compact
+from scene_experts.files.anchors.compact import Coding, decode_steps, encode_steps, read
 from scene_experts.files.anchors.data import AnchorData, by_attribute, by_file_name
-from scene_experts.files.formats import compact
-from scene_experts.files.formats.compact import AXIS_BITS, Coding, decode_steps, encode_steps, morton, read, unmorton
 from support.messages import naming
 
 K, F = 10, 32
 OUT = {"opacity": 10, "cov": 70, "color": 30}
 ORIGIN = (-1.5, 20.25, 0.1 + 0.2)
-TOP = (1 << AXIS_BITS) - 1
 
 
 def scene(n=2000, seed=0, spread=300):
@@ -242,19 +241,6 @@ def test_a_full_disk(tmp_path):
         write(tmp_path / "file" / "c", scene(5))
 
 
-def interleaved(x, y, z):
-    return sum(((v >> bit) & 1) << (3 * bit + axis) for axis, v in enumerate((x, y, z)) for bit in range(AXIS_BITS))
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(*[st.integers(0, TOP)] * 3), max_size=20))
-def test_keys_interleave_bits_and_come_back(cells):
-    array = np.array(cells, np.int64).reshape(-1, 3)
-    keys = morton(array)
-    assert keys.tolist() == [interleaved(*c) for c in cells]
-    assert np.array_equal(unmorton(keys), array)
-
-
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.integers(0, 2**63 - 1), max_size=50))
 def test_steps_come_back(keys):
@@ -266,7 +252,6 @@ def test_short_steps_take_one_byte_and_the_longest_nine():
     assert len(encode_steps(np.array([0, 0, 127, 254], np.uint64))) == 4
     assert len(encode_steps(np.array([128], np.uint64))) == 2
     assert len(encode_steps(np.array([2**63 - 1], np.uint64))) == 9
-    assert interleaved(TOP, TOP, TOP) == 2**63 - 1
 
 
 @pytest.mark.parametrize("data", [[0x80], [0, 0x80], [0x80] * 9 + [0], [0xFF] * 20])

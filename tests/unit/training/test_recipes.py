@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 import scene_experts
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.experts import Experts
+from scene_experts.training.recipes import RECIPES
 
 SOURCE = Path(scene_experts.__file__).parent
 

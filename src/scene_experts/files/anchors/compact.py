@@ -31,23 +31,15 @@ from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import FARTHEST, number, shown, whole_number
 from scene_experts.core.reading.source import Source, opening
 from scene_experts.files.anchors.data import AnchorData
+from scene_experts.files.formats.morton import AXIS_BITS, Keys, morton, unmorton
 from scene_experts.files.registry import Format
 
 KIND, VERSION = "compact scene", 1
 MOST_ANCHORS, MOST_CHANNELS = 1 << 28, 1 << 12  # of a file; K and F
 FARTHEST_CELL = 1 << 52  # coordinate of a cell
-AXIS_BITS = 21  # bits of a cell coordinate; 63 bits per key
 Code = Literal["float32", "float16", "uint16", "uint8"]
-Keys = NDArray[np.uint64]
 _GROUP = 7
 _MAX_GROUPS = 9  # 63 bits
-_SPREAD = (  # (shift, mask): two zeros between every two bits of a 21-bit number
-    (32, 0x001F00000000FFFF),
-    (16, 0x001F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
 
 
 @dataclass(frozen=True)
@@ -235,29 +227,6 @@ def inflate(blob: NDArray[np.uint8], size: int, exact: bool = True) -> NDArray[n
 
 
 # --- cells --------------------------------------------------------------------------------------------------------------------------------
-
-
-def morton(cells: NDArray[np.int64]) -> Keys:
-    """Keys [N] of cells [N, 3], each coordinate in [0, 2^21); x is the lowest of each three bits."""
-    out = np.zeros(len(cells), np.uint64)
-    for axis in range(3):
-        value = cells[:, axis].astype(np.uint64)
-        for shift, mask in _SPREAD:
-            value = (value | (value << np.uint64(shift))) & np.uint64(mask)
-        out |= value << np.uint64(axis)
-    return out
-
-
-def unmorton(keys: Keys) -> NDArray[np.int64]:
-    """Cells [N, 3] of keys [N], the inverse of `morton`."""
-    out = np.empty((len(keys), 3), np.int64)
-    masks = [0x1FFFFF, *(mask for _, mask in _SPREAD)]
-    for axis in range(3):
-        value = (keys >> np.uint64(axis)) & np.uint64(_SPREAD[-1][1])
-        for i in range(len(_SPREAD) - 1, -1, -1):
-            value = (value | (value >> np.uint64(_SPREAD[i][0]))) & np.uint64(masks[i])
-        out[:, axis] = value.astype(np.int64)
-    return out
 
 
 def encode_steps(keys: Keys) -> NDArray[np.uint8]:
