@@ -7,7 +7,8 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from scene_experts.core.fields import flag_of
+from scene_experts.core.fields import Chosen, flag_of, note
+from scene_experts.core.parts import Part, become
 from scene_experts.data.settings import Data
 from scene_experts.training.config import Train
 from scene_experts.training.options import TrainOptions
@@ -24,7 +25,7 @@ def command_of(cfg: Train, data: Data, out: Path | None, options: TrainOptions) 
     changed = changes(RECIPES[cfg.recipe][1], cfg)
     if changed is None or out is None:
         return ""
-    words = ["scene-experts", "train", cfg.recipe, "--data", str(data.path), "--out", str(out)]
+    words = ["scene-experts", "train", cfg.recipe, *words_of("data", data.path), *words_of("out", out)]
     words += [word for place, value in [*(changes(Data(data.path), data) or []), *changed] for word in words_of(place, value)]
     words += [word for name in RECORDED for word in words_of(name, getattr(options, name)) if getattr(options, name)]
     return shlex.join(words)
@@ -38,6 +39,9 @@ def changes(old: Any, new: Any, above: str = "") -> list[tuple[str, Any]] | None
         if not dataclasses.is_dataclass(now):
             out += [(above + field.name, now)] if now != was else []
             continue
+        if isinstance(now, Part) and type(was) is not type(now) and note(type(new), field.name, Chosen) is not None:
+            out.append((above + field.name, now.name))  # type: ignore[attr-defined]
+            was = become(was, type(now))
         below = changes(was, now, f"{above}{field.name}.") if type(was) is type(now) else None
         if below is None:
             return None

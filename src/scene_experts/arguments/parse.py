@@ -11,7 +11,7 @@ from scene_experts.arguments.help import format_usage, page, stands_for
 from scene_experts.arguments.table import Place, Row, choose_parts, make, rows
 from scene_experts.arguments.values import NONE, convert, count, format_value, without_none
 from scene_experts.core.errors import InputError, nearest
-from scene_experts.core.fields import check_value
+from scene_experts.core.fields import check_value, flag_of
 
 T = TypeVar("T")
 NUMBER = re.compile(r"-(\d|\.\d|inf|nan)")
@@ -29,15 +29,20 @@ class Command:
     name: str
     """As it is typed: "scene-experts eval"."""
     positional: tuple[str, ...] = ()
-    """Options that may be given without their name, in this order: ("--run",). Only the last may take several values."""
+    """Names of options that may be given without them, in this order: ("run",). Only the last may take several values."""
     first: tuple[str, ...] = ()
-    """Options that --help shows, where --help-all shows the rest too. Empty: all."""
+    """Names of options that --help shows, where --help-all shows the rest too. Empty: all."""
     about: str = ""
     """What the command does; the dataclass's docstring by default."""
     defaults: Mapping[str, Any] = field(default_factory=dict)
     """Values by dotted place that replace the dataclass's own: {"data.normalise": "none"}."""
     elsewhere: Callable[[str], str] = lambda flag: ""
     """Returns a hint for an unknown option: what it belongs to, or an empty string."""
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The flags of `positional`."""
+        return tuple(map(flag_of, self.positional))
 
 
 def parse(kind: type[T], command: Command, args: Sequence[str]) -> T:
@@ -48,12 +53,13 @@ def parse(kind: type[T], command: Command, args: Sequence[str]) -> T:
     defaults = choose_parts(kind, command.defaults, lambda row: _word_after(row.flag, args))
     table = rows(kind, defaults)
     if any(arg in HELP or arg == HELP_ALL for arg in args):
-        raise HelpAsked(page(kind, command.name, command.about, table, command.positional, () if HELP_ALL in args else command.first))
+        first = () if HELP_ALL in args else tuple(map(flag_of, command.first))
+        raise HelpAsked(page(kind, command.name, command.about, table, command.words, first))
     given = _Reader(command, table).read(list(args))
     chosen = {row.place for row in table if row.part is not None}
     missing = [row for row in table if row.required and row.place not in given]
     if missing:
-        how = format_usage(command.name, table, command.positional)
+        how = format_usage(command.name, table, command.words)
         raise InputError(f"expected {_both(missing, command)}, found {_none(missing)}; write {how}")
     for row in table:
         if row.place in given:
@@ -76,7 +82,7 @@ class _Reader:
     def __init__(self, command: Command, table: Sequence[Row]) -> None:
         self.command = command
         self.by_name = {name: row for row in table for name in row.names}
-        self.waiting = [self.by_name[flag] for flag in command.positional]
+        self.waiting = [self.by_name[flag] for flag in command.words]
         self.given: dict[Place, Any] = {}
         self.written: dict[Place, str] = {}
 
@@ -155,7 +161,7 @@ def _take(row: Row, args: list[str]) -> list[str]:
 
 def _both(missing: Sequence[Row], command: Command) -> str:
     """Return the names of the missing options, for example "--data and --out"."""
-    *some, last = [stands_for(row) if row.flag in command.positional else row.flag for row in missing]
+    *some, last = [stands_for(row) if row.flag in command.words else row.flag for row in missing]
     return f"{', '.join(some)} and {last}" if some else last
 
 

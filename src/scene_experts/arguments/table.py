@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from scene_experts.arguments.option import Option
 from scene_experts.core.fields import Chosen, note, notes_of
-from scene_experts.core.parts import Part, choices
+from scene_experts.core.parts import Part, become, choices
 
 Place = tuple[str, ...]
 """Field names from the root to a value, for example ("cfg", "scene", "voxel_size")."""
@@ -97,8 +97,7 @@ def choose_parts(kind: type, defaults: Mapping[str, Any], chosen: Callable[[Row]
         base = notes_of(row.owner)[row.place[-1]][0]
         part = choices(base).get(name)
         if part is not None:
-            kept = {f.name for f in fields(part) if f.init} & {f.name for f in fields(row.part)}
-            found[".".join(row.place)] = part(**{name: getattr(row.part, name) for name in kept})
+            found[".".join(row.place)] = become(row.part, part)
     return found
 
 

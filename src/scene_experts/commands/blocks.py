@@ -10,7 +10,8 @@ from typing import Annotated
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import HELP, HELP_ALL, Command, HelpAsked, parse
 from scene_experts.commands import PROG
-from scene_experts.core.errors import InputError, expect_at_least, nearest
+from scene_experts.core.errors import InputError, nearest
+from scene_experts.core.fields import Count, CountOrNone, NotNegative, flag_of
 from scene_experts.data.fetch.catalog import defaults_in, defaults_of
 from scene_experts.data.settings import Data
 
@@ -35,21 +36,21 @@ class PlanCommand:
     data: Annotated[Data, Option(name="")]
     out: Annotated[Path, Option(value="PLAN")]
     """Folder to write: plan.json, the views of each block and commands.sh."""
-    blocks: int = 4
+    blocks: Count = 4
     """Number of blocks."""
-    margin: float = 0.1
+    margin: NotNegative = 0.1
     """Choose views by the points in a block and around it, up to this share of its size."""
-    share: float = 0.1
+    share: NotNegative = 0.1
     """A view belongs to a block if at least this share of the points in its picture lie in the enlarged block."""
     recipe: str = "moe-gs"
     """Recipe of the commands; a recipe with anchors."""
-    iterations: int = 30_000
+    iterations: Count = 30_000
     """Iterations of the commands: a third for the coarse scene, the others for each block, and a tenth more for the merged scene."""
     train: Annotated[str, Option(value="OPTIONS")] = ""
     """More options for all trainings, in quotes after =: --train="--scene.voxel-size 0.01 --seed 1"."""
-    coarse_anchors: int = 0
+    coarse_anchors: CountOrNone = 0
     """Maximum number of anchors of the coarse scene; 0 means no limit. Each block holds the coarse scene beside its own anchors."""
-    max_memory: float = 0.0
+    max_memory: NotNegative = 0.0
     """Stop densification in the coarse scene and in each block at this resident memory in GiB; 0 means no limit."""
 
 
@@ -79,8 +80,7 @@ def blocks(args: list[str]) -> int:
 def plan(args: list[str]) -> int:
     """Write a plan and print its commands."""
     brought = {"data.normalise": defaults_in(args).normalise}
-    command = parse(PlanCommand, Command(f"{PROG} blocks plan", ("--data",), defaults=brought), args)
-    expect_at_least([("--coarse-anchors", command.coarse_anchors, 0), ("--max-memory", command.max_memory, 0)])
+    command = parse(PlanCommand, Command(f"{PROG} blocks plan", ("data",), defaults=brought), args)
 
     from scene_experts.core.io import write_bytes
     from scene_experts.data import capture as captures
@@ -118,28 +118,36 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]], every: int =
 
     out, total, more = command.out, command.iterations, split_words(command.train)
     usual = Data(Path(), normalise=defaults_of(command.data.path).normalise)  # what `train` takes without options
-    data = [word for name, value in vars(command.data).items() if value != getattr(usual, name) for word in _flag(name, value)]
+    read = {name: value for name, value in vars(command.data).items() if value != getattr(usual, name)}
+    data = options(**{"data" if name == "path" else name: value for name, value in read.items()})
     train = [PROG, "train", command.recipe, *data, *more]
-    coarse, merged = str(out / "coarse"), str(out / "merged")
-    runs = [str(out / f"run{number}") for number in range(command.blocks)]
-    memory = ["--max-memory", f"{command.max_memory:g}"] if command.max_memory else []
-    few = ["--max-anchors", str(command.coarse_anchors)] if command.coarse_anchors else []
-    cfg = parse_train([*train[2:], "--out", coarse, "--iterations", str(total)]).cfg
+    coarse, merged = out / "coarse", out / "merged"
+    runs = [out / f"run{number}" for number in range(command.blocks)]
+    memory = options(max_memory=f"{command.max_memory:g}") if command.max_memory else []
+    few = options(max_anchors=command.coarse_anchors) if command.coarse_anchors else []
+    cfg = parse_train([*train[2:], *options(out=coarse, iterations=total)]).cfg
     until = max(1, total // 3, cfg.scaled_scene().dense_until)  # a scene is divided among experts before it is cut into blocks
     own = flags_of(cfg, [("scene.decoder.router.speed", 0), *(changes(cfg.scene, cfg.scene.of_views(every), "scene.") or [])])
     block = [PROG, "train", command.recipe, *data, *without(more, own[::2])]
-    same = ["--rates.networks", "0", *own]  # what all anchors share stays equal in all blocks
-    lines = [[*train, "--out", coarse, "--iterations", str(total), "--stop-at", str(until), *few, *memory]]
+    same = [*options(**{"rates.networks": 0}), *own]  # what all anchors share stays equal in all blocks
+    lines = [[*train, *options(out=coarse, iterations=total, stop_at=until), *few, *memory]]
     for number, run in enumerate(runs):
-        views = ["--views", str(out / f"block{number}.json"), "--init-from", coarse, *same]
-        inside = ["--growth.bounds", *(f"{side:.6g}" for side in bounds[number])]
-        lines.append([*block, "--out", run, "--iterations", str(total), *views, *inside, *memory])
-    lines.append([PROG, "blocks", "merge", str(out), "--runs", *runs, "--out", merged])
+        begin = options(out=run, iterations=total, views=out / f"block{number}.json", init_from=coarse)
+        inside = options(**{"growth.bounds": tuple(f"{side:.6g}" for side in bounds[number])})
+        lines.append([*block, *begin, *same, *inside, *memory])
+    lines.append([PROG, "blocks", "merge", str(out), *options(runs=tuple(runs), out=merged)])
     both = total + -(-max(1, total // 10) // cfg.batch) * cfg.batch  # as `total`, a multiple of the batch
     # the rates that a schedule leaves constant fall during the joint training: without it, the blocks' fit is shaken and not restored
-    settle = ["--rates.anneal", str(SETTLE), "--rates.anneal-from", f"{total / both:.4f}"]
-    lines.append([*train, "--out", str(out / "joint"), "--iterations", str(both), "--init-from", merged, *settle])
+    settle = options(**{"rates.anneal": SETTLE, "rates.anneal_from": f"{total / both:.4f}"})
+    lines.append([*train, *options(out=out / "joint", iterations=both, init_from=merged), *settle])
     return [shlex.join(line) for line in lines]
+
+
+def options(**values: object) -> list[str]:
+    """Return the arguments that set options, by the dotted paths of their fields."""
+    from scene_experts.api.command_line import words_of
+
+    return [word for place, value in values.items() for word in words_of(place, value)]
 
 
 def without(words: list[str], flags: list[str]) -> list[str]:
@@ -163,8 +171,9 @@ def check_trainings(lines: list[str], data: Data) -> None:
             check(train.cfg)
             found = vars(train.data)
             for name in (name for name, value in vars(data).items() if name != "views" and value != found[name]):
-                option = f"--{name.replace('_', '-')}"
-                raise InputError(f"expected options of the training in --train, found {option}; give it to `{PROG} blocks plan` itself")
+                raise InputError(
+                    f"expected options of the training in --train, found {flag_of(name)}; give it to `{PROG} blocks plan` itself"
+                )
 
 
 def split_words(text: str) -> list[str]:
@@ -175,14 +184,9 @@ def split_words(text: str) -> list[str]:
         raise InputError(f"expected options for --train, found '{text}' ({error}); correct the quotes") from None
 
 
-def _flag(name: str, value: object) -> list[str]:
-    words = [str(item) for item in value] if isinstance(value, tuple) else [] if value is True else [str(value)]
-    return [f"--{'data' if name == 'path' else name.replace('_', '-')}", *words]
-
-
 def merge(args: list[str]) -> int:
     """Merge runs and print where the merged run is."""
-    command = parse(MergeCommand, Command(f"{PROG} blocks merge", ("--plan",)), args)
+    command = parse(MergeCommand, Command(f"{PROG} blocks merge", ("plan",)), args)
 
     from scene_experts.files.merging import merge_blocks
 

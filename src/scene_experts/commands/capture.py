@@ -35,8 +35,7 @@ class CaptureCommand:
 
 
 def capture(args: list[str]) -> int:
-    command = parse(CaptureCommand, Command(f"{PROG} capture", ("--photos",)), args)
-    command.options.check()
+    command = parse(CaptureCommand, Command(f"{PROG} capture", ("photos",)), args)
 
     from rich.console import Console
 

@@ -40,7 +40,7 @@ class DownloadCommand:
 
 
 def download(args: list[str]) -> int:
-    command = parse(DownloadCommand, Command(f"{PROG} download", ("--scenes",)), args)
+    command = parse(DownloadCommand, Command(f"{PROG} download", ("scenes",)), args)
     root = command.to or captures_dir()
     console = Console(markup=False, highlight=False, soft_wrap=True)
     scenes = select(command.scenes)
@@ -77,7 +77,7 @@ class CatalogCommand:
 
 
 def catalog(args: list[str]) -> int:
-    command = parse(CatalogCommand, Command(f"{PROG} catalog", ("--scenes",)), args)
+    command = parse(CatalogCommand, Command(f"{PROG} catalog", ("scenes",)), args)
     root, console = command.to or captures_dir(), Console(markup=False, highlight=False, soft_wrap=True)
     scenes = select(command.scenes)
     if not scenes:

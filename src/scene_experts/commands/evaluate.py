@@ -35,7 +35,7 @@ class EvalCommand:
 
 
 def evaluate(args: list[str]) -> int:
-    command = parse(EvalCommand, Command(f"{PROG} eval", ("--run",)), args)
+    command = parse(EvalCommand, Command(f"{PROG} eval", ("run",)), args)
 
     from rich.console import Console
 
@@ -71,7 +71,7 @@ class CompareCommand:
 
 
 def compare(args: list[str]) -> int:
-    command = parse(CompareCommand, Command(f"{PROG} compare", ("--runs",)), args)
+    command = parse(CompareCommand, Command(f"{PROG} compare", ("runs",)), args)
 
     from rich.console import Console
 

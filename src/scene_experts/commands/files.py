@@ -17,7 +17,7 @@ from scene_experts.data.settings import Data
 from scene_experts.files.options import Options
 from scene_experts.files.registry import GAUSSIANS, about, format_named, format_names
 
-FIRST = ("--data", "--out", "--iteration", "--images", "--resolution", "--split")
+FIRST = ("data", "out", "iteration", "images", "resolution", "split")
 """The options of `import` that people use first, for --help."""
 
 
@@ -59,7 +59,7 @@ def export(args: list[str]) -> int:
     """Write a run to one or more files and print what was written."""
     standard = "Files without networks are standard files of plain Gaussians: other scenes are baked for them, which takes minutes."
     text = f"{ExportCommand.__doc__}\n\n{formats_help()}\n\n{standard}"
-    command = parse(ExportCommand, Command(f"{PROG} export", ("--run",), about=text), args)
+    command = parse(ExportCommand, Command(f"{PROG} export", ("run",), about=text), args)
 
     from rich.console import Console
 
@@ -102,7 +102,7 @@ def import_(args: list[str]) -> int:
     """Make a run folder of a result folder or a file and print where it is."""
     text = f"{ImportCommand.__doc__}\n\n{formats_help()}"
     brought = {"data.normalise": defaults_in(args).normalise}
-    command = parse(ImportCommand, Command(f"{PROG} import", ("--source",), FIRST, text, brought), args)
+    command = parse(ImportCommand, Command(f"{PROG} import", ("source",), FIRST, text, brought), args)
 
     from scene_experts.files.importing import import_files
     from scene_experts.training.run_folder import named

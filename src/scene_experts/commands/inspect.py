@@ -13,7 +13,7 @@ from scene_experts.data.settings import Data
 def info(args: list[str]) -> int:
     about = "Show what a capture contains: views, picture sizes, cameras, points, split and warnings."
     brought = {"normalise": defaults_in(args).normalise}
-    data = parse(Data, Command(f"{PROG} info", ("--data",), about=about, defaults=brought), args)
+    data = parse(Data, Command(f"{PROG} info", ("data",), about=about, defaults=brought), args)
 
     from rich.console import Console
 

@@ -11,9 +11,10 @@ from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
 from scene_experts.core.choices import Device, Raster
+from scene_experts.core.fields import check_fields
 from scene_experts.view.film_options import FilmOptions
 
-FIRST = ("--out", "--path", "--seconds", "--size", "--show", "--only", "--beside", "--step", "--data", "--device")
+FIRST = ("out", "path", "seconds", "size", "show", "only", "beside", "step", "data", "device")
 """The options that people use first, for --help."""
 
 
@@ -41,8 +42,8 @@ class RenderCommand:
 
 
 def render(args: list[str]) -> int:
-    command = parse(RenderCommand, Command(f"{PROG} render", ("--run",), FIRST), args)
-    command.options.check()
+    command = parse(RenderCommand, Command(f"{PROG} render", ("run",), FIRST), args)
+    check_fields(command.options)
 
     from rich.console import Console
 

@@ -22,7 +22,7 @@ class ReportCommand:
 
 
 def report(args: list[str]) -> int:
-    command = parse(ReportCommand, Command(f"{PROG} report", ("--runs",)), args)
+    command = parse(ReportCommand, Command(f"{PROG} report", ("runs",)), args)
     from scene_experts.report import page
 
     print(f"wrote {page.write(command.runs, command.out)}")

@@ -7,26 +7,26 @@ from scene_experts.commands import PROG
 from scene_experts.reproduce.options import ReproduceOptions
 
 FIRST = (
-    "--captures",
-    "--data",
-    "--scenes",
-    "--recipes",
-    "--baseline",
-    "--seeds",
-    "--iterations",
-    "--resolution",
-    "--scale",
-    "--out",
-    "--workers",
-    "--devices",
-    "--dry-run",
-    "--tables-only",
+    "captures",
+    "data",
+    "scenes",
+    "recipes",
+    "baseline",
+    "seeds",
+    "iterations",
+    "resolution",
+    "scale",
+    "out",
+    "workers",
+    "devices",
+    "dry-run",
+    "tables-only",
 )
 """The options that people use first, for --help."""
 
 
 def reproduce(args: list[str]) -> int:
-    options = parse(ReproduceOptions, Command(f"{PROG} reproduce", ("--experiments",), FIRST), args)
+    options = parse(ReproduceOptions, Command(f"{PROG} reproduce", ("experiments",), FIRST), args)
 
     from rich.console import Console
 

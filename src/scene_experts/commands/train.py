@@ -41,18 +41,18 @@ from scene_experts.view.live import Live
 from scene_experts.view.server import check_port, import_viser
 
 FIRST = (
-    "--data",
-    "--out",
-    "--resolution",
-    "--iterations",
-    "--max-anchors",
-    "--max-memory",
-    "--seed",
-    "--device",
-    "--preview-every",
-    "--viewer",
-    "--resume",
-    "--overwrite",
+    "data",
+    "out",
+    "resolution",
+    "iterations",
+    "max-anchors",
+    "max-memory",
+    "seed",
+    "device",
+    "preview-every",
+    "viewer",
+    "resume",
+    "overwrite",
 )
 """The options that people use first, for --help."""
 

@@ -34,7 +34,7 @@ class ViewCommand:
 
 
 def view(args: list[str]) -> int:
-    command = parse(ViewCommand, Command(f"{PROG} view", ("--run",)), args)
+    command = parse(ViewCommand, Command(f"{PROG} view", ("run",)), args)
 
     from scene_experts.api.backend import backend
     from scene_experts.render import as_trained

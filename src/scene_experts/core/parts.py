@@ -63,6 +63,12 @@ def extend(part: Part, kind: type[P], **numbers: Any) -> P:
     return kind(**{field.name: getattr(part, field.name) for field in dataclasses.fields(part) if field.init} | numbers)
 
 
+def become(part: Part, kind: type[P]) -> P:
+    """Return a part of the class `kind` that takes the place of `part`: settings of both keep their values."""
+    kept = {field.name for field in dataclasses.fields(kind) if field.init} & {field.name for field in dataclasses.fields(part)}
+    return kind(**{name: getattr(part, name) for name in kept})
+
+
 def find(name: str, kind: type[P]) -> type[P] | None:
     """Return the registered subclass of `kind` with the name `name`, or None."""
     part = _REGISTERED.get(name)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scene_experts.core.errors import InputError, few
+from scene_experts.core.fields import flag_of
 from scene_experts.core.io import read_json
 from scene_experts.core.types import Camera
 from scene_experts.data.views import same_poses
@@ -27,15 +28,15 @@ if TYPE_CHECKING:
 
 FAILED = 6.0  # dB below the median of the views: such a view fails
 PROTOCOL = {  # what must agree before scores may be compared: key in results.json, name, option that sets it
-    "capture": ("capture", "--data"),
-    "resolution": ("resolution", "--resolution"),
-    "split": ("split", "--split"),
-    "views": ("views", "--views"),
-    "view_count": ("number of views", "--max-views"),
-    "mean_pixels": ("picture size", "--resolution"),  # after the views: those of another split may have other sizes
-    "appearance": ("appearance codes", "--appearance"),
-    "masked": ("use of masks", "--data"),
-    "background": ("background of transparent photographs", "--background"),
+    "capture": ("capture", "data"),
+    "resolution": ("resolution", "resolution"),
+    "split": ("split", "split"),
+    "views": ("views", "views"),
+    "view_count": ("number of views", "max_views"),
+    "mean_pixels": ("picture size", "resolution"),  # after the views: those of another split may have other sizes
+    "appearance": ("appearance codes", "appearance"),
+    "masked": ("use of masks", "data"),
+    "background": ("background of transparent photographs", "background"),
 }
 DEFAULTS = {"appearance": "rule"}  # the meaning of a results file without the key
 MAY_LACK = ("background",)  # a results file without one of these agrees with every other
@@ -193,9 +194,9 @@ def find_difference(names: Sequence[str], results: Sequence[dict[str, Any]]) -> 
                 continue
             ours, theirs = (r.get(key, DEFAULTS.get(key)) for r in (one, other))
             if ours != theirs:
-                return f"the same {what}, found {ours} in {first} and {theirs} in {second}", option
+                return f"the same {what}, found {ours} in {first} and {theirs} in {second}", flag_of(option)
         if not same_poses(one.get("poses"), other.get("poses")):
-            return f"the same camera poses, found others in {second} than in {first}", "--data"
+            return f"the same camera poses, found others in {second} than in {first}", flag_of("data")
     return None
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 from scene_experts.arguments.option import Option
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import Flag, Range
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,9 @@ class ReproduceOptions:
     """Number of training iterations, instead of what --scale gives."""
     resolution: Annotated[str | None, Option(value="POLICY")] = None
     """Resolution policy (as-is, longest:PX and others), instead of what --scale gives."""
-    seeds: tuple[int, ...] = (0,)
+    seeds: Annotated[tuple[int, ...], Range(0)] = (0,)
     """Seeds; each experiment is run once for each."""
-    workers: int | None = None
+    workers: Annotated[int | None, Range(1)] = None
     """Number of runs at a time, each in its own process; by default one, or one for each of --devices."""
     devices: Annotated[tuple[str, ...], Option(value="INDEX")] = ()
     """Indices of the CUDA devices that the workers share."""
@@ -83,12 +84,10 @@ class ReproduceOptions:
                 raise InputError(f"expected --resources as NAME=AMOUNT with an amount above 0, found '{text}'; give for example GPU=1")
         return found
 
-    def check(self) -> None:
-        """Raises InputError, naming the option, for invalid values."""
+    def check(self, flag: Flag) -> None:
         if self.cluster is not None and (self.workers is not None or self.devices):
-            flag = "--devices" if self.devices else "--workers"
-            raise InputError(f"expected either --cluster or {flag}, found both; the cluster's own workers set their number and devices")
+            other = flag("devices" if self.devices else "workers")
+            raise InputError(f"expected either --cluster or {other}, found both; the cluster's own workers set their number and devices")
         if self.resources and self.cluster is None:
             raise InputError("expected --resources together with --cluster, found no --cluster; add it or leave --resources out")
         self.needs()
-        expect_at_least([("--workers", self.worker_count, 1), *(("--seeds", seed, 0) for seed in self.seeds)])

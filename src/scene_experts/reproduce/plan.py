@@ -122,15 +122,12 @@ class Spec:
 
     def arguments(self, out: Path) -> list[str]:
         """Return the arguments of `scene-experts` that train the run."""
-        args = ["train", base(self.recipe), "--data", str(self.scene.path), "--out", str(out)]
-        args += ["--iterations", str(self.train.iterations), "--seed", str(self.seed), "--preview-every", "0"]
+        read = {name: value for name, value in vars(self.data).items() if value != getattr(Data(path=self.scene.path), name)}
+        set_here = {"data": self.scene.path, "out": out, "iterations": self.train.iterations, "seed": self.seed, "preview_every": 0, **read}
+        args = ["train", base(self.recipe), *(word for name, value in set_here.items() for word in (flag_of(name), str(value)))]
         own = flags(self.recipe)
         given = {word.partition("=")[0] for word in own}
-        args += flags_of(self.train, [(place, value) for place, value in self.scene.numbers if flag_of(place) not in given]) + own
-        for name, value in vars(self.data).items():
-            if name != "path" and value != getattr(Data(path=self.scene.path), name):
-                args += [f"--{name.replace('_', '-')}", str(value)]
-        return args
+        return args + flags_of(self.train, [(place, value) for place, value in self.scene.numbers if flag_of(place) not in given]) + own
 
 
 def identity(scene: str, train: Train, data: Data, code: str = "", start: Path | None = None) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.fields import check_fields
 from scene_experts.core.signals import handled
 from scene_experts.reproduce import report, store
 from scene_experts.reproduce.cluster import ClusterRunner
@@ -21,7 +22,7 @@ def reproduce(options: ReproduceOptions, say: Say) -> bool:
 
     Raises InputError for options that do not fit, RunError if a run fails; the finished runs are kept.
     """
-    options.check()
+    check_fields(options)
     plan = make_plan(options)
     if not plan.wanted:
         say("nothing to run: these experiments have none of these scenes")

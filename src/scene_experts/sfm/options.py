@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.fields import Range
 
 LARGEST = 2**31 - 1  # COLMAP's numbers have 32 bits
 MOST_FRAMES = 5000  # more frame numbers do not fit into one ffmpeg command
@@ -20,7 +20,7 @@ Matching = Literal["auto", "exhaustive", "sequential"]
 class SfmOptions:
     """Settings of the reconstruction."""
 
-    frames: int = 150
+    frames: Annotated[int, Range(3, MOST_FRAMES)] = 150
     """Number of frames to extract from a video. The sharpest frame of each of this many equal segments is used."""
     matching: Matching = "auto"
     """Which photographs are matched. exhaustive: all pairs. sequential: neighbours in the order of their names, as for a video or a walk.
@@ -30,19 +30,9 @@ class SfmOptions:
     mapper: Mapper = "auto"
     """COLMAP's incremental mapper or the global mapper (GLOMAP). auto: incremental; if more than a tenth of the photographs get no pose,
     both are run and the better result is kept."""
-    max_side: int = 1600
+    max_side: Annotated[int, Range(64, LARGEST)] = 1600
     """Longest side in pixels at which features are extracted. The photographs themselves are not changed."""
-    threads: int = 0
+    threads: Annotated[int, Range(0, LARGEST)] = 0
     """Number of threads; 0 uses all cores."""
-    seed: int = 0
+    seed: Annotated[int, Range(0, LARGEST)] = 0
     """Seed of COLMAP's random choices."""
-
-    def check(self) -> None:
-        """Raises InputError, naming the option, for invalid settings."""
-        expect_at_least([("--frames", self.frames, 3), ("--max-side", self.max_side, 64)])
-        expect_at_least([("--threads", self.threads, 0), ("--seed", self.seed, 0)])
-        for flag, value in (("--max-side", self.max_side), ("--threads", self.threads), ("--seed", self.seed)):
-            if value > LARGEST:
-                raise InputError(f"expected {flag} of at most {LARGEST}, found {value}; give a smaller number")
-        if self.frames > MOST_FRAMES:
-            raise InputError(f"expected --frames of at most {MOST_FRAMES:,}, found {self.frames:,}; 100 to 300 frames are enough")

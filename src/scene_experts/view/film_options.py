@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from scene_experts.arguments.option import Option
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import Flag, Range
 from scene_experts.view.show import Show
 
 
@@ -18,11 +19,11 @@ class FilmOptions:
     path: str = "auto"
     """Camera path: orbit, spiral, views (through the captured poses), test (each held-out view), auto (the one of these that fits
     the cameras), or a JSON file of this package or of nerfstudio."""
-    seconds: float = 8.0
+    seconds: Annotated[float, Range(0.01)] = 8.0
     """Duration of orbit, spiral and views."""
-    frames: int | None = None
+    frames: Annotated[int | None, Range(1)] = None
     """Number of frames of orbit, spiral and views, instead of --seconds."""
-    fps: float | None = None
+    fps: Annotated[float | None, Range(0.1)] = None
     """Frames per second; by default 24, or what the path's file says."""
     size: Annotated[str | None, Option(value="WIDTHxHEIGHT")] = None
     """Size of the picture in pixels; by default that of the training views. The vertical field of view stays."""
@@ -30,19 +31,12 @@ class FilmOptions:
     """What to show; several are placed side by side."""
     attribute: Literal["opacity", "cov", "color"] = "color"
     """Attribute whose experts are shown."""
-    only: tuple[int, ...] = ()
+    only: Annotated[tuple[int, ...], Range(1)] = ()
     """Draw only the anchors of these experts, counted from 1."""
-    quality: int = 8
-    """Quality of the video, 1 to 10."""
+    quality: Annotated[int, Range(1, 10)] = 8
+    """Quality of the video."""
 
-    def check(self) -> None:
-        """Raises InputError, naming the option, for invalid values."""
-        fps = 1.0 if self.fps is None else self.fps
-        expect_at_least([("--seconds", self.seconds, 0.01), ("--fps", fps, 0.1), ("--quality", self.quality, 1)])
-        expect_at_least([("--frames", 1 if self.frames is None else self.frames, 1)])
-        expect_at_least([("--only", number, 1) for number in self.only])
-        if self.quality > 10:
-            raise InputError(f"expected --quality of at most 10, found {self.quality}; give a smaller number")
+    def check(self, flag: Flag) -> None:
         self.pixels()
 
     def pixels(self) -> tuple[int, int] | None:
