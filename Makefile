@@ -12,7 +12,7 @@
 # make wheels     the sdist and wheels for Linux, macOS and Windows in dist, compiled by zig and checked (docs/releasing.md); TARGETS="linux-x86_64"
 # make gpu DATA=CAPTURE   everything that a GPU is needed for, in slices below 9 minutes; repeat until it prints "all done"
 # make pretend    the CUDA path on tensors that pretend to be on CUDA: mixed devices, and the kernels, waits and bytes of a step
-# make record-errors, make record-flags   record the command line's error sentences or its flags anew in tests/golden
+# make record-errors, make record-flags   record the command line's error sentences, or its flags and the defaults of all parts, anew in tests/golden
 # Every target builds a virtual environment in .venv first. An importable torch of PYTHON is used as it is; otherwise the pinned CPU
 # version is installed. WORKERS sets the number of test processes (0: none beside pytest's own).
 # Other selections of tests: .venv/bin/python -m pytest -m system (or slow, foreign, gpu; see pyproject.toml), or pytest tests/unit/render.
@@ -94,7 +94,7 @@ record-errors: $(STAMP)
 	SCENE_EXPERTS_RECORD=1 $(BIN)/python -m pytest tests/system/test_cli_bad_input.py
 
 record-flags: $(STAMP)
-	SCENE_EXPERTS_RECORD=1 $(BIN)/python -m pytest tests/system/test_cli.py -k "flags_are or help_is"
+	SCENE_EXPERTS_RECORD=1 $(BIN)/python -m pytest tests/system/test_cli.py tests/unit/training/test_recipes.py -k "no_flag or help_is or default_changes"
 
 sanitize: $(STAMP)
 	$(BIN)/python tools/sanitize.py

@@ -8,12 +8,14 @@ Reads the records of runs (results/README.md has the command of the trainings) a
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
+
+from scene_experts.reproduce import store
+from scene_experts.scene.anchors.rates import Rates
 
 CAPTURES = ("colosseum", "bonsai")
 CASES = ((32, 8, 40), (32, 32, 160), (32, 160, 800), (16, 32, 160), (8, 32, 160))  # features, width, width of equal parameters
@@ -37,26 +39,24 @@ Key = tuple[str, int, int, bool]  # capture, features, hidden width, whether it 
 def read_scores(records: Path) -> dict[Key, Score]:
     """Return the scores of the runs of this comparison among the records."""
     found = {}
-    for path in sorted(records.glob("*/*/seed0-*.json")):
-        record = json.loads(path.read_text())
-        train, scene = record["config"]["train"], record["config"]["train"]["scene"]
+    for record in store.load(records):
+        train, scene = record.config.train, record.config.train.scene
         if (
-            record["scene"] in CAPTURES
-            and train["iterations"] == 3000
-            and record["config"]["data"]["resolution"] == "longest:400"
-            and (train["rates"].get("anneal"), train["rates"].get("networks")) == (ANNEAL, NETWORKS)
-            and train["recipe"] in ("scaffold-gs-opacity", "moe-gs")
-            and is_fair(train["recipe"], scene["decoder"])
+            record.scene in CAPTURES
+            and (record.seed, train.iterations, record.config.data.resolution) == (0, 3000, "longest:400")
+            and isinstance(train.rates, Rates)
+            and (train.rates.anneal, train.rates.networks) == (ANNEAL, NETWORKS)
+            and record.recipe in ("scaffold-gs-opacity", "moe-gs")
+            and is_fair(record.recipe, scene.decoder)
         ):
-            results = record["results"]
-            key = record["scene"], scene["F"], scene["hidden"], train["recipe"] == "moe-gs"
-            found[key] = Score(results["psnr"], results["lpips"], results["size"]["MB"])
+            key = record.scene, scene.F, scene.hidden, record.recipe == "moe-gs"
+            found[key] = Score(record.results["psnr"], record.results["lpips"], record.results["size"]["MB"])
     return found
 
 
-def is_fair(recipe: str, decoder: dict[str, Any]) -> bool:
+def is_fair(recipe: str, decoder: Any) -> bool:
     """Whether experts start with the variance of one network and have gates that are their margins."""
-    return recipe != "moe-gs" or (decoder.get("expert_init"), decoder["router"].get("weights")) == ("variance", "margin")
+    return recipe != "moe-gs" or (decoder.expert_init, decoder.router.name) == ("variance", "margin")
 
 
 def cells(scores: dict[Key, Score], capture: str, features: int, width: int, equal: int) -> list[Score | None]:

@@ -23,6 +23,7 @@ from scene_experts.core.io import write_json
 from scene_experts.data import capture
 from scene_experts.data.images import FrameSource, decode, probe
 from scene_experts.data.lens import Lens
+from scene_experts.data.settings import Data
 from scene_experts.evaluate import results
 from scene_experts.evaluate.lpips import tensor_shapes
 from scene_experts.evaluate.weights import _hash_tensors, _read_cache
@@ -229,7 +230,7 @@ def _blender(folder: Path) -> None:
 
 
 def _read_capture(folder: Path) -> Any:
-    found = capture.load(folder, init="points", allow_no_points=True)
+    found = capture.load(Data(folder), allow_no_points=True)
     frames = [found.images.get(i) for i in range(min(2, len(found.images)))]
     found.images.close()
     return found.views, found.points, found.world, found.extent, frames
@@ -270,8 +271,7 @@ def _read_path(folder: Path) -> Any:
 
 def _record(folder: Path) -> None:
     store.write(folder, record())
-    found = next(folder.glob("*/*/*.json"))
-    found.rename(folder / "record.json")
+    next(folder.glob("*.json")).rename(folder / "record.json")
 
 
 def _weights(folder: Path) -> None:

@@ -9,7 +9,6 @@ SOURCE = ROOT / "src" / "scene_experts"
 TWINS = {  # the name is right for both: the public class wraps the internal one, and is never used beside it
     "Camera": {"api/camera.py", "core/types.py"},
     "Capture": {"api/capture.py", "data/views.py"},
-    "Run": {"api/run.py", "training/loop.py"},  # until the options of a training have another name
 }
 
 

@@ -34,7 +34,7 @@ PATIENCE = 120.0  # seconds that a repeated run waits for the training of a lost
 
 
 @dataclass(frozen=True)
-class Job:
+class PlacedRun:
     """One run, as a worker gets it. All paths are absolute."""
 
     spec: Spec
@@ -75,7 +75,7 @@ class ClusterRunner(Runner):
         task, futures = make_task(), {}
         for number, spec in enumerate(todo):
             there = replace(spec, scene=replace(spec.scene, path=spec.scene.path.absolute()))
-            job = Job(there, self.runs, self.records, token, f"[{number + 1}/{len(todo)}]", self.resources)
+            job = PlacedRun(there, self.runs, self.records, token, f"[{number + 1}/{len(todo)}]", self.resources)
             future = client.submit(
                 task,
                 __version__,
@@ -211,7 +211,7 @@ def make_task() -> Callable[[str, bytes], tuple[str, str]]:
 def work(packed: bytes) -> tuple[str, str]:
     """Train, evaluate and record one run on this worker.
 
-    packed: a pickled `Job`, from the same version of this package.
+    packed: a pickled `PlacedRun`, from the same version of this package.
 
     Returns ("done", one line about the run), or ("input", a sentence) if this machine does not see the folders of the command.
 
@@ -220,7 +220,7 @@ def work(packed: bytes) -> tuple[str, str]:
     from distributed import get_worker
 
     worker = get_worker()
-    job: Job = pickle.loads(packed)
+    job: PlacedRun = pickle.loads(packed)
     capture = job.spec.scene.path
     shared = [(job.runs, job.runs / job.token, "--out"), (job.records, job.records / job.token, "--records")]
     for folder, file, flag in [*shared, (capture, capture, "--captures or --data")]:

@@ -34,7 +34,7 @@ class Draw:
     mirror: Annotated[tuple[str, ...], Option(repeat=True)] = ()
 
 
-COMMAND = Command("se draw", ("--run",), elsewhere=lambda flag: "`se train` has it" if flag == "--rates" else "")
+COMMAND = Command("se draw", ("run",), elsewhere=lambda flag: "`se train` has it" if flag == "--rates" else "")
 NEEDED = ["r", "--out", "o"]
 
 
@@ -103,7 +103,7 @@ def test_words_of_a_list_may_stand_around_options():
         fast: bool = False
 
     for args in (["a", "b", "--fast"], ["a", "--fast", "b"], ["--fast", "a", "b"]):
-        assert parse(Many, Command("se", ("--words",)), args) == Many(("a", "b"), True)
+        assert parse(Many, Command("se", ("words",)), args) == Many(("a", "b"), True)
 
 
 def test_underscores_are_hyphens():

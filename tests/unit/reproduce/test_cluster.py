@@ -18,7 +18,7 @@ from scene_experts import cli
 from scene_experts.core.errors import InputError
 from scene_experts.reproduce import cluster as module
 from scene_experts.reproduce import store
-from scene_experts.reproduce.cluster import ClusterRunner, Job, make_task, threads, work
+from scene_experts.reproduce.cluster import ClusterRunner, PlacedRun, make_task, threads, work
 from scene_experts.reproduce.plan import OWN, CaptureSpec, Scale, Spec
 from support.synthetic import make_capture
 from support.trainings import assert_same, last_tensors
@@ -34,7 +34,7 @@ def job(tmp_path, monkeypatch):
     for name in ("runs", "records"):
         (tmp_path / name / ".token").touch()
     spec = Spec(CaptureSpec("box", OWN, tmp_path / "box"), "moe-gs", 0, Scale(iterations=10))
-    return Job(spec, tmp_path / "runs", tmp_path / "records", ".token", "[1/1]", {})
+    return PlacedRun(spec, tmp_path / "runs", tmp_path / "records", ".token", "[1/1]", {})
 
 
 def test_a_worker_without_the_package_says_so(job, monkeypatch):

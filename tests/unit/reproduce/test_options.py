@@ -3,6 +3,7 @@
 import pytest
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.reproduce.options import ReproduceOptions
 
 
@@ -14,7 +15,7 @@ def test_every_device_has_a_worker_unless_told_otherwise(given, workers):
 @pytest.mark.parametrize(("given", "flag"), [({"workers": 0}, "--workers"), ({"seeds": (0, -1)}, "--seeds")])
 def test_invalid_values_name_their_option(given, flag):
     with pytest.raises(InputError, match=flag):
-        ReproduceOptions(("table3",), **given).check()
+        check_fields(ReproduceOptions(("table3",), **given))
 
 
 def test_options_of_a_cluster():
@@ -26,4 +27,4 @@ def test_options_of_a_cluster():
         *(({"cluster": "tcp://a:1", "resources": (text,)}, "--resources") for text in ("GPU", "GPU=0", "=1", "GPU=many", "GPU=nan")),
     ):
         with pytest.raises(InputError, match=flag):
-            ReproduceOptions(("table3",), **given).check()
+            check_fields(ReproduceOptions(("table3",), **given))

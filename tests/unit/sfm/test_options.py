@@ -3,6 +3,7 @@
 import pytest
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.sfm.options import MOST_FRAMES, SfmOptions
 
 
@@ -21,8 +22,8 @@ from scene_experts.sfm.options import MOST_FRAMES, SfmOptions
 )
 def test_invalid_settings_name_their_option(options, flag):
     with pytest.raises(InputError, match=flag):
-        options.check()
+        check_fields(options)
 
 
 def test_the_defaults_are_valid():
-    SfmOptions().check()
+    check_fields(SfmOptions())

@@ -1,12 +1,19 @@
 import ast
+import dataclasses
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import scene_experts
+from scene_experts.core.fields import default_of
+from scene_experts.core.parts import Part, find, names_of
+from scene_experts.core.plain import lean
 from scene_experts.scene.anchors.experts import Experts
+from scene_experts.training.config import Train
 from scene_experts.training.recipes import RECIPES
+from support.golden import recorded
 
 SOURCE = Path(scene_experts.__file__).parent
 
@@ -26,6 +33,25 @@ def test_every_ablation_of_the_paper_has_a_recipe():
     assert RECIPES["moe-gs-no-load"][1].loss.load == 0 and RECIPES["moe-gs-no-opacity"][1].loss.opacity == 0
     assert RECIPES["moe-gs-e4-top1"][1].scene.decoder.top_k == 1 and RECIPES["moe-gs-e3-dense"][1].scene.decoder.top_k is None
     assert RECIPES["scaffold-gs-opacity"][1].loss.opacity == 0.01
+
+
+def defaults_of(kind):
+    """The number of a part's changes, and the default of each of its settings."""
+    fields = {f.name: lean(default_of(f)) for f in dataclasses.fields(kind) if default_of(f) is not dataclasses.MISSING}
+    return {"changes": len(getattr(kind, "changes", ())), **json.loads(json.dumps(fields))}
+
+
+OURS = [Train, *(kind for name in names_of(Part) if (kind := find(name, Part)) and kind.__module__.startswith("scene_experts."))]
+
+
+@pytest.mark.parametrize("kind", OURS, ids=lambda kind: kind.__name__)
+def test_a_default_changes_only_with_a_sentence_in_changes(kind):
+    """Records state what differs from the defaults: with another default, those that exist would mean other runs."""
+    known, now = recorded("defaults.json", kind.__name__, lambda: defaults_of(kind)), defaults_of(kind)
+    assert known is not None, "run `make record-flags`"
+    if known["changes"] == now["changes"]:  # a new setting needs no record, and one that is gone had its default everywhere
+        changed = {name for name in known.keys() & now.keys() if known[name] != now[name]}
+        assert changed == set(), f"say in `{kind.__name__}.changes` what it computes now, then run `make record-flags`"
 
 
 NAMED = {

@@ -3,6 +3,7 @@
 import pytest
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.fields import check_fields
 from scene_experts.view.film_options import FilmOptions
 
 
@@ -10,7 +11,7 @@ def test_sizes():
     assert FilmOptions(size="640x360").pixels() == (640, 360) and FilmOptions().pixels() is None
     for wrong in ("640", "640x", "0x10", "1x99999", "-5x5"):
         with pytest.raises(InputError, match="--size"):
-            FilmOptions(size=wrong).check()
+            check_fields(FilmOptions(size=wrong))
 
 
 @pytest.mark.parametrize(
@@ -24,4 +25,4 @@ def test_sizes():
 )
 def test_invalid_values_name_their_option(options, flag):
     with pytest.raises(InputError, match=flag):
-        options.check()
+        check_fields(options)

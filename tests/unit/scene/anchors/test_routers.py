@@ -12,12 +12,12 @@ from scene_experts.commands.train import TrainCommand
 from scene_experts.core.errors import InputError
 from scene_experts.core.parts import register
 from scene_experts.core.types import Mode, Routing
-from scene_experts.recipes import RECIPES
 from scene_experts.scene.anchors.balance import Balanced
 from scene_experts.scene.anchors.experts import Experts
 from scene_experts.scene.anchors.mlp import ATTRIBUTES
 from scene_experts.scene.anchors.places import Places
 from scene_experts.scene.anchors.routers import Linear, Margin, Router, RouterModule, top_k
+from scene_experts.training.recipes import RECIPES
 from support.scenes import CAMERA, start_scene
 
 A, F = 50, 32
