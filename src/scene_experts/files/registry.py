@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
+from importlib.machinery import PathFinder
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -202,7 +203,10 @@ def _module(name: str) -> str:
 def about(name: str) -> str:
     """What a format is, in one sentence: the first of its module's docstring, read without
     importing the module."""
-    spec = find_spec(_module(name))
+    root, *below = _module(name).split(".")
+    spec = find_spec(root)
+    for part in below:  # `find_spec` of the whole name would import the packages above the module
+        spec = spec and PathFinder.find_spec(f"{spec.name}.{part}", spec.submodule_search_locations)
     read_source = getattr(spec.loader, "get_source", None) if spec is not None else None  # the loader of an editable install has it too
     source = read_source(spec.name) if spec is not None and read_source is not None else None
     text = ast.get_docstring(ast.parse(source)) if source else None
