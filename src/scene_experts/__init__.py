@@ -1,4 +1,5 @@
-"""Scene Experts: anchor-based 3D Gaussian splatting with a mixture of experts (MoE-GS, AAAI 2026), and its baselines.
+"""Scene Experts: anchor-based 3D Gaussian splatting with a mixture of experts (MoE-GS, AAAI 2026),
+and its baselines.
 
     import scene_experts as se
 
@@ -17,8 +18,10 @@ from typing import TYPE_CHECKING
 
 from scene_experts.core.version import __version__
 
-# OpenMP's threads sleep between torch's operations instead of spinning, where torch is not loaded yet: spinning, they take the cores from
-# the native library's own threads (4.7x slower training on two cores, ten times on a busy machine). It changes no number.
+# OpenMP's threads sleep between torch's operations instead of spinning, where torch is not loaded
+# yet: spinning, they take the cores from
+# the native library's own threads (4.7x slower training on two cores, ten times on a busy machine).
+# It changes no number.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("KMP_BLOCKTIME", "0")
 

@@ -1,4 +1,5 @@
-"""The command line: `scene-experts COMMAND ...`. Finds the command and turns errors into a sentence and an exit code."""
+"""The command line: `scene-experts COMMAND ...`. Finds the command and turns errors into a sentence
+and an exit code."""
 
 from __future__ import annotations
 
@@ -82,7 +83,8 @@ def dispatch(args: list[str]) -> int:
 
 
 def out_of_memory(error: Exception) -> bool:
-    """Whether an error means that an allocation failed. torch has an exception type for this only on the GPU."""
+    """Whether an error means that an allocation failed. torch has an exception type for this only
+    on the GPU."""
     text = str(error).lower()
     return isinstance(error, MemoryError) or "out of memory" in text or "allocate memory" in text
 

@@ -17,9 +17,11 @@ from scene_experts.render.gsplat import explain_missing
 
 
 def backend(device: Device, raster: Raster, antialias: bool, deterministic: bool) -> tuple[str, Rasterizer]:
-    """The device and the rasteriser for it. Raises InputError for one that this machine does not have.
+    """The device and the rasteriser for it. Raises InputError for one that this machine does not
+    have.
 
-    deterministic: also make torch use its deterministic algorithms from now on, in the whole process.
+    deterministic: also make torch use its deterministic algorithms from now on, in the whole
+    process.
     """
     device = device_of(device, raster)
     if deterministic:
@@ -30,8 +32,9 @@ def backend(device: Device, raster: Raster, antialias: bool, deterministic: bool
 def device_of(device: str, raster: Raster = "auto") -> Literal["cpu", "cuda"]:
     """Return "cpu" or "cuda".
 
-    "auto" is CUDA if torch finds a device and the rasteriser `raster` draws on it. If only gsplat is missing for the rasteriser "auto",
-    the CPU is used, and one warning says what to install. Raises InputError for another name, and for "cuda" without CUDA.
+    "auto" is CUDA if torch finds a device and the rasteriser `raster` draws on it. If only gsplat
+    is missing for the rasteriser "auto", the CPU is used, and one warning says what to install.
+    Raises InputError for another name, and for "cuda" without CUDA.
     """
     available = torch.cuda.is_available()
     if device == "cuda" and not available:
@@ -62,7 +65,8 @@ def _warn(reason: str) -> None:
 
 @contextmanager
 def deterministic(on: bool) -> Iterator[None]:
-    """Make torch use its deterministic algorithms inside the `with` block, where `on`; then restore the earlier choice."""
+    """Make torch use its deterministic algorithms inside the `with` block, where `on`; then restore
+    the earlier choice."""
     before, warn_only = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
     if on:
         torch.use_deterministic_algorithms(True, warn_only=True)

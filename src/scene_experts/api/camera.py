@@ -20,13 +20,15 @@ LARGEST = 16384  # px of a side
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera in the capture's own frame and unit: the frame of its COLMAP or transforms.json poses.
+    """A pinhole camera in the capture's own frame and unit: the frame of its COLMAP or
+    transforms.json poses.
 
-    Axes are OpenCV's: x right, y down, z forward. The centre of pixel (column i, row j) is at (i + 0.5, j + 0.5) px.
-    The arrays are read-only.
+    Axes are OpenCV's: x right, y down, z forward. The centre of pixel (column i, row j) is at (i +
+    0.5, j + 0.5) px. The arrays are read-only.
 
     Raises:
-        InputError: The pose is no rotation and translation, the focal length is not above 0, or a side is not within 1 to 16384 px.
+        InputError: The pose is no rotation and translation, the focal length is not above 0, or a
+            side is not within 1 to 16384 px.
     """
 
     world_to_camera: NDArray[np.float64]
@@ -38,9 +40,11 @@ class Camera:
     height: int
     """Height of the picture, px, 1 to 16384."""
     near: float | None = None
-    """Near plane: nothing closer along z is drawn, capture's unit. None uses the near plane of the run."""
+    """Near plane: nothing closer along z is drawn, capture's unit. None uses the near plane of the
+    run."""
     view: int = -1
-    """Index of the view whose photograph this camera took; -1 for any other camera. Appearance codes depend on it."""
+    """Index of the view whose photograph this camera took; -1 for any other camera. Appearance
+    codes depend on it."""
 
     def __post_init__(self) -> None:
         pose, K = matrix(self.world_to_camera, 4, "world_to_camera"), matrix(self.K, 3, "K")
@@ -70,13 +74,15 @@ class Camera:
         fov: float = 50.0,
         near: float | None = None,
     ) -> Camera:
-        """Return a camera that looks at a point. `Capture.look_at` uses the lens and upward direction of a capture instead.
+        """Return a camera that looks at a point. `Capture.look_at` uses the lens and upward
+        direction of a capture instead.
 
         Args:
             eye: [3] Centre of the camera.
             target: [3] Point in the middle of the picture.
-            up: [3] Direction that points upwards in the picture. If it is parallel to the line of sight, the coordinate axis that is most
-                perpendicular to the line of sight replaces it.
+            up: [3] Direction that points upwards in the picture. If it is parallel to the line of
+                sight, the coordinate axis that is most perpendicular to the line of sight replaces
+                it.
             width: Width of the picture, px.
             height: Height of the picture, px.
             fov: Vertical field of view, degrees, between 0 and 180.
@@ -114,8 +120,8 @@ class Camera:
         """Return a camera from its pose and intrinsics.
 
         Args:
-            camera_to_world: [4, 4] or [3, 4] Rotation and translation, OpenCV axes. A rounded rotation becomes the nearest exact one, so
-                `position` is the given centre.
+            camera_to_world: [4, 4] or [3, 4] Rotation and translation, OpenCV axes. A rounded
+                rotation becomes the nearest exact one, so `position` is the given centre.
             width: Width of the picture, px.
             height: Height of the picture, px.
             fx: Horizontal focal length, px, above 0.
@@ -151,11 +157,13 @@ class Camera:
 
     @property
     def fov(self) -> float:
-        """Vertical field of view, degrees, if the principal point is in the middle of the picture."""
+        """Vertical field of view, degrees, if the principal point is in the middle of the
+        picture."""
         return math.degrees(2 * math.atan(self.height / (2 * self.K[1, 1])))
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return the camera with a picture of another size, px. Another aspect ratio stretches the picture."""
+        """Return the camera with a picture of another size, px. Another aspect ratio stretches the
+        picture."""
         factor = np.array([[width / self.width], [height / self.height], [1.0]])
         return replace(self, K=self.K * factor, width=width, height=height)
 
@@ -165,7 +173,8 @@ class Camera:
 
 
 def lens(fov: float, width: int, height: int) -> NDArray[np.float64]:
-    """K [3, 3] of a vertical field of view in degrees, with the principal point in the middle. Raises InputError for no field of view."""
+    """K [3, 3] of a vertical field of view in degrees, with the principal point in the middle.
+    Raises InputError for no field of view."""
     if not 0 < fov < 180:
         raise InputError(f"expected fov between 0 and 180 degrees, found {fov}; correct it")
     focal = height / (2 * math.tan(math.radians(fov) / 2))
@@ -180,7 +189,8 @@ def is_numbers(value: ArrayLike) -> bool:
 
 
 def matrix(value: ArrayLike, side: int, name: str) -> NDArray[np.float64]:
-    """A read-only copy of a [side, side] matrix of finite numbers. Raises InputError for anything else."""
+    """A read-only copy of a [side, side] matrix of finite numbers. Raises InputError for anything
+    else."""
     if not is_numbers(value) or np.shape(value) != (side, side):
         raise InputError(f"expected {name} as a {side} x {side} matrix of finite numbers, found {describe(value)}; correct it")
     out = np.array(value, dtype=np.float64)
@@ -200,7 +210,8 @@ def describe(value: ArrayLike) -> str:
 
 
 def to_trained(camera: Camera, world: World, near: float) -> types.Camera:
-    """The camera in the trained world, float32. near: the run's near plane, trained units, for a camera without its own."""
+    """The camera in the trained world, float32. near: the run's near plane, trained units, for a
+    camera without its own."""
     import torch
 
     from scene_experts.core import types

@@ -23,18 +23,21 @@ from scene_experts.view import paths
 class Capture:
     """Photographs with camera poses, ready for training. `load_capture` returns one.
 
-    Positions, cameras and depths are in the capture's own frame and unit: the frame of its COLMAP or transforms.json poses.
+    Positions, cameras and depths are in the capture's own frame and unit: the frame of its COLMAP
+    or transforms.json poses.
     """
 
     data: Data
-    """How the capture was read: its folder, resolution, split and the other arguments of `load_capture`."""
+    """How the capture was read: its folder, resolution, split and the other arguments of
+    `load_capture`."""
     loaded: views.Capture
     """The capture in the trained world, as the package's own modules use it."""
     seed: int
     """Seed of the random points, where the capture has any."""
 
     numbers: Numbers
-    """Numbers of its data set, (name, value), for a scene of the catalog; a training takes them where its recipe is given by name."""
+    """Numbers of its data set, (name, value), for a scene of the catalog; a training takes them
+    where its recipe is given by name."""
 
     def __init__(self, data: Data, loaded: views.Capture, seed: int = 0, numbers: Numbers = ()) -> None:
         self.data, self.loaded, self.seed, self.numbers = data, loaded, seed, numbers
@@ -51,13 +54,14 @@ class Capture:
 
     @property
     def names(self) -> list[str]:
-        """Names of the photographs, as the capture states them (COLMAP: relative to the image folder), in the order of
-        the views."""
+        """Names of the photographs, as the capture states them (COLMAP: relative to the image
+        folder), in the order of the views."""
         return [view.name for view in self.loaded.views]
 
     @property
     def cameras(self) -> list[Camera]:
-        """The cameras of all photographs, at the resolution that the capture was loaded with; camera i is that of view i."""
+        """The cameras of all photographs, at the resolution that the capture was loaded with;
+        camera i is that of view i."""
         return [from_trained(view.camera, self.loaded.world) for view in self.loaded.views]
 
     @property
@@ -67,7 +71,8 @@ class Capture:
 
     @property
     def test_cameras(self) -> list[Camera]:
-        """The cameras of the held-out views, which no training sees; empty with the split "none"."""
+        """The cameras of the held-out views, which no training sees; empty with the split
+        "none"."""
         return self._cameras(self.loaded.test)
 
     @property
@@ -82,7 +87,8 @@ class Capture:
 
     @property
     def points(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-        """The 3D points that a training starts from: positions [P, 3] float64, and colours [P, 3] uint8, RGB."""
+        """The 3D points that a training starts from: positions [P, 3] float64, and colours [P, 3]
+        uint8, RGB."""
         points = self.loaded.points
         if points is None:
             return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
@@ -90,7 +96,8 @@ class Capture:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """The point [3] that the training cameras look at: the nearest to all their optical axes."""
+        """The point [3] that the training cameras look at: the nearest to all their optical
+        axes."""
         return self.loaded.world.to_input(paths.analyse_cameras(self.loaded).centre).numpy()
 
     @property
@@ -141,10 +148,12 @@ class Capture:
         Args:
             eye: [3] Centre of the camera.
             target: [3] Point in the middle of the picture. Default: `centre`.
-            up: [3] Direction that points upwards in the picture. Default: `up`. If it is parallel to the line of sight, the coordinate
-                axis that is most perpendicular to the line of sight replaces it.
+            up: [3] Direction that points upwards in the picture. Default: `up`. If it is parallel
+                to the line of sight, the coordinate axis that is most perpendicular to the line of
+                sight replaces it.
             size: Width and height of the picture, px. Default: those of the median training camera.
-            fov: Vertical field of view, degrees, between 0 and 180. Default: that of the median training camera.
+            fov: Vertical field of view, degrees, between 0 and 180. Default: that of the median
+                training camera.
 
         Raises:
             InputError: `eye` and `target` are the same point, or a value is out of range.
@@ -162,11 +171,13 @@ class Capture:
         """Return cameras along a path through the scene.
 
         Args:
-            kind: "orbit" goes once around `centre`. "spiral" circles in front of a scene that faces one way. "views" moves smoothly
-                through the training cameras. "auto" chooses an orbit if the cameras surround the scene, else a spiral, or "views" where
-                a spiral looks where no photograph does.
+            kind: "orbit" goes once around `centre`. "spiral" circles in front of a scene that faces
+                one way. "views" moves smoothly through the training cameras. "auto" chooses an
+                orbit if the cameras surround the scene, else a spiral, or "views" where a spiral
+                looks where no photograph does.
             frames: Number of cameras, at least 1.
-            size: Width and height of the pictures, px. Default: those of the median training camera.
+            size: Width and height of the pictures, px. Default: those of the median training
+                camera.
 
         Raises:
             InputError: The kind is unknown, or there are no frames.
@@ -176,7 +187,8 @@ class Capture:
         return [from_trained(camera, self.loaded.world) for camera in made.cameras]
 
     def with_seed(self, seed: int) -> Capture:
-        """Return the capture with the random points of another seed; the capture itself if it has no random points."""
+        """Return the capture with the random points of another seed; the capture itself if it has
+        no random points."""
         if seed == self.seed or (self.data.init != "random" and self.loaded.bounds is None):
             return self
         return Capture(self.data, captures.load(self.data, seed), seed, self.numbers)
@@ -211,23 +223,30 @@ def load_capture(
     background: tuple[float, float, float] | None = None,
     seed: int = 0,
 ) -> Capture:
-    """Load a capture: a COLMAP folder (images/, sparse/0/), or a folder with transforms.json or transforms_train.json.
+    """Load a capture: a COLMAP folder (images/, sparse/0/), or a folder with transforms.json or
+    transforms_train.json.
 
     Args:
-        path: Folder of the capture, or "catalog:SCENE" for a scene that `scene-experts download` fetched.
+        path: Folder of the capture, or "catalog:SCENE" for a scene that `scene-experts download`
+            fetched.
         images: Image folder inside the capture, for example "images_4".
-        resolution: "as-is", "factor:N" (divide by N), "longest:PX" (longest side), "cap1600" (at most 1600 px wide), "share:S" (share of
-            the size that cap1600 gives), "inria:N" (the folder images_N), or "auto": the paper's for a scene of the catalog, else cap1600.
-        split: Which views are held out: "mod8" (every 8th), "modN", "first:N", "none", "files" (as the files of the capture state), or
-            "auto": "files" if they state it, else "mod8".
+        resolution: "as-is", "factor:N" (divide by N), "longest:PX" (longest side), "cap1600" (at
+            most 1600 px wide), "share:S" (share of the size that cap1600 gives), "inria:N" (the
+            folder images_N), or "auto": the paper's for a scene of the catalog, else cap1600.
+        split: Which views are held out: "mod8" (every 8th), "modN", "first:N", "none", "files" (as
+            the files of the capture state), or "auto": "files" if they state it, else "mod8".
         missing: "drop" leaves out views without a photograph instead of raising InputError.
-        normalise: "extent" trains in a world that is scaled to a camera extent of 5, "none" in the capture's own unit. Default: "none"
-            for a scene of the catalog, else "extent". Everything that the API returns is in the capture's own unit either way.
+        normalise: "extent" trains in a world that is scaled to a camera extent of 5, "none" in the
+            capture's own unit. Default: "none" for a scene of the catalog, else "extent".
+            Everything that the API returns is in the capture's own unit either way.
         init: Start from the capture's 3D "points", or from "random" ones.
         max_views: Use at most this many views, evenly spread.
-        near: Near plane, trained units, above 0. Default: the smaller of 0.2 and 0.02 times the camera extent.
-        ignore_principal_point: Move every principal point to the middle of its picture, as the reference implementations do.
-        background: RGB in [0, 1] behind the scene. Default: white for NeRF-synthetic captures, else black.
+        near: Near plane, trained units, above 0. Default: the smaller of 0.2 and 0.02 times the
+            camera extent.
+        ignore_principal_point: Move every principal point to the middle of its picture, as the
+            reference implementations do.
+        background: RGB in [0, 1] behind the scene. Default: white for NeRF-synthetic captures, else
+            black.
         seed: Seed of the random points, at least 0.
 
     Raises:

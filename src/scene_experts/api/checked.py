@@ -1,4 +1,5 @@
-"""Arguments as the plain numbers that config.json holds, from Python or NumPy. A run with another value there could not be opened."""
+"""Arguments as the plain numbers that config.json holds, from Python or NumPy. A run with another
+value there could not be opened."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ T = TypeVar("T")
 
 
 def integer(name: str, value: object, least: int | None = None) -> int:
-    """Return an integer of at least `least`. Raises InputError, naming the argument, for anything else."""
+    """Return an integer of at least `least`. Raises InputError, naming the argument, for anything
+    else."""
     if not isinstance(value, Integral) or (least is not None and value < least):
         what = "an integer" if least is None else f"an integer of at least {least}"
         raise InputError(f"expected {name} as {what}, found {value!r}; correct it")
@@ -25,7 +27,8 @@ def integer(name: str, value: object, least: int | None = None) -> int:
 
 
 def real(name: str, value: object) -> float:
-    """Return a finite number as a float. Raises InputError, naming the argument, for anything else."""
+    """Return a finite number as a float. Raises InputError, naming the argument, for anything
+    else."""
     if not isinstance(value, Real) or not math.isfinite(value):
         raise InputError(f"expected {name} as a finite number, found {value!r}; correct it")
     return float(value)

@@ -19,7 +19,8 @@ RECORDED = ("deterministic", "stop_at", "max_memory")
 
 
 def command_of(cfg: Train, data: Data, out: Path | None, options: TrainOptions) -> str:
-    """`scene-experts train ...` with every number that differs from the recipe; empty where no command can say it."""
+    """`scene-experts train ...` with every number that differs from the recipe; empty where no
+    command can say it."""
     if cfg.recipe not in RECIPES:
         return ""
     changed = changes(RECIPES[cfg.recipe][1], cfg)
@@ -32,7 +33,8 @@ def command_of(cfg: Train, data: Data, out: Path | None, options: TrainOptions) 
 
 
 def changes(old: Any, new: Any, above: str = "") -> list[tuple[str, Any]] | None:
-    """Return dotted names and values of the numbers in which two dataclasses differ, or None if a part is of another kind."""
+    """Return dotted names and values of the numbers in which two dataclasses differ, or None if a
+    part is of another kind."""
     out = []
     for field in dataclasses.fields(new):
         was, now = getattr(old, field.name), getattr(new, field.name)

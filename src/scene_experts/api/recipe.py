@@ -18,7 +18,8 @@ Recipe = Train
 
 
 def list_recipes() -> dict[str, str]:
-    """Return the names of all recipes, with a sentence on each. Installed packages may add recipes."""
+    """Return the names of all recipes, with a sentence on each. Installed packages may add
+    recipes."""
     return {name: text for name, (text, _) in RECIPES.items()}
 
 
@@ -27,12 +28,15 @@ def recipe(name: str | Recipe, /, **numbers: Any) -> Recipe:
 
     Args:
         name: One of `list_recipes()`, or a recipe to change.
-        numbers: Values to change, by the names of the options of `scene-experts train RECIPE --help-all`: `iterations=3000`. The numbers of
-            a part have dotted names, `**{"scene.voxel_size": 0.01}`, or are in a dictionary, `scene={"voxel_size": 0.01}`.
-            `iterations` rescales the whole schedule: learning rates, densification and warm-up keep their share of the training.
+        numbers: Values to change, by the names of the options of `scene-experts train RECIPE
+            --help-all`: `iterations=3000`. The numbers of a part have dotted names,
+            `**{"scene.voxel_size": 0.01}`, or are in a dictionary, `scene={"voxel_size": 0.01}`.
+            `iterations` rescales the whole schedule: learning rates, densification and warm-up keep
+            their share of the training.
 
     Raises:
-        InputError: The recipe or a name is unknown, or a value has the wrong type or is out of range.
+        InputError: The recipe or a name is unknown, or a value has the wrong type or is out of
+            range.
     """
     value = find_recipe(name) if isinstance(name, str) else name
     for place, number in flat(numbers):
@@ -58,7 +62,8 @@ def flat(numbers: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any
 
 
 def with_number(part: Any, place: list[str], name: str, value: Any, whole: Recipe) -> Any:
-    """The part of a recipe with `value` at `place` below it. Raises InputError, with the whole `name`, for what does not fit."""
+    """The part of a recipe with `value` at `place` below it. Raises InputError, with the whole
+    `name`, for what does not fit."""
     first, rest = place[0].replace("-", "_"), place[1:]
     if not has_number(part, first):
         raise InputError(f"the recipe {whole.recipe!r} has no {name!r}{nearest(name, names(whole))}; give the name of an option")

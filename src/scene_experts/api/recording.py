@@ -1,4 +1,5 @@
-"""Trains into a run folder and writes everything that belongs there. `scene-experts train` and the Python API both call it."""
+"""Trains into a run folder and writes everything that belongs there. `scene-experts train` and the
+Python API both call it."""
 
 from __future__ import annotations
 
@@ -27,8 +28,9 @@ from scene_experts.training.record import Recorder
 def train(run: loop.Job, capture: Capture, rasterize: Rasterizer) -> Iterator[Event]:
     """Train the recipe of `run.config` on a capture; yields the events of the training.
 
-    With a folder `run.out`: hold it, write config.json, metrics.jsonl, previews, checkpoints and, once the training is complete,
-    the Scaffold-GS layout (or that of the recipe's family). Nothing is written before the first event. Without one, nothing is written.
+    With a folder `run.out`: hold it, write config.json, metrics.jsonl, previews, checkpoints and,
+    once the training is complete, the Scaffold-GS layout (or that of the recipe's family). Nothing
+    is written before the first event. Without one, nothing is written.
 
     Raises InputError if the folder cannot hold the run, and RunError if a file cannot be written.
     """
@@ -61,7 +63,8 @@ def train(run: loop.Job, capture: Capture, rasterize: Rasterizer) -> Iterator[Ev
 
 
 def is_exported(out: Path, step: int) -> bool:
-    """Return whether the folder holds the complete layout of the iteration `step`. Its description and the cameras are written last."""
+    """Return whether the folder holds the complete layout of the iteration `step`. Its description
+    and the cameras are written last."""
     layout = out / "point_cloud" / f"iteration_{step}"
     return all(path.is_file() for path in (layout / "point_cloud.ply", layout / DESCRIPTION, out / "cameras.json"))
 

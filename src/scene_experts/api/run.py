@@ -46,7 +46,8 @@ class Layers:
     image: NDArray[np.float32]
     """[H, W, 3] RGB in [0, 1], the background blended in."""
     depth: NDArray[np.float32]
-    """[H, W] Depth along z, capture's unit: the mean over what is drawn, weighted by contribution; 0 where nothing is drawn."""
+    """[H, W] Depth along z, capture's unit: the mean over what is drawn, weighted by contribution;
+    0 where nothing is drawn."""
     alpha: NDArray[np.float32]
     """[H, W] Opacity in [0, 1]; the background has the weight 1 - alpha."""
 
@@ -60,16 +61,19 @@ class Scores:
     ssim: float
     """Structural similarity, at most 1; higher is better."""
     lpips: float | None
-    """Learned perceptual distance (VGG16, pictures in [-1, 1]), at least 0; lower is better. None where its weights are not on this
-    machine. `details["lpips_3dgs"]` has it for pictures in [0, 1], as 3DGS and papers after it compute it."""
+    """Learned perceptual distance (VGG16, pictures in [-1, 1]), at least 0; lower is better. None
+    where its weights are not on this machine. `details["lpips_3dgs"]` has it for pictures in [0,
+    1], as 3DGS and papers after it compute it."""
     per_view: dict[str, dict[str, Any]]
     """The scores and counts of each view, by the name of its photograph."""
     details: dict[str, Any]
-    """Everything that RUN/results.json holds: other variants of the metrics, sizes, expert shares, frames a second, versions."""
+    """Everything that RUN/results.json holds: other variants of the metrics, sizes, expert shares,
+    frames a second, versions."""
 
 
 class Run:
-    """A trained scene with its recipe and capture. `train`, `open_run`, `import_run` and `Trainer.run` return one."""
+    """A trained scene with its recipe and capture. `train`, `open_run`, `import_run` and
+    `Trainer.run` return one."""
 
     def __init__(
         self,
@@ -81,7 +85,8 @@ class Run:
         data: Path | None = None,
         training: Training | None = None,
     ) -> None:
-        """capture: the capture of the run, if it is already loaded. data: its new location. training: the training of a scene in memory."""
+        """capture: the capture of the run, if it is already loaded. data: its new location.
+        training: the training of a scene in memory."""
         self._opened, self._device, self._capture, self._data, self._training = opened, device, capture, data, training
         self._rasterize = as_trained(rasterize, opened.config.train.antialias)
         self._draws: Draws | None = None
@@ -109,7 +114,8 @@ class Run:
 
     @property
     def scene(self) -> Scene:
-        """The scene in the trained world, as the package's own modules use it: a torch module with a table of rows.
+        """The scene in the trained world, as the package's own modules use it: a torch module with
+        a table of rows.
 
         A recipe with `average.span` gives it the averaged weights, in memory as in a folder.
         """
@@ -127,7 +133,8 @@ class Run:
         """The capture that the scene was trained on. It is loaded on first use.
 
         Raises:
-            InputError: The capture is gone, or has other views than during the training. `open_run(..., data=FOLDER)` states where it is.
+            InputError: The capture is gone, or has other views than during the training.
+                `open_run(..., data=FOLDER)` states where it is.
         """
         if self._capture is None:
             config, loaded = self._opened.config, run_folder.capture_of(self._opened, self._data)
@@ -151,8 +158,9 @@ class Run:
 
         Args:
             camera: A camera in the capture's frame; its position may be anywhere.
-            show: "picture", or false colours: "depth" (near is light), "alpha", "experts" (a colour for each expert), "entropy" (of the
-                gates) or "activation" (share of the Gaussians of an anchor that are drawn).
+            show: "picture", or false colours: "depth" (near is light), "alpha", "experts" (a colour
+                for each expert), "entropy" (of the gates) or "activation" (share of the Gaussians
+                of an anchor that are drawn).
             attribute: The attribute whose experts are shown.
 
         Returns:
@@ -181,7 +189,8 @@ class Run:
         """Render cameras to a video or to numbered PNG files.
 
         Args:
-            out: FILE.mp4, .mov, .mkv or .webm (needs `pip install 'scene-experts[video]'`), or a folder for PNG files.
+            out: FILE.mp4, .mov, .mkv or .webm (needs `pip install 'scene-experts[video]'`), or a
+                folder for PNG files.
             cameras: One for each frame, all of one size for a video.
             fps: Frames per second, above 0.
             show: As in `render`.
@@ -191,7 +200,8 @@ class Run:
             The path of the video or folder.
 
         Raises:
-            InputError: There is no camera, the cameras differ in size, a value is out of range, or the encoder is not installed.
+            InputError: There is no camera, the cameras differ in size, a value is out of range, or
+                the encoder is not installed.
             RunError: The encoder fails, or the disk is full.
         """
         path, cameras = Path(out), list(cameras)
@@ -224,10 +234,12 @@ class Run:
 
         Args:
             views: Which views to score: the held-out ones, or those of the training.
-            appearance: For scenes with appearance codes: "rule" draws a held-out view with the code that the recipe chooses. "half" fits a
-                code to the left half of each photograph and scores the right half.
+            appearance: For scenes with appearance codes: "rule" draws a held-out view with the code
+                that the recipe chooses. "half" fits a code to the left half of each photograph and
+                scores the right half.
             lpips: Score LPIPS if its weights are found.
-            lpips_weights: Folder or file with these weights. Default: where `scene-experts eval` looks for them.
+            lpips_weights: Folder or file with these weights. Default: where `scene-experts eval`
+                looks for them.
             download_lpips: Download the weights if they are not on this machine.
 
         Raises:
@@ -257,25 +269,33 @@ class Run:
         """Write the scene to a file that other tools or later runs read.
 
         Args:
-            format: "compact" is one small file of this package. "anchors" is the Scaffold-GS folder layout. "ply", "compressed-ply",
-                "splat", "spz", "sog", "glb", "usd" and "html" (a page with a viewer) are standard files of Gaussians; scenes of anchors
-                are baked for them, which takes minutes.
-            out: File or folder; a name without a suffix is a folder. Default: inside the run folder.
+            format: "compact" is one small file of this package. "anchors" is the Scaffold-GS folder
+                layout. "ply", "compressed-ply", "splat", "spz", "sog", "glb", "usd" and "html" (a
+                page with a viewer) are standard files of Gaussians; scenes of anchors are baked for
+                them, which takes minutes.
+            out: File or folder; a name without a suffix is a folder. Default: inside the run
+                folder.
             sh_degree: Standard files: degree of the spherical harmonics, 0 to 3.
-            max_gaussians: Standard files: keep this many Gaussians, those that contribute most; 0 keeps all.
-            prune: Standard files: leave out the Gaussians that contribute least, up to this share (0 to 1) of all contributions.
-            refine: Standard files: iterations that fit the baked Gaussians to pictures of the run; 0 for none.
+            max_gaussians: Standard files: keep this many Gaussians, those that contribute most; 0
+                keeps all.
+            prune: Standard files: leave out the Gaussians that contribute least, up to this share
+                (0 to 1) of all contributions.
+            refine: Standard files: iterations that fit the baked Gaussians to pictures of the run;
+                0 for none.
             frame: Standard files: the frame of the capture, or the trained world.
-            crop: Standard files: keep what is inside "sphere:RADIUS" (around the point that the cameras look at; "1.2x" counts in their
-                distance from it), "sphere:X,Y,Z,RADIUS" or "box:X0,Y0,Z0,X1,Y1,Z1", in the units of the capture's poses.
-            floaters: Standard files: "remove" leaves out Gaussians that no training photograph supports.
+            crop: Standard files: keep what is inside "sphere:RADIUS" (around the point that the
+                cameras look at; "1.2x" counts in their distance from it), "sphere:X,Y,Z,RADIUS" or
+                "box:X0,Y0,Z0,X1,Y1,Z1", in the units of the capture's poses.
+            floaters: Standard files: "remove" leaves out Gaussians that no training photograph
+                supports.
             title: html: title of the page. Default: the name of the capture.
 
         Returns:
             The path of the file or folder.
 
         Raises:
-            InputError: The format cannot hold the scene, the run is only in memory, or a value is unknown or out of range.
+            InputError: The format cannot hold the scene, the run is only in memory, or a value is
+                unknown or out of range.
             RunError: The disk is full.
         """
         options = Options(False, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title)
@@ -287,7 +307,8 @@ class Run:
         return exporting.export(opened, format, None if out is None else Path(out), options)[0].path
 
     def report(self) -> Path:
-        """Write RUN/report.html, a page with curves, held-out views, experts and the command that repeats the run.
+        """Write RUN/report.html, a page with curves, held-out views, experts and the command that
+        repeats the run.
 
         Returns:
             The path of the page.
@@ -298,7 +319,8 @@ class Run:
         return page.write([self._in_folder("report")])
 
     def save(self, out: str | Path) -> Run:
-        """Write a run that is only in memory to a run folder. Every command accepts the folder, and training can resume from it.
+        """Write a run that is only in memory to a run folder. Every command accepts the folder, and
+        training can resume from it.
 
         Returns:
             The run in the folder.
@@ -331,7 +353,8 @@ class Run:
         return view.to(self._device), torch.tensor(capture.background, dtype=torch.float32, device=self._device)
 
     def _frozen(self) -> Draws:
-        """The scene prepared for drawing. Unless it is being trained, values that do not depend on the camera are computed once."""
+        """The scene prepared for drawing. Unless it is being trained, values that do not depend on
+        the camera are computed once."""
         if self._training:
             return self.scene
         if self._draws is None:
@@ -375,10 +398,12 @@ def open_run(
         step: Which checkpoint to open. Default: the newest whole one.
         data: Where the capture is now, if it moved.
         device: "cpu", "cuda", or "auto" (CUDA if torch finds it and gsplat is installed).
-        rasterizer: "cpu" (compiled), "gsplat" (CUDA), "reference" (plain torch, slow), or "auto" (the fastest that works on the device).
+        rasterizer: "cpu" (compiled), "gsplat" (CUDA), "reference" (plain torch, slow), or "auto"
+            (the fastest that works on the device).
 
     Raises:
-        InputError: The folder is no run, has no such checkpoint, or the device or rasteriser is not available.
+        InputError: The folder is no run, has no such checkpoint, or the device or rasteriser is not
+            available.
     """
     where, rasterize = backend(device, rasterizer, False, False)
     return Run(run_folder.open_run(Path(path), where, step), where, rasterize, data=None if data is None else Path(data))
@@ -390,15 +415,17 @@ def import_run(
     """Make a run folder of a published result, or of a file that `Run.export` wrote.
 
     Args:
-        source: Result folder (with point_cloud/iteration_N) of Scaffold-GS, Octree-GS, SAGS or 3DGS, a compact file, or Gaussians as ply,
-            compressed-ply, splat, spz, sog, glb, usd or html.
+        source: Result folder (with point_cloud/iteration_N) of Scaffold-GS, Octree-GS, SAGS or
+            3DGS, a compact file, or Gaussians as ply, compressed-ply, splat, spz, sog, glb, usd or
+            html.
         capture: The capture that it was trained on, or its folder.
         out: Run folder to write.
         iteration: Which iteration of a result folder. Default: the newest.
         device: As in `open_run`.
 
     Raises:
-        InputError: The source holds no scene, the capture does not fit it, or `out` holds something else.
+        InputError: The source holds no scene, the capture does not fit it, or `out` holds something
+            else.
     """
     known = capture if isinstance(capture, Capture) else load_capture(capture)
     import_files(Path(source), known.data, Path(out), iteration)

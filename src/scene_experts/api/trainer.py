@@ -62,25 +62,32 @@ class Trainer:
         """Prepare a training. Nothing is trained or written before the first event.
 
         Args:
-            method: A recipe, or the name of one. By name, a scene of the catalog brings its data set's numbers (`Capture.numbers`), as
-                in the command.
+            method: A recipe, or the name of one. By name, a scene of the catalog brings its data
+                set's numbers (`Capture.numbers`), as in the command.
             capture: A capture, its folder, or "catalog:SCENE".
-            out: Run folder to write, as `scene-experts train --out` does. Default: the scene stays in memory.
+            out: Run folder to write, as `scene-experts train --out` does. Default: the scene stays
+                in memory.
             resume: Continue from the newest whole checkpoint in `out`.
-            overwrite: Start again in a folder that holds an earlier run, whose checkpoints are removed.
-            stop_at: Stop at this iteration of the unchanged schedule; `iterations` of the recipe rescales the schedule instead.
-            deterministic: Bit-identical results on one machine, resumed or not; a little slower. Until the training ends, torch uses
-                deterministic algorithms in the whole process.
+            overwrite: Start again in a folder that holds an earlier run, whose checkpoints are
+                removed.
+            stop_at: Stop at this iteration of the unchanged schedule; `iterations` of the recipe
+                rescales the schedule instead.
+            deterministic: Bit-identical results on one machine, resumed or not; a little slower.
+                Until the training ends, torch uses deterministic algorithms in the whole process.
             device: "cpu", "cuda", or "auto" (CUDA if torch finds it and gsplat is installed).
-            rasterizer: "cpu" (compiled), "gsplat" (CUDA), "reference" (plain torch, slow), or "auto" (the fastest on the device).
+            rasterizer: "cpu" (compiled), "gsplat" (CUDA), "reference" (plain torch, slow), or
+                "auto" (the fastest on the device).
             save_every: Iterations between checkpoints, at least 1.
             preview_every: Iterations between `Previewed` events; 0 for none.
             log_every: Iterations between `Stepped` events, at least 1.
-            max_memory: GiB that the process may reach before growth stops, resident or reserved on the GPU; 0 for no limit.
-            tensorboard: Write `out`/tensorboard too (needs `pip install 'scene-experts[tensorboard]'`).
+            max_memory: GiB that the process may reach before growth stops, resident or reserved on
+                the GPU; 0 for no limit.
+            tensorboard: Write `out`/tensorboard too (needs `pip install
+                'scene-experts[tensorboard]'`).
 
         Raises:
-            InputError: A setting is invalid, the capture cannot be used, or the folder cannot hold the run.
+            InputError: A setting is invalid, the capture cannot be used, or the folder cannot hold
+                the run.
         """
         if max_memory > 0:
             forget_peak()
@@ -116,7 +123,8 @@ class Trainer:
 
     @property
     def run(self) -> Run:
-        """The scene as it is now. After the end of a training with a folder, the run in that folder.
+        """The scene as it is now. After the end of a training with a folder, the run in that
+        folder.
 
         Raises:
             InputError: The training has not begun: no event was yielded yet.
@@ -131,7 +139,8 @@ class Trainer:
         return Run(opened, self._run.device, self._rasterize, capture=self.capture, training=training)
 
     def stop(self, reason: str = "stop") -> None:
-        """End the training after this iteration, and save it if it has a folder. The last event is `Stopped`, with the reason."""
+        """End the training after this iteration, and save it if it has a folder. The last event is
+        `Stopped`, with the reason."""
         self._run.stop.append(reason)
 
     def finish(self) -> Run:
@@ -182,21 +191,25 @@ def train(
 ) -> Run:
     """Train a recipe on a capture.
 
-    Ctrl-C saves a training that has a folder and then raises KeyboardInterrupt; a second Ctrl-C does not wait.
+    Ctrl-C saves a training that has a folder and then raises KeyboardInterrupt; a second Ctrl-C
+    does not wait.
 
     Args:
-        method: A recipe, or the name of one. By name, a scene of the catalog brings its data set's numbers (`Capture.numbers`), as in
-            the command.
+        method: A recipe, or the name of one. By name, a scene of the catalog brings its data set's
+            numbers (`Capture.numbers`), as in the command.
         capture: A capture, its folder, or "catalog:SCENE".
-        out: Run folder to write, as `scene-experts train --out` does. Default: the scene stays in memory.
+        out: Run folder to write, as `scene-experts train --out` does. Default: the scene stays in
+            memory.
         progress: Print iterations, losses and the PSNR of training views.
-        settings: `resume`, `overwrite`, `stop_at`, `deterministic`, `device` and the other settings of `Trainer`.
+        settings: `resume`, `overwrite`, `stop_at`, `deterministic`, `device` and the other settings
+            of `Trainer`.
 
     Returns:
         The run.
 
     Raises:
-        InputError: A setting is invalid, the capture cannot be used, or the folder cannot hold the run.
+        InputError: A setting is invalid, the capture cannot be used, or the folder cannot hold the
+            run.
         RunError: A loss is not finite, or a file cannot be written.
     """
     trainer = Trainer(method, capture, out, **settings)
@@ -209,7 +222,8 @@ def train(
 
 @contextmanager
 def saved_on_interrupt(trainer: Trainer, on: bool) -> Iterator[None]:
-    """Let the first Ctrl-C stop the training, which saves it, and raise KeyboardInterrupt afterwards."""
+    """Let the first Ctrl-C stop the training, which saves it, and raise KeyboardInterrupt
+    afterwards."""
     if not on or threading.current_thread() is not threading.main_thread():
         yield
         return

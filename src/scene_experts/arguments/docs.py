@@ -1,4 +1,5 @@
-"""Read the docstrings of a dataclass and its fields from the source. The docstring of a field is the string below it."""
+"""Read the docstrings of a dataclass and its fields from the source. The docstring of a field is
+the string below it."""
 
 from __future__ import annotations
 

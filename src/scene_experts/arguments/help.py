@@ -1,4 +1,5 @@
-"""Format the help of a command as plain text: its usage, its description and its options in groups."""
+"""Format the help of a command as plain text: its usage, its description and its options in
+groups."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ SMALL = 3  # dataclasses with at most this many options are shown in the enclosi
 
 
 def page(kind: type, name: str, about: str, table: Sequence[Row], positional: Sequence[str], first: Sequence[str]) -> str:
-    """Return the help of the command `name`. `first` lists the options to show in order; if it is empty, all are shown in groups."""
+    """Return the help of the command `name`. `first` lists the options to show in order; if it is
+    empty, all are shown in groups."""
     width = page_width()
     by_flag = {row.flag: row for row in table}
     words = [by_flag[flag] for flag in positional]
@@ -44,7 +46,8 @@ def page_width() -> int:
 
 
 def format_usage(name: str, table: Sequence[Row], positional: Sequence[str]) -> str:
-    """Return the usage of a command with its positional and required options, for example "scene-experts info CAPTURE"."""
+    """Return the usage of a command with its positional and required options, for example
+    "scene-experts info CAPTURE"."""
     by_flag = {row.flag: row for row in table}
     first = [by_flag[flag] for flag in positional]
     words = [text if row.required else f"[{text}]" for row in first if (text := stands_for(row))]
@@ -59,7 +62,8 @@ def stands_for(row: Row) -> str:
 
 
 def paragraphs(text: str, width: int) -> str:
-    """Wrap paragraphs to `width`. Paragraphs with indented lines, such as lists, are not changed."""
+    """Wrap paragraphs to `width`. Paragraphs with indented lines, such as lists, are not
+    changed."""
     return "\n\n".join(part if "\n " in part else wrap(part, width) for part in text.strip().split("\n\n"))
 
 
@@ -71,7 +75,8 @@ def wrap(text: str, width: int, indent: int = 0) -> str:
 
 
 def groups(kind: type, shown: Sequence[Row]) -> list[tuple[str, list[Row]]]:
-    """Group rows by the dataclass that declares them. Rows of a small dataclass belong to the enclosing dataclass."""
+    """Group rows by the dataclass that declares them. Rows of a small dataclass belong to the
+    enclosing dataclass."""
     out: dict[tuple[str, type | None], list[Row]] = {}
     for row in shown:
         out.setdefault(_group(row), []).append(row)
@@ -110,7 +115,8 @@ def entry(row: Row, width: int, word: bool = False) -> list[str]:
 
 
 def columns(left: str, text: str, width: int | None = None) -> list[str]:
-    """Return the lines of a name with its text in a second column. The text starts below a long name."""
+    """Return the lines of a name with its text in a second column. The text starts below a long
+    name."""
     lines = textwrap.wrap(text, (width or page_width()) - COLUMN, break_on_hyphens=False, break_long_words=False)
     if lines and len(left) + 2 <= COLUMN:
         left, lines = left.ljust(COLUMN) + lines[0], lines[1:]

@@ -1,4 +1,5 @@
-"""Parse command-line arguments into a dataclass. All commands use this parser, so they accept and reject the same syntax."""
+"""Parse command-line arguments into a dataclass. All commands use this parser, so they accept and
+reject the same syntax."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ class Command:
     name: str
     """As it is typed: "scene-experts eval"."""
     positional: tuple[str, ...] = ()
-    """Names of options that may be given without them, in this order: ("run",). Only the last may take several values."""
+    """Names of options that may be given without them, in this order: ("run",). Only the last may
+    take several values."""
     first: tuple[str, ...] = ()
     """Names of options that --help shows, where --help-all shows the rest too. Empty: all."""
     about: str = ""

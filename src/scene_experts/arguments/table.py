@@ -1,4 +1,5 @@
-"""List the options of a dataclass, one row per field with name, type and default, and create the dataclass from given values."""
+"""List the options of a dataclass, one row per field with name, type and default, and create the
+dataclass from given values."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ class Row:
 
     @property
     def negative(self) -> str:
-        """The name that turns a switch off, for example `--growth.no-elimination`. Empty for other types."""
+        """The name that turns a switch off, for example `--growth.no-elimination`. Empty for other
+        types."""
         before, dot, last = self.flag.rpartition(".")
         if self.kind is not bool:
             return ""
@@ -87,8 +89,8 @@ def _rows(kind: type, value: Any, prefix: str, place: Place, defaults: Mapping[s
 
 
 def choose_parts(kind: type, defaults: Mapping[str, Any], chosen: Callable[[Row], str | None]) -> dict[str, Any]:
-    """Return the defaults with the parts that `chosen` names, for the rows that choose one. Settings that a part shares with
-    the one that it replaces keep their values."""
+    """Return the defaults with the parts that `chosen` names, for the rows that choose one.
+    Settings that a part shares with the one that it replaces keep their values."""
     found = dict(defaults)
     for row in rows(kind, defaults):
         name = chosen(row) if row.part is not None else None
@@ -148,7 +150,8 @@ def _annotation(kind: type, name: str) -> tuple[Option, Any]:
 
 
 def _dataclass_of(kind: Any, default: Any) -> type | None:
-    """Return the dataclass whose fields are the options of a field, or None if the field itself is an option."""
+    """Return the dataclass whose fields are the options of a field, or None if the field itself is
+    an option."""
     if is_dataclass(default) and not isinstance(default, type):
         return type(default)
     return kind if default is MISSING and isinstance(kind, type) and is_dataclass(kind) else None

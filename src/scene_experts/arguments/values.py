@@ -19,11 +19,13 @@ WORDS: dict[Any, tuple[str, str, Callable[[str], Any]]] = {
     str: ("a value", "TEXT", str),
     Path: ("a path", "PATH", Path),
 }
-"""Basic types: their name in messages, their placeholder in the help, and the function that converts an argument."""
+"""Basic types: their name in messages, their placeholder in the help, and the function that
+converts an argument."""
 
 
 def count(kind: Any) -> tuple[int, int | None]:
-    """Return the minimum and maximum number of arguments of a value. A maximum of None means any number."""
+    """Return the minimum and maximum number of arguments of a value. A maximum of None means any
+    number."""
     inner, optional = without_none(kind)
     if inner is bool:
         return 0, 0
@@ -36,7 +38,8 @@ def count(kind: Any) -> tuple[int, int | None]:
 def convert(kind: Any, words: Sequence[str], name: str, example: str) -> Any:
     """Convert arguments to a value of type `kind`. "none" becomes None or an empty tuple.
 
-    Raises InputError, which names the option `name` and shows a valid `example`, if an argument is invalid.
+    Raises InputError, which names the option `name` and shows a valid `example`, if an argument is
+    invalid.
     """
     inner, optional = without_none(kind)
     many = count(inner)[1] is None
@@ -67,7 +70,8 @@ def _one(kind: Any, word: str, name: str, example: str) -> Any:
 
 
 def describe(kind: Any) -> str:
-    """Return the name of a type in messages, for example "a whole number" or "auto, cpu or cuda"."""
+    """Return the name of a type in messages, for example "a whole number" or "auto, cpu or
+    cuda"."""
     inner, _ = without_none(kind)
     if typing.get_origin(inner) is Literal:
         *some, last = map(str, typing.get_args(inner))
@@ -79,7 +83,8 @@ def describe(kind: Any) -> str:
 
 
 def list_choices(kind: Any) -> str:
-    """Return the choices of a type, "a, b or c", or an empty string if the placeholder shows them."""
+    """Return the choices of a type, "a, b or c", or an empty string if the placeholder shows
+    them."""
     inner, _ = without_none(kind)
     if typing.get_origin(inner) is tuple:
         inner = typing.get_args(inner)[0]
@@ -87,7 +92,8 @@ def list_choices(kind: Any) -> str:
 
 
 def placeholder(kind: Any, name: str = "") -> str:
-    """Return the placeholder of a value in the help: "N", "auto|cpu|cuda", "N ...". `name` replaces the name of the type."""
+    """Return the placeholder of a value in the help: "N", "auto|cpu|cuda", "N ...". `name` replaces
+    the name of the type."""
     inner, _ = without_none(kind)
     if inner is bool:
         return ""
@@ -111,7 +117,8 @@ def format_value(value: Any) -> str:
 
 
 def without_none(kind: Any) -> tuple[Any, bool]:
-    """Return the type without None, and whether None is allowed. Raises TypeError for a union of several other types."""
+    """Return the type without None, and whether None is allowed. Raises TypeError for a union of
+    several other types."""
     rest = [each for each in members(kind) if each is not type(None)]
     if len(rest) != 1:
         raise TypeError(f"an option cannot be one of {rest}")

@@ -1,4 +1,5 @@
-"""A training that takes minutes on this machine: its resolution, its iterations, and an estimate of its time."""
+"""A training that takes minutes on this machine: its resolution, its iterations, and an estimate of
+its time."""
 
 from __future__ import annotations
 
@@ -13,8 +14,10 @@ from scene_experts.render import choose
 LIMIT = 8.0  # minutes, so that a capture of few photographs, its training, scores and page take a quarter of an hour together
 SIDES = ((0, 7000), (1200, 7000), (800, 7000), (800, 4000), (600, 4000), (600, 3000), (600, 2000), (400, 2000))
 """Longest side in pixels (0: as it is) and iterations, the best first."""
-# Iterations of scene-experts on pyramid (0.10 megapixels), colosseum (0.23), banana (0.43), fox (0.52) and sceaux (1.08) take 6.4, 5.6,
-# 5.7, 7.6 and 15.1 times the picture below. The line is near the first and the last, and above the others.
+# Iterations of scene-experts on pyramid (0.10 megapixels), colosseum (0.23), banana (0.43), fox
+# (0.52) and sceaux (1.08) take 6.4, 5.6,
+# 5.7, 7.6 and 15.1 times the picture below. The line is near the first and the last, and above the
+# others.
 FEW, FEW_ITERATIONS = 30, 4000
 BASE, PER_MEGAPIXEL = 4.5, 9.8
 SERIAL = 0.15  # share of an iteration that one thread does
@@ -28,7 +31,8 @@ class Advice:
     """Longest side of the photographs in pixels; 0: as they are."""
     iterations: int
     minutes: float | None
-    """Estimated time on this machine while nothing else runs; None on CUDA, which is not measured."""
+    """Estimated time on this machine while nothing else runs; None on CUDA, which is not
+    measured."""
 
     @property
     def flags(self) -> list[str]:
@@ -41,7 +45,8 @@ class Advice:
 
 
 def measure_picture() -> float:
-    """CPU seconds that one thread takes for a picture of 20,000 Gaussians at 400x272 and its gradients. Takes about a second."""
+    """CPU seconds that one thread takes for a picture of 20,000 Gaussians at 400x272 and its
+    gradients. Takes about a second."""
     with step.use_threads(1):
         picture, rasterize = raster.make_picture(20_000, 400, 272), choose("auto", "cpu")
         return min(sum(raster.time_draw(rasterize, picture, time.process_time)) for _ in range(8))
@@ -54,11 +59,14 @@ def estimate_minutes(width: int, height: int, iterations: int, picture: float, t
 
 
 def suggest(width: int, height: int, views: int, picture: float | None = None) -> Advice:
-    """Suggest a training for photographs of this size: the best one of SIDES that takes at most LIMIT minutes, or the shortest.
+    """Suggest a training for photographs of this size: the best one of SIDES that takes at most
+    LIMIT minutes, or the shortest.
 
-    With FEW photographs or less, at most FEW_ITERATIONS: a longer training fits them better and what lies between them worse.
+    With FEW photographs or less, at most FEW_ITERATIONS: a longer training fits them better and
+    what lies between them worse.
 
-    views: number of photographs. picture: seconds from `measure_picture`, which is called by default.
+    views: number of photographs. picture: seconds from `measure_picture`, which is called by
+    default.
     """
     if torch.cuda.is_available() and choose("auto", "cuda").name != "reference":
         return Advice(0, 30_000, None)

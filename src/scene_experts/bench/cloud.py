@@ -1,7 +1,9 @@
-"""The benchmark scene of the rasterisers: a point cloud turned into any number of Gaussians of realistic sizes.
+"""The benchmark scene of the rasterisers: a point cloud turned into any number of Gaussians of
+realistic sizes.
 
-The cloud comes from structure from motion in an .npz (means3d [P, 3], colors [P, 3] uint8, viewmats, Ks, width, height). Without a file, a
-similar one is synthesised: a table with objects, ground, hedges and a far background, seen from a camera beside the table.
+The cloud comes from structure from motion in an .npz (means3d [P, 3], colors [P, 3] uint8,
+viewmats, Ks, width, height). Without a file, a similar one is synthesised: a table with objects,
+ground, hedges and a far background, seen from a camera beside the table.
 """
 
 from __future__ import annotations
@@ -64,7 +66,8 @@ def make_cloud(seed: int = 0) -> Cloud:
 
 
 def _look_at(eye: np.ndarray) -> np.ndarray:
-    """World to camera (x right, y down, z forward) from `eye` towards the origin, with the z axis of the world up."""
+    """World to camera (x right, y down, z forward) from `eye` towards the origin, with the z axis
+    of the world up."""
     forward = -eye / np.linalg.norm(eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -75,9 +78,11 @@ def _look_at(eye: np.ndarray) -> np.ndarray:
 
 
 def make_scene(cloud: Cloud, count: int, width: int, height: int, seed: int = 0) -> tuple[Gaussians, Camera]:
-    """Sample `count` Gaussians from the cloud (with jitter beyond its size) and scale its camera to `width` x `height` pixels.
+    """Sample `count` Gaussians from the cloud (with jitter beyond its size) and scale its camera to
+    `width` x `height` pixels.
 
-    Scales are the RMS distance to 3 neighbours times exp(N(0, 0.5)) times (1, 1, 0.35); opacities 0.004 + 0.995 Beta(0.7, 0.9).
+    Scales are the RMS distance to 3 neighbours times exp(N(0, 0.5)) times (1, 1, 0.35); opacities
+    0.004 + 0.995 Beta(0.7, 0.9).
     """
     rng = np.random.default_rng(seed)
     total = len(cloud.xyz)

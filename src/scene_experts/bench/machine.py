@@ -17,7 +17,8 @@ CHUNKS = 100  # chunks of the arithmetic loop: about a millisecond
 
 @dataclass(frozen=True)
 class Machine:
-    """The machine of the measurements. Rates are for one thread, and None without the compiled library that measures them."""
+    """The machine of the measurements. Rates are for one thread, and None without the compiled
+    library that measures them."""
 
     processor: str
     cores: int  # available to this process
@@ -49,7 +50,8 @@ def read_processor_name() -> str:
 
 
 def measure_multiply_adds(level: str | None, threads: int, seconds: float, clock: Clock | None = None) -> float | None:
-    """Multiply-adds of single floats per second in a native loop without dependencies; None without a compiled library.
+    """Multiply-adds of single floats per second in a native loop without dependencies; None without
+    a compiled library.
 
     clock: by default processor time for one thread and wall time for more.
     """
@@ -77,7 +79,8 @@ def measure_clock(level: str | None, seconds: float) -> float | None:
 
 
 def measure_copy(seconds: float) -> float:
-    """Bytes per second that one thread reads and writes when it copies an array larger than the caches."""
+    """Bytes per second that one thread reads and writes when it copies an array larger than the
+    caches."""
     source = torch.ones(64 * 2**18)
     target = torch.empty_like(source)
 

@@ -1,4 +1,5 @@
-"""Measure times as minima of interleaved runs, so that other work on the machine changes them little."""
+"""Measure times as minima of interleaved runs, so that other work on the machine changes them
+little."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ def choose_clock(threads: int) -> Clock:
 def measure_minima(
     subjects: Mapping[str, Subject], seconds: float, clock: Clock, runs: Mapping[str, int] | None = None
 ) -> dict[str, tuple[float, ...]]:
-    """Return the minimum time of each part of each subject, s. Each round runs every subject once, until `seconds` have passed.
+    """Return the minimum time of each part of each subject, s. Each round runs every subject once,
+    until `seconds` have passed.
 
     Subjects run at least twice, because memory is cold in the first run.
 
@@ -51,7 +53,8 @@ def measure_minima(
         subjects: Functions that run once and return the seconds of their parts, by name.
         seconds: Budget of wall time, s.
         clock: The clock for the measurements.
-        runs: Maximum number of runs of slow subjects, by name. Their time does not count towards the budget.
+        runs: Maximum number of runs of slow subjects, by name. Their time does not count towards
+            the budget.
     """
     best: dict[str, tuple[float, ...]] = {}
     spent, turn, limits = 0.0, 0, runs or {}

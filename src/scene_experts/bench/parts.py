@@ -24,7 +24,8 @@ ONE_IN_TORCH = "one network in torch"
 
 
 def make_scene(config: Anchors, anchors: int, seen: float = 0.5) -> tuple[AnchorScene, Tensor]:
-    """Create random anchors with features similar to trained ones, and the `anchors` visible rows, which are the share `seen`."""
+    """Create random anchors with features similar to trained ones, and the `anchors` visible rows,
+    which are the share `seen`."""
     torch.manual_seed(0)
     total = round(anchors / seen)
     params = {
@@ -69,7 +70,8 @@ class Decode:
 
 
 def measure_decode(anchors: int, machine: Machine, seconds: float) -> list[Result]:
-    """Measure Top-2 of 5 experts (the paper) and one network, compiled and in torch. Ratios are to one network in torch."""
+    """Measure Top-2 of 5 experts (the paper) and one network, compiled and in torch. Ratios are to
+    one network in torch."""
     one, top2 = Anchors(decoder=Plain()), Anchors(decoder=Experts(num=5, top_k=2))
     kinds = {ONE_IN_TORCH: (one, "composed"), "Top-2 of 5 in torch": (top2, "composed")}
     if machine.level is not None:

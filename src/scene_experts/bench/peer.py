@@ -1,4 +1,5 @@
-"""The scalar peer: the per-pixel algorithm of 3DGS (Kerbl et al. 2023) as published, in plain C++ on one thread.
+"""The scalar peer: the per-pixel algorithm of 3DGS (Kerbl et al. 2023) as published, in plain C++
+on one thread.
 
 Its source is benchmarks/peer. Editable installs of a checkout build it; wheels do not contain it.
 """
@@ -56,7 +57,8 @@ class Peer:
         return self._library.peer_clock_hz()
 
     def draw(self, g: Gaussians, camera: Camera, upstream: Tensor, clock: Clock) -> tuple[float, float, Tensor, Tensor]:
-        """Seconds forward, seconds backward, the image [H, W, 3] over black, and the gradient of the means [M, 3].
+        """Seconds forward, seconds backward, the image [H, W, 3] over black, and the gradient of
+        the means [M, 3].
 
         upstream: gradient of the loss with respect to the image, [H, W, 3].
         """

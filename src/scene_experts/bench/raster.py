@@ -1,4 +1,5 @@
-"""Measure the rasteriser on one thread, forward + backward, against the scalar peer and the pure-torch reference."""
+"""Measure the rasteriser on one thread, forward + backward, against the scalar peer and the
+pure-torch reference."""
 
 from __future__ import annotations
 
@@ -18,9 +19,12 @@ from scene_experts.render.reference import ReferenceRasterizer
 
 GROUP = "rasteriser, one thread"
 REFERENCE = "pure-torch reference"
-# Operations per blended (pixel, Gaussian) pair, colour and depth: multiply-adds, additions, multiplications, comparisons and selections.
-# Forward: 2 for the exponent, 6 for its exponential, 2 for the limits of alpha, 3 for the transmittance, 2 for the weight and its stop,
-# 4 for the sums. Backward: the first 10 again, 5 for weight and stop, 3 for the colour, 6 for what lies behind and the gradient of the
+# Operations per blended (pixel, Gaussian) pair, colour and depth: multiply-adds, additions,
+# multiplications, comparisons and selections.
+# Forward: 2 for the exponent, 6 for its exponential, 2 for the limits of alpha, 3 for the
+# transmittance, 2 for the weight and its stop,
+# 4 for the sums. Backward: the first 10 again, 5 for weight and stop, 3 for the colour, 6 for what
+# lies behind and the gradient of the
 # weight, 8 for the ten sums over pixels (of sixteen Gaussians at a time).
 FORWARD, BACKWARD = 19, 32
 
@@ -56,7 +60,8 @@ def time_draw(rasterize: Rasterizer, scene: Picture, clock: Clock) -> tuple[floa
 
 
 def measure(scene: Picture, machine: Machine, seconds: float) -> list[Result]:
-    """Measure forward and backward times, their ratios to both peers, cycles per pair, and the share of the arithmetic bound."""
+    """Measure forward and backward times, their ratios to both peers, cycles per pair, and the
+    share of the arithmetic bound."""
     subjects: dict[str, Subject] = {}
     if machine.level is not None:
         subjects[machine.level] = partial(time_draw, CpuRasterizer(level=machine.level, threads=1), scene)

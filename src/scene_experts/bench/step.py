@@ -1,4 +1,5 @@
-"""Measure a whole training step on a synthetic scene, part by part, and how it scales with threads."""
+"""Measure a whole training step on a synthetic scene, part by part, and how it scales with
+threads."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ class Work:
     target: Tensor  # [H, W, 3]
 
     def __call__(self, clock: Clock) -> tuple[float, ...]:
-        """Run one step and return the seconds of PARTS. The scene is restored, so every step is the same."""
+        """Run one step and return the seconds of PARTS. The scene is restored, so every step is the
+        same."""
         training, scene = self.training, self.training.scene
         before = {k: v.detach().clone() for k, v in self._values().items()}
         times = [clock()]
@@ -77,9 +79,11 @@ class Work:
 
 
 def make_work(recipe: str, anchors: int, width: int, height: int, rasterize: Rasterizer | None = None, seen: float = 0.5) -> Work:
-    """Create a step on random anchors. The share `seen` of them fills the image of one camera. The others lie behind the camera.
+    """Create a step on random anchors. The share `seen` of them fills the image of one camera. The
+    others lie behind the camera.
 
-    The networks are freshly initialised. The features are random, so that anchors choose different experts.
+    The networks are freshly initialised. The features are random, so that anchors choose different
+    experts.
     """
     torch.manual_seed(0)
     cfg = RECIPES[recipe][1]
@@ -98,7 +102,8 @@ def make_work(recipe: str, anchors: int, width: int, height: int, rasterize: Ras
 
 @torch.no_grad()
 def copy_networks(mixture: Work, base: Work) -> None:
-    """Copy the anchors of a baseline to a mixture, and its networks to every expert. Both then decode the same Gaussians up to rounding."""
+    """Copy the anchors of a baseline to a mixture, and its networks to every expert. Both then
+    decode the same Gaussians up to rounding."""
     for name, value in mixture.training.scene.table.params.items():
         value.copy_(base.training.scene.table.params[name])
     networks = base.training.scene.network_tensors()
@@ -108,7 +113,8 @@ def copy_networks(mixture: Work, base: Work) -> None:
 
 
 def measure(anchors: int, width: int, height: int, machine: Machine, seconds: float) -> list[Result]:
-    """The parts of a step of the mixture, the whole step compared with the baseline, and Adam compared with the memory it must move."""
+    """The parts of a step of the mixture, the whole step compared with the baseline, and Adam
+    compared with the memory it must move."""
     mixture, base = (make_work(recipe, anchors, width, height) for recipe in (MIXTURE, BASELINE))
     copy_networks(mixture, base)
     subjects: dict[str, Subject] = {MIXTURE: mixture, BASELINE: base}
@@ -127,7 +133,8 @@ def measure(anchors: int, width: int, height: int, machine: Machine, seconds: fl
 
 
 def measure_scaling(scene: raster.Picture, machine: Machine, seconds: float) -> list[Result]:
-    """Gain of all threads over one in a pure arithmetic loop, the rasteriser and a whole step. Wall time."""
+    """Gain of all threads over one in a pure arithmetic loop, the rasteriser and a whole step. Wall
+    time."""
     if machine.threads < 2:
         return [Missing(THREADS, "gain of threads", "there is only one core or thread: run with --threads 2 or more")]
     if machine.level is None:

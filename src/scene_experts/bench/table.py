@@ -41,7 +41,8 @@ def choose_size(seconds: float) -> Size:
 
 
 def measure(seconds: float, threads: int, say: Callable[[str], None] = lambda _: None) -> tuple[Machine, Size, list[Result]]:
-    """Measure the rates of the machine and every figure. Takes about `seconds` on an idle machine."""
+    """Measure the rates of the machine and every figure. Takes about `seconds` on an idle
+    machine."""
     machine, size = describe(threads), choose_size(seconds)
     say("rates of the machine")
     share = seconds / 60
@@ -60,7 +61,8 @@ def measure(seconds: float, threads: int, say: Callable[[str], None] = lambda _:
 
 
 def _list_groups(machine: Machine, size: Size, share: float) -> Iterator[tuple[str, Callable[[], list[Result]]]]:
-    """Name and function of each group. Together, with slow peers and the synthesis of scenes, they take 60 times `share` seconds."""
+    """Name and function of each group. Together, with slow peers and the synthesis of scenes, they
+    take 60 times `share` seconds."""
     scene = raster.make_picture(size.gaussians, size.width, size.height)
     yield "rasteriser", lambda: raster.measure(scene, machine, 7 * share)
     yield "decode", lambda: parts.measure_decode(size.anchors // 2, machine, 6 * share)
@@ -72,7 +74,8 @@ def _list_groups(machine: Machine, size: Size, share: float) -> Iterator[tuple[s
 def run(seconds: float, threads: int | None, json: Path | None, console: Console) -> int:
     """Measure, print, and write `json` if it is given.
 
-    Raises InputError for an invalid budget or number of threads, and RunError where `json` cannot be written, before it measures.
+    Raises InputError for an invalid budget or number of threads, and RunError where `json` cannot
+    be written, before it measures.
     """
     if not 0 < seconds < float("inf"):
         raise InputError(f"expected --seconds above 0, found {seconds:g}; use --seconds 60")

@@ -26,7 +26,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "download": ("catalog:download", "Download scenes of the paper"),
     "doctor": ("inspect:doctor", "Check what works on this machine and what is missing"),
 }
-"""By command: module of this package and function, and the line of the help. Only the module of the command that runs is imported."""
+"""By command: module of this package and function, and the line of the help. Only the module of the
+command that runs is imported."""
 
 
 def run(command: str, args: list[str]) -> int:

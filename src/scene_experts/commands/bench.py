@@ -11,12 +11,14 @@ from scene_experts.commands import PROG
 
 @dataclass(frozen=True)
 class BenchCommand:
-    """Measure the speed of this machine: rasteriser, decoding, loss, a training step and multithreading, each next to a named peer."""
+    """Measure the speed of this machine: rasteriser, decoding, loss, a training step and
+    multithreading, each next to a named peer."""
 
     seconds: float = 60.0
     """Approximate duration in seconds. Below 30, smaller scenes are measured."""
     threads: int | None = None
-    """Number of threads to compare with one thread, at most four times the cores; by default PyTorch's setting."""
+    """Number of threads to compare with one thread, at most four times the cores; by default
+    PyTorch's setting."""
     json: Path | None = None
     """Also write the measurements to this file."""
 

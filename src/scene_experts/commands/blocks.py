@@ -30,8 +30,8 @@ merge: merge the runs of the blocks into one run.
 
 @dataclass(frozen=True)
 class PlanCommand:
-    """Divide a capture into blocks with equal numbers of points, choose the views of each block, and write the commands that train a
-    coarse scene, the blocks and the merged scene."""
+    """Divide a capture into blocks with equal numbers of points, choose the views of each block,
+    and write the commands that train a coarse scene, the blocks and the merged scene."""
 
     data: Annotated[Data, Option(name="")]
     out: Annotated[Path, Option(value="PLAN")]
@@ -41,17 +41,22 @@ class PlanCommand:
     margin: NotNegative = 0.1
     """Choose views by the points in a block and around it, up to this share of its size."""
     share: NotNegative = 0.1
-    """A view belongs to a block if at least this share of the points in its picture lie in the enlarged block."""
+    """A view belongs to a block if at least this share of the points in its picture lie in the
+    enlarged block."""
     recipe: str = "moe-gs"
     """Recipe of the commands; a recipe with anchors."""
     iterations: Count = 30_000
-    """Iterations of the commands: a third for the coarse scene, the others for each block, and a tenth more for the merged scene."""
+    """Iterations of the commands: a third for the coarse scene, the others for each block, and a
+    tenth more for the merged scene."""
     train: Annotated[str, Option(value="OPTIONS")] = ""
-    """More options for all trainings, in quotes after =: --train="--scene.voxel-size 0.01 --seed 1"."""
+    """More options for all trainings, in quotes after =: --train="--scene.voxel-size 0.01 --seed
+    1"."""
     coarse_anchors: CountOrNone = 0
-    """Maximum number of anchors of the coarse scene; 0 means no limit. Each block holds the coarse scene beside its own anchors."""
+    """Maximum number of anchors of the coarse scene; 0 means no limit. Each block holds the coarse
+    scene beside its own anchors."""
     max_memory: NotNegative = 0.0
-    """Stop densification in the coarse scene and in each block at this resident memory in GiB; 0 means no limit."""
+    """Stop densification in the coarse scene and in each block at this resident memory in GiB; 0
+    means no limit."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +114,8 @@ def plan(args: list[str]) -> int:
 def commands(command: PlanCommand, bounds: list[tuple[float, ...]], every: int = 0) -> list[str]:
     """The commands that train a coarse scene, the blocks, and the merged scene.
 
-    bounds: corners of the box of each block with its margin, in trained world units.  every: training views of the capture.
-    Raises InputError for wrong options of the trainings.
+    bounds: corners of the box of each block with its margin, in trained world units.  every:
+    training views of the capture. Raises InputError for wrong options of the trainings.
     """
     from scene_experts.api.command_line import changes
     from scene_experts.commands.train import parse_train
@@ -137,7 +142,8 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]], every: int =
         lines.append([*block, *begin, *same, *inside, *memory])
     lines.append([PROG, "blocks", "merge", str(out), *options(runs=tuple(runs), out=merged)])
     both = total + -(-max(1, total // 10) // cfg.batch) * cfg.batch  # as `total`, a multiple of the batch
-    # the rates that a schedule leaves constant fall during the joint training: without it, the blocks' fit is shaken and not restored
+    # the rates that a schedule leaves constant fall during the joint training: without it, the
+    # blocks' fit is shaken and not restored
     settle = options(**{"rates.anneal": SETTLE, "rates.anneal_from": f"{total / both:.4f}"})
     lines.append([*train, *options(out=out / "joint", iterations=both, init_from=merged), *settle])
     return [shlex.join(line) for line in lines]
@@ -161,7 +167,8 @@ def without(words: list[str], flags: list[str]) -> list[str]:
 
 
 def check_trainings(lines: list[str], data: Data) -> None:
-    """Raise InputError if the options of a training in `lines` are wrong, or change how the capture `data` of the plan is read."""
+    """Raise InputError if the options of a training in `lines` are wrong, or change how the capture
+    `data` of the plan is read."""
     from scene_experts.commands.train import parse_train
     from scene_experts.training.config import check
 

@@ -19,14 +19,17 @@ FEW = 0.9  # a smaller share of photographs with a pose gets a warning
 
 @dataclass(frozen=True)
 class CaptureCommand:
-    """Find camera poses and 3D points for photographs or a video with COLMAP, and write a capture for `train`.
+    """Find camera poses and 3D points for photographs or a video with COLMAP, and write a capture
+    for `train`.
 
-    The photographs are copied to CAPTURE/images. Spaces in their names become underscores, and rotated photographs are written upright.
-    Repeat the command to continue an interrupted reconstruction.
+    The photographs are copied to CAPTURE/images. Spaces in their names become underscores, and
+    rotated photographs are written upright. Repeat the command to continue an interrupted
+    reconstruction.
     """
 
     photos: Annotated[Path, Option(value="PHOTOS")]
-    """Folder of photographs (JPEG, PNG and others, also in subfolders), or a video. CAPTURE/images is used in place."""
+    """Folder of photographs (JPEG, PNG and others, also in subfolders), or a video. CAPTURE/images
+    is used in place."""
     out: Annotated[Path, Option(value="CAPTURE")]
     """Folder of the capture to write: images/, sparse/0/ and capture.json."""
     options: Annotated[SfmOptions, Option(name="")] = SfmOptions()

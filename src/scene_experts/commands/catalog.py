@@ -24,13 +24,15 @@ SAY_EVERY = 15.0  # seconds between lines, without a terminal
 
 @dataclass(frozen=True)
 class DownloadCommand:
-    """Download scenes of the paper from their owners, verify and unpack them. Repeat the command to continue a download."""
+    """Download scenes of the paper from their owners, verify and unpack them. Repeat the command to
+    continue a download."""
 
     scenes: Annotated[tuple[str, ...], Option(value="SCENE")] = ()
-    """Scenes (such as bonsai), data sets (mipnerf360, tandt, db, bungeenerf) or all. The archive of a data set is downloaded once, as a
-    whole."""
+    """Scenes (such as bonsai), data sets (mipnerf360, tandt, db, bungeenerf) or all. The archive of
+    a data set is downloaded once, as a whole."""
     to: Path | None = None
-    """Folder for the scenes; by default $SCENE_EXPERTS_CAPTURES, or the cache folder of the user."""
+    """Folder for the scenes; by default $SCENE_EXPERTS_CAPTURES, or the cache folder of the
+    user."""
     mirror: Annotated[tuple[str, ...], Option(value="URL", repeat=True)] = ()
     """Address of a folder with the archives, tried before those of the owners. Can be repeated."""
     keep_archives: bool = True
@@ -68,7 +70,8 @@ def flags(scene: CatalogScene, to: Path | None) -> str:
 
 @dataclass(frozen=True)
 class CatalogCommand:
-    """List the paper's scenes: sources, sizes, licences, evaluation protocol, and which are on this machine."""
+    """List the paper's scenes: sources, sizes, licences, evaluation protocol, and which are on this
+    machine."""
 
     scenes: Annotated[tuple[str, ...], Option(value="SCENE")] = ()
     """Scenes or data sets to describe in detail; by default a table of all."""
@@ -129,7 +132,8 @@ def describe(scene: CatalogScene, root: Path) -> list[str]:
 
 
 class DownloadBar:
-    """Shows the progress of a download: a bar on a terminal, otherwise a line every SAY_EVERY seconds."""
+    """Shows the progress of a download: a bar on a terminal, otherwise a line every SAY_EVERY
+    seconds."""
 
     console: Console
     last: float

@@ -31,7 +31,8 @@ EXTRAS = {
     "docs": ("mkdocs", "this project's documentation (make docs)"),
     "test": ("pytest", "this project's tests (make test)"),
 }
-"""Optional packages of pyproject.toml by the name of their extra: the module, and what it is for. `cuda` has checks of its own."""
+"""Optional packages of pyproject.toml by the name of their extra: the module, and what it is for.
+`cuda` has checks of its own."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,8 @@ def diagnose() -> list[Check]:
 
 
 def run(console: Console) -> int:
-    """Print the report and return the exit code: 0 if training is possible on this machine, else 1."""
+    """Print the report and return the exit code: 0 if training is possible on this machine, else
+    1."""
     checks = diagnose()
     console.print(render(checks), markup=False, soft_wrap=True)
     return exit_code(checks)
@@ -75,7 +77,8 @@ def exit_code(checks: list[Check]) -> int:
 
 
 def render(checks: list[Check]) -> str:
-    """The report as plain text: a line per check, with advice below it if something is missing, and a conclusion."""
+    """The report as plain text: a line per check, with advice below it if something is missing, and
+    a conclusion."""
     width = max(len(check.name) for check in checks)
     lines = []
     for check in checks:
@@ -183,7 +186,8 @@ def lpips() -> Check:
 
 
 def extra(name: str) -> Check:
-    """Check an optional package without importing it: pycolmap corrupts the heap of a process that also uses Pillow."""
+    """Check an optional package without importing it: pycolmap corrupts the heap of a process that
+    also uses Pillow."""
     module, purpose = EXTRAS[name]
     version = _version(module)
     if version is not None:

@@ -30,9 +30,11 @@ class ExportCommand:
     format: Annotated[tuple[str, ...], Option(value="FORMAT")] = ("compact",)
     """File formats, from the list above. Several standard files share one bake."""
     out: Path | None = None
-    """File or folder to write; by default in the run folder. A name without a suffix is a folder; several formats need one."""
+    """File or folder to write; by default in the run folder. A name without a suffix is a folder;
+    several formats need one."""
     hub: Annotated[Path | None, Option(value="FOLDER")] = None
-    """Write a folder for a model hub: compact and spz (or --format), a picture and a card (README.md)."""
+    """Write a folder for a model hub: compact and spz (or --format), a picture and a card
+    (README.md)."""
     licence: str | None = None
     """With --hub: licence of the photographs, for the card, such as mit or cc-by-4.0."""
     step: int | None = None
@@ -44,10 +46,12 @@ class ExportCommand:
 
 @dataclass(frozen=True)
 class ImportCommand:
-    """Make a run folder of a published result or of an exported file, to score, render and convert it."""
+    """Make a run folder of a published result or of an exported file, to score, render and convert
+    it."""
 
     source: Annotated[Path, Option(value="RESULT")]
-    """Result folder of Scaffold-GS, Octree-GS or 3DGS (with point_cloud/iteration_N), or a file of a format in the list above."""
+    """Result folder of Scaffold-GS, Octree-GS or 3DGS (with point_cloud/iteration_N), or a file of
+    a format in the list above."""
     data: Annotated[Data, Option(name="")]
     out: Annotated[Path, Option(short="-m", value="RUN")]
     """Run folder to write."""

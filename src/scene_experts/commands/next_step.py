@@ -9,7 +9,8 @@ from scene_experts.data.settings import Data
 
 
 def propose_training(data: Data, width: int, height: int, views: int) -> str:
-    """Return a command that trains on `views` photographs of this size, read as `data` says, with its estimated time here.
+    """Return a command that trains on `views` photographs of this size, read as `data` says, with
+    its estimated time here.
 
     The resolution is the one that is estimated, not that of `data`.
     """

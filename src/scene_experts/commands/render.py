@@ -25,12 +25,14 @@ class RenderCommand:
     run: Annotated[Path, Option(value="RUN")]
     """Run folder."""
     out: Path | None = None
-    """Video to write (.mp4, .mov, .mkv or .webm), or a folder for PNG files; by default RUN/renders/NAME.mp4 with the path's name."""
+    """Video to write (.mp4, .mov, .mkv or .webm), or a folder for PNG files; by default
+    RUN/renders/NAME.mp4 with the path's name."""
     options: Annotated[FilmOptions, Option(name="")] = FilmOptions()
     beside: Annotated[tuple[Path, ...], Option(value="RUN")] = ()
     """Other runs of the same capture to show side by side."""
     save_path: Path | None = None
-    """Also write the camera path as JSON, in nerfstudio's format if the name ends in .nerfstudio.json."""
+    """Also write the camera path as JSON, in nerfstudio's format if the name ends in
+    .nerfstudio.json."""
     data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
     """Folder of the capture, if it has moved."""
     step: int | None = None

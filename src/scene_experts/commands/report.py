@@ -13,7 +13,8 @@ from scene_experts.commands import PROG
 
 @dataclass(frozen=True)
 class ReportCommand:
-    """Write one self-contained HTML page about evaluated runs: scores, curves, views with a slider, experts and commands."""
+    """Write one self-contained HTML page about evaluated runs: scores, curves, views with a slider,
+    experts and commands."""
 
     runs: Annotated[tuple[Path, ...], Option(value="RUN")]
     """Run folders. Several runs are shown side by side."""

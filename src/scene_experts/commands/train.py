@@ -65,7 +65,8 @@ GROUPS = {
     "Scaffold-GS with deeper networks (Figure 7)": "scaffold-gs-depth.*",
     "Other recipes": ".*",
 }
-"""Headings of the recipes in the help, each with a pattern of the recipes' names; the first that fits counts."""
+"""Headings of the recipes in the help, each with a pattern of the recipes' names; the first that
+fits counts."""
 
 EXAMPLES = (
     "moe-gs --data demo/buddha --out runs/buddha",
@@ -85,12 +86,14 @@ class TrainCommand:
     cfg: Annotated[Train, Option(name="")]
     options: Annotated[TrainOptions, Option(name="")] = TrainOptions()
     init_from: Annotated[Path | None, Option(value="RUN")] = None
-    """Start from the scene of this run, at its iteration; --iterations counts its iterations too. The optimiser starts anew."""
+    """Start from the scene of this run, at its iteration; --iterations counts its iterations too.
+    The optimiser starts anew."""
     shard: bool = False
-    """Divide the anchors among the processes of torchrun, so that each needs less memory. The results are those without it,
-    up to rounding (docs/scaling.md)."""
+    """Divide the anchors among the processes of torchrun, so that each needs less memory. The
+    results are those without it, up to rounding (docs/scaling.md)."""
     viewer: bool = False
-    """Show the training in a browser while it runs (needs `pip install 'scene-experts[viewer]'`)."""
+    """Show the training in a browser while it runs (needs `pip install
+    'scene-experts[viewer]'`)."""
     port: int = 8080
     """Port of the viewer. It only accepts connections from this machine."""
 
@@ -119,7 +122,8 @@ def after_restart(command: TrainCommand, group: Alone) -> TrainCommand:
 
 
 def prepare(command: TrainCommand, line: str, group: Alone) -> tuple[TrainCommand, Job, Capture, Rasterizer]:
-    """Check the options and load the capture. Nothing is written. Raises InputError for invalid options or an invalid capture."""
+    """Check the options and load the capture. Nothing is written. Raises InputError for invalid
+    options or an invalid capture."""
     if command.viewer:
         check_port(command.port)
         import_viser()  # reports a missing package before anything is read
@@ -139,14 +143,16 @@ def prepare(command: TrainCommand, line: str, group: Alone) -> tuple[TrainComman
 
 
 def run_of(command: TrainCommand, line: str) -> Job:
-    """What the loop needs to know of the command, on the CPU. line: the command line, for config.json."""
+    """What the loop needs to know of the command, on the CPU. line: the command line, for
+    config.json."""
     start = None if command.init_from is None else command.init_from.absolute()
     config = RunConfig.of(command.cfg, command.data, command.options, line, run_folder.versions(), start)
     return Job(config, command.out, options=command.options, shard=command.shard)
 
 
 def parse_train(args: list[str]) -> TrainCommand:
-    """The recipe and its options. The numbers of the recipe are the defaults. Raises InputError, or HelpAsked for --help."""
+    """The recipe and its options. The numbers of the recipe are the defaults. Raises InputError, or
+    HelpAsked for --help."""
     name = args[0] if args else ""
     if name not in RECIPES:
         if name in RECIPES.broken:

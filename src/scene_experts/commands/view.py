@@ -15,14 +15,16 @@ from scene_experts.core.choices import Device, Raster
 
 @dataclass(frozen=True)
 class ViewCommand:
-    """Show a run in a browser. The pictures are rendered on this machine, so the browser needs no GPU."""
+    """Show a run in a browser. The pictures are rendered on this machine, so the browser needs no
+    GPU."""
 
     run: Annotated[Path, Option(value="RUN")]
     """Run folder."""
     port: int = 8080
     """Port to listen on."""
     host: str = "127.0.0.1"
-    """Address to listen on. 0.0.0.0 accepts other machines that know the token in the printed address."""
+    """Address to listen on. 0.0.0.0 accepts other machines that know the token in the printed
+    address."""
     data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
     """Folder of the capture, if it has moved."""
     step: int | None = None

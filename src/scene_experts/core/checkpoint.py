@@ -1,7 +1,9 @@
-"""Checkpoints: named tensors and JSON metadata in one safetensors file. Files are written atomically and verified when they are read.
+"""Checkpoints: named tensors and JSON metadata in one safetensors file. Files are written
+atomically and verified when they are read.
 
-The header of the file holds one JSON string under "scene_experts": {"kind", "format", "sha256", "meta"}. The digest covers the name,
-dtype, shape and bytes of every tensor, so truncated, overwritten and damaged files are detected. Nothing is pickled.
+The header of the file holds one JSON string under "scene_experts": {"kind", "format", "sha256",
+"meta"}. The digest covers the name, dtype, shape and bytes of every tensor, so truncated,
+overwritten and damaged files are detected. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ FORMAT = 1
 KIND = "checkpoint"
 KEY = "scene_experts"
 FINITE = ("params.", "facts.", "network.", "average.", "feature", "offsets", "log_scaling", "cells")
-"""Prefixes of the tensors of a scene, whose values must be finite. Statistics and states of an optimiser are not among them."""
+"""Prefixes of the tensors of a scene, whose values must be finite. Statistics and states of an
+optimiser are not among them."""
 _NAME = re.compile(r"ckpt_(\d{6,})\.safetensors")
 
 log: logging.Logger = logging.getLogger(__name__)
@@ -39,15 +42,16 @@ log: logging.Logger = logging.getLogger(__name__)
 
 
 def save(folder: Path, step: int, tensors: dict[str, Tensor], meta: dict[str, Any], keep: int = 2) -> Path:
-    """Write `folder/ckpt_<step>.safetensors` atomically, then remove all but the newest `keep` files up to this step.
+    """Write `folder/ckpt_<step>.safetensors` atomically, then remove all but the newest `keep`
+    files up to this step.
 
     Temporary files of an interrupted save are removed first.
 
     Args:
         folder: The folder of the checkpoints.
         step: The iteration.
-        tensors: Tensors of any dtype that safetensors supports (float64 to bfloat16, integers, bool), on any device. They may share
-            memory.
+        tensors: Tensors of any dtype that safetensors supports (float64 to bfloat16, integers,
+            bool), on any device. They may share memory.
         meta: Plain JSON values without NaN.
         keep: Number of checkpoints to keep, at least 1.
 
@@ -69,7 +73,8 @@ def save(folder: Path, step: int, tensors: dict[str, Tensor], meta: dict[str, An
 
 
 def latest(folder: Path) -> Path | None:
-    """Return the newest valid checkpoint in `folder`, or None. Truncated and damaged files are skipped with a warning."""
+    """Return the newest valid checkpoint in `folder`, or None. Truncated and damaged files are
+    skipped with a warning."""
     found = _whole(folder)
     return found[0] if found else None
 
@@ -99,7 +104,8 @@ def _whole(folder: Path) -> tuple[Path, dict[str, Tensor], dict[str, Any]] | Non
 def load(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Load the tensors (on the CPU) and metadata of a checkpoint.
 
-    Raises InputError if the file does not exist, is damaged, is not a checkpoint or has another format version.
+    Raises InputError if the file does not exist, is damaged, is not a checkpoint or has another
+    format version.
     """
     return read_tensors(path, KIND, FORMAT)
 
@@ -112,7 +118,8 @@ def expect(meta: dict[str, Any], *, recipe: str) -> None:
 
 
 def _numbered(folder: Path) -> list[tuple[int, Path]]:
-    """Return (step, file) of every checkpoint in `folder`, newest first, without verifying the files."""
+    """Return (step, file) of every checkpoint in `folder`, newest first, without verifying the
+    files."""
     if not folder.is_dir():
         return []
     found = [(_NAME.fullmatch(file.name), file) for file in folder.iterdir()]
@@ -123,7 +130,8 @@ def _numbered(folder: Path) -> list[tuple[int, Path]]:
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], kind: str, version: int, meta: dict[str, Any]) -> None:
-    """Write tensors and metadata to a safetensors file of `kind` atomically. Raises RunError if the disk is full or not writable."""
+    """Write tensors and metadata to a safetensors file of `kind` atomically. Raises RunError if the
+    disk is full or not writable."""
     plain = _separate(tensors)
     text = json.dumps({"kind": kind, "format": version, "sha256": digest(plain), "meta": meta}, allow_nan=False)
 
@@ -140,7 +148,8 @@ def read_tensors(path: Path, kind: str, version: int | None = None) -> tuple[dic
     """Read the tensors (on the CPU, without shared memory) and metadata that `write_tensors` wrote.
 
     A `version` of None accepts every format version.
-    Raises InputError if the file does not exist, is truncated or damaged, or has another type, kind or version.
+    Raises InputError if the file does not exist, is truncated or damaged, or has another type, kind
+    or version.
     """
     path = Path(path)
     with guarding(path, CHECKPOINT, f"{kind} file"):

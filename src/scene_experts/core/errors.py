@@ -1,4 +1,5 @@
-"""The two errors that end a command. Each message states in one sentence what was expected, what was found and what to do."""
+"""The two errors that end a command. Each message states in one sentence what was expected, what
+was found and what to do."""
 
 import difflib
 from collections.abc import Iterable, Sequence
@@ -6,18 +7,13 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 
 class InputError(Exception):
-    """The user's input (a capture, a run folder, a flag) cannot be used. The command line exits with code 2."""
+    """The user's input (a capture, a run folder, a flag) cannot be used. The command line exits
+    with code 2."""
 
 
 class RunError(Exception):
-    """Something failed while working on good input (a full disk, an interrupted write). The command line exits with code 1."""
-
-
-def expect_at_least(numbers: list[tuple[str, float, float]]) -> None:
-    """Raise InputError for the first (flag, value, least) whose value is below `least` or NaN."""
-    for flag, value, least in numbers:
-        if not value >= least:
-            raise InputError(f"expected {flag} of at least {least}, found {value}; give a larger number or leave it out")
+    """Something failed while working on good input (a full disk, an interrupted write). The command
+    line exits with code 1."""
 
 
 def expect_among(name: str, value: object, words: Iterable[str]) -> None:
@@ -28,14 +24,16 @@ def expect_among(name: str, value: object, words: Iterable[str]) -> None:
 
 
 def expect_words(options: Any) -> None:
-    """Raise InputError for the first Literal field of a dataclass whose value is not one of its words."""
+    """Raise InputError for the first Literal field of a dataclass whose value is not one of its
+    words."""
     for name, kind in get_type_hints(type(options)).items():
         if get_origin(kind) is Literal:
             expect_among(name, getattr(options, name), get_args(kind))
 
 
 def nearest(word: str, words: Iterable[str]) -> str:
-    """Return a hint with the known words closest to `word`, for example "; did you mean 'moe-gs'?", or an empty string."""
+    """Return a hint with the known words closest to `word`, for example "; did you mean 'moe-gs'?",
+    or an empty string."""
     like = difflib.get_close_matches(word, list(words), 3, 0.6)  # best first
     alike = [difflib.SequenceMatcher(None, found, word).ratio() for found in like]
     close = [found for found, ratio in zip(like, alike) if ratio > alike[0] - 0.05]

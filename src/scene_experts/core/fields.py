@@ -1,9 +1,11 @@
 """What a field of a dataclass says about its setting beside its type and default, as annotations:
-which numbers it may have (`Range`), whether it grows with the training (`SCALES`), and where it has an effect (`Needs`).
+which numbers it may have (`Range`), whether it grows with the training (`SCALES`), and where it has
+an effect (`Needs`).
 
     warmup: Annotated[int, Range(0), SCALES] = 1500
 
-Checks, scaled schedules, help texts and warnings are derived from these; methods remain for relations between fields.
+Checks, scaled schedules, help texts and warnings are derived from these; methods remain for
+relations between fields.
 """
 
 from __future__ import annotations
@@ -19,12 +21,14 @@ from scene_experts.core.errors import InputError
 
 T = TypeVar("T")
 Flag = Callable[[str], str]
-"""Maps the name of a field to its flag, for messages; an empty name to the flag of the dataclass itself."""
+"""Maps the name of a field to its flag, for messages; an empty name to the flag of the dataclass
+itself."""
 
 
 @dataclass(frozen=True)
 class Range:
-    """The numbers that a setting, or each number of a tuple, may have: from `low` to `high`, which both belong to it."""
+    """The numbers that a setting, or each number of a tuple, may have: from `low` to `high`, which
+    both belong to it."""
 
     low: float | None = None
     high: float | None = None
@@ -103,7 +107,8 @@ def note(kind: type, name: str, of: type[T]) -> T | None:
 
 
 def check_value(owner: type, name: str, value: Any, flag: str) -> None:
-    """Raise InputError, which names the flag, if `value` is not in the `Range` or among the words of the field `name` of `owner`."""
+    """Raise InputError, which names the flag, if `value` is not in the `Range` or among the words
+    of the field `name` of `owner`."""
     limits, many = note(owner, name, Range), value if isinstance(value, tuple) else (value,)
     if words := _words(notes_of(owner)[name][0]):
         for each in many:
@@ -118,7 +123,8 @@ def check_value(owner: type, name: str, value: Any, flag: str) -> None:
 
 
 def check_fields(value: Any, place: str = "") -> None:
-    """Check the settings of a dataclass and of all dataclasses in it: ranges, words, and their `check(flag)`, for relations.
+    """Check the settings of a dataclass and of all dataclasses in it: ranges, words, and their
+    `check(flag)`, for relations.
 
     place: Dotted path of `value`, for the flags in messages: "scene.decoder".
 
@@ -140,7 +146,8 @@ def flag_of(place: str) -> str:
 
 
 def scale(value: T, factor: float) -> T:
-    """Return a dataclass whose settings marked `SCALES`, and those of the dataclasses in it, are multiplied by `factor`."""
+    """Return a dataclass whose settings marked `SCALES`, and those of the dataclasses in it, are
+    multiplied by `factor`."""
     changes: dict[str, Any] = {}
     for name, inner in _fields(value):
         mark = note(type(value), name, Scales)
@@ -155,7 +162,8 @@ def scale(value: T, factor: float) -> T:
 
 
 def changed_without(value: Any, has: frozenset[str], place: str = "") -> Iterator[str]:
-    """Yield the dotted paths of settings that need what is not in `has` and that do not have the default of their dataclass."""
+    """Yield the dotted paths of settings that need what is not in `has` and that do not have the
+    default of their dataclass."""
     for field in dataclasses.fields(value):
         inner, here = getattr(value, field.name), f"{place}.{field.name}".lstrip(".")
         need = note(type(value), field.name, Needs)
@@ -175,7 +183,8 @@ def _fields(value: Any) -> list[tuple[str, Any]]:
 
 
 def _words(kind: Any) -> tuple[Any, ...]:
-    """Return the words of a Literal, also one that may be None or repeat in a tuple; empty for other types."""
+    """Return the words of a Literal, also one that may be None or repeat in a tuple; empty for
+    other types."""
     if typing.get_origin(kind) is Literal:
         return typing.get_args(kind)
     return next((words for each in typing.get_args(kind) if (words := _words(each))), ())

@@ -1,7 +1,8 @@
-"""Processes that work on one thing together: one process (`Alone`), or the processes that `torchrun` has started (`Group`).
+"""Processes that work on one thing together: one process (`Alone`), or the processes that
+`torchrun` has started (`Group`).
 
-Both have the same methods, so that the code that uses them does not ask which one it has. Every process must call the methods that
-exchange data in the same order.
+Both have the same methods, so that the code that uses them does not ask which one it has. Every
+process must call the methods that exchange data in the same order.
 """
 
 from __future__ import annotations
@@ -47,11 +48,13 @@ class Alone:
         """Add up the tensors of all processes, in place. They have one shape."""
 
     def gather(self, tensor: Tensor) -> list[Tensor]:
-        """Return the tensors of all processes in the order of their numbers. They have one shape."""
+        """Return the tensors of all processes in the order of their numbers. They have one
+        shape."""
         return [tensor]
 
     def exchange(self, parts: list[Tensor]) -> list[Tensor]:
-        """Send `parts[r]` [n, ...] to process r, and return what each process has sent to this one. Only n may differ."""
+        """Send `parts[r]` [n, ...] to process r, and return what each process has sent to this one.
+        Only n may differ."""
         return parts
 
     def gather_values(self, value: T) -> list[T]:
@@ -74,14 +77,17 @@ class Alone:
         """Overwrite the tensors with those of process 0."""
 
     def agree(self, work: Callable[[], T]) -> T:
-        """Do `work` in every process. If it raises InputError or RunError in one of them, every process ends.
+        """Do `work` in every process. If it raises InputError or RunError in one of them, every
+        process ends.
 
-        The first process that works without an error of its own raises nothing but SystemExit, so the error is printed once.
+        The first process that works without an error of its own raises nothing but SystemExit, so
+        the error is printed once.
         """
         return work()
 
     def in_turn(self, work: Callable[[], T]) -> T:
-        """Do `work` first in one process of each machine and then in the others, for work that fills a cache of the machine."""
+        """Do `work` first in one process of each machine and then in the others, for work that
+        fills a cache of the machine."""
         return work()
 
     def leave(self) -> None:
@@ -97,7 +103,8 @@ class Group(Alone):
         self.local = int(os.environ.get("LOCAL_RANK", self.rank))
         self.restarts = restarts()
         self.sent = 0
-        # Parts of torch import this module later. Its functions would then keep the group as a default argument, and gloo's threads
+        # Parts of torch import this module later. Its functions would then keep the group as a
+        # default argument, and gloo's threads
         # would go on after `leave`: they can abort the process at its end.
         import_module("torch.distributed.nn.functional")
         # Flags and Python values travel over gloo, also beside nccl: they are on the CPU.
@@ -106,10 +113,11 @@ class Group(Alone):
             dist.init_process_group(backends, store=self._meet(), rank=self.rank, world_size=self.size, timeout=TIMEOUT)
 
     def _meet(self) -> Any:
-        """Return the key-value store of this start of the processes, when all of them have reached it.
+        """Return the key-value store of this start of the processes, when all of them have reached
+        it.
 
-        After a restart `torchrun` may serve the store of the processes before. Their addresses are still in it, and gloo would wait
-        for them for ever. Each start has keys of its own.
+        After a restart `torchrun` may serve the store of the processes before. Their addresses are
+        still in it, and gloo would wait for them for ever. Each start has keys of its own.
         """
         from torch.distributed import PrefixStore, rendezvous  # pyright: ignore[reportPrivateImportUsage]  # documented, but not in __all__
 
@@ -182,7 +190,8 @@ class Group(Alone):
 
     @contextmanager
     def _expecting_all(self) -> Iterator[None]:
-        """Turn an error of the connection into RunError: a process has ended, so the others cannot go on."""
+        """Turn an error of the connection into RunError: a process has ended, so the others cannot
+        go on."""
         try:
             yield
         except RuntimeError as error:
@@ -194,7 +203,8 @@ class Group(Alone):
 
 
 def world_size() -> int:
-    """Return the number of processes that `torchrun` has started, 1 without it. Raises InputError if it is not a number."""
+    """Return the number of processes that `torchrun` has started, 1 without it. Raises InputError
+    if it is not a number."""
     words = os.environ.get("WORLD_SIZE", "1")
     if "RANK" not in os.environ:
         return 1

@@ -22,10 +22,12 @@ log: logging.Logger = logging.getLogger(__name__)
 
 
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file atomically: `write(temporary)` writes to a temporary file beside `path`, which then replaces `path`.
+    """Write a file atomically: `write(temporary)` writes to a temporary file beside `path`, which
+    then replaces `path`.
 
-    The data is synced to disk first, so after a crash or a power failure `path` is either the old file or the new one.
-    Raises RunError if the disk is full or not writable. The old file is then unchanged and the temporary file is removed.
+    The data is synced to disk first, so after a crash or a power failure `path` is either the old
+    file or the new one. Raises RunError if the disk is full or not writable. The old file is then
+    unchanged and the temporary file is removed.
     """
     path = Path(path)
     try:
@@ -65,7 +67,8 @@ def _unwritable(path: Path, error: OSError, option: str = "--out") -> RunError:
 
 
 def check_writable(path: Path, option: str = "--out") -> None:
-    """Create the folder of `path`, which `option` has named, and check that files can be created in it. Call it before long work.
+    """Create the folder of `path`, which `option` has named, and check that files can be created in
+    it. Call it before long work.
 
     Raises RunError if not.
     """
@@ -79,7 +82,8 @@ def check_writable(path: Path, option: str = "--out") -> None:
 
 @contextmanager
 def locked(path: Path, busy: str) -> Iterator[None]:
-    """Hold the lock file `path`. The lock ends with the process. Raises InputError(busy) if another process holds it."""
+    """Hold the lock file `path`. The lock ends with the process. Raises InputError(busy) if another
+    process holds it."""
     lock = _make_lock(path)
     try:
         lock.acquire(blocking=False)
@@ -99,7 +103,8 @@ def locked(path: Path, busy: str) -> Iterator[None]:
 
 @contextmanager
 def waiting(path: Path) -> Iterator[None]:
-    """Hold the lock file `path` for a moment; wait while another process holds it. Raises RunError after a minute."""
+    """Hold the lock file `path` for a moment; wait while another process holds it. Raises RunError
+    after a minute."""
     lock = _make_lock(path)
     try:
         lock.acquire(timeout=60)
@@ -117,7 +122,8 @@ def waiting(path: Path) -> Iterator[None]:
 
 
 def _make_lock(path: Path) -> FileLock:
-    """Return a lock of the system. Newer versions of filelock would replace a missing one by a file, which outlives a killed process."""
+    """Return a lock of the system. Newer versions of filelock would replace a missing one by a
+    file, which outlives a killed process."""
     try:
         return FileLock(path, fallback_to_soft=False)
     except TypeError:
@@ -125,7 +131,8 @@ def _make_lock(path: Path) -> FileLock:
 
 
 def new_file_mode(most: int) -> int:
-    """Return the permissions of a new file or folder: `most` without the bits of the umask. Temporary files are created with fewer."""
+    """Return the permissions of a new file or folder: `most` without the bits of the umask.
+    Temporary files are created with fewer."""
     umask = os.umask(0)
     os.umask(umask)
     return most & ~umask
@@ -148,5 +155,6 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write `value` as indented JSON to `path` atomically. Raises ValueError for NaN and infinity, which JSON does not support."""
+    """Write `value` as indented JSON to `path` atomically. Raises ValueError for NaN and infinity,
+    which JSON does not support."""
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())

@@ -12,18 +12,21 @@ from scene_experts.core.fields import scale
 class Part:
     """A part of a recipe: a frozen dataclass of numbers.
 
-    Each field is a flag on the command line, and the docstring of the field is its help text. config.json stores the class name of a
-    part. Annotations of a field state its range, whether it is scaled and where it has an effect (`core/fields.py`). A part with
-    relations between fields has a method `check(flag)`, which raises InputError. Parts of other packages must be registered with
-    `register`.
+    Each field is a flag on the command line, and the docstring of the field is its help text.
+    config.json stores the class name of a part. Annotations of a field state its range, whether it
+    is scaled and where it has an effect (`core/fields.py`). A part with relations between fields
+    has a method `check(flag)`, which raises InputError. Parts of other packages must be registered
+    with `register`.
     """
 
     changes: ClassVar[tuple[str, ...]] = ()
-    """One sentence for each change, since the first release, of what the part computes with the same settings, a new default included.
-    Their number is part of the names of runs and records with this part, so that only these are trained again."""
+    """One sentence for each change, since the first release, of what the part computes with the
+    same settings, a new default included. Their number is part of the names of runs and records
+    with this part, so that only these are trained again."""
 
     def scaled(self, factor: float) -> Self:
-        """Return the part for a training that is `factor` times as long: settings marked `SCALES` are multiplied."""
+        """Return the part for a training that is `factor` times as long: settings marked `SCALES`
+        are multiplied."""
         return scale(self, factor)
 
 
@@ -32,13 +35,15 @@ _REGISTERED: dict[str, type[Part]] = {}
 
 
 def register(part: type[P]) -> type[P]:
-    """Register a part by its class name, so that runs with this part can be opened again. Use it as a decorator:
+    """Register a part by its class name, so that runs with this part can be opened again. Use it as
+    a decorator:
 
         @register
         @dataclass(frozen=True)
         class MyGrowth(GrowAnchors): ...
 
-    Raises TypeError if the class is not a dataclass that subclasses `Part`, and ValueError if another class has the same name.
+    Raises TypeError if the class is not a dataclass that subclasses `Part`, and ValueError if
+    another class has the same name.
     """
     if not dataclasses.is_dataclass(part) or not issubclass(part, Part):
         raise TypeError(f"expected a frozen dataclass that subclasses Part, found {part!r}")
@@ -50,11 +55,13 @@ def register(part: type[P]) -> type[P]:
 
 
 def extend(part: Part, kind: type[P], **numbers: Any) -> P:
-    """Return a part of the class `kind`, a subclass of the class of `part`, with the numbers of `part` and `numbers`:
+    """Return a part of the class `kind`, a subclass of the class of `part`, with the numbers of
+    `part` and `numbers`:
 
         loss = extend(recipe.loss, MyWeights, mine=0.01)
 
-    `MyWeights(mine=0.01)` would have the defaults of the class instead of the numbers of the recipe.
+    `MyWeights(mine=0.01)` would have the defaults of the class instead of the numbers of the
+    recipe.
 
     Raises TypeError if `kind` is no subclass, or has no field of a name.
     """
@@ -64,7 +71,8 @@ def extend(part: Part, kind: type[P], **numbers: Any) -> P:
 
 
 def become(part: Part, kind: type[P]) -> P:
-    """Return a part of the class `kind` that takes the place of `part`: settings of both keep their values."""
+    """Return a part of the class `kind` that takes the place of `part`: settings of both keep their
+    values."""
     kept = {field.name for field in dataclasses.fields(kind) if field.init} & {field.name for field in dataclasses.fields(part)}
     return kind(**{name: getattr(part, name) for name in kept})
 

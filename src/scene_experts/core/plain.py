@@ -19,7 +19,8 @@ class UnknownPart(InputError):
 
 
 def to_json(value: Any) -> Any:
-    """Convert nested dataclasses to plain JSON values. Each dataclass stores its class name under "type"."""
+    """Convert nested dataclasses to plain JSON values. Each dataclass stores its class name under
+    "type"."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         out = {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"type": type(value).__name__, **out}
@@ -31,7 +32,8 @@ def to_json(value: Any) -> Any:
 
 
 def lean(value: Any) -> Any:
-    """Convert nested dataclasses to plain JSON values without the settings that have the default of their dataclass.
+    """Convert nested dataclasses to plain JSON values without the settings that have the default of
+    their dataclass.
 
     `from_json` reads the result back. A part with `changes` has their number under "version".
     """
@@ -52,9 +54,11 @@ def versions_of(value: Any) -> bool:
 
 
 def from_json(kind: Any, value: Any, where: str = "config") -> Any:
-    """Convert a value that `to_json` wrote to the type `kind`. A field for a part accepts all registered subclasses of its type.
+    """Convert a value that `to_json` wrote to the type `kind`. A field for a part accepts all
+    registered subclasses of its type.
 
-    Raises InputError, which names the location, if a value does not fit, and UnknownPart if a part is not registered.
+    Raises InputError, which names the location, if a value does not fit, and UnknownPart if a part
+    is not registered.
     """
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, pytypes.UnionType):
@@ -135,7 +139,8 @@ MOST_DIFFERENCES = 5  # that an error message lists
 
 
 def differences(old: Any, new: Any, where: str = "") -> list[str]:
-    """Return the differences of two nested values in order, for example ["loss.load was 0.01, is now 0.5"]."""
+    """Return the differences of two nested values in order, for example ["loss.load was 0.01, is
+    now 0.5"]."""
     if isinstance(old, dict) and isinstance(new, dict) and old.keys() == new.keys():
         return [found for key in old for found in differences(old[key], new[key], f"{where}.{key}".lstrip("."))]
     return [] if old == new else [f"{where} was {old}, is now {new}"]

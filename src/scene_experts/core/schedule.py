@@ -12,7 +12,8 @@ from scene_experts.core.fields import SCALES, Count, Flag
 
 @dataclass(frozen=True)
 class Every:
-    """True at the multiples of `interval` strictly between `start` and `stop` (as Scaffold-GS compares them)."""
+    """True at the multiples of `interval` strictly between `start` and `stop` (as Scaffold-GS
+    compares them)."""
 
     start: Annotated[int, SCALES]
     """Iteration after which it begins."""
@@ -36,7 +37,8 @@ def passes(step: int, views: int, interval: int) -> bool:
 
 @dataclass(frozen=True)
 class Rate:
-    """A learning rate that runs log-linearly from `first` to `last` over the training; 0 stays 0."""
+    """A learning rate that runs log-linearly from `first` to `last` over the training; 0 stays
+    0."""
 
     first: float
     """At the first iteration."""
@@ -44,7 +46,8 @@ class Rate:
     """At the last iteration."""
 
     def at(self, step: int, total: int) -> float:
-        """Return the rate at `step` (1-based) of `total`: exp((1 - t/T) ln first + (t/T) ln last), with t clipped to [0, T]."""
+        """Return the rate at `step` (1-based) of `total`: exp((1 - t/T) ln first + (t/T) ln last),
+        with t clipped to [0, T]."""
         if self.first == 0.0 and self.last == 0.0:
             return 0.0
         if self.first == self.last:

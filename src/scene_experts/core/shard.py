@@ -1,7 +1,8 @@
 """A table whose rows are divided among several processes.
 
-Every row has a number: its place in the whole table, in the order in which one process would hold the rows. A process holds its rows in
-the order of their numbers. The initial rows and later the new ones are dealt to the processes in turn, so that all hold about equally many.
+Every row has a number: its place in the whole table, in the order in which one process would hold
+the rows. A process holds its rows in the order of their numbers. The initial rows and later the new
+ones are dealt to the processes in turn, so that all hold about equally many.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ BLOCK = 1 << 16  # rows for which random numbers are drawn at once
 
 
 class ShardedTable(Table):
-    """The part of a table that this process holds. Every process must call the methods that exchange data in the same order."""
+    """The part of a table that this process holds. Every process must call the methods that
+    exchange data in the same order."""
 
     def __init__(self, whole: Table, group: Alone) -> None:
-        """Take over the columns and moments of `whole`, which is equal in all processes of `group`, and keep the rows of this process."""
+        """Take over the columns and moments of `whole`, which is equal in all processes of `group`,
+        and keep the rows of this process."""
         numbers = torch.arange(len(whole), device=whole.device)
         super().__init__({}, {**whole.facts, NUMBER: numbers}, whole.stats)
         self.params, self.averages, self._optimizer = whole.params, whole.averages, whole._optimizer
@@ -43,7 +46,8 @@ class ShardedTable(Table):
         self._total += int(count)
 
     def drop(self, mask: Tensor) -> int:
-        """Remove the rows where `mask` [n] is true, and number the others anew. Returns how many were removed in all processes."""
+        """Remove the rows where `mask` [n] is true, and number the others anew. Returns how many
+        were removed in all processes."""
         numbers = self.facts[NUMBER]
         gone = torch.cat(self.share(numbers[mask])).sort().values
         if len(gone):
@@ -60,11 +64,13 @@ class ShardedTable(Table):
         return numbers % self.group.size == self.group.rank
 
     def share(self, rows: Tensor) -> list[Tensor]:
-        """Return the rows [n, ...] of every process, in the order of the processes; n may differ."""
+        """Return the rows [n, ...] of every process, in the order of the processes; n may
+        differ."""
         return self.group.exchange([rows] * self.group.size)
 
     def collect(self, column: Tensor) -> Tensor:
-        """Return the column [n, ...] of this process whole in process 0, [total, ...] on the CPU, and empty in the others."""
+        """Return the column [n, ...] of this process whole in process 0, [total, ...] on the CPU,
+        and empty in the others."""
         numbers = self.facts[NUMBER]
         rest = [column[:0]] * (self.group.size - 1)
         parts = self.group.exchange([column, *rest])
@@ -75,7 +81,8 @@ class ShardedTable(Table):
         return out
 
     def draw(self, generator: torch.Generator, slots: Tensor, K: int) -> Tensor:
-        """Return the random numbers in [0, 1) of some slots, [s]. On the CPU they are those of `torch.rand(total, K)`.
+        """Return the random numbers in [0, 1) of some slots, [s]. On the CPU they are those of
+        `torch.rand(total, K)`.
 
         generator: the same in all processes.  slots [s]: row * K + slot, ascending.
         """
@@ -95,7 +102,8 @@ def pack_rows(columns: Sequence[Tensor]) -> Tensor:
 
 
 def unpack_rows(packed: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
-    """Return the columns that `pack_rows` has packed. `like` has their dtypes and the shapes of their rows."""
+    """Return the columns that `pack_rows` has packed. `like` has their dtypes and the shapes of
+    their rows."""
     out, place = [], 0
     for column in like:
         width = math.prod(column.shape[1:]) * column.element_size()

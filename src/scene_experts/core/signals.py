@@ -10,11 +10,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 PARENT = "SCENE_EXPERTS_PARENT"
-"""Environment variable with the ID of the parent process. The command stops when it ends. `reproduce` sets it for its runs."""
+"""Environment variable with the ID of the parent process. The command stops when it ends.
+`reproduce` sets it for its runs."""
 
 
 def ending() -> list[signal.Signals]:
-    """Return the signals that end a command: SIGINT, SIGTERM, and SIGHUP unless it is ignored (`nohup`)."""
+    """Return the signals that end a command: SIGINT, SIGTERM, and SIGHUP unless it is ignored
+    (`nohup`)."""
     out = [signal.SIGINT, signal.SIGTERM]
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # not on Windows
         out.append(signal.SIGHUP)
@@ -23,7 +25,8 @@ def ending() -> list[signal.Signals]:
 
 @contextmanager
 def handled(handler: Callable[[int, object], None]) -> Iterator[None]:
-    """Call `handler` on the signals that end a command. The previous handlers are restored afterwards."""
+    """Call `handler` on the signals that end a command. The previous handlers are restored
+    afterwards."""
     previous = {number: signal.signal(number, handler) for number in ending()}
     try:
         yield
@@ -33,7 +36,8 @@ def handled(handler: Callable[[int, object], None]) -> Iterator[None]:
 
 
 def follow_parent(every: float = 1.0) -> None:
-    """Watch the parent process that PARENT names. If it has ended, send SIGTERM to this process, which saves and stops.
+    """Watch the parent process that PARENT names. If it has ended, send SIGTERM to this process,
+    which saves and stops.
 
     `every` is the time between checks, s.
     """

@@ -1,4 +1,5 @@
-"""A table whose rows are added and removed during training. Parameters, facts, statistics and Adam's moments stay aligned."""
+"""A table whose rows are added and removed during training. Parameters, facts, statistics and
+Adam's moments stay aligned."""
 
 from __future__ import annotations
 
@@ -12,9 +13,10 @@ from torch import Tensor, nn
 class Table(nn.Module):
     """A table of N rows with named columns [N, ...].
 
-    `params` are learned. `facts` are constant for each row (positions on the lattice, levels). `stats` are the statistics for
-    densification. `averages` are averages of the parameters over the training, if there are any. Rows are added only by `append`
-    and removed only by `keep`, which keep all columns and moments aligned.
+    `params` are learned. `facts` are constant for each row (positions on the lattice, levels).
+    `stats` are the statistics for densification. `averages` are averages of the parameters over the
+    training, if there are any. Rows are added only by `append` and removed only by `keep`, which
+    keep all columns and moments aligned.
     """
 
     params: nn.ParameterDict
@@ -42,7 +44,8 @@ class Table(nn.Module):
         return len(self)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Apply `.to(...)` and similar methods to parameters, facts and statistics. Integer columns keep their dtype."""
+        """Apply `.to(...)` and similar methods to parameters, facts and statistics. Integer columns
+        keep their dtype."""
         super()._apply(fn, recurse)
         self.facts = {name: fn(value) for name, value in self.facts.items()}
         self.stats = {name: fn(value) for name, value in self.stats.items()}
@@ -50,7 +53,8 @@ class Table(nn.Module):
         return self
 
     def columns(self) -> dict[str, Tensor]:
-        """Return parameters and facts by name, without statistics. New rows must have these columns."""
+        """Return parameters and facts by name, without statistics. New rows must have these
+        columns."""
         return {**dict(self.params.items()), **self.facts}
 
     def attach(self, optimizer: torch.optim.Optimizer) -> None:
@@ -70,9 +74,11 @@ class Table(nn.Module):
 
     @torch.no_grad()
     def append(self, new: dict[str, Tensor]) -> None:
-        """Add rows. Their statistics and Adam's moments start at zero, their averages at their values.
+        """Add rows. Their statistics and Adam's moments start at zero, their averages at their
+        values.
 
-        `new` must have the same columns as the table. Raises KeyError, which names both sets of columns, if they differ.
+        `new` must have the same columns as the table. Raises KeyError, which names both sets of
+        columns, if they differ.
         """
         if new.keys() != self.columns().keys():
             raise KeyError(f"expected columns {sorted(self.columns())}, found {sorted(new)}")
@@ -90,7 +96,8 @@ class Table(nn.Module):
 
     @torch.no_grad()
     def keep(self, mask: Tensor) -> None:
-        """Keep the rows where `mask` [N] (bool) is true, in order. Raises ValueError for another dtype or shape."""
+        """Keep the rows where `mask` [N] (bool) is true, in order. Raises ValueError for another
+        dtype or shape."""
         if mask.dtype != torch.bool or mask.shape != (len(self),):
             raise ValueError(f"expected a bool mask of shape ({len(self)},), found {mask.dtype} {tuple(mask.shape)}")
         rows = mask.nonzero().squeeze(1)
@@ -101,11 +108,13 @@ class Table(nn.Module):
         self.averages = {name: value.index_select(0, rows) for name, value in self.averages.items()}
 
     def whole_fact(self, name: str) -> Tensor:
-        """Return a fact of the rows of all processes, [total, ...]. Every process must call this."""
+        """Return a fact of the rows of all processes, [total, ...]. Every process must call
+        this."""
         return self.facts[name]
 
     def drop(self, mask: Tensor) -> int:
-        """Remove the rows where `mask` [N] (bool) is true. Returns how many were removed in all processes."""
+        """Remove the rows where `mask` [N] (bool) is true. Returns how many were removed in all
+        processes."""
         gone = int(mask.sum())
         if gone:
             self.keep(~mask)
@@ -113,7 +122,8 @@ class Table(nn.Module):
 
     @torch.no_grad()
     def assign(self, name: str, value: Tensor) -> None:
-        """Overwrite a parameter column and its average, and set its moments to zero. Raises ValueError if the shapes differ."""
+        """Overwrite a parameter column and its average, and set its moments to zero. Raises
+        ValueError if the shapes differ."""
         if value.shape != self.params[name].shape:
             raise ValueError(f"expected shape {tuple(self.params[name].shape)} for column '{name}', found {tuple(value.shape)}")
         self._replace(name, value.clone(), torch.zeros_like)
@@ -141,7 +151,8 @@ class Table(nn.Module):
                     item.index_fill_(0, rows, 0.0)
 
     def _replace(self, name: str, value: Tensor, edit) -> None:
-        """Replace a parameter with a new one without gradient. `edit` changes the moments; Adam's step counter is kept."""
+        """Replace a parameter with a new one without gradient. `edit` changes the moments; Adam's
+        step counter is kept."""
         old = self.params[name]
         new = nn.Parameter(value)
         self.params[name] = new

@@ -6,11 +6,12 @@ Dimensions
     F feature size   E experts   k experts chosen per anchor   H, W pixels
 
 Frames and units
-    World: the capture's frame after `data.prepare` (scaled and shifted; `Capture.world` undoes it). Lengths are in world units.
-    Camera: OpenCV axes (x right, y down, z forward); `world_to_cam` maps homogeneous world points to camera points.
-    Pixels: pixel (column i, row j) has its centre at (i + 0.5, j + 0.5). `K` uses this convention, as in COLMAP.
-    Images: float RGB in [0, 1], [H, W, 3].  Quaternions: (w, x, y, z).
-    2D gradients: d loss / d (mean in NDC), which is the pixel gradient times (W/2, H/2), in all backends.
+    World: the capture's frame after `data.prepare` (scaled and shifted; `Capture.world` undoes it).
+    Lengths are in world units. Camera: OpenCV axes (x right, y down, z forward); `world_to_cam`
+    maps homogeneous world points to camera points. Pixels: pixel (column i, row j) has its centre
+    at (i + 0.5, j + 0.5). `K` uses this convention, as in COLMAP. Images: float RGB in [0, 1], [H,
+    W, 3].  Quaternions: (w, x, y, z). 2D gradients: d loss / d (mean in NDC), which is the pixel
+    gradient times (W/2, H/2), in all backends.
 """
 
 from __future__ import annotations
@@ -33,9 +34,11 @@ class Mode(enum.Enum):
     """
 
     TRAIN = "train"
-    """Routers add noise, router biases are updated, and coarse-to-fine training uses only the levels reached so far."""
+    """Routers add noise, router biases are updated, and coarse-to-fine training uses only the
+    levels reached so far."""
     DRAW = "draw"
-    """Deterministic and without changes of state: for rendering, evaluation and measurements, with or without gradients."""
+    """Deterministic and without changes of state: for rendering, evaluation and measurements, with
+    or without gradients."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,8 @@ class Camera:
 
     @functools.cached_property
     def pinhole(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy, px. They are cached before a copy to a device, because reading them from a device would synchronise with it."""
+        """fx, fy, cx, cy, px. They are cached before a copy to a device, because reading them from
+        a device would synchronise with it."""
         (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
         return fx, fy, cx, cy
 
@@ -118,8 +122,9 @@ class Gaussians:
 class Render:
     """A rendered image and the values that densification needs.
 
-    `mean2d_grad` is a tensor of zeros that the backward pass of the image fills: with d loss / d mean2d, or, from a rasteriser with
-    `absolute`, with the sums over the pixels of |d loss / d mean2d| through each pixel alone (AbsGS), for each axis.
+    `mean2d_grad` is a tensor of zeros that the backward pass of the image fills: with d loss / d
+    mean2d, or, from a rasteriser with `absolute`, with the sums over the pixels of |d loss / d
+    mean2d| through each pixel alone (AbsGS), for each axis.
     """
 
     image: Tensor  # [H, W, 3], blended with the background, not clamped

@@ -1,1 +1,2 @@
-"""Captures: photographs, cameras and points, from the files of common tools to what training reads."""
+"""Captures: photographs, cameras and points, from the files of common tools to what training
+reads."""

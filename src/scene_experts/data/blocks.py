@@ -1,7 +1,9 @@
-"""Divides a capture into blocks: boxes that hold equal numbers of its points, each with the training views that see it.
+"""Divides a capture into blocks: boxes that hold equal numbers of its points, each with the
+training views that see it.
 
-The boxes fill all of space and do not overlap, so every anchor lies in exactly one of them. The idea of blocks whose views are chosen by
-visibility is that of CityGaussian (Liu et al. 2024) and of VastGaussian (Lin et al. 2024).
+The boxes fill all of space and do not overlap, so every anchor lies in exactly one of them. The
+idea of blocks whose views are chosen by visibility is that of CityGaussian (Liu et al. 2024) and of
+VastGaussian (Lin et al. 2024).
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import InputError, expect_at_least
+from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
 from scene_experts.core.reading.budget import CAPTURE
 from scene_experts.core.reading.numbers import number
@@ -29,7 +31,8 @@ MOST_POINTS = 200_000  # of a capture that decide about its blocks; evenly chose
 
 @dataclass(frozen=True)
 class Block:
-    """A box, in trained world units, and the names of the training views that see it. Outer sides of the outer boxes are infinite."""
+    """A box, in trained world units, and the names of the training views that see it. Outer sides
+    of the outer boxes are infinite."""
 
     low: tuple[float, ...]
     high: tuple[float, ...]
@@ -39,12 +42,14 @@ class Block:
 
     @property
     def bounds(self) -> tuple[float, ...]:
-        """The low and the high corner (x, y, z, x, y, z) of the box with its margin. Infinite sides are at +-1e30."""
+        """The low and the high corner (x, y, z, x, y, z) of the box with its margin. Infinite sides
+        are at +-1e30."""
         sides = [side - self.margin for side in self.low] + [side + self.margin for side in self.high]
         return tuple(min(max(side, -FAR), FAR) for side in sides)
 
     def holds(self, xyz: Tensor, margin: float = 0.0) -> Tensor:
-        """Return which positions [N, 3] lie in the box, [N] bool. Its low sides belong to it, its high sides do not.
+        """Return which positions [N, 3] lie in the box, [N] bool. Its low sides belong to it, its
+        high sides do not.
 
         margin: distance by which all sides are moved outwards.
         """
@@ -56,14 +61,15 @@ def make_blocks(capture: Capture, count: int, margin: float = 0.1, share: float 
     """Divide a capture into `count` blocks.
 
     Args:
-        margin: A view is chosen by the points in the block and around it, up to this share of the block's size.
-        share: A view belongs to a block if at least this share of the points in the picture lie in the enlarged block. Every view belongs
-            at least to the block of which it sees most.
+        margin: A view is chosen by the points in the block and around it, up to this share of the
+            block's size.
+        share: A view belongs to a block if at least this share of the points in the picture lie in
+            the enlarged block. Every view belongs at least to the block of which it sees most.
 
     Raises:
-        InputError: The capture has no points, the numbers are out of range, or a block would have no point or no view.
+        InputError: The capture has no points, the numbers are out of range, or a block would have
+            no point or no view.
     """
-    expect_at_least([("--blocks", count, 1), ("--margin", margin, 0), ("--share", share, 0)])
     if capture.points is None or len(capture.points.xyz) < count:
         raise InputError(f"expected at least {count} points in {capture.root} for {count} blocks, found fewer; give smaller --blocks")
     xyz = capture.points.xyz.double()
@@ -85,9 +91,11 @@ def make_blocks(capture: Capture, count: int, margin: float = 0.1, share: float 
 
 
 def split_box(xyz: Tensor, box: Block, count: int) -> list[Block]:
-    """Split a box into `count` boxes with equal numbers of the points [N, 3], each time across its longest side.
+    """Split a box into `count` boxes with equal numbers of the points [N, 3], each time across its
+    longest side.
 
-    Raises InputError if a box would have no point, because too many points have the same coordinate.
+    Raises InputError if a box would have no point, because too many points have the same
+    coordinate.
     """
     if count == 1:
         return [box]
@@ -107,7 +115,8 @@ def split_box(xyz: Tensor, box: Block, count: int) -> list[Block]:
 
 
 def visible(view: View, xyz: Tensor) -> Tensor:
-    """Return which points [N, 3] lie in the picture of a view and beyond its near plane, [N] bool. Occlusion is ignored."""
+    """Return which points [N, 3] lie in the picture of a view and beyond its near plane, [N] bool.
+    Occlusion is ignored."""
     camera = view.camera
     pose, K = camera.world_to_cam.to(xyz), camera.K.to(xyz)
     local = xyz @ pose[:3, :3].T + pose[:3, 3]
@@ -117,7 +126,8 @@ def visible(view: View, xyz: Tensor) -> Tensor:
 
 
 def _size(xyz: Tensor) -> Tensor:
-    """Return the lengths [3] of the box that holds nine tenths of the points [N, 3] in each direction."""
+    """Return the lengths [3] of the box that holds nine tenths of the points [N, 3] in each
+    direction."""
     ordered = xyz.sort(0).values
     return ordered[int(0.95 * (len(xyz) - 1))] - ordered[int(0.05 * (len(xyz) - 1))]
 
@@ -131,7 +141,8 @@ def write_plan(folder: Path, capture: Capture, blocks: list[Block]) -> None:
 
 
 def read_plan(folder: Path) -> tuple[str, list[Block]]:
-    """Return the fingerprint of the capture and the blocks of a plan. Raises InputError if `folder` holds no plan."""
+    """Return the fingerprint of the capture and the blocks of a plan. Raises InputError if `folder`
+    holds no plan."""
     path = folder / "plan.json"
     if not path.is_file():
         raise InputError(f"expected plan.json in {folder}, found none; make a plan with `scene-experts blocks plan`")

@@ -1,4 +1,5 @@
-"""Loads a capture: reads it, fits lenses to the photographs, splits, normalises and resizes. `load` is the only entry point."""
+"""Loads a capture: reads it, fits lenses to the photographs, splits, normalises and resizes. `load`
+is the only entry point."""
 
 from __future__ import annotations
 
@@ -31,12 +32,14 @@ __all__ = ["Capture", "Frame", "View", "World", "load"]
 def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_bytes: int | None = None) -> Capture:
     """Load the capture that `data` describes.
 
-    The kind is recognised by its files: COLMAP (sparse/0 and images), NeRF-synthetic (transforms_train.json), nerfstudio
-    (transforms.json), or a kind whose reader was registered (see `data.readers`).
+    The kind is recognised by its files: COLMAP (sparse/0 and images), NeRF-synthetic
+    (transforms_train.json), nerfstudio (transforms.json), or a kind whose reader was registered
+    (see `data.readers`).
 
     Args:
         seed: Seed of random points.
-        allow_no_points: Load a capture without 3D points, with a warning. Training cannot start from it.
+        allow_no_points: Load a capture without 3D points, with a warning. Training cannot start
+            from it.
         cache_bytes: Memory for decoded frames. None is a third of the free memory.
 
     Raises:
@@ -67,7 +70,8 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
 
 
 def choose_views(capture: Capture, path: Path) -> Capture:
-    """Return the capture with only those training views that the JSON list at `path` names. Raises InputError for unknown names."""
+    """Return the capture with only those training views that the JSON list at `path` names. Raises
+    InputError for unknown names."""
     names = set(read_view_names(path))
     chosen = tuple(index for index in capture.train if capture.views[index].name in names)
     if len(chosen) < len(names):
@@ -90,7 +94,8 @@ def _read(data: Data, policy: str, cache_bytes: int | None) -> tuple[RawCapture,
 
 
 def _find_image_folder(root: Path, images: str | None, policy: str) -> str | None:
-    """Return the folder that was asked for, images_N for "inria:N", or None for the capture's own. Raises InputError if it is absent."""
+    """Return the folder that was asked for, images_N for "inria:N", or None for the capture's own.
+    Raises InputError if it is absent."""
     if not root.is_dir():
         beside = [p.name for p in root.absolute().parent.iterdir() if p.is_dir()] if root.absolute().parent.is_dir() else []
         found = "a file" if root.is_file() else "nothing"
@@ -144,7 +149,8 @@ def _assemble(root: Path, kind: str, raw: RawCapture, centred: bool, background:
 
 
 def _fit_lens(image: PosedImage) -> tuple[Lens, bool]:
-    """Return the lens at the size of the image file, and whether the file must be rotated by its EXIF orientation to fit."""
+    """Return the lens at the size of the image file, and whether the file must be rotated by its
+    EXIF orientation to fit."""
     stored, turned = probe(image.path)
     if image.lens is None:
         w, h = stored

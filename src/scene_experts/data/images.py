@@ -1,8 +1,10 @@
-"""Turns a photograph file into the pixels that training sees: decode, rotate, undistort, resize, composite, mask.
+"""Turns a photograph file into the pixels that training sees: decode, rotate, undistort, resize,
+composite, mask.
 
-Structure-from-motion tools work on the stored pixels, so the EXIF orientation is not applied. The exception is a photograph that
-has the size of its camera model only after rotation: then the tool applied the orientation, too.
-Masks come from alpha channels and mask files. As in COLMAP, black pixels do not count.
+Structure-from-motion tools work on the stored pixels, so the EXIF orientation is not applied. The
+exception is a photograph that has the size of its camera model only after rotation: then the tool
+applied the orientation, too. Masks come from alpha channels and mask files. As in COLMAP, black
+pixels do not count.
 """
 
 from __future__ import annotations
@@ -44,7 +46,8 @@ class FrameSource:
 
 
 def probe(path: Path) -> tuple[Size, Size]:
-    """Return the stored size of the image at `path`, and its size with the EXIF orientation applied. Reads only the header."""
+    """Return the stored size of the image at `path`, and its size with the EXIF orientation
+    applied. Reads only the header."""
     with opening_picture(path, PHOTOGRAPH) as image:
         size = image.size
         turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)  # PNG stores EXIF after the pixels: a truncated file fails here
@@ -54,9 +57,10 @@ def probe(path: Path) -> tuple[Size, Size]:
 def target_size(policy: str, size: Size) -> Size:
     """Return the width and height in px of an image of `size` under the resolution policy `policy`.
 
-    "as-is" and "inria:N" (which reads the folder images_N) keep the size. "cap1600" limits the width to 1600 px and truncates to
-    whole pixels, as Scaffold-GS does. "factor:N" divides by N and rounds. "longest:N" limits the longer side to N px. "share:S"
-    multiplies the result of "cap1600" by S, with a longer side of at least 16 px. No policy enlarges an image.
+    "as-is" and "inria:N" (which reads the folder images_N) keep the size. "cap1600" limits the
+    width to 1600 px and truncates to whole pixels, as Scaffold-GS does. "factor:N" divides by N and
+    rounds. "longest:N" limits the longer side to N px. "share:S" multiplies the result of "cap1600"
+    by S, with a longer side of at least 16 px. No policy enlarges an image.
     """
     w, h = size
     kind, _, number = policy.partition(":")
@@ -76,7 +80,8 @@ def target_size(policy: str, size: Size) -> Size:
 
 
 def check_policy(policy: str) -> str:
-    """Return `policy`, with "auto" replaced by "cap1600". Raises InputError for an unknown policy."""
+    """Return `policy`, with "auto" replaced by "cap1600". Raises InputError for an unknown
+    policy."""
     if policy in ("auto", "cap1600", "as-is"):
         return "cap1600" if policy == "auto" else policy
     kind, _, number = policy.partition(":")
@@ -95,11 +100,13 @@ def check_policy(policy: str) -> str:
 
 
 def decode(source: FrameSource) -> tuple[Tensor, Tensor | None]:
-    """Return the frame of `source`: rgb [H, W, 3] uint8 and its mask [H, W] uint8 (255 = counts), or None if every pixel counts.
+    """Return the frame of `source`: rgb [H, W, 3] uint8 and its mask [H, W] uint8 (255 = counts),
+    or None if every pixel counts.
 
-    The photograph is undistorted at the resolution of its file, resized with Pillow's antialiased bicubic filter as in the
-    reference codes, then composited in float and rounded. The result depends on the files only.
-    Raises InputError if a file is unreadable or does not have the expected size.
+    The photograph is undistorted at the resolution of its file, resized with Pillow's antialiased
+    bicubic filter as in the reference codes, then composited in float and rounded. The result
+    depends on the files only. Raises InputError if a file is unreadable or does not have the
+    expected size.
     """
     image = _load_pixels(source)
     mask = _load_mask(source)
@@ -169,9 +176,11 @@ def to_8_bit(image: Image.Image) -> Image.Image:
 
 
 def _load_mask(source: FrameSource) -> Image.Image | None:
-    """Load the mask file as L, at its own size. Raises InputError if it has another aspect ratio than the photograph.
+    """Load the mask file as L, at its own size. Raises InputError if it has another aspect ratio
+    than the photograph.
 
-    If the photograph was rotated and the mask was not, the mask is rotated by its own EXIF orientation or by the photograph's.
+    If the photograph was rotated and the mask was not, the mask is rotated by its own EXIF
+    orientation or by the photograph's.
     """
     if source.mask is None:
         return None
@@ -188,7 +197,8 @@ def _load_mask(source: FrameSource) -> Image.Image | None:
 
 
 def fits(size: Size, whole: Size) -> bool:
-    """Return whether a picture of `size` is one of `whole` at another scale. Sides are whole pixels, so ratios may differ by one."""
+    """Return whether a picture of `size` is one of `whole` at another scale. Sides are whole
+    pixels, so ratios may differ by one."""
     (w, h), (width, height) = size, whole
     return abs(w * height - h * width) <= max(w, h, width, height, 0.01 * w * height)
 
@@ -202,13 +212,15 @@ def _turn_mask(source: FrameSource, out: Image.Image) -> Image.Image:
 
 
 def to_mask(image: Image.Image) -> Image.Image:
-    """Convert a mask file to L (255 = counts): its alpha if every colour is black, otherwise its brightness."""
+    """Convert a mask file to L (255 = counts): its alpha if every colour is black, otherwise its
+    brightness."""
     return image.getchannel("A") if image.mode == "RGBA" and image.convert("L").getextrema() == (0, 0) else image.convert("L")
 
 
 @functools.lru_cache(maxsize=2)  # neighbouring views share their camera
 def _make_grid(lens: Lens) -> Tensor:
-    """Return where each pixel of the undistorted image lies in the photograph: [h, w, 2] float32 in [-1, 1], for grid_sample."""
+    """Return where each pixel of the undistorted image lies in the photograph: [h, w, 2] float32 in
+    [-1, 1], for grid_sample."""
     pinhole = to_pinhole(lens)
     out = np.empty((pinhole.height, pinhole.width, 2), np.float32)
     u = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
@@ -235,6 +247,7 @@ def _undistort(image: Image.Image, lens: Lens) -> Image.Image:
 
 
 def _make_outside_mask(lens: Lens) -> Image.Image | None:
-    """Return a mask that is black where the undistorted image exceeds the photograph, or None if it nowhere does."""
+    """Return a mask that is black where the undistorted image exceeds the photograph, or None if it
+    nowhere does."""
     inside = (_make_grid(lens).abs() <= 1).all(-1)
     return None if bool(inside.all()) else Image.fromarray(inside.numpy().astype(np.uint8) * 255)

@@ -1,6 +1,8 @@
-"""Camera lenses: the eleven classic COLMAP camera models, their distortion, and the pinhole camera that each is undistorted to.
+"""Camera lenses: the eleven classic COLMAP camera models, their distortion, and the pinhole camera
+that each is undistorted to.
 
-(u, v) are normalised pinhole coordinates x/z, y/z. Pixel coordinates are COLMAP's: the centre of the first pixel is (0.5, 0.5).
+(u, v) are normalised pinhole coordinates x/z, y/z. Pixel coordinates are COLMAP's: the centre of
+the first pixel is (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -40,8 +42,8 @@ _LARGEST_ANGLE = math.radians(88.0)  # rays further from the axis are not usable
 class Lens:
     """A COLMAP camera model with its image size and parameters in pixels.
 
-    Raises InputError for an unknown model, a wrong number of parameters, values that are not finite, and a focal length or size
-    that is not positive.
+    Raises InputError for an unknown model, a wrong number of parameters, values that are not
+    finite, and a focal length or size that is not positive.
     """
 
     model: str
@@ -86,15 +88,18 @@ class Lens:
 
     @property
     def distorted(self) -> bool:
-        """Whether straight lines appear bent: always for a fisheye lens, otherwise if a distortion coefficient is not 0."""
+        """Whether straight lines appear bent: always for a fisheye lens, otherwise if a distortion
+        coefficient is not 0."""
         geometric = {"f", "fx", "fy", "cx", "cy"}
         return self.model in FISHEYE or any(p != 0 for n, p in zip(MODELS[self.model], self.params) if n not in geometric)
 
     def resize(self, width: int, height: int) -> Lens:
-        """Return the same lens for an image of another size. Each axis is scaled by its own ratio, exactly.
+        """Return the same lens for an image of another size. Each axis is scaled by its own ratio,
+        exactly.
 
-        With pixel centres at +0.5, the focal length and the principal point are multiplied by the ratio, without an offset. A
-        model with one focal length becomes a model with two if the ratios differ.
+        With pixel centres at +0.5, the focal length and the principal point are multiplied by the
+        ratio, without an offset. A model with one focal length becomes a model with two if the
+        ratios differ.
         """
         sx, sy = width / self.width, height / self.height
         if sx == sy == 1.0:
@@ -109,7 +114,8 @@ class Lens:
         return Lens(model, width, height, tuple(p * factor.get(n, 1.0) for n, p in zip(names, params)))
 
     def distort(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Map normalised pinhole coordinates to normalised distorted ones (u', v'); the pixel is (fx u' + cx, fy v' + cy)."""
+        """Map normalised pinhole coordinates to normalised distorted ones (u', v'); the pixel is
+        (fx u' + cx, fy v' + cy)."""
         if self.model == "FOV":
             return _distort_fov(self.value("omega"), u, v)
         if self.model in FISHEYE:  # equidistant projection first: |(u, v)| = angle from the axis
@@ -119,10 +125,11 @@ class Lens:
         return self._distort_polynomial(u, v)
 
     def undistort(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Invert `distort` by Newton's method. Rays over 88 degrees from the axis of a fisheye lens are clamped to 88 degrees.
+        """Invert `distort` by Newton's method. Rays over 88 degrees from the axis of a fisheye lens
+        are clamped to 88 degrees.
 
-        The result is NaN where no ray nearer to the axis than `find_fold` gets there, as in the corners of a photograph whose polynomial
-        was fitted to its middle.
+        The result is NaN where no ray nearer to the axis than `find_fold` gets there, as in the
+        corners of a photograph whose polynomial was fitted to its middle.
         """
         if self.model == "FOV":
             return _undistort_fov(self.value("omega"), u, v)
@@ -138,7 +145,8 @@ class Lens:
         return a, b
 
     def find_fold(self) -> float:
-        """Return the radius at which the radial polynomial turns back, so that rays further out fall onto nearer ones; infinity: nowhere.
+        """Return the radius at which the radial polynomial turns back, so that rays further out
+        fall onto nearer ones; infinity: nowhere.
 
         The radius is that of (u, v), and the angle from the axis in radians for a fisheye lens.
         """
@@ -152,12 +160,14 @@ class Lens:
         return math.sqrt(ahead.min()) if len(ahead) else math.inf
 
     def is_folded(self, u: Array, v: Array) -> NDArray[np.bool_]:
-        """Return which rays lie beyond `find_fold`: the photograph does not show them, wherever `distort` puts them."""
+        """Return which rays lie beyond `find_fold`: the photograph does not show them, wherever
+        `distort` puts them."""
         r = np.hypot(u, v)
         return (np.arctan(r) if self.model in FISHEYE else r) > self.find_fold()
 
     def _distort_polynomial(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Apply the radial, tangential and thin-prism terms, the polynomial part of every model (formulas of OpenCV and COLMAP)."""
+        """Apply the radial, tangential and thin-prism terms, the polynomial part of every model
+        (formulas of OpenCV and COLMAP)."""
         k = [self.value(n) for n in ("k1", "k2", "k3", "k4", "k5", "k6")]
         p1, p2, sx, sy = (self.value(n) for n in ("p1", "p2", "sx1", "sy1"))
         r2 = u * u + v * v
@@ -172,7 +182,8 @@ class Lens:
         )
 
     def _undistort_polynomial(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Solve `_distort_polynomial(a, b) = (u, v)` by Newton's method with central differences, starting at (u, v)."""
+        """Solve `_distort_polynomial(a, b) = (u, v)` by Newton's method with central differences,
+        starting at (u, v)."""
         a, b, h = u.copy(), v.copy(), 1e-6
         for _ in range(60):
             fu, fv = self._distort_polynomial(a, b)
@@ -200,7 +211,8 @@ _TWO_FOCALS = {
 
 
 def _distort_fov(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
-    """Apply the field-of-view model of Devernay and Faugeras: r' = atan(2 r tan(omega/2)) / omega."""
+    """Apply the field-of-view model of Devernay and Faugeras: r' = atan(2 r tan(omega/2)) /
+    omega."""
     if abs(omega) < 1e-9:
         return u, v
     r = np.hypot(u, v)
@@ -219,11 +231,13 @@ def _undistort_fov(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
 
 
 def to_pinhole(lens: Lens) -> Lens:
-    """Return the pinhole camera that `lens` is undistorted to: the same focal lengths and the largest size without empty pixels.
+    """Return the pinhole camera that `lens` is undistorted to: the same focal lengths and the
+    largest size without empty pixels.
 
-    As in COLMAP, the image border is undistorted, and each axis is grown or cropped about the principal point until every output
-    pixel lies inside the photograph, within 0.2 to 2 times the original size. Border pixels that no ray reaches do not count; a side
-    without any other pixel lies at the fold of the lens. A lens without distortion keeps its size.
+    As in COLMAP, the image border is undistorted, and each axis is grown or cropped about the
+    principal point until every output pixel lies inside the photograph, within 0.2 to 2 times the
+    original size. Border pixels that no ray reaches do not count; a side without any other pixel
+    lies at the fold of the lens. A lens without distortion keeps its size.
     """
     w, h = lens.width, lens.height
     if not lens.distorted:
@@ -245,7 +259,8 @@ def to_pinhole(lens: Lens) -> Lens:
     right = innermost(border(np.full(h, w - 0.5), rows)[0], np.min, lens.cx + reach * lens.fx)
     top = innermost(border(cols, np.full(w, 0.5))[1], np.max, lens.cy - reach * lens.fy)
     bottom = innermost(border(cols, np.full(w, h - 0.5))[1], np.min, lens.cy + reach * lens.fy)
-    # The principal point keeps its fraction of the image, hence the larger (stricter) of the two ratios.
+    # The principal point keeps its fraction of the image, hence the larger (stricter) of the two
+    # ratios.
     scale_x = 1 / max(lens.cx / max(lens.cx - left, 1e-9), (w - 0.5 - lens.cx) / max(right - lens.cx, 1e-9))
     scale_y = 1 / max(lens.cy / max(lens.cy - top, 1e-9), (h - 0.5 - lens.cy) / max(bottom - lens.cy, 1e-9))
     width, height = (max(1, int(min(max(s, 0.2), 2.0) * n)) for s, n in ((scale_x, w), (scale_y, h)))

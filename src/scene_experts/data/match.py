@@ -1,4 +1,5 @@
-"""Finds the photographs and masks that the files of a capture name. Files are matched by name, never by sorted position."""
+"""Finds the photographs and masks that the files of a capture name. Files are matched by name,
+never by sorted position."""
 
 from __future__ import annotations
 
@@ -22,9 +23,11 @@ class Match:
 
 
 def to_relative_name(name: str) -> str:
-    """Turn `name` into a path that stays inside any folder: "/" between its parts, without root, drive, "." or "..".
+    """Turn `name` into a path that stays inside any folder: "/" between its parts, without root,
+    drive, "." or "..".
 
-    Results are written under the names of views, and a capture may name "../photos/a.png" or an absolute path of another machine.
+    Results are written under the names of views, and a capture may name "../photos/a.png" or an
+    absolute path of another machine.
     """
     parts = name.replace("\\", "/").split("/")
     return "/".join(part for part in parts if part not in ("", ".", "..") and not part.endswith(":"))
@@ -33,9 +36,9 @@ def to_relative_name(name: str) -> str:
 def match_images(folder: Path, names: Sequence[str]) -> Match:
     """Find the file in `folder` for each of `names` (relative, "/" between folders).
 
-    The exact path is tried first, then the only file with the same stem and another extension, then the only file anywhere in
-    `folder` with that base name. The last two require that no other name shares the stem or base name. `warnings` reports
-    every match that is not exact.
+    The exact path is tried first, then the only file with the same stem and another extension, then
+    the only file anywhere in `folder` with that base name. The last two require that no other name
+    shares the stem or base name. `warnings` reports every match that is not exact.
     """
     files = [path for path in folder.rglob("*") if path.suffix.lower() in EXTENSIONS] if folder.is_dir() else []
     by_stem, by_base = defaultdict(list), defaultdict(list)
@@ -79,7 +82,8 @@ def absent_error(folder: Path, names: Sequence[str], absent: Sequence[str]) -> I
 def find_mask(root: Path, name: str, image: Path) -> Path | None:
     """Return the mask file of view `name`, or None.
 
-    A mask is masks/NAME, masks/NAME.png or masks/STEM.png in `root`, or STEM.mask.png or STEM_mask.png beside the photograph.
+    A mask is masks/NAME, masks/NAME.png or masks/STEM.png in `root`, or STEM.mask.png or
+    STEM_mask.png beside the photograph.
     """
     stem = PurePosixPath(name).with_suffix("").as_posix()
     candidates = [root / "masks" / part for part in (name, f"{name}.png", f"{stem}.png")]

@@ -1,6 +1,8 @@
-"""Functions from a capture to a capture: select views, split, resize, transform the world, drop outliers, add random points.
+"""Functions from a capture to a capture: select views, split, resize, transform the world, drop
+outliers, add random points.
 
-`load` is built from them, and each can be applied to a loaded capture. They read no pixels and do not modify their argument.
+`load` is built from them, and each can be applied to a loaded capture. They read no pixels and do
+not modify their argument.
 """
 
 from __future__ import annotations
@@ -32,9 +34,11 @@ def camera_centres(views: Sequence[View]) -> Tensor:
 
 
 def camera_extent(capture: Capture) -> float:
-    """Return 1.1 times the largest distance of a training camera from the mean training camera ("cameras extent" in 3DGS).
+    """Return 1.1 times the largest distance of a training camera from the mean training camera
+    ("cameras extent" in 3DGS).
 
-    If all training cameras are at one place, return the median distance of the points from there, or 1 without points.
+    If all training cameras are at one place, return the median distance of the points from there,
+    or 1 without points.
     """
     xyz = camera_centres([capture.views[i] for i in capture.train])
     middle = xyz.mean(0)
@@ -47,7 +51,8 @@ def camera_extent(capture: Capture) -> float:
 
 
 def near_plane(extent: float) -> float:
-    """Return the near plane for a world of this extent: 0.2 as in 3DGS, or less in small worlds so that nothing is clipped."""
+    """Return the near plane for a world of this extent: 0.2 as in 3DGS, or less in small worlds so
+    that nothing is clipped."""
     return min(0.2, 0.02 * extent)
 
 
@@ -72,7 +77,8 @@ def select_views(capture: Capture, indices: Sequence[int]) -> Capture:
 
 
 def limit_views(capture: Capture, count: int) -> Capture:
-    """Keep at most `count` views, spread evenly over the sorted names. Raises InputError if `count` is below 1."""
+    """Keep at most `count` views, spread evenly over the sorted names. Raises InputError if `count`
+    is below 1."""
     if count < 1:
         raise InputError(f"expected --max-views of at least 1, found {count}; give a positive number or omit the option")
     total = len(capture.views)
@@ -83,10 +89,10 @@ def hold_out(capture: Capture, split: str) -> Capture:
     """Divide the views, sorted by name, into training and test views.
 
     Args:
-        split: "modN" or "mod:N" holds out every Nth view, beginning with the first ("mod8" is the protocol of 3DGS);
-            "fold:K/N" holds out every Nth view, beginning with the Kth, so that the folds 1/N to N/N hold out each
-            view once; "first:N" holds out the first N; "none" holds out none; "files" keeps the split that the files
-            state.
+        split: "modN" or "mod:N" holds out every Nth view, beginning with the first ("mod8" is the
+            protocol of 3DGS); "fold:K/N" holds out every Nth view, beginning with the Kth, so that
+            the folds 1/N to N/N hold out each view once; "first:N" holds out the first N; "none"
+            holds out none; "files" keeps the split that the files state.
 
     Raises:
         InputError: for another word, if the files state no split, or if no training view is left.
@@ -121,7 +127,8 @@ def hold_out(capture: Capture, split: str) -> Capture:
 
 
 def downscale(capture: Capture, policy: str) -> Capture:
-    """Resize each undistorted photograph as `policy` says (see `images.target_size`), and scale its intrinsics exactly."""
+    """Resize each undistorted photograph as `policy` says (see `images.target_size`), and scale its
+    intrinsics exactly."""
     policy = check_policy(policy)
     views, sources = [], []
     for view, source in zip(capture.views, capture.images.sources):
@@ -138,7 +145,8 @@ def _resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def transform(capture: Capture, shift: Vector, scale: float) -> Capture:
-    """Map cameras, points, extent and near planes by `(trained + shift) * scale`, and extend `world` by that step."""
+    """Map cameras, points, extent and near planes by `(trained + shift) * scale`, and extend
+    `world` by that step."""
     step = World(scale, shift)
     views = tuple(replace(v, camera=step.camera_from_input(v.camera)) for v in capture.views)
     points = capture.points and Points(step.from_input(capture.points.xyz), capture.points.rgb)
@@ -152,14 +160,16 @@ def scale(capture: Capture, factor: float) -> Capture:
 
 
 def normalise(capture: Capture) -> Capture:
-    """Move the origin to the mean training camera and scale the extent to 5, whatever the unit of the capture is."""
+    """Move the origin to the mean training camera and scale the extent to 5, whatever the unit of
+    the capture is."""
     x, y, z = (-camera_centres([capture.views[i] for i in capture.train]).mean(0)).tolist()
     out = transform(capture, (x, y, z), NORMAL_EXTENT / capture.extent)
     return _with_near(replace(out, extent=NORMAL_EXTENT))  # exactly 5, so that captures in different units agree to the last bit
 
 
 def drop_outlier_views(capture: Capture) -> Capture:
-    """Drop the views whose camera is more than 50 median distances from the median camera. Such poses are errors and distort the extent.
+    """Drop the views whose camera is more than 50 median distances from the median camera. Such
+    poses are errors and distort the extent.
 
     A capture of fewer than 8 views is not changed.
     """
@@ -176,8 +186,8 @@ def drop_outlier_views(capture: Capture) -> Capture:
 def drop_outliers(capture: Capture) -> Capture:
     """Drop the points that are not finite or are too far from the mean training camera.
 
-    A point is too far beyond both 50 extents and 20 median distances. Both limits are needed because cameras on a short arc may
-    see things hundreds of extents away.
+    A point is too far beyond both 50 extents and 20 median distances. Both limits are needed
+    because cameras on a short arc may see things hundreds of extents away.
     """
     if capture.points is None:
         return capture
@@ -198,9 +208,9 @@ def drop_outliers(capture: Capture) -> Capture:
 def add_random_points(capture: Capture, count: int = RANDOM_POINTS, seed: int = 0) -> Capture:
     """Replace the points by `count` uniformly distributed, nearly grey points.
 
-    They fill `capture.bounds` if that is known, as 3DGS does for NeRF-synthetic scenes. Otherwise they fill the box of the
-    training cameras and of the places 1.5 extents in front of them, which holds the subject of inward-facing and of
-    forward-facing captures.
+    They fill `capture.bounds` if that is known, as 3DGS does for NeRF-synthetic scenes. Otherwise
+    they fill the box of the training cameras and of the places 1.5 extents in front of them, which
+    holds the subject of inward-facing and of forward-facing captures.
     """
     rng = np.random.default_rng(seed)
     if capture.bounds is not None:

@@ -17,35 +17,41 @@ class Data:
     """The capture and how it is read."""
 
     path: Annotated[Path, Option(name="data", short="-s", value="CAPTURE")]
-    """Folder of the capture: a COLMAP folder (images/ and sparse/0/), a folder with transforms*.json, or catalog:SCENE for a scene that
-    `scene-experts download` downloaded."""
+    """Folder of the capture: a COLMAP folder (images/ and sparse/0/), a folder with
+    transforms*.json, or catalog:SCENE for a scene that `scene-experts download` downloaded."""
     images: Annotated[str | None, Option(value="FOLDER")] = None
     """Image folder inside the capture, for example images_4."""
     resolution: Annotated[str, Option(short="-r", value="POLICY")] = "auto"
-    """Size of the training pictures: as-is, factor:N (sides divided by N), longest:PX, cap1600 (width at most 1600 px), share:S (a
-    share of what cap1600 gives), inria:N (as factor:N from the folder images_N) or auto (cap1600)."""
+    """Size of the training pictures: as-is, factor:N (sides divided by N), longest:PX, cap1600
+    (width at most 1600 px), share:S (a share of what cap1600 gives), inria:N (as factor:N from the
+    folder images_N) or auto (cap1600)."""
     split: Annotated[str, Option(value="RULE")] = "auto"
-    """Which views are held out: mod8 (every 8th), mod:N (every Nth), fold:K/N (every Nth from the Kth), first:N, none, files
-    (as the capture's files say) or auto (files if they say it, else mod8)."""
+    """Which views are held out: mod8 (every 8th), mod:N (every Nth), fold:K/N (every Nth from the
+    Kth), first:N, none, files (as the capture's files say) or auto (files if they say it, else
+    mod8)."""
     missing: Literal["error", "drop"] = "error"
     """What to do if the photograph of a view is missing: stop, or drop the view."""
     normalise: Literal["extent", "none"] = "extent"
-    """extent: scale the world to a camera extent of 5 for the training; every exported file is scaled back. none: train in the capture's
-    own units."""
+    """extent: scale the world to a camera extent of 5 for the training; every exported file is
+    scaled back. none: train in the capture's own units."""
     init: Literal["points", "random"] = "points"
     """Start from the capture's 3D points, or from random points."""
     max_views: Annotated[int | None, Range(1)] = None
     """Use at most this many views, evenly spread."""
     near: Annotated[float | None, Range(above=0, below=math.inf)] = None
-    """Nearest depth that is drawn, in trained units; by default min(0.2, 0.02 x scene radius). The reference implementations use 0.2 in any
-    unit."""
+    """Nearest depth that is drawn, in trained units; by default min(0.2, 0.02 x scene radius). The
+    reference implementations use 0.2 in any unit."""
     ignore_principal_point: bool = False
-    """Assume that the principal point is the centre of the picture, as the reference implementations do."""
+    """Assume that the principal point is the centre of the picture, as the reference
+    implementations do."""
     views: Annotated[Path | None, Option(value="FILE")] = None
-    """Train only on the training views that this JSON list names. The world and the held-out views stay those of the whole capture."""
+    """Train only on the training views that this JSON list names. The world and the held-out views
+    stay those of the whole capture."""
     background: Annotated[tuple[float, float, float] | None, Range(0, 1)] = None
-    """Background colour, RGB; by default that of the kind of capture (white for NeRF-synthetic, else black)."""
+    """Background colour, RGB; by default that of the kind of capture (white for NeRF-synthetic,
+    else black)."""
 
     def settings(self) -> dict[str, Any]:
-        """What differs from the defaults of how a capture is read, as plain JSON, without its path."""
+        """What differs from the defaults of how a capture is read, as plain JSON, without its
+        path."""
         return {name: value for name, value in lean(self).items() if name != "path"}

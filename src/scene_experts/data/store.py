@@ -1,6 +1,7 @@
 """Caches decoded frames within a memory limit, and decodes frames ahead in other threads.
 
-Decoding depends on the files only, so the content of a frame never depends on the cache or on the timing of the threads.
+Decoding depends on the files only, so the content of a frame never depends on the cache or on the
+timing of the threads.
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ Decoded = tuple[Tensor, Tensor | None]  # rgb [H, W, 3] uint8, mask [H, W] uint8
 
 
 def available_bytes() -> int | None:
-    """Return the memory in bytes that this process may still allocate, or None if the system does not tell.
+    """Return the memory in bytes that this process may still allocate, or None if the system does
+    not tell.
 
-    It is the smaller of what the machine and the control group leave free. File pages held by a control group count as free, as
-    they do in MemAvailable, because the kernel reclaims them on demand.
+    It is the smaller of what the machine and the control group leave free. File pages held by a
+    control group count as free, as they do in MemAvailable, because the kernel reclaims them on
+    demand.
     """
     left = []
     with suppress(OSError, ValueError, KeyError):
@@ -54,7 +57,8 @@ def _read_numbers(path: Path | str) -> dict[str, int]:
 
 
 class _Cache:
-    """The state that the threads share. It is separate from ImageStore so that the threads do not keep the store alive."""
+    """The state that the threads share. It is separate from ImageStore so that the threads do not
+    keep the store alive."""
 
     def __init__(self, sources: tuple[FrameSource, ...], budget: int) -> None:
         self.sources, self.budget, self.used = sources, budget, 0
@@ -100,14 +104,15 @@ class _Cache:
     def _choose_victim(self) -> int:
         """Choose the frame to drop: the most recently used one that is not prefetched.
 
-        Training sees every view once per epoch, so this frame is needed last. With a cache for half of the frames, the hit rate is
-        50 %; dropping the least recently used frame gives 12 %.
+        Training sees every view once per epoch, so this frame is needed last. With a cache for half
+        of the frames, the hit rate is 50 %; dropping the least recently used frame gives 12 %.
         """
         free = (index for index in reversed(self.frames) if index not in self.ahead)
         return next(free, next(iter(self.frames)))
 
     def decode_ahead(self) -> None:
-        """Decode the wanted frames in order until stopped; runs in each thread. `get` reports files that cannot be decoded."""
+        """Decode the wanted frames in order until stopped; runs in each thread. `get` reports files
+        that cannot be decoded."""
         while True:
             with self.changed:
                 while not self.wanted and not self.stopped:
@@ -142,7 +147,8 @@ class ImageStore:
 
     Args:
         sources: One source per frame.
-        cache_bytes: Memory for decoded frames. None is a third of `available_bytes()`, or of 4 GiB if that is unknown.
+        cache_bytes: Memory for decoded frames. None is a third of `available_bytes()`, or of 4 GiB
+            if that is unknown.
     """
 
     sources: tuple[FrameSource, ...]
@@ -175,18 +181,22 @@ class ImageStore:
             self.cache_bytes = self._cache.budget = max(0, min(cache_bytes, self.cache_bytes))
 
     def get(self, index: int) -> Decoded:
-        """Return rgb [H, W, 3] uint8 and the mask [H, W] uint8 (255 = counts) or None. The tensors are shared: do not modify them.
+        """Return rgb [H, W, 3] uint8 and the mask [H, W] uint8 (255 = counts) or None. The tensors
+        are shared: do not modify them.
 
         Raises InputError if a file is unreadable or has changed its size.
         """
         return self._cache.get(index)
 
     def prefetch(self, indices: Iterable[int], threads: int = 1) -> None:
-        """Decode these frames in the background, in this order. They replace the frames of the previous call.
+        """Decode these frames in the background, in this order. They replace the frames of the
+        previous call.
 
-        At most half of the cache is filled; nothing is done if it has room for fewer than two frames.
+        At most half of the cache is filled; nothing is done if it has room for fewer than two
+        frames.
 
-        threads: Number of threads that decode. The store has at least as many as any call has asked for.
+        threads: Number of threads that decode. The store has at least as many as any call has asked
+        for.
         """
         room, wanted = self.cache_bytes // 2, []
         for index in dict.fromkeys(indices):

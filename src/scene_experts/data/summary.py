@@ -19,8 +19,9 @@ from scene_experts.geometry.neighbours import median_neighbour_distance
 def summarise(capture: Capture) -> dict[str, Any]:
     """Return the facts of a capture as plain values that JSON can hold. Reads no pixels.
 
-    The keys include the kind, the numbers of views, their sizes in px, camera models, the number of points, the split, the
-    resolution policy and the warnings. Lengths are in units of the trained world; `world` maps the capture's own frame to it.
+    The keys include the kind, the numbers of views, their sizes in px, camera models, the number of
+    points, the split, the resolution policy and the warnings. Lengths are in units of the trained
+    world; `world` maps the capture's own frame to it.
     """
     sources, points = capture.images.sources, capture.points
     sizes = Counter(f"{v.camera.width}x{v.camera.height}" for v in capture.views)
@@ -53,7 +54,8 @@ def summarise(capture: Capture) -> dict[str, Any]:
 def neighbour_distance(xyz: Tensor, exact: int = 100_000) -> float:
     """Return the median distance from a point of `xyz` [P, 3] to its nearest neighbour.
 
-    With more than `exact` points, the median is estimated from 256 randomly chosen points to keep it fast.
+    With more than `exact` points, the median is estimated from 256 randomly chosen points to keep
+    it fast.
     """
     if len(xyz) <= exact:
         return median_neighbour_distance(xyz)

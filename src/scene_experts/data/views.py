@@ -42,7 +42,8 @@ class Frame:
 class World:
     """The coordinate frame that a capture is trained in.
 
-    A point is mapped by `trained = (input + shift) * scale`, where `input` is the capture's own frame. Axes are not rotated.
+    A point is mapped by `trained = (input + shift) * scale`, where `input` is the capture's own
+    frame. Axes are not rotated.
     """
 
     scale: float = 1.0
@@ -62,14 +63,16 @@ class World:
         return xyz / self.scale - torch.tensor(self.shift, dtype=xyz.dtype, device=xyz.device)
 
     def camera_from_input(self, camera: Camera) -> Camera:
-        """Map a camera from the capture's own frame to the trained world. The near plane is a length and is scaled too."""
+        """Map a camera from the capture's own frame to the trained world. The near plane is a
+        length and is scaled too."""
         pose = camera.world_to_cam.double()
         shift = torch.tensor(self.shift, dtype=torch.float64, device=pose.device)
         t = (pose[:3, 3] - pose[:3, :3] @ shift) * self.scale  # x_cam = R (X / scale - shift) + t, then lengths times scale
         return _with_translation(camera, t, self.scale)
 
     def camera_to_input(self, camera: Camera) -> Camera:
-        """Map a camera from the trained world to the capture's own frame, the inverse of `camera_from_input`."""
+        """Map a camera from the trained world to the capture's own frame, the inverse of
+        `camera_from_input`."""
         pose = camera.world_to_cam.double()
         shift = torch.tensor(self.shift, dtype=torch.float64, device=pose.device)
         return _with_translation(camera, pose[:3, 3] / self.scale + pose[:3, :3] @ shift, 1 / self.scale)
@@ -88,7 +91,8 @@ def _with_translation(camera: Camera, t: Tensor, scale: float) -> Camera:
 
 @dataclass(frozen=True)
 class Capture:
-    """Photographs with camera poses, ready for training, and the choices that were made while loading them."""
+    """Photographs with camera poses, ready for training, and the choices that were made while
+    loading them."""
 
     name: str
     root: Path
@@ -111,7 +115,8 @@ class Capture:
 
     @property
     def alpha_over(self) -> Vector | None:
-        """RGB in [0, 1] that transparent pixels of the photographs are composited over; None: alpha is a mask."""
+        """RGB in [0, 1] that transparent pixels of the photographs are composited over; None: alpha
+        is a mask."""
         return next((source.background for source in self.images.sources), None)
 
     def frame(self, index: int) -> Frame:
@@ -129,14 +134,17 @@ class Capture:
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
     def chosen(self) -> str:
-        """Return a short hash of the names of the training views if --views leaves some out, else an empty string."""
+        """Return a short hash of the names of the training views if --views leaves some out, else
+        an empty string."""
         names = [self.views[i].name for i in self.train] if self.left_out else []
         return hashlib.sha256(json.dumps(names).encode()).hexdigest()[:16] if names else ""
 
     def poses(self) -> str:
-        """Return the poses of up to four views, the first and the last among them, as text that `same_poses` compares.
+        """Return the poses of up to four views, the first and the last among them, as text that
+        `same_poses` compares.
 
-        Each view has nine numbers: the centre of its camera in the capture's own frame and unit, its forward axis and its down axis.
+        Each view has nine numbers: the centre of its camera in the capture's own frame and unit,
+        its forward axis and its down axis.
         """
         if not self.views:
             return ""
@@ -150,7 +158,8 @@ class Capture:
         return "; ".join(out)
 
     def expect_poses(self, poses: object, run: Path | None) -> None:
-        """Raise InputError, and close the capture, if its cameras are not where they were (`poses`) when `run` was trained."""
+        """Raise InputError, and close the capture, if its cameras are not where they were (`poses`)
+        when `run` was trained."""
         if not same_poses(poses, self.poses()):
             self.images.close()
             raise InputError(
@@ -162,8 +171,9 @@ class Capture:
 def same_poses(one: object, other: object) -> bool:
     """Return whether two texts of `Capture.poses` agree.
 
-    Centres may differ by a thousandth of the largest distance between the cameras, and entries of the axes by 0.001. A value that is no
-    such text agrees with every other, as checkpoints of earlier versions have none.
+    Centres may differ by a thousandth of the largest distance between the cameras, and entries of
+    the axes by 0.001. A value that is no such text agrees with every other, as checkpoints of
+    earlier versions have none.
     """
     ours, theirs = _parse_poses(one), _parse_poses(other)
     if ours is None or theirs is None:

@@ -27,11 +27,13 @@ def evaluate_run(
     step: int | None = None,
     group: Alone | None = None,
 ) -> dict[str, Any]:
-    """Evaluate the newest checkpoint of a run folder, or the one at `step`. data: the folder of the capture, if it has moved.
+    """Evaluate the newest checkpoint of a run folder, or the one at `step`. data: the folder of the
+    capture, if it has moved.
 
     group: The processes that share the views, as in `evaluate`.
 
-    The rasteriser antialiases as the run's recipe does, if it can. Raises InputError if run, checkpoint, capture and options do not fit.
+    The rasteriser antialiases as the run's recipe does, if it can. Raises InputError if run,
+    checkpoint, capture and options do not fit.
     """
     group = group or Alone()
     opened = group.agree(lambda: run_folder.open_run(run, device, step))

@@ -1,4 +1,5 @@
-"""How the experts share a scene: the share of each expert in numbers (Figure 3 of the MoE-GS paper) and in pictures (Figure 5)."""
+"""How the experts share a scene: the share of each expert in numbers (Figure 3 of the MoE-GS paper)
+and in pictures (Figure 5)."""
 
 from __future__ import annotations
 
@@ -62,7 +63,8 @@ def measure_shares(routing: Routing) -> Shares:
 
 @torch.no_grad()
 def measure_scene_shares(scene: Routed, step: int) -> dict[str, Shares]:
-    """Return the shares over all rows of a scene, by attribute. The result is empty for a scene without experts."""
+    """Return the shares over all rows of a scene, by attribute. The result is empty for a scene
+    without experts."""
     return {attribute: measure_shares(routing) for attribute, routing in scene.routing(step).items()}
 
 
@@ -73,9 +75,11 @@ def select_gaussians(gaussians: Gaussians, mask: Tensor) -> Gaussians:
 
 
 def assign_gaussians(decoded: Decoded, attribute: str, K: int) -> Tensor:
-    """Return a mask [M, E] bool: which experts of `attribute` the row of each Gaussian is routed to.
+    """Return a mask [M, E] bool: which experts of `attribute` the row of each Gaussian is routed
+    to.
 
-    While every row uses all experts, a Gaussian is assigned to the expert with the largest gate only.
+    While every row uses all experts, a Gaussian is assigned to the expert with the largest gate
+    only.
     """
     routing = decoded.routing[attribute]
     experts = routing.gates.shape[1]
@@ -89,9 +93,11 @@ def assign_gaussians(decoded: Decoded, attribute: str, K: int) -> Tensor:
 def draw_experts(
     scene: Scene, camera: Camera, step: int, rasterize: Rasterizer, background: Tensor, attribute: str = "color"
 ) -> tuple[Tensor, list[Tensor]]:
-    """Draw the scene [H, W, 3] in [0, 1], and once for each expert of `attribute` the Gaussians of the rows routed to it.
+    """Draw the scene [H, W, 3] in [0, 1], and once for each expert of `attribute` the Gaussians of
+    the rows routed to it.
 
-    With Top-2 routing every row is in two of the pictures. Raises KeyError if the attribute has no experts.
+    With Top-2 routing every row is in two of the pictures. Raises KeyError if the attribute has no
+    experts.
     """
     decoded = scene(camera, step, Mode.DRAW, rasterize.visible)
     mask = assign_gaussians(decoded, attribute, scene.K)
@@ -120,7 +126,8 @@ def draw_expert_strip(
 
 @torch.no_grad()
 def write_expert_strips(folder: Path, scene: Scene, camera: Camera, step: int, rasterize: Rasterizer, background: Tensor) -> None:
-    """Write FOLDER/experts/<attribute>.png, the strip of one view, for each attribute whose Gaussians the experts share at `step`."""
+    """Write FOLDER/experts/<attribute>.png, the strip of one view, for each attribute whose
+    Gaussians the experts share at `step`."""
     for attribute in scene(camera, step, Mode.DRAW, rasterize.visible).routing:
         sheet = draw_expert_strip(scene, camera, step, rasterize, background, attribute, WIDEST)
         pictures.write_picture(folder / "experts" / f"{attribute}.png", sheet)

@@ -1,7 +1,9 @@
-"""Fits the appearance codes of held-out views to the left half of each photograph. Only the right half is then scored.
+"""Fits the appearance codes of held-out views to the left half of each photograph. Only the right
+half is then scored.
 
-This is the protocol of NeRF in the Wild (Martin-Brualla et al. 2021, section 4) for captures whose light changes between views:
-the exposure of a photograph is known only from the photograph, and no pixel is used both to fit and to score.
+This is the protocol of NeRF in the Wild (Martin-Brualla et al. 2021, section 4) for captures whose
+light changes between views: the exposure of a photograph is known only from the photograph, and no
+pixel is used both to fit and to score.
 """
 
 from __future__ import annotations
@@ -34,12 +36,14 @@ def require_codes(scene: Scene) -> Codes:
 
 
 def left_half(height: int, width: int, device: torch.device | str = "cpu") -> Tensor:
-    """Return a mask [H, W] that is 1 on the left half. The middle column of an odd width belongs to the right half."""
+    """Return a mask [H, W] that is 1 on the left half. The middle column of an odd width belongs to
+    the right half."""
     return (torch.arange(width, device=device) < width // 2).float().expand(height, width)
 
 
 def right_half(mask: Tensor | None, height: int, width: int) -> Tensor:
-    """Return the right half of `mask` [H, W] (None: every pixel counts), the pixels that are scored."""
+    """Return the right half of `mask` [H, W] (None: every pixel counts), the pixels that are
+    scored."""
     half = 1.0 - left_half(height, width)
     return half if mask is None else half * mask
 
@@ -54,7 +58,8 @@ def fitted_codes(
     background: Tensor,
     tell: Callable[[int, int], None] = lambda done, total: None,
 ) -> Iterator[None]:
-    """Fit the code of each of the views `chosen`; context manager in which the scene draws them with it. Nothing of it stays in the scene.
+    """Fit the code of each of the views `chosen`; context manager in which the scene draws them
+    with it. Nothing of it stays in the scene.
 
     tell: Called with the number of views that are done and the number of views.
     """
@@ -75,7 +80,8 @@ def fitted_codes(
 def fit_code(
     scene: Scene, codes: Codes, rasterize: Rasterizer, camera: Camera, photo: Tensor, counts: Tensor, step: int, background: Tensor
 ) -> Tensor:
-    """Return the code [dim] with the least L1 error over the counted pixels, starting from the mean of all codes.
+    """Return the code [dim] with the least L1 error over the counted pixels, starting from the mean
+    of all codes.
 
     Args:
         photo: Photograph [H, W, 3] in [0, 1].

@@ -1,9 +1,11 @@
-"""LPIPS v0.1 (Zhang et al., CVPR 2018): the distance between two pictures in the feature space of VGG16 or AlexNet.
+"""LPIPS v0.1 (Zhang et al., CVPR 2018): the distance between two pictures in the feature space of
+VGG16 or AlexNet.
 
     d(x, y) = sum_l mean_hw sum_c w_lc (f_l(x) / |f_l(x)| - f_l(y) / |f_l(y)|)^2
 
-f_l are five ReLU outputs of the backbone, |.| is the norm over channels at one pixel, and w_l >= 0 are learned weights. Pictures
-are [H, W, 3], features [2, C, h, w] (both pictures together). Large pictures are processed in strips of rows; the result is exact.
+f_l are five ReLU outputs of the backbone, |.| is the norm over channels at one pixel, and w_l >= 0
+are learned weights. Pictures are [H, W, 3], features [2, C, h, w] (both pictures together). Large
+pictures are processed in strips of rows; the result is exact.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ class Conv:
 
 @dataclass(frozen=True)
 class Stage:
-    """The convolutions up to one of the five outputs that are compared. `pool`: kernel and stride of the max pooling before them."""
+    """The convolutions up to one of the five outputs that are compared. `pool`: kernel and stride
+    of the max pooling before them."""
 
     convs: tuple[Conv, ...]
     pool: tuple[int, int] | None = None
@@ -66,7 +69,8 @@ SMALLEST = {"vgg": 16, "alex": 31}  # px; a smaller side leaves no features afte
 
 
 def tensor_shapes(net: str) -> dict[str, tuple[int, ...]]:
-    """Return the names and shapes of the tensors of `net` ("vgg" or "alex"): conv<i>.weight, conv<i>.bias and lin<l> (w_l)."""
+    """Return the names and shapes of the tensors of `net` ("vgg" or "alex"): conv<i>.weight,
+    conv<i>.bias and lin<l> (w_l)."""
     out: dict[str, tuple[int, ...]] = {}
     convs = [conv for stage in BACKBONES[net] for conv in stage.convs]
     for i, conv in enumerate(convs):
@@ -78,7 +82,8 @@ def tensor_shapes(net: str) -> dict[str, tuple[int, ...]]:
 
 
 class Lpips:
-    """LPIPS with one backbone: `Lpips("vgg", tensors)(x, y)`. The names of `tensors` are those of `tensor_shapes`."""
+    """LPIPS with one backbone: `Lpips("vgg", tensors)(x, y)`. The names of `tensors` are those of
+    `tensor_shapes`."""
 
     net: str
     tensors: dict[str, Tensor]
@@ -101,7 +106,8 @@ class Lpips:
     def __call__(self, x: Tensor, y: Tensor) -> float:
         """Return the distance between two pictures [H, W, 3] of one size, 0 for identical ones.
 
-        The network was trained on RGB in [-1, 1]. Raises InputError if a side is below 16 px (VGG) or 31 px (AlexNet).
+        The network was trained on RGB in [-1, 1]. Raises InputError if a side is below 16 px (VGG)
+        or 31 px (AlexNet).
         """
         if x.shape != y.shape or x.dim() != 3 or x.shape[2] != 3:
             raise ValueError(f"expected two pictures [H, W, 3] of one size, found {tuple(x.shape)} and {tuple(y.shape)}")
@@ -123,7 +129,8 @@ class Lpips:
         return total
 
     def stage(self, f: Tensor, stage: Stage, first: int, level: int, pool: tuple[int, int] | None) -> tuple[float, Tensor]:
-        """Return one term of the distance and the input of the next stage. `first` is the index of the stage's first convolution."""
+        """Return one term of the distance and the input of the next stage. `first` is the index of
+        the stage's first convolution."""
         rows, halo, height = self.strip_rows(f, stage, pool), stage.halo, f.shape[2]
         total, count, following = 0.0, 0, []
         for top in range(0, height, rows):
@@ -140,7 +147,8 @@ class Lpips:
 
     @staticmethod
     def strip_rows(f: Tensor, stage: Stage, pool: tuple[int, int] | None) -> int:
-        """Return the number of rows per strip: all rows if strides or overlapping pools would not align at a cut."""
+        """Return the number of rows per strip: all rows if strides or overlapping pools would not
+        align at a cut."""
         if any(conv.stride != 1 for conv in stage.convs) or pool not in (None, (2, 2)):
             return f.shape[2]
         rows = STRIP // (2 * max(conv.outputs for conv in stage.convs) * f.shape[3])
@@ -154,7 +162,8 @@ class Lpips:
         return f
 
     def distance(self, f: Tensor, level: int) -> float:
-        """Return sum_hw sum_c w_c (x - y)^2 of the features f [2, C, h, w] after normalising them to unit length."""
+        """Return sum_hw sum_c w_c (x - y)^2 of the features f [2, C, h, w] after normalising them
+        to unit length."""
         unit = f / (f.square().sum(1, keepdim=True).sqrt() + EPS)
         squared = (unit[0] - unit[1]).square()
         return float((squared * self.tensors[f"lin{level}"][:, None, None]).sum(dtype=torch.float64))

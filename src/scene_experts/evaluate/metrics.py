@@ -1,7 +1,9 @@
-"""Scores of a rendered picture against its photograph: PSNR, SSIM, LPIPS, sharpness. Each name stands for one exact variant.
+"""Scores of a rendered picture against its photograph: PSNR, SSIM, LPIPS, sharpness. Each name
+stands for one exact variant.
 
-Pictures are [H, W, 3] float RGB in [0, 1] with 8-bit values, masks [H, W] in [0, 1] (1 = the pixel counts). With a mask, only
-counted pixels are scored: the photograph replaces the rest of the render, and the dissimilarity is divided by the counted area.
+Pictures are [H, W, 3] float RGB in [0, 1] with 8-bit values, masks [H, W] in [0, 1] (1 = the pixel
+counts). With a mask, only counted pixels are scored: the photograph replaces the rest of the
+render, and the dissimilarity is divided by the counted area.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def sharpness(image: Tensor, mask: Tensor | None = None) -> float:
-    """Return the mean norm of the brightness gradient (forward differences per pixel). Blur lowers it; 0 for a side of 1 px."""
+    """Return the mean norm of the brightness gradient (forward differences per pixel). Blur lowers
+    it; 0 for a side of 1 px."""
     gray = image.mean(dim=2)
     if min(gray.shape) < 2:
         return 0.0
@@ -59,7 +62,8 @@ def sharpness(image: Tensor, mask: Tensor | None = None) -> float:
 
 
 def _fill_masked(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, float]:
-    """Return the render with the photograph where pixels do not count, and the fraction of the picture that counts."""
+    """Return the render with the photograph where pixels do not count, and the fraction of the
+    picture that counts."""
     if mask is None:
         return image, 1.0
     return torch.lerp(target, image, mask[..., None]), float(mask.mean())
@@ -110,7 +114,8 @@ class Perceptual:
         return cls(absent=dict.fromkeys(NETWORKS, "not computed: evaluate again without --no-lpips"))
 
     def __call__(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> dict[str, float]:
-        """Return the scores of the available variants by name. Variants that this picture is too small for are added to `absent`."""
+        """Return the scores of the available variants by name. Variants that this picture is too
+        small for are added to `absent`."""
         filled, area = _fill_masked(image, target, mask)
         out: dict[str, float] = {}
         for metric, backbone in NETWORKS.items():
@@ -126,7 +131,8 @@ class Perceptual:
 
 
 def score(image: Tensor, target: Tensor, mask: Tensor | None, perceptual: Perceptual) -> dict[str, float]:
-    """Return every score of one view by name, with the sharpness of the render and of the photograph."""
+    """Return every score of one view by name, with the sharpness of the render and of the
+    photograph."""
     with _full_precision():
         return {
             "psnr": psnr(image, target, mask),
@@ -139,7 +145,8 @@ def score(image: Tensor, target: Tensor, mask: Tensor | None, perceptual: Percep
 
 @contextmanager
 def _full_precision() -> Iterator[None]:
-    """Compute convolutions in float32 on CUDA. By default cuDNN rounds inputs to 10 bits (TF32), which changes SSIM and LPIPS."""
+    """Compute convolutions in float32 on CUDA. By default cuDNN rounds inputs to 10 bits (TF32),
+    which changes SSIM and LPIPS."""
     before = torch.backends.cudnn.allow_tf32
     torch.backends.cudnn.allow_tf32 = False
     try:

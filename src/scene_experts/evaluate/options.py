@@ -14,8 +14,9 @@ class EvalOptions:
     views: Literal["test", "train"] = "test"
     """Which views to score: the held-out views, or the training views."""
     appearance: Literal["rule", "half"] = "rule"
-    """For scenes with appearance codes. rule: held-out views use the code that the recipe chooses. half: the code is fitted to the left
-    half of each photograph and the right half is scored (protocol of NeRF in the Wild); the results get files of their own."""
+    """For scenes with appearance codes. rule: held-out views use the code that the recipe chooses.
+    half: the code is fitted to the left half of each photograph and the right half is scored
+    (protocol of NeRF in the Wild); the results get files of their own."""
     lpips: bool = True
     """Score LPIPS if its weights are on this machine."""
     lpips_weights: Path | None = None

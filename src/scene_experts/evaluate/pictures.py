@@ -1,4 +1,5 @@
-"""The pictures of an evaluation as 8-bit PNG files: renders, photographs, error maps, comparisons, and captioned rows."""
+"""The pictures of an evaluation as 8-bit PNG files: renders, photographs, error maps, comparisons,
+and captioned rows."""
 
 from __future__ import annotations
 
@@ -55,7 +56,8 @@ def remove_pictures(folder: Path) -> None:
 
 @contextmanager
 def replacing(folder: Path, first: bool = True) -> Iterator[Path]:
-    """Context manager that yields an empty folder for new pictures. At its end they replace those in `folder`.
+    """Context manager that yields an empty folder for new pictures. At its end they replace those
+    in `folder`.
 
     After an error the pictures in `folder` are unchanged and the new ones are removed.
     first: Whether this process owns the folder; others only write into it.
@@ -103,13 +105,15 @@ def color_errors(error: np.ndarray) -> np.ndarray:
 
 
 def draw_error_map(render: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
-    """Draw the mean absolute difference over RGB, uint8 [H, W, 3]. Pixels that the mask excludes are black."""
+    """Draw the mean absolute difference over RGB, uint8 [H, W, 3]. Pixels that the mask excludes
+    are black."""
     error = np.abs(render.astype(np.float32) - photo.astype(np.float32)).mean(axis=2) / 255
     return color_errors(error if mask is None else error * (mask.astype(np.float32) / 255))
 
 
 def compose_comparison(photo: np.ndarray, render: np.ndarray, errors: np.ndarray, captions: tuple[str, str, str]) -> np.ndarray:
-    """Compose photograph, render and error map in a row, each with a caption and the last with a colour scale."""
+    """Compose photograph, render and error map in a row, each with a caption and the last with a
+    colour scale."""
     width = photo.shape[1]
     sheet = _draw_row((photo, render, errors), captions)
     _draw_scale(ImageDraw.Draw(sheet), sheet.width, width)
@@ -117,7 +121,8 @@ def compose_comparison(photo: np.ndarray, render: np.ndarray, errors: np.ndarray
 
 
 def compose_row(parts: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
-    """Compose pictures of one size in a row, each with a caption that is legible when the row is shown `PAGE` px wide."""
+    """Compose pictures of one size in a row, each with a caption that is legible when the row is
+    shown `PAGE` px wide."""
     return np.asarray(_draw_row(parts, captions, max(1.0, len(parts) * parts[0].shape[1] / PAGE)))
 
 
@@ -137,7 +142,8 @@ def _draw_row(parts: Sequence[np.ndarray], captions: Sequence[str], scale: float
 def _fit_text(draw: ImageDraw.ImageDraw, text: str, room: int, largest: int) -> tuple[str, ImageFont.ImageFont | ImageFont.FreeTypeFont]:
     """Return the text and the largest font of 9 to `largest` px in which it fits.
 
-    Parts of a text are separated by two spaces; the last parts are dropped if the text does not fit at 9 px.
+    Parts of a text are separated by two spaces; the last parts are dropped if the text does not fit
+    at 9 px.
     """
     parts, font = text.split("  "), ImageFont.load_default(9)
     while True:
@@ -151,7 +157,8 @@ def _fit_text(draw: ImageDraw.ImageDraw, text: str, room: int, largest: int) -> 
 
 
 def _draw_scale(draw: ImageDraw.ImageDraw, right: int, width: int) -> None:
-    """Draw the colours from 0 to `WORST` at the right end of the caption bar, if there is room beside the caption."""
+    """Draw the colours from 0 to `WORST` at the right end of the caption bar, if there is room
+    beside the caption."""
     length = min(90, width // 4)
     if length < 40:
         return

@@ -1,4 +1,5 @@
-"""results.json: what it states about an evaluation, how it is read back, and when the scores of two runs may be compared."""
+"""results.json: what it states about an evaluation, how it is read back, and when the scores of two
+runs may be compared."""
 
 from __future__ import annotations
 
@@ -62,7 +63,8 @@ def mean_over_views(per_view: dict[str, dict[str, Any]], key: str) -> float | No
 
 
 def describe_scores(per_view: dict[str, dict[str, Any]], perceptual: Perceptual) -> dict[str, Any]:
-    """Return the mean scores. A variant that is absent for any view is null, and `absent` states the reason.
+    """Return the mean scores. A variant that is absent for any view is null, and `absent` states
+    the reason.
 
     Raises InputError if masks exclude every pixel of every view.
     """
@@ -82,7 +84,8 @@ def describe_scores(per_view: dict[str, dict[str, Any]], perceptual: Perceptual)
 
 
 def describe_size(scene: Scene) -> dict[str, Any]:
-    """Return the sizes in bytes of the scene in its family's PLY file and of its networks, and the total in MB and MiB.
+    """Return the sizes in bytes of the scene in its family's PLY file and of its networks, and the
+    total in MB and MiB.
 
     A row has float32 values: 316 bytes per anchor for K = 10 and F = 32, 248 bytes per Gaussian.
     """
@@ -93,7 +96,8 @@ def describe_size(scene: Scene) -> dict[str, Any]:
 
 
 def describe_scene(scene: Scene, step: int) -> dict[str, Any]:
-    """Return the size of the scene, the numbers of its rows and Gaussians, and the shares of its experts."""
+    """Return the size of the scene, the numbers of its rows and Gaussians, and the shares of its
+    experts."""
     rows = len(scene.table)
     return {
         "size": describe_size(scene),
@@ -137,7 +141,8 @@ def describe_run(about: About, step: int, rasterize: Rasterizer, perceptual: Per
 
 
 def find_failed(per_view: dict[str, dict[str, Any]]) -> list[str]:
-    """Return the names of the views whose PSNR is more than FAILED below the (upper) median of all, the worst first."""
+    """Return the names of the views whose PSNR is more than FAILED below the (upper) median of all,
+    the worst first."""
     scored = {name: facts["psnr"] for name, facts in per_view.items() if isinstance(facts.get("psnr"), (int, float))}
     if not scored:
         return []
@@ -187,7 +192,8 @@ def find_outdated(names: Sequence[str], runs: Sequence[Path], results: Sequence[
 
 
 def find_difference(names: Sequence[str], results: Sequence[dict[str, Any]]) -> tuple[str, str] | None:
-    """Return the first difference in what was scored, in words, and the option that sets it; None if scores may be compared."""
+    """Return the first difference in what was scored, in words, and the option that sets it; None
+    if scores may be compared."""
     for (first, one), (second, other) in combinations(zip(names, results), 2):
         for key, (what, option) in PROTOCOL.items():
             if key in MAY_LACK and not (key in one and key in other):
@@ -201,7 +207,8 @@ def find_difference(names: Sequence[str], results: Sequence[dict[str, Any]]) -> 
 
 
 def check_protocol(names: Sequence[str], results: Sequence[dict[str, Any]]) -> None:
-    """Raise InputError with the first difference in what was scored. The resolution alone changes PSNR by up to 0.5 dB."""
+    """Raise InputError with the first difference in what was scored. The resolution alone changes
+    PSNR by up to 0.5 dB."""
     if found := find_difference(names, results):
         raise InputError(
             f"expected runs with {found[0]}; repeat one with the {found[1]} of the other, or compare them nevertheless with --mixed"

@@ -1,11 +1,13 @@
-"""Evaluates a trained scene: renders views to disk, scores the 8-bit files, and states everything that the scores depend on.
+"""Evaluates a trained scene: renders views to disk, scores the 8-bit files, and states everything
+that the scores depend on.
 
-OUT/test/{renders,gt,errors,side_by_side}/<view name>.png    pictures of each view; masks/ if the capture has masks
-OUT/test/experts/<attribute>.png                             the first view drawn for each expert alone, if the scene has experts
-OUT/results.json, OUT/per_view.json                          mean scores and scores of each view
+OUT/test/{renders,gt,errors,side_by_side}/<view name>.png    pictures of each view; masks/ if the
+capture has masks OUT/test/experts/<attribute>.png                             the first view drawn
+for each expert alone, if the scene has experts OUT/results.json, OUT/per_view.json
+mean scores and scores of each view
 
-The names change with the options: OUT/train and results_train.json for training views, OUT/test_half and results_half.json for
-appearance codes that are fitted to half of each photograph.
+The names change with the options: OUT/train and results_train.json for training views,
+OUT/test_half and results_half.json for appearance codes that are fitted to half of each photograph.
 """
 
 from __future__ import annotations
@@ -64,7 +66,8 @@ def evaluate(
         step: Iteration whose schedule values (such as Top-k) the scene uses.
         about: Facts about the training for the results file.
         progress: Called with the name of the work, how much is done and how much there is.
-        group: The processes that share the views; None: this process alone. Process 0 measures the speed and writes the results.
+        group: The processes that share the views; None: this process alone. Process 0 measures the
+            speed and writes the results.
 
     Returns:
         The content of results.json; empty in other processes than process 0.
@@ -131,7 +134,8 @@ def evaluate(
 def choose_views(capture: Capture, options: EvalOptions) -> tuple[int, ...]:
     """Return the views to score.
 
-    Raises InputError for an unknown word in the options, if there are no views, or if codes would be fitted to training views.
+    Raises InputError for an unknown word in the options, if there are no views, or if codes would
+    be fitted to training views.
     """
     expect_words(options)
     views = options.views
@@ -164,7 +168,8 @@ class Drawing:
 
     @torch.no_grad()
     def draw(self, capture: Capture, index: int, camera: Camera, file: str) -> dict[str, Any]:
-        """Draw view `index`, write the render, the photograph and the mask, and return the counts of the view."""
+        """Draw view `index`, write the render, the photograph and the mask, and return the counts
+        of the view."""
         frame = capture.frame(index)
         decoded = self.draws(camera, self.step, Mode.DRAW, self.rasterize.visible)
         render = self.rasterize(decoded.gaussians, camera, self.background)
@@ -183,7 +188,8 @@ class Drawing:
 
 
 def count_gaussians(decoded: Decoded, render: Render) -> dict[str, Any]:
-    """Return the counts of one view. The activation ratio is the fraction of Gaussians with positive opacity (MoE-GS, Table 3)."""
+    """Return the counts of one view. The activation ratio is the fraction of Gaussians with
+    positive opacity (MoE-GS, Table 3)."""
     raw = decoded.raw_opacity
     return {
         "anchors_visible": len(decoded.rows),
@@ -194,7 +200,8 @@ def count_gaussians(decoded: Decoded, render: Render) -> dict[str, Any]:
 
 
 def score_files(folder: Path, file: str, perceptual: Perceptual, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Return the scores of one view from its 8-bit files. The result is empty if the mask excludes every pixel."""
+    """Return the scores of one view from its 8-bit files. The result is empty if the mask excludes
+    every pixel."""
     render, photo = (pictures.from_8bit(pictures.read_picture(folder / kind / file)).to(device) for kind in ("renders", "gt"))
     path = folder / "masks" / file
     mask = pictures.from_8bit(pictures.read_picture(path, "L")).to(device) if path.is_file() else None
@@ -204,7 +211,8 @@ def score_files(folder: Path, file: str, perceptual: Perceptual, device: torch.d
 
 
 def write_comparison(folder: Path, file: str, scores: dict[str, Any]) -> None:
-    """Write the error map, and photograph, render and error map beside each other with their scores."""
+    """Write the error map, and photograph, render and error map beside each other with their
+    scores."""
     render, photo = pictures.read_picture(folder / "renders" / file), pictures.read_picture(folder / "gt" / file)
     mask = folder / "masks" / file
     errors = pictures.draw_error_map(render, photo, pictures.read_picture(mask, "L") if mask.is_file() else None)

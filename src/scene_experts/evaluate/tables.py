@@ -1,4 +1,5 @@
-"""Tables of the results of several runs, and of the paper's numbers, for terminals, in Markdown and in CSV."""
+"""Tables of the results of several runs, and of the paper's numbers, for terminals, in Markdown and
+in CSV."""
 
 from __future__ import annotations
 
@@ -89,7 +90,8 @@ class ResultTable:
 
 
 def make_table(names: Sequence[str], results: Sequence[dict[str, Any]], columns: Sequence[ResultColumn] = COLUMNS) -> ResultTable:
-    """Make a table with one row per result. Columns without values are omitted; notes explain absent scores."""
+    """Make a table with one row per result. Columns without values are omitted; notes explain
+    absent scores."""
     values = [[column.value(result) for column in columns] for result in results]
     used = [j for j in range(len(columns)) if any(row[j] is not None for row in values)]
     best: set[tuple[int, int]] = set()
@@ -115,7 +117,8 @@ def explain(titles: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _name_scene_rows(results: Sequence[dict[str, Any]]) -> str:
-    """Return what the rows of the scenes are called. Results without an activation ratio belong to explicit Gaussians."""
+    """Return what the rows of the scenes are called. Results without an activation ratio belong to
+    explicit Gaussians."""
     explicit = {result.get("activation_ratio") is None for result in results if result.get("anchors") is not None}
     return "Gaussians" if explicit == {True} else "anchors" if explicit == {False} else "anchors or Gaussians"
 
@@ -133,7 +136,8 @@ def _explain_absent(names: Sequence[str], results: Sequence[dict[str, Any]]) -> 
 
 
 def _warn_of_few_views(results: Sequence[dict[str, Any]]) -> tuple[str, ...]:
-    """Return a note where so few held-out views were scored that differences between runs are chance."""
+    """Return a note where so few held-out views were scored that differences between runs are
+    chance."""
     counts = [count for result in results if (count := result.get("view_count")) and result.get("views") != "train"]
     if len(counts) < 2 or min(counts) >= FEW_VIEWS:
         return ()
@@ -188,12 +192,14 @@ def _measure_width(table: ResultTable) -> int:
 
 
 def name_runs(runs: Sequence[Path], results: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a distinct name for each run from the recipe in its results, see `distinguish_runs`."""
+    """Return a distinct name for each run from the recipe in its results, see
+    `distinguish_runs`."""
     return distinguish_runs(runs, [sentence(result.get("recipe") or run.name) for run, result in zip(runs, results)])
 
 
 def distinguish_runs(runs: Sequence[Path], recipes: Sequence[str]) -> list[str]:
-    """Return a distinct name for each run: the recipe, or the name of the run folder with it, or the whole path with it."""
+    """Return a distinct name for each run: the recipe, or the name of the run folder with it, or
+    the whole path with it."""
     for names in (list(recipes), [f"{run.resolve().name} ({recipe})" for run, recipe in zip(runs, recipes)]):
         if len(set(names)) == len(names):
             return names
@@ -201,9 +207,11 @@ def distinguish_runs(runs: Sequence[Path], recipes: Sequence[str]) -> list[str]:
 
 
 def compare_runs(runs: Sequence[Path], format: Format, mixed: bool, console: Console, paper: str | None = None) -> ResultTable:
-    """Print a table of evaluated runs, followed by the paper's numbers for the data set `paper`, and return it.
+    """Print a table of evaluated runs, followed by the paper's numbers for the data set `paper`,
+    and return it.
 
-    Raises InputError if the runs were scored on different photographs (see `check_protocol`), unless `mixed` is set.
+    Raises InputError if the runs were scored on different photographs (see `check_protocol`),
+    unless `mixed` is set.
     """
     if not runs:
         raise InputError("expected at least one run folder, found none; give the folders that `scene-experts train --out` wrote")
@@ -267,9 +275,11 @@ def load_paper() -> dict[str, Any]:
 
 
 def paper_results(dataset: str) -> dict[str, dict[str, Any]]:
-    """Return the paper's results for a data set of its tables 1 and 2, by "<method> (paper)" and shaped like results.json.
+    """Return the paper's results for a data set of its tables 1 and 2, by "<method> (paper)" and
+    shaped like results.json.
 
-    Its LPIPS follows the convention of 3DGS and is `lpips_3dgs`. Raises InputError for a data set without a table.
+    Its LPIPS follows the convention of 3DGS and is `lpips_3dgs`. Raises InputError for a data set
+    without a table.
     """
     tables = {**_select_datasets("table1"), **_select_datasets("table2")}
     if dataset not in tables:

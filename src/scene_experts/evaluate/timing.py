@@ -1,6 +1,8 @@
-"""Measures how fast a trained scene draws: visibility filter, decode and rasterisation, without reading or writing pictures.
+"""Measures how fast a trained scene draws: visibility filter, decode and rasterisation, without
+reading or writing pictures.
 
-Two decodes are measured: that of the frozen scene (`Scene.frozen`), which determines the frames per second, and that of training.
+Two decodes are measured: that of the frozen scene (`Scene.frozen`), which determines the frames per
+second, and that of training.
 """
 
 from __future__ import annotations

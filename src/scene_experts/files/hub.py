@@ -1,8 +1,9 @@
-"""A folder for a model hub: a trained scene in several formats, a picture, and a card (README.md) that hubs read.
+"""A folder for a model hub: a trained scene in several formats, a picture, and a card (README.md)
+that hubs read.
 
-The card begins with YAML: licence, tags, and the scores of `scene-experts eval` where the run was evaluated at this iteration.
-Whoever publishes a scene must know the licence of its photographs: licence texts beside them are copied, and the card says where none
-was stated.
+The card begins with YAML: licence, tags, and the scores of `scene-experts eval` where the run was
+evaluated at this iteration. Whoever publishes a scene must know the licence of its photographs:
+licence texts beside them are copied, and the card says where none was stated.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ _LONGEST = 1 << 20  # bytes of such a text
 
 
 def default_formats(run: OpenRun) -> tuple[str, ...]:
-    """The formats of a folder for which none was chosen: the small one that keeps the networks, where the family has one, and SPZ."""
+    """The formats of a folder for which none was chosen: the small one that keeps the networks,
+    where the family has one, and SPZ."""
     return ("compact", "spz") if "compact" in formats_of(run.scene.traits.family, ("compact",)) else ("spz",)
 
 
@@ -62,7 +64,8 @@ def write_hub(
         folder: Folder to write; files of the same names are replaced.
         formats: Names of formats; none for `default_formats`.
         options: What the files hold, as for `export`.
-        licence: Licence of the photographs and so of the scene, as hubs name it: "mit", "cc-by-4.0".
+        licence: Licence of the photographs and so of the scene, as hubs name it: "mit",
+            "cc-by-4.0".
         tell: Called with the progress: what, done, total.
         command: The command line, kept in the files' notes.
 
@@ -89,7 +92,8 @@ def write_hub(
 
 
 def find_scores(run: OpenRun) -> dict[str, Any]:
-    """The content of results.json; empty where the run was not evaluated. Scores of another iteration are left out, with a warning."""
+    """The content of results.json; empty where the run was not evaluated. Scores of another
+    iteration are left out, with a warning."""
     try:
         scores = load_results(run.path)
     except InputError:
@@ -124,8 +128,8 @@ def copy_notices(capture: Path, folder: Path) -> list[str]:
 def make_card(
     run: OpenRun, files: Sequence[Written], scores: dict[str, Any], licence: str, notices: Sequence[str], imports: bool = True
 ) -> str:
-    """The text of the card. scores: the content of results.json, or empty. imports: whether `import` reads the first of the files, or
-    the result folder that it is in."""
+    """The text of the card. scores: the content of results.json, or empty. imports: whether
+    `import` reads the first of the files, or the result folder that it is in."""
     recipe, scene = run.config.train.recipe, run.config.data.path.name or "scene"
     metrics = [{"type": name, "name": title, "value": round(float(scores[name]), 4)} for name, title in METRICS.items() if scores.get(name)]
     head: dict[str, Any] = {

@@ -25,7 +25,8 @@ log: logging.Logger = logging.getLogger(__name__)
 
 
 def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
-    """Merge trained blocks into one scene: from each run, the anchors inside its own box. Returns the number of anchors.
+    """Merge trained blocks into one scene: from each run, the anchors inside its own box. Returns
+    the number of anchors.
 
     Args:
         plan: The folder of the plan.
@@ -33,8 +34,9 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
         out: New run folder, with configuration, checkpoint and result folder.
 
     Raises:
-        InputError: The number of runs differs from that of the blocks, a run was trained for another box, or the runs have other
-            captures, lattices or networks than the first one. The message names the run.
+        InputError: The number of runs differs from that of the blocks, a run was trained for
+            another box, or the runs have other captures, lattices or networks than the first one.
+            The message names the run.
     """
     fingerprint, blocks = read_plan(plan)
     if len(runs) != len(blocks):
@@ -84,7 +86,8 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
 
 
 def _check_box(blocks: Sequence[Block], number: int, run: OpenRun) -> None:
-    """Raise InputError if a run was trained for another box than that of its block. Warns if its training has not ended."""
+    """Raise InputError if a run was trained for another box than that of its block. Warns if its
+    training has not ended."""
     train, last = run.config.train, run.config.stop_at or run.config.train.iterations
     bounds = train.growth.box  # empty: a run that creates anchors everywhere fits every block
     if bounds and not _is_same_box(bounds, blocks[number]):

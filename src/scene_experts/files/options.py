@@ -13,10 +13,12 @@ MAX_DEGREE = 3  # of spherical harmonics in any format
 
 @dataclass(frozen=True)
 class Options:
-    """What to write, and whether to measure it. All but `measure` are for formats of standard Gaussians."""
+    """What to write, and whether to measure it. All but `measure` are for formats of standard
+    Gaussians."""
 
     measure: bool = True
-    """Draw the held-out views from the run and from the file, and say what the file costs in PSNR."""
+    """Draw the held-out views from the run and from the file, and say what the file costs in
+    PSNR."""
     sh_degree: int = MAX_DEGREE
     """Standard files: degree of the spherical harmonics, 0 (smallest file) to 3 (best)."""
     max_gaussians: int = 0
@@ -31,12 +33,12 @@ class Options:
     frame: Literal["capture", "trained"] = "capture"
     """Standard files: the capture's own frame, or the frame that the scene was trained in."""
     crop: Annotated[str | None, Option(value="SHAPE")] = None
-    """Standard files: keep what is inside sphere:RADIUS (around the point that the cameras look at; 1.2x
-    counts in their distance from it), sphere:X,Y,Z,RADIUS or box:X0,Y0,Z0,X1,Y1,Z1, in the units of
-    the capture's poses."""
+    """Standard files: keep what is inside sphere:RADIUS (around the point that the cameras look at;
+    1.2x counts in their distance from it), sphere:X,Y,Z,RADIUS or box:X0,Y0,Z0,X1,Y1,Z1, in the
+    units of the capture's poses."""
     floaters: Literal["keep", "remove"] = "keep"
-    """Standard files: remove Gaussians that no training photograph supports: those that cover less than
-    0.3 pixels of each, and large, faint ones that fewer than 4 show."""
+    """Standard files: remove Gaussians that no training photograph supports: those that cover less
+    than 0.3 pixels of each, and large, faint ones that fewer than 4 show."""
     title: str | None = None
     """html: title of the page; by default it names the capture."""
     levels: bool = False

@@ -65,7 +65,8 @@ Note = dict[str, Any]
 
 @dataclass(frozen=True)
 class Format:
-    """A file format: what it is called, what it can hold, and how it is written, recognised and read."""
+    """A file format: what it is called, what it can hold, and how it is written, recognised and
+    read."""
 
     suffix: str
     """How file names end, with the dot; empty for the result folder of a family."""
@@ -90,13 +91,17 @@ class Format:
     sh_degree: int = 3
     """Highest degree of spherical harmonics that a file holds."""
     antialias: bool = False
-    """The writer uses the entry `antialias` of the note: whether to draw the Gaussians with antialiasing."""
+    """The writer uses the entry `antialias` of the note: whether to draw the Gaussians with
+    antialiasing."""
     is_antialiased: Callable[[Path], bool] | None = None
-    """is_antialiased(path): whether a file says that it is drawn with antialiasing. None: files do not say."""
+    """is_antialiased(path): whether a file says that it is drawn with antialiasing. None: files do
+    not say."""
     needs: Callable[[], None] | None = None
-    """needs(): raises InputError where a library that the writer needs is missing. It is called before a scene is baked."""
+    """needs(): raises InputError where a library that the writer needs is missing. It is called
+    before a scene is baked."""
     view_note: Callable[[Capture, World], Note] | None = None
-    """view_note(capture, world): entries about the capture's cameras that the writer adds to the note."""
+    """view_note(capture, world): entries about the capture's cameras that the writer adds to the
+    note."""
 
     @property
     def is_folder(self) -> bool:
@@ -135,7 +140,8 @@ class Family(Protocol):
         ...
 
     def write(self, run: OpenRun, world: World, folder: Path, about: dict[str, Any]) -> dict[str, Any]:
-        """Write the scene into `folder` (point_cloud/iteration_N of a result folder); about: the description.
+        """Write the scene into `folder` (point_cloud/iteration_N of a result folder); about: the
+        description.
 
         Returns the settings for cfg_args, which readers of the 3DGS family look up; empty for none.
         Raises RunError when the disk is full.
@@ -147,7 +153,8 @@ class Family(Protocol):
         ...
 
     def find(self, source: Path, iteration: int | None) -> Path | None:
-        """The part of the result folder `source` that `read` takes; None where the folder holds another family."""
+        """The part of the result folder `source` that `read` takes; None where the folder holds
+        another family."""
         ...
 
     def read(self, source: Path, data: Data, iteration: int | None) -> Imported:
@@ -225,7 +232,8 @@ def formats_of(family: str, names: Iterable[str] | None = None) -> dict[str, For
 
 
 def recognise(path: Path) -> tuple[str, Format]:
-    """The format of a file, by its first bytes; formats without a signature by whatever they look at, last.
+    """The format of a file, by its first bytes; formats without a signature by whatever they look
+    at, last.
 
     Raises InputError for a missing file and for one of no known format.
     """

@@ -1,7 +1,8 @@
 """Result folders of the 3DGS family, read: point_cloud/iteration_N with our description of the
 scene, and cfg_args above it.
 
-Published folders have no description. Everything in a folder is in the capture's own frame and unit.
+Published folders have no description. Everything in a folder is in the capture's own frame and
+unit.
 """
 
 from __future__ import annotations
@@ -114,7 +115,8 @@ def expect_world(trained: World, found: World) -> None:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """The settings in cfg_args of the result folder above an iteration's folder; empty without the file.
+    """The settings in cfg_args of the result folder above an iteration's folder; empty without the
+    file.
 
     The file is the text of a Python namespace, `Namespace(voxel_size=0.001, ...)`. Its values are
     parsed as literals and never evaluated; others (a path object, a call) are left out. Raises

@@ -1,5 +1,5 @@
-"""Result folders of the 3DGS family, written: point_cloud/iteration_N with the scene and our description
-of it, cfg_args and cameras.json above it. `result_folder.py` reads them."""
+"""Result folders of the 3DGS family, written: point_cloud/iteration_N with the scene and our
+description of it, cfg_args and cameras.json above it. `result_folder.py` reads them."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def result_warnings(run: OpenRun) -> list[str]:
 
 
 def write_scene_folder(run: OpenRun, family: Family, world: World, out: Path, width: int | None) -> Path:
-    """Write point_cloud/iteration_N with the scene and its description, and cfg_args above it; return
-    the iteration's folder. The description comes last: a folder that has it is complete.
+    """Write point_cloud/iteration_N with the scene and its description, and cfg_args above it;
+    return the iteration's folder. The description comes last: a folder that has it is complete.
 
     width: Of the views trained on, in px; None if it is unknown.
     """
@@ -56,7 +56,8 @@ def write_scene_folder(run: OpenRun, family: Family, world: World, out: Path, wi
 
 
 def width_in(path: Path) -> int | None:
-    """Return the width in px of the first view of a cameras.json, or None if the file does not say it."""
+    """Return the width in px of the first view of a cameras.json, or None if the file does not say
+    it."""
     try:
         width = read_json(path, "list of views")[0]["width"]
     except (InputError, LookupError, TypeError):
@@ -68,15 +69,16 @@ def capture_settings(data: Data, width: int | None = None) -> dict[str, Any]:
     """Return the settings for cfg_args that say where the capture is and how the published tools
     read it, as closely as their settings can express ours.
 
-    source_path is the path that the run was given. resolution: -1 limits the width to 1600 px, 1, 2,
-    4 and 8 divide the sides, other numbers are the width in px: `width`, that of the views trained on.
-    Where it is unknown, -1 stands for a width that only the photographs tell. eval holds out every 8th
-    view; with lod, from 1 to 49, the views 0 to lod instead.
+    source_path is the path that the run was given. resolution: -1 limits the width to 1600 px, 1,
+    2, 4 and 8 divide the sides, other numbers are the width in px: `width`, that of the views
+    trained on. Where it is unknown, -1 stands for a width that only the photographs tell. eval
+    holds out every 8th view; with lod, from 1 to 49, the views 0 to lod instead.
     """
     kind, _, number = data.resolution.partition(":")
     held = data.split.removeprefix("first:")
     first = int(held) if held != data.split and held.isdecimal() else 0
-    # NeRF-synthetic captures are white by default; the published tools recognise them by this file too.
+    # NeRF-synthetic captures are white by default; the published tools recognise them by this file
+    # too.
     synthetic = (data.path / "transforms_train.json").is_file()
     white = (data.background is None and synthetic) or data.background == (1.0, 1.0, 1.0)
     if kind in ("cap1600", "inria"):
@@ -99,7 +101,8 @@ def capture_settings(data: Data, width: int | None = None) -> dict[str, Any]:
 
 
 def world_of(run: OpenRun) -> World:
-    """The world that a run was trained in: from a description in its result folder, else from its capture."""
+    """The world that a run was trained in: from a description in its result folder, else from its
+    capture."""
     data = trained_in(run)["data"]
     for path in sorted((run.path / "point_cloud").glob(f"iteration_*/{DESCRIPTION}"), key=lambda p: p.stat().st_mtime, reverse=True):
         try:

@@ -68,14 +68,16 @@ def parse_crop(text: str) -> Crop:
 
 
 def find_subject(capture: Capture) -> tuple[Tensor, float]:
-    """Return the point that the cameras look at [3] and their median distance from it, in the frame of the capture."""
+    """Return the point that the cameras look at [3] and their median distance from it, in the frame
+    of the capture."""
     rig = analyse_cameras(capture)
     distance = float((rig.positions - rig.centre).norm(dim=1).median())
     return capture.world.to_input(rig.centre), distance / capture.world.scale
 
 
 def crop(contents: Splats, how: Crop, capture: Capture, world: World) -> Splats:
-    """Return the Gaussians inside a crop. world: the frame of `contents`. Raises InputError where none is inside."""
+    """Return the Gaussians inside a crop. world: the frame of `contents`. Raises InputError where
+    none is inside."""
     own = contents.means if world == capture.world else capture.world.to_input(contents.means.double())
     inside = how.contains(own, capture)
     if not bool(inside.any()):
@@ -89,7 +91,8 @@ def crop(contents: Splats, how: Crop, capture: Capture, world: World) -> Splats:
 
 @torch.no_grad()
 def find_floaters(contents: Splats, painter: Painter, cameras: Sequence[Camera], tell: Tell) -> Tensor:
-    """Return which Gaussians are floaters, [N] bool. painter: draws `contents`; cameras: those of the training photographs."""
+    """Return which Gaussians are floaters, [N] bool. painter: draws `contents`; cameras: those of
+    the training photographs."""
     from scene_experts.files.bake.observe import contributions
 
     most, photographs, size = (torch.zeros(len(contents)) for _ in range(3))

@@ -1,4 +1,5 @@
-"""Runs to files of standard Gaussians: baked where the scene depends on the camera, written, read again and measured."""
+"""Runs to files of standard Gaussians: baked where the scene depends on the camera, written, read
+again and measured."""
 
 from __future__ import annotations
 
@@ -104,7 +105,8 @@ def _make_gaussians(work: ExportTask, world: World, capture: Capture | None) -> 
 def export_gaussians(
     work: ExportTask, path: Path, level: int | None, capture: Capture | None, made: dict[tuple[int | None, int], Made]
 ) -> Written:
-    """Make, write, read again and measure one file. made: what earlier files made, by level and degree of the harmonics."""
+    """Make, write, read again and measure one file. made: what earlier files made, by level and
+    degree of the harmonics."""
     run, options, format, gaussians = work.run, work.options, work.format, family_named(GAUSSIANS)
     assert gaussians is not None and format.write is not None
     world = World() if options.frame == "trained" else world_of(run) if capture is None else capture.world

@@ -1,6 +1,8 @@
-"""Curvature of a point cloud, and midpoints that make its flat regions denser (Ververas et al., SAGS, ECCV 2024).
+"""Curvature of a point cloud, and midpoints that make its flat regions denser (Ververas et al.,
+SAGS, ECCV 2024).
 
-Structure from motion finds few points on untextured surfaces. Midpoints between neighbours fill them, most densely in flat regions.
+Structure from motion finds few points on untextured surfaces. Midpoints between neighbours fill
+them, most densely in flat regions.
 """
 
 from __future__ import annotations
@@ -14,9 +16,11 @@ _CHUNK = 1 << 16  # neighbourhoods decomposed at a time, which limits the memory
 
 
 def curvature(points: Tensor, k: int = 10) -> Tensor:
-    """Curvature [P] float64 in [0, 1/3] of points [P, 3]: smallest singular value of the centred neighbourhood / sum of all three.
+    """Curvature [P] float64 in [0, 1/3] of points [P, 3]: smallest singular value of the centred
+    neighbourhood / sum of all three.
 
-    A neighbourhood is a point and its k - 1 nearest neighbours. The curvature of a plane, a line or coincident points is 0.
+    A neighbourhood is a point and its k - 1 nearest neighbours. The curvature of a plane, a line or
+    coincident points is 0.
     """
     xyz = points.detach().to(torch.float64)
     _, index = find_neighbours(xyz, k - 1)
@@ -31,17 +35,19 @@ def curvature(points: Tensor, k: int = 10) -> Tensor:
 
 
 def find_flat(curvatures: Tensor, sigmas: float = 1.0) -> Tensor:
-    """Mask [P] bool of the points whose curvature is more than `sigmas` standard deviations below the mean."""
+    """Mask [P] bool of the points whose curvature is more than `sigmas` standard deviations below
+    the mean."""
     if len(curvatures) < 2:
         return torch.zeros_like(curvatures, dtype=torch.bool)
     return curvatures - curvatures.mean() < -sigmas * curvatures.std()
 
 
 def find_midpoint_pairs(points: Tensor, flat: Tensor, low: int, high: int) -> Tensor:
-    """Unordered pairs [M, 2] int64 (first <= second) of points [P, 3] whose midpoints are the denser cloud; each pair once.
+    """Unordered pairs [M, 2] int64 (first <= second) of points [P, 3] whose midpoints are the
+    denser cloud; each pair once.
 
-    Each point pairs with itself. A point in `flat` [P] also pairs with its `low` - 1 nearest neighbours, any other point with its `high`
-    nearest neighbours.
+    Each point pairs with itself. A point in `flat` [P] also pairs with its `low` - 1 nearest
+    neighbours, any other point with its `high` nearest neighbours.
     """
     n = len(points)
     _, index = find_neighbours(points, max(low - 1, high))

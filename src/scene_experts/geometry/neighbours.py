@@ -1,4 +1,5 @@
-"""Exact nearest neighbours, for the initial sizes of anchors and Gaussians and for graphs over points."""
+"""Exact nearest neighbours, for the initial sizes of anchors and Gaussians and for graphs over
+points."""
 
 from __future__ import annotations
 
@@ -10,11 +11,13 @@ _CHUNK = 1 << 16  # points whose neighbours are sorted at a time, which limits t
 
 
 def find_neighbours(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Squared distances [P, k'] (ascending) and indices [P, k'] of the k' = min(k, P - 1) nearest neighbours of `points` [P, 3].
+    """Squared distances [P, k'] (ascending) and indices [P, k'] of the k' = min(k, P - 1) nearest
+    neighbours of `points` [P, 3].
 
-    A neighbour is a point with another index, so a duplicate is a neighbour at distance 0. Distances are float64, exact to rounding.
-    Equally near neighbours are in the order of their indices; which of them are the last of a list is not defined, but always the same.
-    Raises ValueError for positions that are not finite.
+    A neighbour is a point with another index, so a duplicate is a neighbour at distance 0.
+    Distances are float64, exact to rounding. Equally near neighbours are in the order of their
+    indices; which of them are the last of a list is not defined, but always the same. Raises
+    ValueError for positions that are not finite.
     """
     n = points.shape[0]
     k = max(0, min(k, n - 1))
@@ -33,10 +36,12 @@ def find_neighbours(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 def knn_d2(points: Tensor) -> Tensor:
-    """Mean squared distance [P] float64 to the 3 nearest neighbours of points [P, 3], in squared world units.
+    """Mean squared distance [P] float64 to the 3 nearest neighbours of points [P, 3], in squared
+    world units.
 
-    With 2 or 3 points the mean is over the neighbours that exist; a single point gives 0. Coincident points give 0 too, so callers clamp
-    the result (3DGS and Scaffold-GS: to at least 1e-7) before the logarithm.
+    With 2 or 3 points the mean is over the neighbours that exist; a single point gives 0.
+    Coincident points give 0 too, so callers clamp the result (3DGS and Scaffold-GS: to at least
+    1e-7) before the logarithm.
     """
     d2, _ = find_neighbours(points, 3)
     return d2.mean(1) if d2.shape[1] else d2.new_zeros(points.shape[0])
@@ -49,7 +54,8 @@ def median_neighbour_distance(points: Tensor) -> float:
 
 
 def _find_near(xyz: np.ndarray, k: int) -> tuple[Tensor, Tensor]:
-    """For each place with points, at least k + 1 points that no other is nearer than, [places, m] (-1: none); and the place of each point.
+    """For each place with points, at least k + 1 points that no other is nearer than, [places, m]
+    (-1: none); and the place of each point.
 
     The tree has each place once: duplicates would all be in one leaf of it.
     """

@@ -1,4 +1,5 @@
-"""Camera poses: construction, interpolation, and cameras that belong to no view of a capture. OpenCV axes, float64."""
+"""Camera poses: construction, interpolation, and cameras that belong to no view of a capture.
+OpenCV axes, float64."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ def normalise(vector: Tensor) -> Tensor:
 
 
 def make_pose(position: Tensor, rotation: Tensor) -> Tensor:
-    """Return the world-to-camera matrix [4, 4] of a camera centre [3] and a camera-to-world rotation [3, 3]."""
+    """Return the world-to-camera matrix [4, 4] of a camera centre [3] and a camera-to-world
+    rotation [3, 3]."""
     out = torch.eye(4, dtype=torch.float64)
     out[:3, :3] = rotation.T
     out[:3, 3] = -(rotation.T @ position)
@@ -28,7 +30,8 @@ def make_pose(position: Tensor, rotation: Tensor) -> Tensor:
 
 
 def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """Return the world-to-camera matrix [4, 4] of a camera at `position` that looks at `target`, with `up` upwards in its image."""
+    """Return the world-to-camera matrix [4, 4] of a camera at `position` that looks at `target`,
+    with `up` upwards in its image."""
     forward = normalise(target - position)
     right = torch.linalg.cross(forward, up)
     if float(right.norm()) < 1e-6:  # looking straight up or down
@@ -70,7 +73,8 @@ def interpolate_poses(positions: Tensor, rotations: Tensor, frames: int, times: 
 
 
 def catmull_rom(a: Tensor, b: Tensor, c: Tensor, d: Tensor, u: float) -> Tensor:
-    """Return the point at `u` in [0, 1] between b and c on the Catmull-Rom curve through a, b, c and d."""
+    """Return the point at `u` in [0, 1] between b and c on the Catmull-Rom curve through a, b, c
+    and d."""
     return 0.5 * (2 * b + (c - a) * u + (2 * a - 5 * b + 4 * c - d) * u**2 + (3 * b - a - 3 * c + d) * u**3)
 
 
@@ -85,7 +89,8 @@ def slerp(a: Tensor, b: Tensor, u: float) -> Tensor:
 
 
 def with_fov(camera: Camera, fov: float, width: int, height: int) -> Camera:
-    """Return a free camera at the same pose with a vertical field of view in radians, a size in px and a centred principal point."""
+    """Return a free camera at the same pose with a vertical field of view in radians, a size in px
+    and a centred principal point."""
     f = height / (2 * math.tan(fov / 2))
     K = torch.tensor([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
     return replace(camera, K=K, width=width, height=height, id=FREE)

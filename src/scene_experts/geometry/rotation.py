@@ -7,14 +7,16 @@ from torch import Tensor
 
 
 def normalise_quats(quats: Tensor, eps: float = 1e-12) -> Tensor:
-    """Normalise quaternions [..., 4]. Shorter ones than `eps` are divided by `eps`, so zero stays zero and there is no NaN."""
+    """Normalise quaternions [..., 4]. Shorter ones than `eps` are divided by `eps`, so zero stays
+    zero and there is no NaN."""
     return quats / quats.norm(dim=-1, keepdim=True).clamp_min(eps)
 
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of unit quaternions [..., 4].
 
-    The caller normalises the quaternions; gradients are with respect to the values passed. The zero quaternion gives the identity.
+    The caller normalises the quaternions; gradients are with respect to the values passed. The zero
+    quaternion gives the identity.
     """
     w, x, y, z = quats.unbind(-1)
     rows = [
@@ -28,8 +30,8 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 def matrix_to_quat(matrices: Tensor) -> Tensor:
     """Unit quaternions [..., 4] with w >= 0 of rotation matrices [..., 3, 3].
 
-    The squares of the components follow from the diagonal. The signs follow from the off-diagonal sums divided by the largest component,
-    so no divisor is small.
+    The squares of the components follow from the diagonal. The signs follow from the off-diagonal
+    sums divided by the largest component, so no divisor is small.
     """
     m = matrices
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
@@ -52,17 +54,20 @@ def matrix_to_quat(matrices: Tensor) -> Tensor:
 
 
 def covariance(quats: Tensor, scales: Tensor) -> Tensor:
-    """Covariances R S S^T R^T, [..., 3, 3] in squared world units, of unit quaternions [..., 4] and standard deviations [..., 3]."""
+    """Covariances R S S^T R^T, [..., 3, 3] in squared world units, of unit quaternions [..., 4] and
+    standard deviations [..., 3]."""
     half = quat_to_matrix(quats) * scales[..., None, :]
     return half @ half.transpose(-1, -2)
 
 
 def estimate_up(rotations: Tensor) -> Tensor:
-    """Unit up direction [3] of the world, from camera-to-world rotations [V, 3, 3] (x right, y down).
+    """Unit up direction [3] of the world, from camera-to-world rotations [V, 3, 3] (x right, y
+    down).
 
-    The mean of the cameras' up axes is biased if some photographs lie on their side (portraits stored without rotation) or if the cameras
-    look down from one side more often. This function starts from the mean and finds the direction that is most orthogonal to the more
-    level axis, right or up, of each camera.
+    The mean of the cameras' up axes is biased if some photographs lie on their side (portraits
+    stored without rotation) or if the cameras look down from one side more often. This function
+    starts from the mean and finds the direction that is most orthogonal to the more level axis,
+    right or up, of each camera.
     """
     right, ups = rotations[:, :, 0].double(), -rotations[:, :, 1].double()
     mean = ups.mean(0)
@@ -71,7 +76,8 @@ def estimate_up(rotations: Tensor) -> Tensor:
     off = torch.eye(3, dtype=torch.float64, device=up.device) - mean[:, None] * mean
     for _ in range(5):  # until the level axis of each camera is known
         level = torch.where(((right @ up).abs() < (ups @ up).abs())[:, None], right, ups)
-        # cameras that all look one way exclude only one axis; the last term then stays near the mean
+        # cameras that all look one way exclude only one axis; the last term then stays near the
+        # mean
         up = torch.linalg.eigh(level.T @ level / len(level) + 0.02 * off)[1][:, 0]
         up = up if float(up @ mean) >= 0 else -up
     return up

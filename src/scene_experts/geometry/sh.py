@@ -1,4 +1,5 @@
-"""Real spherical harmonics up to degree 3 in the layout of 3DGS: sh [..., (degree + 1)^2, 3], the constant (DC) first."""
+"""Real spherical harmonics up to degree 3 in the layout of 3DGS: sh [..., (degree + 1)^2, 3], the
+constant (DC) first."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ MAX_DEGREE = 3
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Values [..., (degree + 1)^2] of the harmonics at unit directions [..., 3], in the order and with the signs of 3DGS files."""
+    """Values [..., (degree + 1)^2] of the harmonics at unit directions [..., 3], in the order and
+    with the signs of 3DGS files."""
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"expected a degree from 0 to {MAX_DEGREE}, found {degree}")
     x, y, z = directions.unbind(-1)
@@ -47,9 +49,11 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def sh_to_rgb(sh: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """Colours max(0, sum + 0.5), [..., 3], along `directions` [..., 3] (Gaussian centre minus camera centre, of any length).
+    """Colours max(0, sum + 0.5), [..., 3], along `directions` [..., 3] (Gaussian centre minus
+    camera centre, of any length).
 
-    `sh` [..., C, 3] may hold more coefficients than `degree` uses. The gradient is zero where the colour is clamped to 0.
+    `sh` [..., C, 3] may hold more coefficients than `degree` uses. The gradient is zero where the
+    colour is clamped to 0.
     """
     count = (degree + 1) ** 2
     if sh.shape[-2] < count:

@@ -1,4 +1,5 @@
-"""Colours of Gaussians from spherical harmonics, with gradients: in the compiled library on the CPU, else in torch.
+"""Colours of Gaussians from spherical harmonics, with gradients: in the compiled library on the
+CPU, else in torch.
 
 Gradients reach the harmonics and, through the viewing direction, the positions (as in 3DGS).
 """
@@ -17,8 +18,9 @@ from scene_experts.native import library as native
 def compute_sh_colors(means: Tensor, dc: Tensor, rest: Tensor, rows: Tensor | None, position: Tensor, degree: int) -> Tensor:
     """Colours max(0, harmonics + 0.5), [A, 3], of Gaussians seen from `position` [3].
 
-    means [A, 3] world; dc [N, 3] and rest [N, C - 1, 3] are the harmonics of a table, whose `rows` [A] int64 (each at most once; None: all
-    N in order) belong to `means`. `rest` may hold more coefficients than `degree` (0 to 3) uses; their gradient is zero.
+    means [A, 3] world; dc [N, 3] and rest [N, C - 1, 3] are the harmonics of a table, whose `rows`
+    [A] int64 (each at most once; None: all N in order) belong to `means`. `rest` may hold more
+    coefficients than `degree` (0 to 3) uses; their gradient is zero.
     """
     if not 0 <= degree <= MAX_DEGREE or rest.shape[1] < (degree + 1) ** 2 - 1:
         raise ValueError(f"expected a degree from 0 to {MAX_DEGREE} that fits {rest.shape[1] + 1} coefficients, found {degree}")

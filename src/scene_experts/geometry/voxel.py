@@ -1,7 +1,9 @@
-"""The integer lattice of the anchors. Cells are int64 triples, so that neither rounding nor the device affects comparisons of cells.
+"""The integer lattice of the anchors. Cells are int64 triples, so that neither rounding nor the
+device affects comparisons of cells.
 
-Scaffold-GS keeps float positions and rounds them again for each cell size. Anchors then lie on rounding ties, and float32 and float64
-disagree for up to a fifth of them. This module rounds a point once, in float64, and derives coarser cells by integer arithmetic.
+Scaffold-GS keeps float positions and rounds them again for each cell size. Anchors then lie on
+rounding ties, and float32 and float64 disagree for up to a fifth of them. This module rounds a
+point once, in float64, and derives coarser cells by integer arithmetic.
 """
 
 from __future__ import annotations
@@ -21,9 +23,11 @@ AXIS_LIMIT = 1 << (AXIS_BITS - 1)  # coordinates of cells lie in [-AXIS_LIMIT, A
 
 
 def to_lattice(points: Tensor, size: float) -> Tensor:
-    """Cells [N, 3] int64 of `points` [N, 3] on a lattice of edge `size` (world units): round(point / size) in float64, ties to even.
+    """Cells [N, 3] int64 of `points` [N, 3] on a lattice of edge `size` (world units): round(point
+    / size) in float64, ties to even.
 
-    Raises InputError for coordinates that are not finite or too large for exact float64 cell numbers (2^53).
+    Raises InputError for coordinates that are not finite or too large for exact float64 cell
+    numbers (2^53).
     """
     if not size > 0:
         raise InputError(f"expected a voxel size above 0, found {size}; give one with --scene.voxel-size, or 0 for the automatic size")
@@ -37,7 +41,8 @@ def to_lattice(points: Tensor, size: float) -> Tensor:
 
 
 def coarsen(cells: Tensor, m: int) -> Tensor:
-    """Cells of an m times coarser lattice: floor((i + m/2) / m) in integers, so ties round up. m = 1 returns equal cells."""
+    """Cells of an m times coarser lattice: floor((i + m/2) / m) in integers, so ties round up. m =
+    1 returns equal cells."""
     if m < 1:
         raise ValueError(f"expected a factor of at least 1 between cell sizes, found {m}")
     if m & (m - 1) == 0:
@@ -46,7 +51,8 @@ def coarsen(cells: Tensor, m: int) -> Tensor:
 
 
 def pack(cells: Tensor) -> Tensor:
-    """One int64 key [N] per cell [N, 3], 21 bits per axis. Keys sort like (x, y, z). Raises InputError for a cell outside [-2^20, 2^20)."""
+    """One int64 key [N] per cell [N, 3], 21 bits per axis. Keys sort like (x, y, z). Raises
+    InputError for a cell outside [-2^20, 2^20)."""
     if cells.numel() and not bool(((cells >= -AXIS_LIMIT) & (cells < AXIS_LIMIT)).all()):
         found = int(cells.abs().max())
         raise InputError(
@@ -64,13 +70,15 @@ def unpack(keys: Tensor) -> Tensor:
 
 
 def find_unique_cells(cells: Tensor) -> tuple[Tensor, Tensor]:
-    """The distinct cells [U, 3] in the order of (x, y, z), and the index [N] of each of `cells` [N, 3] among them."""
+    """The distinct cells [U, 3] in the order of (x, y, z), and the index [N] of each of `cells` [N,
+    3] among them."""
     keys, inverse = torch.unique(pack(cells), return_inverse=True)
     return unpack(keys), inverse
 
 
 def in_set(keys: Tensor, others: Tensor) -> Tensor:
-    """Whether each of `keys` [N] occurs among `others` [M] (any order, repeats allowed), [N] bool."""
+    """Whether each of `keys` [N] occurs among `others` [M] (any order, repeats allowed), [N]
+    bool."""
     if not others.numel() or not keys.numel():
         return torch.zeros_like(keys, dtype=torch.bool)
     if len(keys) < len(others):  # sort the shorter list and look the longer one up
@@ -85,13 +93,15 @@ def in_set(keys: Tensor, others: Tensor) -> Tensor:
 
 
 def scatter_max(values: Tensor, group: Tensor, groups: int) -> Tensor:
-    """Element-wise maximum [groups, F] of the rows of `values` [P, F] per `group` [P]; 0 for a group without rows."""
+    """Element-wise maximum [groups, F] of the rows of `values` [P, F] per `group` [P]; 0 for a
+    group without rows."""
     out = values.new_zeros((groups, values.shape[1]))
     return out.scatter_reduce(0, group[:, None].expand_as(values), values, reduce="amax", include_self=False)
 
 
 def choose_voxel_size(points: Tensor, rule: VoxelChoice) -> float:
-    """Edge of the lattice for points [P, 3], in their unit: a quarter of the median neighbour distance, or as `estimate_voxel_size`.
+    """Edge of the lattice for points [P, 3], in their unit: a quarter of the median neighbour
+    distance, or as `estimate_voxel_size`.
 
     Raises InputError if no two points differ.
     """
@@ -104,9 +114,11 @@ def choose_voxel_size(points: Tensor, rule: VoxelChoice) -> float:
 def estimate_voxel_size(points: Tensor, rule: VoxelRule = "squared_median", factor: float = 1.0) -> float:
     """A voxel size from the spacing of `points` [P, 3], times `factor`.
 
-    "squared_median" is the computation of Scaffold-GS: the int(P / 2)-th smallest mean *squared* distance to 3 neighbours, without a root,
-    so it depends quadratically on the unit. "median_nn" is its documentation: the median distance to the nearest neighbour in world units.
-    If more than half of the points coincide, only points with a positive spacing count. Raises InputError if no two points differ.
+    "squared_median" is the computation of Scaffold-GS: the int(P / 2)-th smallest mean *squared*
+    distance to 3 neighbours, without a root, so it depends quadratically on the unit. "median_nn"
+    is its documentation: the median distance to the nearest neighbour in world units. If more than
+    half of the points coincide, only points with a positive spacing count. Raises InputError if no
+    two points differ.
     """
     if rule == "squared_median":
         spacing = knn_d2(points)

@@ -1,7 +1,9 @@
-"""The C interface of the native library for ctypes: the twin of csrc/se_api.h, which documents every function and field.
+"""The C interface of the native library for ctypes: the twin of csrc/se_api.h, which documents
+every function and field.
 
-`tests/unit/native/test_api.py` holds the two equal. After a change of the interface raise `ABI_VERSION`: the build compiles it into the
-library, and `library.load` refuses a library with another number. Data pointers are `c_void_p`; `library.pointer` makes them of tensors.
+`tests/unit/native/test_api.py` holds the two equal. After a change of the interface raise
+`ABI_VERSION`: the build compiles it into the library, and `library.load` refuses a library with
+another number. Data pointers are `c_void_p`; `library.pointer` makes them of tensors.
 """
 
 from __future__ import annotations

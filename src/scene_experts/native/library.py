@@ -1,7 +1,9 @@
-"""Load the compiled library built for this processor (sources in csrc/), or explain why there is none.
+"""Load the compiled library built for this processor (sources in csrc/), or explain why there is
+none.
 
-`scene_experts/_native` holds one shared library per instruction set; `load` takes the best one that this processor runs and binds it to
-the interface of `api.py`. Of the package this module imports only two modules of `core`, so every layer may use it.
+`scene_experts/_native` holds one shared library per instruction set; `load` takes the best one that
+this processor runs and binds it to the interface of `api.py`. Of the package this module imports
+only two modules of `core`, so every layer may use it.
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ def find(level: str) -> Path | None:
 def load(level: str | None = None) -> Library | None:
     """Load and bind the library for `level` (None: the best for this processor).
 
-    Returns None if no library is installed, or if it is damaged or has another interface (`api.ABI_VERSION`).
+    Returns None if no library is installed, or if it is damaged or has another interface
+    (`api.ABI_VERSION`).
     """
     for name in (level,) if level else list_levels():
         path = find(name)
@@ -69,7 +72,8 @@ def load(level: str | None = None) -> Library | None:
 
 
 def require(level: str | None = None) -> Library:
-    """The library for `level` (None: the best for this processor). Raises InputError if `load` returns None."""
+    """The library for `level` (None: the best for this processor). Raises InputError if `load`
+    returns None."""
     library = load(level)
     if library is None:
         raise InputError(explain_missing() or f"the compiled CPU library for {level} is not installed: choose one of {', '.join(LEVELS)}")
@@ -77,7 +81,8 @@ def require(level: str | None = None) -> Library:
 
 
 def check(code: int, work: str) -> None:
-    """Raise RunError if `code`, returned by a function of the library, says that `work` ran out of memory."""
+    """Raise RunError if `code`, returned by a function of the library, says that `work` ran out of
+    memory."""
     if code:
         raise RunError(f"{work} ran out of memory: use fewer Gaussians (--max-anchors, --max-memory) or smaller pictures (--resolution)")
 

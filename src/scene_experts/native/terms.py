@@ -1,4 +1,5 @@
-"""Two sums of the objective in the compiled library: volumes of Gaussians and the opacity hinge. Gradients equal autograd's bit for bit."""
+"""Two sums of the objective in the compiled library: volumes of Gaussians and the opacity hinge.
+Gradients equal autograd's bit for bit."""
 
 from __future__ import annotations
 

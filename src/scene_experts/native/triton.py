@@ -1,4 +1,5 @@
-"""What all Triton kernels need: whether they can run, and a launch on the device of their tensors."""
+"""What all Triton kernels need: whether they can run, and a launch on the device of their
+tensors."""
 
 from __future__ import annotations
 
@@ -42,7 +43,8 @@ def covers(*tensors: Tensor) -> bool:
 
 
 def guard(device: torch.device) -> AbstractContextManager[Any]:
-    """Context manager in which `device` is the current CUDA device. Triton launches on the current device, not on that of the tensors."""
+    """Context manager in which `device` is the current CUDA device. Triton launches on the current
+    device, not on that of the tensors."""
     return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
 
 

@@ -1,5 +1,6 @@
 # pyright: basic, reportMissingImports=false
-"""The smallest Triton kernel; `native/triton.py` runs it to see whether kernels compile on this machine."""
+"""The smallest Triton kernel; `native/triton.py` runs it to see whether kernels compile on this
+machine."""
 
 from __future__ import annotations
 

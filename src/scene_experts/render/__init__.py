@@ -1,6 +1,7 @@
 """Rasterisers behind one protocol, and the choice among them.
 
-`reference` (plain torch, slow) defines the picture; `cpu` (compiled) and `gsplat` (CUDA) draw the same one fast.
+`reference` (plain torch, slow) defines the picture; `cpu` (compiled) and `gsplat` (CUDA) draw the
+same one fast.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ NAMES = ("auto", "reference", "cpu", "gsplat")
 
 
 class Rasterizer(Protocol):
-    """Draws Gaussians; every backend gives the picture, depth, radii and gradients that `types.Render` describes."""
+    """Draws Gaussians; every backend gives the picture, depth, radii and gradients that
+    `types.Render` describes."""
 
     @property
     def name(self) -> str:
@@ -29,21 +31,24 @@ class Rasterizer(Protocol):
         ...
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
-        """Draws M Gaussians over `background` [3]; a later backward pass overwrites the picture's `mean2d_grad`."""
+        """Draws M Gaussians over `background` [3]; a later backward pass overwrites the picture's
+        `mean2d_grad`."""
         ...
 
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
-        """Whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] would be drawn (3 sigma radius > 0), [A] bool."""
+        """Whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] would be drawn (3
+        sigma radius > 0), [A] bool."""
         ...
 
 
 def choose(name: str, device: torch.device | str, antialias: bool = False, deterministic: bool = False) -> Rasterizer:
     """The rasteriser called `name` for tensors on `device`.
 
-    `auto`: gsplat on CUDA; on the CPU the compiled rasteriser if it loads, otherwise the reference with one warning. On CUDA without gsplat
-    `auto` raises InputError: the reference is hundreds of times slower there.
-    `antialias` multiplies opacities by the share of the 2D Gaussian's area that the 0.3 px blur left (Mip-Splatting's compensation).
-    `deterministic`: bit-identical gradients from run to run, where the backend can. Raises InputError for what cannot be had.
+    `auto`: gsplat on CUDA; on the CPU the compiled rasteriser if it loads, otherwise the reference
+    with one warning. On CUDA without gsplat `auto` raises InputError: the reference is hundreds of
+    times slower there. `antialias` multiplies opacities by the share of the 2D Gaussian's area that
+    the 0.3 px blur left (Mip-Splatting's compensation). `deterministic`: bit-identical gradients
+    from run to run, where the backend can. Raises InputError for what cannot be had.
     """
     device = torch.device(device)
     if name == "auto":
@@ -70,14 +75,16 @@ def choose(name: str, device: torch.device | str, antialias: bool = False, deter
 
 
 def as_trained(rasterize: Rasterizer, antialias: bool) -> Rasterizer:
-    """Return the rasteriser with the antialiasing that a run was trained with, if it supports it."""
+    """Return the rasteriser with the antialiasing that a run was trained with, if it supports
+    it."""
     if getattr(rasterize, "antialias", antialias) != antialias:
         return replace(rasterize, antialias=antialias)  # type: ignore[type-var]
     return rasterize
 
 
 def for_growth(rasterize: Rasterizer, absolute: bool) -> Rasterizer:
-    """Return the rasteriser whose `mean2d_grad` holds sums of absolute values if `absolute`. Raises InputError if it has none."""
+    """Return the rasteriser whose `mean2d_grad` holds sums of absolute values if `absolute`. Raises
+    InputError if it has none."""
     if not absolute:
         return rasterize
     if not hasattr(rasterize, "absolute"):

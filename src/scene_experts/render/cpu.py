@@ -1,8 +1,10 @@
-"""The fast CPU rasteriser: the image that reference.py defines and all its gradients, computed by the compiled library (csrc/raster*).
+"""The fast CPU rasteriser: the image that reference.py defines and all its gradients, computed by
+the compiled library (csrc/raster*).
 
-It works in float32 and, like the reference, does not normalise quaternions. Two correct rasterisers may differ in single pixels by 4e-3 of
-a colour where an alpha is within rounding of 1/255, and by 1e-2 where a transmittance is within rounding of the stop (two alphas of 0.99
-are), so compare means and quantiles.
+It works in float32 and, like the reference, does not normalise quaternions. Two correct rasterisers
+may differ in single pixels by 4e-3 of a colour where an alpha is within rounding of 1/255, and by
+1e-2 where a transmittance is within rounding of the stop (two alphas of 0.99 are), so compare means
+and quantiles.
 """
 
 from __future__ import annotations
@@ -24,9 +26,11 @@ from scene_experts.native.api import SeCamera, SeRasterBackward, SeRasterForward
 class CpuRasterizer:
     """Renders Gaussians on the CPU with the compiled library.
 
-    `deterministic`: gradients are bit-identical from run to run and for any number of threads, on one machine and instruction set (images
-    always are). `level`: the instruction set, one of `native.LEVELS` (None: the best of this processor). `threads`: None for torch's
-    setting. `absolute`: `mean2d_grad` holds the sums of absolute values. Raises InputError if the library cannot be loaded.
+    `deterministic`: gradients are bit-identical from run to run and for any number of threads, on
+    one machine and instruction set (images always are). `level`: the instruction set, one of
+    `native.LEVELS` (None: the best of this processor). `threads`: None for torch's setting.
+    `absolute`: `mean2d_grad` holds the sums of absolute values. Raises InputError if the library
+    cannot be loaded.
     """
 
     antialias: bool = False
@@ -42,7 +46,8 @@ class CpuRasterizer:
             raise InputError(f"{why}; or choose the slow rasteriser `reference`")
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
-        """Render M Gaussians over `background` [3]; see `types.Render`. The backward pass overwrites `mean2d_grad`."""
+        """Render M Gaussians over `background` [3]; see `types.Render`. The backward pass
+        overwrites `mean2d_grad`."""
         inputs = (g.means, g.quats, g.scales, g.opacities, g.colors)
         _check(inputs)
         _check_size(camera)
@@ -52,7 +57,8 @@ class CpuRasterizer:
 
     @torch.no_grad()
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
-        """Mask [A] bool of the unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] that have a radius > 0 (Scaffold-GS)."""
+        """Mask [A] bool of the unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] that have
+        a radius > 0 (Scaffold-GS)."""
         means, scales = _convert(means), _convert(scales)
         out = torch.empty(len(means), dtype=torch.bool)
         where = [native.pointer(t) for t in (means, scales, out)]
@@ -65,7 +71,8 @@ class CpuRasterizer:
 
 
 class _State:
-    """Memory of the library for the backward pass of one image; released with the graph, whether the backward pass ran or not."""
+    """Memory of the library for the backward pass of one image; released with the graph, whether
+    the backward pass ran or not."""
 
     def __init__(self, library: ctypes.CDLL, address: int) -> None:
         self.library, self.address = library, address

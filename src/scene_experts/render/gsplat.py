@@ -1,15 +1,20 @@
-"""Draws on CUDA with gsplat (Apache-2.0), adapted to the pictures and gradients that `reference` defines.
+"""Draws on CUDA with gsplat (Apache-2.0), adapted to the pictures and gradients that `reference`
+defines.
 
-The adapter uses the near plane and blur of the reference. `radii` follow the 3 sigma rule, and Gaussians without a radius are not drawn,
-whatever extent gsplat sorts with (since 1.5 it is smaller for faint Gaussians and empty below opacity 1/255). Depth is a fourth colour
-channel over a background of 0. The gradient of the 2D mean is converted from px to NDC. The antialiasing factor is at least 0.005.
+The adapter uses the near plane and blur of the reference. `radii` follow the 3 sigma rule, and
+Gaussians without a radius are not drawn, whatever extent gsplat sorts with (since 1.5 it is smaller
+for faint Gaussians and empty below opacity 1/255). Depth is a fourth colour channel over a
+background of 0. The gradient of the 2D mean is converted from px to NDC. The antialiasing factor is
+at least 0.005.
 
-These differences remain with gsplat 1.5.3: alpha is clamped at 0.999 instead of 0.99 (since 1.6 at 0.99). A pixel stops at T <= 1e-4
-instead of T < 1e-4. Quaternions are normalised inside, so their gradient has no component along the quaternion. Where the factor without
-its floor takes an opacity below 1/255, nothing is drawn; the reference draws an alpha of at most 0.005. Sums on the GPU are not
-deterministic in the last bits.
+These differences remain with gsplat 1.5.3: alpha is clamped at 0.999 instead of 0.99 (since 1.6 at
+0.99). A pixel stops at T <= 1e-4 instead of T < 1e-4. Quaternions are normalised inside, so their
+gradient has no component along the quaternion. Where the factor without its floor takes an opacity
+below 1/255, nothing is drawn; the reference draws an alpha of at most 0.005. Sums on the GPU are
+not deterministic in the last bits.
 
-gsplat is imported on first use. Without a prebuilt wheel it then compiles its CUDA code once, which takes minutes.
+gsplat is imported on first use. Without a prebuilt wheel it then compiles its CUDA code once, which
+takes minutes.
 """
 
 from __future__ import annotations
@@ -59,7 +64,8 @@ class GsplatRasterizer:
     absolute: bool = False
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
-        """Draw M Gaussians over `background` [3], see `types.Render`. Raises InputError if gsplat cannot run."""
+        """Draw M Gaussians over `background` [3], see `types.Render`. Raises InputError if gsplat
+        cannot run."""
         library = _import_gsplat()
         if len(g) == 0:
             return _draw_nothing(g, camera, background)
@@ -91,7 +97,8 @@ class GsplatRasterizer:
         return Render(picture[..., :3], alpha, picture[..., 3], radii, grad)
 
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
-        """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] are drawn (radius > 0)."""
+        """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] are
+        drawn (radius > 0)."""
         if triton.covers(means, scales):
             return find_radii(means, None, scales, camera) > 0
         return visible(means, scales, camera)
@@ -99,7 +106,8 @@ class GsplatRasterizer:
 
 @torch.no_grad()
 def _find_radii(g: Gaussians, camera: Camera, extents: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the radii [M] int32 by the 3 sigma rule, and gsplat's extents [1, M, 2] with 0 for Gaussians without a radius."""
+    """Return the radii [M] int32 by the 3 sigma rule, and gsplat's extents [1, M, 2] with 0 for
+    Gaussians without a radius."""
     if triton.covers(g.means, g.quats, g.scales):
         return find_radii(g.means, g.quats, g.scales, camera, extents), extents
     radii = project(g.means, g.quats, g.scales, camera).radii
@@ -133,9 +141,11 @@ def _rasterize(
     background: Tensor,
     absolute: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Sort into tiles and blend one view. Returns the picture [H, W, 4] (colour and depth) and alpha [H, W].
+    """Sort into tiles and blend one view. Returns the picture [H, W, 4] (colour and depth) and
+    alpha [H, W].
 
-    `absolute`: the backward pass sets `means2d.absgrad` to the sums of the absolute values of the pixels' gradients.
+    `absolute`: the backward pass sets `means2d.absgrad` to the sums of the absolute values of the
+    pixels' gradients.
     """
     across, down = -(-camera.width // TILE), -(-camera.height // TILE)
     _, keys, order = library.isect_tiles(means2d, extents, depths, TILE, across, down)

@@ -1,4 +1,5 @@
-"""Radii of Gaussians by the 3 sigma rule on CUDA: one kernel instead of the 270 of `reference.project`."""
+"""Radii of Gaussians by the 3 sigma rule on CUDA: one kernel instead of the 270 of
+`reference.project`."""
 
 from __future__ import annotations
 

@@ -1,29 +1,38 @@
-"""The rasteriser in plain torch. It defines the picture, and the other rasterisers are tested against it.
+"""The rasteriser in plain torch. It defines the picture, and the other rasterisers are tested
+against it.
 
 It is slow, but autograd differentiates it on any device and in any precision.
 
 Per Gaussian (EWA splatting as in 3DGS, with the true principal point as in gsplat):
     view      p = R mean + t. The Gaussian is drawn only if p.z > near.
-    centre    u = fx p.x / p.z + cx, and v likewise. The centre of pixel (i, j) is (i + 0.5, j + 0.5).
-    Jacobian  J = [[fx / z, 0, -fx tx / z^2], [0, fy / z, -fy ty / z^2]], where tx = z clamp(p.x / z, -cx / fx - m, (W - cx) / fx + m) with
-              m = 0.3 W / (2 fx), i.e. 1.3 tan(fov / 2) on either side of a centred axis; ty likewise. Outside these limits p.x
-              has no gradient through J, and z has the gradient of tx = z limit.
-    2D cov    C = J R Sigma R^T J^T + 0.3 I, with Sigma from the quaternions as passed (they are not normalised here). A Gaussian
+    centre    u = fx p.x / p.z + cx, and v likewise. The centre of pixel (i, j) is (i + 0.5, j +
+    0.5). Jacobian  J = [[fx / z, 0, -fx tx / z^2], [0, fy / z, -fy ty / z^2]], where tx = z
+    clamp(p.x / z, -cx / fx - m, (W - cx) / fx + m) with
+              m = 0.3 W / (2 fx), i.e. 1.3 tan(fov / 2) on either side of a centred axis; ty
+              likewise. Outside these limits p.x has no gradient through J, and z has the gradient
+              of tx = z limit.
+    2D cov    C = J R Sigma R^T J^T + 0.3 I, with Sigma from the quaternions as passed (they are not
+    normalised here). A Gaussian
               with det C <= 0 is not drawn.
-    antialias (off by default) opacity *= sqrt(max(0.005^2, det(C - 0.3 I) / det C)). The ratio has no gradient at the floor.
+    antialias (off by default) opacity *= sqrt(max(0.005^2, det(C - 0.3 I) / det C)). The ratio has
+    no gradient at the floor.
               gsplat has this floor since 1.6; in 1.5.3 the floor is 0.
-    radius    r = ceil(3 sqrt(lambda)), lambda = mid + sqrt(max(0.1, mid^2 - det C)), mid = trace / 2. The Gaussian is not drawn,
-              and its radius is 0, if the square [u - r, u + r] x [v - r, v + r] overlaps no 16 x 16 tile of the picture, i.e. if
-              u + r <= 0 or u - r >= 16 ceil(W / 16), or likewise for v.
+    radius    r = ceil(3 sqrt(lambda)), lambda = mid + sqrt(max(0.1, mid^2 - det C)), mid = trace /
+    2. The Gaussian is not drawn,
+              and its radius is 0, if the square [u - r, u + r] x [v - r, v + r] overlaps no 16 x 16
+              tile of the picture, i.e. if u + r <= 0 or u - r >= 16 ceil(W / 16), or likewise for
+              v.
 Per pixel, for all drawn Gaussians in order of depth z (then of index):
-    power = -1/2 (a dx^2 + c dy^2) - b dx dy with the conic (a, b, c) = C^-1. The Gaussian is skipped if power > 0.
-    alpha = min(0.99, opacity exp(power)). The Gaussian is skipped if alpha < 1/255.
-    If T (1 - alpha) < 1e-4, the pixel stops without this Gaussian. Otherwise colour += T alpha c, depth += T alpha z, T *= 1 - alpha.
-    The output is colour + T background, 1 - T, and depth.
+    power = -1/2 (a dx^2 + c dy^2) - b dx dy with the conic (a, b, c) = C^-1. The Gaussian is
+    skipped if power > 0. alpha = min(0.99, opacity exp(power)). The Gaussian is skipped if alpha <
+    1/255. If T (1 - alpha) < 1e-4, the pixel stops without this Gaussian. Otherwise colour += T
+    alpha c, depth += T alpha z, T *= 1 - alpha. The output is colour + T background, 1 - T, and
+    depth.
 
-Two things differ from the original CUDA code of 3DGS. A drawn Gaussian reaches every pixel where its alpha is at least 1/255; there it
-reaches only the tiles of its 3 sigma square, which cuts off alphas up to 0.011. The gradient is exact, i.e. zero where alpha is clamped
-to 0.99; there it passes the clamp (see `clamp_gradient`).
+Two things differ from the original CUDA code of 3DGS. A drawn Gaussian reaches every pixel where
+its alpha is at least 1/255; there it reaches only the tiles of its 3 sigma square, which cuts off
+alphas up to 0.011. The gradient is exact, i.e. zero where alpha is clamped to 0.99; there it passes
+the clamp (see `clamp_gradient`).
 """
 
 from __future__ import annotations
@@ -67,9 +76,12 @@ class ReferenceRasterizer:
 
     Args:
         antialias: Multiply opacities by the compensation of the blur (Mip-Splatting).
-        clamp_gradient: Pass the gradient of opacity and shape through the clamp of alpha at 0.99, as the original CUDA code does.
-        tile: Edge in px of the blocks that the picture is drawn in (None: one block). It affects speed and memory only.
-        absolute: `mean2d_grad` holds, for each axis, the sum over pixels of the absolute values of a pixel's gradient (AbsGS).
+        clamp_gradient: Pass the gradient of opacity and shape through the clamp of alpha at 0.99,
+            as the original CUDA code does.
+        tile: Edge in px of the blocks that the picture is drawn in (None: one block). It affects
+            speed and memory only.
+        absolute: `mean2d_grad` holds, for each axis, the sum over pixels of the absolute values of
+            a pixel's gradient (AbsGS).
     """
 
     antialias: bool = False
@@ -79,7 +91,8 @@ class ReferenceRasterizer:
     absolute: bool = False
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
-        """Draw M Gaussians over `background` [3], see `types.Render`. A backward pass overwrites `mean2d_grad`."""
+        """Draw M Gaussians over `background` [3], see `types.Render`. A backward pass overwrites
+        `mean2d_grad`."""
         projected = project(g.means, g.quats, g.scales, camera)
         ids = torch.where(projected.radii > 0)[0]
         ids = ids[projected.depth.detach()[ids].argsort(stable=True)]  # near to far
@@ -98,11 +111,13 @@ class ReferenceRasterizer:
 
     @torch.no_grad()
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
-        """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] are drawn (radius > 0)."""
+        """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] are
+        drawn (radius > 0)."""
         return visible(means, scales, camera)
 
     def _draw_blocks(self, splats: Tensor, reach: Tensor, camera: Camera, sums: Tensor | None) -> Tensor:
-        """Return colour, depth and final transmittance [H, W, 5] of splats [V, 10] that are sorted from near to far.
+        """Return colour, depth and final transmittance [H, W, 5] of splats [V, 10] that are sorted
+        from near to far.
 
         The backward pass adds the absolute values of the pixels' gradients to `sums` [V, 2].
         """
@@ -132,7 +147,8 @@ class ReferenceRasterizer:
 
 
 def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Projected:
-    """Compute the steps from view to radius for M Gaussians. Those that are not drawn have finite values and radius 0."""
+    """Compute the steps from view to radius for M Gaussians. Those that are not drawn have finite
+    values and radius 0."""
     camera = camera.to(means.device, means.dtype)
     rotation, shift = camera.world_to_cam[:3, :3], camera.world_to_cam[:3, 3]
     view = means @ rotation.T + shift
@@ -162,7 +178,8 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
 
 @torch.no_grad()
 def visible(means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
-    """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] have a radius above 0 (Scaffold-GS)."""
+    """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] have a
+    radius above 0 (Scaffold-GS)."""
     quats = torch.zeros((len(means), 4), dtype=means.dtype, device=means.device)
     quats[:, 0] = 1
     return project(means, quats, scales, camera).radii > 0
@@ -176,10 +193,11 @@ def record_mean2d_grad(
     ids: Tensor | slice,
     instead: Callable[[], Tensor] | None = None,
 ) -> Tensor:
-    """Return a buffer [total, 2] of zeros. The backward pass writes d loss / d `mean2d` in NDC to its rows `ids`.
+    """Return a buffer [total, 2] of zeros. The backward pass writes d loss / d `mean2d` in NDC to
+    its rows `ids`.
 
-    The gradient in NDC is the gradient in px times (W/2, H/2). `instead` returns sums of absolute values in px; the backward pass writes
-    these instead and sets them to zero.
+    The gradient in NDC is the gradient in px times (W/2, H/2). `instead` returns sums of absolute
+    values in px; the backward pass writes these instead and sets them to zero.
     """
     buffer = mean2d.new_zeros((total, 2))
     if not torch.is_grad_enabled():
@@ -226,7 +244,8 @@ def _compute_reach(mean2d: Tensor, cov2d: Tensor, opacity: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _sort_into_blocks(reach: Tensor, block: tuple[int, int], down: int, across: int) -> tuple[Tensor, list[int]]:
-    """Sort splats into blocks. Returns their indices [B], block after block in row order, and the number in each block.
+    """Sort splats into blocks. Returns their indices [B], block after block in row order, and the
+    number in each block.
 
     Within a block the splats keep their order.
     """
@@ -248,12 +267,14 @@ def _sort_into_blocks(reach: Tensor, block: tuple[int, int], down: int, across: 
 
 
 def add_absolute(sums: Tensor, places: Tensor, axis: int, gradient: Tensor) -> None:
-    """Add the sums over pixels of |gradient| [P, S] to column `axis` of `sums` [V, 2] at `places` [S]."""
+    """Add the sums over pixels of |gradient| [P, S] to column `axis` of `sums` [V, 2] at `places`
+    [S]."""
     sums[:, axis].index_add_(0, places, gradient.detach().abs().sum(0))
 
 
 def _pixel_centres(corner: tuple[int, int], block: tuple[int, int], like: Tensor) -> Tensor:
-    """Return the pixel centres [P, 2] (x, y) of a block whose first pixel is `corner` (row, column)."""
+    """Return the pixel centres [P, 2] (x, y) of a block whose first pixel is `corner` (row,
+    column)."""
     rows = torch.arange(block[0], device=like.device, dtype=like.dtype) + (corner[0] + 0.5)
     columns = torch.arange(block[1], device=like.device, dtype=like.dtype) + (corner[1] + 0.5)
     y, x = torch.meshgrid(rows, columns, indexing="ij")
@@ -261,9 +282,11 @@ def _pixel_centres(corner: tuple[int, int], block: tuple[int, int], like: Tensor
 
 
 def _blend(splats: Tensor, pixels: Tensor, clamp_gradient: bool, see: Callable[[int, Tensor], None] | None = None) -> Tensor:
-    """Blend sorted splats [S, 10] front to back at pixels [P, 2]. Returns colour, depth and final transmittance [P, 5].
+    """Blend sorted splats [S, 10] front to back at pixels [P, 2]. Returns colour, depth and final
+    transmittance [P, 5].
 
-    The backward pass calls `see` with each axis and the gradients [P, S] of the pixels in the splats' centres along it.
+    The backward pass calls `see` with each axis and the gradients [P, S] of the pixels in the
+    splats' centres along it.
     """
     u, v, a, b, c, opacity = splats[:, :6].unbind(1)
     dx, dy = u - pixels[:, :1], v - pixels[:, 1:]  # [P, S]

@@ -1,5 +1,6 @@
 # pyright: basic, reportMissingImports=false
-"""Triton kernel of the 3 sigma radii; `project_cuda.py` launches it. `reference.project` is the same in plain torch."""
+"""Triton kernel of the 3 sigma radii; `project_cuda.py` launches it. `reference.project` is the
+same in plain torch."""
 
 from __future__ import annotations
 
@@ -18,9 +19,11 @@ def radii(
     means, quats, scales, view, out, extents, M, near, fx, fy, cx, cy, left, right, top, bottom, width, height,
     BLUR: tl.constexpr, ROTATED: tl.constexpr, MASKED: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Write the radii [M] int32 in px, 0 for Gaussians that are not drawn; if MASKED, also 0 to the rows of `extents` [M, 2] of these.
+    """Write the radii [M] int32 in px, 0 for Gaussians that are not drawn; if MASKED, also 0 to the
+    rows of `extents` [M, 2] of these.
 
-    `left` to `bottom` bound x / z and y / z in the Jacobian; `width` and `height` are those of all 16 px tiles of the picture.
+    `left` to `bottom` bound x / z and y / z in the Jacobian; `width` and `height` are those of all
+    16 px tiles of the picture.
     """
     at = tl.program_id(0) * B + tl.arange(0, B)
     inside = at < M

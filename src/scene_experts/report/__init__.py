@@ -1,1 +1,2 @@
-"""The web page of one run (RUN/report.html) or of several: one file that needs no other file and no network."""
+"""The web page of one run (RUN/report.html) or of several: one file that needs no other file and no
+network."""

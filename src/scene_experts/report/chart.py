@@ -21,7 +21,8 @@ class Line:
 
 
 def lines(title: str, series: Sequence[Line], unit: str = "", log: bool = False) -> str:
-    """Draw several lines over the iterations; empty where no line has two finite points. `log`: a logarithmic y axis."""
+    """Draw several lines over the iterations; empty where no line has two finite points. `log`: a
+    logarithmic y axis."""
     shown = []
     for line in series:
         points = [(x, y) for x, y in line.points if math.isfinite(x) and math.isfinite(y) and (y > 0 or not log)]
@@ -72,7 +73,8 @@ def bars(title: str, shares: Sequence[float]) -> str:
 
 
 def text_on(colour: str) -> str:
-    """Return the colour of text on a background "#rrggbb": black or white, whichever has more contrast (WCAG 2)."""
+    """Return the colour of text on a background "#rrggbb": black or white, whichever has more
+    contrast (WCAG 2)."""
     parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     r, g, b = (p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts)
     return "#000" if 0.2126 * r + 0.7152 * g + 0.0722 * b > 0.179 else "#fff"
@@ -90,7 +92,8 @@ def thin_out(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]
 
 
 def smooth(points: Sequence[tuple[float, float]], window: int = 15) -> list[tuple[float, float]]:
-    """Return the running mean over `window` points, without values that are not finite. It hides the differences between views."""
+    """Return the running mean over `window` points, without values that are not finite. It hides
+    the differences between views."""
     points, out, total = [(x, y) for x, y in points if math.isfinite(y)], [], 0.0
     for i, (x, y) in enumerate(points):
         total += y - (points[i - window][1] if i >= window else 0.0)
@@ -114,7 +117,8 @@ def ticks(low: float, high: float, count: int = 5) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Return logarithms of round numbers between two logarithms: 1, 2, 5 of each decade, or some decades if there are many."""
+    """Return logarithms of round numbers between two logarithms: 1, 2, 5 of each decade, or some
+    decades if there are many."""
     decades = range(math.floor(low), math.ceil(high) + 1)
     every = max(1, math.ceil(len(decades) / 6))
     factors = (1, 2, 5) if len(decades) <= 4 else (1,)

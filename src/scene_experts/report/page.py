@@ -1,4 +1,5 @@
-"""Build a web page from run folders: scores, held-out views with a slider, training curves, experts, configuration and command."""
+"""Build a web page from run folders: scores, held-out views with a slider, training curves,
+experts, configuration and command."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ LOSSES = {
 
 
 def write(runs: Sequence[Path], out: Path | None = None) -> Path:
-    """Write the page of evaluated runs and return its path, by default RUN/report.html for a single run.
+    """Write the page of evaluated runs and return its path, by default RUN/report.html for a single
+    run.
 
     Raises InputError if a run is not evaluated, and for several runs without `out`.
     """
@@ -104,7 +106,8 @@ def find_failures(sources: Sequence[ShownRun]) -> list[str]:
 def format_table(found: ResultTable) -> str:
     """Return a table as HTML with its best cells marked, its notes below, and what its columns are.
 
-    The scores of a few runs are rows, which fit on a phone, each beside its explanation. Those of many runs are columns.
+    The scores of a few runs are rows, which fit on a phone, each beside its explanation. Those of
+    many runs are columns.
     """
     notes = "".join(f"<p class='soft'>{escape(note)}</p>" for note in found.notes)
     terms = dict(explain(found.titles))
@@ -136,7 +139,8 @@ def explain_curves(sources: Sequence[ShownRun]) -> str:
 
 
 def draw_curves(sources: Sequence[ShownRun]) -> str:
-    """Draw charts over the iterations: PSNR, losses, anchors, Gaussians, active share, wall time."""
+    """Draw charts over the iterations: PSNR, losses, anchors, Gaussians, active share, wall
+    time."""
 
     def series(key: str, factor: float = 1.0, smooth: bool = True, anchored: bool = False) -> list[Line]:
         out = []
@@ -164,7 +168,8 @@ def draw_curves(sources: Sequence[ShownRun]) -> str:
 
 
 def show_experts(sources: Sequence[ShownRun]) -> str:
-    """Show the experts' shares at the end, one view by the anchors of each expert, and curves of shares and gate entropy.
+    """Show the experts' shares at the end, one view by the anchors of each expert, and curves of
+    shares and gate entropy.
 
     Empty without experts.
     """
@@ -190,7 +195,8 @@ def show_experts(sources: Sequence[ShownRun]) -> str:
 
 
 def show_strips(s: ShownRun) -> str:
-    """Show one held-out view by the anchors of each expert: colour open, other attributes folded. Empty without such pictures."""
+    """Show one held-out view by the anchors of each expert: colour open, other attributes folded.
+    Empty without such pictures."""
     folder = s.path / "test" / "experts"
     found = {a: inside(folder, f"{a}.png") for a in s.results.get("experts") or {}}
     present = sorted((a for a, path in found.items() if path.is_file()), key=lambda a: a != "color")

@@ -21,7 +21,8 @@ from scene_experts.training.config import RunConfig
 
 @dataclass(frozen=True)
 class ShownRun:
-    """What the page shows of one run. `metrics`: lines of metrics.jsonl; `per_view`: scores by the name of a view."""
+    """What the page shows of one run. `metrics`: lines of metrics.jsonl; `per_view`: scores by the
+    name of a view."""
 
     name: str
     path: Path
@@ -32,7 +33,8 @@ class ShownRun:
 
 
 def read_run(run: Path) -> ShownRun:
-    """Read a run folder. Raises InputError if it is not evaluated or its scores by view are invalid."""
+    """Read a run folder. Raises InputError if it is not evaluated or its scores by view are
+    invalid."""
     config, results = run_folder.read_config(run), load_results(run)
     path = run / "per_view.json"
     per_view = read_json(path, "scores by view") if path.is_file() else {}
@@ -56,7 +58,8 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def group_by_capture(sources: Sequence[ShownRun]) -> dict[str, list[ShownRun]]:
-    """Group runs by the name and the camera poses of their capture: only these can have views in common.
+    """Group runs by the name and the camera poses of their capture: only these can have views in
+    common.
 
     The keys are the names, with a number where captures of one name have other poses.
     """

@@ -1,4 +1,5 @@
-"""The held-out views of the page: photograph, renders and errors under a slider, the best and the worst view first."""
+"""The held-out views of the page: photograph, renders and errors under a slider, the best and the
+worst view first."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ def show_captures(groups: dict[str, list[ShownRun]]) -> tuple[str, dict[str, str
 
 
 def show_views(sources: Sequence[ShownRun], prefix: str) -> tuple[str, dict[str, str]]:
-    """Return up to MOST_VIEWS views with their sliders as HTML, and their pictures as data URLs by key. Keys start with `prefix`."""
+    """Return up to MOST_VIEWS views with their sliders as HTML, and their pictures as data URLs by
+    key. Keys start with `prefix`."""
     pictures: dict[str, str] = {}
     blocks = []
     names = find_common_views(sources)
@@ -67,7 +69,8 @@ def show_views(sources: Sequence[ShownRun], prefix: str) -> tuple[str, dict[str,
 
 
 def encode_picture(path: Path, longest: int = LONGEST) -> str:
-    """Return a picture as the data URL of a JPEG of at most `longest` px a side. Raises InputError if it is unreadable."""
+    """Return a picture as the data URL of a JPEG of at most `longest` px a side. Raises InputError
+    if it is unreadable."""
     picture = Image.fromarray(read_picture(path))
     picture.thumbnail((longest, longest), Image.Resampling.LANCZOS)
     stream = io.BytesIO()
@@ -76,7 +79,8 @@ def encode_picture(path: Path, longest: int = LONGEST) -> str:
 
 
 def choose_shown(sources: Sequence[ShownRun], names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return up to MOST_VIEWS views as (name, label): the best and the worst by mean PSNR over the runs, then others in order."""
+    """Return up to MOST_VIEWS views as (name, label): the best and the worst by mean PSNR over the
+    runs, then others in order."""
     scores = {n: [s.per_view[n]["psnr"] for s in sources if s.per_view[n].get("psnr") is not None] for n in names}
     scored = sorted((name for name in names if scores[name]), key=lambda name: fmean(scores[name]))
     ends = [(scored[-1], "best view"), (scored[0], "worst view")] if len(scored) > 1 else []

@@ -76,7 +76,8 @@ def compare_scores(claim: Better, a: list[Record], b: list[Record]) -> Finding:
 
 
 def judge_no_gain(d: Difference) -> Verdict:
-    """Judge whether A has at most EQUAL more than B. No number of runs can show that a difference is 0."""
+    """Judge whether A has at most EQUAL more than B. No number of runs can show that a difference
+    is 0."""
     return "confirmed" if d.high < EQUAL else "contradicted" if d.verdict(1) == "confirmed" else "undecided"
 
 
@@ -170,7 +171,8 @@ def check_experts(by: Groups) -> list[Finding]:
 
 
 def compare_parts(claim: str, by: Groups, pairs: dict[str, tuple[str, str]], judge: Callable[[Difference], Verdict]) -> Finding:
-    """Judge a claim with several parts, each a difference of two recipes. One part can contradict it; all must have runs and confirm it."""
+    """Judge a claim with several parts, each a difference of two recipes. One part can contradict
+    it; all must have runs and confirm it."""
     found = {name: d for name, (a, b) in pairs.items() if (d := difference(by.get(a, []), by.get(b, []))) is not None}
     if not found:
         return Finding(claim, None, "no runs")

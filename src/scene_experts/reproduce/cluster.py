@@ -1,7 +1,7 @@
 """Train the runs of an experiment on the workers of a Dask cluster (`--cluster`).
 
-Dask places the runs, and repeats a run whose worker is lost or whose training failed. All machines share the run folders, so a repeated
-run continues from its last checkpoint.
+Dask places the runs, and repeats a run whose worker is lost or whose training failed. All machines
+share the run folders, so a repeated run continues from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -41,14 +41,16 @@ class PlacedRun:
     runs: Path
     records: Path
     token: str
-    """Name of a file in `runs` and in `records` that exists while the command works. A worker that does not find it has other folders."""
+    """Name of a file in `runs` and in `records` that exists while the command works. A worker that
+    does not find it has other folders."""
     place: str
     resources: dict[str, float]
 
 
 @dataclass
 class ClusterRunner(Runner):
-    """Trains each run on a worker of a Dask cluster. Records, pictures and the removal of run folders are as in `Runner`."""
+    """Trains each run on a worker of a Dask cluster. Records, pictures and the removal of run
+    folders are as in `Runner`."""
 
     address: str = ""
     """Address of the scheduler."""
@@ -59,7 +61,8 @@ class ClusterRunner(Runner):
     def run_all(self, specs: Sequence[Spec]) -> list[Failure]:
         """Train every run that has no record yet; return the failures.
 
-        Raises InputError if the scheduler does not answer, or if a worker has no such package, another version of it, or other folders.
+        Raises InputError if the scheduler does not answer, or if a worker has no such package,
+        another version of it, or other folders.
         """
         done = store.load(self.records)
         todo = [spec for spec in specs if store.find(done, spec) is None]
@@ -89,7 +92,8 @@ class ClusterRunner(Runner):
         return futures
 
     def _gather(self, client: Client, futures: dict[Future, Spec]) -> list[Failure]:
-        """Wait for the runs and return the failures. After `end`, wait only for those that run now: they save and end."""
+        """Wait for the runs and return the failures. After `end`, wait only for those that run now:
+        they save and end."""
         failures, pending = [], set(futures)
         while pending:
             time.sleep(0.2)
@@ -157,7 +161,8 @@ class ClusterRunner(Runner):
 
 @contextmanager
 def connect(address: str) -> Iterator[Client]:
-    """Connect to the scheduler at `address`. Raises InputError if `distributed` is not installed or if no scheduler answers."""
+    """Connect to the scheduler at `address`. Raises InputError if `distributed` is not installed or
+    if no scheduler answers."""
     try:
         from distributed import Client
     except ImportError as error:
@@ -166,8 +171,8 @@ def connect(address: str) -> Iterator[Client]:
     class Closing(Client):
         """A client that is closed at once if it cannot connect.
 
-        Dask leaves it to the garbage collector, which may close it while this thread starts another client and holds the lock that closing
-        takes: the program then waits for ever.
+        Dask leaves it to the garbage collector, which may close it while this thread starts another
+        client and holds the lock that closing takes: the program then waits for ever.
         """
 
         def __init__(self) -> None:
@@ -189,7 +194,8 @@ def connect(address: str) -> Iterator[Client]:
 def make_task() -> Callable[[str, bytes], tuple[str, str]]:
     """Return the function that a worker calls.
 
-    It is a nested function without names of this package, so Dask sends its code. A worker without this package can therefore say so.
+    It is a nested function without names of this package, so Dask sends its code. A worker without
+    this package can therefore say so.
     """
 
     def task(version: str, job: bytes) -> tuple[str, str]:
@@ -213,7 +219,8 @@ def work(packed: bytes) -> tuple[str, str]:
 
     packed: a pickled `PlacedRun`, from the same version of this package.
 
-    Returns ("done", one line about the run), or ("input", a sentence) if this machine does not see the folders of the command.
+    Returns ("done", one line about the run), or ("input", a sentence) if this machine does not see
+    the folders of the command.
 
     Raises RuntimeError with the reason if the run fails, so that Dask repeats it.
     """
@@ -243,7 +250,8 @@ def work(packed: bytes) -> tuple[str, str]:
 
 
 def threads(nthreads: int, total: dict[str, Any], wanted: dict[str, float]) -> int:
-    """Return the threads of a run: those of its worker, shared among the runs that the worker can hold at a time."""
+    """Return the threads of a run: those of its worker, shared among the runs that the worker can
+    hold at a time."""
     at_once = min([nthreads, *(int(total.get(name, 0) // amount) for name, amount in wanted.items())])
     return max(1, nthreads // max(1, at_once))
 

@@ -1,4 +1,5 @@
-"""Lists of objects as columns, and compact JSON text that stays readable in a diff. Records are written this way."""
+"""Lists of objects as columns, and compact JSON text that stays readable in a diff. Records are
+written this way."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ COMPACT = (",", ":")
 
 
 def columns(rows: list[Any]) -> Any:
-    """Return `[{"a": 1}, {"a": 2}]` as `{"a": [1, 2]}`, at every depth. Rows without the same keys stay as they are."""
+    """Return `[{"a": 1}, {"a": 2}]` as `{"a": [1, 2]}`, at every depth. Rows without the same keys
+    stay as they are."""
     if rows and all(isinstance(row, dict) for row in rows) and all(row.keys() == rows[0].keys() for row in rows):
         return {key: columns([row[key] for row in rows]) for key in rows[0]}
     return rows
@@ -29,7 +31,8 @@ def length(found: Any) -> int:
 
 
 def text(value: Any, depth: int = 2) -> str:
-    """Return JSON without indentation, one line for each entry of the objects in the first `depth` levels. Raises ValueError for NaN."""
+    """Return JSON without indentation, one line for each entry of the objects in the first `depth`
+    levels. Raises ValueError for NaN."""
     if depth == 0 or not isinstance(value, dict) or not value:
         return json.dumps(value, separators=COMPACT, allow_nan=False)
     lines = (f"{json.dumps(key)}:{text(each, depth - 1)}" for key, each in value.items())

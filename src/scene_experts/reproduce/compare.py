@@ -1,4 +1,5 @@
-"""`reproduce compare`: any recipes beside a baseline, with the differences capture by capture and their intervals."""
+"""`reproduce compare`: any recipes beside a baseline, with the differences capture by capture and
+their intervals."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ DIGITS = {"psnr": 2, "ssim": 4, "lpips_3dgs": 4}
 def make_comparison(options: ReproduceOptions) -> Experiment:
     """Return the comparison of --recipes with --baseline, by default the first recipe.
 
-    A recipe may have flags, and a name before them (see `variants.split_name`). Raises InputError for unknown recipes and flags.
+    A recipe may have flags, and a name before them (see `variants.split_name`). Raises InputError
+    for unknown recipes and flags.
     """
     rows = dict(split_name(text) for text in options.recipes)
     lines = list(rows.values())
@@ -45,7 +47,8 @@ def make_comparison(options: ReproduceOptions) -> Experiment:
 
 
 def make_difference_tables(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str]) -> dict[str, ResultTable]:
-    """Return, for each baseline of an experiment and each score, the table of the differences from it on `scenes`."""
+    """Return, for each baseline of an experiment and each score, the table of the differences from
+    it on `scenes`."""
     here = [r for r in records if r.scene in scenes]
     made, names = {}, {recipe: name for name, recipe in experiment.rows.items()}
     for baseline in experiment.baselines:
@@ -59,10 +62,11 @@ def make_difference_tables(experiment: Experiment, records: Sequence[Record], sc
 def make_difference_table(
     records: Sequence[Record], recipes: Mapping[str, str], baseline: str, score: str, scenes: Sequence[str]
 ) -> ResultTable:
-    """Return the table of the differences of recipes from a baseline in a score: each capture, the mean and both intervals.
+    """Return the table of the differences of recipes from a baseline in a score: each capture, the
+    mean and both intervals.
 
-    `recipes` maps the title of each row to its recipe. Each difference is paired by view and seed. Recipes that share no run with the
-    baseline have no row.
+    `recipes` maps the title of each row to its recipe. Each difference is paired by view and seed.
+    Recipes that share no run with the baseline have no row.
     """
     base, digits = [r for r in records if r.recipe == baseline], DIGITS[score]
     rows, notes = [], []
@@ -85,7 +89,8 @@ def make_difference_table(
 
 
 def intervals(found: Difference, digits: int) -> tuple[str, str]:
-    """Write the two intervals of a difference; "-" for the second where there are too few captures."""
+    """Write the two intervals of a difference; "-" for the second where there are too few
+    captures."""
     first = f"{found.low:+.{digits}f} to {found.high:+.{digits}f}"
     across = found.over_captures
     return first, "-" if across is None else f"{across[0]:+.{digits}f} to {across[1]:+.{digits}f}"

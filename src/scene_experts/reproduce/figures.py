@@ -21,7 +21,8 @@ ROUTING_NAMES = {"top1": "Top-1", "top2": "Top-2", "dense": "dense"}
 
 
 def canvas(columns: int = 1, width: float = 6.4, height: float = 3.8) -> tuple[Any, Any]:
-    """Return a figure and its axes [1, columns]; `width` and `height` in inches. Raises InputError without matplotlib."""
+    """Return a figure and its axes [1, columns]; `width` and `height` in inches. Raises InputError
+    without matplotlib."""
     try:
         import matplotlib
     except ImportError as error:
@@ -33,7 +34,8 @@ def canvas(columns: int = 1, width: float = 6.4, height: float = 3.8) -> tuple[A
 
 
 def save(figure: Any, path: Path) -> list[Path]:
-    """Write a PNG file of 256 colours, whole or not at all. The same figure gives the same bytes."""
+    """Write a PNG file of 256 colours, whole or not at all. The same figure gives the same
+    bytes."""
     from matplotlib import pyplot
 
     drawn, small = io.BytesIO(), io.BytesIO()
@@ -47,7 +49,8 @@ def save(figure: Any, path: Path) -> list[Path]:
 
 
 def relative_psnr(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str], path: Path) -> list[Path]:
-    """Draw Figure 1(b): PSNR relative to the first row (3DGS) in %, scenes in the order of Scaffold-GS's anchor counts."""
+    """Draw Figure 1(b): PSNR relative to the first row (3DGS) in %, scenes in the order of
+    Scaffold-GS's anchor counts."""
     anchors = {s: m.value for s in scenes if (m := mean(select(records, "scaffold-gs", s), "anchors"))}
     (_, first), *others = experiment.rows.items()
     shown = sorted((s for s in scenes if s in anchors and select(records, first, s)), key=lambda s: anchors[s])
@@ -70,7 +73,8 @@ def relative_psnr(experiment: Experiment, records: Sequence[Record], scenes: Seq
 
 
 def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str, path: Path, attribute: str = "cov") -> list[Path]:
-    """Draw Figure 3: each expert's share of the assignments (of the gates while dense) during training, one panel per row."""
+    """Draw Figure 3: each expert's share of the assignments (of the gates while dense) during
+    training, one panel per row."""
     found = [(name, select(records, recipe, scene)) for name, recipe in experiment.rows.items()]
     found = [(name, min(rows, key=lambda r: r.seed)) for name, rows in found if rows]
     found = [(name, record) for name, record in found if any(attribute in c.get("scene_routing", {}) for c in record.curves)]
@@ -91,7 +95,8 @@ def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str,
 
 
 def cost(experiment: Experiment, records: Sequence[Record], path: Path) -> list[Path]:
-    """Draw Figure 6: PSNR against training time, one line per routing, one point per number of experts."""
+    """Draw Figure 6: PSNR against training time, one line per routing, one point per number of
+    experts."""
     figure, axes = canvas()
     drawn, records = False, on_common_runs(records, experiment.rows.values())
     clock = clock_of(records)

@@ -20,8 +20,8 @@ class ReproduceOptions:
     """
 
     experiments: Annotated[tuple[str, ...], Option(value="EXPERIMENT")]
-    """table1, table2, table3, table4, fig1b, fig3, fig5, fig6, fig7, appendix, all of these (all), extras (recipes that the paper does not
-    have), or compare (the recipes of --recipes)."""
+    """table1, table2, table3, table4, fig1b, fig3, fig5, fig6, fig7, appendix, all of these (all),
+    extras (recipes that the paper does not have), or compare (the recipes of --recipes)."""
     captures: Annotated[tuple[Path, ...], Option(value="CAPTURE")] = ()
     """Your own captures instead of the paper's scenes."""
     data: Path | None = None
@@ -33,7 +33,8 @@ class ReproduceOptions:
     runs: Path | None = None
     """Folder for run folders; by default OUT/runs."""
     records: Path | None = None
-    """Folder for records of finished runs; by default OUT/records. Reproductions at different scales can share it."""
+    """Folder for records of finished runs; by default OUT/records. Reproductions at different
+    scales can share it."""
     scale: float = 1.0
     """1 is the size of the paper. Smaller values shorten the schedule and reduce the resolution."""
     iterations: int | None = None
@@ -43,20 +44,23 @@ class ReproduceOptions:
     seeds: Annotated[tuple[int, ...], Range(0)] = (0,)
     """Seeds; each experiment is run once for each."""
     workers: Annotated[int | None, Range(1)] = None
-    """Number of runs at a time, each in its own process; by default one, or one for each of --devices."""
+    """Number of runs at a time, each in its own process; by default one, or one for each of
+    --devices."""
     devices: Annotated[tuple[str, ...], Option(value="INDEX")] = ()
     """Indices of the CUDA devices that the workers share."""
     cluster: Annotated[str | None, Option(value="ADDRESS")] = None
-    """Train the runs on the workers of the Dask scheduler at this address, e.g. tcp://HOST:8786 (needs
-    `pip install 'scene-experts[cluster]'`). All machines must share the folders."""
+    """Train the runs on the workers of the Dask scheduler at this address, e.g. tcp://HOST:8786
+    (needs `pip install 'scene-experts[cluster]'`). All machines must share the folders."""
     resources: Annotated[tuple[str, ...], Option(value="NAME=AMOUNT")] = ()
-    """With --cluster: what a run takes from its worker, e.g. GPU=1; by default one thread. Start the workers with
-    `dask worker --resources "GPU=1"`."""
+    """With --cluster: what a run takes from its worker, e.g. GPU=1; by default one thread. Start
+    the workers with `dask worker --resources "GPU=1"`."""
     recipes: Annotated[tuple[str, ...], Option(value="RECIPE")] = ()
-    """Run only the rows of these recipes. With compare: the recipes to compare, any recipe of `scene-experts train`, also with flags and a
-    name: "moe-gs" "narrow=moe-gs --scene.hidden 16"."""
+    """Run only the rows of these recipes. With compare: the recipes to compare, any recipe of
+    `scene-experts train`, also with flags and a name: "moe-gs" "narrow=moe-gs --scene.hidden
+    16"."""
     baseline: Annotated[tuple[str, ...], Option(value="RECIPE")] = ()
-    """With compare: show the differences from these recipes (or names of --recipes); by default from the first of --recipes."""
+    """With compare: show the differences from these recipes (or names of --recipes); by default
+    from the first of --recipes."""
     discard: bool = False
     """Delete each run folder when its record is written."""
     adopt: Annotated[tuple[Path, ...], Option(value="RUN")] = ()
@@ -72,7 +76,8 @@ class ReproduceOptions:
         return self.workers if self.workers is not None else max(1, len(self.devices))
 
     def needs(self) -> dict[str, float]:
-        """Return --resources as amounts by name. Raises InputError if one is not NAME=AMOUNT with a positive amount."""
+        """Return --resources as amounts by name. Raises InputError if one is not NAME=AMOUNT with a
+        positive amount."""
         found = {}
         for text in self.resources:
             name, _, amount = text.partition("=")

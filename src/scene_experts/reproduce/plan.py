@@ -1,4 +1,5 @@
-"""The runs that an experiment needs, each with every setting that changes its numbers, and the size of a smaller experiment."""
+"""The runs that an experiment needs, each with every setting that changes its numbers, and the size
+of a smaller experiment."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ OWN = "captures"  # the data set of the user's own captures
 
 @dataclass(frozen=True)
 class CaptureSpec:
-    """A capture to train on. Its protocol sets `options` of Data (resolution, split, normalise, ...) and `numbers` of Train."""
+    """A capture to train on. Its protocol sets `options` of Data (resolution, split, normalise,
+    ...) and `numbers` of Train."""
 
     name: str
     dataset: str
@@ -52,7 +54,8 @@ class Scale:
 
     @classmethod
     def of(cls, scale: float, iterations: int | None = None, resolution: str | None = None) -> Scale:
-        """Make a scale. `scale` in (0, 1] shortens the schedule and the pictures' sides; the other two override it. Raises InputError."""
+        """Make a scale. `scale` in (0, 1] shortens the schedule and the pictures' sides; the other
+        two override it. Raises InputError."""
         if not 0 < scale <= 1:
             raise InputError(f"expected --scale above 0 and at most 1, found {scale}; 1 is the paper's size")
         if iterations is not None and iterations < 1:
@@ -60,12 +63,14 @@ class Scale:
         return cls(scale, iterations, check_policy(resolution) if resolution and resolution != "auto" else resolution)
 
     def length(self, cfg: Train) -> int:
-        """Return the iterations of a recipe. The full schedule of Octree-GS has 40,000, that of the others 30,000."""
+        """Return the iterations of a recipe. The full schedule of Octree-GS has 40,000, that of the
+        others 30,000."""
         return self.iterations or max(1, round(cfg.schedule * self.share))
 
 
 def shrink(policy: str, share: float) -> str:
-    """Return the policy whose pictures have `share` of the side lengths of `policy`. inria:N becomes factor:M of the full photographs."""
+    """Return the policy whose pictures have `share` of the side lengths of `policy`. inria:N
+    becomes factor:M of the full photographs."""
     kind, _, number = policy.partition(":")
     if kind in ("inria", "factor", "as-is"):
         return f"factor:{float(number or 1) / share:g}"
@@ -76,7 +81,8 @@ def shrink(policy: str, share: float) -> str:
 
 @dataclass(frozen=True)
 class Spec:
-    """One run: a recipe on a scene with a seed. The recipe may have flags: "moe-gs --scene.hidden 8"."""
+    """One run: a recipe on a scene with a seed. The recipe may have flags: "moe-gs --scene.hidden
+    8"."""
 
     scene: CaptureSpec
     recipe: str
@@ -99,12 +105,14 @@ class Spec:
 
     @property
     def key(self) -> str:
-        """A short hash of every setting that changes the run's numbers. The path of the capture is left out."""
+        """A short hash of every setting that changes the run's numbers. The path of the capture is
+        left out."""
         return identity(self.scene.name, self.train, self.data, self.code)
 
     @property
     def numbers(self) -> str:
-        """The same hash without the recipe's name. Rows of different experiments with the same hash are the same training."""
+        """The same hash without the recipe's name. Rows of different experiments with the same hash
+        are the same training."""
         return identity(self.scene.name, replace(self.train, recipe=""), self.data, self.code)
 
     @cached_property
@@ -131,8 +139,9 @@ class Spec:
 
 
 def identity(scene: str, train: Train, data: Data, code: str = "", start: Path | None = None) -> str:
-    """Return the hash that names a run: of the scene's name, what differs from the defaults of the recipe's parts (`lean`) and of how the
-    capture is read (not its path), the code of other packages (`code_of`), and the name of the run whose scene it started from."""
+    """Return the hash that names a run: of the scene's name, what differs from the defaults of the
+    recipe's parts (`lean`) and of how the capture is read (not its path), the code of other
+    packages (`code_of`), and the name of the run whose scene it started from."""
     more = [code] if code else []
     more += [f"from {start.name}"] if start else []
     text = json.dumps([scene, lean(train), data.settings(), *more], sort_keys=True)
@@ -140,7 +149,8 @@ def identity(scene: str, train: Train, data: Data, code: str = "", start: Path |
 
 
 def code_of(train: Train) -> str:
-    """Return a hash of the source files of the packages, other than this one, that a recipe has parts of; "" without such parts.
+    """Return a hash of the source files of the packages, other than this one, that a recipe has
+    parts of; "" without such parts.
 
     A run is therefore trained again after a change of the code that it was trained with.
     """
@@ -170,7 +180,8 @@ def parts_of(value: Any) -> Iterator[Any]:
 
 
 def find_own_scenes(captures: Sequence[Path]) -> list[CaptureSpec]:
-    """Return the user's captures as scenes of one data set. Raises InputError where a folder is missing or two have the same name."""
+    """Return the user's captures as scenes of one data set. Raises InputError where a folder is
+    missing or two have the same name."""
     scenes = [CaptureSpec(path.resolve().name, OWN, path) for path in captures]
     for scene in scenes:
         if not scene.path.is_dir():
@@ -188,7 +199,8 @@ def check_folders(scenes: Sequence[CaptureSpec]) -> None:
 
 
 def find_paper_scenes(root: Path) -> list[CaptureSpec]:
-    """Find the paper's scenes below `root`, each with the paper's protocol. As in the paper's code, they keep their own units."""
+    """Find the paper's scenes below `root`, each with the paper's protocol. As in the paper's code,
+    they keep their own units."""
     found = []
     for scene in catalog.SCENES:
         if is_present(root, scene):
@@ -198,9 +210,11 @@ def find_paper_scenes(root: Path) -> list[CaptureSpec]:
 
 
 def list_runs(experiments: Iterable[Experiment], scenes: Sequence[CaptureSpec], seeds: Sequence[int], scale: Scale) -> list[Spec]:
-    """List the runs that experiments need, each once. All runs of a seed come before the next seed, so a table is complete early.
+    """List the runs that experiments need, each once. All runs of a seed come before the next seed,
+    so a table is complete early.
 
-    The user's own captures are used in place of every data set. The paper's scenes are used in the experiments that name them.
+    The user's own captures are used in place of every data set. The paper's scenes are used in the
+    experiments that name them.
     """
     wanted: dict[Spec, None] = {}
     for seed in seeds:

@@ -1,4 +1,5 @@
-"""Write the tables and figures of experiments, the checklist of claims, and a page that links to them."""
+"""Write the tables and figures of experiments, the checklist of claims, and a page that links to
+them."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ DISJOINT = "No scene has runs of every row: each mean is over the scenes of its 
 def write(
     out: Path, experiments: Sequence[Experiment], scenes: Sequence[CaptureSpec], records: Sequence[Record], command: str = ""
 ) -> list[Path]:
-    """Write the files of experiments below `out` and return their paths. Ignores records of other scenes. The page quotes `command`."""
+    """Write the files of experiments below `out` and return their paths. Ignores records of other
+    scenes. The page quotes `command`."""
     wanted = {scene.name for scene in scenes}
     records = [r for r in records if r.scene in wanted]
     written: list[Path] = []
@@ -72,7 +74,8 @@ def below_title(text: str) -> list[str]:
 
 
 def caveat(records: Sequence[Record]) -> list[str]:
-    """Return the caveat for verdicts from trainings that are shorter than the paper's; empty for full-length ones."""
+    """Return the caveat for verdicts from trainings that are shorter than the paper's; empty for
+    full-length ones."""
     usual = [r for r in records if r.config.train.schedule == SCHEDULE] or records  # that of Octree-GS is longer
     length = max((r.config.train.iterations for r in usual), default=SCHEDULE)
     if length >= SCHEDULE:
@@ -88,7 +91,8 @@ def caveat(records: Sequence[Record]) -> list[str]:
 
 
 def write_tables(out: Path, experiment: Experiment, scenes: Sequence[CaptureSpec], records: Sequence[Record]) -> list[Path]:
-    """Write an experiment's tables: means for each data set, and the first column scene by scene."""
+    """Write an experiment's tables: means for each data set, and the first column scene by
+    scene."""
     made: dict[str, ResultTable] = {}
     datasets = list(dict.fromkeys(s.dataset for s in scenes if s.dataset == OWN or s.dataset in experiment.datasets))
     for dataset in datasets:
@@ -141,7 +145,8 @@ def strip_path(out: Path, scene: str) -> Path:
 
 
 def draw_experts(spec: Spec, run: Path, out: Path, attribute: str = "color") -> Path:
-    """Draw Figure 5 of a run: the first held-out view, then the anchors of each expert alone. Returns `strip_path`."""
+    """Draw Figure 5 of a run: the first held-out view, then the anchors of each expert alone.
+    Returns `strip_path`."""
     opened = run_folder.open_run(run)
     capture = captures.load(replace(opened.config.data, path=spec.scene.path), spec.seed)
     try:
@@ -157,6 +162,7 @@ def draw_experts(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
 
 
 def adopt(run: Path, folder: Path) -> Path:
-    """Write the record of a run folder that another command trained. Its scene is the name of its capture."""
+    """Write the record of a run folder that another command trained. Its scene is the name of its
+    capture."""
     config = run_folder.read_config(run)
     return store.write(folder, store.read_run(run, Path(config.data.path).resolve().name, code_of(config.train)))

@@ -43,7 +43,8 @@ class StudyPlan:
 def make_plan(options: ReproduceOptions) -> StudyPlan:
     """The plan of the options.
 
-    Raises InputError for unknown experiments, scenes and recipes, for settings that `train` refuses, and for folders that are files.
+    Raises InputError for unknown experiments, scenes and recipes, for settings that `train`
+    refuses, and for folders that are files.
     """
     for folder in (options.out, options.runs, options.records):
         if folder and folder.exists() and not folder.is_dir():
@@ -61,7 +62,8 @@ def make_plan(options: ReproduceOptions) -> StudyPlan:
 
 
 def choose_rows(experiments: list[Experiment], recipes: tuple[str, ...]) -> list[Experiment]:
-    """The experiments with only the rows of `recipes`. Raises InputError for a recipe that none of them has."""
+    """The experiments with only the rows of `recipes`. Raises InputError for a recipe that none of
+    them has."""
     known = {recipe for experiment in experiments for recipe in experiment.rows.values()}
     for recipe in recipes:
         if recipe not in known:
@@ -87,7 +89,8 @@ def choose_experiments(options: ReproduceOptions) -> list[Experiment]:
 
 
 def choose_scenes(options: ReproduceOptions) -> list[CaptureSpec]:
-    """The captures of the options: the user's own, or the paper's scenes on this machine. Raises InputError for unknown scenes."""
+    """The captures of the options: the user's own, or the paper's scenes on this machine. Raises
+    InputError for unknown scenes."""
     root = options.data or captures_dir()
     scenes = find_own_scenes(options.captures) if options.captures else find_paper_scenes(root)
     unknown = set(options.scenes) - {s.name for s in scenes}

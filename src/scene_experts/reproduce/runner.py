@@ -1,4 +1,5 @@
-"""Train the runs of an experiment, several at a time: skip those that are done, resume those that stopped, go on after a failure."""
+"""Train the runs of an experiment, several at a time: skip those that are done, resume those that
+stopped, go on after a failure."""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ class Runner:
     workers: int = 1
     """Runs at a time."""
     devices: Sequence[str] = ()
-    """Indices of the CUDA devices to share among the workers, among those of CUDA_VISIBLE_DEVICES. Empty: the CPU, or the first device."""
+    """Indices of the CUDA devices to share among the workers, among those of CUDA_VISIBLE_DEVICES.
+    Empty: the CPU, or the first device."""
     discard: bool = False
     """Remove a run folder once its record is written."""
     say: Say = print
@@ -93,8 +95,8 @@ class Runner:
         return failures
 
     def run(self, spec: Spec, slot: int, place: str) -> Failure | None:
-        """Train, evaluate and record one run, unless another command did or does it. `slot` is the number of its worker, `place` its
-        number among all runs as text."""
+        """Train, evaluate and record one run, unless another command did or does it. `slot` is the
+        number of its worker, `place` its number among all runs as text."""
         folder = spec.folder(self.runs)
         log = folder.parent / f"{folder.name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -142,7 +144,8 @@ class Runner:
 
     @contextmanager
     def _patient(self, lock: Callable[[], AbstractContextManager[None]]) -> Iterator[None]:
-        """Hold a lock, for which it waits up to `patience` seconds. Raises InputError if another process still holds it."""
+        """Hold a lock, for which it waits up to `patience` seconds. Raises InputError if another
+        process still holds it."""
         until = time.monotonic() + self.patience
         with ExitStack() as stack:
             while True:
@@ -159,7 +162,8 @@ class Runner:
         return Failure(spec, why, log)
 
     def call(self, args: list[str], slot: int, log: Path) -> int:
-        """Run `scene-experts ARGS` with the worker's share of the cores, append its output to the log, return the exit code."""
+        """Run `scene-experts ARGS` with the worker's share of the cores, append its output to the
+        log, return the exit code."""
         environment = {**os.environ, PARENT: str(os.getpid())}
         if self.threads or self.workers > 1:
             environment["OMP_NUM_THREADS"] = str(self.threads or max(1, native.count_cores() // self.workers))
@@ -168,7 +172,8 @@ class Runner:
         with log.open("a") as stream:
             stream.write(f"$ scene-experts {' '.join(args)}\n")
             stream.flush()
-            # Its own process group: a terminal's Ctrl-C must not reach it beside our SIGTERM, as a second signal ends it without saving.
+            # Its own process group: a terminal's Ctrl-C must not reach it beside our SIGTERM, as a
+            # second signal ends it without saving.
             process = subprocess.Popen(
                 [sys.executable, "-m", "scene_experts", *args],
                 stdout=stream,
@@ -196,9 +201,11 @@ class Runner:
 
 
 def visible_device(index: str, visible: str | None) -> str:
-    """Return CUDA_VISIBLE_DEVICES for a run on device `index` (--devices) of the devices that a scheduler gave to this process.
+    """Return CUDA_VISIBLE_DEVICES for a run on device `index` (--devices) of the devices that a
+    scheduler gave to this process.
 
-    visible: CUDA_VISIBLE_DEVICES of this process, or None if it is not set. With "4,5", index 1 is device 5.
+    visible: CUDA_VISIBLE_DEVICES of this process, or None if it is not set. With "4,5", index 1 is
+    device 5.
 
     Raises InputError, which names --devices, if `index` is not among the visible devices.
     """
@@ -215,8 +222,8 @@ def visible_device(index: str, visible: str | None) -> str:
 def build_kernels() -> None:
     """Build the CUDA code of gsplat in a process of its own, if this machine has a CUDA device.
 
-    gsplat compiles itself on its first import, and removes the lock and the build folder of a build that another process runs. Workers
-    that start together would therefore break each other's build.
+    gsplat compiles itself on its first import, and removes the lock and the build folder of a build
+    that another process runs. Workers that start together would therefore break each other's build.
     """
     if torch.cuda.is_available():
         code = "from scene_experts.render.gsplat import explain_missing; explain_missing()"
@@ -224,7 +231,8 @@ def build_kernels() -> None:
 
 
 def reason(code: int, log: Path) -> str:
-    """Return why a command with the exit code `code` failed: the last line of its log, and the signal that has ended it, if one has."""
+    """Return why a command with the exit code `code` failed: the last line of its log, and the
+    signal that has ended it, if one has."""
     said = last_line(log)
     if code >= 0:
         return said or f"exit code {code}"

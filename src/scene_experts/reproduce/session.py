@@ -1,4 +1,5 @@
-"""One call of `scene-experts reproduce`: train what is missing, then write the tables and figures."""
+"""One call of `scene-experts reproduce`: train what is missing, then write the tables and
+figures."""
 
 from __future__ import annotations
 
@@ -18,9 +19,11 @@ from scene_experts.reproduce.runner import Failure, Runner, Say
 
 
 def reproduce(options: ReproduceOptions, say: Say) -> bool:
-    """Run the missing experiments and write the tables and figures; returns False if a signal stopped it before the end.
+    """Run the missing experiments and write the tables and figures; returns False if a signal
+    stopped it before the end.
 
-    Raises InputError for options that do not fit, RunError if a run fails; the finished runs are kept.
+    Raises InputError for options that do not fit, RunError if a run fails; the finished runs are
+    kept.
     """
     check_fields(options)
     plan = make_plan(options)
@@ -48,7 +51,8 @@ def reproduce(options: ReproduceOptions, say: Say) -> bool:
 
 
 def make_runner(options: ReproduceOptions, plan: StudyPlan, say: Say, draw: Callable[[Spec, Path], None]) -> Runner:
-    """The runner of the options: the workers of a cluster (--cluster), or processes of this machine."""
+    """The runner of the options: the workers of a cluster (--cluster), or processes of this
+    machine."""
     if options.cluster is not None:
         cluster = {"address": options.cluster, "resources": options.needs()}
         return ClusterRunner(plan.runs.absolute(), plan.records.absolute(), discard=options.discard, say=say, after=draw, **cluster)
@@ -65,7 +69,8 @@ def list_plan(plan: StudyPlan, say: Say) -> None:
 
 
 def figure_drawer(options: ReproduceOptions, plan: StudyPlan) -> Callable[[Spec, Path], None]:
-    """A function that draws Figure 5 from a run folder, if the figure is requested and the run belongs to it and has the first seed."""
+    """A function that draws Figure 5 from a run folder, if the figure is requested and the run
+    belongs to it and has the first seed."""
     figure5 = set(EXPERIMENTS["fig5"].rows.values()) if any(e.name == "fig5" for e in plan.experiments) else set()
 
     def draw(spec: Spec, folder: Path) -> None:
@@ -76,7 +81,8 @@ def figure_drawer(options: ReproduceOptions, plan: StudyPlan) -> Callable[[Spec,
 
 
 def run_plan(runner: Runner, plan: StudyPlan, out: Path) -> list[Failure]:
-    """Train the missing runs and draw missing pictures of the finished ones into `out`; returns the runs that failed."""
+    """Train the missing runs and draw missing pictures of the finished ones into `out`; returns the
+    runs that failed."""
     with handled(lambda *_: runner.end()):
         failures = runner.run_all(plan.wanted)
     for spec in plan.wanted:

@@ -1,4 +1,5 @@
-"""Means over scenes with their spread over seeds, and differences between recipes, paired by view and seed."""
+"""Means over scenes with their spread over seeds, and differences between recipes, paired by view
+and seed."""
 
 from __future__ import annotations
 
@@ -14,9 +15,9 @@ from scipy.special import stdtrit
 from scene_experts.reproduce.store import Record
 
 SEED_SD = {"psnr": 0.28, "ssim": 0.005, "lpips_3dgs": 0.005}
-"""Assumed standard deviation over seeds of the difference of two runs on one capture, PSNR in dB: that of the ten pairs of five recipes
-with three seeds on seven captures at 7,000 iterations, pooled (results/moe-gs.md). Single pairs have 0.15 to 0.39 dB, 0.003 to 0.007 and
-0.003 to 0.006."""
+"""Assumed standard deviation over seeds of the difference of two runs on one capture, PSNR in dB:
+that of the ten pairs of five recipes with three seeds on seven captures at 7,000 iterations, pooled
+(results/moe-gs.md). Single pairs have 0.15 to 0.39 dB, 0.003 to 0.007 and 0.003 to 0.006."""
 VIEW_SD = {"psnr": 0.4, "ssim": 0.003, "lpips_3dgs": 0.004}
 """The same over the views of a capture. Used for captures with a single view."""
 SEED_WEIGHT = 4
@@ -30,14 +31,16 @@ def select(records: Sequence[Record], recipe: str, scene: str | None = None) -> 
 
 
 def on_common_scenes(records: Sequence[Record], recipes: Iterable[str]) -> list[Record]:
-    """Select the records of recipes on the scenes that every recipe with a run has: means over different scenes cannot be compared."""
+    """Select the records of recipes on the scenes that every recipe with a run has: means over
+    different scenes cannot be compared."""
     by = {recipe: rows for recipe in recipes if (rows := select(records, recipe))}
     scenes = set.intersection(*({r.scene for r in rows} for rows in by.values())) if by else set()
     return [r for rows in by.values() for r in rows if r.scene in scenes]
 
 
 def on_common_runs(records: Sequence[Record], recipes: Iterable[str]) -> list[Record]:
-    """As `on_common_scenes`, of the scenes with the seeds that every recipe with a run has: another seed moves a score too."""
+    """As `on_common_scenes`, of the scenes with the seeds that every recipe with a run has: another
+    seed moves a score too."""
     by = {recipe: rows for recipe in recipes if (rows := select(records, recipe))}
     runs = set.intersection(*({(r.scene, r.seed) for r in rows} for rows in by.values())) if by else set()
     return [r for rows in by.values() for r in rows if (r.scene, r.seed) in runs]
@@ -58,7 +61,8 @@ def complete_seeds(records: Sequence[Record]) -> set[int]:
 
 
 def mean(records: Sequence[Record], column: str) -> Mean | None:
-    """Average a column over scenes for each seed, then over the seeds that have every scene. None where no record has a value."""
+    """Average a column over scenes for each seed, then over the seeds that have every scene. None
+    where no record has a value."""
     found = {(r.seed, r.scene): value for r in records if (value := r.value(column)) is not None}
     if not found:
         return None
@@ -75,7 +79,8 @@ def mean(records: Sequence[Record], column: str) -> Mean | None:
 
 @dataclass(frozen=True)
 class Difference:
-    """A - B in a score, paired by view and seed: mean over captures and 95 % interval. PSNR in dB."""
+    """A - B in a score, paired by view and seed: mean over captures and 95 % interval. PSNR in
+    dB."""
 
     mean: float
     low: float
@@ -87,20 +92,23 @@ class Difference:
     gains: int
     """Number of captures where A is above B."""
     fit: float | None = None
-    """A - B in PSNR (dB) on training views in the second half of the trainings: tells whether A fits the training views better."""
+    """A - B in PSNR (dB) on training views in the second half of the trainings: tells whether A
+    fits the training views better."""
     metric: str = "psnr"
     by_capture: dict[str, float] = field(default_factory=dict)
     """A - B on each capture: mean over seeds and views."""
 
     @property
     def over_captures(self) -> tuple[float, float] | None:
-        """Ends of the 95 % interval of the mean with captures as the sample; None with fewer than three."""
+        """Ends of the 95 % interval of the mean with captures as the sample; None with fewer than
+        three."""
         return estimate_over_captures(list(self.by_capture.values()))
 
     def verdict(self, sign: int) -> Verdict:
         """Judge the claim that A - B has a sign (+1 or -1).
 
-        The difference has a sign where the whole interval and more than half of the captures have it.
+        The difference has a sign where the whole interval and more than half of the captures have
+        it.
         """
         most = 2 * self.gains - self.captures
         found = 1 if self.low > 0 and most > 0 else -1 if self.high < 0 and most < 0 else 0
@@ -108,7 +116,8 @@ class Difference:
 
 
 def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -> Difference | None:
-    """Compute the difference of two recipes in a score of SEED_SD on the captures, seeds and views of both. None without a pair."""
+    """Compute the difference of two recipes in a score of SEED_SD on the captures, seeds and views
+    of both. None without a pair."""
     theirs = {(r.scene, r.seed): r for r in b}
     blocks: dict[str, dict[int, dict[str, float]]] = {}
     for record in a:
@@ -133,12 +142,14 @@ def difference(a: Sequence[Record], b: Sequence[Record], metric: str = "psnr") -
 
 
 def estimate(grids: Sequence[NDArray[np.float64]], seed_sd: float, view_sd: float) -> tuple[float, float]:
-    """Return the mean over captures of differences [seeds, views], and half the width of its 95 % interval.
+    """Return the mean over captures of differences [seeds, views], and half the width of its 95 %
+    interval.
 
-    The interval covers other views and other seeds of the same captures. Its variance is a sum of two. The variance over views is that
-    of each capture's views, averaged over seeds (`view_sd` for a single view). The variance over seeds is the same for all captures; it
-    is pooled from the captures with several seeds and from `seed_sd`, which has SEED_WEIGHT degrees of freedom. Student's t, with the
-    degrees of freedom of the sum after Satterthwaite (1946).
+    The interval covers other views and other seeds of the same captures. Its variance is a sum of
+    two. The variance over views is that of each capture's views, averaged over seeds (`view_sd` for
+    a single view). The variance over seeds is the same for all captures; it is pooled from the
+    captures with several seeds and from `seed_sd`, which has SEED_WEIGHT degrees of freedom.
+    Student's t, with the degrees of freedom of the sum after Satterthwaite (1946).
     """
     terms: list[tuple[float, int]] = []  # variance of the mean, degrees of freedom
     squares, freedom = SEED_WEIGHT * seed_sd**2, SEED_WEIGHT
@@ -155,9 +166,11 @@ def estimate(grids: Sequence[NDArray[np.float64]], seed_sd: float, view_sd: floa
 
 
 def estimate_over_captures(means: Sequence[float]) -> tuple[float, float] | None:
-    """Return the ends of the 95 % interval of the mean of capture means, by Student's t. None for fewer than three captures.
+    """Return the ends of the 95 % interval of the mean of capture means, by Student's t. None for
+    fewer than three captures.
 
-    The captures are the sample, so the interval is about captures like these and not only about these.
+    The captures are the sample, so the interval is about captures like these and not only about
+    these.
     """
     if len(means) < 3:
         return None
@@ -171,10 +184,12 @@ def student(freedom: float) -> float:
 
 
 def compare_fit(a: Sequence[Record], b: Sequence[Record]) -> float | None:
-    """Average A - B in PSNR (dB) of the training views over the second half of the trainings (`Record.fit`), paired by run.
+    """Average A - B in PSNR (dB) of the training views over the second half of the trainings
+    (`Record.fit`), paired by run.
 
-    Trainings with the same seed see the same views in the same order, whatever the recipe, unless one draws random backgrounds and the
-    other does not: such pairs are left out. The mean is over seeds, then over captures. None where nothing pairs.
+    Trainings with the same seed see the same views in the same order, whatever the recipe, unless
+    one draws random backgrounds and the other does not: such pairs are left out. The mean is over
+    seeds, then over captures. None where nothing pairs.
     """
     theirs = {_views_seen(r): r.fit for r in b}
     found: dict[str, list[float]] = {}
@@ -186,11 +201,13 @@ def compare_fit(a: Sequence[Record], b: Sequence[Record]) -> float | None:
 
 
 def _views_seen(record: Record) -> tuple[str, int, bool, int]:
-    """Return what decides which training views are drawn at which logged iteration, and over which background."""
+    """Return what decides which training views are drawn at which logged iteration, and over which
+    background."""
     train = record.config.train
     return record.scene, record.seed, train.random_background, train.iterations
 
 
 def clock_of(records: Iterable[Record]) -> str:
-    """Return the column with the time of these trainings: CPU time where every record has it, else wall time."""
+    """Return the column with the time of these trainings: CPU time where every record has it, else
+    wall time."""
     return "cpu_seconds" if all(r.value("cpu_seconds") is not None for r in records) else "train_seconds"

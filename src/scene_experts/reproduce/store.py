@@ -1,7 +1,9 @@
-"""Records of finished runs: one JSON file a capture, with the configuration, results, scores by view and curves of each run.
+"""Records of finished runs: one JSON file a capture, with the configuration, results, scores by
+view and curves of each run.
 
-A record holds everything that the tables and figures need. It takes at most 8 kB, so it can be committed where checkpoints
-cannot. Its configuration states what differs from the defaults (`core.plain.lean`).
+A record holds everything that the tables and figures need. It takes at most 8 kB, so it can be
+committed where checkpoints cannot. Its configuration states what differs from the defaults
+(`core.plain.lean`).
 """
 
 from __future__ import annotations
@@ -45,9 +47,10 @@ PER_VIEW = (*MEANS, "activation_ratio", "gaussians_rendered")
 class Record:
     """One finished run.
 
-    `results` is its results.json. `per_view` maps the name of a held-out view to its scores (PER_VIEW). `curves` holds the
-    values of CURVES at up to POINTS iterations. `fit` is the mean PSNR (dB) of the training views over the second half of the
-    training, at up to SAMPLES iterations in all; None where none was logged. `code` is a hash of the code of other packages
+    `results` is its results.json. `per_view` maps the name of a held-out view to its scores
+    (PER_VIEW). `curves` holds the values of CURVES at up to POINTS iterations. `fit` is the mean
+    PSNR (dB) of the training views over the second half of the training, at up to SAMPLES
+    iterations in all; None where none was logged. `code` is a hash of the code of other packages
     that it was trained with (`plan.code_of`).
     """
 
@@ -78,7 +81,8 @@ class Record:
         return self.config.train.seed
 
     def value(self, column: str) -> float | None:
-        """Return the value of a table's column, e.g. psnr (dB), size_mb (10^6 bytes), active_percent, train_seconds; None if unknown."""
+        """Return the value of a table's column, e.g. psnr (dB), size_mb (10^6 bytes),
+        active_percent, train_seconds; None if unknown."""
         if column == "size_mb":
             return self.results["size"]["MB"]
         if column == "active_percent":
@@ -88,7 +92,8 @@ class Record:
 
 
 def read_run(run: Path, scene: str, code: str = "") -> Record:
-    """Make the record of an evaluated run folder. Raises InputError where files are missing or the training was scored before its end."""
+    """Make the record of an evaluated run folder. Raises InputError where files are missing or the
+    training was scored before its end."""
     for name in ("config.json", "results.json", "per_view.json"):
         if not (run / name).is_file():
             raise InputError(f"expected an evaluated run with {name} in {run}, found none; run `scene-experts eval {run}` first")
@@ -115,7 +120,8 @@ def _make_record(run: Path, scene: str, config: RunConfig, results: dict[str, An
 
 
 def check_means(results: dict[str, Any], per_view: dict[str, dict[str, Any]], where: str, advice: str) -> None:
-    """Raise InputError where a mean score is not that of the scores by view: one of both is of another evaluation, or was edited."""
+    """Raise InputError where a mean score is not that of the scores by view: one of both is of
+    another evaluation, or was edited."""
     for metric in MEANS:
         scores = [facts[metric] for facts in per_view.values() if metric in facts]
         if scores and results.get(metric) is not None and abs(fmean(scores) - results[metric]) > 1e-6:
@@ -133,13 +139,15 @@ def read_curves(path: Path) -> list[dict[str, Any]]:
 
 
 def fit_of(lines: Sequence[dict[str, Any]], iterations: int) -> float | None:
-    """Return the mean PSNR (dB) of the training views in the second half of a training; None without any."""
+    """Return the mean PSNR (dB) of the training views in the second half of a training; None
+    without any."""
     late = [line["psnr"] for line in lines if 2 * line["step"] > iterations]
     return fmean(late) if late else None
 
 
 def thin(lines: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return up to POINTS of the lines, with the decimals of CURVES. Every second one has the shares of the experts."""
+    """Return up to POINTS of the lines, with the decimals of CURVES. Every second one has the
+    shares of the experts."""
     found = [{name: rounded(value, CURVES[name]) for name, value in line.items()} for line in spread(lines, POINTS)]
     return [{**line, "scene_routing": {}} if i % 2 and "scene_routing" in line else line for i, line in enumerate(found)]
 
@@ -157,7 +165,8 @@ def record_path(store: Path, scene: str) -> Path:
 
 
 def write(store: Path, record: Record) -> Path:
-    """Add a record to the file of its capture, in place of one of the same run; return the path of the file.
+    """Add a record to the file of its capture, in place of one of the same run; return the path of
+    the file.
 
     Several processes, also of several machines, may write at once.
     """
@@ -173,7 +182,8 @@ def write(store: Path, record: Record) -> Path:
 
 
 def pack(record: Record) -> dict[str, Any]:
-    """Return the JSON of a record: what differs from the defaults, scores by view and curves as columns, and a checksum."""
+    """Return the JSON of a record: what differs from the defaults, scores by view and curves as
+    columns, and a checksum."""
     config = lean(replace(record.config, data=replace(record.config.data, path=Path(record.scene)), command="", versions={}))
     if start := config.pop("init_from", None):
         config["init_from"] = Path(start).name
@@ -192,7 +202,8 @@ def pack(record: Record) -> dict[str, Any]:
 
 
 def short_results(results: dict[str, Any]) -> dict[str, Any]:
-    """Return results as a record keeps them: shares of experts with 3 decimals, no places of a machine."""
+    """Return results as a record keeps them: shares of experts with 3 decimals, no places of a
+    machine."""
     own = rounded(without_places(results))
     return {**own, "experts": rounded(own["experts"], 3)} if "experts" in own else own
 
@@ -207,7 +218,8 @@ def rounded(value: Any, digits: int = DIGITS) -> Any:
 
 
 def without_places(results: dict[str, Any]) -> dict[str, Any]:
-    """Return the results with the names of the files of LPIPS's weights alone: where they were on a machine is not published."""
+    """Return the results with the names of the files of LPIPS's weights alone: where they were on a
+    machine is not published."""
     found = results.get("lpips_weights", {})
     cached = {net: "cache " * place.startswith("cache ") for net, place in found.items()}
     named = {net: cached[net] + re.split(r"[/\\]", place.removeprefix(cached[net]))[-1] for net, place in found.items()}
@@ -215,7 +227,8 @@ def without_places(results: dict[str, Any]) -> dict[str, Any]:
 
 
 def read(path: Path) -> list[Record]:
-    """Read the records of a file, without those of parts that compute something else by now (`Part.changes`).
+    """Read the records of a file, without those of parts that compute something else by now
+    (`Part.changes`).
 
     Raises InputError where it is something else or was edited by hand.
     """
@@ -281,11 +294,12 @@ def find_all(records: Sequence[Record], specs: Sequence[Spec]) -> list[Record]:
 
 
 def check_captures(records: Sequence[Record], specs: Sequence[Spec]) -> None:
-    """Raise InputError where a record of `specs` belongs to another capture of that name: it was scored on other views than its capture
-    holds out, had another number of 3D points or other camera poses, as after new structure from motion.
+    """Raise InputError where a record of `specs` belongs to another capture of that name: it was
+    scored on other views than its capture holds out, had another number of 3D points or other
+    camera poses, as after new structure from motion.
 
-    Checks the views of one run of each scene, and the points and poses of all. Captures that cannot be read are skipped here; their
-    training reports the error.
+    Checks the views of one run of each scene, and the points and poses of all. Captures that cannot
+    be read are skipped here; their training reports the error.
     """
     by_scene: dict[str, list[tuple[Spec, Record]]] = {}
     for spec in specs:

@@ -1,4 +1,5 @@
-"""Tables of an experiment with the spread over seeds and the paper's numbers, as Markdown, CSV and LaTeX."""
+"""Tables of an experiment with the spread over seeds and the paper's numbers, as Markdown, CSV and
+LaTeX."""
 
 from __future__ import annotations
 
@@ -43,12 +44,14 @@ def rows_of(experiment: Experiment, records: Sequence[Record], scenes: Sequence[
 
 
 def cases(records: Sequence[Record], column: str | None = None) -> set[tuple[str, int]]:
-    """Return the pairs of scene and seed that a mean covers: of the records, or of those with a value of a column."""
+    """Return the pairs of scene and seed that a mean covers: of the records, or of those with a
+    value of a column."""
     return {(r.scene, r.seed) for r in records if column is None or r.value(column) is not None}
 
 
 def by_dataset(experiment: Experiment, records: Sequence[Record], dataset: str, scenes: Sequence[str]) -> ResultTable:
-    """Make the table with one row per method and means over `scenes`: our columns, then the paper's where it has this data set."""
+    """Make the table with one row per method and means over `scenes`: our columns, then the paper's
+    where it has this data set."""
     found = rows_of(experiment, records, scenes)
     theirs = paper_numbers(experiment, dataset)
     together = [r for some in found.values() for r in some]
@@ -73,13 +76,15 @@ def by_dataset(experiment: Experiment, records: Sequence[Record], dataset: str, 
 
 
 def columns_of(experiment: Experiment, records: Sequence[Record]) -> list[str]:
-    """Return the columns of a table of these records: "time" as CPU or wall time, and `added` columns that every record has."""
+    """Return the columns of a table of these records: "time" as CPU or wall time, and `added`
+    columns that every record has."""
     own = [clock_of(records) if c == "time" else c for c in experiment.columns]
     return own + [c for c in experiment.added if records and all(r.value(c) is not None for r in records)]
 
 
 def by_scene(experiment: Experiment, records: Sequence[Record], scenes: Sequence[str]) -> ResultTable:
-    """Make the table of the experiment's first column (PSNR as a rule), one row per method and one column per scene."""
+    """Make the table of the experiment's first column (PSNR as a rule), one row per method and one
+    column per scene."""
     found, column = rows_of(experiment, records, scenes), experiment.columns[0]
     rows, values = [], []
     every = {scene: {r.seed for some in found.values() for r in some if r.scene == scene} for scene in scenes}
@@ -93,7 +98,8 @@ def by_scene(experiment: Experiment, records: Sequence[Record], scenes: Sequence
 
 
 def expert_shares(experiment: Experiment, records: Sequence[Record], scene: str) -> ResultTable | None:
-    """Make the table of each expert's share of all N anchors at the end of the training, in %: of the N k assignments, then of the anchors.
+    """Make the table of each expert's share of all N anchors at the end of the training, in %: of
+    the N k assignments, then of the anchors.
 
     Uses the first seed. None where no row has experts on this scene.
     """
@@ -130,7 +136,8 @@ def text(value: Mean | None, column: str) -> str:
 
 
 def best(values: list[list[float | None]], columns: Sequence[str]) -> frozenset[tuple[int, int]]:
-    """Return the best cells of each of our columns, as (row, column of the table): all that read as the best one does."""
+    """Return the best cells of each of our columns, as (row, column of the table): all that read as
+    the best one does."""
     out = set()
     for j, column in enumerate(columns):
         present = {i: value for i, row in enumerate(values) if (value := row[j]) is not None}
@@ -179,7 +186,8 @@ def notes(found: dict[str, list[Record]]) -> tuple[str, ...]:
 
 
 def lacking_notes(found: dict[str, list[Record]], columns: Sequence[str]) -> tuple[str, ...]:
-    """Write a note for each mean that leaves runs out because they have no value, such as LPIPS where its weights were absent."""
+    """Write a note for each mean that leaves runs out because they have no value, such as LPIPS
+    where its weights were absent."""
     out = []
     for name, records in found.items():
         for column in columns:
@@ -190,7 +198,8 @@ def lacking_notes(found: dict[str, list[Record]], columns: Sequence[str]) -> tup
 
 
 def time_notes(records: Sequence[Record]) -> tuple[str, ...]:
-    """Write the notes of a column of training times: which time it is, and the load of the machine."""
+    """Write the notes of a column of training times: which time it is, and the load of the
+    machine."""
     if clock_of(records) == "cpu_seconds":
         out = ["Training times are CPU times of all threads of the training loop."]
     else:
@@ -204,12 +213,14 @@ def time_notes(records: Sequence[Record]) -> tuple[str, ...]:
 
 
 def densifications(train: Train) -> int | None:
-    """Return the number of densification steps. Shorter trainings densify at the same interval, so less often in total."""
+    """Return the number of densification steps. Shorter trainings densify at the same interval, so
+    less often in total."""
     return train.scaled().growth.count_steps(train.iterations)
 
 
 def count_range(counts: Iterable[int | None]) -> str:
-    """Write the numbers of densification steps as "13" or "13 to 17"; empty where a growth rule does not say."""
+    """Write the numbers of densification steps as "13" or "13 to 17"; empty where a growth rule
+    does not say."""
     known = [n for n in counts if n is not None]
     return " to ".join(str(n) for n in sorted({min(known), max(known)})) if known else ""
 
@@ -239,7 +250,8 @@ def escape(cell: str) -> str:
 
 
 def to_csv(tables: dict[str, ResultTable]) -> str:
-    """Format one line per cell: table, row, column, value, spread over seeds. Empty cells are left out."""
+    """Format one line per cell: table, row, column, value, spread over seeds. Empty cells are left
+    out."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(("table", "row", "column", "value", "spread"))
@@ -253,7 +265,8 @@ def to_csv(tables: dict[str, ResultTable]) -> str:
 
 
 def write_all(title: str, tables: dict[str, ResultTable]) -> dict[str, str]:
-    """Return the text of the files of an experiment by suffix: md, csv and tex, each with all its tables."""
+    """Return the text of the files of an experiment by suffix: md, csv and tex, each with all its
+    tables."""
     markdown = f"# {title}\n\n" + "\n".join(f"## {name}\n\n{to_markdown(table)}" for name, table in tables.items())
     return {
         "md": markdown,

@@ -1,4 +1,5 @@
-"""Recipes with flags, for comparisons: "moe-gs --scene.hidden 8", or with a name for the tables, "narrow=moe-gs --scene.hidden 8"."""
+"""Recipes with flags, for comparisons: "moe-gs --scene.hidden 8", or with a name for the tables,
+"narrow=moe-gs --scene.hidden 8"."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ class _Holder:
 
 
 def split_name(text: str) -> tuple[str, str]:
-    """Split "NAME=RECIPE FLAGS" into the name and the line "RECIPE FLAGS". Without a name, the name is the line."""
+    """Split "NAME=RECIPE FLAGS" into the name and the line "RECIPE FLAGS". Without a name, the name
+    is the line."""
     name, found, line = text.partition("=")
     return (name.strip(), line.strip()) if found and name.strip() and "--" not in name else (text.strip(), text.strip())
 
@@ -44,7 +46,8 @@ def flags(line: str) -> list[str]:
 
 @functools.cache
 def read_line(line: str, numbers: Numbers = ()) -> Train:
-    """Return the settings of a recipe with flags; their recipe is the whole line. Raises InputError for unknown recipes and flags.
+    """Return the settings of a recipe with flags; their recipe is the whole line. Raises InputError
+    for unknown recipes and flags.
 
     numbers: Settings of a scene's protocol; flags have the last word.
     """

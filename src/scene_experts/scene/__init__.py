@@ -30,14 +30,17 @@ Draws = Callable[[Camera, int, Mode, Cull], Decoded]
 
 @dataclass(frozen=True)
 class Traits:
-    """Properties and capabilities of a scene. Other modules read these values and never test the scene's class."""
+    """Properties and capabilities of a scene. Other modules read these values and never test the
+    scene's class."""
 
     family: str
-    """Key of the scene's family: "anchors", "gaussians", "graph". `files` looks up readers and writers by it."""
+    """Key of the scene's family: "anchors", "gaussians", "graph". `files` looks up readers and
+    writers by it."""
     rows: str
     """What one row of the table is called, in the plural: "anchors", "Gaussians", "points"."""
     voxel: float = 0.0
-    """Edge of the finest lattice cell that rows lie on, trained world units; 0: rows lie on no lattice."""
+    """Edge of the finest lattice cell that rows lie on, trained world units; 0: rows lie on no
+    lattice."""
     experts: int = 0
     """Experts per attribute; 0: the scene has no mixture of experts."""
     dense_until: int = 0
@@ -45,9 +48,11 @@ class Traits:
     levels: int = 0
     """Levels of detail; 0: the scene has none. `Scene.at_level` draws fewer of them."""
     activation: bool = False
-    """A network decides each Gaussian's opacity, so a view has an activation ratio (share of Gaussians with positive opacity)."""
+    """A network decides each Gaussian's opacity, so a view has an activation ratio (share of
+    Gaussians with positive opacity)."""
     sh_degree: int | None = None
-    """Degree of the spherical harmonics where each row is a standard Gaussian; None where shape or opacity depend on the camera."""
+    """Degree of the spherical harmonics where each row is a standard Gaussian; None where shape or
+    opacity depend on the camera."""
     appearance: int = 0
     """Size of the appearance code of each training view; 0: the scene has no codes."""
 
@@ -96,7 +101,8 @@ class Scene(nn.Module):
 
     @abstractmethod
     def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
-        """The Gaussians that `camera` sees at `step`. `cull(means, scales, camera)` is the rasteriser's visibility test."""
+        """The Gaussians that `camera` sees at `step`. `cull(means, scales, camera)` is the
+        rasteriser's visibility test."""
 
     @abstractmethod
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -111,7 +117,8 @@ class Scene(nn.Module):
         return {}
 
     def routing(self, step: int, most: int | None = None, mode: Mode = Mode.DRAW) -> dict[str, Routing]:
-        """Routing of all rows, or of at most `most` evenly spaced rows, by attribute. Empty for a scene without experts."""
+        """Routing of all rows, or of at most `most` evenly spaced rows, by attribute. Empty for a
+        scene without experts."""
         return {}
 
     def rows_by_level(self) -> list[int]:
@@ -119,52 +126,62 @@ class Scene(nn.Module):
         return []
 
     def at_level(self, level: int | None) -> AbstractContextManager[None]:
-        """Context manager that limits drawing to levels up to `level` (0 is the coarsest; None draws all levels).
+        """Context manager that limits drawing to levels up to `level` (0 is the coarsest; None
+        draws all levels).
 
         It has no effect on a scene without levels.
         """
         return nullcontext()
 
     def frozen(self, step: int) -> Draws:
-        """Prepare the scene for faster drawing at `step` without gradients. The images do not change.
+        """Prepare the scene for faster drawing at `step` without gradients. The images do not
+        change.
 
         Do not train the scene while the result is in use.
         """
         return self
 
     def describe_decode(self, step: int) -> str:
-        """Say which implementation decodes the scene at `step`, and why not the fastest. Empty for a scene with one."""
+        """Say which implementation decodes the scene at `step`, and why not the fastest. Empty for
+        a scene with one."""
         return ""
 
     def end_batch(self, views: int) -> None:
-        """Learn what no gradient teaches, once for a batch of `views` views, before the optimiser's step. The gradients of all views are
-        added up by then, and divided by their number. The default does nothing."""
+        """Learn what no gradient teaches, once for a batch of `views` views, before the optimiser's
+        step. The gradients of all views are added up by then, and divided by their number. The
+        default does nothing."""
 
     def set_training_cameras(self, cameras: Sequence[Camera]) -> None:
-        """Give the scene the cameras of its training views, before each training or its resumption. The default does nothing."""
+        """Give the scene the cameras of its training views, before each training or its resumption.
+        The default does nothing."""
 
     def begin_iteration(self, before: int, step: int, companions: Callable[[Tensor], list[Tensor]]) -> None:
-        """Prepare for training iteration `step`, before its view is drawn. The default does nothing.
+        """Prepare for training iteration `step`, before its view is drawn. The default does
+        nothing.
 
         Args:
             before: Step of the last iteration; 0 before the first.
             step: Step of this one: `before` and the number of views of a batch.
-            companions: Returns the tensors that follow a network's parameter, of its shape: Adam's moments, its average.
+            companions: Returns the tensors that follow a network's parameter, of its shape: Adam's
+                moments, its average.
         """
 
 
 class LatticeScene(Scene):
-    """A scene whose rows lie on a lattice. Densification adds rows at empty cells. The table has a fact `cell` [N, 3] int64."""
+    """A scene whose rows lie on a lattice. Densification adds rows at empty cells. The table has a
+    fact `cell` [N, 3] int64."""
 
     voxel: float  # edge of the finest lattice cell, in trained world units
 
     @abstractmethod
     def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
-        """Columns of new rows at the cells [n, 3] of `level`, with scaling `size` (trained world units) and features [n, F]."""
+        """Columns of new rows at the cells [n, 3] of `level`, with scaling `size` (trained world
+        units) and features [n, F]."""
 
     @abstractmethod
     def slot_points(self, slots: Tensor, rows: Tensor) -> Tensor:
-        """Positions [P, 3] float64 of the Gaussians at the flat `slots` [P] (row * K + slot) of `rows` [P]."""
+        """Positions [P, 3] float64 of the Gaussians at the flat `slots` [P] (row * K + slot) of
+        `rows` [P]."""
 
 
 @dataclass(frozen=True)
@@ -177,10 +194,12 @@ class SceneConfig(Part, ABC):
     @property
     @abstractmethod
     def grown_as(self) -> str:
-        """Value of `Strategy.grows` that strategies for this scene must have, for example "anchors on levels"."""
+        """Value of `Strategy.grows` that strategies for this scene must have, for example "anchors
+        on levels"."""
 
     def needs_whole_table(self) -> str:
-        """Return the setting that needs all rows in every process, for the message of --shard; "" if none does. The default refuses."""
+        """Return the setting that needs all rows in every process, for the message of --shard; ""
+        if none does. The default refuses."""
         return f"a scene of {self.grown_as}"
 
     @property
@@ -189,29 +208,35 @@ class SceneConfig(Part, ABC):
         return 0
 
     def phases(self) -> dict[str, int]:
-        """Return the last iteration of each phase that a training leaves for good, by the dotted path of the field that sets it."""
+        """Return the last iteration of each phase that a training leaves for good, by the dotted
+        path of the field that sets it."""
         return {}
 
     @property
     def has(self) -> frozenset[str]:
-        """What the scene has of OPACITY, ROUTERS and EXPLICIT. Settings that need another have no effect; a training warns about them."""
+        """What the scene has of OPACITY, ROUTERS and EXPLICIT. Settings that need another have no
+        effect; a training warns about them."""
         return frozenset()
 
     def of_views(self, views: int) -> Self:
-        """Return the settings with which any number of training views is treated as `views` of them. The default depends on no number."""
+        """Return the settings with which any number of training views is treated as `views` of
+        them. The default depends on no number."""
         return self
 
     @abstractmethod
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> Scene:
-        """Create a scene from a point cloud and the cameras of the training views. Some families ignore the cameras."""
+        """Create a scene from a point cloud and the cameras of the training views. Some families
+        ignore the cameras."""
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of a row in the columns that a checkpoint must have (`params.NAME`, `facts.NAME`). Empty: not checked."""
+        """Return the shapes of a row in the columns that a checkpoint must have (`params.NAME`,
+        `facts.NAME`). Empty: not checked."""
         return {}
 
     @abstractmethod
     def load(self, table: Table, meta: dict[str, Any]) -> Scene:
-        """Build a scene from a checkpoint's table and `Scene.meta()`. `restore_scene` loads the tensors of its networks."""
+        """Build a scene from a checkpoint's table and `Scene.meta()`. `restore_scene` loads the
+        tensors of its networks."""
 
 
 def restore_scene(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[str, Any], averaged: bool = False) -> Scene:
@@ -219,10 +244,11 @@ def restore_scene(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[st
 
     Args:
         config: Settings of the scene, scaled to the length of the training.
-        tensors: Columns `params.NAME` and `facts.NAME` of the table, and networks `network.NAME`. Other tensors are ignored.
+        tensors: Columns `params.NAME` and `facts.NAME` of the table, and networks `network.NAME`.
+            Other tensors are ignored.
         meta: The values of `Scene.meta()`. Other values are ignored.
-        averaged: Use the averages of the weights (`average.params.NAME`, `average.network.NAME`), if there are any, in place of the
-            last weights.
+        averaged: Use the averages of the weights (`average.params.NAME`, `average.network.NAME`),
+            if there are any, in place of the last weights.
 
     Raises:
         InputError: The networks have other names or shapes than those of `config`.
@@ -242,11 +268,13 @@ def restore_scene(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[st
 
 @dataclass(frozen=True)
 class LearningRates(Part, ABC):
-    """Learning rates of a family: one `Rate` for each group of `Scene.rate_groups`. The flags are under --rates."""
+    """Learning rates of a family: one `Rate` for each group of `Scene.rate_groups`. The flags are
+    under --rates."""
 
     family: ClassVar[str]
     """Key of the family, as in `Traits.family`."""
 
     @abstractmethod
     def at(self, group: str, step: int, total: int, extent: float) -> float:
-        """Learning rate of `group` at `step` of `total`. extent: the extent R of the scene, in trained world units."""
+        """Learning rate of `group` at `step` of `total`. extent: the extent R of the scene, in
+        trained world units."""

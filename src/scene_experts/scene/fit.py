@@ -1,6 +1,8 @@
-"""Checks that the tensors and metadata of a foreign checkpoint fit the settings of its scene, before the scene is built.
+"""Checks that the tensors and metadata of a foreign checkpoint fit the settings of its scene,
+before the scene is built.
 
-A scene indexes its columns without further checks, and its settings decide how much memory its networks take.
+A scene indexes its columns without further checks, and its settings decide how much memory its
+networks take.
 """
 
 from __future__ import annotations
@@ -25,10 +27,12 @@ MOST_STEPS = 1 << 40  # iterations of a training
 
 
 def check_fit(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
-    """Check tensors and metadata of a checkpoint against the settings of its scene. Allocates nothing of their size.
+    """Check tensors and metadata of a checkpoint against the settings of its scene. Allocates
+    nothing of their size.
 
-    Raises Damaged for columns of other shapes or types, values that are not finite, metadata out of range, and settings that ask for
-    larger networks than the stored ones; InputError for invalid settings.
+    Raises Damaged for columns of other shapes or types, values that are not finite, metadata out of
+    range, and settings that ask for larger networks than the stored ones; InputError for invalid
+    settings.
     """
     check_fields(config, "scene")
     number(meta["extent"], "the extent", 1e-15, FARTHEST)
@@ -50,7 +54,8 @@ def check_fit(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[str, A
 def restore_foreign(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[str, Any], averaged: bool = False) -> Scene:
     """Build the scene of a checkpoint as `restore_scene` does, after `check_fit`.
 
-    Raises Damaged also for settings that ask for larger networks than the stored ones, before their memory is allocated.
+    Raises Damaged also for settings that ask for larger networks than the stored ones, before their
+    memory is allocated.
     """
     check_fit(config, tensors, meta)
     stored = [value for name, value in tensors.items() if name.startswith("network.")]
@@ -60,7 +65,8 @@ def restore_foreign(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[
 
 
 def check_columns(shapes: dict[str, tuple[int, ...]], columns: dict[str, Tensor]) -> None:
-    """Raise Damaged unless the columns have these shapes after the first axis, one length, and the type that their names imply."""
+    """Raise Damaged unless the columns have these shapes after the first axis, one length, and the
+    type that their names imply."""
     lengths = {len(value) if value.dim() else -1 for value in columns.values()}
     if len(lengths) > 1 or -1 in lengths or (shapes and not columns):
         raise Damaged("columns of different lengths, or none")
@@ -95,7 +101,8 @@ def check_levels(meta: dict[str, Any], level: Tensor | None) -> None:
 
 
 class _Limited(TorchFunctionMode):
-    """Raises Damaged after `calls` calls of torch, and before torch creates a tensor of over `values` values."""
+    """Raises Damaged after `calls` calls of torch, and before torch creates a tensor of over
+    `values` values."""
 
     def __init__(self, calls: int, values: int) -> None:
         super().__init__()

@@ -1,7 +1,8 @@
-"""Explicit Gaussians (3DGS, Kerbl et al. 2023): each row is one Gaussian with its colour in spherical harmonics.
+"""Explicit Gaussians (3DGS, Kerbl et al. 2023): each row is one Gaussian with its colour in
+spherical harmonics.
 
-Columns: means [N, 3], log_scales [N, 3], quats [N, 4] (w, x, y, z; normalised when decoded), raw_opacity [N] (logits),
-sh_dc [N, 3] and sh_rest [N, (degree + 1)^2 - 1, 3] (spherical harmonics).
+Columns: means [N, 3], log_scales [N, 3], quats [N, 4] (w, x, y, z; normalised when decoded),
+raw_opacity [N] (logits), sh_dc [N, 3] and sh_rest [N, (degree + 1)^2 - 1, 3] (spherical harmonics).
 The active degree starts at 0 and increases by one every `sh_ramp` iterations.
 """
 
@@ -84,7 +85,8 @@ class Explicit(SceneConfig):
         return {f"params.{name}": shape for name, shape in shapes.items()}
 
     def load(self, table: Table, meta: dict[str, Any]) -> GaussianScene:
-        """Build the scene of a checkpoint. Raises InputError if the table does not have the expected columns."""
+        """Build the scene of a checkpoint. Raises InputError if the table does not have the
+        expected columns."""
         if set(table.params) != set(COLUMNS) or table.params["sh_rest"].shape[1] != (self.sh_degree + 1) ** 2 - 1:
             raise InputError("expected the columns of explicit Gaussians in the checkpoint, found others; use its own run folder")
         return GaussianScene(self, table, float(meta["extent"]))
@@ -118,14 +120,17 @@ class GaussianScene(Scene):
     def degree(self, step: int) -> int:
         """Active degree of the spherical harmonics at `step`.
 
-        Step 0 uses the full degree: a new scene has zero higher harmonics, and a file may not record its iteration.
+        Step 0 uses the full degree: a new scene has zero higher harmonics, and a file may not
+        record its iteration.
         """
         return min(self.config.sh_degree, step // self.config.sh_ramp) if step else self.config.sh_degree
 
     def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
-        """Decode the Gaussians that may overlap the image of `camera`. `cull` is the rasteriser's visibility test.
+        """Decode the Gaussians that may overlap the image of `camera`. `cull` is the rasteriser's
+        visibility test.
 
-        The test uses a ball with the radius of the largest axis. The ball contains the Gaussian, so no visible Gaussian is lost.
+        The test uses a ball with the radius of the largest axis. The ball contains the Gaussian, so
+        no visible Gaussian is lost.
         """
         p = self.table.params
         with torch.no_grad():
@@ -134,7 +139,8 @@ class GaussianScene(Scene):
         return replace(self.decode(rows, camera, step), population=(p["raw_opacity"], p["log_scales"]))
 
     def decode(self, rows: Tensor, camera: Camera, step: int) -> Decoded:
-        """Decode the given rows [A] into Gaussians, with the colours that `camera` sees at `step`."""
+        """Decode the given rows [A] into Gaussians, with the colours that `camera` sees at
+        `step`."""
         p = self.table.params
         means = p["means"].index_select(0, rows)
         gaussians = Gaussians(

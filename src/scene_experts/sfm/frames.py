@@ -1,4 +1,5 @@
-"""Extracts the sharpest frames of a video, spread evenly over its length, with the ffmpeg that imageio installs."""
+"""Extracts the sharpest frames of a video, spread evenly over its length, with the ffmpeg that
+imageio installs."""
 
 from __future__ import annotations
 
@@ -20,10 +21,11 @@ JPEG_QUALITY = 95
 
 
 def extract_frames(video: Path, folder: Path, count: int, progress: Progress) -> list[str]:
-    """Write about `count` frames of `video` into `folder` as frame_00001.jpg, ... and return their names.
+    """Write about `count` frames of `video` into `folder` as frame_00001.jpg, ... and return their
+    names.
 
-    The video is divided into `count` segments of equal length, and the sharpest frame of each is extracted.
-    Raises InputError if imageio-ffmpeg is missing or ffmpeg cannot decode the file.
+    The video is divided into `count` segments of equal length, and the sharpest frame of each is
+    extracted. Raises InputError if imageio-ffmpeg is missing or ffmpeg cannot decode the file.
     """
     grades, expected, frames = [], *read_frames(video, f"scale={GRADING_WIDTH}:-2,format=gray", "gray", 1)
     for frame in frames:
@@ -42,7 +44,8 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
 
 
 def select_frames(numbers: Sequence[int]) -> str:
-    """Return ffmpeg's expression that is true for these frames: a balanced tree, because ffmpeg limits the depth of expressions to 100."""
+    """Return ffmpeg's expression that is true for these frames: a balanced tree, because ffmpeg
+    limits the depth of expressions to 100."""
     if len(numbers) == 1:
         return rf"eq(n\,{numbers[0]})"
     middle = len(numbers) // 2
@@ -50,7 +53,8 @@ def select_frames(numbers: Sequence[int]) -> str:
 
 
 def choose_sharpest(grades: Sequence[float], count: int) -> list[int]:
-    """Return the index of the highest grade in each of `count` segments of equal length, or every index if there are fewer."""
+    """Return the index of the highest grade in each of `count` segments of equal length, or every
+    index if there are fewer."""
     edges = np.linspace(0, len(grades), min(count, len(grades)) + 1).round().astype(int)
     return [int(a + np.argmax(grades[a:b])) for a, b in pairwise(edges)]
 
@@ -63,9 +67,11 @@ def sharpness(gray: np.ndarray) -> float:
 
 
 def read_frames(video: Path, filters: str, pixels: str, channels: int) -> tuple[int, Iterator[np.ndarray]]:
-    """Return the approximate number of frames of a video, and the frames [H, W, channels] uint8 that ffmpeg's `filters` keep.
+    """Return the approximate number of frames of a video, and the frames [H, W, channels] uint8
+    that ffmpeg's `filters` keep.
 
-    No frame is duplicated or dropped. Raises InputError if imageio-ffmpeg is missing or ffmpeg cannot decode the file.
+    No frame is duplicated or dropped. Raises InputError if imageio-ffmpeg is missing or ffmpeg
+    cannot decode the file.
     """
     ffmpeg = import_ffmpeg()
     options = ["-vf", filters, "-fps_mode", "passthrough"]
@@ -86,7 +92,8 @@ def read_frames(video: Path, filters: str, pixels: str, channels: int) -> tuple[
 
 
 def import_ffmpeg() -> Any:
-    """Return the module imageio_ffmpeg. Raises InputError, which says what to install, if it is missing."""
+    """Return the module imageio_ffmpeg. Raises InputError, which says what to install, if it is
+    missing."""
     try:
         import imageio_ffmpeg
     except ImportError as error:

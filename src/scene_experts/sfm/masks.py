@@ -1,4 +1,5 @@
-"""Writes the masks of photographs in COLMAP's format. COLMAP extracts no features where a mask is black."""
+"""Writes the masks of photographs in COLMAP's format. COLMAP extracts no features where a mask is
+black."""
 
 from __future__ import annotations
 
@@ -17,11 +18,12 @@ from scene_experts.sfm.work import remove
 
 
 def write_masks(photos: Sequence[Photo], images: Path, folder: Path) -> list[str]:
-    """Write FOLDER/NAME.png for every photograph NAME in the folder `images`, if any photograph has a mask.
+    """Write FOLDER/NAME.png for every photograph NAME in the folder `images`, if any photograph has
+    a mask.
 
-    The mask of a photograph is a mask file, found as training finds it, or its alpha channel. It is written at the size of the
-    photograph, 255 where features are extracted and 0 elsewhere. COLMAP skips photographs without a mask if others have one,
-    so those get a white mask.
+    The mask of a photograph is a mask file, found as training finds it, or its alpha channel. It is
+    written at the size of the photograph, 255 where features are extracted and 0 elsewhere. COLMAP
+    skips photographs without a mask if others have one, so those get a white mask.
 
     Returns a checksum of each written mask; an empty list if no photograph has a mask.
     Raises InputError if a mask file is unreadable.
@@ -54,7 +56,8 @@ def has_alpha(path: Path) -> bool:
 def read_mask(path: Path, photo: Photo) -> Image.Image:
     """Read the mask file of `photo` at the size and in the orientation of the stored photograph.
 
-    A mask that is upright although EXIF rotates its photograph is rotated back. Raises InputError if the file is unreadable.
+    A mask that is upright although EXIF rotates its photograph is rotated back. Raises InputError
+    if the file is unreadable.
     """
     with opening_picture(path, CAPTURED) as image:
         mask = to_mask(image)
@@ -66,7 +69,8 @@ def read_mask(path: Path, photo: Photo) -> Image.Image:
 
 
 def read_alpha(path: Path) -> Image.Image:
-    """Return the alpha channel of a photograph as a mask. It is white if there is no alpha channel."""
+    """Return the alpha channel of a photograph as a mask. It is white if there is no alpha
+    channel."""
     with opening_picture(path, CAPTURED, heic=True) as image:
         return image.convert("RGBA").getchannel("A").point(binarise) if has_alpha(path) else Image.new("L", image.size, 255)
 

@@ -21,17 +21,19 @@ class SfmOptions:
     """Settings of the reconstruction."""
 
     frames: Annotated[int, Range(3, MOST_FRAMES)] = 150
-    """Number of frames to extract from a video. The sharpest frame of each of this many equal segments is used."""
+    """Number of frames to extract from a video. The sharpest frame of each of this many equal
+    segments is used."""
     matching: Matching = "auto"
-    """Which photographs are matched. exhaustive: all pairs. sequential: neighbours in the order of their names, as for a video or a walk.
-    auto: exhaustive for up to 300 photographs."""
+    """Which photographs are matched. exhaustive: all pairs. sequential: neighbours in the order of
+    their names, as for a video or a walk. auto: exhaustive for up to 300 photographs."""
     camera_model: CameraModel = "OPENCV"
     """COLMAP's lens model. Photographs of the same size, camera and focal length share one lens."""
     mapper: Mapper = "auto"
-    """COLMAP's incremental mapper or the global mapper (GLOMAP). auto: incremental; if more than a tenth of the photographs get no pose,
-    both are run and the better result is kept."""
+    """COLMAP's incremental mapper or the global mapper (GLOMAP). auto: incremental; if more than a
+    tenth of the photographs get no pose, both are run and the better result is kept."""
     max_side: Annotated[int, Range(64, LARGEST)] = 1600
-    """Longest side in pixels at which features are extracted. The photographs themselves are not changed."""
+    """Longest side in pixels at which features are extracted. The photographs themselves are not
+    changed."""
     threads: Annotated[int, Range(0, LARGEST)] = 0
     """Number of threads; 0 uses all cores."""
     seed: Annotated[int, Range(0, LARGEST)] = 0

@@ -1,4 +1,5 @@
-"""Finds and inspects the photographs of a folder, groups them by camera, and copies them in a form that COLMAP reads."""
+"""Finds and inspects the photographs of a folder, groups them by camera, and copies them in a form
+that COLMAP reads."""
 
 from __future__ import annotations
 
@@ -43,23 +44,27 @@ class Photo:
 
     @property
     def stored(self) -> str:
-        """Its name in the capture. COLMAP's lists of pairs allow neither blanks nor a leading "#"."""
+        """Its name in the capture. COLMAP's lists of pairs allow neither blanks nor a leading
+        "#"."""
         name = re.sub(r"\s+", "_", self.name)
         name = "_" + name[1:] if name.startswith("#") else name
         return str(PurePosixPath(name).with_suffix(self.suffix)) if self.suffix else name
 
     @property
     def upright(self) -> Photo:
-        """The photograph as it is copied into a capture: under its stored name and rotated upright."""
+        """The photograph as it is copied into a capture: under its stored name and rotated
+        upright."""
         size = (self.size[1], self.size[0]) if self.orientation in (5, 6, 7, 8) else self.size
         return Photo(self.stored, size, self.camera, stamp=self.stamp)
 
 
 def find_photos(folder: Path, exclude: Path | None = None) -> list[Photo]:
-    """Return the photographs in `folder` and its subfolders except `exclude`, sorted so that "2.jpg" precedes "10.jpg".
+    """Return the photographs in `folder` and its subfolders except `exclude`, sorted so that
+    "2.jpg" precedes "10.jpg".
 
-    Every photograph is decoded at an eighth of its size to verify it. A HEIC file beside a photograph of the same name is left out.
-    Raises InputError if there are too few, if one is damaged or its name cannot be used, or if HEIC files cannot be read.
+    Every photograph is decoded at an eighth of its size to verify it. A HEIC file beside a
+    photograph of the same name is left out. Raises InputError if there are too few, if one is
+    damaged or its name cannot be used, or if HEIC files cannot be read.
     """
     files = list_files(folder, exclude)
     paths = [path for path in files if path.suffix.lower() in EXTENSIONS]
@@ -81,7 +86,8 @@ def find_photos(folder: Path, exclude: Path | None = None) -> list[Photo]:
 
 
 def find_heic(files: Sequence[Path], others: set[Path], folder: Path) -> list[Path]:
-    """Return the HEIC photographs among `files`, without those that `others` (paths without extension) has in another format.
+    """Return the HEIC photographs among `files`, without those that `others` (paths without
+    extension) has in another format.
 
     Raises InputError if there are any and pillow-heif is missing.
     """
@@ -99,7 +105,8 @@ def find_heic(files: Sequence[Path], others: set[Path], folder: Path) -> list[Pa
 
 
 def list_files(folder: Path, exclude: Path | None) -> list[Path]:
-    """Return the files in `folder` and its subfolders except hidden ones and `exclude`. Symbolic links are followed."""
+    """Return the files in `folder` and its subfolders except hidden ones and `exclude`. Symbolic
+    links are followed."""
     out, seen = [], set()
     for place, folders, files in os.walk(folder, followlinks=True):
         here = Path(place).resolve()
@@ -118,14 +125,16 @@ def natural_key(name: str) -> list[tuple[int, str]]:
 
 
 def find_masks_beside(names: Sequence[str]) -> dict[str, str]:
-    """Return the names of masks in the same folder as their photographs, by the name of the photograph."""
+    """Return the names of masks in the same folder as their photographs, by the name of the
+    photograph."""
     there = set(names)
     stems = ((name, str(PurePosixPath(name).with_suffix(""))) for name in names)
     return {name: f"{stem}{ending}" for name, stem in stems for ending in MASK_ENDINGS if f"{stem}{ending}" in there}
 
 
 def inspect_photo(folder: Path, name: str, mask: str) -> Photo:
-    """Read the size and EXIF data of a photograph. Raises InputError if it is damaged or its name is not UTF-8."""
+    """Read the size and EXIF data of a photograph. Raises InputError if it is damaged or its name
+    is not UTF-8."""
     path = folder / name
     try:
         name.encode()
@@ -163,7 +172,8 @@ def file_stamp(path: Path) -> tuple[int, int]:
 
 
 def group_by_camera(photos: Sequence[Photo]) -> list[list[str]]:
-    """Group names by camera: the same size, maker, model, lens and focal length. Each zoom setting is a camera of its own."""
+    """Group names by camera: the same size, maker, model, lens and focal length. Each zoom setting
+    is a camera of its own."""
     groups: dict[object, list[str]] = {}
     for photo in photos:
         groups.setdefault((photo.size, photo.camera), []).append(photo.name)
@@ -171,17 +181,19 @@ def group_by_camera(photos: Sequence[Photo]) -> list[list[str]]:
 
 
 def check_in_place(photos: Sequence[Photo], folder: Path) -> list[Photo]:
-    """Return the photographs of a capture's own image folder, which are not modified. Raises InputError if COLMAP cannot read one."""
+    """Return the photographs of a capture's own image folder, which are not modified. Raises
+    InputError if COLMAP cannot read one."""
     if other := next((photo for photo in photos if photo.name != photo.stored), None):
         raise InputError(f"COLMAP cannot read '{other.name}' in {folder} as it is; make a new capture from these photographs with --out")
     return list(photos)
 
 
 def copy_photos(photos: Sequence[Photo], source: Path, target: Path) -> list[Photo]:
-    """Copy photographs and their masks into `target` under their stored names and return them. Other files in `target` are removed.
+    """Copy photographs and their masks into `target` under their stored names and return them.
+    Other files in `target` are removed.
 
-    Photographs that EXIF rotates are written upright at high quality: COLMAP uses the stored pixels, and a scene of sideways
-    photographs would lie on its side. Existing copies are kept.
+    Photographs that EXIF rotates are written upright at high quality: COLMAP uses the stored
+    pixels, and a scene of sideways photographs would lie on its side. Existing copies are kept.
     """
     note = target.with_name(COPIED)
     kept: dict[str, list[int]] = read_json(note, "list of copies") if note.is_file() else {}
@@ -207,7 +219,8 @@ def _mask_copy(photo: Photo, target: Path) -> Path:
 
 
 def transfer(old: Path, new: Path, orientation: int, suffix: str = "") -> None:
-    """Copy an image file, or rewrite it rotated upright (`orientation` as in EXIF) or in another format (`suffix`)."""
+    """Copy an image file, or rewrite it rotated upright (`orientation` as in EXIF) or in another
+    format (`suffix`)."""
     new.parent.mkdir(parents=True, exist_ok=True)
     if orientation == 1 and not suffix:
         write_atomic(new, lambda temporary: shutil.copyfile(old, temporary))

@@ -1,4 +1,5 @@
-"""Makes a capture from photographs or a video: images, camera poses, points, and a note about how they were made."""
+"""Makes a capture from photographs or a video: images, camera poses, points, and a note about how
+they were made."""
 
 from __future__ import annotations
 
@@ -39,9 +40,11 @@ Say = Callable[[str], None]
 def reconstruct(
     source: Path, out: Path, options: SfmOptions, *, overwrite: bool = False, say: Say = print, progress: Progress = lambda *_: None
 ) -> dict[str, Any]:
-    """Make the capture `out` from the photographs in the folder `source`, or from the frames of the video `source`.
+    """Make the capture `out` from the photographs in the folder `source`, or from the frames of the
+    video `source`.
 
-    An interrupted call is continued by the same call. Until it is complete, only a hidden folder in `out` changes.
+    An interrupted call is continued by the same call. Until it is complete, only a hidden folder in
+    `out` changes.
 
     Args:
         overwrite: Replace an existing capture once the new one is complete.
@@ -52,7 +55,8 @@ def reconstruct(
         The content of capture.json.
 
     Raises:
-        InputError: if the photographs cannot be used or no poses are found, or if pycolmap is missing.
+        InputError: if the photographs cannot be used or no poses are found, or if pycolmap is
+            missing.
         RunError: if COLMAP fails.
     """
     check_request(source, out, overwrite)
@@ -106,7 +110,8 @@ def reconstruct(
 
 
 def check_request(source: Path, out: Path, overwrite: bool) -> None:
-    """Raise InputError if no capture can be made from `source`, or if `out` contains files that must not be replaced."""
+    """Raise InputError if no capture can be made from `source`, or if `out` contains files that
+    must not be replaced."""
     if not source.exists():
         raise InputError(f"expected a folder of photographs or a video at {source}, found nothing; correct the path")
     if source.is_file() and source.suffix.lower() in EXTENSIONS:
@@ -132,7 +137,8 @@ def check_request(source: Path, out: Path, overwrite: bool) -> None:
 
 
 def extract_photos(video: Path, images: Path, options: SfmOptions, progress: Progress) -> list[Photo]:
-    """Extract the frames of a video into `images` and return them. Frames of an earlier call with the same video are reused."""
+    """Extract the frames of a video into `images` and return them. Frames of an earlier call with
+    the same video are reused."""
     note, mark = images.with_name(VIDEO), f"{video.name} {video.stat().st_size} {video.stat().st_mtime_ns} {options.frames}"
     if not note.is_file() or note.read_text() != mark:
         work.remove(images)
@@ -146,10 +152,12 @@ def extract_photos(video: Path, images: Path, options: SfmOptions, progress: Pro
 
 
 def choose_pairs(count: int, matching: Matching = "auto", neighbours: int = NEIGHBOURS) -> list[tuple[int, int]]:
-    """Return the pairs (i, j), i < j, of `count` photographs in order that are matched with each other.
+    """Return the pairs (i, j), i < j, of `count` photographs in order that are matched with each
+    other.
 
-    "exhaustive": all pairs. "sequential": each photograph with its next `neighbours`, and with those 16, 32, 64, ... further on,
-    which closes loops. "auto": exhaustive up to MOST_EXHAUSTIVE photographs, otherwise sequential.
+    "exhaustive": all pairs. "sequential": each photograph with its next `neighbours`, and with
+    those 16, 32, 64, ... further on, which closes loops. "auto": exhaustive up to MOST_EXHAUSTIVE
+    photographs, otherwise sequential.
     """
     if matching == "exhaustive" or (matching == "auto" and count <= MOST_EXHAUSTIVE):
         return list(combinations(range(count), 2))
@@ -159,7 +167,8 @@ def choose_pairs(count: int, matching: Matching = "auto", neighbours: int = NEIG
 
 
 def prepare_folder(folder: Path, found: list[Photo], options: SfmOptions, masks: list[str]) -> None:
-    """Empty the work folder for this request. The database is kept if it holds features of the same photographs and masks.
+    """Empty the work folder for this request. The database is kept if it holds features of the same
+    photographs and masks.
 
     masks: Checksums of the masks.
     """
@@ -181,7 +190,8 @@ def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress)
     """
     environment = {**os.environ, "OMP_NUM_THREADS": str(request["threads"])}
     with log.open("w") as stream:
-        # -P: modules are not searched in the worker's folder. In a new session, because this process handles Ctrl-C.
+        # -P: modules are not searched in the worker's folder. In a new session, because this
+        # process handles Ctrl-C.
         process = subprocess.Popen(
             [sys.executable, "-P", worker.__file__],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream, text=True, env=environment, start_new_session=True,
@@ -220,7 +230,8 @@ def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress)
 
 
 def check_space(folder: Path) -> None:
-    """Raise RunError if a file of 1 MiB cannot be written to `folder`. COLMAP's own messages do not say that the disk is full."""
+    """Raise RunError if a file of 1 MiB cannot be written to `folder`. COLMAP's own messages do not
+    say that the disk is full."""
     probe = folder / ".probe"
     try:
         write_bytes(probe, bytes(1 << 20))
@@ -240,7 +251,8 @@ def describe_result(
 ) -> dict[str, Any]:
     """Return the content of capture.json.
 
-    copied: Whether the capture's images are copies. exhaustive: Whether all photographs were matched with each other.
+    copied: Whether the capture's images are copies. exhaustive: Whether all photographs were
+    matched with each other.
     """
     registered = set(result["registered"])
     facts = {k: v for k, v in result.items() if k not in ("step", "registered", "version")}

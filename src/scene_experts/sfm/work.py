@@ -1,4 +1,5 @@
-"""The hidden folder in which a capture is made. The rest of the capture is not touched until everything in it is complete."""
+"""The hidden folder in which a capture is made. The rest of the capture is not touched until
+everything in it is complete."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ PLACES = {"images": "images", "model": "sparse/0", "capture.json": "capture.json
 
 @contextmanager
 def open_work_folder(out: Path) -> Iterator[Path]:
-    """Lock the work folder of the capture `out` for this process and yield it. Complete results of a killed process are published first.
+    """Lock the work folder of the capture `out` for this process and yield it. Complete results of
+    a killed process are published first.
 
     After an error, folders that were made here are removed if nothing was written to them.
 
@@ -40,7 +42,8 @@ def open_work_folder(out: Path) -> Iterator[Path]:
 
 
 def publish(out: Path) -> None:
-    """Move the results to their places, then remove what they replace. A process that is killed meanwhile is continued by the next call."""
+    """Move the results to their places, then remove what they replace. A process that is killed
+    meanwhile is continued by the next call."""
     folder = out / NAME
     (folder / WHOLE).touch()
     for name, place in PLACES.items():

@@ -1,8 +1,10 @@
-"""Runs pycolmap in a process of its own, because pycolmap can corrupt memory in a process that also loads Pillow, torch or OpenCV.
+"""Runs pycolmap in a process of its own, because pycolmap can corrupt memory in a process that also
+loads Pillow, torch or OpenCV.
 
-The script is started by its path and imports nothing of this project. It reads a request (JSON) from standard input and writes a
-line of JSON per step to standard output; COLMAP logs to standard error. Finished work stays in the database, so a repeated
-request continues where the previous one stopped.
+The script is started by its path and imports nothing of this project. It reads a request (JSON)
+from standard input and writes a line of JSON per step to standard output; COLMAP logs to standard
+error. Finished work stays in the database, so a repeated request continues where the previous one
+stopped.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ def report(**what: Any) -> None:
 
 
 def extract_features(colmap: Any, ask: dict[str, Any]) -> None:
-    """Extract the features of every photograph that has none yet. The photographs of a group share one camera."""
+    """Extract the features of every photograph that has none yet. The photographs of a group share
+    one camera."""
     options = colmap.FeatureExtractionOptions()
     options.num_threads, options.max_image_size, options.use_gpu = ask["threads"], ask["max_side"], False
     total, done = sum(map(len, ask["groups"])), 0
@@ -55,7 +58,8 @@ def extract_features(colmap: Any, ask: dict[str, Any]) -> None:
 
 
 def read_done(colmap: Any, database: str, names: list[str]) -> tuple[int | None, list[str]]:
-    """Return the camera id of a group, or None if no photograph of it is done, and the names of the photographs without features."""
+    """Return the camera id of a group, or None if no photograph of it is done, and the names of the
+    photographs without features."""
     if not Path(database).exists():
         return None, names
     with colmap.Database.open(database) as there:
@@ -132,7 +136,8 @@ def registered_names(model: Any) -> set[str]:
 
 
 def explain_missing(colmap: Any, ask: dict[str, Any], have: set[str], apart: set[str]) -> dict[str, str]:
-    """Return why each photograph that is not in `have` has no pose, by name. apart: photographs with poses in a model of their own."""
+    """Return why each photograph that is not in `have` has no pose, by name. apart: photographs
+    with poses in a model of their own."""
     names = [name for group in ask["groups"] for name in group if name not in have]
     if not names:
         return {}
@@ -151,7 +156,8 @@ def explain_missing(colmap: Any, ask: dict[str, Any], have: set[str], apart: set
 def explain(features: int, shared: dict[int, int], posed: set[int], apart: bool) -> str:
     """Return why a photograph has no pose.
 
-    shared: The number of points that it shares with other photographs, by their id. posed: Ids of the photographs that have a pose.
+    shared: The number of points that it shares with other photographs, by their id. posed: Ids of
+    the photographs that have a pose.
     """
     with_posed = [count for other, count in shared.items() if other in posed and count]
     if features < FEW_FEATURES:

@@ -30,12 +30,14 @@ class Edit:
 
 @dataclass(frozen=True)
 class Strategy(Part, Generic[S], ABC):
-    """Hyper-parameters of a densification strategy for scenes of class S. The flags are under --growth.
+    """Hyper-parameters of a densification strategy for scenes of class S. The flags are under
+    --growth.
 
-    The strategy keeps its running statistics in `table.stats`. After the backward pass of a view, the training calls `observe`. After
-    the last view of a batch it calls `survey` and `update` for each iteration of the batch, and `finish` after the optimiser's step.
-    A batch has one view by default. Several processes share its views: each observes its own views, the statistics are then added up,
-    and every process makes the same changes.
+    The strategy keeps its running statistics in `table.stats`. After the backward pass of a view,
+    the training calls `observe`. After the last view of a batch it calls `survey` and `update` for
+    each iteration of the batch, and `finish` after the optimiser's step. A batch has one view by
+    default. Several processes share its views: each observes its own views, the statistics are then
+    added up, and every process makes the same changes.
     """
 
     grows: ClassVar[str]
@@ -53,23 +55,27 @@ class Strategy(Part, Generic[S], ABC):
 
     @property
     def box(self) -> tuple[float, ...]:
-        """Low and high corner (x, y, z, x, y, z) of the box in which rows are created, in trained world units; empty means everywhere."""
+        """Low and high corner (x, y, z, x, y, z) of the box in which rows are created, in trained
+        world units; empty means everywhere."""
         return ()
 
     def needs_whole_table(self) -> str:
-        """Return the setting that needs all rows in every process, for the message of --shard; "" if none does. The default refuses."""
+        """Return the setting that needs all rows in every process, for the message of --shard; ""
+        if none does. The default refuses."""
         return "this growth rule"
 
     def count_steps(self, iterations: int) -> int | None:
-        """Number of densification steps in a training of `iterations` iterations; None if unknown."""
+        """Number of densification steps in a training of `iterations` iterations; None if
+        unknown."""
         return None
 
     def observe(self, scene: S, decoded: Decoded, render: Render, step: int) -> None:
-        """Add one view to the statistics. The default does nothing. It may only add to sums, and create sums of zeros: other processes
-        add other views."""
+        """Add one view to the statistics. The default does nothing. It may only add to sums, and
+        create sums of zeros: other processes add other views."""
 
     def reads(self, step: int) -> bool:
-        """Whether `survey` or `update` at `step` reads or removes statistics, or removes rows. The default is the safe answer, True.
+        """Whether `survey` or `update` at `step` reads or removes statistics, or removes rows. The
+        default is the safe answer, True.
 
         Several processes exchange their statistics only then.
         """
@@ -83,15 +89,18 @@ class Strategy(Part, Generic[S], ABC):
         return True
 
     def survey(self, scene: S, survey: Survey, step: int, generator: torch.Generator) -> None:
-        """Look at further training views before `update`. The default does nothing. generator: the only source of randomness."""
+        """Look at further training views before `update`. The default does nothing. generator: the
+        only source of randomness."""
 
     @abstractmethod
     def update(self, scene: S, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
         """Add and remove rows if densification is due at `step`. Returns None if it is not due.
 
         generator: the only source of randomness.
-        cap: maximum number of rows at this step (`max_anchors`, or the number that fits in memory); 0 means no limit.
+        cap: maximum number of rows at this step (`max_anchors`, or the number that fits in memory);
+        0 means no limit.
         """
 
     def finish(self, scene: S, step: int, rates: dict[str, float], generator: torch.Generator) -> None:
-        """Run after the optimiser's step. The default does nothing. rates: the current learning rates by group."""
+        """Run after the optimiser's step. The default does nothing. rates: the current learning
+        rates by group."""

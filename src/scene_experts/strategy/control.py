@@ -1,4 +1,5 @@
-"""Density control shared by all anchor methods (Scaffold-GS): the statistics, the schedule and the removal of anchors."""
+"""Density control shared by all anchor methods (Scaffold-GS): the statistics, the schedule and the
+removal of anchors."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ class AnchorControl(Strategy[L]):
 
     grows = "anchors"
     largest_log_size: ClassVar[float | None] = 0.05
-    """Upper bound of the logarithms of the Gaussians' sizes after each densification step, as in Scaffold-GS; None: no bound."""
+    """Upper bound of the logarithms of the Gaussians' sizes after each densification step, as in
+    Scaffold-GS; None: no bound."""
 
     start_stat: Annotated[int, SCALES] = 500
     """Iteration from which statistics are collected."""
@@ -35,32 +37,37 @@ class AnchorControl(Strategy[L]):
     grad_threshold: float = 0.0002
     """Mean 2D gradient (NDC units) above which new anchors are created."""
     gradient: Literal["signed", "absolute"] = "signed"
-    """signed: the gradients of a Gaussian's pixels cancel where they differ in sign. absolute: their absolute values are added (AbsGS)."""
+    """signed: the gradients of a Gaussian's pixels cancel where they differ in sign. absolute:
+    their absolute values are added (AbsGS)."""
     success_threshold: float = 0.8
-    """Share of the interval in which an anchor must be seen before it can be removed; half of it before it can grow."""
+    """Share of the interval in which an anchor must be seen before it can be removed; half of it
+    before it can grow."""
     min_opacity: float = 0.005
     """Anchors whose mean opacity is lower are removed."""
     error_views: CountOrNone = 0
-    """Number of random training views whose errors decide at each densification step where anchors are created (FastGS); 0 means that
-    errors do not count."""
+    """Number of random training views whose errors decide at each densification step where anchors
+    are created (FastGS); 0 means that errors do not count."""
     error_quantile: Annotated[float, Range(0, below=1)] = 0.7
     """Quantile of a view's pixel errors above which an error is high."""
     error_share: NotNegative = 0.3
-    """Share of a Gaussian's contribution that must lie on pixels with high errors before it can create an anchor."""
+    """Share of a Gaussian's contribution that must lie on pixels with high errors before it can
+    create an anchor."""
     least_contribution: NotNegative = 0.0
-    """Anchors that contribute less than this many pixels to each of at least 8 of the error views are removed; 0 removes none."""
+    """Anchors that contribute less than this many pixels to each of at least 8 of the error views
+    are removed; 0 removes none."""
     mask_contribution: NotNegative = 0.0
-    """Gaussians of an anchor that contribute less than this many pixels to every training view are no longer drawn, and anchors without
-    others are removed; 0 masks none."""
+    """Gaussians of an anchor that contribute less than this many pixels to every training view are
+    no longer drawn, and anchors without others are removed; 0 masks none."""
     mask_at: Annotated[tuple[int, ...], SCALES] = (20_000, 30_000)
     """Iterations at which Gaussians are masked."""
     mask_views: CountOrNone = 0
     """Number of random training views that a mask looks at; 0 means all."""
     max_anchors: CountOrNone = 0
-    """Maximum number of anchors; 0 means no limit. Anchors with the largest gradients are created first."""
+    """Maximum number of anchors; 0 means no limit. Anchors with the largest gradients are created
+    first."""
     bounds: tuple[float, ...] = ()
-    """Corners (low x, y, z, high x, y, z) of the box in which anchors are created, in trained world units; empty means everywhere. Blocks
-    of a large capture use it."""
+    """Corners (low x, y, z, high x, y, z) of the box in which anchors are created, in trained world
+    units; empty means everywhere. Blocks of a large capture use it."""
 
     @property
     def absolute(self) -> bool:
@@ -99,7 +106,8 @@ class AnchorControl(Strategy[L]):
         return self.enabled and self.adjust.due(step)
 
     def survey(self, scene: L, survey: Survey, step: int, generator: torch.Generator) -> None:
-        """Measure errors over random training views before densification, and the contributions of all slots before a mask."""
+        """Measure errors over random training views before densification, and the contributions of
+        all slots before a mask."""
         if self.error_views and self.grows_at(scene, step):
             errors.observe_errors(scene, survey, self.error_views, self.error_quantile, step, generator)
         if self.mask_contribution > 0 and self.enabled and step in self.mask_at:
@@ -110,7 +118,8 @@ class AnchorControl(Strategy[L]):
         return self.enabled and self.adjust.due(step) and "visits" in scene.table.stats
 
     def update(self, scene: L, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
-        """Create and remove anchors if densification or a mask is due at `step`. Returns None if neither is due.
+        """Create and remove anchors if densification or a mask is due at `step`. Returns None if
+        neither is due.
 
         `generator` selects the candidates that random elimination removes.
         """
@@ -136,19 +145,23 @@ class AnchorControl(Strategy[L]):
         raise NotImplementedError
 
     def inside(self, points: Tensor) -> Tensor:
-        """Return which points [P, 3] lie in the box in which anchors are created, [P] bool. Its low sides belong to it."""
+        """Return which points [P, 3] lie in the box in which anchors are created, [P] bool. Its low
+        sides belong to it."""
         low, high = (torch.tensor(side, dtype=points.dtype, device=points.device) for side in (self.bounds[:3], self.bounds[3:]))
         return ((points >= low) & (points < high)).all(1)
 
     def gate(self) -> float:
-        """Number of views that must draw a slot before the slot can create an anchor: more than 40 of 100 by default."""
+        """Number of views that must draw a slot before the slot can create an anchor: more than 40
+        of 100 by default."""
         return self.adjust.interval * self.success_threshold * 0.5
 
     @torch.no_grad()
     def prune(self, scene: L) -> int:
-        """Remove anchors that were seen often enough and have a low mean opacity. Returns the number of removed anchors.
+        """Remove anchors that were seen often enough and have a low mean opacity. Returns the
+        number of removed anchors.
 
-        Also resets the statistics of all anchors that were seen often enough, and clamps the sizes of the Gaussians.
+        Also resets the statistics of all anchors that were seen often enough, and clamps the sizes
+        of the Gaussians.
         """
         table = scene.table
         seen = table.stats["visits"] > self.adjust.interval * self.success_threshold  # 80 of 100 by default

@@ -1,8 +1,10 @@
-"""Growth and removal of anchors by errors over several views (after FastGS, Ren et al. 2025), and masks of slots that no view needs.
+"""Growth and removal of anchors by errors over several views (after FastGS, Ren et al. 2025), and
+masks of slots that no view needs.
 
 Statistics of a table, beside those of `observe`:
 
-- `covered` [N, K]: contribution of the slot to the sampled views, px; each densification step halves the older sum.
+- `covered` [N, K]: contribution of the slot to the sampled views, px; each densification step
+  halves the older sum.
 - `wrong` [N, K]: the part of it on pixels with high errors.
 - `looks` [N]: sampled views that saw the anchor since its last test.
 - `reach` [N]: largest contribution of the anchor to one of them, px.
@@ -46,13 +48,15 @@ def observe_errors(scene: LatticeScene, survey: Survey, count: int, quantile: fl
 
 
 def find_wrong(stats: dict[str, Tensor], share: float) -> Tensor:
-    """Return [N, K] bool: slots with at least `share` of their contribution on pixels with high errors."""
+    """Return [N, K] bool: slots with at least `share` of their contribution on pixels with high
+    errors."""
     return (stats["wrong"] >= share * stats["covered"]) & (stats["covered"] > 0)
 
 
 @torch.no_grad()
 def find_unneeded(stats: dict[str, Tensor], least: float) -> Tensor:
-    """Return [N] bool: anchors that contribute less than `least` px to each of at least LOOKS views. Tested anchors begin anew."""
+    """Return [N] bool: anchors that contribute less than `least` px to each of at least LOOKS
+    views. Tested anchors begin anew."""
     tested = stats["looks"] >= LOOKS
     unneeded = tested & (stats["reach"] < least)
     for name in ("looks", "reach"):
@@ -62,7 +66,8 @@ def find_unneeded(stats: dict[str, Tensor], least: float) -> Tensor:
 
 @torch.no_grad()
 def measure_contributions(scene: LatticeScene, survey: Survey, count: int, step: int, generator: torch.Generator) -> Tensor:
-    """Return the largest contribution of each slot to one of `count` training views (0: all of them), [N, K] px."""
+    """Return the largest contribution of each slot to one of `count` training views (0: all of
+    them), [N, K] px."""
     like = next(iter(scene.table.params.values()))
     most = like.new_zeros(len(scene.table) * scene.K)
     for view in survey.sample(count, generator):
@@ -74,7 +79,8 @@ def measure_contributions(scene: LatticeScene, survey: Survey, count: int, step:
 
 @torch.no_grad()
 def mask_slots(table: Table, contribution: Tensor, least: float) -> int:
-    """Mask the slots that contribute less than `least` px, [N, K], and remove anchors without other slots. Returns their number.
+    """Mask the slots that contribute less than `least` px, [N, K], and remove anchors without other
+    slots. Returns their number.
 
     A masked slot stays masked. With one slot per row, rows are removed and no mask is kept.
     """

@@ -1,7 +1,8 @@
 """Densification of anchors on an integer lattice (Scaffold-GS).
 
-Every `interval` iterations, offsets with a large mean 2D gradient create anchors in the empty cells of three lattices, from
-coarse to fine. Anchors with a low mean opacity are removed. Cells are integers, so all devices agree on which cells are occupied.
+Every `interval` iterations, offsets with a large mean 2D gradient create anchors in the empty cells
+of three lattices, from coarse to fine. Anchors with a low mean opacity are removed. Cells are
+integers, so all devices agree on which cells are occupied.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ class GrowAnchors(AnchorControl[L]):
     """Keep only a random part of the candidates: half at the coarsest level, then 3/4, then 7/8."""
 
     def cell_factors(self) -> list[int]:
-        """Cell edges of the levels, coarse to fine, in units of the scene's voxel size: [16, 4, 1] by default.
+        """Cell edges of the levels, coarse to fine, in units of the scene's voxel size: [16, 4, 1]
+        by default.
 
         Levels with a factor of 0 are left out.
         """
@@ -65,7 +67,8 @@ class GrowAnchors(AnchorControl[L]):
         return next((flag_of(f"growth.{name}") for name in surveys if getattr(self, name)), "")
 
     def search(self, scene: L, generator: torch.Generator, cap: int = 0) -> tuple[list[dict[str, Tensor]], int, bool]:
-        """Find the anchors to create and reset the statistics of the slots that were seen often enough.
+        """Find the anchors to create and reset the statistics of the slots that were seen often
+        enough.
 
         Returns the new rows by level, their number, and whether the limit rejected candidates.
         """
@@ -94,9 +97,11 @@ class GrowAnchors(AnchorControl[L]):
         return rows, born, capped
 
     def candidates(self, scene: L) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return the slots that were seen often enough, [e], and those whose gradients are large enough for a level.
+        """Return the slots that were seen often enough, [e], and those whose gradients are large
+        enough for a level.
 
-        The latter have their flat indices [s], mean gradients [s], rows [s] and positions [s, 3] in units of fine voxels.
+        The latter have their flat indices [s], mean gradients [s], rows [s] and positions [s, 3] in
+        units of fine voxels.
         """
         stats = scene.table.stats
         eligible = (stats["count"].view(-1) > self.gate()).nonzero().squeeze(1)  # flat slot index: row * K + k
@@ -116,7 +121,8 @@ class GrowAnchors(AnchorControl[L]):
     def search_shards(
         self, scene: L, table: ShardedTable, generator: torch.Generator, cap: int = 0
     ) -> tuple[list[dict[str, Tensor]], int, bool]:
-        """Do the same as `search` for a table that is divided among several processes. Returns the new rows of this process."""
+        """Do the same as `search` for a table that is divided among several processes. Returns the
+        new rows of this process."""
         stats = table.stats
         eligible, slots, g, parents, fine = self.candidates(scene)
         cells, rows, born, capped = table.facts["cell"], [], 0, False
@@ -138,9 +144,11 @@ class GrowAnchors(AnchorControl[L]):
 
 
 def strongest(strength: Tensor, cap: int, rows: int) -> Tensor:
-    """Indices of the candidates to keep so that a table of `rows` rows stays within `cap` rows (0: no limit).
+    """Indices of the candidates to keep so that a table of `rows` rows stays within `cap` rows (0:
+    no limit).
 
-    strength [n]: gradients of the candidates. The strongest candidates are kept, in their original order.
+    strength [n]: gradients of the candidates. The strongest candidates are kept, in their original
+    order.
     """
     if not cap or rows + len(strength) <= cap:
         return torch.arange(len(strength), device=strength.device)
@@ -153,9 +161,10 @@ def empty_cells(
     """Find the empty cells, in units of `factor` voxels, that contain candidate points.
 
     features [N, F]: features of the table.  taken [N, 3]: occupied fine cells.
-    fine [P, 3] float64: candidate points in units of fine voxels.  parents [P]: their rows.  g [P]: their gradients.
-    Returns cells [n, 3] int64, features [n, F] (element-wise maximum over the parents of all points in a cell) and the largest
-    gradient per cell [n]. Returns None if there is no empty cell.
+    fine [P, 3] float64: candidate points in units of fine voxels.  parents [P]: their rows.  g [P]:
+    their gradients. Returns cells [n, 3] int64, features [n, F] (element-wise maximum over the
+    parents of all points in a cell) and the largest gradient per cell [n]. Returns None if there is
+    no empty cell.
     """
     if len(fine) == 0:
         return None

@@ -1,8 +1,8 @@
 """Densification of anchors on the levels of an octree (Octree-GS).
 
-Offsets with a medium mean 2D gradient create anchors on their parent's level. Offsets with a large mean 2D gradient create
-anchors on the next finer level. Anchors whose gradients are large on average also request finer levels from then on. Anchors
-are removed as in Scaffold-GS.
+Offsets with a medium mean 2D gradient create anchors on their parent's level. Offsets with a large
+mean 2D gradient create anchors on the next finer level. Anchors whose gradients are large on
+average also request finer levels from then on. Anchors are removed as in Scaffold-GS.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from scene_experts.strategy.grow import empty_cells, strongest
 @register
 @dataclass(frozen=True)
 class GrowOctree(AnchorControl[AnchorScene]):
-    """Densification of Octree-GS: gradient thresholds grow by the factor fork^update_ratio per level."""
+    """Densification of Octree-GS: gradient thresholds grow by the factor fork^update_ratio per
+    level."""
 
     grows = "anchors on levels"
 
@@ -34,13 +35,15 @@ class GrowOctree(AnchorControl[AnchorScene]):
     update_ratio: NotNegative = 0.2
     """The gradient threshold grows by the factor fork^update_ratio from level to level."""
     extra_ratio: float = 0.25
-    """Anchors whose mean gradient reaches this share of the threshold of their level request finer levels."""
+    """Anchors whose mean gradient reaches this share of the threshold of their level request finer
+    levels."""
     extra_up: float = 0.01
     """Level increment per densification step."""
 
     @torch.no_grad()
     def grow(self, scene: AnchorScene, generator: torch.Generator, step: int = 0, cap: int = 0) -> tuple[int, bool]:
-        """Create anchors level by level, coarse to fine, up to `cap` anchors in total (0: no limit).
+        """Create anchors level by level, coarse to fine, up to `cap` anchors in total (0: no
+        limit).
 
         Returns the number of new anchors and whether the limit rejected candidates.
         """
@@ -91,8 +94,8 @@ class GrowOctree(AnchorControl[AnchorScene]):
     def gradients(self, stats: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Mean gradients per slot and per anchor.
 
-        Returns the eligible slots [N, K] (bool), their mean gradients [N, K] (0 for other slots), and the mean of each anchor over
-        its eligible slots [N].
+        Returns the eligible slots [N, K] (bool), their mean gradients [N, K] (0 for other slots),
+        and the mean of each anchor over its eligible slots [N].
         """
         eligible = stats["count"] > self.gate()
         g = torch.where(eligible, stats["grad"] / stats["count"].clamp_min(1), 0.0)
@@ -106,6 +109,7 @@ class GrowOctree(AnchorControl[AnchorScene]):
         return self.grad_threshold * float(levels.fork) ** (self.update_ratio * level)
 
     def extra(self, mean: Tensor, level: Tensor, levels: Levels) -> Tensor:
-        """Increments [N] of the level that anchors request, from their mean gradients `mean` [N] and levels `level` [N]."""
+        """Increments [N] of the level that anchors request, from their mean gradients `mean` [N]
+        and levels `level` [N]."""
         thresholds = self.extra_ratio * mean.new_tensor([self.threshold(i, levels) for i in range(levels.count)])
         return self.extra_up * (mean >= thresholds[level]).to(mean.dtype)

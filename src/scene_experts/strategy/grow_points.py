@@ -1,4 +1,5 @@
-"""Densification of graph points (SAGS): the rules of Scaffold-GS with one Gaussian per row, placed by a network."""
+"""Densification of graph points (SAGS): the rules of Scaffold-GS with one Gaussian per row, placed
+by a network."""
 
 from __future__ import annotations
 
@@ -14,16 +15,18 @@ from scene_experts.strategy.grow import GrowAnchors
 @register
 @dataclass(frozen=True)
 class GrowPoints(GrowAnchors):
-    """Densification of SAGS. It differs from that of anchors in the definition of a visit, and it does not clamp sizes."""
+    """Densification of SAGS. It differs from that of anchors in the definition of a visit, and it
+    does not clamp sizes."""
 
     grows = "graph points"
     largest_log_size = None
 
     success_threshold: float = 0.6
-    """Share of the interval in which an anchor must be seen before it can be removed; half of it before it can grow."""
+    """Share of the interval in which an anchor must be seen before it can be removed; half of it
+    before it can grow."""
     visits: Literal["drawn", "seen"] = "drawn"
-    """drawn: a view counts only for the points that it draws, so a point that is never drawn is never removed (SAGS). seen: a view counts
-    for all points that it decodes."""
+    """drawn: a view counts only for the points that it draws, so a point that is never drawn is
+    never removed (SAGS). seen: a view counts for all points that it decodes."""
 
     def observe(self, scene: LatticeScene, decoded: Decoded, render: Render, step: int) -> None:
         """Add one view to the statistics, after its backward pass."""

@@ -1,7 +1,8 @@
 """Empty cells for new anchors, found by several processes that each hold a part of the anchors.
 
-The processes exchange the keys of the cells and the largest gradient in each (16 bytes per candidate). The features of a new anchor travel
-only to the process that gets it. The results are those of `grow.empty_cells` for the whole table: maxima do not depend on any order.
+The processes exchange the keys of the cells and the largest gradient in each (16 bytes per
+candidate). The features of a new anchor travel only to the process that gets it. The results are
+those of `grow.empty_cells` for the whole table: maxima do not depend on any order.
 """
 
 from __future__ import annotations
@@ -16,13 +17,15 @@ _COLUMNS = 8  # columns of the features that are copied at once
 
 
 class Candidates:
-    """Empty cells that contain candidate points of any process. Every process has the same `cells` and `strength`."""
+    """Empty cells that contain candidate points of any process. Every process has the same `cells`
+    and `strength`."""
 
     cells: Tensor  # [n, 3] int64, in the order of their keys
     strength: Tensor  # [n], the largest gradient per cell
 
     def __init__(self, table: ShardedTable, features: Tensor, taken: Tensor, fine: Tensor, parents: Tensor, g: Tensor, factor: int) -> None:
-        """Find the cells. The arguments are those of `grow.empty_cells`, for the anchors of this process."""
+        """Find the cells. The arguments are those of `grow.empty_cells`, for the anchors of this
+        process."""
         self.table, self.features = table, features
         fine = torch.floor(fine + 0.5)
         inside = (fine.abs() < AXIS_LIMIT - factor).all(1)
@@ -38,7 +41,8 @@ class Candidates:
         self.cells = unpack(self.found)
 
     def features_of(self, chosen: Tensor, owners: Tensor) -> Tensor:
-        """Return the features of the new anchors that this process gets, [m, F]: the maximum over the parents of all points in the cell.
+        """Return the features of the new anchors that this process gets, [m, F]: the maximum over
+        the parents of all points in the cell.
 
         chosen [c]: the cells that become anchors, ascending.  owners [c]: their processes.
         """

@@ -1,4 +1,5 @@
-"""Densification by sampling (3DGS as Markov chain Monte Carlo, Kheradmand et al. 2024): relocate, add and perturb Gaussians.
+"""Densification by sampling (3DGS as Markov chain Monte Carlo, Kheradmand et al. 2024): relocate,
+add and perturb Gaussians.
 
 The method's two regularisers are loss weights: `Weights.mean_opacity` and `Weights.mean_size`.
 """
@@ -52,7 +53,8 @@ class MCMC(Strategy[GaussianScene]):
         return self.enabled and self.adjust.due(step)
 
     def update(self, scene: GaussianScene, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
-        """Relocate and add Gaussians if densification is due at `step`. Returns None if it is not due.
+        """Relocate and add Gaussians if densification is due at `step`. Returns None if it is not
+        due.
 
         `generator` samples the Gaussians to copy.
         """
@@ -66,7 +68,8 @@ class MCMC(Strategy[GaussianScene]):
 
     @torch.no_grad()
     def relocate(self, scene: GaussianScene, generator: torch.Generator) -> int:
-        """Move each dead Gaussian onto a live one, sampled in proportion to opacity. Returns the number of moved Gaussians."""
+        """Move each dead Gaussian onto a live one, sampled in proportion to opacity. Returns the
+        number of moved Gaussians."""
         table = scene.table
         opacity = table.params["raw_opacity"].sigmoid()
         dead = (opacity <= self.min_opacity).nonzero().squeeze(1)
@@ -80,7 +83,8 @@ class MCMC(Strategy[GaussianScene]):
 
     @torch.no_grad()
     def add(self, scene: GaussianScene, generator: torch.Generator, cap: int = 0) -> tuple[int, bool]:
-        """Add copies of Gaussians sampled in proportion to opacity, up to `cap` Gaussians in total (0: no limit).
+        """Add copies of Gaussians sampled in proportion to opacity, up to `cap` Gaussians in total
+        (0: no limit).
 
         Returns the number of new Gaussians and whether the limit rejected some.
         """
@@ -95,9 +99,11 @@ class MCMC(Strategy[GaussianScene]):
         return target - n, target < wanted
 
     def share(self, scene: GaussianScene, sources: Tensor) -> None:
-        """Adjust the opacity and scale of the Gaussians `sources` [D] for their copies, and reset their optimiser moments.
+        """Adjust the opacity and scale of the Gaussians `sources` [D] for their copies, and reset
+        their optimiser moments.
 
-        An index that occurs c times in `sources` has c copies, so c + 1 Gaussians replace the original one.
+        An index that occurs c times in `sources` has c copies, so c + 1 Gaussians replace the
+        original one.
         """
         rows, drawn = sources.unique(return_counts=True)
         p = scene.table.params
@@ -130,7 +136,8 @@ class MCMC(Strategy[GaussianScene]):
 
 
 def disturb(means: Tensor, quats: Tensor, log_scales: Tensor, raw_opacity: Tensor, eta: Tensor, size: float, faint: float) -> None:
-    """Compute means += Sigma eta size sigmoid(-100 (opacity - faint)) in place, in PyTorch, for any device and dtype."""
+    """Compute means += Sigma eta size sigmoid(-100 (opacity - faint)) in place, in PyTorch, for any
+    device and dtype."""
     gate = torch.sigmoid(-_SHARP * (raw_opacity.sigmoid() - faint))
     turn = quat_to_matrix(normalise_quats(quats))
     along = (turn.transpose(1, 2) @ eta[..., None]).squeeze(-1) * (2 * log_scales).exp()
@@ -138,7 +145,8 @@ def disturb(means: Tensor, quats: Tensor, log_scales: Tensor, raw_opacity: Tenso
 
 
 def draw(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Sample indices [count] with replacement, in proportion to `weight` [N] >= 0. At least one weight must be positive."""
+    """Sample indices [count] with replacement, in proportion to `weight` [N] >= 0. At least one
+    weight must be positive."""
     total = weight.double().cumsum(0)
     own = generator_on(total.device, generator)
     at = torch.rand(count, generator=own, dtype=torch.float64, device=total.device) * total[-1]
@@ -146,12 +154,13 @@ def draw(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
 
 
 def share_opacity(opacity: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity and scale factor, both [D], of n [D] (at most 51) equal Gaussians that replace one Gaussian of `opacity` [D].
+    """Opacity and scale factor, both [D], of n [D] (at most 51) equal Gaussians that replace one
+    Gaussian of `opacity` [D].
 
     The new opacity is o' = 1 - (1 - o)^(1/n). The scale factor is o / Q with
     Q = sum_{i=1..n} sum_{k=0..i-1} binom(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1) (eq. 9 of the paper).
-    The hockey-stick identity gives Q = sum_{j=1..n} binom(n, j) (-1)^(j-1) o'^j / sqrt(j). The signs alternate, so the sum is
-    computed in float64.
+    The hockey-stick identity gives Q = sum_{j=1..n} binom(n, j) (-1)^(j-1) o'^j / sqrt(j). The
+    signs alternate, so the sum is computed in float64.
     """
     n, o = n.clamp(1, MOST), opacity.double()
     new = 1 - (1 - o) ** (1 / n)
@@ -162,6 +171,7 @@ def share_opacity(opacity: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
 
 @functools.cache
 def _signed_binomials() -> Tensor:
-    """Table of binom(n, j) (-1)^(j-1) / sqrt(j) for n = 0 .. MOST (rows) and j = 1 .. MOST (columns), float64."""
+    """Table of binom(n, j) (-1)^(j-1) / sqrt(j) for n = 0 .. MOST (rows) and j = 1 .. MOST
+    (columns), float64."""
     rows = [[math.comb(n, j) * (-1) ** (j - 1) / math.sqrt(j) for j in range(1, MOST + 1)] for n in range(MOST + 1)]
     return torch.tensor(rows, dtype=torch.float64)

@@ -35,10 +35,11 @@ def stop(table: Table) -> None:
 
 @torch.no_grad()
 def observe(table: Table, decoded: Decoded, render: Render) -> None:
-    """Add one view, after its backward pass. A slot counts if its opacity is positive and its splat overlaps the image.
+    """Add one view, after its backward pass. A slot counts if its opacity is positive and its splat
+    overlaps the image.
 
-    Each row and slot occurs at most once per view, so the compiled library adds them in parallel. Its results are bit-identical
-    to the PyTorch implementation.
+    Each row and slot occurs at most once per view, so the compiled library adds them in parallel.
+    Its results are bit-identical to the PyTorch implementation.
     """
     assert decoded.raw_opacity is not None
     raw, library = decoded.raw_opacity.detach(), native.load()
@@ -54,7 +55,8 @@ def observe(table: Table, decoded: Decoded, render: Render) -> None:
 
 @torch.no_grad()
 def observe_drawn(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:
-    """Add one view to `grad` and `count` only (one value per slot). Explicit Gaussians need no other statistics."""
+    """Add one view to `grad` and `count` only (one value per slot). Explicit Gaussians need no
+    other statistics."""
     columns, library = [stats["grad"], stats["count"]], native.load()
     parts = [*columns, render.mean2d_grad]
     if library is None or not all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in parts):
@@ -76,6 +78,7 @@ def _by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> Non
 def _drawn_by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:
     drawn, source = render.radii > 0, decoded.gaussians.source
     norms = render.mean2d_grad.norm(dim=1)
-    # Add zeros for slots that were not drawn. Selecting the drawn slots would synchronise the host with the GPU.
+    # Add zeros for slots that were not drawn. Selecting the drawn slots would synchronise the host
+    # with the GPU.
     stats["grad"].view(-1).index_add_(0, source, torch.where(drawn, norms, 0.0))
     stats["count"].view(-1).index_add_(0, source, drawn.to(norms.dtype))

@@ -1,8 +1,10 @@
-"""Densification of explicit Gaussians (3DGS, Kerbl et al. 2023, section 5): clone, split, prune, reset opacities.
+"""Densification of explicit Gaussians (3DGS, Kerbl et al. 2023, section 5): clone, split, prune,
+reset opacities.
 
 Statistics:
 
-- `grad` [N]: sum of the norms of the 2D-mean gradients (NDC units) over the views that drew the Gaussian.
+- `grad` [N]: sum of the norms of the 2D-mean gradients (NDC units) over the views that drew the
+  Gaussian.
 - `count` [N]: number of these views.
 """
 
@@ -39,13 +41,16 @@ class SplitClone(Strategy[GaussianScene]):
     grad_threshold: float = 0.0002
     """Mean 2D gradient (NDC units) above which a Gaussian is cloned or split."""
     gradient: Literal["signed", "absolute"] = "signed"
-    """signed: the gradients of a Gaussian's pixels cancel where they differ in sign. absolute: their absolute values are added (AbsGS)."""
+    """signed: the gradients of a Gaussian's pixels cancel where they differ in sign. absolute:
+    their absolute values are added (AbsGS)."""
     dense_size: float = 0.01
-    """Largest size of a cloned Gaussian, as a share of the scene's extent; larger ones are split."""
+    """Largest size of a cloned Gaussian, as a share of the scene's extent; larger ones are
+    split."""
     min_opacity: float = 0.005
     """Gaussians with a lower opacity are removed."""
     max_size: float = 0.1
-    """Gaussians larger than this share of the scene's extent are removed after the first opacity reset."""
+    """Gaussians larger than this share of the scene's extent are removed after the first opacity
+    reset."""
     reset: Every = Every(0, 15_000, 3000)
     """When opacities are reset."""
     reset_least: Count = 1000
@@ -53,7 +58,8 @@ class SplitClone(Strategy[GaussianScene]):
     reset_opacity: Annotated[float, Range(above=0, below=1)] = 0.01
     """Upper bound of the opacities after a reset."""
     max_anchors: CountOrNone = 0
-    """Maximum number of Gaussians; 0 means no limit. Gaussians with the largest gradients are added first."""
+    """Maximum number of Gaussians; 0 means no limit. Gaussians with the largest gradients are added
+    first."""
 
     @property
     def absolute(self) -> bool:
@@ -63,7 +69,8 @@ class SplitClone(Strategy[GaussianScene]):
     def scaled(self, factor: float) -> Self:
         """Scale the schedule to a training `factor` times as long.
 
-        The reset interval scales too, but not below `reset_least`. The densification interval does not change.
+        The reset interval scales too, but not below `reset_least`. The densification interval does
+        not change.
         """
         least = min(self.reset_least, self.reset.interval)
         made = super().scaled(factor)
@@ -91,7 +98,8 @@ class SplitClone(Strategy[GaussianScene]):
         return self.enabled and self.adjust.due(step)
 
     def update(self, scene: GaussianScene, step: int, generator: torch.Generator, cap: int = 0) -> Edit | None:
-        """Clone, split, remove and reset Gaussians if due at `step`. Returns None if densification is not due.
+        """Clone, split, remove and reset Gaussians if due at `step`. Returns None if densification
+        is not due.
 
         `generator` samples the positions of the two halves of a split Gaussian.
         """
@@ -115,7 +123,8 @@ class SplitClone(Strategy[GaussianScene]):
 
     @torch.no_grad()
     def grow(self, scene: GaussianScene, generator: torch.Generator, cap: int = 0) -> tuple[int, bool]:
-        """Clone small Gaussians and split large ones where gradients are large, up to `cap` Gaussians in total (0: no limit).
+        """Clone small Gaussians and split large ones where gradients are large, up to `cap`
+        Gaussians in total (0: no limit).
 
         Returns the number of Gaussians gained and whether the limit rejected candidates.
         """
@@ -141,7 +150,8 @@ class SplitClone(Strategy[GaussianScene]):
 
     @torch.no_grad()
     def prune(self, scene: GaussianScene, step: int) -> int:
-        """Remove Gaussians of low opacity and, after the first reset, very large ones. Returns the number of removed Gaussians."""
+        """Remove Gaussians of low opacity and, after the first reset, very large ones. Returns the
+        number of removed Gaussians."""
         p = scene.table.params
         gone = p["raw_opacity"].sigmoid() < self.min_opacity
         if step > self.reset.interval:
@@ -152,15 +162,18 @@ class SplitClone(Strategy[GaussianScene]):
 
     @torch.no_grad()
     def press_opacities(self, scene: GaussianScene) -> None:
-        """Clamp all opacities to at most `reset_opacity` and reset Adam's moments of the opacities."""
+        """Clamp all opacities to at most `reset_opacity` and reset Adam's moments of the
+        opacities."""
         most = math.log(self.reset_opacity / (1 - self.reset_opacity))
         scene.table.assign("raw_opacity", scene.table.params["raw_opacity"].detach().clamp_max(most))
 
 
 def split_rows(params: torch.nn.ParameterDict, rows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-    """Split each of the Gaussians `rows` [S] into two; returns columns of 2 S rows, all first halves before all second halves.
+    """Split each of the Gaussians `rows` [S] into two; returns columns of 2 S rows, all first
+    halves before all second halves.
 
-    Each half has a mean sampled from the original Gaussian and scales divided by 1.6. Its other columns are copies.
+    Each half has a mean sampled from the original Gaussian and scales divided by 1.6. Its other
+    columns are copies.
     """
     halves = {name: torch.cat([column.index_select(0, rows)] * 2) for name, column in params.items()}
     quats, scales = halves["quats"], halves["log_scales"].exp()

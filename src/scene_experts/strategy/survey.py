@@ -1,8 +1,9 @@
-"""Surveys: what training views show of a scene's Gaussians, beyond the view of the current iteration.
+"""Surveys: what training views show of a scene's Gaussians, beyond the view of the current
+iteration.
 
-The contribution of a Gaussian to a picture is the sum over pixels of its blending weight T alpha, in pixels. It is the derivative of
-the picture's sum with respect to the Gaussian's colour. One backward pass gives three such sums, with another weight of the pixels in
-each channel.
+The contribution of a Gaussian to a picture is the sum over pixels of its blending weight T alpha,
+in pixels. It is the derivative of the picture's sum with respect to the Gaussian's colour. One
+backward pass gives three such sums, with another weight of the pixels in each channel.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ class Survey:
 
     @torch.no_grad()
     def see(self, scene: Scene, view: int, step: int, weigh: Callable[[Tensor, TrainingPhoto], Tensor]) -> tuple[Decoded, Tensor]:
-        """Draw a view. Returns the decoded scene and the sums [M, 3] over pixels of T alpha times `weigh(image, photo)` [H, W, 3]."""
+        """Draw a view. Returns the decoded scene and the sums [M, 3] over pixels of T alpha times
+        `weigh(image, photo)` [H, W, 3]."""
         photo = self.photo(view)
         decoded = scene(photo.camera, step, Mode.DRAW, self.draw.visible)
         colors = decoded.gaussians.colors.detach().clone().requires_grad_()
@@ -66,9 +68,11 @@ def weigh_all(image: Tensor, photo: TrainingPhoto) -> Tensor:
 
 
 def weigh_errors(image: Tensor, photo: TrainingPhoto, quantile: float) -> Tensor:
-    """Weights [H, W, 3]: 1, then 1 at pixels whose error is above the quantile of the picture, then the error.
+    """Weights [H, W, 3]: 1, then 1 at pixels whose error is above the quantile of the picture, then
+    the error.
 
-    The error of a pixel is the mean over the channels of |image - photograph|. The weights of masked pixels are 0.
+    The error of a pixel is the mean over the channels of |image - photograph|. The weights of
+    masked pixels are 0.
     """
     error = (image.clamp(0, 1) - photo.image).abs().mean(2)
     known = torch.ones_like(error) if photo.mask is None else (photo.mask > 0).to(error)

@@ -1,9 +1,12 @@
-"""An average of the weights along the training, which is evaluated and exported in place of the last weights.
+"""An average of the weights along the training, which is evaluated and exported in place of the
+last weights.
 
-The average of n updates is a_n = a_(n-1) + w_n (p_n - a_(n-1)) with w_n = max(1 / n, interval / (span T)): the mean of all weights so far
-at first, then an exponential average over the last `span` of the T iterations. It is a function of the step alone, so a resumed run
-continues it. New rows of a table start with their own values (`Table.append`); removed rows leave (`Table.keep`).
-Source: Polyak and Juditsky 1992; Izmailov et al. 2018, "Averaging weights leads to wider optima and better generalization".
+The average of n updates is a_n = a_(n-1) + w_n (p_n - a_(n-1)) with w_n = max(1 / n, interval /
+(span T)): the mean of all weights so far at first, then an exponential average over the last `span`
+of the T iterations. It is a function of the step alone, so a resumed run continues it. New rows of
+a table start with their own values (`Table.append`); removed rows leave (`Table.keep`). Source:
+Polyak and Juditsky 1992; Izmailov et al. 2018, "Averaging weights leads to wider optima and better
+generalization".
 """
 
 from __future__ import annotations
@@ -26,21 +29,25 @@ class Average(Part):
     """Which average of the weights is evaluated and exported; flags under --average."""
 
     span: Share = 0.0
-    """Share of the training that the average spans (0.05 to 0.2 are useful); 0 uses the last weights."""
+    """Share of the training that the average spans (0.05 to 0.2 are useful); 0 uses the last
+    weights."""
     interval: Count = 10
     """Iterations between two updates of the average."""
 
     def due(self, step: int) -> bool:
-        """Whether the average is updated after iteration `step`. Before the first interval ends, the average is the last weights."""
+        """Whether the average is updated after iteration `step`. Before the first interval ends,
+        the average is the last weights."""
         return self.span > 0 and (step < self.interval or step % self.interval == 0)
 
     def weight(self, step: int, total: int) -> float:
-        """Return the weight of the new values in the update after iteration `step` of `total`, in (0, 1]."""
+        """Return the weight of the new values in the update after iteration `step` of `total`, in
+        (0, 1]."""
         return min(1.0, max(self.interval / step, self.interval / (self.span * total)))
 
 
 class Averages:
-    """The averages of a scene's weights: columns in the scene's table, which keeps their rows aligned, and networks here."""
+    """The averages of a scene's weights: columns in the scene's table, which keeps their rows
+    aligned, and networks here."""
 
     networks: dict[str, Tensor]
 
@@ -62,7 +69,8 @@ class Averages:
 
     @contextmanager
     def swapped(self) -> Iterator[None]:
-        """Context manager in which the scene has the averages as its weights. Do not train in it."""
+        """Context manager in which the scene has the averages as its weights. Do not train in
+        it."""
         self._swap()
         try:
             yield

@@ -1,10 +1,12 @@
 """How the views of a batch become one optimiser step, in one process or in several.
 
-The loss of a batch is the mean of the losses of its B views. Each view is differentiated alone and with weight 1, so that its 2D gradients
-have the size that densification expects. The gradients of the parameters are then added up over the views and divided by B.
+The loss of a batch is the mean of the losses of its B views. Each view is differentiated alone and
+with weight 1, so that its 2D gradients have the size that densification expects. The gradients of
+the parameters are then added up over the views and divided by B.
 
-Process r of W sees the views r, r + W, ... of a batch. All processes have the same scene, the same optimiser and the same random numbers,
-and make the same decisions. They exchange gradients after each batch, and the statistics for densification when somebody reads them.
+Process r of W sees the views r, r + W, ... of a batch. All processes have the same scene, the same
+optimiser and the same random numbers, and make the same decisions. They exchange gradients after
+each batch, and the statistics for densification when somebody reads them.
 """
 
 from __future__ import annotations
@@ -40,12 +42,14 @@ class Direct:
     def scene_of(self, cameras: Sequence[Camera | None], step: int, mode: Mode, cull: Cull) -> Scene:
         """Return the scene from which this process draws its view. Every process must call this.
 
-        cameras: One for each process; None for a process that draws nothing. With TRAIN, process r draws as iteration step + r.
+        cameras: One for each process; None for a process that draws nothing. With TRAIN, process r
+        draws as iteration step + r.
         """
         return self.training.scene
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors of a checkpoint, in process 0. Every process must call this, after `complete`."""
+        """Return the tensors of a checkpoint, in process 0. Every process must call this, after
+        `complete`."""
         return self.training.tensors()
 
     def add(self, decoded: Decoded, render: Render, number: int) -> None:
@@ -66,15 +70,18 @@ class Direct:
     def limit(self, cap: int, measured: bool) -> int:
         """Return the limit on the number of rows: the smallest of all processes. 0 means no limit.
 
-        measured: Whether the limit depends on the memory of the process, and may differ between processes.
+        measured: Whether the limit depends on the memory of the process, and may differ between
+        processes.
         """
         return cap
 
     def compare(self, rows: int, edited: bool) -> None:
-        """Raise RunError if the processes have different numbers of rows after densification (`edited`)."""
+        """Raise RunError if the processes have different numbers of rows after densification
+        (`edited`)."""
 
     def rows(self) -> Tensor | None:
-        """Return the rows that a view of the batch has decoded, [A] int64 without duplicates; None if the loss reaches all rows."""
+        """Return the rows that a view of the batch has decoded, [A] int64 without duplicates; None
+        if the loss reaches all rows."""
         seen, self.seen = self.seen, []
         if len(seen) == 1:
             return seen[0]
@@ -149,9 +156,11 @@ class Reduced(Direct):
         return None if chosen[-1] else chosen[:-1].nonzero().squeeze(1)
 
     def _observe(self, scene: Scene, decoded: Decoded, render: Render, number: int, into: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Add a view, that of iteration `number`, to the statistics `into` in place of those of the table, and return them.
+        """Add a view, that of iteration `number`, to the statistics `into` in place of those of the
+        table, and return them.
 
-        Where this view does not count but another of the same turn does, they are zeros: all processes have the same columns.
+        Where this view does not count but another of the same turn does, they are zeros: all
+        processes have the same columns.
         """
         table, growth = scene.table, self.training.cfg.growth
         kept, table.stats = table.stats, into
@@ -190,8 +199,8 @@ class Reduced(Direct):
 
 
 class Ordered(Reduced):
-    """One or several processes: gradients and statistics are added in the order of the views, so that the bits of the sums do not depend
-    on the number of processes."""
+    """One or several processes: gradients and statistics are added in the order of the views, so
+    that the bits of the sums do not depend on the number of processes."""
 
     def __init__(self, training: Training, group: Alone, stop: list[str]) -> None:
         super().__init__(training, group, stop)
@@ -217,7 +226,8 @@ class Ordered(Reduced):
 
 
 def make_exchange(training: Training, group: Alone, stop: list[str], deterministic: bool) -> Direct:
-    """Return the exchange for a training. Raises InputError unless the number of processes divides the batch."""
+    """Return the exchange for a training. Raises InputError unless the number of processes divides
+    the batch."""
     check_batch(training.cfg.batch, group.size)
     if deterministic and training.cfg.batch > 1:
         return Ordered(training, group, stop)
@@ -225,7 +235,8 @@ def make_exchange(training: Training, group: Alone, stop: list[str], determinist
 
 
 def check_batch(batch: int, processes: int) -> None:
-    """Raise InputError, which names --batch, unless the processes can share the views of a batch evenly."""
+    """Raise InputError, which names --batch, unless the processes can share the views of a batch
+    evenly."""
     if batch % processes:
         wanted = -(-batch // processes) * processes
         raise InputError(f"expected a --batch that {processes} processes share evenly, found {batch}; give for example --batch {wanted}")
@@ -236,7 +247,8 @@ def _parameters(training: Training) -> list[Tensor]:
 
 
 def _gradients(training: Training) -> list[Tensor]:
-    """Return the gradients of all parameters in the order of the optimiser. A parameter without one gets zeros."""
+    """Return the gradients of all parameters in the order of the optimiser. A parameter without one
+    gets zeros."""
     found = []
     for parameter in _parameters(training):
         if parameter.grad is None:

@@ -1,4 +1,5 @@
-"""Store the location of a run's capture. The run finds the capture from any folder, also after both have moved together."""
+"""Store the location of a run's capture. The run finds the capture from any folder, also after both
+have moved together."""
 
 from __future__ import annotations
 
@@ -6,7 +7,8 @@ import os
 from pathlib import Path
 
 KEY = "capture_from_run"
-"""Key of config.json: the capture's path relative to the run folder. Earlier runs do not have it."""
+"""Key of config.json: the capture's path relative to the run folder. Earlier runs do not have
+it."""
 
 
 def absolute(path: Path) -> Path:
@@ -15,7 +17,8 @@ def absolute(path: Path) -> Path:
 
 
 def from_run(run: Path, path: Path) -> str | None:
-    """Return the path of a capture relative to its run folder, or None if there is none (two drives on Windows)."""
+    """Return the path of a capture relative to its run folder, or None if there is none (two drives
+    on Windows)."""
     try:
         return Path(os.path.relpath(path, run)).as_posix()
     except ValueError:
@@ -25,8 +28,9 @@ def from_run(run: Path, path: Path) -> str | None:
 def find(run: Path, path: Path, relative: str | None) -> Path:
     """Return the folder of a run's capture.
 
-    An absolute path is tried first, then the path relative to the run folder. Earlier runs store the path as it was given on the
-    command line. If that path is relative, it is tried from the current folder, the run folder and each parent of the run folder.
+    An absolute path is tried first, then the path relative to the run folder. Earlier runs store
+    the path as it was given on the command line. If that path is relative, it is tried from the
+    current folder, the run folder and each parent of the run folder.
 
     Args:
         run: The run folder.

@@ -11,20 +11,24 @@ from typing import Any
 
 
 def load_average() -> float | None:
-    """Return the load average of the last minute, or None if the system does not report it (Windows)."""
+    """Return the load average of the last minute, or None if the system does not report it
+    (Windows)."""
     return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
 
 
 @dataclass
 class Clock:
-    """Total time of the iterations, including those before a resume. Excludes saving, previews and evaluation."""
+    """Total time of the iterations, including those before a resume. Excludes saving, previews and
+    evaluation."""
 
     seconds: float = 0.0
     """Wall time, s."""
     cpu_seconds: float | None = 0.0
-    """User and system time of all threads of this process, s. None: an older checkpoint, which does not say."""
+    """User and system time of all threads of this process, s. None: an older checkpoint, which does
+    not say."""
     load: dict[str, float | None] = field(default_factory=lambda: {"cores": os.cpu_count(), "start": load_average()})
-    """`cores` of the machine, and its load averages at the `start` and the `end` of the training; empty for an older checkpoint."""
+    """`cores` of the machine, and its load averages at the `start` and the `end` of the training;
+    empty for an older checkpoint."""
 
     @contextmanager
     def running(self) -> Iterator[None]:
@@ -36,7 +40,8 @@ class Clock:
             self.cpu_seconds += time.process_time() - cpu
 
     def meta(self) -> dict[str, Any]:
-        """Return the values that a checkpoint stores. The current load average is stored as `end`."""
+        """Return the values that a checkpoint stores. The current load average is stored as
+        `end`."""
         return {"seconds": self.seconds, "cpu_seconds": self.cpu_seconds, "load": {**self.load, "end": load_average()}}
 
     @classmethod

@@ -46,13 +46,14 @@ class Train:
     average: Average = Average()
     """An average of the weights, which is evaluated and exported in place of the last weights."""
     iterations: Count = SCHEDULE
-    """Number of training iterations. Another number rescales the whole schedule (learning rates, densification, warm-up)."""
+    """Number of training iterations. Another number rescales the whole schedule (learning rates,
+    densification, warm-up)."""
     batch: Count = 1
-    """Training views per optimiser step. Iterations count views, so N iterations make N / batch steps. Several processes (torchrun) share
-    the views of a batch."""
+    """Training views per optimiser step. Iterations count views, so N iterations make N / batch
+    steps. Several processes (torchrun) share the views of a batch."""
     batch_rates: Share = 0.5
-    """Learning rates are multiplied by batch to this power. 0.5 keeps the variance of what a view moves (Zhao et al. 2024),
-    1 keeps how far the views together move."""
+    """Learning rates are multiplied by batch to this power. 0.5 keeps the variance of what a view
+    moves (Zhao et al. 2024), 1 keeps how far the views together move."""
     seed: Annotated[int, Range(0, LARGEST_SEED)] = 0
     """Seed of all random numbers."""
     antialias: bool = False
@@ -60,21 +61,24 @@ class Train:
     random_background: bool = False
     """Use a random background colour in each iteration."""
     max_anchors: CountOrNone = 0
-    """Stop densification at this number of anchors; 0 leaves that of the growth rule (a million for 3dgs-mcmc, otherwise none)."""
+    """Stop densification at this number of anchors; 0 leaves that of the growth rule (a million for
+    3dgs-mcmc, otherwise none)."""
     sparse_adam: bool = False
-    """Update only the rows that a view has decoded (SelectiveAdam of gsplat). Faster if views see a small part of the scene; changes the
-    results."""
+    """Update only the rows that a view has decoded (SelectiveAdam of gsplat). Faster if views see a
+    small part of the scene; changes the results."""
     schedule: Annotated[int, Option(hidden=True)] = SCHEDULE
     """The iterations that this recipe's windows are written for."""
 
     def scaled(self) -> Train:
-        """Return a copy whose schedule is scaled by iterations / schedule. Raises InputError if `iterations` is below 1."""
+        """Return a copy whose schedule is scaled by iterations / schedule. Raises InputError if
+        `iterations` is below 1."""
         factor = self._factor()
         made = scale(self, factor)
         return replace(made, growth=replace(made.growth, max_anchors=self.max_anchors or self.growth.max_anchors))
 
     def scaled_scene(self) -> SceneConfig:
-        """Return the scene's settings of `scaled()`: all that drawing a trained scene needs. Raises InputError as `scaled` does."""
+        """Return the scene's settings of `scaled()`: all that drawing a trained scene needs. Raises
+        InputError as `scaled` does."""
         return self.scene.scaled(self._factor())
 
     def _factor(self) -> float:
@@ -87,7 +91,8 @@ class Train:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Contents of a run folder's config.json: everything needed to evaluate, resume and repeat the run."""
+    """Contents of a run folder's config.json: everything needed to evaluate, resume and repeat the
+    run."""
 
     train: Train
     data: Data
@@ -125,7 +130,8 @@ def check(cfg: Train) -> None:
 
 
 def find_unused(cfg: Train) -> list[str]:
-    """Return the flags of the settings that have no effect on the scene of `cfg` and do not have the default of their part."""
+    """Return the flags of the settings that have no effect on the scene of `cfg` and do not have
+    the default of their part."""
     places = list(changed_without(cfg, cfg.scene.has))
     if cfg.sparse_adam and cfg.loss.regularises and EXPLICIT in cfg.scene.has:
         places.append("sparse_adam")  # these losses move every row
@@ -133,7 +139,8 @@ def find_unused(cfg: Train) -> list[str]:
 
 
 def unregistered(value: Any) -> list[str]:
-    """Return the class names of the parts of `value` that are not registered. A run with such a part cannot be opened again."""
+    """Return the class names of the parts of `value` that are not registered. A run with such a
+    part cannot be opened again."""
     if not dataclasses.is_dataclass(value):
         return []
     below = [name for f in dataclasses.fields(value) for name in unregistered(getattr(value, f.name))]
@@ -142,7 +149,8 @@ def unregistered(value: Any) -> list[str]:
 
 
 def with_numbers(cfg: Train, numbers: Sequence[tuple[str, Any]]) -> Train:
-    """Return a copy of `cfg` with new values at dotted paths, for example ("scene.voxel_size", 0.001). Ignores unknown paths."""
+    """Return a copy of `cfg` with new values at dotted paths, for example ("scene.voxel_size",
+    0.001). Ignores unknown paths."""
     for place, value in numbers:
         if _has(cfg, place):
             cfg = _put(cfg, place.split("."), value)

@@ -24,12 +24,14 @@ class Started:
     traits: Traits
     """What the scene is and can do."""
     decode: str = ""
-    """Which implementation decodes the scene in the first iteration, and why not the fused one; empty without a choice."""
+    """Which implementation decodes the scene in the first iteration, and why not the fused one;
+    empty without a choice."""
 
 
 @dataclass(frozen=True)
 class Stepped:
-    """Figures of an iteration and of the one view that it saw. Yielded every 10 iterations unless asked otherwise."""
+    """Figures of an iteration and of the one view that it saw. Yielded every 10 iterations unless
+    asked otherwise."""
 
     step: int
     """The iteration, counted from 1."""
@@ -42,17 +44,22 @@ class Stepped:
     visible: int
     """Number of rows that this view decoded."""
     gaussians: int
-    """Number of Gaussians handed to the rasteriser: those of the visible rows with positive opacity."""
+    """Number of Gaussians handed to the rasteriser: those of the visible rows with positive
+    opacity."""
     active: float
-    """Share of the decoded Gaussians with positive opacity, 0 to 1; 0 for scenes without decoders."""
+    """Share of the decoded Gaussians with positive opacity, 0 to 1; 0 for scenes without
+    decoders."""
     seconds: float
     """Wall time of the iterations so far, s, without saving and previews."""
     routing: dict[str, list[float]]
-    """Each expert's share of this view's anchors, 0 to 1, by attribute; its share of the gates during the dense warm-up."""
+    """Each expert's share of this view's anchors, 0 to 1, by attribute; its share of the gates
+    during the dense warm-up."""
     balance: dict[str, float] = field(default_factory=dict)
-    """Load-balancing loss by attribute, L_load^S / k (L_load^D during the dense warm-up); 1 is perfect balance."""
+    """Load-balancing loss by attribute, L_load^S / k (L_load^D during the dense warm-up); 1 is
+    perfect balance."""
     entropy: dict[str, float] = field(default_factory=dict)
-    """Entropy of the gates by attribute, 0 to 1: 1 if all experts count alike, 0 if one counts alone."""
+    """Entropy of the gates by attribute, 0 to 1: 1 if all experts count alike, 0 if one counts
+    alone."""
     scene_routing: dict[str, list[float]] = field(default_factory=dict)
     """As `routing`, of anchors sampled all over the scene."""
     scene_gates: dict[str, list[float]] = field(default_factory=dict)

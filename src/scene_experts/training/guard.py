@@ -1,8 +1,9 @@
-"""Stop a training whose numbers are no longer finite, before a checkpoint is replaced by a broken one.
+"""Stop a training whose numbers are no longer finite, before a checkpoint is replaced by a broken
+one.
 
-Native Adam reports such numbers after every step, in the pass that it makes anyway. For every other optimiser the parameters and the
-optimiser's state are scanned every EVERY iterations: what is not finite in a moment stays so, and is found later. Every save scans the
-whole state first.
+Native Adam reports such numbers after every step, in the pass that it makes anyway. For every other
+optimiser the parameters and the optimiser's state are scanned every EVERY iterations: what is not
+finite in a moment stays so, and is found later. Every save scans the whole state first.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ EVERY = 100  # iterations between scans where the optimiser does not report
 
 
 def find_broken(optimizer: torch.optim.Optimizer, step: int, views: int = 1) -> str:
-    """Return the name of a parameter that the last `views` iterations left with a value or state that is not finite, else "".
+    """Return the name of a parameter that the last `views` iterations left with a value or state
+    that is not finite, else "".
 
     The groups of `optimizer` have a "name". `FusedAdam` reports the name after every step.
     """
@@ -32,7 +34,8 @@ def find_broken(optimizer: torch.optim.Optimizer, step: int, views: int = 1) -> 
 
 
 def check_state(tensors: dict[str, Tensor], step: int, folder: Path | None) -> None:
-    """Raise RunError, which names the tensor, if a tensor of the state to be saved is not finite."""
+    """Raise RunError, which names the tensor, if a tensor of the state to be saved is not
+    finite."""
     for name, tensor in tensors.items():
         if not are_finite([tensor]):
             raise RunError(explain(f"'{name}'", step, folder))
@@ -53,7 +56,8 @@ def explain(what: str, step: int, folder: Path | None) -> str:
 
 @torch.no_grad()
 def are_finite(tensors: Iterable[Tensor]) -> bool:
-    """Return whether every number of the floating-point tensors is finite. Reads each tensor once and allocates nothing of its size."""
+    """Return whether every number of the floating-point tensors is finite. Reads each tensor once
+    and allocates nothing of its size."""
     ends = [torch.stack(torch.aminmax(t.detach())) for t in tensors if t.is_floating_point() and t.numel()]
     return all(bool(end.isfinite().all()) for end in ends)  # all scans are queued before the first answer is waited for
 

@@ -1,4 +1,5 @@
-"""The training loop. It yields events, saves checkpoints and resumes runs. It does not depend on any method."""
+"""The training loop. It yields events, saves checkpoints and resumes runs. It does not depend on
+any method."""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ ROUTED = 16_384  # anchors sampled for the routing statistics; the shares are wi
 
 @dataclass(frozen=True)
 class Job:
-    """A training to be done: what is trained, where and how. `config` has the settings that results depend on."""
+    """A training to be done: what is trained, where and how. `config` has the settings that results
+    depend on."""
 
     config: RunConfig  # with `stop_at`, `max_memory` and `init_from`
     out: Path | None = None  # the run folder; None writes no files
@@ -62,7 +64,8 @@ class Job:
 
 @dataclass(frozen=True)
 class Iteration:
-    """Inputs and results of the last view of a batch that this process drew, and what densification did after the batch."""
+    """Inputs and results of the last view of a batch that this process drew, and what densification
+    did after the batch."""
 
     decoded: Decoded
     render: Render
@@ -85,8 +88,10 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
         The events of the training. The first is `Started`; the last is `Finished` or `Stopped`.
 
     Raises:
-        InputError: The settings, the capture or the checkpoint cannot be used, or the processes cannot share a batch evenly.
-        RunError: Another process has ended, a loss or a parameter is not finite, or a checkpoint cannot be written.
+        InputError: The settings, the capture or the checkpoint cannot be used, or the processes
+            cannot share a batch evenly.
+        RunError: Another process has ended, a loss or a parameter is not finite, or a checkpoint
+            cannot be written.
     """
     cfg = cfg.scaled()
     folder = run.out / "checkpoints" if run.out else None
@@ -140,12 +145,14 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
 
 
 def last_iteration(cfg: Train, run: Job) -> int:
-    """Return the iteration at which a training ends: `stop_at` at the end of its batch, or all iterations."""
+    """Return the iteration at which a training ends: `stop_at` at the end of its batch, or all
+    iterations."""
     return min(cfg.iterations, -(-(run.config.stop_at or cfg.iterations) // cfg.batch) * cfg.batch)
 
 
 def begin(cfg: Train, run: Job, capture: Capture, folder: Path | None, rasterize: Rasterizer) -> Training:
-    """Start a training, or restore it from the newest whole checkpoint in `folder`. `cfg` must be scaled. Raises InputError as `train`."""
+    """Start a training, or restore it from the newest whole checkpoint in `folder`. `cfg` must be
+    scaled. Raises InputError as `train`."""
     training = resume(cfg, folder, run.device) if run.options.resume and folder else None
     if training and training.capture_id not in ("", capture.fingerprint()):
         raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
@@ -169,7 +176,8 @@ def begin(cfg: Train, run: Job, capture: Capture, folder: Path | None, rasterize
 
 
 def start_exchange(training: Training, run: Job) -> Direct:
-    """Return the exchange of a training, and divide or compare the scenes of the processes. Raises InputError as `train`."""
+    """Return the exchange of a training, and divide or compare the scenes of the processes. Raises
+    InputError as `train`."""
     if run.shard:
         check_batch(training.cfg.batch, run.group.size)
         check_shard(training.cfg, run.max_memory, viewer=False)
@@ -181,10 +189,12 @@ def start_exchange(training: Training, run: Job) -> Direct:
 
 
 def iterate(training: Training, run: Job, capture: Capture, rasterize: Rasterizer, exchange: Direct | None = None) -> Iteration:
-    """See the views of one batch and take one optimiser step. Iterations count views, so the step advances by `cfg.batch`.
+    """See the views of one batch and take one optimiser step. Iterations count views, so the step
+    advances by `cfg.batch`.
 
-    The order is that of the paper: learning rates; view, decoding, rendering, loss, gradients; densification; Adam.
-    exchange: How the gradients and statistics of the views come together; None for one process.
+    The order is that of the paper: learning rates; view, decoding, rendering, loss, gradients;
+    densification; Adam. exchange: How the gradients and statistics of the views come together; None
+    for one process.
     """
     cfg, scene = training.cfg, training.scene
     exchange = exchange or Direct(training, run.group, run.stop)
@@ -239,9 +249,11 @@ def see_view(
     color: Tensor | None,
     scene: Scene | None = None,
 ) -> Iteration:
-    """Draw training view `index` as iteration `number`, and add the gradients of its loss to those of the parameters.
+    """Draw training view `index` as iteration `number`, and add the gradients of its loss to those
+    of the parameters.
 
-    color: Background [3] of this view; None is the background of the capture.  scene: What to draw; None is the scene of the training.
+    color: Background [3] of this view; None is the background of the capture.  scene: What to draw;
+    None is the scene of the training.
     """
     cfg, scene = training.cfg, scene or training.scene
     camera = capture.views[index].camera.to(run.device, run.dtype)
@@ -274,7 +286,8 @@ def survey_of(training: Training, run: Job, capture: Capture, rasterize: Rasteri
 
 
 def without_graph(value: Any) -> Any:
-    """Return the same value with every tensor detached, so that the buffers of the autograd graph can be freed."""
+    """Return the same value with every tensor detached, so that the buffers of the autograd graph
+    can be freed."""
     if isinstance(value, Tensor):
         return value.detach()
     if isinstance(value, (tuple, list)):
@@ -287,7 +300,8 @@ def without_graph(value: Any) -> Any:
 
 
 def check_finite(step: int, parts: dict[str, Tensor]) -> None:
-    """Check the losses before saving. Raises RunError if one is not finite, so that the last valid checkpoint is kept."""
+    """Check the losses before saving. Raises RunError if one is not finite, so that the last valid
+    checkpoint is kept."""
     bad = [name for name, value in parts.items() if not math.isfinite(value)]
     if bad:
         raise RunError(
@@ -327,7 +341,8 @@ def measure_step(training: Training, done: Iteration) -> Stepped:
 
 
 def use(r: Routing) -> list[float]:
-    """Return each expert's share of the assignments, or its mean gate while routing is dense, [E]."""
+    """Return each expert's share of the assignments, or its mean gate while routing is dense,
+    [E]."""
     A, E = r.gates.shape
     share = r.gates.sum(0) / max(A, 1) if r.chosen is None else torch.bincount(r.chosen.reshape(-1), minlength=E) / max(r.chosen.numel(), 1)
     return [round(float(c), 4) for c in share]
@@ -335,7 +350,8 @@ def use(r: Routing) -> list[float]:
 
 @torch.no_grad()
 def preview(training: Training, run: Job, capture: Capture, rasterize: Rasterizer, exchange: Direct | None = None) -> Previewed | None:
-    """Render one held-out view, or a training view if none is held out, in process 0. Every process must call this."""
+    """Render one held-out view, or a training view if none is held out, in process 0. Every process
+    must call this."""
     exchange = exchange or Direct(training, run.group, run.stop)
     index = (capture.test or capture.train)[0]
     camera = capture.views[index].camera.to(run.device, run.dtype)

@@ -1,7 +1,9 @@
-"""The training loss: a sum of named terms. A new term needs one function and one entry in `Weights.terms`.
+"""The training loss: a sum of named terms. A new term needs one function and one entry in
+`Weights.terms`.
 
-Images are [H, W, 3] float RGB in [0, 1]. The mean over an empty set (no Gaussians, anchors or pixels) is 0.
-Equation numbers refer to "Scene Experts" (MoE-GS, AAAI 2026). The photometric loss is that of 3DGS.
+Images are [H, W, 3] float RGB in [0, 1]. The mean over an empty set (no Gaussians, anchors or
+pixels) is 0. Equation numbers refer to "Scene Experts" (MoE-GS, AAAI 2026). The photometric loss is
+that of 3DGS.
 """
 
 from __future__ import annotations
@@ -35,15 +37,18 @@ class Sample:
 
 
 Term = Callable[["Weights", Sample], dict[str, Tensor]]
-"""Function that maps weights and a sample to weighted terms by name, each []. Empty if the term is off or does not apply."""
+"""Function that maps weights and a sample to weighted terms by name, each []. Empty if the term is
+off or does not apply."""
 
 
 @register
 @dataclass(frozen=True)
 class Weights(Part):
-    """Weights of the loss terms, and settings for what the paper leaves open. A term of weight 0 is left out.
+    """Weights of the loss terms, and settings for what the paper leaves open. A term of weight 0 is
+    left out.
 
-    A recipe with a term of its own subclasses this class, adds a field for the weight, and adds the function to `terms`.
+    A recipe with a term of its own subclasses this class, adds a field for the weight, and adds the
+    function to `terms`.
     """
 
     terms: ClassVar[tuple[Term, ...]] = ()
@@ -67,8 +72,8 @@ class Weights(Part):
     opacity_until: Annotated[int | None, SCALES] = None
     """Last iteration with the opacity hinge; none means the last iteration of the training."""
     residual_quantile: Share = 1.0
-    """Share of each picture's pixels that count in full, those with the smallest residuals; 1 means all. Below 1, things that move between
-    the photographs count less."""
+    """Share of each picture's pixels that count in full, those with the smallest residuals; 1 means
+    all. Below 1, things that move between the photographs count less."""
     residual_weight: Share = 0.0
     """Weight of the pixels with larger residuals."""
     residual_from: Annotated[int, SCALES] = 1500
@@ -157,7 +162,8 @@ def volume(scales: Tensor) -> Tensor:
 
 
 def opacity_hinge(raw_opacity: Tensor, tau: float = 0.0) -> Tensor:
-    """Mean of max(0, tau - sigma) over all K Gaussians of the decoded anchors, rendered or not (eq. 8), []. raw_opacity is [A, K]."""
+    """Mean of max(0, tau - sigma) over all K Gaussians of the decoded anchors, rendered or not (eq.
+    8), []. raw_opacity is [A, K]."""
     if native_terms.covers(raw_opacity):
         return native_terms.sum_hinge(raw_opacity, tau) / max(raw_opacity.numel(), 1)
     return functional.relu(tau - raw_opacity).sum() / max(raw_opacity.numel(), 1)
@@ -183,12 +189,14 @@ def load_sparse(gates: Tensor, chosen: Tensor) -> Tensor:
 
 
 def load_dense(gates: Tensor) -> Tensor:
-    """E sum_i C_i^2 (eq. 7), []. C_i is the mean gate of expert i, and gates is [A, E]. 1 is perfect balance, E is full collapse."""
+    """E sum_i C_i^2 (eq. 7), []. C_i is the mean gate of expert i, and gates is [A, E]. 1 is
+    perfect balance, E is full collapse."""
     return gates.shape[1] * _mean(gates).square().sum()
 
 
 def load(routing: dict[str, Routing]) -> Tensor:
-    """Load-balancing loss, []: the sum over the attributes with experts of eq. 7 while dense, of eq. 6 after it.
+    """Load-balancing loss, []: the sum over the attributes with experts of eq. 7 while dense, of
+    eq. 6 after it.
 
     `routing` must not be empty.
     """

@@ -1,4 +1,5 @@
-"""Measure the memory of a training, limit the number of anchors for `--max-memory`, and reuse freed memory."""
+"""Measure the memory of a training, limit the number of anchors for `--max-memory`, and reuse freed
+memory."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ _FILLED = 0.92  # share of the limit that growth may fill
 
 @dataclass
 class Largest:
-    """What a training has needed so far: its largest frame, and what its measured peak of memory includes."""
+    """What a training has needed so far: its largest frame, and what its measured peak of memory
+    includes."""
 
     gaussians: int = 0  # rendered by one frame
     pixels: int = 0
@@ -42,16 +44,19 @@ class Largest:
         self.rows = max(self.rows, len(decoded.rows))
 
     def search(self, rows: int, peak: int) -> None:
-        """Record a search for new rows in a table of `rows` rows, and the peak of the process after it, bytes."""
+        """Record a search for new rows in a table of `rows` rows, and the peak of the process after
+        it, bytes."""
         self.searched, self.searching = rows, peak
 
 
 def gaussian_bytes(pairs: float = _TILES) -> float:
-    """Return the bytes that one rendered Gaussian needs during a step on the CPU. `pairs` is the number of tiles that it overlaps.
+    """Return the bytes that one rendered Gaussian needs during a step on the CPU. `pairs` is the
+    number of tiles that it overlaps.
 
-    The decoded Gaussian takes 68 bytes (14 floats, its length, its slot). Its gradients, radius and 2D gradient take 76 bytes.
-    The rasteriser uses 64 bytes for its record, 16 for its rectangle and key, 64 per thread for sums, and 8 per pair
-    (its place in a list, the masks and checkpoints of its batch).
+    The decoded Gaussian takes 68 bytes (14 floats, its length, its slot). Its gradients, radius and
+    2D gradient take 76 bytes. The rasteriser uses 64 bytes for its record, 16 for its rectangle and
+    key, 64 per thread for sums, and 8 per pair (its place in a list, the masks and checkpoints of
+    its batch).
     """
     sums = 64 * min(native.count_threads(), 4)
     return 68 + 76 + _SPARE * (64 + 16 + sums + 8 * pairs)
@@ -60,14 +65,15 @@ def gaussian_bytes(pairs: float = _TILES) -> float:
 def frame_bytes(gaussians: int, pixels: int, pairs: float = _TILES) -> int:
     """Return the bytes of all buffers of one frame on the CPU, forward and backward.
 
-    A pixel takes 20 bytes for image, alpha and depth, and 24 for target and gradient. The rasteriser uses 4 bytes per pixel for the
-    transmittance and 8 for the data of its tile.
+    A pixel takes 20 bytes for image, alpha and depth, and 24 for target and gradient. The
+    rasteriser uses 4 bytes per pixel for the transmittance and 8 for the data of its tile.
     """
     return int(gaussians * gaussian_bytes(pairs) + pixels * (44 + _SPARE * 12))
 
 
 def row_bytes(scene: Scene) -> int:
-    """Return the bytes of one row of the table during training: values, gradients, both moments, averages and statistics."""
+    """Return the bytes of one row of the table during training: values, gradients, both moments,
+    averages and statistics."""
     columns = [*scene.table.columns().values(), *scene.table.averages.values()]
     return sum(v.element_size() * v[:1].numel() * (4 if v.requires_grad else 1) for v in columns) + 4 * (2 + 2 * scene.K)
 
@@ -75,9 +81,10 @@ def row_bytes(scene: Scene) -> int:
 def anchor_cap(scene: Scene, cap: int, max_memory: float, largest: Largest) -> int:
     """Return the current limit on the number of anchors; 0 means no limit.
 
-    The memory of the process above `largest.level` is assumed to grow with the number of rows, which is the worst case: some of it does
-    not grow. Each edit may fill half of what is left below 92 % of the limit, because later frames can be larger and because freed memory
-    is not always used again. The next edit measures again.
+    The memory of the process above `largest.level` is assumed to grow with the number of rows,
+    which is the worst case: some of it does not grow. Each edit may fill half of what is left below
+    92 % of the limit, because later frames can be larger and because freed memory is not always
+    used again. The next edit measures again.
 
     Args:
         scene: The scene.
@@ -98,9 +105,10 @@ def anchor_cap(scene: Scene, cap: int, max_memory: float, largest: Largest) -> i
 def expected_bytes(scene: Scene, largest: Largest) -> int:
     """Return the peak that a training is expected to reach if its table does not grow.
 
-    It is the largest of three: the measured peak with the Gaussians of visible rows that were transparent in every frame so far; what
-    the process holds now with the buffers of a search for new rows (later searches need as much for each row as the last one); and what
-    it holds now with the copy of the state that a save or an export makes.
+    It is the largest of three: the measured peak with the Gaussians of visible rows that were
+    transparent in every frame so far; what the process holds now with the buffers of a search for
+    new rows (later searches need as much for each row as the last one); and what it holds now with
+    the copy of the state that a save or an export makes.
     """
     n, used, rate = len(scene.table), used_bytes(scene.table.device), _SEARCHED * scene.K
     transparent = max(0, largest.rows * scene.K - largest.gaussians)
@@ -116,7 +124,8 @@ def check_start(scene: Scene, begun: bool, max_memory: float, largest: Largest, 
         scene: The scene at the start.
         begun: Whether the moments are already there, as in a resumed training.
         max_memory: Limit on the memory that `peak_bytes` reports, GiB.
-        largest: What trial views have needed; before any of them, the frame counts as one Gaussian for each row.
+        largest: What trial views have needed; before any of them, the frame counts as one Gaussian
+            for each row.
         images: Bytes that the cache of the photographs will still take.
     """
     if max_memory <= 0:
@@ -135,7 +144,8 @@ def check_start(scene: Scene, begun: bool, max_memory: float, largest: Largest, 
 
 
 def used_bytes(device: torch.device) -> int:
-    """Return the memory of this process, bytes: reserved GPU memory for CUDA, else resident memory. 0 if the system does not report it."""
+    """Return the memory of this process, bytes: reserved GPU memory for CUDA, else resident memory.
+    0 if the system does not report it."""
     if device.type == "cuda":
         return torch.cuda.memory_reserved(device)
     try:
@@ -145,7 +155,8 @@ def used_bytes(device: torch.device) -> int:
 
 
 def peak_bytes(device: torch.device) -> int:
-    """Return the peak of `used_bytes` since `forget_peak`, or since the process began. 0 if the system does not report it."""
+    """Return the peak of `used_bytes` since `forget_peak`, or since the process began. 0 if the
+    system does not report it."""
     if device.type == "cuda":
         return torch.cuda.max_memory_reserved(device)
     with suppress(OSError, ValueError):
@@ -156,7 +167,8 @@ def peak_bytes(device: torch.device) -> int:
 
 
 def forget_peak() -> None:
-    """Let `peak_bytes` begin anew in a process that has done other work, where the system allows it."""
+    """Let `peak_bytes` begin anew in a process that has done other work, where the system allows
+    it."""
     if torch.cuda.is_initialized():
         torch.cuda.reset_peak_memory_stats()
     with suppress(OSError):
@@ -164,7 +176,8 @@ def forget_peak() -> None:
 
 
 def _most_used() -> int:
-    """Return the peak resident memory of this process, bytes, for systems that report only the peak (macOS). 0 if unknown."""
+    """Return the peak resident memory of this process, bytes, for systems that report only the peak
+    (macOS). 0 if unknown."""
     try:
         import resource
     except ImportError:
@@ -173,12 +186,15 @@ def _most_used() -> int:
 
 
 def reuse_freed() -> bool:
-    """Let the C library keep up to 256 MiB of freed memory for reuse instead of returning it to the system.
+    """Let the C library keep up to 256 MiB of freed memory for reuse instead of returning it to the
+    system.
 
-    Each iteration allocates new gradients. With a million Gaussians, page faults of new memory took a quarter of its time.
+    Each iteration allocates new gradients. With a million Gaussians, page faults of new memory took
+    a quarter of its time.
 
     Returns:
-        Whether the setting is active. It is not if the C library is not glibc, or if environment variables configure malloc.
+        Whether the setting is active. It is not if the C library is not glibc, or if environment
+        variables configure malloc.
     """
     if not sys.platform.startswith("linux") or any(name.startswith("MALLOC_") for name in os.environ) or "GLIBC_TUNABLES" in os.environ:
         return False
@@ -190,7 +206,8 @@ def reuse_freed() -> bool:
 
 
 def give_back() -> None:
-    """Return freed memory to the system, where the C library can, instead of keeping it for reuse."""
+    """Return freed memory to the system, where the C library can, instead of keeping it for
+    reuse."""
     if not sys.platform.startswith("linux"):
         return
     with suppress(OSError, AttributeError):

@@ -1,7 +1,8 @@
-"""Optimisers. On the CPU, Adam is one native call for all parameters, with bit-identical results to torch's fused Adam. On CUDA it is one
-Triton kernel.
+"""Optimisers. On the CPU, Adam is one native call for all parameters, with bit-identical results to
+torch's fused Adam. On CUDA it is one Triton kernel.
 
-The state uses torch's names (`exp_avg`, `exp_avg_sq`, `step`), so checkpoints work with both implementations.
+The state uses torch's names (`exp_avg`, `exp_avg_sq`, `step`), so checkpoints work with both
+implementations.
 """
 
 from __future__ import annotations
@@ -28,26 +29,31 @@ BLOCK = 1024  # values per program of the Triton kernel
 
 @dataclass(frozen=True)
 class Optimizer(Part, ABC):
-    """Which optimiser moves the parameters; flags under --optimizer. Learning rates are the recipe's `rates`."""
+    """Which optimiser moves the parameters; flags under --optimizer. Learning rates are the
+    recipe's `rates`."""
 
     prefix: ClassVar[str] = "optimizer"
     """First word of the names that its state has in checkpoints."""
     by_row: ClassVar[bool] = False
-    """Whether `step(rows=...)` of the built optimiser can move some rows of a table only; --sparse-adam needs it."""
+    """Whether `step(rows=...)` of the built optimiser can move some rows of a table only;
+    --sparse-adam needs it."""
 
     def for_batch(self, views: int) -> Self:
-        """Return the settings for steps that see `views` views each. The learning rates are multiplied by views**batch_rates elsewhere."""
+        """Return the settings for steps that see `views` views each. The learning rates are
+        multiplied by views**batch_rates elsewhere."""
         return self
 
     @abstractmethod
     def build(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
         """Build the optimiser.
 
-        The training sets "lr" before every step. The state of a parameter may hold only scalar tensors and tensors of the
-        parameter's shape. Densification adds and removes rows of the latter together with the rows of the table.
+        The training sets "lr" before every step. The state of a parameter may hold only scalar
+        tensors and tensors of the parameter's shape. Densification adds and removes rows of the
+        latter together with the rows of the table.
 
         Args:
-            groups: {"params": tensors, "name": str, "lr": 0.0, "by_row": whether the parameters are columns of the table}.
+            groups: {"params": tensors, "name": str, "lr": 0.0, "by_row": whether the parameters are
+                columns of the table}.
         """
 
 
@@ -65,7 +71,8 @@ class Adam(Optimizer):
     """Term added to the denominator."""
 
     def for_batch(self, views: int) -> Self:
-        """Return the settings with betas^views and eps / sqrt(views) (Zhao et al. 2024, "On scaling up 3D Gaussian splatting training")."""
+        """Return the settings with betas^views and eps / sqrt(views) (Zhao et al. 2024, "On scaling
+        up 3D Gaussian splatting training")."""
         beta1, beta2 = self.betas
         return replace(self, betas=(beta1**views, beta2**views), eps=self.eps / math.sqrt(views))
 
@@ -76,12 +83,14 @@ class Adam(Optimizer):
 class FusedAdam(torch.optim.Adam):
     """Adam without weight decay. All groups share the betas and eps.
 
-    Groups with `by_row` hold parameters [N, ...]. `step(rows=...)` updates only the given rows of these parameters.
-    The native step finds numbers that are not finite at no cost: `broken` is then the name of the parameter's group, else "".
+    Groups with `by_row` hold parameters [N, ...]. `step(rows=...)` updates only the given rows of
+    these parameters. The native step finds numbers that are not finite at no cost: `broken` is then
+    the name of the parameter's group, else "".
     """
 
     broken: str | None = None
-    """The parameter that the last step left with a value or moment that is not finite; "": none; None: this form does not look."""
+    """The parameter that the last step left with a value or moment that is not finite; "": none;
+    None: this form does not look."""
 
     def __init__(self, groups: Iterable[dict[str, Any]], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15) -> None:
         """Create the optimiser.
@@ -104,8 +113,9 @@ class FusedAdam(torch.optim.Adam):
 
         Args:
             closure: Function that evaluates the loss again and returns it, as in torch.
-            rows: [A] int64 without duplicates. Only these rows of the `by_row` groups are updated, values and moments both ("sparse"
-                or "selective" Adam). The bias correction counts every step. None updates all rows.
+            rows: [A] int64 without duplicates. Only these rows of the `by_row` groups are updated,
+                values and moments both ("sparse" or "selective" Adam). The bias correction counts
+                every step. None updates all rows.
 
         Returns:
             The loss that `closure` returns, or None.
@@ -127,7 +137,8 @@ class FusedAdam(torch.optim.Adam):
         return loss
 
     def _prepared(self, parameter: Tensor, group: dict[str, Any], rows: Tensor | None) -> tuple[Tensor, Tensor | None, float, float, dict]:
-        """Count the step. Return (parameter, its rows or None for all, step size, root of the second bias correction, group)."""
+        """Count the step. Return (parameter, its rows or None for all, step size, root of the
+        second bias correction, group)."""
         state = self.state[parameter]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32, device="cpu" if self._triton else parameter.device)

@@ -1,4 +1,5 @@
-"""How a recipe is trained: the options that `scene-experts train`, the Python API and the training loop share."""
+"""How a recipe is trained: the options that `scene-experts train`, the Python API and the training
+loop share."""
 
 from __future__ import annotations
 
@@ -12,15 +13,16 @@ from scene_experts.core.fields import Count, CountOrNone, NotNegative, Range
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """How a recipe is trained. Results depend on `stop_at` and `max_memory`; their rounding on `deterministic`, `device` and
-    `rasterizer`."""
+    """How a recipe is trained. Results depend on `stop_at` and `max_memory`; their rounding on
+    `deterministic`, `device` and `rasterizer`."""
 
     overwrite: bool = False
     """Replace the run in the folder: its checkpoints and results are deleted."""
     resume: bool = False
     """Continue from the newest intact checkpoint of the run."""
     stop_at: Annotated[int | None, Range(1)] = None
-    """Stop at this iteration and leave the schedule as it is; --iterations rescales the schedule."""
+    """Stop at this iteration and leave the schedule as it is; --iterations rescales the
+    schedule."""
     deterministic: bool = False
     """Give bit-identical results on the same machine, also after --resume. Slightly slower."""
     device: Device = "auto"
@@ -34,6 +36,7 @@ class TrainOptions:
     log_every: Annotated[Count, Option(hidden=True)] = 10
     """Iterations between `Stepped` events."""
     max_memory: NotNegative = 0.0
-    """Stop densification at this memory of the process in GiB, resident or reserved on the GPU; 0 means no limit."""
+    """Stop densification at this memory of the process in GiB, resident or reserved on the GPU; 0
+    means no limit."""
     tensorboard: bool = False
     """Also write RUN/tensorboard (needs `pip install 'scene-experts[tensorboard]'`)."""

@@ -1,6 +1,7 @@
 """L1 and SSIM: the photometric loss of 3DGS as two terms.
 
-Images are [H, W, 3] float RGB in [0, 1]. float32 on the CPU uses one call of the compiled library. Other inputs use plain torch.
+Images are [H, W, 3] float RGB in [0, 1]. float32 on the CPU uses one call of the compiled library.
+Other inputs use plain torch.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ def l1(image: Tensor, target: Tensor) -> Tensor:
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Structural similarity, []. It is 1 for equal images.
 
-    The window is an 11 x 11 Gaussian with sigma 1.5 and zero padding. Variances are biased. The result is the mean over pixels and
-    channels (Wang et al. 2004 with the padding of 3DGS). It is differentiable in both images.
+    The window is an 11 x 11 Gaussian with sigma 1.5 and zero padding. Variances are biased. The
+    result is the mean over pixels and channels (Wang et al. 2004 with the padding of 3DGS). It is
+    differentiable in both images.
 
     Args:
         image: [H, W, 3] of any size, device and floating-point dtype.
@@ -41,8 +43,9 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 def dissimilarity(image: Tensor, target: Tensor) -> Tensor:
     """1 - SSIM, []. The formula does not lose float32 precision if the images are nearly equal.
 
-    With the sum s and the difference d of the images: S = (1 - p)(1 - q), p = E[d]^2 / (mx^2 + my^2 + C1) and
-    q = var(d) / (var(x) + var(y) + C2), where mx^2 + my^2 = (E[s]^2 + E[d]^2) / 2. The same identity holds for the variances.
+    With the sum s and the difference d of the images: S = (1 - p)(1 - q), p = E[d]^2 / (mx^2 + my^2
+    + C1) and q = var(d) / (var(x) + var(y) + C2), where mx^2 + my^2 = (E[s]^2 + E[d]^2) / 2. The
+    same identity holds for the variances.
     """
     s, d = (image + target - 1).movedim(2, 0), (image - target).movedim(2, 0)  # [3, H, W]
     # Subtracting 1 from the sum and its padding keeps the variance and makes the squares smaller.
@@ -68,15 +71,15 @@ def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
 def photometric(image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Photometric loss of 3DGS as two terms: (1 - lambda) L1 and lambda (1 - SSIM), both [].
 
-    float32 on the CPU uses one call of the compiled library for values and gradient, and on CUDA one Triton kernel. Other inputs, and a
-    target that requires a gradient, use plain torch.
+    float32 on the CPU uses one call of the compiled library for values and gradient, and on CUDA
+    one Triton kernel. Other inputs, and a target that requires a gradient, use plain torch.
 
     Args:
         image: [H, W, 3], the rendered image.
         target: [H, W, 3], the photograph.
         lambda_dssim: Weight of 1 - SSIM, 0 to 1.
-        mask: [H, W] in [0, 1]; pixels with 0 are ignored. The target replaces the image at ignored pixels, and both terms are divided
-            by the mean of the mask.
+        mask: [H, W] in [0, 1]; pixels with 0 are ignored. The target replaces the image at ignored
+            pixels, and both terms are divided by the mean of the mask.
     """
     if mask is not None:
         image = torch.lerp(target, image, mask.to(image.dtype)[..., None])
@@ -97,7 +100,8 @@ def _divide_by_mean(both: tuple[Tensor, Tensor], mask: Tensor) -> tuple[Tensor, 
 
 
 class _Photometric(torch.autograd.Function):
-    """Compute both terms and the gradient of their sum in one pass over the image. The backward pass only scales the gradient."""
+    """Compute both terms and the gradient of their sum in one pass over the image. The backward
+    pass only scales the gradient."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, lambda_dssim: float) -> tuple[Tensor, Tensor]:
@@ -130,7 +134,8 @@ PRECISION = "tf32x3"  # of the windows' products: nearly float32 on tensor cores
 
 
 class _PhotometricCuda(torch.autograd.Function):
-    """Compute both terms and the gradient of 1 - SSIM in one kernel. The backward pass adds the gradient of L1 in another one."""
+    """Compute both terms and the gradient of 1 - SSIM in one kernel. The backward pass adds the
+    gradient of L1 in another one."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, lambda_dssim: float) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,5 @@
-"""Shows the progress of a training, and of other long work, on the terminal or as plain lines if there is no terminal."""
+"""Shows the progress of a training, and of other long work, on the terminal or as plain lines if
+there is no terminal."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ class TrainingProgress:
     Args:
         console: Where the events are shown. A terminal has one line that is updated in place.
         every: Seconds between lines if the console is not a terminal.
-        out: The folder of the run, for the place of the first picture; without it no place is shown.
+        out: The folder of the run, for the place of the first picture; without it no place is
+            shown.
     """
 
     console: Console
@@ -97,7 +99,8 @@ class TrainingProgress:
                     self.print_line(f"first picture: {self.out / 'previews' / f'{event.step:06d}.png'}")
 
     def show_step(self, event: Stepped) -> None:
-        """Show an iteration: running means of losses and training PSNR, the number of rows, speed and remaining time."""
+        """Show an iteration: running means of losses and training PSNR, the number of rows, speed
+        and remaining time."""
         for name, value in event.terms.items():
             self.loss[name] = SMOOTHING * self.loss.get(name, value) + (1 - SMOOTHING) * value
         self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr
@@ -116,7 +119,8 @@ class TrainingProgress:
             self.print_line(line)
 
     def find_speed(self, step: int) -> float:
-        """Return the iterations per second of the last RECENT seconds, until iteration `step` now."""
+        """Return the iterations per second of the last RECENT seconds, until iteration `step`
+        now."""
         now, times = time.perf_counter(), self.times
         while len(times) > 1 and now - times[1][0] >= RECENT:
             times.popleft()
@@ -133,7 +137,8 @@ class TrainingProgress:
 class ProgressBar:
     """Shows the progress of other work: a bar on a terminal, otherwise a line now and then.
 
-    Use it as a context manager and call it with the name of the work, how much is done and how much there is.
+    Use it as a context manager and call it with the name of the work, how much is done and how much
+    there is.
 
     Args:
         console: Where the progress is shown.

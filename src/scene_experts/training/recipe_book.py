@@ -1,4 +1,5 @@
-"""Recipes by name: those of this package and those of other packages, which are imported on first use."""
+"""Recipes by name: those of this package and those of other packages, which are imported on first
+use."""
 
 from __future__ import annotations
 
@@ -20,13 +21,14 @@ log: logging.Logger = logging.getLogger(__name__)
 
 
 class RecipeBook(Mapping[str, Recipe]):
-    """Recipes by name. Other packages add recipes with entry points of the group `scene_experts.recipes` in their pyproject.toml:
+    """Recipes by name. Other packages add recipes with entry points of the group
+    `scene_experts.recipes` in their pyproject.toml:
 
         [project.entry-points."scene_experts.recipes"]
         my-method = "my_package.recipes:my_method"
 
-    The object is a `Train` value, a pair of a description and a `Train` value, or a dictionary of these by name. Packages that
-    cannot be loaded are skipped with one warning.
+    The object is a `Train` value, a pair of a description and a `Train` value, or a dictionary of
+    these by name. Packages that cannot be loaded are skipped with one warning.
     """
 
     broken: dict[str, str]
@@ -43,7 +45,8 @@ class RecipeBook(Mapping[str, Recipe]):
         self._others: dict[str, Recipe] | None = None
 
     def load(self) -> dict[str, Recipe]:
-        """Return the recipes of other packages. The first call imports these packages, which also registers their parts."""
+        """Return the recipes of other packages. The first call imports these packages, which also
+        registers their parts."""
         if self._others is None:
             self._others = {}
             for entry in entry_points(group=GROUP):
@@ -71,7 +74,8 @@ class RecipeBook(Mapping[str, Recipe]):
 
 
 def locate(error: BaseException) -> str:
-    """Return the file and line where an error was raised, "my_package.py:12"; of several, the innermost outside this package and Python."""
+    """Return the file and line where an error was raised, "my_package.py:12"; of several, the
+    innermost outside this package and Python."""
     places = traceback.extract_tb(error.__traceback__)
     skip = (str(Path(__file__).parents[1]), sysconfig.get_paths()["stdlib"], "<")
     theirs = [place for place in places if not place.filename.startswith(skip)] or list(places)
@@ -79,7 +83,8 @@ def locate(error: BaseException) -> str:
 
 
 def read_entry(entry: EntryPoint) -> dict[str, Recipe]:
-    """Return the recipes of an entry point. Raises TypeError for an object of another type. Errors of the import are passed on."""
+    """Return the recipes of an entry point. Raises TypeError for an object of another type. Errors
+    of the import are passed on."""
     value = entry.load()
     recipes = value if isinstance(value, Mapping) else {entry.name: value}
     out: dict[str, Recipe] = {}

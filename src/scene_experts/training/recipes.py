@@ -1,5 +1,5 @@
-"""The methods and ablations of the paper as recipes. Training, rendering and evaluation do not depend on the names of recipes.
-Other packages can add recipes; see `training/recipe_book.py`.
+"""The methods and ablations of the paper as recipes. Training, rendering and evaluation do not
+depend on the names of recipes. Other packages can add recipes; see `training/recipe_book.py`.
 
 3DGS: Kerbl et al., SIGGRAPH 2023.  3DGS-MCMC: Kheradmand et al., NeurIPS 2024.
 Scaffold-GS: Lu et al., CVPR 2024.  Octree-GS: Ren et al., 2024.  SAGS: Ververas et al., ECCV 2024.

@@ -1,4 +1,5 @@
-"""Writes what a training leaves on disk besides checkpoints: metrics.jsonl, previews and, if requested, TensorBoard files."""
+"""Writes what a training leaves on disk besides checkpoints: metrics.jsonl, previews and, if
+requested, TensorBoard files."""
 
 from __future__ import annotations
 
@@ -15,11 +16,13 @@ from scene_experts.training.events import Densified, Event, Previewed, Started, 
 
 
 class Recorder:
-    """Writes training events into a run folder. Use it as a context manager and call it with each event.
+    """Writes training events into a run folder. Use it as a context manager and call it with each
+    event.
 
     Args:
         out: The run folder.
-        tensorboard: Also write TensorBoard files. Raises InputError if TensorBoard is not installed.
+        tensorboard: Also write TensorBoard files. Raises InputError if TensorBoard is not
+            installed.
     """
 
     path: Path

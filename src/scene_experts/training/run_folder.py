@@ -3,8 +3,8 @@
 RUN/config.json                      recipe, numbers, capture, command, versions
 RUN/metrics.jsonl                    one line per logged iteration
 RUN/checkpoints/ckpt_NNNNNN.safetensors
-RUN/point_cloud/iteration_N/, RUN/cameras.json      the Scaffold-GS layout, in the coordinate frame of the capture
-RUN/previews/, RUN/test/, RUN/results.json, RUN/per_view.json
+RUN/point_cloud/iteration_N/, RUN/cameras.json      the Scaffold-GS layout, in the coordinate frame
+of the capture RUN/previews/, RUN/test/, RUN/results.json, RUN/per_view.json
 RUN/.lock                            held by the training that writes to this folder
 """
 
@@ -71,8 +71,9 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
     """Check that a run can be written to `out`. Changes nothing on disk.
 
     Raises:
-        InputError: The folder holds another run or foreign files, is that of `init_from`, or has a path that is not UTF-8, the settings
-            are not finite, or the run to resume has another recipe, other capture settings, other training settings or another start.
+        InputError: The folder holds another run or foreign files, is that of `init_from`, or has a
+            path that is not UTF-8, the settings are not finite, or the run to resume has another
+            recipe, other capture settings, other training settings or another start.
     """
     place = next(p for p in (out, *out.absolute().parents) if p.exists())
     if not place.is_dir():
@@ -104,7 +105,8 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
 
 
 def _foreign(out: Path) -> str:
-    """Return the first file name in a folder that is not a run folder, or an empty string if nothing can be lost."""
+    """Return the first file name in a folder that is not a run folder, or an empty string if
+    nothing can be lost."""
     if any((out / "checkpoints").glob("ckpt_*.safetensors")):
         return ""
     try:
@@ -118,7 +120,8 @@ def _foreign(out: Path) -> str:
 
 
 def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
-    """Raise InputError if a setting that affects the results differs between two configurations. The capture may have moved."""
+    """Raise InputError if a setting that affects the results differs between two configurations.
+    The capture may have moved."""
     if found.train.recipe != config.train.recipe:
         raise InputError(
             f"expected a run of '{config.train.recipe}' to resume in {out}, found one of '{found.train.recipe}'; "
@@ -144,12 +147,14 @@ def _place(path: Path | None) -> Path | None:
 
 
 _UNFINISHED = (".config.json.*.part", ".cfg_args.*.part", "checkpoints/.*.part", "previews/.*.part", "point_cloud/*/.*.part")
-"""Temporary files of `core.io.write_atomic` that a killed training may leave; evaluations and viewers write elsewhere."""
+"""Temporary files of `core.io.write_atomic` that a killed training may leave; evaluations and
+viewers write elsewhere."""
 
 
 @contextmanager
 def held(out: Path) -> Iterator[None]:
-    """Lock `out` for one training. The lock ends with the process. Raises InputError if another training holds the lock."""
+    """Lock `out` for one training. The lock ends with the process. Raises InputError if another
+    training holds the lock."""
     out.mkdir(parents=True, exist_ok=True)
     busy = f"expected a run folder that nobody writes to, found a training at work in {out}; choose another --out"
     with locked(out / ".lock", busy):
@@ -157,8 +162,9 @@ def held(out: Path) -> Iterator[None]:
 
 
 def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False, exported: Iterable[Path] = ()) -> None:
-    """Prepare `out` for a run: call `check`, remove unfinished files of a killed training, the metrics of a run that is not resumed and
-    the checkpoints and results of an overwritten run, and write config.json."""
+    """Prepare `out` for a run: call `check`, remove unfinished files of a killed training, the
+    metrics of a run that is not resumed and the checkpoints and results of an overwritten run, and
+    write config.json."""
     check(out, config, resume, overwrite)
     if resume:  # a run is deterministic if all parts of its training were, and limited if one part was
         begun = read_config(out)
@@ -182,20 +188,23 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False,
 
 
 def as_begun(out: Path, config: RunConfig) -> RunConfig:
-    """Return the configuration with the `init_from` of the run in `out`, unless it has one or there is no run. For a run to resume."""
+    """Return the configuration with the `init_from` of the run in `out`, unless it has one or there
+    is no run. For a run to resume."""
     if config.init_from is not None or not (out / "config.json").is_file():
         return config
     return replace(config, init_from=read_config(out).init_from)
 
 
 def as_trained(out: Path, config: RunConfig) -> RunConfig:
-    """Return the configuration of the run in `out` with the capture at the place of `config`. For a run whose training has ended."""
+    """Return the configuration of the run in `out` with the capture at the place of `config`. For a
+    run whose training has ended."""
     found = read_config(out)
     return replace(found, data=replace(found.data, path=config.data.path))
 
 
 def _write_config(out: Path, config: RunConfig) -> None:
-    """Write config.json with the absolute path of the capture and its path relative to the run folder."""
+    """Write config.json with the absolute path of the capture and its path relative to the run
+    folder."""
     path = capture_place.absolute(named(config.data).path)
     relative = capture_place.from_run(out, path)
     beside = {} if relative is None else {capture_place.KEY: relative}
@@ -204,7 +213,8 @@ def _write_config(out: Path, config: RunConfig) -> None:
 
 
 def read_config(run: Path) -> RunConfig:
-    """Read the configuration of a run folder and find its capture. Raises InputError if the folder is not a run folder."""
+    """Read the configuration of a run folder and find its capture. Raises InputError if the folder
+    is not a run folder."""
     if not (run / "config.json").is_file():
         raise InputError(f"expected a run folder with config.json at {run}, found none; give the folder that `train --out` wrote")
     value = read_json(run / "config.json", "run configuration")
@@ -223,7 +233,8 @@ def read_config(run: Path) -> RunConfig:
 
 
 def named(data: Data) -> Data:
-    """Replace `catalog:SCENE` with the folder of the scene. A resolution or split of "auto" is replaced with that of the paper."""
+    """Replace `catalog:SCENE` with the folder of the scene. A resolution or split of "auto" is
+    replaced with that of the paper."""
     path, resolution, split = resolve(data.path, data.resolution, data.split)
     views = None if data.views is None else data.views.absolute()
     return replace(data, path=path, resolution=resolution, split=split, views=views)
@@ -232,8 +243,8 @@ def named(data: Data) -> Data:
 def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
     """Load the capture that a run was trained on. `data` is its new location if it has moved.
 
-    Raises InputError, which names --data, if the capture does not exist or has other views. Other views would define another world
-    frame.
+    Raises InputError, which names --data, if the capture does not exist or has other views. Other
+    views would define another world frame.
     """
     where = named(run.config.data if data is None else replace(run.config.data, path=data))
     if data is None and not where.path.exists():
@@ -247,14 +258,16 @@ def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
 
 
 def with_capture(run: OpenRun, data: Path | None) -> OpenRun:
-    """Return the run with its capture at `data` (a folder or catalog:SCENE). None returns the run unchanged."""
+    """Return the run with its capture at `data` (a folder or catalog:SCENE). None returns the run
+    unchanged."""
     if data is None:
         return run
     return replace(run, config=replace(run.config, data=replace(run.config.data, path=named(Data(data)).path)))
 
 
 def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun:
-    """Open the newest valid checkpoint of a run, or the one at `step`. Raises InputError if there is none."""
+    """Open the newest valid checkpoint of a run, or the one at `step`. Raises InputError if there
+    is none."""
     config = read_config(run)
     folder = run / "checkpoints"
     tensors, meta = newest(folder) if step is None else at_step(folder, step)
@@ -266,7 +279,8 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
 
 
 def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Load the tensors and metadata of the newest valid checkpoint. Raises InputError if there is none."""
+    """Load the tensors and metadata of the newest valid checkpoint. Raises InputError if there is
+    none."""
     found = checkpoint.newest(folder)
     if found is None and any(folder.glob("ckpt_*.safetensors")):
         raise InputError(f"expected a whole checkpoint in {folder}, found only damaged ones; copy one back or train again")
@@ -278,7 +292,8 @@ def newest(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def at_step(folder: Path, step: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Load the tensors and metadata of the checkpoint at a step. Raises InputError if there is none."""
+    """Load the tensors and metadata of the checkpoint at a step. Raises InputError if there is
+    none."""
     path = folder / f"ckpt_{step:06d}.safetensors"
     if not path.is_file():
         kept = ", ".join(str(int(p.stem[5:])) for p in sorted(folder.glob("ckpt_*.safetensors")) if p.stem[5:].isdecimal()) or "none"

@@ -1,10 +1,13 @@
-"""How the views of a batch become one optimiser step when the rows of the table are divided among the processes (`--shard`).
+"""How the views of a batch become one optimiser step when the rows of the table are divided among
+the processes (`--shard`).
 
-Each process holds some rows with their moments and statistics (`core/shard.py`); all hold the same networks. The processes take turns of W
-views, one view each. In a turn, each process culls its rows for all W views and sends the visible ones to the process that draws the view.
-That process puts them into a table for this view alone, in the order of their numbers. The gradients and statistics of the rows travel back
-and are added in the order of the views. If the gradients of the networks are ordered too, no bit of the results depends on the number of
-processes. They are those of `batch.Ordered`, but for the rounding that `rows` describes.
+Each process holds some rows with their moments and statistics (`core/shard.py`); all hold the same
+networks. The processes take turns of W views, one view each. In a turn, each process culls its rows
+for all W views and sends the visible ones to the process that draws the view. That process puts
+them into a table for this view alone, in the order of their numbers. The gradients and statistics
+of the rows travel back and are added in the order of the views. If the gradients of the networks
+are ordered too, no bit of the results depends on the number of processes. They are those of
+`batch.Ordered`, but for the rounding that `rows` describes.
 """
 
 from __future__ import annotations
@@ -49,9 +52,11 @@ class Sharded(Reduced):
         self.scene.table = self.table = ShardedTable(self.scene.table, self.group)
 
     def scene_of(self, cameras: Sequence[Camera | None], step: int, mode: Mode, cull: Cull) -> AnchorScene:
-        """Return the rows that the camera of this process sees, as a scene. Every process must call this.
+        """Return the rows that the camera of this process sees, as a scene. Every process must call
+        this.
 
-        cameras: One for each process; None for a process that draws nothing. With TRAIN, process r draws as iteration step + r.
+        cameras: One for each process; None for a process that draws nothing. With TRAIN, process r
+        draws as iteration step + r.
         """
         table, size = self.scene.table, self.group.size
         columns = {name: column.detach() for name, column in table.columns().items() if name not in AT_HOME}
@@ -70,7 +75,8 @@ class Sharded(Reduced):
 
     @torch.no_grad()
     def add(self, decoded: Decoded, render: Render, number: int) -> None:
-        """Send the gradients and statistics of the rows of the view home, and add those that arrive to the rows of this process."""
+        """Send the gradients and statistics of the rows of the view home, and add those that arrive
+        to the rows of this process."""
         assert self.view is not None
         here, table, cfg = self.view.table, self.scene.table, self.training.cfg
         stats = self._observe(self.view, decoded, render, number, {})
@@ -120,9 +126,11 @@ class Sharded(Reduced):
         """Nothing is left to do: statistics travel with the gradients."""
 
     def rows(self) -> Tensor | None:
-        """Return the rows of this process that the optimiser moves: those that a view has decoded with `sparse_adam`, otherwise all.
+        """Return the rows of this process that the optimiser moves: those that a view has decoded
+        with `sparse_adam`, otherwise all.
 
-        Adam by rows does not depend on the place of a row in memory. Without rows, it rounds the last values of a column as torch does.
+        Adam by rows does not depend on the place of a row in memory. Without rows, it rounds the
+        last values of a column as torch does.
         """
         cfg, table = self.training.cfg, self.scene.table
         chosen, self.decoded = self.decoded, None
@@ -131,7 +139,8 @@ class Sharded(Reduced):
         return torch.arange(len(table), device=table.device) if cfg.optimizer.by_row else None
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the state as `Training.tensors` of one process has it: whole in process 0, on the CPU. Every process must call this."""
+        """Return the state as `Training.tensors` of one process has it: whole in process 0, on the
+        CPU. Every process must call this."""
         table, out = self.table, {}
         prefixes = ("params.", "facts.", "stats.", "average.params.", *(f"{self.training.cfg.optimizer.prefix}.{n}." for n in table.params))
         for name, value in self.training.tensors().items():

@@ -33,7 +33,8 @@ log: logging.Logger = logging.getLogger(__name__)
 
 
 class Training:
-    """The state of a training: scene, optimiser, averages, random number generators, queue of views and clock."""
+    """The state of a training: scene, optimiser, averages, random number generators, queue of views
+    and clock."""
 
     cfg: Train
     scene: Scene
@@ -64,7 +65,8 @@ class Training:
     def start(cls, cfg: Train, capture: Capture, device: str, dtype: torch.dtype = torch.float32) -> Training:
         """Create a new training of `cfg`, which must be scaled, on a capture.
 
-        Raises InputError if the capture has no points or no training views, or if the scene starts with more than `max_anchors` rows.
+        Raises InputError if the capture has no points or no training views, or if the scene starts
+        with more than `max_anchors` rows.
         """
         if capture.points is None:
             raise InputError("expected 3D points in the capture, found none; use --init random, or run structure from motion again")
@@ -83,13 +85,16 @@ class Training:
 
     @classmethod
     def start_from(cls, cfg: Train, run: Path, capture: Capture, device: str, now: RunConfig) -> Training:
-        """Create a training of `cfg`, which must be scaled, that starts from the scene of a run folder, at its iteration.
+        """Create a training of `cfg`, which must be scaled, that starts from the scene of a run
+        folder, at its iteration.
 
-        The scene has its averaged weights, if there are any. The optimiser, the statistics and the order of the views start anew.
-        now: The configuration of the new run, with the settings before scaling.
+        The scene has its averaged weights, if there are any. The optimiser, the statistics and the
+        order of the views start anew. now: The configuration of the new run, with the settings
+        before scaling.
 
-        Raises InputError if the run has no checkpoint, another recipe, capture, world or scene, or as many iterations as `cfg` already, or
-        if `cfg` would put its scene back into a phase that it has left, such as the dense warm-up.
+        Raises InputError if the run has no checkpoint, another recipe, capture, world or scene, or
+        as many iterations as `cfg` already, or if `cfg` would put its scene back into a phase that
+        it has left, such as the dense warm-up.
         """
         found = checkpoint.newest(run / "checkpoints")
         if found is None:
@@ -125,13 +130,15 @@ class Training:
         return training
 
     def next_view(self, train: tuple[int, ...], ahead: int = 3) -> tuple[int, list[int]]:
-        """Return the next training view and the `ahead` views after it. Each epoch uses every view once, in random order."""
+        """Return the next training view and the `ahead` views after it. Each epoch uses every view
+        once, in random order."""
         while len(self.queue) < ahead + 1:
             self.queue += [train[i] for i in torch.randperm(len(train), generator=self.views_rng).tolist()]
         return self.queue.pop(0), self.queue[:ahead]
 
     def next_batch(self, train: tuple[int, ...]) -> list[tuple[int, Tensor | None]]:
-        """Return the next `cfg.batch` training views, each with its random background [3], or None without random backgrounds."""
+        """Return the next `cfg.batch` training views, each with its random background [3], or None
+        without random backgrounds."""
         batch: list[tuple[int, Tensor | None]] = []
         for _ in range(self.cfg.batch):
             index, _ = self.next_view(train)
@@ -139,23 +146,27 @@ class Training:
         return batch
 
     def views_of(self, step: int) -> range:
-        """Return the numbers, from 1, of the views that the optimiser step at iteration `step` sees."""
+        """Return the numbers, from 1, of the views that the optimiser step at iteration `step`
+        sees."""
         return range(step - self.cfg.batch + 1, step + 1)
 
     def seed_view(self, number: int) -> None:
-        """Make the random numbers of a view, such as dropped anchors, depend on its number alone. No effect for a batch of one view."""
+        """Make the random numbers of a view, such as dropped anchors, depend on its number alone.
+        No effect for a batch of one view."""
         if self.cfg.batch > 1:
             digest = hashlib.blake2b(f"{self.cfg.seed} {number}".encode(), digest_size=8).digest()
             torch.manual_seed(int.from_bytes(digest, "little") >> 1)
 
     def set_rates(self) -> None:
-        """Set the learning rates of the iteration. They grow with the batch to the power `batch_rates`."""
+        """Set the learning rates of the iteration. They grow with the batch to the power
+        `batch_rates`."""
         for group in self.optimizer.param_groups:
             rate = self.cfg.rates.at(group["name"], self.step, self.cfg.iterations, self.scene.extent)
             group["lr"] = rate * self.cfg.batch**self.cfg.batch_rates
 
     def optimizer_step(self, rows: Tensor | None = None) -> None:
-        """Run one optimiser step and remove the gradients. rows: [A] int64, the only rows of the table to update; None updates all."""
+        """Run one optimiser step and remove the gradients. rows: [A] int64, the only rows of the
+        table to update; None updates all."""
         if rows is None:
             self.optimizer.step()
         else:
@@ -163,7 +174,8 @@ class Training:
         self.optimizer.zero_grad(set_to_none=True)
 
     def companions(self, parameter: Tensor) -> list[Tensor]:
-        """Return the tensors that follow a parameter of a network, each of its shape: the optimiser's moments and the average."""
+        """Return the tensors that follow a parameter of a network, each of its shape: the
+        optimiser's moments and the average."""
         moments = [t for t in self.optimizer.state.get(parameter, {}).values() if t.shape == parameter.shape]
         averages = self.averages.networks if self.averages is not None else {}
         return moments + [averages[name] for name, p in self.scene.network_tensors().items() if p is parameter and name in averages]
@@ -177,11 +189,13 @@ class Training:
                 self.averages.update(self.cfg.average.weight(number, self.cfg.iterations))
 
     def averaged(self) -> AbstractContextManager[None]:
-        """Context manager in which the scene has its averaged weights, as in the saved run. No effect without averages."""
+        """Context manager in which the scene has its averaged weights, as in the saved run. No
+        effect without averages."""
         return nullcontext() if self.averages is None else self.averages.swapped()
 
     def averaged_scene(self) -> Scene:
-        """Return a copy of the scene with its averaged weights, as in the saved run; without averages the scene itself."""
+        """Return a copy of the scene with its averaged weights, as in the saved run; without
+        averages the scene itself."""
         if self.averages is None:
             return self.scene
         own = {name: value.clone() for name, value in self.tensors().items() if name.startswith(("average.", "facts."))}
@@ -225,7 +239,8 @@ class Training:
 
     @classmethod
     def restore(cls, cfg: Train, tensors: dict[str, Tensor], meta: dict[str, Any], device: str) -> Training:
-        """Restore a training from a checkpoint. Raises InputError if the checkpoint has another configuration."""
+        """Restore a training from a checkpoint. Raises InputError if the checkpoint has another
+        configuration."""
         check_same(cfg, meta)
         scene = restore_foreign(cfg.scene, tensors, meta)
         scene.table.stats = {k.removeprefix("stats."): v for k, v in tensors.items() if k.startswith("stats.")}
@@ -258,9 +273,11 @@ def _changes(before: Data | SceneConfig, now: Data | SceneConfig, where: str = "
 
 
 def check_phases(cfg: Train, before: SceneConfig, step: int) -> None:
-    """Raise InputError if a scene that was trained with `before` until iteration `step` has left a phase in which `cfg` still is then.
+    """Raise InputError if a scene that was trained with `before` until iteration `step` has left a
+    phase in which `cfg` still is then.
 
-    Both must be scaled. In an earlier phase, other networks, levels or harmonics draw the scene than those that were trained last.
+    Both must be scaled. In an earlier phase, other networks, levels or harmonics draw the scene
+    than those that were trained last.
     """
     left = {place for place, last in before.phases().items() if step > last}
     for place, last in cfg.scene.phases().items():
@@ -273,7 +290,8 @@ def check_phases(cfg: Train, before: SceneConfig, step: int) -> None:
 
 
 def check_same(cfg: Train, meta: dict[str, Any]) -> None:
-    """Raise InputError if the checkpoint of `meta` was trained with settings other than `cfg`, which must be scaled."""
+    """Raise InputError if the checkpoint of `meta` was trained with settings other than `cfg`,
+    which must be scaled."""
     if "train" not in meta:
         other = "it was imported, and has no state of an optimiser"
     else:
@@ -288,7 +306,8 @@ def check_same(cfg: Train, meta: dict[str, Any]) -> None:
 def save(training: Training, folder: Path, keep: int, tensors: dict[str, Tensor] | None = None) -> Path:
     """Write a checkpoint atomically and return its path. The newest `keep` checkpoints are kept.
 
-    tensors: The state as named tensors, if it is divided among several processes; None means `training.tensors()`.
+    tensors: The state as named tensors, if it is divided among several processes; None means
+    `training.tensors()`.
 
     Raises RunError if a number of the state is not finite. Earlier checkpoints are then unchanged.
     """

@@ -18,15 +18,18 @@ IMAGES = 0.25  # share of the memory that is left at the start, for decoded phot
 
 
 def fit_memory(training: Training, max_memory: float, capture: Capture, see: Callable[[int, int, Tensor | None], object]) -> None:
-    """Limit the cache of the photographs, and check that a training fits into memory before it begins.
+    """Limit the cache of the photographs, and check that a training fits into memory before it
+    begins.
 
-    The views are drawn as the first and as the last iteration draw them. The training is then as it was before.
+    The views are drawn as the first and as the last iteration draw them. The training is then as it
+    was before.
 
     Args:
         training: The training, at its start or restored.
         max_memory: Limit on the memory of the process, GiB.
         capture: The capture that it is trained on.
-        see: Draws a view and adds the gradients of its loss: number of the iteration, index of the view, background [3] or None.
+        see: Draws a view and adds the gradients of its loss: number of the iteration, index of the
+            view, background [3] or None.
 
     Raises:
         InputError: The training does not fit.
@@ -52,7 +55,8 @@ def fit_memory(training: Training, max_memory: float, capture: Capture, see: Cal
 
 @contextmanager
 def unchanged(scene: Scene) -> Iterator[None]:
-    """Context manager after which the random number generators and the tensors of a scene's networks are as they were before."""
+    """Context manager after which the random number generators and the tensors of a scene's
+    networks are as they were before."""
     columns = {id(v) for v in scene.table.params.values()}
     networks = [*(p for p in scene.parameters() if id(p) not in columns), *scene.buffers()]
     before = [t.detach().clone() for t in networks]

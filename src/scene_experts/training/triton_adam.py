@@ -1,5 +1,6 @@
 # pyright: basic, reportMissingImports=false
-"""Triton kernel of one Adam step for all parameters; `optim.py` launches it and has the same step in plain torch."""
+"""Triton kernel of one Adam step for all parameters; `optim.py` launches it and has the same step
+in plain torch."""
 
 from __future__ import annotations
 
@@ -13,9 +14,10 @@ COLUMNS = tl.constexpr(10)
 def step(table, count, beta1, beta2, eps, B: tl.constexpr):
     """Update B values of the tensor that this program belongs to.
 
-    `table` [count, 10] int64 has one row per tensor: the addresses of value, gradient, first and second moment and rows (0: all rows),
-    the number of values and of values per row, the first program, and the bits of two float64 numbers: the step size, and the root of
-    the second bias correction.
+    `table` [count, 10] int64 has one row per tensor: the addresses of value, gradient, first and
+    second moment and rows (0: all rows), the number of values and of values per row, the first
+    program, and the bits of two float64 numbers: the step size, and the root of the second bias
+    correction.
     """
     program, mine = tl.program_id(0), 0
     for i in range(count):

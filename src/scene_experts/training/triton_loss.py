@@ -1,9 +1,11 @@
 # pyright: basic, reportMissingImports=false
-"""Triton kernels of L1 and SSIM with their gradient; `photometric` calls them on CUDA and has the same loss in plain torch.
+"""Triton kernels of L1 and SSIM with their gradient; `photometric` calls them on CUDA and has the
+same loss in plain torch.
 
-A program computes a tile of T x T pixels of one channel. The 11-tap window needs a border of 5 pixels for the means and variances, and
-another 5 for the gradient, so the program writes the inner T - 20. A window is two products with a band matrix: rows, then columns.
-Images are [H, W, 3]. No sum uses atomics, so the results are the same bits in every run.
+A program computes a tile of T x T pixels of one channel. The 11-tap window needs a border of 5
+pixels for the means and variances, and another 5 for the gradient, so the program writes the inner
+T - 20. A window is two products with a band matrix: rows, then columns. Images are [H, W, 3]. No
+sum uses atomics, so the results are the same bits in every run.
 """
 
 from __future__ import annotations
@@ -24,10 +26,12 @@ def forward(
     R: tl.constexpr, SCALE: tl.constexpr, NORM: tl.constexpr, C1: tl.constexpr, C2: tl.constexpr,
     T: tl.constexpr, WANTED: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Write this tile's part of both terms to `sums` [programs, 2] and, if WANTED, the gradient [H, W, 3] of 1 - SSIM.
+    """Write this tile's part of both terms to `sums` [programs, 2] and, if WANTED, the gradient [H,
+    W, 3] of 1 - SSIM.
 
-    The weights include the division by the number of values. Window: exp(-SCALE t^2) / NORM for |t| <= R. Symbols as in
-    `photometric.dissimilarity`: s and d are the sum (minus 1) and the difference of the images.
+    The weights include the division by the number of values. Window: exp(-SCALE t^2) / NORM for |t|
+    <= R. Symbols as in `photometric.dissimilarity`: s and d are the sum (minus 1) and the
+    difference of the images.
     """
     INNER: tl.constexpr = T - 4 * R
     place = tl.arange(0, T)
@@ -61,7 +65,8 @@ def forward(
 
 @triton.jit(do_not_specialize=["count"])
 def backward(image, target, gradient, by_l1, by_dssim, out, count, l1_weight, B: tl.constexpr):
-    """Write the gradient of the image: that of each term times the gradient of the loss in that term ([], on the device)."""
+    """Write the gradient of the image: that of each term times the gradient of the loss in that
+    term ([], on the device)."""
     at = tl.program_id(0) * B + tl.arange(0, B)
     inside = at < count
     d = tl.load(image + at, mask=inside, other=0.0) - tl.load(target + at, mask=inside, other=0.0)

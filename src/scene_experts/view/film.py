@@ -35,7 +35,8 @@ class Film:
     def write(self, out: Path, rasterize: Rasterizer, device: str, progress: Progress) -> int:
         """Write a video, or PNG files if `out` is a folder, and return the number of frames.
 
-        Raises InputError if a video is impossible, RunError if the encoder fails or the disk is full.
+        Raises InputError if a video is impossible, RunError if the encoder fails or the disk is
+        full.
         """
         if not video.is_video(out):
             return video.write_pictures(out, self.draw_frames(rasterize, device, progress))
@@ -74,7 +75,8 @@ class Film:
 
 
 def make_film(options: FilmOptions, runs: Sequence[OpenRun], capture: Capture) -> Film:
-    """Return the film of `runs`. Raises InputError for runs of different captures, unknown experts and an unknown path."""
+    """Return the film of `runs`. Raises InputError for runs of different captures, unknown experts
+    and an unknown path."""
     for run in runs:
         count = run.scene.traits.experts
         if options.only and max(options.only) > count:
@@ -108,7 +110,8 @@ def make_path(options: FilmOptions, capture: Capture) -> CameraPath:
 
 
 def resize_camera(camera: Camera, size: tuple[int, int] | None) -> Camera:
-    """Return the camera with another picture size and the same vertical field of view, as the other paths have it.
+    """Return the camera with another picture size and the same vertical field of view, as the other
+    paths have it.
 
     A wider picture shows more at the sides, a narrower one less; nothing is stretched.
     """

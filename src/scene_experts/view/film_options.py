@@ -17,8 +17,9 @@ class FilmOptions:
     """Camera path and picture."""
 
     path: str = "auto"
-    """Camera path: orbit, spiral, views (through the captured poses), test (each held-out view), auto (the one of these that fits
-    the cameras), or a JSON file of this package or of nerfstudio."""
+    """Camera path: orbit, spiral, views (through the captured poses), test (each held-out view),
+    auto (the one of these that fits the cameras), or a JSON file of this package or of
+    nerfstudio."""
     seconds: Annotated[float, Range(0.01)] = 8.0
     """Duration of orbit, spiral and views."""
     frames: Annotated[int | None, Range(1)] = None
@@ -26,7 +27,8 @@ class FilmOptions:
     fps: Annotated[float | None, Range(0.1)] = None
     """Frames per second; by default 24, or what the path's file says."""
     size: Annotated[str | None, Option(value="WIDTHxHEIGHT")] = None
-    """Size of the picture in pixels; by default that of the training views. The vertical field of view stays."""
+    """Size of the picture in pixels; by default that of the training views. The vertical field of
+    view stays."""
     show: tuple[Show, ...] = ("picture",)
     """What to show; several are placed side by side."""
     attribute: Literal["opacity", "cov", "color"] = "color"

@@ -2,12 +2,15 @@
 
 viser serves every request and applies every message. This gate stands before it:
 
-* A request must name a host that this server answers for, and come from a page of this server (`Origin`). So another web page cannot
-  reach the viewer, also not through a name that its owner points at this machine (DNS rebinding).
-* Where a token is required, the request must carry it: in its address, or in the cookie that the first answer sets.
-* A message must be one that the page sends, with values within the limits of its control. Others are dropped. A client that sends many
-  of them is disconnected.
-* Messages, connections and the processor time of the server's thread are limited, so that a training beside it keeps its speed.
+* A request must name a host that this server answers for, and come from a page of this server
+  (`Origin`). So another web page cannot reach the viewer, also not through a name that its owner
+  points at this machine (DNS rebinding).
+* Where a token is required, the request must carry it: in its address, or in the cookie that the
+  first answer sets.
+* A message must be one that the page sends, with values within the limits of its control. Others
+  are dropped. A client that sends many of them is disconnected.
+* Messages, connections and the processor time of the server's thread are limited, so that a
+  training beside it keeps its speed.
 """
 
 from __future__ import annotations
@@ -76,7 +79,8 @@ class RateLimit:
 class Gate:
     """The rules of one server.
 
-    `host` is the address it listens on. `share` returns the fraction of one core that its thread may use; None does not limit it.
+    `host` is the address it listens on. `share` returns the fraction of one core that its thread
+    may use; None does not limit it.
     """
 
     host: str
@@ -95,7 +99,8 @@ class Gate:
     # --- requests
 
     def check_request(self, path: str, headers: Any) -> None:
-        """Raise Refused unless a request names this server, comes from its page and carries the token."""
+        """Raise Refused unless a request names this server, comes from its page and carries the
+        token."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self.answers_for(hosts[0]):
             raise Refused("the request names another host")
@@ -105,7 +110,8 @@ class Gate:
             raise Refused("the address lacks its token; use the address that scene-experts printed")
 
     def answers_for(self, host: str) -> bool:
-        """Return whether a Host header may name this server. Beyond this machine any name may; there the token decides."""
+        """Return whether a Host header may name this server. Beyond this machine any name may;
+        there the token decides."""
         try:
             name = urlsplit(f"//{host}").hostname or ""
         except ValueError:
@@ -124,7 +130,8 @@ class Gate:
 
     @property
     def cookie(self) -> str:
-        """Name of the cookie. Cookies of all ports of a host are sent to each of them, so every server has a name of its own."""
+        """Name of the cookie. Cookies of all ports of a host are sent to each of them, so every
+        server has a name of its own."""
         return f"scene-experts-{self.token[:6]}"
 
     async def admit(self, request: Any, subprotocol: str) -> None:
@@ -144,7 +151,8 @@ class Gate:
     # --- messages
 
     def check_message(self, message: Any) -> bool:
-        """Return whether a decoded message is passed on. Raises Refused if it is invalid; messages without use here are dropped."""
+        """Return whether a decoded message is passed on. Raises Refused if it is invalid; messages
+        without use here are dropped."""
         if not isinstance(message, dict) or not isinstance(message.get("type"), str):
             raise Refused("a message without a type")
         check = _CHECKS.get(message["type"])
@@ -218,7 +226,8 @@ def check_value(handle: Any, value: Any) -> None:
 
 
 def check_numbers(values: Any, count: int, most: float, least: float | None = None) -> None:
-    """Raise Refused unless `values` are `count` finite numbers between `least` (None: -most) and `most`."""
+    """Raise Refused unless `values` are `count` finite numbers between `least` (None: -most) and
+    `most`."""
     if not isinstance(values, (list, tuple)) or len(values) != count:
         raise Refused(f"expected {count} numbers")
     least = -most if least is None else least
@@ -251,7 +260,8 @@ class GuardedConnection:
         return getattr(self._connection, name)
 
     async def recv(self) -> bytes:
-        """Return the next message that passes. Messages beyond the rate wait, which slows their sender down."""
+        """Return the next message that passes. Messages beyond the rate wait, which slows their
+        sender down."""
         import msgspec
 
         while True:
@@ -271,9 +281,11 @@ class GuardedConnection:
 
 @contextmanager
 def guarding(gate: Gate, subprotocol: str) -> Iterator[None]:
-    """While this context is open, a server that `websockets` starts is behind `gate`. viser has no place to give it.
+    """While this context is open, a server that `websockets` starts is behind `gate`. viser has no
+    place to give it.
 
-    Raises InputError if no server was started, which means that this version of viser serves in another way.
+    Raises InputError if no server was started, which means that this version of viser serves in
+    another way.
     """
     import websockets.asyncio.server as module
 
@@ -318,7 +330,8 @@ def guarding(gate: Gate, subprotocol: str) -> Iterator[None]:
 
 @dataclass
 class Governor:
-    """Holds the processor time of the thread that it beats in to a share: a thread that used more sleeps, whatever it was asked to do."""
+    """Holds the processor time of the thread that it beats in to a share: a thread that used more
+    sleeps, whatever it was asked to do."""
 
     share: Callable[[], float]
     credit: float = BURST  # seconds of processor time
@@ -326,7 +339,8 @@ class Governor:
     used: float = field(default_factory=time.thread_time)
 
     def beat(self) -> None:
-        """Compare the time used since the last beat with the share, sleep off what is above, and come again."""
+        """Compare the time used since the last beat with the share, sleep off what is above, and
+        come again."""
         wall, used, share = time.monotonic(), time.thread_time(), self.share()
         self.credit = min(BURST, self.credit + share * (wall - self.wall)) - (used - self.used)
         if self.credit < 0:

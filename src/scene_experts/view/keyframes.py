@@ -1,4 +1,5 @@
-"""The controls that make camera paths: keyframes are set where a user stands, played back, and saved for `render --path`."""
+"""The controls that make camera paths: keyframes are set where a user stands, played back, and
+saved for `render --path`."""
 
 from __future__ import annotations
 
@@ -93,7 +94,8 @@ class Keyframes:
         return CameraPath(tuple(self.keys), 1 / float(self.seconds.value))
 
     def save(self, client: Any) -> None:
-        """Send the path to the browser and write it to a file. A file that cannot be written is reported, and the browser has the path."""
+        """Send the path to the browser and write it to a file. A file that cannot be written is
+        reported, and the browser has the path."""
         if not self.keys:
             self.words.content = "no keyframes to save; add one first"
             return
@@ -116,7 +118,8 @@ class Keyframes:
         self.toggle(client, Flight(tuple(self.keys), bool(self.loop.value), float(self.seconds.value)))
 
     def fly_around(self, client: Any) -> None:
-        """Move a client along a closed path that fits the capture, or stop it. The keyframes stay as they are."""
+        """Move a client along a closed path that fits the capture, or stop it. The keyframes stay
+        as they are."""
         if client is not None:
             self.toggle(client, Flight(make_path("auto", self.capture, AROUND).cameras, True, ROUND / AROUND))
 
@@ -131,7 +134,8 @@ class Keyframes:
         return self.playing.pop(client, None) is not None
 
     def move_client(self, client: Any, flight: Flight, fps: float = 15.0) -> None:
-        """Move a client along its flight. Returns at the end, or when `playing` does not have the flight any more."""
+        """Move a client along its flight. Returns at the end, or when `playing` does not have the
+        flight any more."""
         try:
             for pose in flight.poses(fps):
                 if self.playing.get(client.client_id) is not flight:

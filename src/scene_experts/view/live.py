@@ -1,4 +1,5 @@
-"""Shows a training in a browser while it runs. The viewer draws between two iterations, in the training's own thread."""
+"""Shows a training in a browser while it runs. The viewer draws between two iterations, in the
+training's own thread."""
 
 from __future__ import annotations
 
@@ -20,10 +21,12 @@ SERVING = 0.04  # fraction of one core that the server's thread may use while th
 
 @dataclass
 class Live:
-    """Draws between the iterations of a training, within its share of the time, and waits while the training is paused.
+    """Draws between the iterations of a training, within its share of the time, and waits while the
+    training is paused.
 
-    Call it with the training after each iteration (`Run.watch`). The page can pause the training and write camera paths, so its address
-    has a token, also on this machine. A pause ends when the last browser leaves.
+    Call it with the training after each iteration (`Run.watch`). The page can pause the training
+    and write camera paths, so its address has a token, also on this machine. A pause ends when the
+    last browser leaves.
     """
 
     capture: Capture

@@ -1,4 +1,5 @@
-"""Draws what a picture can show of a scene: colours, depth, opacity, or how the experts share the rows."""
+"""Draws what a picture can show of a scene: colours, depth, opacity, or how the experts share the
+rows."""
 
 from __future__ import annotations
 
@@ -52,10 +53,12 @@ def paint(
 
     Args:
         background: RGB [3] in [0, 1] on the scene's device.
-        draws: The same scene frozen (`Scene.frozen`), which is faster. Expert pictures need the routing and do not use it.
+        draws: The same scene frozen (`Scene.frozen`), which is faster. Expert pictures need the
+            routing and do not use it.
 
     Raises:
-        InputError: if the look needs experts or an activation ratio and the scene has none, or not yet.
+        InputError: if the look needs experts or an activation ratio and the scene has none, or not
+            yet.
     """
     routed = look.only is not None or look.show in ("experts", "entropy")
     decoded = (scene if draws is None or routed else draws)(camera, step, Mode.DRAW, rasterize.visible)
@@ -81,7 +84,8 @@ def paint(
 
 
 def to_picture(render: Render, show: Show) -> Tensor:
-    """Return the colours, the opacity or the depth of a render as a picture [H, W, 3] in [0, 1]. Near is light."""
+    """Return the colours, the opacity or the depth of a render as a picture [H, W, 3] in [0, 1].
+    Near is light."""
     if show == "alpha":
         return render.alpha[..., None].expand(-1, -1, 3).clamp(0, 1)
     if show == "depth":

@@ -1,4 +1,5 @@
-"""The controls beside the picture: what is shown, experts, views, crop, levels, camera paths, and the curves of a training."""
+"""The controls beside the picture: what is shown, experts, views, crop, levels, camera paths, and
+the curves of a training."""
 
 from __future__ import annotations
 
@@ -115,7 +116,8 @@ class Panel:
         return control
 
     def queue(self, name: str, job: Callable[[], None]) -> None:
-        """Let the drawing thread do a longer job, whose time then counts as drawing. A job of the same name that waits is replaced."""
+        """Let the drawing thread do a longer job, whose time then counts as drawing. A job of the
+        same name that waits is replaced."""
         self.jobs[name] = job
         self.changed()
 
@@ -142,7 +144,8 @@ class Panel:
                 self.changed()
 
     def add_view_controls(self) -> None:
-        """Add a choice of the views, the photograph over the picture, and switches for the cameras and rows."""
+        """Add a choice of the views, the photograph over the picture, and switches for the cameras
+        and rows."""
         gui, views = self.server.gui, self.capture.views
         test = set(self.capture.test)
         names = tuple(f"{'test  ' if i in test else 'train '} {view.name}" for i, view in enumerate(views))
@@ -158,7 +161,8 @@ class Panel:
         self.chosen, self.names = chosen, names
 
     def add_crop_controls(self, scene: Scene) -> None:
-        """Add a crop box in the capture's units. Its sliders span the central 99 % of the rows along each axis."""
+        """Add a crop box in the capture's units. Its sliders span the central 99 % of the rows
+        along each axis."""
         gui = self.server.gui
         xyz = scene.positions.cpu().float()
         low, high = (
@@ -193,7 +197,8 @@ class Panel:
         return Look(show=self.show.value, attribute=attribute, only=only, box=box)
 
     def read_box(self) -> torch.Tensor:
-        """Return the lower and the upper corner of the crop box, [2, 3] float64, in the capture's own frame."""
+        """Return the lower and the upper corner of the crop box, [2, 3] float64, in the capture's
+        own frame."""
         return torch.tensor([sorted(map(float, bound.value)) for bound in self.bounds], dtype=torch.float64).T
 
     def crop_words(self) -> str:
@@ -224,7 +229,8 @@ class Panel:
     # --- what is shown beside the picture
 
     def report_picture(self, seconds: float, camera: Camera) -> None:
-        """Show the size and the time of a picture. During a training the status line shows the training instead."""
+        """Show the size and the time of a picture. During a training the status line shows the
+        training instead."""
         now = time.monotonic()
         if now - self.status_time > STATUS_INTERVAL and not self.charts:
             self.status_time = now
@@ -235,7 +241,8 @@ class Panel:
         self.status.content = text
 
     def show_frusta(self, visible: bool) -> None:
-        """Show or hide the cameras of the capture (at most MOST_FRUSTA). A click on one moves the clients there."""
+        """Show or hide the cameras of the capture (at most MOST_FRUSTA). A click on one moves the
+        clients there."""
         chosen = np.linspace(0, len(self.capture.views) - 1, min(len(self.capture.views), MOST_FRUSTA)).round().astype(int)
         for i in sorted({int(i) for i in chosen}):
             name, view = f"/cameras/{i}", self.capture.views[i]
@@ -306,7 +313,8 @@ class Panel:
                 pass
 
     def update_curves(self, event: Stepped) -> None:
-        """Show the latest iteration in the status line and in the curves, which have at most about 500 points."""
+        """Show the latest iteration in the status line and in the curves, which have at most about
+        500 points."""
         terms = " ".join(f"{name} {value:.4f}" for name, value in event.terms.items())
         self.show_status(f"iteration {event.step:,}, {event.anchors:,} {self.traits.rows}, {100 * event.active:.0f} % active\n\n{terms}")
         every = max(1, len(self.curves["step"]) // 500)

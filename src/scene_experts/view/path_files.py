@@ -1,4 +1,5 @@
-"""Reads and writes camera paths: this project's JSON (keyframes in the capture's own frame) and nerfstudio's camera-path JSON."""
+"""Reads and writes camera paths: this project's JSON (keyframes in the capture's own frame) and
+nerfstudio's camera-path JSON."""
 
 from __future__ import annotations
 
@@ -34,10 +35,12 @@ def write_path(path: Path, cameras: CameraPath, world: World, loop: bool = False
 def describe_path(cameras: CameraPath, world: World, loop: bool = False, play_fps: float | None = None) -> dict[str, Any]:
     """Return the cameras of a path as keyframes in the capture's own frame, as JSON values.
 
-    They are {"format": 1, "fps", "loop", "width", "height", "keyframes": [{"time", "camera_to_world", "fov"}]} with times in
-    seconds, 4x4 matrices with OpenCV axes and vertical fields of view in degrees.
+    They are {"format": 1, "fps", "loop", "width", "height", "keyframes": [{"time",
+    "camera_to_world", "fov"}]} with times in seconds, 4x4 matrices with OpenCV axes and vertical
+    fields of view in degrees.
 
-    play_fps: Frames per second between the keyframes. None is `cameras.fps`, one frame per keyframe.
+    play_fps: Frames per second between the keyframes. None is `cameras.fps`, one frame per
+    keyframe.
     """
     keys = [
         {"time": i / cameras.fps, "camera_to_world": to_input_frame(camera, world).tolist(), "fov": math.degrees(camera.fov)}
@@ -55,7 +58,8 @@ def describe_path(cameras: CameraPath, world: World, loop: bool = False, play_fp
 
 
 def write_nerfstudio(path: Path, cameras: CameraPath, world: World) -> None:
-    """Write nerfstudio's camera-path JSON: one entry per frame, with poses in the capture's own frame and OpenGL axes."""
+    """Write nerfstudio's camera-path JSON: one entry per frame, with poses in the capture's own
+    frame and OpenGL axes."""
     first = cameras.cameras[0]
     entries = [
         {
@@ -81,7 +85,8 @@ def write_nerfstudio(path: Path, cameras: CameraPath, world: World) -> None:
 
 
 def read_path(path: Path, world: World, model: Camera, size: tuple[int, int] | None = None, fps: float | None = None) -> CameraPath:
-    """Read a camera path of either format and return it in the trained world. Poses between keyframes are interpolated.
+    """Read a camera path of either format and return it in the trained world. Poses between
+    keyframes are interpolated.
 
     Args:
         world: The trained world of the capture.
@@ -133,7 +138,8 @@ def parse_keyframes(value: dict[str, Any], world: World, model: Camera, size: tu
 
 
 def parse_nerfstudio(value: dict[str, Any], world: World, model: Camera, size: tuple[int, int] | None, fps: float | None) -> CameraPath:
-    """Return the path in nerfstudio's JSON. Raises ValueError for values out of range and for cameras without perspective."""
+    """Return the path in nerfstudio's JSON. Raises ValueError for values out of range and for
+    cameras without perspective."""
     if value.get("camera_type", "perspective") != "perspective":
         raise ValueError(f"the camera_type {value['camera_type']}, but only perspective is supported")
     width, height = size or check_size(value["render_width"], value["render_height"])
@@ -172,7 +178,8 @@ def check_rate(value: Any) -> float:
 
 
 def make_camera(model: Camera, to_cam: Tensor, fov: float, width: int, height: int) -> Camera:
-    """Return a camera with the pose `to_cam` and a vertical field of view in radians. Raises ValueError if that is out of range."""
+    """Return a camera with the pose `to_cam` and a vertical field of view in radians. Raises
+    ValueError if that is out of range."""
     if not 0 < fov < math.pi:
         raise ValueError(f"a fov of {math.degrees(fov):.3g} degrees, which is not between 0 and 180")
     return replace(with_fov(model, fov, width, height), world_to_cam=to_cam.float())

@@ -1,4 +1,5 @@
-"""Camera paths through a capture: orbit, spiral, or along the captured poses. In the trained world, OpenCV axes."""
+"""Camera paths through a capture: orbit, spiral, or along the captured poses. In the trained world,
+OpenCV axes."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ class CameraPath:
 
 @dataclass(frozen=True)
 class CameraRig:
-    """The training cameras of a capture: their poses, the point that they look at, and their common up direction."""
+    """The training cameras of a capture: their poses, the point that they look at, and their common
+    up direction."""
 
     centre: Tensor  # [3] point nearest to all optical axes
     up: Tensor  # [3] unit
@@ -52,14 +54,16 @@ class CameraRig:
 
 
 def analyse_cameras(capture: Capture) -> CameraRig:
-    """Analyse the training cameras of a capture, or its test cameras if there are no training cameras."""
+    """Analyse the training cameras of a capture, or its test cameras if there are no training
+    cameras."""
     cameras = tuple(capture.views[i].camera for i in (capture.train or capture.test))
     poses = torch.stack([c.world_to_cam.double() for c in cameras])
     rotations = poses[:, :3, :3].transpose(1, 2)
     positions = -(rotations @ poses[:, :3, 3:]).squeeze(2)
     up = estimate_up(rotations)
     forward = rotations[:, :, 2]
-    # the point with the least sum of squared distances to all axes: sum (I - d d^T) (p - c) = 0; parallel axes leave the depth open
+    # the point with the least sum of squared distances to all axes: sum (I - d d^T) (p - c) = 0;
+    # parallel axes leave the depth open
     across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
     total = across.sum(0) / len(cameras)
     if torch.linalg.eigvalsh(total)[0] > 0.01:
@@ -71,10 +75,12 @@ def analyse_cameras(capture: Capture) -> CameraRig:
 
 
 def choose_best_view(capture: Capture) -> int:
-    """Return the index of the view that shows a capture best at first sight, among the training views: those are drawn best.
+    """Return the index of the view that shows a capture best at first sight, among the training
+    views: those are drawn best.
 
-    The view is upright (or the one nearest to upright) and not nearer to the centre than half of the training cameras (or the
-    farthest). Among those, the view is chosen that looks most level and most directly at the centre.
+    The view is upright (or the one nearest to upright) and not nearer to the centre than half of
+    the training cameras (or the farthest). Among those, the view is chosen that looks most level
+    and most directly at the centre.
     """
     rig = analyse_cameras(capture)
     middle = float((rig.positions - rig.centre).norm(dim=1).median())
@@ -91,7 +97,8 @@ def choose_best_view(capture: Capture) -> int:
 
 
 def median_depth(capture: Capture, position: Tensor, direction: Tensor) -> float:
-    """Return the median depth of the points in front of `position` along `direction`, or the extent if there are none."""
+    """Return the median depth of the points in front of `position` along `direction`, or the extent
+    if there are none."""
     if capture.points is None or not len(capture.points.xyz):
         return capture.extent
     along = (capture.points.xyz.double() - position) @ direction
@@ -124,7 +131,8 @@ def make_path(name: str, capture: Capture, frames: int, size: tuple[int, int] | 
 
 
 def orbit(rig: CameraRig, frames: int) -> list[Tensor]:
-    """Go once around the centre at the median height and distance of the cameras, looking at it. Returns world-to-camera matrices."""
+    """Go once around the centre at the median height and distance of the cameras, looking at it.
+    Returns world-to-camera matrices."""
     offset = rig.positions - rig.centre
     heights = offset @ rig.up
     flat = offset - heights[:, None] * rig.up
@@ -140,7 +148,8 @@ def orbit(rig: CameraRig, frames: int) -> list[Tensor]:
 
 
 def spiral(rig: CameraRig, frames: int, turns: int = 2, reach: float = 0.5) -> list[Tensor]:
-    """Circle in front of the scene within the spread of the cameras, looking at the centre: for captures that face one way."""
+    """Circle in front of the scene within the spread of the cameras, looking at the centre: for
+    captures that face one way."""
     middle = rig.positions.mean(0)
     forward = normalise(rig.centre - middle)
     right = normalise(torch.linalg.cross(forward, rig.up))
@@ -157,7 +166,8 @@ def spiral(rig: CameraRig, frames: int, turns: int = 2, reach: float = 0.5) -> l
 
 
 def follow_views(rig: CameraRig, frames: int) -> list[Tensor]:
-    """Move smoothly along the captured poses in the order of their names (at most MOST_POSES of them, evenly spread)."""
+    """Move smoothly along the captured poses in the order of their names (at most MOST_POSES of
+    them, evenly spread)."""
     count = min(len(rig.cameras), MOST_POSES)
     chosen = torch.linspace(0, len(rig.cameras) - 1, count).round().long()
     return interpolate_poses(rig.positions[chosen], rig.rotations[chosen], frames)
@@ -169,7 +179,8 @@ PATHS = {"orbit": orbit, "spiral": spiral, "views": follow_views}
 def choose_path(rig: CameraRig) -> str:
     """Return the name of the path that fits the shape of a capture.
 
-    Orbit if the cameras surround the scene, otherwise spiral, or views where a spiral looks where no photograph does.
+    Orbit if the cameras surround the scene, otherwise spiral, or views where a spiral looks where
+    no photograph does.
     """
     names = ["spiral", "views"] if float(rig.forward.mean(0).norm()) > FACING else ["orbit", "spiral", "views"]
     for name in names[:-1]:
@@ -180,7 +191,8 @@ def choose_path(rig: CameraRig) -> str:
 
 
 def count_unseen(path: CameraPath, capture: Capture) -> int:
-    """Return the number of cameras that look in a direction which no training camera has within SEEN degrees.
+    """Return the number of cameras that look in a direction which no training camera has within
+    SEEN degrees.
 
     They show backs of things that nobody photographed. Position is not considered.
     """
@@ -194,7 +206,8 @@ def count_unseen_directions(along: Tensor, rig: CameraRig) -> int:
 
 
 def median_camera(cameras: Sequence[Camera], size: tuple[int, int] | None = None) -> Camera:
-    """Return a free camera with the median vertical field of view of `cameras` and a centred principal point.
+    """Return a free camera with the median vertical field of view of `cameras` and a centred
+    principal point.
 
     size: Width and height in px. None takes those of the camera with the median field of view.
     """

@@ -1,4 +1,5 @@
-"""The region that photographs were taken in: pictures from outside it show what no photograph does."""
+"""The region that photographs were taken in: pictures from outside it show what no photograph
+does."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ class Region:
 
 
 def find_region(places: Tensor, distance: float) -> Region:
-    """Return the region of photographs taken from `places` [V, 3], at about `distance` from what they show."""
+    """Return the region of photographs taken from `places` [V, 3], at about `distance` from what
+    they show."""
     places = places.double()
     radius = NEAR * distance
     if len(places) > 1:

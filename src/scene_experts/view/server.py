@@ -1,7 +1,9 @@
-"""Serves a scene to browsers (viser). This process draws the pictures, so neither it nor the browser needs a display or a GPU.
+"""Serves a scene to browsers (viser). This process draws the pictures, so neither it nor the
+browser needs a display or a GPU.
 
-One thread draws for all clients in turn: the thread that calls `serve`, or the training's thread between two iterations. A client
-gets small pictures while its camera moves and a full-size picture when it rests.
+One thread draws for all clients in turn: the thread that calls `serve`, or the training's thread
+between two iterations. A client gets small pictures while its camera moves and a full-size picture
+when it rests.
 """
 
 from __future__ import annotations
@@ -72,7 +74,8 @@ def check_port(port: int) -> None:
 
 
 def check_host(host: str) -> None:
-    """Raise InputError if this machine cannot listen on an address. viser would wait for it for ever."""
+    """Raise InputError if this machine cannot listen on an address. viser would wait for it for
+    ever."""
     try:
         family = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0][0]
         socket.create_server((host, 0), family=family).close()
@@ -103,8 +106,9 @@ class Client:
 class Viewer:
     """Serves a scene to browsers.
 
-    `current()` returns the scene and the step at which it is drawn. Both change during training. `gate` decides who is served; by
-    default only pages of this server on this machine, and beyond it those that know the token in `url`.
+    `current()` returns the scene and the step at which it is drawn. Both change during training.
+    `gate` decides who is served; by default only pages of this server on this machine, and beyond
+    it those that know the token in `url`.
     """
 
     capture: Capture
@@ -135,7 +139,8 @@ class Viewer:
         rig = analyse_cameras(self.capture)
         self.server.scene.set_up_direction(tuple(rig.up.tolist()))
         self.centre: Tensor = rig.centre
-        # photographs that were all taken from one point look at nothing in common: the points say how far the scene is
+        # photographs that were all taken from one point look at nothing in common: the points say
+        # how far the scene is
         depth = median_depth(self.capture, rig.positions.mean(0), rig.forward[0])
         self.reach: float = max(float((rig.positions - rig.centre).norm(dim=1).median()), 0.05 * depth)
         self.region: Region = find_region(rig.positions, self.reach)
@@ -189,7 +194,8 @@ class Viewer:
         self.changed.set()
 
     def set_start(self) -> None:
-        """Let pages open at the first view. A page that still loads when `connect` moves it may lose that message."""
+        """Let pages open at the first view. A page that still loads when `connect` moves it may
+        lose that message."""
         start = getattr(self.server, "initial_camera", None)  # viser 1.0.0 has none
         if start is not None:
             camera = self.capture.views[self.first].camera
@@ -201,7 +207,8 @@ class Viewer:
             start.fov = camera.fov
 
     def find_distance(self, view: int) -> float:
-        """Return how far ahead of the camera of a view the point lies that the mouse turns around."""
+        """Return how far ahead of the camera of a view the point lies that the mouse turns
+        around."""
         camera = self.capture.views[view].camera
         forward = camera.world_to_cam[2, :3].double()
         return max(float((self.centre - camera.position.double()) @ forward), 0.1 * self.reach)
@@ -237,7 +244,8 @@ class Viewer:
     # --- drawing
 
     def find_due(self, now: float) -> list[Client]:
-        """Return the clients that need a picture: something changed, or they rest and have only a small picture."""
+        """Return the clients that need a picture: something changed, or they rest and have only a
+        small picture."""
         with self.lock:
             return [c for c in self.clients.values() if c.wanted or (not c.full and not c.is_moving(now))]
 
@@ -289,7 +297,8 @@ class Viewer:
         self.panel.report_picture(time.monotonic() - began, camera)
 
     def bring_back(self, client: Client, camera: Camera) -> None:
-        """Move a resting client to where its picture was drawn, if it left the region of the photographs."""
+        """Move a resting client to where its picture was drawn, if it left the region of the
+        photographs."""
         place, seen = camera.position.double(), client.handle.camera
         moved = place - torch.tensor(np.asarray(seen.position), dtype=torch.float64)
         if float(moved.norm()) > 1e-4 * self.region.radius:
@@ -300,7 +309,8 @@ class Viewer:
 
     @torch.no_grad()
     def render_picture(self, client: Client, scene: Scene, step: int, camera: Camera) -> torch.Tensor:
-        """Draw the picture [H, W, 3] of a client as the panel asks, with the photograph over its left part if it stands at a view."""
+        """Draw the picture [H, W, 3] of a client as the panel asks, with the photograph over its
+        left part if it stands at a view."""
         look, background = self.panel.read_look(), torch.tensor(self.panel.read_background(), device=self.device)
         with scene.at_level(self.panel.read_finest()):  # only here: a scene in training keeps using all its levels
             picture = paint(scene, camera.to(self.device), step, self.rasterize, background, look, self.draws).cpu()
@@ -312,7 +322,8 @@ class Viewer:
         return picture
 
     def reproject_photograph(self, view: int, camera: Camera) -> torch.Tensor:
-        """Resample the photograph of a view for `camera` at the same pose, [H, W, 3]. Pixels outside the photograph are grey."""
+        """Resample the photograph of a view for `camera` at the same pose, [H, W, 3]. Pixels
+        outside the photograph are grey."""
         frame, source = self.capture.frame(view), self.capture.views[view].camera
         rgb = frame.rgb.permute(2, 0, 1)[None].float() / 255
         y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
@@ -324,7 +335,8 @@ class Viewer:
         return torch.where(inside[..., None], found, 0.5)
 
     def read_camera(self, client: Client) -> Camera:
-        """Return the camera of a client at full size. Raises ValueError for invalid values (a broken or hostile message)."""
+        """Return the camera of a client at full size. Raises ValueError for invalid values (a
+        broken or hostile message)."""
         seen = client.handle.camera
         quat, place = torch.tensor(np.asarray(seen.wxyz), dtype=torch.float64), torch.tensor(np.asarray(seen.position), dtype=torch.float64)
         fov, aspect = float(seen.fov), float(seen.aspect)

@@ -1,4 +1,5 @@
-"""Writes frames to disk: a folder of PNG files, or a video with the ffmpeg that imageio installs."""
+"""Writes frames to disk: a folder of PNG files, or a video with the ffmpeg that imageio
+installs."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ def is_video(path: Path) -> bool:
 
 
 def import_ffmpeg() -> Any:
-    """Return the module imageio_ffmpeg. Raises InputError, which says what to install, if it is missing."""
+    """Return the module imageio_ffmpeg. Raises InputError, which says what to install, if it is
+    missing."""
     try:
         import imageio_ffmpeg
     except ImportError as error:
@@ -73,10 +75,11 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: i
 
 
 def write_pictures(folder: Path, frames: Iterable[np.ndarray]) -> int:
-    """Write frames as 00000.png, 00001.png, ... and their number as frames.json, and return their number.
+    """Write frames as 00000.png, 00001.png, ... and their number as frames.json, and return their
+    number.
 
-    Frames that an earlier call wrote into the folder are replaced. Raises InputError, before the first frame is drawn, if the
-    folder holds such pictures from elsewhere.
+    Frames that an earlier call wrote into the folder are replaced. Raises InputError, before the
+    first frame is drawn, if the folder holds such pictures from elsewhere.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"expected a folder for pictures, found the file {folder}; choose another --out")

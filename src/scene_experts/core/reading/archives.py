@@ -24,7 +24,8 @@ class Archive:
         self.names = archive.namelist()
 
     def read(self, name: object, limit: int) -> bytes:
-        """Return the bytes of one member. Raises Damaged if it is absent, has more than `limit` bytes, or is beyond the budget."""
+        """Return the bytes of one member. Raises Damaged if it is absent, has more than `limit`
+        bytes, or is beyond the budget."""
         if not isinstance(name, str) or name not in self._archive.NameToInfo:
             raise Damaged(f"no member {name!r:.60}")
         info = self._archive.getinfo(name)
@@ -43,7 +44,8 @@ class Archive:
 
 @contextmanager
 def open_zip(source: Source) -> Iterator[Archive]:
-    """Open the zip archive of `source`. Raises ValueError and the exceptions of zipfile, which `opening` turns into sentences."""
+    """Open the zip archive of `source`. Raises ValueError and the exceptions of zipfile, which
+    `opening` turns into sentences."""
     with source.stream() as stream:
         stream.seek(max(0, source.size - _TAIL))
         tail = stream.read(_TAIL)

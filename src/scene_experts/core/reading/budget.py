@@ -1,10 +1,13 @@
-"""How much one file of each format may cost: its size, what it unpacks to, its items, its nesting and its time.
+"""How much one file of each format may cost: its size, what it unpacks to, its items, its nesting
+and its time.
 
-A limit is far above what an honest file needs: a PLY file of 10 million Gaussians has 2.5 GB, a compact file of 2 million anchors
-0.3 GB, and a capture of 5,000 views has a transforms.json of 4 MB. What a file unpacks to is limited relative to its size, so a
-small file can never take much memory, and a large honest file is never refused. Values are decoded to four times their stored size
+A limit is far above what an honest file needs: a PLY file of 10 million Gaussians has 2.5 GB, a
+compact file of 2 million anchors 0.3 GB, and a capture of 5,000 views has a transforms.json of 4
+MB. What a file unpacks to is limited relative to its size, so a small file can never take much
+memory, and a large honest file is never refused. Values are decoded to four times their stored size
 at most, and honest columns compress by two to four: hence the ratio of 16. Harmonics of degree 3
-compress by more in packed files: a Gaussian may have 16 bytes in SPZ or 13 in SOG, and 472 in memory. So their ratios are 32 and 40.
+compress by more in packed files: a Gaussian may have 16 bytes in SPZ or 13 in SOG, and 472 in
+memory. So their ratios are 32 and 40.
 """
 
 from __future__ import annotations
@@ -17,7 +20,8 @@ BYTES_PER_SECOND = 2 * MIB
 
 
 class Damaged(ValueError):
-    """The content of a file does not fit its format. The message completes "expected a whole FILE at PATH, found ..."."""
+    """The content of a file does not fit its format. The message completes "expected a whole FILE
+    at PATH, found ..."."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +33,11 @@ class Budget:
         bytes_in: Largest file in bytes.
         floor: Bytes in memory that a file of any size may unpack to.
         ratio: Bytes in memory per byte of the file, in addition to `floor`.
-        items: Largest number of entries: members of an archive, values of a JSON file, operations of a pickle, lines of a header.
+        items: Largest number of entries: members of an archive, values of a JSON file, operations
+            of a pickle, lines of a header.
         depth: Largest nesting of lists and objects.
-        seconds: Processor time that a small file may take; see BYTES_PER_SECOND. Readers check it between their steps.
+        seconds: Processor time that a small file may take; see BYTES_PER_SECOND. Readers check it
+            between their steps.
         advice: What the user can do about a damaged file.
     """
 

@@ -1,4 +1,5 @@
-"""Checks that parsed numbers are finite and within the range that the computations after them can bear."""
+"""Checks that parsed numbers are finite and within the range that the computations after them can
+bear."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from scene_experts.core.reading.budget import Damaged
 
 log: logging.Logger = logging.getLogger(__name__)
 FARTHEST = 1e15
-"""Largest magnitude of a position or length: its square and its multiples stay finite in float32."""
+"""Largest magnitude of a position or length: its square and its multiples stay finite in
+float32."""
 LARGEST_LOG = 80.0
 """Largest logarithm of a length: exp(80) = 5e34 is finite in float32."""
 LARGEST = 1e18
@@ -70,7 +72,8 @@ def expect_finite_tensors(tensors: Mapping[str, Tensor]) -> None:
 
 
 def all_finite(value: Tensor) -> bool:
-    """Return whether all values are finite. It needs no memory of its own for large float32 and float64 tensors."""
+    """Return whether all values are finite. It needs no memory of its own for large float32 and
+    float64 tensors."""
     if value.is_complex():
         value = torch.view_as_real(value.detach().resolve_conj())
     if not value.numel() or not value.is_floating_point():
@@ -83,7 +86,8 @@ def all_finite(value: Tensor) -> bool:
 
 
 def usable_rows(xyz: NDArray[Any], path: Path) -> NDArray[np.bool_]:
-    """Return which points [P, 3] have a usable position: finite, and not beyond FARTHEST. Logs a warning if some have not."""
+    """Return which points [P, 3] have a usable position: finite, and not beyond FARTHEST. Logs a
+    warning if some have not."""
     kept: NDArray[np.bool_] = np.asarray((np.abs(xyz) <= FARTHEST).all(1))  # False for NaN
     if not kept.all():
         log.warning("dropped %s of %s points of %s that have no usable position", f"{(~kept).sum():,}", f"{len(xyz):,}", path)

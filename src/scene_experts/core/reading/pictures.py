@@ -14,7 +14,8 @@ from scene_experts.core.reading.budget import Budget, Damaged
 from scene_experts.core.reading.source import Source, opening
 
 FORMATS = ("BMP", "GIF", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
-"""The formats that are read, by their content. Pillow's others are not: each decoder is a way in."""
+"""The formats that are read, by their content. Pillow's others are not: each decoder is a way
+in."""
 HEIC = "HEIF"  # read too where pillow-heif has registered it, by those who pass `heic`
 SIDE_LIMIT = 1 << 17  # px
 ORIENTATION = 0x0112  # tag of EXIF and TIFF
@@ -23,10 +24,12 @@ _STORED = 4  # bytes per pixel in Pillow's memory, at most
 
 @contextmanager
 def opening_picture(path: Path, budget: Budget = budgets.PICTURE, heic: bool = False) -> Iterator[Image.Image]:
-    """Open the picture at `path` without decoding it. The block decodes it to the pixels as they are stored, whatever its EXIF orientation.
+    """Open the picture at `path` without decoding it. The block decodes it to the pixels as they
+    are stored, whatever its EXIF orientation.
 
     `heic` admits HEIC photographs where pillow-heif reads them.
-    Raises InputError if it is absent, damaged, of another format or beyond the budget, or if the block fails.
+    Raises InputError if it is absent, damaged, of another format or beyond the budget, or if the
+    block fails.
     """
     formats = (*FORMATS, HEIC) if heic and HEIC in Image.OPEN else FORMATS
     with opening(path, budget) as source, source.stream() as stream, Image.open(stream, formats=formats) as image:
@@ -36,8 +39,8 @@ def opening_picture(path: Path, budget: Budget = budgets.PICTURE, heic: bool = F
 
 
 def keep_as_stored(image: Image.Image) -> None:
-    """Decode a TIFF file with an orientation to its stored pixels. Pillow would turn it upright and drop the orientation, unlike the
-    pictures of other formats, and unlike COLMAP."""
+    """Decode a TIFF file with an orientation to its stored pixels. Pillow would turn it upright and
+    drop the orientation, unlike the pictures of other formats, and unlike COLMAP."""
     if image.format != "TIFF":
         return
     exif = image.getexif()
@@ -50,7 +53,8 @@ def keep_as_stored(image: Image.Image) -> None:
 
 
 def decode_picture(data: bytes, pixels: int, format: str) -> Image.Image:
-    """Decode a picture of one format that is a part of another file. Raises Damaged for more than `pixels` pixels."""
+    """Decode a picture of one format that is a part of another file. Raises Damaged for more than
+    `pixels` pixels."""
     with Image.open(io.BytesIO(data), formats=[format]) as image:
         if image.width * image.height > pixels or max(image.size) > SIDE_LIMIT:
             raise Damaged(f"a picture of {image.width} x {image.height} pixels")

@@ -1,4 +1,5 @@
-"""Reads JSON, lines of JSON and Python literals: plain values, nested within the budget, with finite numbers only."""
+"""Reads JSON, lines of JSON and Python literals: plain values, nested within the budget, with
+finite numbers only."""
 
 from __future__ import annotations
 
@@ -21,16 +22,17 @@ _LONGEST_VALUE = 4096  # characters of a Python literal
 def read_json(path: Path, what: str) -> Any:
     """Read the JSON file `path`: UTF-8 in every locale, with or without a byte order mark.
 
-    `what` names the file in messages, for example "run configuration". Raises InputError if the file is absent or is not valid
-    JSON, and for values beyond the budget: see `parse_json`.
+    `what` names the file in messages, for example "run configuration". Raises InputError if the
+    file is absent or is not valid JSON, and for values beyond the budget: see `parse_json`.
     """
     with opening(path, budgets.JSON, f"{what} in JSON") as source:
         return parse_json(source.read(), budgets.JSON)
 
 
 def parse_json(text: bytes | str, budget: Budget = budgets.META, finite: bool = True) -> Any:
-    """Parse JSON text. Raises ValueError if it is invalid, too long or nested too deeply, has too many values, or has numbers that
-    are not finite or integers of more than 64 bits. `finite=False` allows NaN and infinity, which metrics of a training may have.
+    """Parse JSON text. Raises ValueError if it is invalid, too long or nested too deeply, has too
+    many values, or has numbers that are not finite or integers of more than 64 bits. `finite=False`
+    allows NaN and infinity, which metrics of a training may have.
     """
     if len(text) > budget.bytes_in:
         raise Damaged(f"{len(text):,} bytes of JSON, more than the {budget.bytes_in:,} that are read")
@@ -40,7 +42,8 @@ def parse_json(text: bytes | str, budget: Budget = budgets.META, finite: bool = 
 
 
 def check_plain(value: Any, budget: Budget, finite: bool = True) -> None:
-    """Raise Damaged for nested plain values beyond the budget's items and depth, and for numbers out of range."""
+    """Raise Damaged for nested plain values beyond the budget's items and depth, and for numbers
+    out of range."""
     level, depth, items = [value], 0, 0
     while level:  # breadth first: no recursion, whatever the nesting
         items += len(level)
@@ -64,7 +67,8 @@ def check_plain(value: Any, budget: Budget, finite: bool = True) -> None:
 
 
 def read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the objects of a file of one JSON object per line. Other lines are skipped: a power failure may leave anything."""
+    """Yield the objects of a file of one JSON object per line. Other lines are skipped: a power
+    failure may leave anything."""
     with opening(path, budgets.LINES) as source, source.stream() as stream:
         for line in iter(lambda: stream.readline(budgets.LINE.bytes_in), b""):
             source.spend_items(1)
@@ -77,10 +81,11 @@ def read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def parse_namespace(text: str, budget: Budget = budgets.SETTINGS) -> dict[str, Any]:
-    """Parse the text of a Python namespace, `Namespace(name=value, ...)`, as programs of the 3DGS family write it.
+    """Parse the text of a Python namespace, `Namespace(name=value, ...)`, as programs of the 3DGS
+    family write it.
 
-    Values are parsed as literals and never evaluated. Other values (a path object, a call) are left out. Raises Damaged for a text
-    of another form.
+    Values are parsed as literals and never evaluated. Other values (a path object, a call) are left
+    out. Raises Damaged for a text of another form.
     """
     match = re.fullmatch(r"Namespace\((.*)\)", text.strip(), re.S)
     if match is None:

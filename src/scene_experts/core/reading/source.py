@@ -1,4 +1,5 @@
-"""Opens a foreign file within its budget, and turns whatever fails in its reader into one InputError."""
+"""Opens a foreign file within its budget, and turns whatever fails in its reader into one
+InputError."""
 
 from __future__ import annotations
 
@@ -48,7 +49,8 @@ class Source:
         return self.path.open("rb")
 
     def spend_bytes(self, count: float) -> None:
-        """Announce that the reader will take `count` more bytes of memory. Raises Damaged beyond the budget. Call it first."""
+        """Announce that the reader will take `count` more bytes of memory. Raises Damaged beyond
+        the budget. Call it first."""
         self.memory += max(0, int(count))
         if self.memory > self.budget.allowance(self.size):
             raise Damaged(f"{self.size:,} bytes that unpack to {self.memory:,}")
@@ -61,7 +63,8 @@ class Source:
         self.check_time()
 
     def check_time(self) -> None:
-        """Raise Damaged if the reader has used up its time, in seconds of the processor: a busy machine is not the fault of a file."""
+        """Raise Damaged if the reader has used up its time, in seconds of the processor: a busy
+        machine is not the fault of a file."""
         if time.thread_time() > self._end:
             raise Damaged(f"content that takes longer than {self.budget.time_limit(self.size):.0f} s to read")
 
@@ -70,8 +73,9 @@ class Source:
 def opening(path: Path, budget: Budget, what: str | None = None) -> Iterator[Source]:
     """Open `path` for a reader: `with opening(path, budget.SPZ) as source`.
 
-    `what` replaces the budget's name of the file in messages. Raises InputError, in one sentence, if the file is absent, is not a
-    regular file, is larger than its budget, or if the block fails with any exception but an InputError or RunError of its own.
+    `what` replaces the budget's name of the file in messages. Raises InputError, in one sentence,
+    if the file is absent, is not a regular file, is larger than its budget, or if the block fails
+    with any exception but an InputError or RunError of its own.
     """
     path = Path(path)
     with guarding(path, budget, what):
@@ -89,7 +93,8 @@ def opening(path: Path, budget: Budget, what: str | None = None) -> Iterator[Sou
 
 @contextmanager
 def guarding(path: Path | str, budget: Budget, what: str | None = None) -> Iterator[None]:
-    """Turn every exception of a block that interprets the content of `path` into one InputError; InputError and RunError pass."""
+    """Turn every exception of a block that interprets the content of `path` into one InputError;
+    InputError and RunError pass."""
     try:
         yield
     except InputError as error:
@@ -132,13 +137,15 @@ def describe(error: BaseException) -> str:
 
 
 def sentence(text: object) -> str:
-    """Return a message in a form that a terminal can show: as it is, or `shorten`ed if it is very long or quotes unprintable characters."""
+    """Return a message in a form that a terminal can show: as it is, or `shorten`ed if it is very
+    long or quotes unprintable characters."""
     line = str(text)
     return line if line.isprintable() and len(line) <= _LONGEST_SENTENCE else shorten(line, _LONGEST_SENTENCE)
 
 
 def shorten(text: str, most: int = _LONGEST) -> str:
-    """Return the text on one line, cut after `most` characters, with unprintable characters replaced."""
+    """Return the text on one line, cut after `most` characters, with unprintable characters
+    replaced."""
     line = "".join(c if c.isprintable() else " " for c in text[: 4 * most])
     line = " ".join(line.split())
     return line if len(line) <= most else line[: most - 3] + "..."
@@ -150,9 +157,11 @@ def article(noun: str) -> str:
 
 
 def inside(folder: Path, name: object) -> Path:
-    """Return the path of `name` in `folder`. Raises Damaged unless it is the name of a place inside that folder.
+    """Return the path of `name` in `folder`. Raises Damaged unless it is the name of a place inside
+    that folder.
 
-    Files name other files; such a name must not lead out of its folder by "..", an absolute path or a symbolic link.
+    Files name other files; such a name must not lead out of its folder by "..", an absolute path or
+    a symbolic link.
     """
     if not isinstance(name, str) or not name or "\0" in name or len(name) > 4096:
         raise Damaged(f"{shorten(repr(name), 60)} where the name of a file is expected")

@@ -1,4 +1,5 @@
-"""Reads files of named tensors (safetensors), which hold no code. Their memory is that of the file."""
+"""Reads files of named tensors (safetensors), which hold no code. Their memory is that of the
+file."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ _HEADER_LIMIT = 32 << 20  # bytes of the JSON header, which the library parses a
 
 
 def read_safetensors(path: Path, budget: Budget, what: str | None = None) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Return the tensors (on the CPU, each with memory of its own) and the metadata of a safetensors file.
+    """Return the tensors (on the CPU, each with memory of its own) and the metadata of a
+    safetensors file.
 
     Raises InputError if the file is absent, damaged or beyond its budget.
     """
@@ -29,7 +31,8 @@ def read_safetensors(path: Path, budget: Budget, what: str | None = None) -> tup
 
 
 def read_metadata(path: Path, budget: Budget, what: str | None = None) -> dict[str, str]:
-    """Return the metadata of a safetensors file without its tensors. Raises InputError as `read_safetensors` does."""
+    """Return the metadata of a safetensors file without its tensors. Raises InputError as
+    `read_safetensors` does."""
     with opening(path, budget, what) as source:
         check_header(source)
         with safe_open(path, framework="pt", device="cpu") as file:
@@ -44,5 +47,6 @@ def check_header(source: Source) -> None:
 
 
 def find_not_finite(tensors: dict[str, Tensor], prefixes: tuple[str, ...]) -> str | None:
-    """Return the name of the first tensor with one of the prefixes that has values that are not finite, or None."""
+    """Return the name of the first tensor with one of the prefixes that has values that are not
+    finite, or None."""
     return next((name for name, value in tensors.items() if name.startswith(prefixes) and not all_finite(value)), None)

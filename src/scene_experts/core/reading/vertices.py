@@ -39,7 +39,8 @@ class Header:
 
 
 def read_header(source: Source) -> Header:
-    """Parse the header. Raises Damaged unless its first element is `vertex`, with scalar properties of known types."""
+    """Parse the header. Raises Damaged unless its first element is `vertex`, with scalar properties
+    of known types."""
     head = source.head(HEADER_LIMIT)
     match = re.search(rb"\nend_header[ \t]*\r?\n", head)
     if not head.startswith(b"ply") or match is None:

@@ -1,4 +1,5 @@
-"""Extracts one scene from a zip or tar archive: only plain files of the wanted folder, within size limits, all of them or none."""
+"""Extracts one scene from a zip or tar archive: only plain files of the wanted folder, within size
+limits, all of them or none."""
 
 from __future__ import annotations
 
@@ -62,7 +63,8 @@ class Extracted:
 
 @contextmanager
 def open_archive(archive: Path) -> Iterator[list[Member]]:
-    """Open a zip or tar archive of any compression and yield its entries. Raises RunError if the file is damaged or something else."""
+    """Open a zip or tar archive of any compression and yield its entries. Raises RunError if the
+    file is damaged or something else."""
     try:
         if zipfile.is_zipfile(archive):
             with zipfile.ZipFile(archive) as opened:
@@ -96,12 +98,14 @@ def extract(archive: Path, scene: str, into: Path, inside: Sequence[str] = (), p
     """Write the files of `scene` to the folder `into`. The folder appears when it is complete.
 
     Args:
-        inside: Expected folders in the archive, e.g. "tandt/truck". Otherwise the only folder of that name that contains `images` is used.
+        inside: Expected folders in the archive, e.g. "tandt/truck". Otherwise the only folder of
+            that name that contains `images` is used.
         progress: Called with the bytes so far and in total.
 
     Raises:
-        RunError: if the archive is damaged, does not contain the scene, contains a link or a name that leads outside the folder,
-            exceeds MOST_BYTES or MOST_FILES, or does not fit on the disk.
+        RunError: if the archive is damaged, does not contain the scene, contains a link or a name
+            that leads outside the folder, exceeds MOST_BYTES or MOST_FILES, or does not fit on the
+            disk.
     """
     with open_archive(archive) as entries:
         prefix = find_scene(entries, scene, inside, archive)
@@ -129,7 +133,8 @@ def extract(archive: Path, scene: str, into: Path, inside: Sequence[str] = (), p
 
 
 def _copy(source: IO[bytes], stream: IO[bytes], member: Member, done: int, total: int, progress: ByteProgress | None) -> int:
-    """Copy one entry, at most as many bytes as it declares. Reading a zip entry verifies its checksum."""
+    """Copy one entry, at most as many bytes as it declares. Reading a zip entry verifies its
+    checksum."""
     left = member.bytes
     while block := source.read(min(1 << 20, left + 1)):
         left -= len(block)
@@ -164,7 +169,8 @@ def find_scene(entries: Sequence[Member], scene: str, inside: Sequence[str], arc
 
 
 def _check_entries(wanted: Sequence[tuple[tuple[str, ...], Member]], archive: Path) -> int:
-    """Return the total size in bytes of the entries `wanted`. Raises RunError if one of them is not trustworthy."""
+    """Return the total size in bytes of the entries `wanted`. Raises RunError if one of them is not
+    trustworthy."""
 
     def refuse(found: str) -> RunError:
         return RunError(f"expected plain files of a scene in {archive.name}, found {found}; remove this archive, it is not trustworthy")
@@ -204,7 +210,8 @@ def _split_name(name: str) -> tuple[str, ...]:
 
 
 def _parts_after(name: str, prefix: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the parts of `name` after the folder `prefix`, or an empty tuple if it is not inside that folder."""
+    """Return the parts of `name` after the folder `prefix`, or an empty tuple if it is not inside
+    that folder."""
     parts = _split_name(name)
     return parts[len(prefix) :] if parts[: len(prefix)] == prefix else ()
 

@@ -1,7 +1,9 @@
-"""The 17 scenes of the paper: where their owners publish them, under which terms, and in which protocol the paper evaluates them.
+"""The 17 scenes of the paper: where their owners publish them, under which terms, and in which
+protocol the paper evaluates them.
 
-The facts are those that the owners of the data publish. A checksum is listed only if many independent users report the same one.
-This module uses neither the network nor the disk; `data.fetch.obtain` does.
+The facts are those that the owners of the data publish. A checksum is listed only if many
+independent users report the same one. This module uses neither the network nor the disk;
+`data.fetch.obtain` does.
 """
 
 from __future__ import annotations
@@ -40,12 +42,14 @@ class Collection:
     licence: str  # as the owner states it
     source: str  # publication of its authors
     numbers: Numbers = ()
-    """Settings of the scripts of Scaffold-GS and Octree-GS for these scenes, by the field of `Train`; in the captures' own units."""
+    """Settings of the scripts of Scaffold-GS and Octree-GS for these scenes, by the field of
+    `Train`; in the captures' own units."""
 
 
 @dataclass(frozen=True)
 class CatalogScene:
-    """A scene and its protocol in the paper: image sizes and held-out views as in 3DGS (Kerbl et al. 2023)."""
+    """A scene and its protocol in the paper: image sizes and held-out views as in 3DGS (Kerbl et
+    al. 2023)."""
 
     name: str
     collection: Collection
@@ -145,8 +149,8 @@ COLLECTIONS = (MIPNERF360, TANDT, DEEP_BLENDING, BUNGEENERF)
 def select(words: Sequence[str]) -> list[CatalogScene]:
     """Return the scenes that `words` name, each once and in catalog order.
 
-    A word names a scene ("bonsai", "mipnerf360/bonsai"), a data set ("tandt") or everything ("all").
-    Raises InputError for any other word and suggests the nearest names.
+    A word names a scene ("bonsai", "mipnerf360/bonsai"), a data set ("tandt") or everything
+    ("all"). Raises InputError for any other word and suggests the nearest names.
     """
     chosen: list[CatalogScene] = []
     for word in words:
@@ -180,16 +184,19 @@ class Defaults:
 
 
 def defaults_of(capture: str | Path) -> Defaults:
-    """Return what a capture brings: `catalog:SCENE` the units and numbers of its data set, any other path nothing.
+    """Return what a capture brings: `catalog:SCENE` the units and numbers of its data set, any
+    other path nothing.
 
-    Its resolution and split are those that `obtain.resolve` puts in place of "auto". Raises InputError for an unknown scene.
+    Its resolution and split are those that `obtain.resolve` puts in place of "auto". Raises
+    InputError for an unknown scene.
     """
     word = str(capture)
     return Defaults("none", one(word).collection.numbers) if word.startswith(PREFIX) else Defaults()
 
 
 def defaults_in(args: Sequence[str]) -> Defaults:
-    """Return what the capture among the words of a command brings. Raises InputError for an unknown scene."""
+    """Return what the capture among the words of a command brings. Raises InputError for an unknown
+    scene."""
     words = (arg.removeprefix("--data=") for arg in args)
     return defaults_of(next((word for word in words if word.startswith(PREFIX)), ""))
 

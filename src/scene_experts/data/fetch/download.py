@@ -1,4 +1,5 @@
-"""Downloads files over HTTP: resumes interrupted downloads, tries several addresses, verifies checksums and writes atomically."""
+"""Downloads files over HTTP: resumes interrupted downloads, tries several addresses, verifies
+checksums and writes atomically."""
 
 from __future__ import annotations
 
@@ -86,10 +87,12 @@ def fetch(
 ) -> Fetched:
     """Download a file to `path` from the first of `urls` that serves it.
 
-    An interrupted download leaves `<name>.part`, which is resumed if the server allows it. Content with a wrong checksum is removed.
+    An interrupted download leaves `<name>.part`, which is resumed if the server allows it. Content
+    with a wrong checksum is removed.
 
     Args:
-        digest: Expected SHA-256. Without it, only the length and the MD5 that the server states are verified.
+        digest: Expected SHA-256. Without it, only the length and the MD5 that the server states are
+            verified.
         size: Expected size in bytes, if known.
         progress: Called with the bytes so far and in total (0: unknown).
         say: Called with the reason when an address is given up.
@@ -155,7 +158,8 @@ def _download(url: str, part: Path, digest: str | None, size: int | None, progre
 
 
 def _verify(part: Path, begun: _Partial, digest: str | None, size: int | None) -> str:
-    """Return the SHA-256 of a complete download. Raises _Refused if its length or a checksum is wrong."""
+    """Return the SHA-256 of a complete download. Raises _Refused if its length or a checksum is
+    wrong."""
     if size is not None and part.stat().st_size != size:
         raise _Refused(f"expected {size:,} bytes, found {part.stat().st_size:,}")
     if digest is None and begun.md5:
@@ -170,9 +174,11 @@ def _verify(part: Path, begun: _Partial, digest: str | None, size: int | None) -
 
 
 def _continue(url: str, part: Path, known: bool, size: int | None, progress: ByteProgress | None) -> _Partial:
-    """Append the missing bytes of `url` to `part`, or start over if the server sends the whole file.
+    """Append the missing bytes of `url` to `part`, or start over if the server sends the whole
+    file.
 
-    known: Whether the checksum is known. Then a part from another address is resumed, too, because the checksum is verified at the end.
+    known: Whether the checksum is known. Then a part from another address is resumed, too, because
+    the checksum is verified at the end.
     """
     have, begun = _find_resumable(url, part, known)
     headers = {"User-Agent": "scene-experts", "Accept-Encoding": "identity"}
@@ -242,7 +248,8 @@ class _WebRedirects(urllib.request.HTTPRedirectHandler):
 
 
 def _ask(url: str, headers: dict[str, str]) -> http.client.HTTPResponse:
-    """Send a request and return the answer when its head has arrived. Raises TimeoutError if that takes longer than ANSWER seconds."""
+    """Send a request and return the answer when its head has arrived. Raises TimeoutError if that
+    takes longer than ANSWER seconds."""
     sockets: list[socket.socket] = []
     over = threading.Event()
 
@@ -294,7 +301,8 @@ def _read(answer: http.client.HTTPResponse) -> bytes:
 
 @contextmanager
 def _plain_errors() -> Iterator[None]:
-    """Turn what http.client and urllib raise for malformed answers (ValueError, UnicodeError, AssertionError...) into HTTPException."""
+    """Turn what http.client and urllib raise for malformed answers (ValueError, UnicodeError,
+    AssertionError...) into HTTPException."""
     try:
         yield
     except (OSError, http.client.HTTPException, _Refused):
@@ -304,7 +312,8 @@ def _plain_errors() -> Iterator[None]:
 
 
 def _one_line(text: str) -> str:
-    """Return what a server said as one short line without control characters, which a terminal would obey."""
+    """Return what a server said as one short line without control characters, which a terminal
+    would obey."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:200]
 
 
@@ -315,7 +324,8 @@ def _read_length(headers: http.client.HTTPMessage) -> int:
 
 
 def _find_resumable(url: str, part: Path, known: bool) -> tuple[int, _Partial]:
-    """Return the number of bytes of `part` that `url` can continue (0: start over), and the facts about their file."""
+    """Return the number of bytes of `part` that `url` can continue (0: start over), and the facts
+    about their file."""
     have = part.stat().st_size if part.is_file() else 0
     begun = _Partial()
     with suppress(OSError, ValueError, TypeError):
@@ -325,7 +335,8 @@ def _find_resumable(url: str, part: Path, known: bool) -> tuple[int, _Partial]:
 
 
 def _expect_file(kind: str, total: int, size: int | None) -> None:
-    """Raise _Refused for an answer that is not the file: a web page (file moved, quota used up) or another length."""
+    """Raise _Refused for an answer that is not the file: a web page (file moved, quota used up) or
+    another length."""
     if kind.partition(";")[0].strip().lower() in ("text/html", "application/xhtml+xml"):
         raise _Refused("the server sent a web page instead of the file (the file moved, or its download quota is used up)")
     if size is not None and total and total != size:
@@ -351,7 +362,8 @@ def _read_version(headers: http.client.HTTPMessage) -> str:
 
 
 def _read_md5(headers: http.client.HTTPMessage) -> str:
-    """Return the MD5 of the whole file in hexadecimal if the server states it (x-goog-hash), otherwise an empty string."""
+    """Return the MD5 of the whole file in hexadecimal if the server states it (x-goog-hash),
+    otherwise an empty string."""
     for value in headers.get_all("x-goog-hash") or []:
         if found := re.search(r"md5=([A-Za-z0-9+/]{22}==)", value):
             return base64.b64decode(found[1]).hex()
@@ -369,7 +381,8 @@ def _remove_part(part: Path) -> None:
 
 @contextmanager
 def _lock(part: Path) -> Iterator[None]:
-    """Hold a lock on `part`. Raises RunError while another process on this machine downloads the same file."""
+    """Hold a lock on `part`. Raises RunError while another process on this machine downloads the
+    same file."""
     try:
         import fcntl
     except ImportError:  # Windows does not replace open files, which is protection enough

@@ -1,8 +1,9 @@
 """Downloads scenes of the catalog, verifies and unpacks them into one folder, and finds them there.
 
 ROOT/archives/360_v2.zip             an archive as published, downloaded once for all its scenes
-ROOT/archives/checksums.json         checksums of the first downloads, for comparison with later ones
-ROOT/mipnerf360/bonsai/              a scene: images/, sparse/0/, and source.json, which states its origin
+ROOT/archives/checksums.json         checksums of the first downloads, for comparison with later
+ones ROOT/mipnerf360/bonsai/              a scene: images/, sparse/0/, and source.json, which states
+its origin
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ VARIABLE = "SCENE_EXPERTS_CAPTURES"
 
 
 def captures_dir() -> Path:
-    """Return the folder of downloaded scenes: $SCENE_EXPERTS_CAPTURES, or `captures` in the user's cache folder."""
+    """Return the folder of downloaded scenes: $SCENE_EXPERTS_CAPTURES, or `captures` in the user's
+    cache folder."""
     return Path(os.environ.get(VARIABLE) or cache_dir() / "captures")
 
 
@@ -33,7 +35,8 @@ def is_present(root: Path, scene: CatalogScene) -> bool:
 
 
 def resolve(path: Path, resolution: str, split: str) -> tuple[Path, str, str]:
-    """Return the folder, resolution and split of a capture. A path `catalog:SCENE` is looked up, any other path is returned as it is.
+    """Return the folder, resolution and split of a capture. A path `catalog:SCENE` is looked up,
+    any other path is returned as it is.
 
     For a scene of the catalog, "auto" is replaced by the paper's protocol.
     Raises InputError for an unknown scene and for a scene that is not on this machine.
@@ -58,10 +61,12 @@ def obtain(
     say: Say = print,
     progress: Progress | None = None,
 ) -> None:
-    """Download and unpack `scenes` into `root`. Scenes that are already there are not touched; shared archives are downloaded once.
+    """Download and unpack `scenes` into `root`. Scenes that are already there are not touched;
+    shared archives are downloaded once.
 
     Args:
-        mirrors: Addresses of folders (or of the archive itself) that are tried before the owner's address.
+        mirrors: Addresses of folders (or of the archive itself) that are tried before the owner's
+            address.
         keep: Keep the archives for other scenes.
         say: Called with each message.
         progress: Called with the name of the work, the bytes so far and in total.
@@ -117,7 +122,8 @@ def _unpack(scene: CatalogScene, archive: Path, digest: str, root: Path, say: Sa
 def _fetch_archive(
     archive: RemoteArchive, root: Path, mirrors: Sequence[str], say: Say, progress: Progress | None
 ) -> tuple[Path, str, str]:
-    """Return the archive's file, its SHA-256 and the address that it was downloaded from. Downloads it unless it is there."""
+    """Return the archive's file, its SHA-256 and the address that it was downloaded from. Downloads
+    it unless it is there."""
     path = root / "archives" / archive.name
     known = _read_record(root).get(archive.name, {})
     digest = archive.sha256 or known.get("sha256")
@@ -134,7 +140,8 @@ def _fetch_archive(
 
 
 def _verify(archive: RemoteArchive, path: Path, known: dict, root: Path, say: Say) -> str:
-    """Return the SHA-256 of an existing archive. Only a new or changed file is read; otherwise the recorded value is used."""
+    """Return the SHA-256 of an existing archive. Only a new or changed file is read; otherwise the
+    recorded value is used."""
     about = path.stat()
     if known and known.get("bytes") == about.st_size and known.get("changed") == about.st_mtime_ns:
         return str(known["sha256"])

@@ -1,6 +1,7 @@
 """The readers of captures. A new kind is one file in this folder and one line in READERS.
 
-A reader outside this package is added with `register`, or by an entry point of the group "scene_experts.readers".
+A reader outside this package is added with `register`, or by an entry point of the group
+"scene_experts.readers".
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ _registered: list[Reader] = []
 
 
 def register(reader: Reader) -> None:
-    """Add a reader. It is asked before the built-in readers, and before readers registered earlier."""
+    """Add a reader. It is asked before the built-in readers, and before readers registered
+    earlier."""
     _registered.insert(0, reader)
 
 
@@ -49,7 +51,8 @@ def _load_built_in() -> tuple[Reader, ...]:
 
 @functools.cache
 def _load_installed() -> tuple[Reader, ...]:
-    """Load the readers that installed packages offer. Raises InputError if one cannot be imported."""
+    """Load the readers that installed packages offer. Raises InputError if one cannot be
+    imported."""
     found = []
     for entry in entry_points(group=GROUP):
         try:
@@ -69,7 +72,8 @@ def find_reader(folder: Path) -> Reader | None:
 
 
 def tell_others(folder: Path, reader: Reader) -> list[str]:
-    """Return a warning if `folder` also holds a capture of a kind that a later built-in reader reads."""
+    """Return a warning if `folder` also holds a capture of a kind that a later built-in reader
+    reads."""
     built_in = _load_built_in()
     later = built_in[built_in.index(reader) + 1 :] if reader in built_in else ()
     return [
@@ -85,7 +89,8 @@ def is_capture(folder: Path) -> bool:
 
 
 def unrecognised_error(folder: Path) -> InputError:
-    """Return the error for a folder that no reader recognises. It says what to do, e.g. with photographs without camera poses."""
+    """Return the error for a folder that no reader recognises. It says what to do, e.g. with
+    photographs without camera poses."""
     kinds = ", ".join(reader.files for reader in (*_load_built_in(), *_load_installed(), *_registered))
     expected = f"expected a capture in {folder} ({kinds}), found"
     if is_capture(folder.absolute().parent):

@@ -1,4 +1,5 @@
-"""Reads NeRF-synthetic captures: transforms_train.json and transforms_test.json, as rendered with Blender."""
+"""Reads NeRF-synthetic captures: transforms_train.json and transforms_test.json, as rendered with
+Blender."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ BOUNDS = ((-1.3, -1.3, -1.3), (1.3, 1.3, 1.3))  # 3DGS fills this cube with rand
 
 
 class BlenderReader:
-    """Reads a NeRF-synthetic capture. Such captures state their split and have transparent photographs, but no points."""
+    """Reads a NeRF-synthetic capture. Such captures state their split and have transparent
+    photographs, but no points."""
 
     name = "blender"
     files = "transforms_train.json (NeRF-synthetic)"
@@ -24,10 +26,11 @@ class BlenderReader:
         return (folder / "transforms_train.json").is_file()
 
     def read(self, folder: Path, options: ReadOptions) -> RawCapture:
-        """Read poses, the split and, if there are any, points. Alpha is composited over `options.background` (default white).
+        """Read poses, the split and, if there are any, points. Alpha is composited over
+        `options.background` (default white).
 
-        Frames without an image are dropped with a warning. Raises InputError if a file is damaged, if no frame is left, and for
-        `options.images`: each file path names its folder.
+        Frames without an image are dropped with a warning. Raises InputError if a file is damaged,
+        if no frame is left, and for `options.images`: each file path names its folder.
         """
         if options.images is not None:
             raise InputError(

@@ -1,4 +1,5 @@
-"""Reads COLMAP captures: a reconstruction (sparse/0) beside the folder of its photographs (images)."""
+"""Reads COLMAP captures: a reconstruction (sparse/0) beside the folder of its photographs
+(images)."""
 
 from __future__ import annotations
 
@@ -28,8 +29,8 @@ class ColmapReader:
     def read(self, folder: Path, options: ReadOptions) -> RawCapture:
         """Read poses, points and masks.
 
-        Raises InputError if a file of the reconstruction is damaged, an image is listed twice, or photographs are absent
-        (with `options.missing == "drop"`: if all are).
+        Raises InputError if a file of the reconstruction is damaged, an image is listed twice, or
+        photographs are absent (with `options.missing == "drop"`: if all are).
         """
         with guarding(folder, CAPTURE):
             return self._read(folder, options)
@@ -62,7 +63,8 @@ class ColmapReader:
 
 
 def _check_whole(folder: Path, place: Path, images: str) -> None:
-    """Raise InputError if `folder` is the reconstruction itself, not the folder that contains it and the photographs."""
+    """Raise InputError if `folder` is the reconstruction itself, not the folder that contains it
+    and the photographs."""
     above = next((p for p in (folder.absolute().parent, folder.absolute().parent.parent) if (p / images).is_dir()), None)
     if not (folder / images).is_dir() and above is not None and place.samefile(folder):
         raise InputError(

@@ -1,8 +1,10 @@
-"""Reads and writes COLMAP reconstructions, binary and text, with numpy only. 2D tracks are read but not written.
+"""Reads and writes COLMAP reconstructions, binary and text, with numpy only. 2D tracks are read but
+not written.
 
-Binary layouts are little endian. cameras: u64 count, then i32 id, i32 model, u64 width, u64 height, f64 parameters. images: u64 count, then
-i32 id, f64 quaternion (wxyz), f64 translation (world to camera), i32 camera, zero-terminated name, u64 n, n x (f64 x, f64 y, i64 point).
-points3D: u64 count, then u64 id, f64 xyz, u8 rgb, f64 error, u64 n, n x (i32 image, i32 index).
+Binary layouts are little endian. cameras: u64 count, then i32 id, i32 model, u64 width, u64 height,
+f64 parameters. images: u64 count, then i32 id, f64 quaternion (wxyz), f64 translation (world to
+camera), i32 camera, zero-terminated name, u64 n, n x (f64 x, f64 y, i64 point). points3D: u64
+count, then u64 id, f64 xyz, u8 rgb, f64 error, u64 n, n x (i32 image, i32 index).
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """A registered image: world-to-camera quaternion (w, x, y, z) and translation, and the id of its camera."""
+    """A registered image: world-to-camera quaternion (w, x, y, z) and translation, and the id of
+    its camera."""
 
     id: int
     name: str
@@ -69,7 +72,8 @@ class Model:
 def find_model(root: Path) -> Path | None:
     """Return the folder of the reconstruction in `root`, or None.
 
-    It is the first of sparse/0, sparse, colmap/sparse/0, colmap/sparse and `root` itself that holds a file of a reconstruction.
+    It is the first of sparse/0, sparse, colmap/sparse/0, colmap/sparse and `root` itself that holds
+    a file of a reconstruction.
     """
     for name in ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "."):
         folder = root / name
@@ -82,8 +86,8 @@ def read_model(folder: Path, observations: bool = False) -> Model:
     """Read the reconstruction in `folder`. Binary files take precedence over text files.
 
     Without a points3D file the model has no points. `observations` also reads the 2D tracks.
-    Raises InputError if a file is missing, truncated or malformed, if there are no cameras or images, and if an image has a
-    pose that is not finite or an unknown camera.
+    Raises InputError if a file is missing, truncated or malformed, if there are no cameras or
+    images, and if an image has a pose that is not finite or an unknown camera.
     """
     cameras_file, images_file, points_file = (_pick_file(folder, name) for name in ("cameras", "images", "points3D"))
     for name, found in (("cameras", cameras_file), ("images", images_file)):
@@ -136,7 +140,8 @@ def _check_images(images: tuple[ColmapImage, ...], cameras: dict[int, Lens], pat
 
 
 class _Bytes:
-    """A cursor over the bytes of a file. Reading past the end raises an InputError that names the file."""
+    """A cursor over the bytes of a file. Reading past the end raises an InputError that names the
+    file."""
 
     def __init__(self, source: Source, smallest: int) -> None:
         self.path, self.data, self.at = source.path, source.read(), 0
@@ -283,7 +288,8 @@ def _read_points_txt(source: Source) -> NDArray:
 
 
 def write_model(folder: Path, model: Model, text: bool = False) -> None:
-    """Write `model` to `folder` in COLMAP's format, binary by default. 2D tracks, which training does not use, are not written."""
+    """Write `model` to `folder` in COLMAP's format, binary by default. 2D tracks, which training
+    does not use, are not written."""
     kind, make = (".txt", _to_text) if text else (".bin", _to_binary)
     for name, data in make(model).items():
         write_bytes(folder / f"{name}{kind}", data)

@@ -24,10 +24,11 @@ class NerfstudioReader:
         return (folder / "transforms.json").is_file()
 
     def read(self, folder: Path, options: ReadOptions) -> RawCapture:
-        """Read poses, masks, points and the test views that `test_filenames`, or without it `val_filenames`, names.
+        """Read poses, masks, points and the test views that `test_filenames`, or without it
+        `val_filenames`, names.
 
-        `options.images` replaces the first folder of every file path. Frames without an image are dropped with a warning; names of
-        no frame and absent masks get one too.
+        `options.images` replaces the first folder of every file path. Frames without an image are
+        dropped with a warning; names of no frame and absent masks get one too.
         Raises InputError if a file is damaged or no frame is left.
         """
         with guarding(folder, CAPTURE):
@@ -61,10 +62,11 @@ class NerfstudioReader:
 
 
 def _held_out(meta: dict[str, Any], path: Path, warnings: list[str]) -> set[PurePosixPath]:
-    """Return the file paths of the frames that are held out: those of test_filenames, else of val_filenames.
+    """Return the file paths of the frames that are held out: those of test_filenames, else of
+    val_filenames.
 
-    Adds warnings about names of no frame, about validation frames beside test frames, and about frames that train_filenames does not
-    name. Raises InputError for what is no list.
+    Adds warnings about names of no frame, about validation frames beside test frames, and about
+    frames that train_filenames does not name. Raises InputError for what is no list.
     """
     train, test, val = (_read_names(meta, f"{part}_filenames", path) for part in ("train", "test", "val"))
     key, held = ("test_filenames", test) if test or not val else ("val_filenames", val)

@@ -1,4 +1,5 @@
-"""Reads point clouds from PLY files: positions and colours, in the three encodings of the format."""
+"""Reads point clouds from PLY files: positions and colours, in the three encodings of the
+format."""
 
 from __future__ import annotations
 
@@ -14,12 +15,15 @@ from scene_experts.core.reading.vertices import read_header, read_table
 
 
 def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return xyz [P, 3] float64 and rgb [P, 3] uint8 of the vertices in `path`. Without colours, rgb is 128 (grey).
+    """Return xyz [P, 3] float64 and rgb [P, 3] uint8 of the vertices in `path`. Without colours,
+    rgb is 128 (grey).
 
-    Colours are 0 to 255, floats in [0, 1], or 0 to 65535 of 16 bits; the largest value of the file tells which.
+    Colours are 0 to 255, floats in [0, 1], or 0 to 65535 of 16 bits; the largest value of the file
+    tells which.
 
-    Raises InputError if the file is not a PLY file whose first element is `vertex` without list properties, is truncated, or has
-    colours that are not finite. Points without a usable position are dropped with a warning.
+    Raises InputError if the file is not a PLY file whose first element is `vertex` without list
+    properties, is truncated, or has colours that are not finite. Points without a usable position
+    are dropped with a warning.
     """
     with opening(path, POINTS) as source:
         header = read_header(source)

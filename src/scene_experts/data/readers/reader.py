@@ -40,7 +40,8 @@ class PosedImage:
 class RawCapture:
     """A capture as its files state it, before it is split, scaled or normalised.
 
-    The defaults of the last fields fit a format that states neither a split nor the place of the scene.
+    The defaults of the last fields fit a format that states neither a split nor the place of the
+    scene.
     """
 
     images: list[PosedImage]
@@ -53,7 +54,8 @@ class RawCapture:
 
 
 class Reader(Protocol):
-    """Reads one kind of capture. A module-level object or an instance of a class can be a reader."""
+    """Reads one kind of capture. A module-level object or an instance of a class can be a
+    reader."""
 
     @property
     def name(self) -> str:
@@ -62,11 +64,13 @@ class Reader(Protocol):
 
     @property
     def files(self) -> str:
-        """The files by which a user recognises the kind, for error messages, e.g. "transforms.json"."""
+        """The files by which a user recognises the kind, for error messages, e.g.
+        "transforms.json"."""
         ...
 
     def recognise(self, folder: Path) -> bool:
-        """Return whether `folder` holds a capture of this kind. It must be fast and must not raise for unreadable content."""
+        """Return whether `folder` holds a capture of this kind. It must be fast and must not raise
+        for unreadable content."""
         ...
 
     def read(self, folder: Path, options: ReadOptions) -> RawCapture:

@@ -1,7 +1,7 @@
 """Reads the frames of transforms*.json, which NeRF-synthetic and nerfstudio captures share.
 
-`transform_matrix` maps the camera to the world with OpenGL axes (y up, looking along -z). Its second and third columns are
-negated to obtain OpenCV axes.
+`transform_matrix` maps the camera to the world with OpenGL axes (y up, looking along -z). Its
+second and third columns are negated to obtain OpenCV axes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ _MODELS = ("OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL",
 
 
 def read_meta(path: Path) -> dict[str, Any]:
-    """Read the JSON object in `path`. Raises InputError if it has no list of frames, or if the list is empty."""
+    """Read the JSON object in `path`. Raises InputError if it has no list of frames, or if the list
+    is empty."""
     meta = read_json(path, "list of camera poses")
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not all(isinstance(f, dict) for f in meta["frames"]):
         raise InputError(f"expected an object with a list of frames in {path}, found something else; restore the file")
@@ -52,7 +53,8 @@ def read_file_path(frame: dict[str, Any], index: int, path: Path) -> str:
 
 
 def read_angle(meta: dict[str, Any], frame: dict[str, Any], path: Path, axis: str = "x") -> float:
-    """Return the field of view along an axis, in radians, of a frame without a focal length. Raises InputError if it has neither."""
+    """Return the field of view along an axis, in radians, of a frame without a focal length. Raises
+    InputError if it has neither."""
     angle = {**meta, **frame}.get(f"camera_angle_{axis}")
     if not isinstance(angle, (int, float)) or not 1e-6 < angle < math.pi - 1e-6:
         raise InputError(
@@ -62,14 +64,16 @@ def read_angle(meta: dict[str, Any], frame: dict[str, Any], path: Path, axis: st
 
 
 def to_pure(name: str) -> PurePosixPath:
-    """Return the path that a name in the file stands for: "./a/b" and "a\\b" are the same as "a/b"."""
+    """Return the path that a name in the file stands for: "./a/b" and "a\\b" are the same as
+    "a/b"."""
     return PurePosixPath(name.replace("\\", "/"))
 
 
 def find_image(root: Path, file_path: str, images: str | None) -> tuple[str, Path | None]:
     """Return the name of a view and its file, or None instead of the file if it is absent.
 
-    A path without an extension matches an image with any known extension. `images` replaces the first folder of the path.
+    A path without an extension matches an image with any known extension. `images` replaces the
+    first folder of the path.
     """
     parts = list(to_pure(file_path).parts)
     if images is not None:
@@ -123,11 +127,13 @@ def read_pose(frame: dict[str, Any], path: Path) -> NDArray[np.float64]:
 
 
 def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path, image: Path | None) -> Lens | None:
-    """Return the lens of a frame, or None if only the field of view is given. Values of the frame override shared ones.
+    """Return the lens of a frame, or None if only the field of view is given. Values of the frame
+    override shared ones.
 
-    Without a focal length, the field of view gives it; `image` gives the size where w and h are absent. `is_fisheye`
-    (instant-ngp) stands for a camera model. Raises InputError for an unsupported camera model, for values that are not numbers, and for
-    k4 without k5 and k6 outside a fisheye and FULL_OPENCV: nerfstudio multiplies by its term, OpenCV divides by it.
+    Without a focal length, the field of view gives it; `image` gives the size where w and h are
+    absent. `is_fisheye` (instant-ngp) stands for a camera model. Raises InputError for an
+    unsupported camera model, for values that are not numbers, and for k4 without k5 and k6 outside
+    a fisheye and FULL_OPENCV: nerfstudio multiplies by its term, OpenCV divides by it.
     """
     both = {**meta, **frame}
     model = str(both.get("camera_model", "OPENCV_FISHEYE" if both.get("is_fisheye") is True else "OPENCV")).upper()
@@ -168,7 +174,8 @@ def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path, image: Pa
 
 
 def read_points(root: Path, named: object) -> Points | None:
-    """Read the points from the PLY file `named`, or from a file with a usual name. Returns None if there are no points.
+    """Read the points from the PLY file `named`, or from a file with a usual name. Returns None if
+    there are no points.
 
     Raises InputError if the named file is absent or the file is damaged.
     """

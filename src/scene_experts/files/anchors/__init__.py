@@ -1,7 +1,7 @@
 """The result folder of Scaffold-GS, with its networks.
 
-This module states the files of scenes of anchors: this folder (`write`, `read`) and the compact file
-(`compact`).
+This module states the files of scenes of anchors: this folder (`write`, `read`) and the compact
+file (`compact`).
 """
 
 from __future__ import annotations

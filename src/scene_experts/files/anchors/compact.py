@@ -66,7 +66,8 @@ class Sizes:
 
 
 def write(path: Path, data: AnchorData, note: dict[str, Any], coding: Coding = Coding()) -> Sizes:
-    """Write a scene to one file, atomically. The note has no place in it: the description says more.
+    """Write a scene to one file, atomically. The note has no place in it: the description says
+    more.
 
     Raises InputError for anchors on no lattice or on several, for values that are not finite, and
     for cells that span more than 2^21 voxels; RunError when the disk is full.

@@ -17,7 +17,8 @@ Network = dict[str, Tensor]
 experts; with a router router_w [E, F] and router_b [E]; with more than two layers (E = 1)
 middle.i.weight [H, H] and middle.i.bias [H]."""
 FILE_NAMES = {"router_w": "router.weight", "router_b": "router.bias", **{name: f"experts.{name}" for name in ("w1", "b1", "w2", "b2")}}
-"""Short name of a network's tensor -> its name in files. Other tensors have the same name in both."""
+"""Short name of a network's tensor -> its name in files. Other tensors have the same name in
+both."""
 _SHORT_NAMES = {long: short for short, long in FILE_NAMES.items()}
 
 
@@ -50,8 +51,8 @@ class AnchorData:
     """cfg_args of a result folder."""
 
     def checked(self) -> AnchorData:
-        """This scene. Raises Damaged for values of anchors and networks that are not finite or that no computation in float32 can
-        bear."""
+        """This scene. Raises Damaged for values of anchors and networks that are not finite or that
+        no computation in float32 can bear."""
         expect_range(self.columns["xyz"], "positions", -FARTHEST, FARTHEST)
         expect_range(self.columns["log_scaling"], "logarithms of scales", -LARGEST, LARGEST_LOG)
         if "interval" in self.columns:

@@ -89,7 +89,8 @@ def meta_of(data: AnchorData, capture: Capture) -> dict[str, Any]:
     """The values of `Scene.meta` that a result implies with its capture: levels of detail, and the
     views of appearance codes.
 
-    Raises InputError where the capture has another number of training views than the result has codes.
+    Raises InputError where the capture has another number of training views than the result has
+    codes.
     """
     out: dict[str, Any] = {}
     if "level" in data.columns:

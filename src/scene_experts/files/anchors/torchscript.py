@@ -75,7 +75,8 @@ def _save_trace(path: Path, module: nn.Module, example: Tensor) -> None:
 
 
 def _linear_layers(network: Network) -> list[tuple[Tensor, Tensor]]:
-    """(weight, bias) of the linear layers of a single network, first to last, float32 on the CPU."""
+    """(weight, bias) of the linear layers of a single network, first to last, float32 on the
+    CPU."""
     depth = sum(re.fullmatch(r"middle\.\d+\.weight", name) is not None for name in network)
     pairs = [(network["w1"][0], network["b1"][0])]
     pairs += [(network[f"middle.{i}.weight"], network[f"middle.{i}.bias"]) for i in range(depth)]

@@ -173,7 +173,8 @@ def write(run: OpenRun, world: World, folder: Path, about: dict[str, Any]) -> di
 
 
 def is_plain(networks: dict[str, Tensor]) -> bool:
-    """Whether every attribute has a single network, as in Scaffold-GS. networks: by name in files."""
+    """Whether every attribute has a single network, as in Scaffold-GS. networks: by name in
+    files."""
     return all(len(networks[f"{a}.experts.w1"]) == 1 and f"{a}.router.weight" not in networks for a in ATTRIBUTES)
 
 
@@ -200,7 +201,8 @@ def vertices(data: AnchorData) -> Columns:
 
 
 def pack_slots(slots: Tensor) -> Tensor:
-    """Masks [N, K] bool as whole numbers [N, ceil(K / 16)] float32; bit i of number j is slot 16 j + i."""
+    """Masks [N, K] bool as whole numbers [N, ceil(K / 16)] float32; bit i of number j is slot 16 j
+    + i."""
     groups = torch.nn.functional.pad(slots, (0, -slots.shape[1] % SLOT_BITS)).view(len(slots), -1, SLOT_BITS)
     return (groups.long() << torch.arange(SLOT_BITS)).sum(2).float()
 

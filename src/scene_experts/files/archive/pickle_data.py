@@ -65,8 +65,8 @@ _FIXED = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
 def decode(data: bytes) -> Any:
-    """The value of a pickle as dicts, lists, tuples, numbers and texts, with `ObjectRecord`, `Global` and
-    `Outside` for the rest.
+    """The value of a pickle as dicts, lists, tuples, numbers and texts, with `ObjectRecord`,
+    `Global` and `Outside` for the rest.
 
     Raises NotData.
     """
@@ -88,9 +88,11 @@ def decode(data: bytes) -> Any:
 
 
 class _Machine:
-    """The stack and memo of the decoder. `deep` has the nesting of every value on the stack, `marks` the places of the marks.
+    """The stack and memo of the decoder. `deep` has the nesting of every value on the stack,
+    `marks` the places of the marks.
 
-    Values are nested at most DEPTH_LIMIT deep, because Python hashes, compares and prints nested values by recursion.
+    Values are nested at most DEPTH_LIMIT deep, because Python hashes, compares and prints nested
+    values by recursion.
     """
 
     def __init__(self) -> None:

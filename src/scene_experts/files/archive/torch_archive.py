@@ -38,7 +38,8 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     """Every tensor of the file by its dotted place (`0.weight`, `opacity_mlp.0.weight`), on the CPU
     in the file's own dtype.
 
-    Raises InputError: absent, not such an archive, damaged, or naming anything that is not tensor data.
+    Raises InputError: absent, not such an archive, damaged, or naming anything that is not tensor
+    data.
     """
     with opening(path, NETWORK) as source:
         try:

@@ -63,7 +63,8 @@ class Baked:
     closed_form: GaussianScene
     """The same before its refinement."""
     about: dict[str, Any]
-    """How it was baked, as JSON values: all settings, and how many Gaussians contributed to any view."""
+    """How it was baked, as JSON values: all settings, and how many Gaussians contributed to any
+    view."""
 
 
 def bake(run: OpenRun, capture: Capture, how: Bake, rasterize: Rasterizer | None, tell: Tell) -> Baked:

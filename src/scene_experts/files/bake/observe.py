@@ -37,7 +37,8 @@ class Sums:
     of_views: tuple[Tensor, ...]  # contributions [M] of each view's Gaussians, in the order of drawing
 
     def opacity(self) -> Tensor:
-        """Mean opacity [S] in [0, 1] over the views that drew the slot, weighted by potential contribution."""
+        """Mean opacity [S] in [0, 1] over the views that drew the slot, weighted by potential
+        contribution."""
         return (self.weight / self.potential.clamp_min(1e-12)).clamp(0, 1)
 
 
@@ -52,7 +53,8 @@ def contributions(gaussians: Gaussians, camera: Camera, rasterize: Rasterizer) -
 
 @torch.no_grad()
 def sum_views(painter: Painter, slots: int, cameras: Sequence[Camera], tell: Tell) -> Sums:
-    """Sums over the pictures of `cameras`. slots: rows of the scene's table times Gaussians per row."""
+    """Sums over the pictures of `cameras`. slots: rows of the scene's table times Gaussians per
+    row."""
     total, of_views = torch.zeros(slots, 12), []  # weight, potential, means, log-scales, quaternions
     for i, camera in enumerate(cameras):
         g = painter.gaussians(camera)

@@ -62,7 +62,8 @@ class Views:
         return replace(first, world_to_cam=make_pose(place, quat_to_matrix(turned)).to(first.world_to_cam.dtype))
 
     def _three(self, generator: torch.Generator) -> tuple[int, list[int]]:
-        """A training view and two of its neighbours; the view itself takes the place of missing ones."""
+        """A training view and two of its neighbours; the view itself takes the place of missing
+        ones."""
         first = int(torch.randint(len(self.cameras), (1,), generator=generator))
         near = self.near[first]
         others = near[torch.randperm(len(near), generator=generator)[:2]].tolist()

@@ -85,8 +85,8 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of all primitives with the extension, together. Transforms of nodes are not applied, and colours of another space
-    are not converted; a warning tells of them.
+    """The Gaussians of all primitives with the extension, together. Transforms of nodes are not
+    applied, and colours of another space are not converted; a warning tells of them.
 
     Raises InputError for damaged files and for files without such a primitive.
     """
@@ -113,7 +113,8 @@ def read(path: Path) -> Splats:
 
 
 def _has_transforms(scene: dict[str, Any]) -> bool:
-    """Whether a node with Gaussians, or a node above one, has a transform other than the identity."""
+    """Whether a node with Gaussians, or a node above one, has a transform other than the
+    identity."""
     nodes, meshes = scene.get("nodes", []), scene["meshes"]
     above = {child: i for i, node in enumerate(nodes) for child in node.get("children", [])}
     waiting = {i for i, node in enumerate(nodes) if "mesh" in node and _has_gaussians(meshes[node["mesh"]])}

@@ -1,11 +1,11 @@
 """A page that shows the scene in any browser, opened from disk; it fetches nothing.
 
 Renderer, scene and start pose are in one file. The renderer is Spark on three.js (MIT), bundled by
-tools/viewer; the scene is an SPZ file in base64, in a unit that suits its sizes. The note may set the start: `camera`, an entry as
-in cameras.json (position, rotation as rows of the 3x3 camera-to-world matrix, and fov in degrees or
-fy and height; width is optional), `cameras`, a list of such entries to step through, `flight`,
-a closed path of such entries, `background` (RGB in [0, 1]),
-`antialias` and `title`.
+tools/viewer; the scene is an SPZ file in base64, in a unit that suits its sizes. The note may set
+the start: `camera`, an entry as in cameras.json (position, rotation as rows of the 3x3
+camera-to-world matrix, and fov in degrees or fy and height; width is optional), `cameras`, a list
+of such entries to step through, `flight`, a closed path of such entries, `background` (RGB in [0,
+1]), `antialias` and `title`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ Pose = dict[str, Any]
 
 
 def write(path: Path, splats: Splats, note: dict[str, Any]) -> str | None:
-    """Write the page. Returns a warning about sizes that it cannot hold, or None. Raises InputError for invalid cameras in the note."""
+    """Write the page. Returns a warning about sizes that it cannot hold, or None. Raises InputError
+    for invalid cameras in the note."""
     settings, scene = page_settings(splats, note), scaled(splats, unit_of(splats))
     code = (ASSETS / "viewer.min.js.gz").read_bytes()
     page = Template((ASSETS / "page.html").read_text()).substitute(
@@ -82,8 +83,9 @@ def read(path: Path) -> Splats:
 
 
 def unit_of(splats: Splats) -> float:
-    """The factor by which the page multiplies lengths: 1 where SPZ holds every size and position, else the power of two that
-    brings the median size to the middle of its range, without a position beyond it."""
+    """The factor by which the page multiplies lengths: 1 where SPZ holds every size and position,
+    else the power of two that brings the median size to the middle of its range, without a position
+    beyond it."""
     reach = float(splats.means.abs().max()) if len(splats) else 0.0
     if reach < FARTHEST and not out_of_range(splats).any():
         return 1.0
@@ -93,7 +95,8 @@ def unit_of(splats: Splats) -> float:
 
 
 def is_antialiased(path: Path) -> bool:
-    """Whether the settings of a page say that it is drawn with antialiasing. Raises InputError for damaged settings."""
+    """Whether the settings of a page say that it is drawn with antialiasing. Raises InputError for
+    damaged settings."""
     with opening(path, budget.HTML) as source:
         return _settings(source.read()).get("antialias") is True
 

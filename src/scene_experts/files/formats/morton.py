@@ -1,4 +1,5 @@
-"""The Morton curve: keys that interleave the bits of the axes, so that near cells have near keys."""
+"""The Morton curve: keys that interleave the bits of the axes, so that near cells have near
+keys."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ _SPREAD = (  # (shift, mask): two zeros between every two bits of a 21-bit numbe
 
 
 def morton(cells: NDArray[np.int64]) -> Keys:
-    """Keys [N] of cells [N, 3], each coordinate in [0, 2^21); x is the lowest of each three bits."""
+    """Keys [N] of cells [N, 3], each coordinate in [0, 2^21); x is the lowest of each three
+    bits."""
     out = np.zeros(len(cells), np.uint64)
     for axis in range(3):
         value = cells[:, axis].astype(np.uint64)

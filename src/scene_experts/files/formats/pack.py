@@ -35,7 +35,8 @@ _PARITY = (  # how often x, y, z occur in each harmonic, by coefficient: (odd x,
 
 
 def check_count(source: Source, count: int, bytes_each: int) -> None:
-    """Raise Damaged where a file declares more Gaussians than are read, or more than its size can honestly unpack to.
+    """Raise Damaged where a file declares more Gaussians than are read, or more than its size can
+    honestly unpack to.
 
     bytes_each: what a Gaussian takes in memory while it is decoded.
     """
@@ -47,7 +48,8 @@ def check_count(source: Source, count: int, bytes_each: int) -> None:
 
 
 def decoded_bytes(degree: int) -> int:
-    """Bytes that a Gaussian takes while it is decoded in float64: position, scale, rotation, opacity and harmonics."""
+    """Bytes that a Gaussian takes while it is decoded in float64: position, scale, rotation,
+    opacity and harmonics."""
     return 8 * (11 + 3 * (degree + 1) ** 2)
 
 
@@ -116,8 +118,9 @@ def turn(splats: Splats, axis: Literal["x", "z"]) -> Splats:
 
 
 def flip(splats: Splats, signs: tuple[int, int, int], reuse: bool = False) -> Splats:
-    """The Gaussians in a frame whose axes x, y, z are these signs (1 or -1) times the old ones. Applied twice it changes nothing.
-    Scales keep their axes. reuse: write the harmonics, most of the memory, over those of `splats`."""
+    """The Gaussians in a frame whose axes x, y, z are these signs (1 or -1) times the old ones.
+    Applied twice it changes nothing. Scales keep their axes. reuse: write the harmonics, most of
+    the memory, over those of `splats`."""
     x, y, z = signs
     parities = np.prod(np.where(np.array(_PARITY[: splats.sh.shape[1]]) == 1, np.array(signs), 1), axis=1)
     factors = torch.from_numpy(parities).float()[:, None]
@@ -144,6 +147,7 @@ def scaled(splats: Splats, factor: float) -> Splats:
 
 
 def tensor(values: NDArray[Any]) -> torch.Tensor:
-    """A float32 tensor with memory of its own. Numbers beyond float32 become infinite, which readers refuse."""
+    """A float32 tensor with memory of its own. Numbers beyond float32 become infinite, which
+    readers refuse."""
     with np.errstate(over="ignore"):
         return torch.from_numpy(np.array(values, dtype=np.float32, order="C"))

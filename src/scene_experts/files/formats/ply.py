@@ -113,7 +113,8 @@ def note_comments(note: Mapping[str, Any]) -> list[str]:
     """The comment lines of a note on how a file was made: "scene-experts {...}" in JSON and ASCII,
     or none for an empty note.
 
-    The longest entries are left out until the line has at most 64 KiB, and `antialias` where it is false.
+    The longest entries are left out until the line has at most 64 KiB, and `antialias` where it is
+    false.
     """
     kept = {name: value for name, value in note.items() if name != "antialias" or value}
     text = json.dumps(kept, allow_nan=False, default=str)
@@ -172,8 +173,9 @@ def write(path: Path, splats: Splats, note: Mapping[str, Any], normals: bool = T
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of 3DGS's file. The smoothing filter of Mip-Splatting is not applied; a warning tells of it. Raises InputError
-    for other or damaged files, and for anchors, whose networks are elsewhere."""
+    """The Gaussians of 3DGS's file. The smoothing filter of Mip-Splatting is not applied; a warning
+    tells of it. Raises InputError for other or damaged files, and for anchors, whose networks are
+    elsewhere."""
     columns = read_vertices(path)
     if "f_offset_0" in columns:
         raise InputError(

@@ -56,7 +56,8 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)  # a fixed date: equal scenes give equal bytes
 
 
 def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
-    """Write the file; the note goes into the asset entry of meta.json, its entry `antialias` into that of the format."""
+    """Write the file; the note goes into the asset entry of meta.json, its entry `antialias` into
+    that of the format."""
     write_bytes(path, sog_bytes(splats, note))
 
 
@@ -110,7 +111,8 @@ def read(path: Path) -> Splats:
 
 
 def is_antialiased(path: Path) -> bool:
-    """Whether a file says that it is drawn with antialiasing. Raises InputError for a damaged file."""
+    """Whether a file says that it is drawn with antialiasing. Raises InputError for a damaged
+    file."""
     with opening(path, budget.SOG) as source, open_zip(source) as archive:
         return parse_json(archive.read("meta.json", _META_LIMIT)).get("antialias") is True
 

@@ -37,7 +37,8 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of a file, of degree 0. Raises InputError for a size or values that no such file has."""
+    """The Gaussians of a file, of degree 0. Raises InputError for a size or values that no such
+    file has."""
     with opening(path, budget.SPLAT) as source:
         data = source.read()
         if len(data) % ROW.itemsize:

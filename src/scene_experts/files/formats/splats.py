@@ -64,8 +64,8 @@ class Splats:
                 raise InputError(f"expected finite {name} in {where}, found {bad:,} Gaussians with others; make it again")
 
     def checked(self, where: Path) -> Splats:
-        """These Gaussians. Raises InputError, naming the file `where`, for values that are not finite, and Damaged for positions
-        and scales that no computation in float32 can bear."""
+        """These Gaussians. Raises InputError, naming the file `where`, for values that are not
+        finite, and Damaged for positions and scales that no computation in float32 can bear."""
         self.expect_finite(str(where))
         expect_range(self.means, "positions", -FARTHEST, FARTHEST)
         expect_range(self.log_scales, "logarithms of scales", -LARGEST, LARGEST_LOG)

@@ -4,8 +4,8 @@ It is written as version 3 (one gzip stream, which every reader accepts) and rea
 (4 needs `zstandard`). The file stores one attribute after the other: positions in 24-bit fixed
 point, opacity, colour, log scale (steps of 1/16 from -10), rotation (the smallest three components,
 10 bits each), and harmonics over [-1, 1]. The frame is x right, y up, z back: half a turn about x
-from ours. Files of other programs may hold further records (type, length, content). The one that names another frame is
-followed, others are passed over.
+from ours. Files of other programs may hold further records (type, length, content). The one that
+names another frame is followed, others are passed over.
 """
 
 from __future__ import annotations
@@ -62,14 +62,16 @@ FARTHEST = 1 << 22  # units; positions must be nearer
 
 
 def write(path: Path, splats: Splats, note: dict[str, Any]) -> str | None:
-    """Write version 3. Of the note it stores `antialias` only. Returns a warning about sizes that the format cannot hold, or None."""
+    """Write version 3. Of the note it stores `antialias` only. Returns a warning about sizes that
+    the format cannot hold, or None."""
     write_bytes(path, spz_bytes(splats, antialias=bool(note.get("antialias", False))))
     return size_warning(splats)
 
 
 def out_of_range(splats: Splats) -> Tensor:
-    """Which Gaussians [N] have a wrong size in the file: an axis longer than the longest that it holds, or all shorter than the
-    shortest. A single short axis is harmless: such a Gaussian stays flat."""
+    """Which Gaussians [N] have a wrong size in the file: an axis longer than the longest that it
+    holds, or all shorter than the shortest. A single short axis is harmless: such a Gaussian stays
+    flat."""
     longest, (low, high), half_step = splats.log_scales.amax(1), _LOG_SCALES, 1 / 32
     return (longest > high + half_step) | (longest < low - half_step)
 
@@ -164,9 +166,11 @@ def _sizes(version: int, n: int, degree: int) -> dict[str, int]:
 
 
 def _signs(records: bytes) -> tuple[int, int, int]:
-    """The signs of our axes in the frame that the records name. Raises Damaged for a frame whose axes are in another order.
+    """The signs of our axes in the frame that the records name. Raises Damaged for a frame whose
+    axes are in another order.
 
-    Frame n is 1 + 1 (x right, else left) + 2 (y up, else down) + 4 (z forward, else back); 0 says nothing.
+    Frame n is 1 + 1 (x right, else left) + 2 (y up, else down) + 4 (z forward, else back); 0 says
+    nothing.
     """
     at = 0
     while at + 8 <= len(records):
@@ -200,7 +204,8 @@ def _streams_gzip(data: bytes, source: Source) -> tuple[int, int, int, int, byte
 
 
 def _streams_v4(data: bytes, source: Source) -> tuple[int, int, int, int, bytes, dict[str, Bytes]]:
-    """The same for version 4: a plain header, the records, a table of sizes, and one zstd stream per attribute."""
+    """The same for version 4: a plain header, the records, a table of sizes, and one zstd stream
+    per attribute."""
     try:
         import zstandard
     except ImportError:
@@ -228,7 +233,8 @@ def _streams_v4(data: bytes, source: Source) -> tuple[int, int, int, int, bytes,
 
 
 def _unpack_zstd(zstandard: Any, part: bytes, size: int) -> bytes:
-    """The `size` bytes of a zstd frame. Raises Damaged for a frame that declares or holds another number, and for a huge window."""
+    """The `size` bytes of a zstd frame. Raises Damaged for a frame that declares or holds another
+    number, and for a huge window."""
     if not part and not size:
         return b""
     if zstandard.frame_content_size(part) != size:

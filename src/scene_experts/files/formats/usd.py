@@ -1,8 +1,9 @@
 """OpenUSD's ParticleField3DGaussianSplat, exact; needs usd-core 26.3 or newer.
 
-Scales and opacities are stored directly (no logarithms or logits), harmonics in the order of 3DGS. +Y is up: half a turn about x
-from ours, so a USD camera without a transform looks the way ours does. A name that ends in .usda gets the text form, others the binary
-one. usd-core runs in a process of its own (`usd_worker.py`).
+Scales and opacities are stored directly (no logarithms or logits), harmonics in the order of 3DGS.
++Y is up: half a turn about x from ours, so a USD camera without a transform looks the way ours
+does. A name that ends in .usda gets the text form, others the binary one. usd-core runs in a
+process of its own (`usd_worker.py`).
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ _STARTING = 60  # seconds that usd-core may take to start on a busy machine, bes
 
 
 def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
-    """Write the file; the note goes into customLayerData. Raises InputError without usd-core, RunError where it fails."""
+    """Write the file; the note goes into customLayerData. Raises InputError without usd-core,
+    RunError where it fails."""
     expect_library()
     s = turn(splats, "x")
     arrays = {
@@ -71,8 +73,8 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of all prims of the kind, together. Transforms of prims are not applied, and y is taken as up; a warning tells
-    where that is wrong. Other files are not opened.
+    """The Gaussians of all prims of the kind, together. Transforms of prims are not applied, and y
+    is taken as up; a warning tells where that is wrong. Other files are not opened.
 
     Raises InputError for damaged files, for files without such a prim, and without usd-core.
     """
@@ -126,7 +128,8 @@ def _prim(source: Source, data: Any, number: int) -> tuple[Floats, ...]:
 
 
 def _work(task: str, source: Path, target: Path, seconds: int, *limits: str) -> subprocess.CompletedProcess[str]:
-    """Run the worker. Raises InputError for a usd-core that is too old, and Damaged after `seconds`."""
+    """Run the worker. Raises InputError for a usd-core that is too old, and Damaged after
+    `seconds`."""
     roots = [str(folder.parent) for folder in package_folders()]
     paths = os.pathsep.join([*roots, *filter(None, [os.environ.get("PYTHONPATH")])])
     command = [sys.executable, "-m", "scene_experts.files.formats.usd_worker", task, str(source), str(target), *limits]

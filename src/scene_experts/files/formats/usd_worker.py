@@ -1,8 +1,9 @@
 """Write and read OpenUSD files in a process of its own: only this module imports usd-core.
 
-`usd.py` starts it as `python -m scene_experts.files.formats.usd_worker write|read SOURCE TARGET [MEMORY SECONDS]`. Arrays travel as NumPy
-archives. usd-core is compiled code that damaged files can crash; its process takes the crash, and is held to the limits of memory in
-bytes and of processor time in seconds. No layer but the given one is opened: references to other files are not followed.
+`usd.py` starts it as `python -m scene_experts.files.formats.usd_worker write|read SOURCE TARGET
+[MEMORY SECONDS]`. Arrays travel as NumPy archives. usd-core is compiled code that damaged files can
+crash; its process takes the crash, and is held to the limits of memory in bytes and of processor
+time in seconds. No layer but the given one is opened: references to other files are not followed.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ WIDTHS = {"positions": 3, "scales": 3, "orientations": 4, "opacities": 1, COEFFI
 
 
 def write(source: Path, target: Path) -> None:
-    """Write the arrays of an archive as one prim: positions, scales [N, 3], orientations [N, 4] (x, y, z, w), opacities [N],
-    sh [N, C, 3], and note (JSON text)."""
+    """Write the arrays of an archive as one prim: positions, scales [N, 3], orientations [N, 4] (x,
+    y, z, w), opacities [N], sh [N, C, 3], and note (JSON text)."""
     sdf, usd, usd_geom, usd_vol, vt = map(_pxr, ("Sdf", "Usd", "UsdGeom", "UsdVol", "Vt"))
     with np.load(source) as data:
         arrays = {name: data[name] for name in data.files}
@@ -50,8 +51,9 @@ def write(source: Path, target: Path) -> None:
 
 
 def read(source: Path, target: Path) -> str | None:
-    """Write the arrays of all prims of the kind `KIND`, with names as in the file, numbered by prim, their `count`, whether a
-    transform moves one (`moved`), and the name of the axis that is up (`up`). Returns what is wrong, or None."""
+    """Write the arrays of all prims of the kind `KIND`, with names as in the file, numbered by
+    prim, their `count`, whether a transform moves one (`moved`), and the name of the axis that is
+    up (`up`). Returns what is wrong, or None."""
     sdf = _pxr("Sdf")
     layer = sdf.Layer.OpenAsAnonymous(str(source))
     if layer is None:
@@ -101,7 +103,8 @@ def _moves(spec: Any) -> bool:
 
 
 def _is_still(kind: str, value: Any) -> bool:
-    """Whether an operation on the frame of a prim (`translate`, `rotateXYZ`, `orient`, ...) changes nothing at this value."""
+    """Whether an operation on the frame of a prim (`translate`, `rotateXYZ`, `orient`, ...) changes
+    nothing at this value."""
     if value is None:  # values over time
         return False
     if kind == "orient":

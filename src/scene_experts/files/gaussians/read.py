@@ -45,9 +45,10 @@ def find(source: Path, iteration: int | None) -> Path | None:
 def read(source: Path, data: Data, iteration: int | None) -> Imported:
     """The run in a file of Gaussians, published or ours, in the frame and unit of the capture.
 
-    The recipe is 3DGS and the step 0, or `iteration`, unless the description or the name of its folder
-    says otherwise. Whether it is drawn with antialiasing, the description beside it (FILE.json) or the file
-    says. Raises InputError where the former says that the file is in another frame.
+    The recipe is 3DGS and the step 0, or `iteration`, unless the description or the name of its
+    folder says otherwise. Whether it is drawn with antialiasing, the description beside it
+    (FILE.json) or the file says. Raises InputError where the former says that the file is in
+    another frame.
     """
     antialias = is_antialiased(source)
     about = result_folder.read_description(source.parent) or {}
@@ -87,7 +88,8 @@ def read_splats(path: Path) -> Splats:
 
 
 def table_columns(splats: Splats, world: World) -> dict[str, Tensor]:
-    """The columns of a table of explicit Gaussians, trained world: the inverse of `write.splats_of`."""
+    """The columns of a table of explicit Gaussians, trained world: the inverse of
+    `write.splats_of`."""
     return {
         "means": world.from_input(splats.means.double()).float(),
         "log_scales": (splats.log_scales.double() + math.log(world.scale)).float(),

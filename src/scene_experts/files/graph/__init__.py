@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 
 class GraphFiles:
-    """See `registry.Family`. There is no file format with these contents beside the result folder."""
+    """See `registry.Family`. There is no file format with these contents beside the result
+    folder."""
 
     describe = staticmethod(writing.describe)
     contents = staticmethod(writing.contents)

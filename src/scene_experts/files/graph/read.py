@@ -77,7 +77,8 @@ def meta(about: dict[str, Any], world: World, voxel: float) -> dict[str, Any]:
 
 
 def rows(path: Path, world: World, voxel: float) -> dict[str, Tensor]:
-    """The columns of the table, in the trained world. Positions lie exactly on the lattice of half voxels.
+    """The columns of the table, in the trained world. Positions lie exactly on the lattice of half
+    voxels.
 
     Raises InputError for missing columns.
     """
@@ -99,7 +100,8 @@ def rows(path: Path, world: World, voxel: float) -> dict[str, Tensor]:
 
 
 def networks(path: Path, scale: float) -> dict[str, Tensor]:
-    """The networks for distances in trained units. Raises InputError for a missing or damaged file."""
+    """The networks for distances in trained units. Raises InputError for a missing or damaged
+    file."""
     if not path.is_file():
         raise InputError(f"expected the networks of the scene at {path}, found none; copy the whole folder")
     tensors, _ = read_tensors(path, KIND)

@@ -1,4 +1,5 @@
-"""Scenes of graph points to files: SAGS's PLY with the networks beside it, in the capture's own frame.
+"""Scenes of graph points to files: SAGS's PLY with the networks beside it, in the capture's own
+frame.
 
 From the trained world to the capture's frame, positions move and lengths scale: log-scalings, the
 distances that networks see, and the cube of the hash grid.

@@ -1,7 +1,9 @@
-"""Appearance codes: one learned vector per training view, for captures whose light or camera settings change.
+"""Appearance codes: one learned vector per training view, for captures whose light or camera
+settings change.
 
-The colour network receives the code. All anchors of a view share it, so it acts as a bias of the network's first layer. `fold` adds it
-to that bias, so kernels without support for codes decode these scenes too.
+The colour network receives the code. All anchors of a view share it, so it acts as a bias of the
+network's first layer. `fold` adds it to that bias, so kernels without support for codes decode
+these scenes too.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ from scene_experts.scene.anchors.mlp import HeadWeights
 class Codes(nn.Module):
     """One code per training view, initialized from a standard normal distribution (Scaffold-GS).
 
-    views: the training cameras' ids. Any other camera has the mean of all codes. `fitted` holds codes of other cameras, by id, that an
-    evaluation found; they are no part of the scene.
+    views: the training cameras' ids. Any other camera has the mean of all codes. `fitted` holds
+    codes of other cameras, by id, that an evaluation found; they are no part of the scene.
     """
 
     views: tuple[int, ...]
@@ -49,6 +51,7 @@ class Codes(nn.Module):
 
 
 def fold(weights: HeadWeights, code: Tensor) -> HeadWeights:
-    """Fold the code [dim], the last inputs of w1, into the first bias: w1 [x, code] + b1 = w1' x + b1'."""
+    """Fold the code [dim], the last inputs of w1, into the first bias: w1 [x, code] + b1 = w1' x +
+    b1'."""
     D = weights.w1.shape[2] - len(code)
     return replace(weights, w1=weights.w1[:, :, :D], b1=weights.b1 + weights.w1[:, :, D:] @ code)

@@ -1,8 +1,11 @@
-"""The mixture of experts of the paper (section 3.2): dense mixture, Top-k mixture, curriculum. `routers.py` has the routers.
+"""The mixture of experts of the paper (section 3.2): dense mixture, Top-k mixture, curriculum.
+`routers.py` has the routers.
 
-Symbols: A anchors, F feature size, D input size, E experts, k chosen experts. g are the gates, which depend only on the anchor.
+Symbols: A anchors, F feature size, D input size, E experts, k chosen experts. g are the gates,
+which depend only on the anchor.
     dense  (eq. 4)  y = sum_i g_i E_i(z)                          for the first `warmup` iterations
-    sparse (eq. 5)  y = sum_{i in Top-k} w_i E_i(z),  w_i = g_i / sum_{j in Top-k} g_j, the softmax over the k chosen logits
+    sparse (eq. 5)  y = sum_{i in Top-k} w_i E_i(z),  w_i = g_i / sum_{j in Top-k} g_j, the softmax
+    over the k chosen logits
 The load-balancing losses L_load^S and L_load^D (eq. 6, 7) are in `losses.py`.
 """
 
@@ -44,9 +47,9 @@ class Experts(Decoder):
     attributes: tuple[Attribute, ...] = ATTRIBUTES
     """Attributes that have experts. The others have one network."""
     expert_init: Annotated[Init, Needs(ROUTERS)] = "independent"
-    """independent: initialise each expert on its own. clone_jitter: copies of one network with small noise. variance:
-    independent, with the last layers times sqrt(num), so that the outputs of the dense mixture vary as much as those of one
-    network."""
+    """independent: initialise each expert on its own. clone_jitter: copies of one network with
+    small noise. variance: independent, with the last layers times sqrt(num), so that the outputs of
+    the dense mixture vary as much as those of one network."""
     router: Annotated[Router, CHOSEN] = Linear()
     """How experts are chosen and weighed."""
 
@@ -78,7 +81,8 @@ class Experts(Decoder):
 
 
 class Networks(nn.Module):
-    """E two-layer networks of one attribute: w1 [E, H, D], b1 [E, H], w2 [E, out, H], b2 [E, out]."""
+    """E two-layer networks of one attribute: w1 [E, H, D], b1 [E, H], w2 [E, out, H], b2 [E,
+    out]."""
 
     w1: nn.Parameter
     b1: nn.Parameter
@@ -108,7 +112,8 @@ class Networks(nn.Module):
         return sum((w[:, i : i + 1] * self.one(i, x) for i in range(self.count)), start=x.new_zeros(()))  # type: ignore[return-value]
 
     def chosen(self, x: Tensor, chosen: Tensor, w: Tensor) -> Tensor:
-        """Return the same sum over the chosen experts [A, k]: each is computed only for the anchors that chose it."""
+        """Return the same sum over the chosen experts [A, k]: each is computed only for the anchors
+        that chose it."""
         A, k = chosen.shape
         order = chosen.reshape(-1).argsort(stable=True)
         counts = torch.bincount(chosen.reshape(-1), minlength=self.count).tolist()
@@ -134,7 +139,8 @@ class Mixture(nn.Module):
         self.router = config.router.build(config.num, feature)
 
     def k(self, step: int) -> int | None:
-        """Return the number of experts per anchor at `step`, or None if dense. Iterations 1 .. warmup are dense."""
+        """Return the number of experts per anchor at `step`, or None if dense. Iterations 1 ..
+        warmup are dense."""
         return None if self.config.top_k is None or step <= self.config.warmup else self.config.top_k
 
     def begin(self, before: int, step: int, positions: Callable[[], Tensor], companions: Companions) -> None:

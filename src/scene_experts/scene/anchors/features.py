@@ -1,4 +1,5 @@
-"""Features that decoders receive: the anchor's own feature, or a blend of several resolutions (Scaffold-GS's feature bank).
+"""Features that decoders receive: the anchor's own feature, or a blend of several resolutions
+(Scaffold-GS's feature bank).
 
 Routers always receive the raw feature. Routing therefore depends on the anchor and not on the view.
 """
@@ -21,10 +22,12 @@ from scene_experts.scene.anchors.mlp import linear_init
 
 
 class Mixer(Protocol):
-    """A module that computes the features of anchors `rows` [A] for one camera. The `mix` rate applies to its parameters."""
+    """A module that computes the features of anchors `rows` [A] for one camera. The `mix` rate
+    applies to its parameters."""
 
     def __call__(self, table: Table, rows: Tensor, direction: Tensor, distance: Tensor) -> Tensor:
-        """direction [A, 3] of unit length, camera to anchor; distance [A, 1] in trained world units -> [A, width]."""
+        """direction [A, 3] of unit length, camera to anchor; distance [A, 1] in trained world units
+        -> [A, width]."""
         ...
 
 
@@ -41,7 +44,8 @@ class FeatureMix(Part, ABC):
         """Build the `Mixer`. None passes the feature on unchanged."""
 
     def check_size(self, F: int) -> None:
-        """Raises InputError, naming the flag, for invalid settings with features of size F. By default every setting is valid."""
+        """Raises InputError, naming the flag, for invalid settings with features of size F. By
+        default every setting is valid."""
 
 
 @register
@@ -61,7 +65,8 @@ class OwnFeature(FeatureMix):
 class FeatureBank(FeatureMix):
     """The feature bank of Scaffold-GS.
 
-    It blends every fourth, every second and all channels of the feature with camera-dependent weights.
+    It blends every fourth, every second and all channels of the feature with camera-dependent
+    weights.
     """
 
     hidden: Count = 32
@@ -80,7 +85,8 @@ class FeatureBank(FeatureMix):
 
 
 class Bank(nn.Module):
-    """(w0, w1, w2) = softmax(network(u, d)); f <- w0 tile(f[::4], 4) + w1 tile(f[::2], 2) + w2 f  (Scaffold-GS).
+    """(w0, w1, w2) = softmax(network(u, d)); f <- w0 tile(f[::4], 4) + w1 tile(f[::2], 2) + w2 f
+    (Scaffold-GS).
 
     `tile` repeats the whole strided vector. Tensors have a leading axis of 1, as in every head.
     """

@@ -1,15 +1,19 @@
-"""What keeps anchors from learning their training views by heart: moved viewing positions and dropped anchors.
+"""What keeps anchors from learning their training views by heart: moved viewing positions and
+dropped anchors.
 
-The networks see the direction from the camera to an anchor, so with few photographs they can learn another scene for each of them, and
-held-out views between these fall apart. With `view_jitter` s, a training view is drawn from its camera, but decoded as seen from
+The networks see the direction from the camera to an anchor, so with few photographs they can learn
+another scene for each of them, and held-out views between these fall apart. With `view_jitter` s, a
+training view is drawn from its camera, but decoded as seen from
     c' = c + s d n / sqrt(3),   n ~ N(0, I),
-where d is the mean distance from c to the two nearest other training cameras. What one photograph shows is then asked of all positions
-around it, and neighbouring photographs have to agree on the positions between them. s is the root mean square of |c' - c| / d.
+where d is the mean distance from c to the two nearest other training cameras. What one photograph
+shows is then asked of all positions around it, and neighbouring photographs have to agree on the
+positions between them. s is the root mean square of |c' - c| / d.
 
-With `dropout` p, each anchor is left out of a training view with probability p (after DropGaussian, Park et al., CVPR 2025).
+With `dropout` p, each anchor is left out of a training view with probability p (after DropGaussian,
+Park et al., CVPR 2025).
 
-With `few_views` m, both fall linearly to nothing from m to 2 m training views: with more photographs, little
-is left to guess, and both cost sharpness.
+With `few_views` m, both fall linearly to nothing from m to 2 m training views: with more
+photographs, little is left to guess, and both cost sharpness.
 """
 
 from __future__ import annotations
@@ -28,7 +32,8 @@ NEAREST = 2  # neighbours whose mean distance is a camera's spacing: on a path, 
 
 
 def find_spacings(cameras: Sequence[Camera]) -> dict[int, float]:
-    """Return by id the mean distance from each camera to its two nearest others, world units; 0 for a single camera."""
+    """Return by id the mean distance from each camera to its two nearest others, world units; 0 for
+    a single camera."""
     d2, _ = find_neighbours(torch.stack([camera.position.cpu() for camera in cameras]), NEAREST)
     means = d2.sqrt().mean(dim=1).tolist() if d2.shape[1] else [0.0] * len(cameras)
     return {camera.id: distance for camera, distance in zip(cameras, means, strict=True)}
@@ -51,7 +56,8 @@ def drop_anchors(rows: Tensor, share: float) -> Tensor:
 
 
 def find_weight(few: int, views: int) -> float:
-    """Return the factor of the dropout and the displacement with `views` training views: 1 up to `few` of them, 0 from 2 few on.
+    """Return the factor of the dropout and the displacement with `views` training views: 1 up to
+    `few` of them, 0 from 2 few on.
 
     It falls linearly between. With few = 0 it is 1 for any number of views.
     """

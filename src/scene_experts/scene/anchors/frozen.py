@@ -1,7 +1,9 @@
-"""A trained anchor scene prepared for drawing: values that do not depend on the camera are computed once.
+"""A trained anchor scene prepared for drawing: values that do not depend on the camera are computed
+once.
 
-Routing depends only on the anchor, so the chosen experts of each anchor and their weights are stored. The Gaussians are the same bits as
-those of the native decode, on the CPU and on CUDA. Symbols as in `types.py`.
+Routing depends only on the anchor, so the chosen experts of each anchor and their weights are
+stored. The Gaussians are the same bits as those of the native decode, on the CPU and on CUDA.
+Symbols as in `types.py`.
 """
 
 from __future__ import annotations
@@ -51,7 +53,8 @@ class Kept:
 
 
 class Frozen:
-    """Draws a scene at one step without gradients. The result contains no routing (`AnchorScene.routing` returns it)."""
+    """Draws a scene at one step without gradients. The result contains no routing
+    (`AnchorScene.routing` returns it)."""
 
     scene: Drawn
     step: int
@@ -80,7 +83,8 @@ class Frozen:
 
     @torch.no_grad()
     def __call__(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
-        """Do the same as `AnchorScene.forward`. Raises ValueError for another step or another mode than DRAW."""
+        """Do the same as `AnchorScene.forward`. Raises ValueError for another step or another mode
+        than DRAW."""
         if mode is not Mode.DRAW or step != self.step:
             raise ValueError(f"expected to draw step {self.step}, found {mode} at step {step}; call `Scene.frozen` again")
         scene = self.scene
@@ -102,12 +106,14 @@ class Frozen:
         return Decoded(Gaussians(*made), rows, raw, {})
 
     def _at(self, camera: Camera) -> dict[str, HeadWeights]:
-        """Return the heads for `camera`. Its appearance code, if the scene has codes, is added to the first bias of the colour network."""
+        """Return the heads for `camera`. Its appearance code, if the scene has codes, is added to
+        the first bias of the colour network."""
         codes = self.scene.codes
         return self.weights if codes is None else {**self.weights, "color": _detach(fold(self.weights["color"], codes(camera, Mode.DRAW)))}
 
     def _routers(self) -> dict[str, HeadWeights]:
-        """Return heads that route as those of every camera do: with any code, because the routing does not depend on it."""
+        """Return heads that route as those of every camera do: with any code, because the routing
+        does not depend on it."""
         codes = self.scene.codes
         return self.weights if codes is None else {**self.weights, "color": _detach(fold(self.weights["color"], codes.table[0]))}
 

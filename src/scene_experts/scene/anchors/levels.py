@@ -1,4 +1,5 @@
-"""Lattices of Octree-GS: L levels of cells, each `fork` times finer than the previous one. The distance selects the level."""
+"""Lattices of Octree-GS: L levels of cells, each `fork` times finer than the previous one. The
+distance selects the level."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ class Levels:
         return self.edge / self.fork**level
 
     def units(self, points: Tensor, level: int) -> Tensor:
-        """Return points [P, 3] in cell units of `level`, float64. Rounding them gives their cells."""
+        """Return points [P, 3] in cell units of `level`, float64. Rounding them gives their
+        cells."""
         return (points.double() - torch.tensor(self.origin, dtype=torch.float64, device=points.device)) / self.size(level)
 
     def cells(self, points: Tensor, level: int) -> Tensor:
@@ -53,9 +55,11 @@ class Levels:
         return cells.double() * self.size(level) + torch.tensor(self.origin, dtype=torch.float64, device=cells.device)
 
     def asked(self, xyz: Tensor, level: Tensor, camera: Tensor) -> Tensor:
-        """Return real-valued levels of detail [n] for anchors xyz [n, 3] of `level` [n] and a camera at `camera` [3].
+        """Return real-valued levels of detail [n] for anchors xyz [n, 3] of `level` [n] and a
+        camera at `camera` [3].
 
-        The value is log_fork(standard / r), where r is the distance to the anchor moved by half a cell (Octree-GS).
+        The value is log_fork(standard / r), where r is the distance to the anchor moved by half a
+        cell (Octree-GS).
         """
         halves = upload(torch.tensor([0.5 * self.size(i) for i in range(self.count)], dtype=xyz.dtype), xyz.device)
         v = xyz - camera.to(xyz) + halves.index_select(0, level)[:, None]
@@ -70,7 +74,8 @@ class Levels:
         return total.double() / len(self.cameras)
 
     def wanted(self, xyz: Tensor, level: Tensor) -> Tensor:
-        """Return a mask [n] of the anchors to keep: those selected by a share above the threshold, or by all cameras."""
+        """Return a mask [n] of the anchors to keep: those selected by a share above the threshold,
+        or by all cameras."""
         share = self.share(xyz, level)
         return (share > self.threshold) | (share >= 1)
 
@@ -85,7 +90,8 @@ class Levels:
 
 
 def whole(asked: Tensor, rule: LevelRule, top: int) -> Tensor:
-    """Round real-valued levels of detail [n] to the finest level in use [n] int64, among levels 0 .. top - 1.
+    """Round real-valued levels of detail [n] to the finest level in use [n] int64, among levels 0
+    .. top - 1.
 
     `blend` uses one more level than `floor`: the finest level, which fades in.
     """
@@ -96,12 +102,14 @@ def whole(asked: Tensor, rule: LevelRule, top: int) -> Tensor:
 
 
 def blend_levels(asked: Tensor, top: int) -> Tensor:
-    """Return level + 1 [n], clamped to [0.9999, top - 0.0001]. Its floor is the finest level, its fraction that level's weight."""
+    """Return level + 1 [n], clamped to [0.9999, top - 0.0001]. Its floor is the finest level, its
+    fraction that level's weight."""
     return (asked + 1).clamp(0.9999, top - 1 + 0.9999)
 
 
 def distances(points: Tensor, cameras: Sequence[Camera], ratio: float) -> tuple[float, float]:
-    """Return quantiles (far, near) of the camera distances of points [P, 3]; 1 - `ratio` of views and points lie beyond each."""
+    """Return quantiles (far, near) of the camera distances of points [P, 3]; 1 - `ratio` of views
+    and points lie beyond each."""
     xyz, found = points.unique(dim=0).double(), []
     for camera in cameras:
         d = (xyz - camera.position.to(xyz)).norm(dim=1).numpy()
@@ -121,8 +129,8 @@ def level_count(far: float, near: float, fork: int) -> int:
 
 
 def cube(points: Tensor, extend: float) -> tuple[float, float]:
-    """Return (low corner, edge) of the bounding cube of points [P, 3], scaled by `extend` about its centre. The values hold for all
-    axes."""
+    """Return (low corner, edge) of the bounding cube of points [P, 3], scaled by `extend` about its
+    centre. The values hold for all axes."""
     low, high = float(points.min()), float(points.max())
     edge = extend * max(high - low, 1e-9)
     return 0.5 * (low + high - edge), edge
@@ -139,7 +147,8 @@ def within_reach(count: int, edge: float, cube_edge: float, fork: int) -> int:
 
 
 def occupied(levels: Levels, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the cells [n, 3] and levels [n] of the occupied cells of all levels, coarse to fine."""
+    """Return the cells [n, 3] and levels [n] of the occupied cells of all levels, coarse to
+    fine."""
     per_level = [find_unique_cells(levels.cells(points, level))[0] for level in range(levels.count)]
     level = torch.cat([torch.full((len(cells),), i) for i, cells in enumerate(per_level)])
     return torch.cat(per_level), level

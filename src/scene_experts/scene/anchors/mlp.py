@@ -1,4 +1,5 @@
-"""Decoder heads. A head maps an anchor's feature and the viewing direction to K values of one attribute (as in Scaffold-GS)."""
+"""Decoder heads. A head maps an anchor's feature and the viewing direction to K values of one
+attribute (as in Scaffold-GS)."""
 
 from __future__ import annotations
 
@@ -27,8 +28,9 @@ CHANNELS = {"opacity": 1, "cov": 7, "color": 3}  # values per Gaussian: opacity;
 class HeadWeights:
     """The tensors of a head, for kernels and files. A plain network has E = 1 and no router.
 
-    k: number of experts that decode an anchor. None means dense: all, weighted by their gates. A head with several experts and no
-    `router_w` is routed outside the kernels, which take the mixture weights as an input.
+    k: number of experts that decode an anchor. None means dense: all, weighted by their gates. A
+    head with several experts and no `router_w` is routed outside the kernels, which take the
+    mixture weights as an input.
     """
 
     router_w: Tensor | None  # [E, F], or [E, F + 3] if the router receives the anchor's position
@@ -56,11 +58,13 @@ class Head(Protocol):
     def __call__(
         self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW
     ) -> tuple[Tensor, Routing | None]:
-        """x [A, inputs], feature [A, F], position [A, 3] over the scene's extent -> activated outputs [A, out], routing."""
+        """x [A, inputs], feature [A, F], position [A, 3] over the scene's extent -> activated
+        outputs [A, out], routing."""
         ...
 
     def begin(self, before: int, step: int, positions: Callable[[], Tensor], companions: Callable[[Tensor], list[Tensor]]) -> None:
-        """Prepare for training iteration `step`, see `Scene.begin_iteration`. positions() are [N, 3], over the scene's extent."""
+        """Prepare for training iteration `step`, see `Scene.begin_iteration`. positions() are [N,
+        3], over the scene's extent."""
         ...
 
     def weights(self, step: int) -> HeadWeights:
@@ -68,7 +72,8 @@ class Head(Protocol):
         ...
 
     def route(self, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW) -> tuple[Routing, Tensor] | None:
-        """Return the routing and the mixture weights [A, k], or [A, E] while dense; None without experts. They never depend on the view."""
+        """Return the routing and the mixture weights [A, k], or [A, E] while dense; None without
+        experts. They never depend on the view."""
         ...
 
     def end_batch(self, views: int) -> None:
@@ -84,7 +89,8 @@ class Head(Protocol):
         ...
 
     def tensors(self) -> dict[str, nn.Parameter]:
-        """Return the parameters by their names in files: those of the networks, then those of a router (`router_...`)."""
+        """Return the parameters by their names in files: those of the networks, then those of a
+        router (`router_...`)."""
         ...
 
 
@@ -115,13 +121,15 @@ class Decoder(Part, ABC):
 
     @abstractmethod
     def build(self, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> nn.Module:
-        """Build the `Head` of an attribute. It maps inputs [A, inputs] and features [A, feature] to outputs [A, outputs]."""
+        """Build the `Head` of an attribute. It maps inputs [A, inputs] and features [A, feature] to
+        outputs [A, outputs]."""
 
 
 @register
 @dataclass(frozen=True)
 class Plain(Decoder):
-    """One network per attribute, as in Scaffold-GS. `depth` counts linear layers (the paper's Figure 7 goes to 6)."""
+    """One network per attribute, as in Scaffold-GS. `depth` counts linear layers (the paper's
+    Figure 7 goes to 6)."""
 
     depth: Annotated[int, Range(2)] = 2
     """Number of linear layers per network."""
@@ -131,7 +139,8 @@ class Plain(Decoder):
 
 
 class MLP(nn.Module):
-    """Linear - ReLU - (Linear - ReLU)* - Linear - activation; weights stacked with a leading expert axis of 1."""
+    """Linear - ReLU - (Linear - ReLU)* - Linear - activation; weights stacked with a leading expert
+    axis of 1."""
 
     w1: nn.Parameter
     b1: nn.Parameter

@@ -1,8 +1,10 @@
-"""Decode of an anchor scene in the compiled CPU library: gather -> direction -> routing -> experts -> Gaussians.
+"""Decode of an anchor scene in the compiled CPU library: gather -> direction -> routing -> experts
+-> Gaussians.
 
-Forward and backward compute the same function as `AnchorScene.decode_composed`, the reference. The anchors of each expert are gathered, so
-Top-k evaluates k networks per anchor instead of E. The backward pass recomputes the hidden layers. Gradients are the same bits for every
-number of threads. Symbols as in `types.py`. A head has D inputs, H hidden units and L middle layers.
+Forward and backward compute the same function as `AnchorScene.decode_composed`, the reference. The
+anchors of each expert are gathered, so Top-k evaluates k networks per anchor instead of E. The
+backward pass recomputes the hidden layers. Gradients are the same bits for every number of threads.
+Symbols as in `types.py`. A head has D inputs, H hidden units and L middle layers.
 """
 
 from __future__ import annotations
@@ -58,8 +60,9 @@ def decode(
 ) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
     """Decode anchors into Gaussians.
 
-    Differentiable with respect to feature, log_scaling, offsets, the tensors of the heads and the weights in `outside`, but not xyz and
-    the camera. All tensors are float32 on the CPU unless noted.
+    Differentiable with respect to feature, log_scaling, offsets, the tensors of the heads and the
+    weights in `outside`, but not xyz and the camera. All tensors are float32 on the CPU unless
+    noted.
 
     Args:
         rows: [A] int64, without duplicates.
@@ -71,10 +74,12 @@ def decode(
         heads: Tensors of the networks by attribute ("opacity", "cov", "color").
         with_dist: Whether the network of an attribute receives the distance to the camera.
         extent: Routers that receive positions receive xyz / extent.
-        outside: Routing and mixture weights ([A, k], or [A, E] while dense) of the heads that are `HeadWeights.routed_outside`.
+        outside: Routing and mixture weights ([A, k], or [A, E] while dense) of the heads that are
+            `HeadWeights.routed_outside`.
 
     Returns:
-        The Gaussians of positive opacity, ordered by (row, slot); the raw opacities [A, K]; the routing of the heads with experts.
+        The Gaussians of positive opacity, ordered by (row, slot); the raw opacities [A, K]; the
+        routing of the heads with experts.
 
     Raises:
         ValueError: The shapes do not match.
@@ -105,8 +110,8 @@ def decode(
 
 
 def check_outside(heads: Mapping[str, HeadWeights], outside: Mapping[str, tuple[Routing, Tensor]], A: int) -> None:
-    """Raise ValueError unless `outside` has weights of the right shape for each head that is routed outside, IndexError for experts that do
-    not exist."""
+    """Raise ValueError unless `outside` has weights of the right shape for each head that is routed
+    outside, IndexError for experts that do not exist."""
     for a, h in heads.items():
         if h.routed_outside != (a in outside):
             raise ValueError(f"expected mixture weights for the heads that are routed outside, found other ones for {a}")
@@ -121,7 +126,8 @@ def check_outside(heads: Mapping[str, HeadWeights], outside: Mapping[str, tuple[
 def make_plan(
     rows: Tensor, xyz: Tensor, camera: Tensor, heads: dict[str, HeadWeights], with_dist: dict[str, bool], extent: float, ascending: bool
 ) -> Plan:
-    """Collect the inputs that are not differentiated. The arguments are those of `decode`; ascending: whether `rows` are sorted."""
+    """Collect the inputs that are not differentiated. The arguments are those of `decode`;
+    ascending: whether `rows` are sorted."""
     found = [heads[a] for a in ATTRIBUTES]
     k = tuple(h.k or 0 for h in found)
     distance = tuple(int(with_dist[a]) for a in ATTRIBUTES)
@@ -153,15 +159,16 @@ def _check(xyz: Tensor, feature: Tensor, log_scaling: Tensor, offsets: Tensor, h
 
 
 def route(call: SeDecode) -> None:
-    """Compute only the gates, chosen experts and weights, into the tensors given to `set_routing`."""
+    """Compute only the gates, chosen experts and weights, into the tensors given to
+    `set_routing`."""
     native.check(native.require().se_decode_route(ctypes.byref(call)), WHAT)
 
 
 def run(call: SeDecode) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor]:
     """Decode with the inputs of `make_call` and the outputs of `set_routing`.
 
-    Returns the fields of `Gaussians` and the raw opacities [A, K]; for the backward pass, the first Gaussian of each chunk and the inverse
-    lengths [M] of the quaternions before normalisation.
+    Returns the fields of `Gaussians` and the raw opacities [A, K]; for the backward pass, the first
+    Gaussian of each chunk and the inverse lengths [M] of the quaternions before normalisation.
     """
     library = native.require()
     raw, starts = torch.empty(call.A, call.K), torch.zeros(library.se_decode_chunks(call.A) + 1, dtype=torch.int64)
@@ -212,7 +219,8 @@ class _DecodeFunction(torch.autograd.Function):
         set_routing(call, routing[:3], routing[3:6], routing[6:])
         given = [None if g is None else g.contiguous() for g in upstream]
         set_pointers(call, d_means=given[0], d_quats=given[1], d_scales=given[2], d_opacities=given[3], d_colors=given[4], d_raw=given[6])
-        # If the rows are sorted, the library writes every row of the gradients, with zeros for rows that are not decoded.
+        # If the rows are sorted, the library writes every row of the gradients, with zeros for rows
+        # that are not decoded.
         fresh = torch.empty_like if plan.ascending else torch.zeros_like
         d_columns, d_weights = [fresh(t) for t in columns], [None if t is None else torch.empty_like(t) for t in weights]
         set_pointers(call, d_feature=d_columns[0], d_log_scaling=d_columns[1], d_offsets=d_columns[2])

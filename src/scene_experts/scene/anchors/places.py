@@ -1,12 +1,14 @@
-"""Experts for places: one network per attribute learns first; then each part of the scene goes on with its own copy of it.
+"""Experts for places: one network per attribute learns first; then each part of the scene goes on
+with its own copy of it.
 
-For iterations 1 .. warmup, expert 0 decodes every anchor. Then all experts become copies of it, with its Adam moments (sparse
-upcycling, Komatsuzaki et al. 2023), so the picture does not change. From then on an anchor at x is decoded by the expert of
-the nearest centre:
+For iterations 1 .. warmup, expert 0 decodes every anchor. Then all experts become copies of it,
+with its Adam moments (sparse upcycling, Komatsuzaki et al. 2023), so the picture does not change.
+From then on an anchor at x is decoded by the expert of the nearest centre:
     I = argmin_i |x - c_i|^2 = argmax_i (2 c_i x - |c_i|^2) / s
-The centres c_i are those of k-means over the anchors' positions, divided by the scene's extent, and s is the mean squared
-distance to the nearest of them. A linear router computes this with weights that are not trained. Anchors do not move, so no
-anchor ever changes its expert, and none needs a balancing loss.
+The centres c_i are those of k-means over the anchors' positions, divided by the scene's extent, and
+s is the mean squared distance to the nearest of them. A linear router computes this with weights
+that are not trained. Anchors do not move, so no anchor ever changes its expert, and none needs a
+balancing loss.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ MARGIN = 0.02  # share of the positions that k-means ignores at either end of ea
 @register
 @dataclass(frozen=True)
 class Places(Router):
-    """The experts of the nearest places decode an anchor; expert 0 decodes all of them during the warm-up."""
+    """The experts of the nearest places decode an anchor; expert 0 decodes all of them during the
+    warm-up."""
 
     name = "places"
     learns = False
@@ -39,7 +42,8 @@ class Places(Router):
 
 
 class PlacesModule(LinearModule):
-    """A linear router that sees positions. `begin` sets its weights as the warm-up ends; no loss trains them."""
+    """A linear router that sees positions. `begin` sets its weights as the warm-up ends; no loss
+    trains them."""
 
     def __init__(self, experts: int, feature: int) -> None:
         super().__init__(experts, feature, input_pos=True)
@@ -84,9 +88,11 @@ class PlacesModule(LinearModule):
 
 
 def find_centres(positions: Tensor, count: int) -> tuple[Tensor, float]:
-    """Return `count` centres [count, 3] of positions [N, 3] by k-means, and the mean squared distance to the nearest of them.
+    """Return `count` centres [count, 3] of positions [N, 3] by k-means, and the mean squared
+    distance to the nearest of them.
 
-    The result is float64 and the same on every device and for every number of threads. N must be at least 1.
+    The result is float64 and the same on every device and for every number of threads. N must be at
+    least 1.
     """
     x = positions.double()[:: -(-len(positions) // SAMPLE)]
     low, high = x.quantile(MARGIN, dim=0), x.quantile(1.0 - MARGIN, dim=0)
@@ -105,8 +111,8 @@ def find_centres(positions: Tensor, count: int) -> tuple[Tensor, float]:
 
 
 def _halve(x: Tensor, count: int) -> Tensor:
-    """Return the means [count, 3] of `count` equal parts of the rows x [n, 3]: halved across the axis of the largest variance, each half
-    again, and so on."""
+    """Return the means [count, 3] of `count` equal parts of the rows x [n, 3]: halved across the
+    axis of the largest variance, each half again, and so on."""
     if count == 1 or len(x) == 1:
         return x.mean(dim=0).expand(count, 3)
     first = count // 2

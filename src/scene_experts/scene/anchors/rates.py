@@ -40,10 +40,11 @@ class Rates(LearningRates):
     router_scale: Annotated[NotNegative, Needs(ROUTERS)] = 1.0
     """Factor of a router's learning rate over that of its attribute."""
     networks: NotNegative = 1.0
-    """Factor of the learning rates of the decoder networks and their routers. 0 also keeps the feature bank and the appearance codes."""
+    """Factor of the learning rates of the decoder networks and their routers. 0 also keeps the
+    feature bank and the appearance codes."""
     anneal: Annotated[float, Range(above=0, high=1)] = 1.0
-    """Final value of the learning rates that are constant otherwise (feature, log_scaling, cov), relative to their first; 1 leaves them
-    constant."""
+    """Final value of the learning rates that are constant otherwise (feature, log_scaling, cov),
+    relative to their first; 1 leaves them constant."""
     anneal_from: Annotated[float, Range(0, below=1)] = 2 / 3
     """Share of the training after which these rates fall, log-linearly."""
 

@@ -1,8 +1,10 @@
-"""Routers: which experts decode an anchor, and with which weights. Both depend on the anchor alone, never on the view.
+"""Routers: which experts decode an anchor, and with which weights. Both depend on the anchor alone,
+never on the view.
 
-A router is a part (its settings, a subclass of `Router`) that builds a module (a subclass of `RouterModule`).
-`--scene.decoder.router NAME` chooses a registered part by its name. The fused decode takes choices and weights as inputs,
-so a new router needs no kernel. Symbols: A anchors, F feature size, E experts, k chosen experts.
+A router is a part (its settings, a subclass of `Router`) that builds a module (a subclass of
+`RouterModule`). `--scene.decoder.router NAME` chooses a registered part by its name. The fused
+decode takes choices and weights as inputs, so a new router needs no kernel. Symbols: A anchors, F
+feature size, E experts, k chosen experts.
 """
 
 from __future__ import annotations
@@ -35,8 +37,8 @@ class RouterModule(nn.Module, ABC):
         feature [A, F]; position [A, 3], divided by the scene's extent, or None where it is unknown.
 
         Returns:
-            The gates of all experts and the chosen ones, for losses and figures; the weights of the chosen experts [A, k],
-            or of all [A, E] while dense.
+            The gates of all experts and the chosen ones, for losses and figures; the weights of the
+            chosen experts [A, k], or of all [A, E] while dense.
         """
 
     def alone(self, k: int | None) -> int | None:
@@ -44,14 +46,16 @@ class RouterModule(nn.Module, ABC):
         return None
 
     def fused(self) -> tuple[Tensor, Tensor, bool] | None:
-        """Return the weights [E, F] or [E, F + 3] and bias [E] of a linear router with softmax weights, and whether it sees
-        positions: kernels compute it themselves. None: `forward` routes, and kernels take its result."""
+        """Return the weights [E, F] or [E, F + 3] and bias [E] of a linear router with softmax
+        weights, and whether it sees positions: kernels compute it themselves. None: `forward`
+        routes, and kernels take its result."""
         return None
 
     def begin(
         self, networks: nn.Module, before: int, step: int, warmup: int, positions: Callable[[], Tensor], companions: Companions
     ) -> None:
-        """Prepare for training iteration `step`, see `Scene.begin_iteration`. networks: the `Networks` of the mixture."""
+        """Prepare for training iteration `step`, see `Scene.begin_iteration`. networks: the
+        `Networks` of the mixture."""
 
     def end_batch(self, views: int) -> None:
         """Learn what no gradient teaches, see `Scene.end_batch`."""
@@ -64,9 +68,11 @@ class Router(Part, ABC):
     name: ClassVar[str]
     """Name on the command line."""
     learns: ClassVar[bool] = True
-    """Whether losses train the router. Otherwise load balancing and the learning rate of routers have no effect."""
+    """Whether losses train the router. Otherwise load balancing and the learning rate of routers
+    have no effect."""
     sums_to_one: ClassVar[bool] = True
-    """Whether the weights of the chosen experts sum to 1. With k = 1 the picture then does not train the router."""
+    """Whether the weights of the chosen experts sum to 1. With k = 1 the picture then does not
+    train the router."""
 
     @abstractmethod
     def build(self, experts: int, feature: int) -> RouterModule:
@@ -76,13 +82,14 @@ class Router(Part, ABC):
 @register
 @dataclass(frozen=True)
 class Linear(Router):
-    """The paper's "simple linear layer": g = softmax(W f + b) (eq. 3). Top-k takes the largest logits, and w_i = g_i / sum of
-    the chosen g_j (eq. 5)."""
+    """The paper's "simple linear layer": g = softmax(W f + b) (eq. 3). Top-k takes the largest
+    logits, and w_i = g_i / sum of the chosen g_j (eq. 5)."""
 
     name = "linear"
 
     input_pos: bool = False
-    """Append the anchor's position, divided by the scene's extent, to the router's input (the paper's appendix)."""
+    """Append the anchor's position, divided by the scene's extent, to the router's input (the
+    paper's appendix)."""
 
     def build(self, experts: int, feature: int) -> LinearModule:
         return LinearModule(experts, feature, self.input_pos)
@@ -131,8 +138,8 @@ class LinearModule(RouterModule):
 @register
 @dataclass(frozen=True)
 class Margin(Linear):
-    """A linear router whose weights are proportional to a gate minus the largest gate that is not chosen, so that no weight
-    jumps where two experts change ranks."""
+    """A linear router whose weights are proportional to a gate minus the largest gate that is not
+    chosen, so that no weight jumps where two experts change ranks."""
 
     name = "margin"
 
@@ -141,7 +148,8 @@ class Margin(Linear):
 
 
 class MarginModule(LinearModule):
-    """w_i = (g_i - r + LEAST_MARGIN) / sum over the chosen, r = the largest gate that is not chosen (0 if all are)."""
+    """w_i = (g_i - r + LEAST_MARGIN) / sum over the chosen, r = the largest gate that is not chosen
+    (0 if all are)."""
 
     def weigh(self, logits: Tensor, gates: Tensor, chosen: Tensor) -> Tensor:
         rest = gates.scatter(1, chosen, 0.0).amax(dim=1, keepdim=True)
@@ -153,7 +161,8 @@ class MarginModule(LinearModule):
 
 
 def top_k(logits: Tensor, k: int) -> Tensor:
-    """Return indices [A, k] of the k largest logits [A, E], largest first. Ties go to the lowest index on every device."""
+    """Return indices [A, k] of the k largest logits [A, E], largest first. Ties go to the lowest
+    index on every device."""
     remaining, chosen = logits.detach(), []
     for _ in range(k):
         best = remaining.argmax(dim=1, keepdim=True)  # the first of equal maxima

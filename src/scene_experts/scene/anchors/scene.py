@@ -1,8 +1,9 @@
 """Anchors (Scaffold-GS): select -> cull -> decode -> Gaussians.
 
-An anchor v lies on an integer voxel lattice. It has a feature f, a log-scaling l and K offsets O. For a camera, three heads compute the
-opacity, covariance and colour of K Gaussians from f and the viewing direction. The Gaussians lie at
-mu = x_v + O_v * exp(l_v)[0:3] (paper eq. 2). Anchors do not move; `strategy.grow` adds and removes them.
+An anchor v lies on an integer voxel lattice. It has a feature f, a log-scaling l and K offsets O.
+For a camera, three heads compute the opacity, covariance and colour of K Gaussians from f and the
+viewing direction. The Gaussians lie at mu = x_v + O_v * exp(l_v)[0:3] (paper eq. 2). Anchors do not
+move; `strategy.grow` adds and removes them.
 """
 
 from __future__ import annotations
@@ -61,10 +62,11 @@ class Anchors(SceneConfig):
     voxel_size: NotNegative = 0.0
     """Edge of the finest voxels in trained units; 0 lets voxel_rule choose it."""
     voxel_rule: VoxelChoice = "neighbours"
-    """neighbours: a quarter of the median distance to the nearest neighbours. squared_median and median_nn: the rule of Scaffold-GS as
-    implemented and as documented."""
+    """neighbours: a quarter of the median distance to the nearest neighbours. squared_median and
+    median_nn: the rule of Scaffold-GS as implemented and as documented."""
     decode: Literal["auto", "composed", "native"] = "auto"
-    """Implementation that decodes anchors: native (fused), composed (PyTorch), or auto (native if it supports the scene)."""
+    """Implementation that decodes anchors: native (fused), composed (PyTorch), or auto (native if
+    it supports the scene)."""
     decoder: Decoder = Plain()
     """The networks that turn features into Gaussians."""
     select: Selection = AllAnchors()
@@ -74,19 +76,20 @@ class Anchors(SceneConfig):
     appearance: CountOrNone = 0
     """Size of the appearance code per training view; 0 means no codes."""
     dropout: Annotated[float, Range(0, below=1)] = 0.0
-    """Share of the anchors that a training view leaves out from iteration `dropout_full` on; it rises linearly from 0. Meant for few
-    photographs (after DropGaussian, Park et al. 2025)."""
+    """Share of the anchors that a training view leaves out from iteration `dropout_full` on; it
+    rises linearly from 0. Meant for few photographs (after DropGaussian, Park et al. 2025)."""
     dropout_full: Annotated[int, Range(1), Scales(least=1)] = 30_000
     """Iteration at which the share of dropped anchors is reached. --iterations rescales it."""
     view_jitter: NotNegative = 0.0
-    """Training views are decoded as seen from a random position around their camera. Its root mean square distance from the camera, as a
-    share of the distance to the nearest other training cameras; 0 means no displacement."""
+    """Training views are decoded as seen from a random position around their camera. Its root mean
+    square distance from the camera, as a share of the distance to the nearest other training
+    cameras; 0 means no displacement."""
     few_views: CountOrNone = 0
-    """Number of training views up to which dropout and view_jitter have their whole value. Both fall linearly to 0 at twice as many
-    views; 0: the same values for any number of views."""
+    """Number of training views up to which dropout and view_jitter have their whole value. Both
+    fall linearly to 0 at twice as many views; 0: the same values for any number of views."""
     smoothing: NotNegative = 0.0
-    """Variance of the 3D smoothing filter in squared pixels of the closest training view (0.2 in Mip-Splatting); 0 means no filter. It
-    helps cameras that come closer than the training views."""
+    """Variance of the 3D smoothing filter in squared pixels of the closest training view (0.2 in
+    Mip-Splatting); 0 means no filter. It helps cameras that come closer than the training views."""
 
     @property
     def grown_as(self) -> str:
@@ -142,7 +145,8 @@ class AnchorScene(LatticeScene):
     def __init__(
         self, config: Anchors, table: Table, voxel: float, extent: float, select: Selector | None = None, views: Sequence[int] = ()
     ) -> None:
-        """voxel: edge of the finest lattice cell; extent: the scene's R; both in trained world units. views: the training cameras' ids."""
+        """voxel: edge of the finest lattice cell; extent: the scene's R; both in trained world
+        units. views: the training cameras' ids."""
         super().__init__(table, extent)
         self.config, self.voxel, self.dense_until = config, voxel, config.dense_until
         self.select = select or AllAnchors()
@@ -189,7 +193,8 @@ class AnchorScene(LatticeScene):
 
     @classmethod
     def from_points(cls, config: Anchors, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
-        """Create one anchor per occupied voxel of the point cloud, on each level. Raises InputError if there are no points."""
+        """Create one anchor per occupied voxel of the point cloud, on each level. Raises InputError
+        if there are no points."""
         if len(points.xyz) == 0:
             raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
         voxel = config.voxel_size or choose_voxel_size(points.xyz, config.voxel_rule)
@@ -208,7 +213,8 @@ class AnchorScene(LatticeScene):
         return cls(config, table, voxel, extent, select, [c.id for c in cameras])
 
     def set_training_cameras(self, cameras: Sequence[Camera]) -> None:
-        """Give the scene the cameras of its training views. The smoothing filter, the dropout and the jitter need them."""
+        """Give the scene the cameras of its training views. The smoothing filter, the dropout and
+        the jitter need them."""
         self.few_weight = find_weight(self.config.few_views, len(cameras))
         self.spacings = find_spacings(cameras) if self.config.view_jitter else {}
         if not self.config.smoothing:
@@ -222,7 +228,8 @@ class AnchorScene(LatticeScene):
             head.begin(before, step, lambda: self.table.whole_fact("xyz") / self.extent, companions)
 
     def new_rows(self, cells: Tensor, size: float, feature: Tensor, level: int = 0) -> dict[str, Tensor]:
-        """Return rows for new anchors at lattice cells [n, 3] of `level`, with scaling `size`, features [n, F] and zero offsets."""
+        """Return rows for new anchors at lattice cells [n, 3] of `level`, with scaling `size`,
+        features [n, F] and zero offsets."""
         n = len(cells)
         facts = self.select.places(cells, self.voxel, level)
         if "interval" in self.table.facts:
@@ -243,7 +250,8 @@ class AnchorScene(LatticeScene):
         return self.table.facts["xyz"].index_select(0, rows).double() + (offsets * scaling).double()
 
     def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
-        """Return the Gaussians visible from `camera` at `step`. `cull(means, scales, camera)` is the rasteriser's visibility test."""
+        """Return the Gaussians visible from `camera` at `step`. `cull(means, scales, camera)` is
+        the rasteriser's visibility test."""
         table = self.table
         rows, seen_from, config = self.visible(camera, step, mode, cull), camera, self.config
         if config.dropout and self.few_weight and mode is Mode.TRAIN:
@@ -268,7 +276,8 @@ class AnchorScene(LatticeScene):
         return scene
 
     def decode(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:
-        """Decode the given anchors [A]. Uses the device's fused kernels if they support the scene, otherwise PyTorch."""
+        """Decode the given anchors [A]. Uses the device's fused kernels if they support the scene,
+        otherwise PyTorch."""
         weights = self.fused_weights(step)
         if weights is None:
             return self.decode_composed(rows, camera, step, mode)
@@ -285,7 +294,8 @@ class AnchorScene(LatticeScene):
     def route_outside(
         self, weights: dict[str, HeadWeights], rows: Tensor, step: int, mode: Mode = Mode.DRAW
     ) -> dict[str, tuple[Routing, Tensor]]:
-        """Return the routing and the mixture weights of rows [A] by attribute, where the fused decode has no code for the router."""
+        """Return the routing and the mixture weights of rows [A] by attribute, where the fused
+        decode has no code for the router."""
         heads = {a: self.heads[a] for a, w in weights.items() if w.routed_outside}
         if not heads:
             return {}
@@ -293,7 +303,8 @@ class AnchorScene(LatticeScene):
         return {a: head.route(feature, step, position, mode) for a, head in heads.items()}  # type: ignore[misc]
 
     def fused_weights(self, step: int) -> dict[str, HeadWeights] | None:
-        """Return the heads' tensors for the fused decode (compiled on the CPU, Triton on CUDA), or None if it does not apply.
+        """Return the heads' tensors for the fused decode (compiled on the CPU, Triton on CUDA), or
+        None if it does not apply.
 
         Raises InputError with `decode = native` where it does not apply.
         """
@@ -316,7 +327,8 @@ class AnchorScene(LatticeScene):
         return f"networks of {wide[0]} that are too deep or too wide for the kernels" if wide else ""
 
     def describe_decode(self, step: int) -> str:
-        """Say which decode runs at `step`, and why not the fused one, as `Scene.describe_decode`."""
+        """Say which decode runs at `step`, and why not the fused one, as
+        `Scene.describe_decode`."""
         weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
         why = self.why_composed(weights) or ("--scene.decode composed" if self.config.decode == "composed" else "")
         if why:
@@ -326,13 +338,15 @@ class AnchorScene(LatticeScene):
         return f"fused ({kernels})" + (f", routed in torch ({', '.join(outside)}: a router without a kernel)" if outside else "")
 
     def inputs(self, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-        """Return features [A, F], unit directions from camera to anchor [A, 3] and distances [A, 1]."""
+        """Return features [A, F], unit directions from camera to anchor [A, 3] and distances [A,
+        1]."""
         v = self.table.facts["xyz"].index_select(0, rows) - camera.position.to(self.table.facts["xyz"])
         distance = v.norm(dim=1, keepdim=True)
         return self.table.params["feature"].index_select(0, rows), v / distance.clamp_min(EPS), distance
 
     def decode_composed(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:
-        """Reference decode in PyTorch: call one head per attribute, then mask, activate and place the Gaussians."""
+        """Reference decode in PyTorch: call one head per attribute, then mask, activate and place
+        the Gaussians."""
         p, K = self.table.params, self.K
         feature, direction, distance = self.inputs(rows, camera)
         seen = feature if self.bank is None else self.bank(self.table, rows, direction, distance)
@@ -366,7 +380,8 @@ class AnchorScene(LatticeScene):
         return Decoded(gaussians, rows, raw, routing)
 
     def routing(self, step: int, most: int | None = None, mode: Mode = Mode.DRAW) -> dict[str, Routing]:
-        """Return the routing by attribute for all anchors, or for at most `most` evenly spaced ones. It is independent of the camera."""
+        """Return the routing by attribute for all anchors, or for at most `most` evenly spaced
+        ones. It is independent of the camera."""
         every = max(1, -(-len(self.table) // most)) if most else 1
         feature, position = self.table.params["feature"][::every], self.table.facts["xyz"][::every] / self.extent
         found = {a: self.heads[a].route(feature, step, position, mode) for a in ATTRIBUTES}
@@ -377,12 +392,14 @@ class AnchorScene(LatticeScene):
             head.end_batch(views)
 
     def rows_by_level(self) -> list[int]:
-        """Return the number of anchors per level of detail, coarse to fine. Empty without levels."""
+        """Return the number of anchors per level of detail, coarse to fine. Empty without
+        levels."""
         return self.table.facts["level"].bincount().tolist() if self.select.count else []
 
     @contextmanager
     def at_level(self, level: int | None) -> Iterator[None]:
-        """Context manager in which the scene draws no level finer than `level`. See `Scene.at_level`."""
+        """Context manager in which the scene draws no level finer than `level`. See
+        `Scene.at_level`."""
         whole = self.select
         self.select = whole.with_cap(level)
         try:
@@ -391,7 +408,8 @@ class AnchorScene(LatticeScene):
             self.select = whole
 
     def frozen(self, step: int) -> Draws:
-        """Return the scene with precomputed routing if the native decode supports it, otherwise the scene itself."""
+        """Return the scene with precomputed routing if the native decode supports it, otherwise the
+        scene itself."""
         weights = self.fused_weights(step) if len(self.table) else None
         if weights is None:
             return self

@@ -1,4 +1,5 @@
-"""Anchor selection before the visibility filter: all anchors, or the levels of detail that match the distance (Octree-GS)."""
+"""Anchor selection before the visibility filter: all anchors, or the levels of detail that match
+the distance (Octree-GS)."""
 
 from __future__ import annotations
 
@@ -45,7 +46,8 @@ class Selector(Protocol):
         ...
 
     def __call__(self, table: Table, camera: Camera, step: int, mode: Mode) -> Tensor | None:
-        """Return the ascending row indices [S] int64 of the selected anchors, or None for all anchors."""
+        """Return the ascending row indices [S] int64 of the selected anchors, or None for all
+        anchors."""
         ...
 
     def fade(self, table: Table, rows: Tensor, camera: Camera, step: int, mode: Mode) -> Tensor | None:
@@ -69,12 +71,14 @@ class Selection(Part, ABC):
     """Whether anchors lie on levels of detail."""
 
     def phases(self) -> dict[str, int]:
-        """Return the last iterations of its phases by the names of their fields, as `SceneConfig.phases`."""
+        """Return the last iterations of its phases by the names of their fields, as
+        `SceneConfig.phases`."""
         return {}
 
     @abstractmethod
     def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
-        """Create the initial anchors from points [P, 3]. Returns the facts of the rows, the edge of the finest cell and the selector."""
+        """Create the initial anchors from points [P, 3]. Returns the facts of the rows, the edge of
+        the finest cell and the selector."""
 
     @abstractmethod
     def restore(self, meta: dict[str, Any]) -> Selector:
@@ -113,7 +117,8 @@ class AllAnchors(Selection):
         return {}
 
     def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
-        """Create one anchor per occupied voxel of points [P, 3]. Returns the row facts, the edge of the finest cell and the selector."""
+        """Create one anchor per occupied voxel of points [P, 3]. Returns the row facts, the edge of
+        the finest cell and the selector."""
         cells, _ = find_unique_cells(to_lattice(points, voxel))
         return self.places(cells, voxel, 0), voxel, self
 
@@ -124,7 +129,8 @@ class AllAnchors(Selection):
 @register
 @dataclass(frozen=True)
 class Octree(Selection):
-    """Levels of detail (Ren et al., Octree-GS). Anchors lie on several lattices; near cameras use finer levels."""
+    """Levels of detail (Ren et al., Octree-GS). Anchors lie on several lattices; near cameras use
+    finer levels."""
 
     has_levels = True
 
@@ -135,25 +141,30 @@ class Octree(Selection):
     first: Annotated[int, Range(-1)] = -1
     """Finest level at the start of coarse-to-fine training; -1 means half of the levels."""
     base_layer: int = -1
-    """Level 0 divides the scene's cube into fork^base_layer cells per axis; -1 derives it from coarseness."""
+    """Level 0 divides the scene's cube into fork^base_layer cells per axis; -1 derives it from
+    coarseness."""
     coarseness: Positive = 4.0
     """Cell size of the middle level in voxels, if base_layer is -1."""
     dist_ratio: Annotated[float, Range(above=0.5, high=1)] = 0.999
-    """Quantile of the camera distances that is used as the largest distance; one minus it gives the smallest."""
+    """Quantile of the camera distances that is used as the largest distance; one minus it gives the
+    smallest."""
     visible_threshold: Annotated[float, Range(below=1)] = -1.0
-    """Remove anchors that are selected by no larger share of the training cameras; a negative value means the mean share."""
+    """Remove anchors that are selected by no larger share of the training cameras; a negative value
+    means the mean share."""
     rule: LevelRule = "round"
-    """How the level of detail is rounded to an integer. blend fades in the opacity of the finest level."""
+    """How the level of detail is rounded to an integer. blend fades in the opacity of the finest
+    level."""
     coarse_until: Annotated[int, Range(0), SCALES] = 10_000
-    """Training starts with the coarser half of the levels and adds the finer ones one by one until this iteration; 0 starts with all.
-    --iterations rescales it."""
+    """Training starts with the coarser half of the levels and adds the finer ones one by one until
+    this iteration; 0 starts with all. --iterations rescales it."""
     coarse_factor: Positive = 1.5
     """Ratio of the waiting times of successive levels in coarse-to-fine training."""
     extend: Annotated[float, Range(1)] = 1.1
     """Edge of the scene's cube, in edges of the bounding cube of the points."""
 
     def begin(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> tuple[dict[str, Tensor], float, Selector]:
-        """Create anchors in the occupied cells of every level and remove those that too few cameras select.
+        """Create anchors in the occupied cells of every level and remove those that too few cameras
+        select.
 
         Returns the facts of the rows, the edge of the finest cell and the selector.
         """
@@ -169,7 +180,8 @@ class Octree(Selection):
     def levels(self, points: Tensor, voxel: float, cameras: Sequence[Camera]) -> Levels:
         """Create the lattices for points [P, 3] and training cameras.
 
-        Raises InputError if there is no camera, or if an axis has more cells than the lattice can index.
+        Raises InputError if there is no camera, or if an axis has more cells than the lattice can
+        index.
         """
         if not cameras:
             raise InputError("expected training cameras to choose levels of detail from, found none; choose another --split")
@@ -198,7 +210,8 @@ class Octree(Selection):
         return {"coarse_until": self.coarse_until}
 
     def turns(self, levels: Levels) -> list[float]:
-        """Iterations after which one more level is used. Intervals shrink by `coarse_factor`; the last ends at `coarse_until`."""
+        """Iterations after which one more level is used. Intervals shrink by `coarse_factor`; the
+        last ends at `coarse_until`."""
         m, q = levels.count - 1 - levels.first, 1.0 / self.coarse_factor
         if m < 1:
             return []
@@ -230,7 +243,8 @@ class LevelSelector:
         return self.lattices.asked(xyz, level, camera.position) + extra
 
     def top(self, step: int, mode: Mode) -> int:
-        """Return the number of levels in use. During coarse-to-fine training, these are the levels added before `step`."""
+        """Return the number of levels in use. During coarse-to-fine training, these are the levels
+        added before `step`."""
         count = self.lattices.count
         if mode is Mode.TRAIN:
             count = self.lattices.first + 1 + sum(turn < step for turn in self.config.turns(self.lattices))
@@ -259,7 +273,8 @@ class LevelSelector:
 
 
 def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera: Camera, cull: Cull) -> Tensor:
-    """Return rows [A] of the selected anchors whose ellipsoid overlaps the image. means [N, 3], scales [N, 3]; no gradient."""
+    """Return rows [A] of the selected anchors whose ellipsoid overlaps the image. means [N, 3],
+    scales [N, 3]; no gradient."""
     with torch.no_grad():
         if selected is None:
             return cull(means, scales, camera).nonzero().squeeze(1)
@@ -267,7 +282,8 @@ def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera:
 
 
 def fade_opacities(decoded: Decoded, fade: Tensor | None, rows: int, K: int) -> Decoded:
-    """Multiply the raw and drawn opacities of `decoded` by `fade` [A]. rows: number of rows of the whole table."""
+    """Multiply the raw and drawn opacities of `decoded` by `fade` [A]. rows: number of rows of the
+    whole table."""
     if fade is None or decoded.raw_opacity is None:
         return decoded
     of_row = fade.new_ones(rows).index_copy(0, decoded.rows, fade)
@@ -278,7 +294,8 @@ def fade_opacities(decoded: Decoded, fade: Tensor | None, rows: int, K: int) -> 
 
 
 def drop_masked(decoded: Decoded, slots: Tensor | None) -> Decoded:
-    """Leave out the Gaussians of masked slots. slots [N, K] bool: the slots that are drawn; None: all. Raw opacities do not change."""
+    """Leave out the Gaussians of masked slots. slots [N, K] bool: the slots that are drawn; None:
+    all. Raw opacities do not change."""
     if slots is None:
         return decoded
     g = decoded.gaussians

@@ -1,9 +1,11 @@
 """The 3D smoothing filter of Mip-Splatting (Yu et al., CVPR 2024, section 4.1).
 
-A training view samples the scene at intervals of T = z / f world units: one pixel at depth z and focal length f. Details smaller than
-the finest of these intervals cannot be observed, so the filter adds the variance s T^2 to every Gaussian. Its opacity is multiplied by
-sqrt(det Sigma / det Sigma'). Without the filter, Gaussians may be thinner than a pixel of any training view, which shows when the camera
-comes closer or the focal length grows. T is a constant of the anchor, whose Gaussians lie near it.
+A training view samples the scene at intervals of T = z / f world units: one pixel at depth z and
+focal length f. Details smaller than the finest of these intervals cannot be observed, so the filter
+adds the variance s T^2 to every Gaussian. Its opacity is multiplied by sqrt(det Sigma / det
+Sigma'). Without the filter, Gaussians may be thinner than a pixel of any training view, which shows
+when the camera comes closer or the focal length grows. T is a constant of the anchor, whose
+Gaussians lie near it.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ MARGIN = 0.15  # of the picture's sides: a view also samples points this far out
 
 @torch.no_grad()
 def find_intervals(xyz: Tensor, cameras: Sequence[Camera]) -> Tensor:
-    """Return the finest sampling interval T of points xyz [N, 3] in the views of the cameras, [N], world units.
+    """Return the finest sampling interval T of points xyz [N, 3] in the views of the cameras, [N],
+    world units.
 
     Points that no view sees have the coarsest interval of the others, and 0 if there are no others.
     """
@@ -41,7 +44,8 @@ def find_intervals(xyz: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 
 def smooth(decoded: Decoded, intervals: Tensor | None, variance: float, K: int) -> Decoded:
-    """Apply the filter to the Gaussians. intervals [N]: T of the rows; None: no filter. variance: s, in squared intervals."""
+    """Apply the filter to the Gaussians. intervals [N]: T of the rows; None: no filter. variance:
+    s, in squared intervals."""
     if intervals is None:
         return decoded
     g = decoded.gaussians

@@ -1,9 +1,11 @@
-"""Decode of an anchor scene on CUDA with Triton kernels: gather -> direction -> routing -> experts -> Gaussians.
+"""Decode of an anchor scene on CUDA with Triton kernels: gather -> direction -> routing -> experts
+-> Gaussians.
 
-Forward and backward compute the same function as `AnchorScene.decode_composed`, the reference. Anchors are sorted by their set of chosen
-experts. Top-k therefore evaluates k networks per anchor instead of E, and no tensor [A, k, outputs] is stored. The host waits for the
-device once, for the number of Gaussians. The backward pass recomputes the hidden layers. No sum uses atomics: on one device, the same
-inputs give the same bits. Symbols as in `types.py`.
+Forward and backward compute the same function as `AnchorScene.decode_composed`, the reference.
+Anchors are sorted by their set of chosen experts. Top-k therefore evaluates k networks per anchor
+instead of E, and no tensor [A, k, outputs] is stored. The host waits for the device once, for the
+number of Gaussians. The backward pass recomputes the hidden layers. No sum uses atomics: on one
+device, the same inputs give the same bits. Symbols as in `types.py`.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ WIDEST = 256  # largest padded number of outputs
 
 
 def covers(attribute: str, h: HeadWeights, F: int, K: int) -> bool:
-    """Whether the kernels support a network (two layers, held in registers) and its number of experts."""
+    """Whether the kernels support a network (two layers, held in registers) and its number of
+    experts."""
     E, H = h.w1.shape[:2]
     fits = pad(F + 5) <= 64 and pad(H) <= 64 and pad(K * CHANNELS[attribute]) <= WIDEST
     return h.middle_w is None and fits and E <= MOST_EXPERTS
@@ -86,11 +89,13 @@ def decode(
 ) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
     """Decode anchors into Gaussians.
 
-    Differentiable with respect to feature, log_scaling, offsets, the tensors of the heads and the weights in `outside`, but not xyz and
-    the camera. All tensors are float32 on one device unless noted.
+    Differentiable with respect to feature, log_scaling, offsets, the tensors of the heads and the
+    weights in `outside`, but not xyz and the camera. All tensors are float32 on one device unless
+    noted.
 
     Args:
-        rows: [A] int64, without duplicates and inside the table. This is not checked, because the check would wait for the device.
+        rows: [A] int64, without duplicates and inside the table. This is not checked, because the
+            check would wait for the device.
         xyz: Positions [N, 3].
         feature: Features [N, F].
         log_scaling: Logarithms of the scalings [N, 6].
@@ -99,11 +104,12 @@ def decode(
         heads: Tensors of the networks by attribute ("opacity", "cov", "color").
         with_dist: Whether the network of an attribute receives the distance to the camera.
         extent: Routers that receive positions receive xyz / extent.
-        outside: Routing and mixture weights ([A, k], or [A, E] while dense) of the heads that are `HeadWeights.routed_outside`. The
-            experts are not checked.
+        outside: Routing and mixture weights ([A, k], or [A, E] while dense) of the heads that are
+            `HeadWeights.routed_outside`. The experts are not checked.
 
     Returns:
-        The Gaussians of positive opacity, ordered by (row, slot); the raw opacities [A, K]; the routing of the heads with experts.
+        The Gaussians of positive opacity, ordered by (row, slot); the raw opacities [A, K]; the
+        routing of the heads with experts.
 
     Raises:
         ValueError: The shapes do not match, or the kernels do not support a network.
@@ -125,7 +131,8 @@ def decode(
 
 
 def _spread(outside: tuple[Routing, Tensor], E: int) -> tuple[Tensor, Tensor | None]:
-    """Return the weights of all experts [A, E], 0 for those that are not chosen, and the set of chosen experts as bits [A] int32."""
+    """Return the weights of all experts [A, E], 0 for those that are not chosen, and the set of
+    chosen experts as bits [A] int32."""
     chosen, w = outside[0].chosen, outside[1]
     if chosen is None:
         return w.contiguous(), None
@@ -156,7 +163,8 @@ def _kernels() -> ModuleType:
 
 
 def _parts(device: torch.device, experts: int, blocks: int) -> int:
-    """Number of programs that share the weight gradients of one expert. It depends only on the device, the experts and the blocks."""
+    """Number of programs that share the weight gradients of one expert. It depends only on the
+    device, the experts and the blocks."""
     units = torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 2
     return max(1, min(blocks, 2 * units // experts))
 
@@ -203,7 +211,8 @@ class _Decode(torch.autograd.Function):
 
 
 def _draw(plan: _Plan, columns: list[Tensor], weights: Any, routes: Any) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
-    """Return the Gaussians and raw opacities [A, K] of routed anchors; the place [A K] of each Gaussian, -1: not drawn; shapes [M, 7]."""
+    """Return the Gaussians and raw opacities [A, K] of routed anchors; the place [A K] of each
+    Gaussian, -1: not drawn; shapes [M, 7]."""
     (feature, log_scaling, offsets), A, K = columns, len(plan.rows), columns[2].shape[1]
     raw = feature.new_empty(A, K)
     _forward(plan, 0, routes, feature, weights, raw, raw)
@@ -222,7 +231,8 @@ def _draw(plan: _Plan, columns: list[Tensor], weights: Any, routes: Any) -> tupl
 
 
 class Routes:
-    """The routing of all anchors, which does not depend on the camera, and the decode with it. Without gradients."""
+    """The routing of all anchors, which does not depend on the camera, and the decode with it.
+    Without gradients."""
 
     @torch.no_grad()
     def __init__(
@@ -234,7 +244,8 @@ class Routes:
         extent: float,
         outside: Mapping[str, tuple[Routing, Tensor]] = NOTHING,
     ) -> None:
-        """xyz [N, 3]; columns: feature [N, F], log_scaling [N, 6], offsets [N, K, 3], all contiguous. Other arguments: see `decode`."""
+        """xyz [N, 3]; columns: feature [N, F], log_scaling [N, 6], offsets [N, K, 3], all
+        contiguous. Other arguments: see `decode`."""
         F, K = columns[0].shape[1], columns[2].shape[1]
         self.columns, self.heads = columns, tuple(_head(a, heads[a], with_dist[a], F, K) for a in ATTRIBUTES)
         everyone = torch.arange(len(xyz), device=xyz.device)
@@ -252,7 +263,8 @@ class Routes:
 
     @torch.no_grad()
     def decode(self, rows: Tensor, camera_position: Tensor, heads: dict[str, HeadWeights]) -> tuple[Gaussians, Tensor]:
-        """Decode anchors into the Gaussians and raw opacities [A, K] of `decode`, the same bits. heads: contiguous tensors."""
+        """Decode anchors into the Gaussians and raw opacities [A, K] of `decode`, the same bits.
+        heads: contiguous tensors."""
         plan = replace(self.plan, rows=rows.contiguous(), camera=camera_position.to(self.plan.xyz).contiguous())
         weights, keys = _gather(self.weights, plan.rows), _gather(self.keys, plan.rows)
         routes = [(None, w, None, k, None if k is None else plan.order(k)) for w, k in zip(weights, keys)]
@@ -276,7 +288,8 @@ def _gather(columns: Columns, rows: Tensor) -> list[Tensor | None]:
 
 
 def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Tensor | None, ...]:
-    """Return gates [A, E], weights [A, E] (the gates while dense), chosen experts [A, k], keys [A], order [A]. None: unused."""
+    """Return gates [A, E], weights [A, E] (the gates while dense), chosen experts [A, k], keys [A],
+    order [A]. None: unused."""
     if not head.routed:
         return (None,) * 5
     A, device = len(plan.rows), feature.device
@@ -296,7 +309,8 @@ def _route(plan: _Plan, head: _Head, feature: Tensor, weights: Any) -> tuple[Ten
 
 
 def _given(plan: _Plan, weight: Tensor | None, keys: Tensor | None) -> tuple[Tensor | None, ...]:
-    """Return the same as `_route` for given weights [A, E] and sets of chosen experts [A]: without gates and indices."""
+    """Return the same as `_route` for given weights [A, E] and sets of chosen experts [A]: without
+    gates and indices."""
     return None, weight, None, keys, None if keys is None else plan.order(keys)
 
 
@@ -314,7 +328,8 @@ def _forward(plan: _Plan, i: int, routes: Any, feature: Tensor, weights: Any, ds
 def _backward(
     plan: _Plan, i: int, route: Any, feature: Tensor, weights: Any, dst: Tensor, d_out: Tensor, d_gates: Tensor | None, d_feature: Tensor
 ) -> tuple[list[Tensor | None], Tensor | None]:
-    """Return the gradients of the six tensors of attribute i and of given mixture weights, and add its part to `d_feature`."""
+    """Return the gradients of the six tensors of attribute i and of given mixture weights, and add
+    its part to `d_feature`."""
     head, own, A = plan.heads[i], weights[6 * i : 6 * i + 6], len(plan.rows)
     gates, weight, _, keys, order = route
     if not A:

@@ -1,16 +1,18 @@
 # pyright: basic, reportMissingImports=false
 """Triton kernels of the CUDA decode; `triton_decode` calls them. This file alone imports triton.
 
-Each program processes a block of B anchors. The anchors are sorted by their set of chosen experts. Most blocks therefore evaluate only
-k experts, and the program mixes their outputs in registers. No sum uses atomics, so the results are the same bits in every run.
+Each program processes a block of B anchors. The anchors are sorted by their set of chosen experts.
+Most blocks therefore evaluate only k experts, and the program mixes their outputs in registers. No
+sum uses atomics, so the results are the same bits in every run.
 
-Tiles are padded to powers of two: XP inputs, HP hidden units, COLS outputs, EP experts, KP slots. The input of a network is
-x = (feature, unit direction, distance if used, 1). The 1 multiplies the bias, so one matrix product computes the first layer and one
-its gradient. Activations: TANH, NONE, SIGMOID. `dst` [A * K] is the index of each slot among the drawn Gaussians, or -1 if the slot is
-not drawn.
+Tiles are padded to powers of two: XP inputs, HP hidden units, COLS outputs, EP experts, KP slots.
+The input of a network is x = (feature, unit direction, distance if used, 1). The 1 multiplies the
+bias, so one matrix product computes the first layer and one its gradient. Activations: TANH, NONE,
+SIGMOID. `dst` [A * K] is the index of each slot among the drawn Gaussians, or -1 if the slot is not
+drawn.
 
-Triton compiles a kernel anew for a count that is 1 or divisible by 16, unless `do_not_specialize` names it. The counts change in every
-step.
+Triton compiles a kernel anew for a count that is 1 or divisible by 16, unless `do_not_specialize`
+names it. The counts change in every step.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ EPS = tl.constexpr(1e-12)  # keeps directions and quaternions finite if their le
 
 @triton.jit
 def activate(y, ACT: tl.constexpr):
-    """Activation of the last layer. Near 0, tanh is a polynomial fitted on [0, 0.625] with a relative error of 8e-8."""
+    """Activation of the last layer. Near 0, tanh is a polynomial fitted on [0, 0.625] with a
+    relative error of 8e-8."""
     if ACT == 0:
         z = y * y
         small = y + y * z * (-0.3333328 + z * (0.13331442 + z * (-0.05373971 + z * (0.020639075 - 0.0057049743 * z))))
@@ -47,7 +50,8 @@ def slope(a, ACT: tl.constexpr):
 
 @triton.jit
 def inputs(feature, xyz, camera, row, mine, F: tl.constexpr, DISTANCE: tl.constexpr, XP: tl.constexpr):
-    """Inputs x [B, XP] of the anchors in rows `row` [B] of the table. Rows outside the mask `mine` [B] are 0: NaN there does not spread."""
+    """Inputs x [B, XP] of the anchors in rows `row` [B] of the table. Rows outside the mask `mine`
+    [B] are 0: NaN there does not spread."""
     column = tl.arange(0, XP)[None, :]
     x = tl.load(feature + row[:, None] * F + column, mask=mine[:, None] & (column < F), other=0.0)
     vx = tl.load(xyz + row * 3, mask=mine, other=0.0) - tl.load(camera)
@@ -88,7 +92,8 @@ def relu(z):
 
 @triton.jit
 def members(key, inside, e, SPARSE: tl.constexpr):
-    """Mask [B] of the anchors in the block that expert e decodes. Bit e of `key` [B] is set if expert e is chosen."""
+    """Mask [B] of the anchors in the block that expert e decodes. Bit e of `key` [B] is set if
+    expert e is chosen."""
     if SPARSE:
         inside = inside & (((key >> e) & 1) == 1)
     return inside
@@ -96,7 +101,8 @@ def members(key, inside, e, SPARSE: tl.constexpr):
 
 @triton.jit
 def block_of(order, keys, rows, block, A, B: tl.constexpr, SPARSE: tl.constexpr):
-    """Anchors of a block: indices into `rows`, rows of the table, keys, and a mask of those that exist, [B] each."""
+    """Anchors of a block: indices into `rows`, rows of the table, keys, and a mask of those that
+    exist, [B] each."""
     place = block * B + tl.arange(0, B)
     inside = place < A
     anchor, key = place.to(tl.int64), place
@@ -108,7 +114,8 @@ def block_of(order, keys, rows, block, A, B: tl.constexpr, SPARSE: tl.constexpr)
 
 @triton.jit
 def outputs(dst, anchor, inside, K: tl.constexpr, C: tl.constexpr, COLS: tl.constexpr, COMPACT: tl.constexpr):
-    """Addresses [B, COLS] of the K * C outputs of each anchor, and a mask. COMPACT: drawn Gaussians only, otherwise all slots."""
+    """Addresses [B, COLS] of the K * C outputs of each anchor, and a mask. COMPACT: drawn Gaussians
+    only, otherwise all slots."""
     column = tl.arange(0, COLS)[None, :]
     there = inside[:, None] & (column < K * C)
     at = anchor[:, None] * (K * C) + column
@@ -124,7 +131,8 @@ def route(
     F: tl.constexpr, E: tl.constexpr, TOP: tl.constexpr, BIAS: tl.constexpr, POSITION: tl.constexpr,
     B: tl.constexpr, FP: tl.constexpr, EP: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Compute the gates [A, E] (eq. 3). If TOP > 0, also the chosen experts [A, TOP], their weights [A, E] (eq. 5) and the keys [A].
+    """Compute the gates [A, E] (eq. 3). If TOP > 0, also the chosen experts [A, TOP], their weights
+    [A, E] (eq. 5) and the keys [A].
 
     Ties go to the lowest index. POSITION: the router also receives xyz / extent.
     """
@@ -167,7 +175,8 @@ def head_forward(
     DISTANCE: tl.constexpr, ROUTED: tl.constexpr, SPARSE: tl.constexpr, ACT: tl.constexpr, COMPACT: tl.constexpr,
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Compute one attribute of a block of anchors (gather, direction, experts, mixture) and write it to `out`."""
+    """Compute one attribute of a block of anchors (gather, direction, experts, mixture) and write
+    it to `out`."""
     anchor, row, key, inside = block_of(order, keys, rows, tl.program_id(0), A, B, SPARSE)
     x = inputs(feature, xyz, camera, row, inside, F, DISTANCE, XP)
     y = tl.zeros((B, COLS), tl.float32)
@@ -192,9 +201,11 @@ def head_backward(
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, EP: tl.constexpr, POSITION: tl.constexpr,
     OUTSIDE: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Add the gradient of one attribute, through networks and router, to `d_feature`. Write the gradient of the logits [A, E].
+    """Add the gradient of one attribute, through networks and router, to `d_feature`. Write the
+    gradient of the logits [A, E].
 
-    OUTSIDE: the mixture weights are given. Their gradient [A, E] takes the place of that of the logits, and there is no router.
+    OUTSIDE: the mixture weights are given. Their gradient [A, E] takes the place of that of the
+    logits, and there is no router.
     """
     anchor, row, key, inside = block_of(order, keys, rows, tl.program_id(0), A, B, SPARSE)
     x = inputs(feature, xyz, camera, row, inside, F, DISTANCE, XP)
@@ -240,7 +251,8 @@ def weight_backward(
     DISTANCE: tl.constexpr, ROUTED: tl.constexpr, SPARSE: tl.constexpr, ACT: tl.constexpr, COMPACT: tl.constexpr,
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Program (e, p) sums the weight gradients of expert e over every P-th block. It writes part p of d_w1 [P, E, H, D] etc."""
+    """Program (e, p) sums the weight gradients of expert e over every P-th block. It writes part p
+    of d_w1 [P, E, H, D] etc."""
     e, part = tl.program_id(0), tl.program_id(1)
     D: tl.constexpr = F + 3 + DISTANCE
     first = first_layer(w1, b1, e, H, D, HP, XP)
@@ -277,7 +289,8 @@ def place(
     rows, xyz, offsets, log_scaling, raw, cov, dst, means, quats, scales, opacities, source, A,
     K: tl.constexpr, B: tl.constexpr, KP: tl.constexpr,
 ):  # fmt: skip
-    """Write the drawn Gaussians except their colours: means (eq. 2), scales and unit quaternions from `cov` [M, 7], opacities, sources."""
+    """Write the drawn Gaussians except their colours: means (eq. 2), scales and unit quaternions
+    from `cov` [M, 7], opacities, sources."""
     anchor = tl.program_id(0) * B + tl.arange(0, B)
     inside = anchor < A
     row = tl.load(rows + anchor, mask=inside, other=0)
@@ -310,7 +323,8 @@ def place_backward(
     d_offsets, d_log_scaling, d_cov, d_opacity_head, A,
     K: tl.constexpr, B: tl.constexpr, KP: tl.constexpr,
 ):  # fmt: skip
-    """Compute the gradients of offsets, log-scaling, `cov` [M, 7] and the opacities [A, K] of all slots from those of the Gaussians."""
+    """Compute the gradients of offsets, log-scaling, `cov` [M, 7] and the opacities [A, K] of all
+    slots from those of the Gaussians."""
     anchor = tl.program_id(0) * B + tl.arange(0, B)
     inside = anchor < A
     row = tl.load(rows + anchor, mask=inside, other=0)

@@ -1,8 +1,9 @@
-"""Multi-resolution hash grid (Mueller et al., Instant Neural Graphics Primitives, 2022): maps positions to learned features.
+"""Multi-resolution hash grid (Mueller et al., Instant Neural Graphics Primitives, 2022): maps
+positions to learned features.
 
-Level l divides the unit cube into N_l = floor(base growth^l) cells per axis. Features are stored at the corners of the cells and
-interpolated trilinearly. If a level has more corners than table rows, a hash maps corners to shared rows. The compiled library is
-used if it is available.
+Level l divides the unit cube into N_l = floor(base growth^l) cells per axis. Features are stored at
+the corners of the cells and interpolated trilinearly. If a level has more corners than table rows,
+a hash maps corners to shared rows. The compiled library is used if it is available.
 """
 
 from __future__ import annotations
@@ -66,7 +67,8 @@ class HashGrid:
 
 
 class Grid(nn.Module):
-    """Learned table [rows of all levels, features] and the low corner and edge (world units) of the cube that it covers."""
+    """Learned table [rows of all levels, features] and the low corner and edge (world units) of the
+    cube that it covers."""
 
     config: HashGrid
     low: tuple[float, ...]
@@ -79,21 +81,25 @@ class Grid(nn.Module):
         self.table = nn.Parameter(torch.empty(sum(config.rows()), config.features).uniform_(-INITIAL, INITIAL))
 
     def unit(self, xyz: Tensor) -> Tensor:
-        """Convert world positions [A, 3] to grid coordinates: those in the cube around the initial points, clamped to [0, 1]."""
+        """Convert world positions [A, 3] to grid coordinates: those in the cube around the initial
+        points, clamped to [0, 1]."""
         return ((xyz - upload(torch.tensor(self.low, dtype=xyz.dtype), xyz.device)) / self.edge).clamp(0, 1)
 
     def forward(self, xyz: Tensor) -> Tensor:
-        """Features [A, levels * features], level by level, at world positions [A, 3]. Positions get no gradient."""
+        """Features [A, levels * features], level by level, at world positions [A, 3]. Positions get
+        no gradient."""
         return encode(self.table, self.unit(xyz), self.config)
 
 
 def encode(table: Tensor, unit: Tensor, config: HashGrid) -> Tensor:
-    """Features [A, levels * features] at positions `unit` [A, 3] in grid coordinates. Differentiable in the table only."""
+    """Features [A, levels * features] at positions `unit` [A, 3] in grid coordinates.
+    Differentiable in the table only."""
     return _Encode.apply(table, unit, config)  # type: ignore[return-value]
 
 
 def corners(unit: Tensor, cells: int, rows: int) -> tuple[Tensor, Tensor]:
-    """Table rows [A, 8] int64 and trilinear weights [A, 8] of the corners around positions `unit` [A, 3].
+    """Table rows [A, 8] int64 and trilinear weights [A, 8] of the corners around positions `unit`
+    [A, 3].
 
     The level has `cells` cells per axis and `rows` table rows.
     """
@@ -112,7 +118,8 @@ def corners(unit: Tensor, cells: int, rows: int) -> tuple[Tensor, Tensor]:
 
 
 class _Encode(torch.autograd.Function):
-    """Interpolation, level by level. The backward pass recomputes the indices, to store 3 numbers per position instead of 256."""
+    """Interpolation, level by level. The backward pass recomputes the indices, to store 3 numbers
+    per position instead of 256."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, unit: Tensor, config: HashGrid) -> Tensor:

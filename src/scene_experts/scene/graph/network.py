@@ -1,6 +1,8 @@
-"""Neighbourhood graph of points and the aggregation of features along it (Ververas et al., SAGS, ECCV 2024).
+"""Neighbourhood graph of points and the aggregation of features along it (Ververas et al., SAGS,
+ECCV 2024).
 
-Points do not move, so the graph changes only when rows are added or removed. A camera uses the subgraph of the points it sees.
+Points do not move, so the graph changes only when rows are added or removed. A camera uses the
+subgraph of the points it sees.
 """
 
 from __future__ import annotations
@@ -29,17 +31,19 @@ class Graph:
 
     @classmethod
     def of(cls, xyz: Tensor, k: int) -> Graph:
-        """Build the exact graph of points [N, 3] with their k - 1 nearest neighbours. The result depends on the positions only."""
+        """Build the exact graph of points [N, 3] with their k - 1 nearest neighbours. The result
+        depends on the positions only."""
         d2, others = find_neighbours(xyz, k - 1)
         me = torch.arange(len(xyz), device=xyz.device)[:, None]
         close = 1 / d2.sqrt().clamp_min(NEAREST)
         return cls(torch.cat([me, others], dim=1), torch.cat([d2.new_zeros(len(xyz), 1), close], dim=1).to(xyz.dtype))
 
     def among(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Subgraph of `rows` [A]: neighbours [A, k] as indices into `rows` (-1 if the neighbour is not in `rows`) and weights [A, k].
+        """Subgraph of `rows` [A]: neighbours [A, k] as indices into `rows` (-1 if the neighbour is
+        not in `rows`) and weights [A, k].
 
-        The weight of a neighbour is its closeness, divided by the sum over all neighbours and by the number of neighbours,
-        including the point itself.
+        The weight of a neighbour is its closeness, divided by the sum over all neighbours and by
+        the number of neighbours, including the point itself.
         """
         place = torch.full((len(self.index),), -1, dtype=torch.int64, device=rows.device)
         place[rows] = torch.arange(len(rows), device=rows.device)
@@ -51,10 +55,12 @@ class Graph:
 
 
 def blend_neighbours(feature: Tensor, found: Tensor, weight: Tensor, share: float = 0.5) -> Tensor:
-    """f_u + share * sum_v w_uv h_v, with h_v = max over the points u that have v as a neighbour of (f_v - f_u), element-wise; [A, F].
+    """f_u + share * sum_v w_uv h_v, with h_v = max over the points u that have v as a neighbour of
+    (f_v - f_u), element-wise; [A, F].
 
-    feature [A, F]; found [A, k] (-1: no neighbour) and weight [A, k] of `Graph.among`. Differentiable in the features. If several
-    points attain a maximum, they share its gradient equally.
+    feature [A, F]; found [A, k] (-1: no neighbour) and weight [A, k] of `Graph.among`.
+    Differentiable in the features. If several points attain a maximum, they share its gradient
+    equally.
     """
     return _Blend.apply(feature, found, weight, share)  # type: ignore[return-value]
 
@@ -94,7 +100,8 @@ class _Blend(torch.autograd.Function):
 
 
 def _forward(feature: Tensor, found: Tensor, weight: Tensor, share: float) -> tuple[Tensor, Tensor]:
-    """Returns the minima over the points that have a point as a neighbour, and the blended features, [A, F] each.
+    """Returns the minima over the points that have a point as a neighbour, and the blended
+    features, [A, F] each.
 
     Works neighbour by neighbour, to avoid tensors of size A k F.
     """
@@ -123,10 +130,11 @@ def _backward(feature: Tensor, found: Tensor, weight: Tensor, least: Tensor, gra
 
 
 def _columns(found: Tensor, weight: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """For each j: the points that have a j-th neighbour, this neighbour, its weight, and [.., 1] bool: whether it is there.
+    """For each j: the points that have a j-th neighbour, this neighbour, its weight, and [.., 1]
+    bool: whether it is there.
 
-    Selecting points would synchronise the host with a GPU. There all points are listed, and a missing neighbour is the point itself
-    with the weight 0.
+    Selecting points would synchronise the host with a GPU. There all points are listed, and a
+    missing neighbour is the point itself with the weight 0.
     """
     out, everyone, yes = [], torch.arange(len(found), device=found.device), torch.ones((), dtype=torch.bool, device=found.device)
     for j in range(found.shape[1]):

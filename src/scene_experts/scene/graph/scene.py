@@ -1,8 +1,10 @@
-"""Points that aggregate features over a graph (Ververas et al., SAGS: Structure-Aware 3D Gaussian Splatting, ECCV 2024).
+"""Points that aggregate features over a graph (Ververas et al., SAGS: Structure-Aware 3D Gaussian
+Splatting, ECCV 2024).
 
-Each row is one Gaussian: a fixed point with a feature and a log-scaling. For each camera, the features of the visible points are
-blended along their graph and concatenated with their element-wise maximum and with the hash grid's features at the point. Four
-small networks without biases decode the result into the Gaussian.
+Each row is one Gaussian: a fixed point with a feature and a log-scaling. For each camera, the
+features of the visible points are blended along their graph and concatenated with their
+element-wise maximum and with the hash grid's features at the point. Four small networks without
+biases decode the result into the Gaussian.
 """
 
 from __future__ import annotations
@@ -51,20 +53,24 @@ class GraphPoints(SceneConfig):
     offset_hidden: Count = 64
     """Width of the offset network (one hidden layer, no activation)."""
     neighbours: Count = 10
-    """Number of points in a neighbourhood, including the point itself, for the graph and the curvature."""
+    """Number of points in a neighbourhood, including the point itself, for the graph and the
+    curvature."""
     blend: float = 0.5
     """Weight of the neighbours in the feature of a point."""
     low: Count = 10
-    """Flat regions: number of nearest points, including the point itself, to which midpoints are added."""
+    """Flat regions: number of nearest points, including the point itself, to which midpoints are
+    added."""
     high: CountOrNone = 5
-    """Other regions: number of nearest points to which midpoints are added (SAGS's scripts use 2 to 8)."""
+    """Other regions: number of nearest points to which midpoints are added (SAGS's scripts use 2 to
+    8)."""
     flat_sigmas: float = 1.0
-    """A point is in a flat region if its curvature is this many standard deviations below the mean."""
+    """A point is in a flat region if its curvature is this many standard deviations below the
+    mean."""
     voxel_size: NotNegative = 0.0
     """Edge of the finest voxels in trained units; 0 lets voxel_rule choose it."""
     voxel_rule: VoxelChoice = "neighbours"
-    """neighbours: a quarter of the median distance to the nearest neighbours. squared_median and median_nn: the rule of Scaffold-GS as
-    implemented and as documented."""
+    """neighbours: a quarter of the median distance to the nearest neighbours. squared_median and
+    median_nn: the rule of Scaffold-GS as implemented and as documented."""
     grid: HashGrid = HashGrid()
 
     @property
@@ -76,7 +82,8 @@ class GraphPoints(SceneConfig):
         return frozenset({OPACITY})
 
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> GraphScene:
-        """Create points at the occupied voxels of the cloud and midpoints between them. Raises InputError if the cloud is empty."""
+        """Create points at the occupied voxels of the cloud and midpoints between them. Raises
+        InputError if the cloud is empty."""
         if len(points.xyz) == 0:
             raise InputError("expected 3D points to start from, found none; run structure from motion again or use --init random")
         voxel = self.voxel_size or choose_voxel_size(points.xyz, self.voxel_rule)
@@ -119,14 +126,16 @@ class Unbiased(nn.Module):
         return out
 
     def after_first(self, h: Tensor) -> Tensor:
-        """Apply the remaining layers to the output of the first layer, with a ReLU before each of them."""
+        """Apply the remaining layers to the output of the first layer, with a ReLU before each of
+        them."""
         for layer in list(self.layers)[1:]:
             h = functional.linear(functional.relu(h), layer)
         return h
 
 
 class GraphScene(LatticeScene):
-    """N points, one Gaussian each. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], log_scaling [N,6]."""
+    """N points, one Gaussian each. Columns: cell [N,3] int64, xyz [N,3]; feature [N,F], log_scaling
+    [N,6]."""
 
     config: GraphPoints
     voxel: float
@@ -149,11 +158,13 @@ class GraphScene(LatticeScene):
 
     @property
     def file_values(self) -> int:
-        """Number of float32 values per row in a file: position, normal, feature, opacity, scaling, rotation (SAGS's layout)."""
+        """Number of float32 values per row in a file: position, normal, feature, opacity, scaling,
+        rotation (SAGS's layout)."""
         return 3 + 3 + self.config.F + 1 + 6 + 4
 
     def __init__(self, config: GraphPoints, table: Table, voxel: float, extent: float, corner: tuple[float, ...], edge: float) -> None:
-        """voxel: edge of the finest lattice cell; extent: the scene's R; corner, edge: the hash grid's cube; in trained world units."""
+        """voxel: edge of the finest lattice cell; extent: the scene's R; corner, edge: the hash
+        grid's cube; in trained world units."""
         super().__init__(table, extent)
         self.config, self.voxel = config, voxel
         self.grid = config.grid.build(corner, edge)
@@ -166,7 +177,8 @@ class GraphScene(LatticeScene):
         self._graph: tuple[Tensor, Graph] | None = None  # the positions and the graph built from them
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move the tensors, as for `.to(...)`, and discard the graph. It is rebuilt on its next use."""
+        """Move the tensors, as for `.to(...)`, and discard the graph. It is rebuilt on its next
+        use."""
         self._graph = None
         return super()._apply(fn, recurse)
 
@@ -180,10 +192,12 @@ class GraphScene(LatticeScene):
 
     @torch.no_grad()
     def face(self, cameras: Sequence[Camera]) -> None:
-        """Flip the sign of the opacity network if its initial opacities are negative on average over the cameras.
+        """Flip the sign of the opacity network if its initial opacities are negative on average
+        over the cameras.
 
-        The initial features are zero and the network has no biases, so its inputs are mostly distances, and the opacities have
-        the same sign for most points. Points with negative opacities are not drawn and would get no gradient.
+        The initial features are zero and the network has no biases, so its inputs are mostly
+        distances, and the opacities have the same sign for most points. Points with negative
+        opacities are not drawn and would get no gradient.
         """
         rows = torch.arange(0, len(self.table), max(1, len(self.table) // PROBES))
         own, strongest = self.encode(rows)
@@ -200,7 +214,8 @@ class GraphScene(LatticeScene):
         return self._graph[1]
 
     def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
-        """Decode the Gaussians that `camera` sees. `cull(means, scales, camera)` is the rasteriser's visibility test."""
+        """Decode the Gaussians that `camera` sees. `cull(means, scales, camera)` is the
+        rasteriser's visibility test."""
         table = self.table
         rows = visible_rows(None, table.facts["xyz"], table.params["log_scaling"].detach()[:, :3].exp(), camera, cull)
         return self.decode(rows, camera)
@@ -208,8 +223,8 @@ class GraphScene(LatticeScene):
     def encode(self, rows: Tensor, told: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Inputs of the networks for the points `rows` [A], from their subgraph.
 
-        Returns the inputs of each point [A, grid + F] and the shared maximum of the features [F]. With `told` [P], the inputs are
-        those of `rows[told]` only, [P, grid + F].
+        Returns the inputs of each point [A, grid + F] and the shared maximum of the features [F].
+        With `told` [P], the inputs are those of `rows[told]` only, [P, grid + F].
         """
         feature = self.table.params["feature"].index_select(0, rows)
         near = blend_neighbours(feature, *self.graph().among(rows), self.config.blend)
@@ -219,10 +234,12 @@ class GraphScene(LatticeScene):
         return torch.cat([self.grid(self.table.facts["xyz"].index_select(0, rows)), near], dim=1), strongest
 
     def fold(self, weight: Tensor, strongest: Tensor) -> tuple[Tensor, Tensor]:
-        """Fold the affine layer and the shared features into a first layer `weight` [H, 2 F + grid (+ 4 view channels)].
+        """Fold the affine layer and the shared features into a first layer `weight` [H, 2 F + grid
+        (+ 4 view channels)].
 
-        Returns a weight [H, grid + F (+ 4)] and a bias [H] that give weight ([own, strongest] alpha + beta). This avoids scaling
-        tensors of size A, and it multiplies the shared features only once.
+        Returns a weight [H, grid + F (+ 4)] and a bias [H] that give weight ([own, strongest] alpha
+        + beta). This avoids scaling tensors of size A, and it multiplies the shared features only
+        once.
         """
         width, own = len(self.alpha), len(self.alpha) - self.config.F
         encoded = weight[:, :width] * self.alpha
@@ -239,7 +256,8 @@ class GraphScene(LatticeScene):
         return functional.linear(own, *self.fold(self.offsets.product(), strongest))
 
     def decode(self, rows: Tensor, camera: Camera) -> Decoded:
-        """Decode the given points [A]. Shape and colour are computed only for Gaussians with positive opacity."""
+        """Decode the given points [A]. Shape and colour are computed only for Gaussians with
+        positive opacity."""
         own, strongest = self.encode(rows)
         x = torch.cat([own, self.view(rows, camera)], dim=1)
         raw = self.opacity(x, strongest)
@@ -268,7 +286,8 @@ class GraphScene(LatticeScene):
 
     @torch.no_grad()
     def slot_points(self, slots: Tensor, rows: Tensor) -> Tensor:
-        """Positions [P, 3] float64 of the Gaussians of `rows` [P]. Uses the whole graph, because there is no camera."""
+        """Positions [P, 3] float64 of the Gaussians of `rows` [P]. Uses the whole graph, because
+        there is no camera."""
         everyone = torch.arange(len(self.table), device=rows.device)
         offset = self.offset(*self.encode(everyone, rows)) * self.table.params["log_scaling"].index_select(0, rows)[:, :3].exp()
         return self.table.facts["xyz"].index_select(0, rows).double() + offset.double()
@@ -280,7 +299,8 @@ class GraphScene(LatticeScene):
         return groups | {"offsets": list(self.offsets.parameters()), "grid": [self.grid.table], "affine": [self.alpha, self.beta]}
 
     def network_tensors(self) -> dict[str, Tensor]:
-        """All learned tensors that are not columns of the table, by name (`opacity.0`, `grid.table`, ...), for files."""
+        """All learned tensors that are not columns of the table, by name (`opacity.0`,
+        `grid.table`, ...), for files."""
         named = {**dict(self.heads.items()), "offsets": self.offsets}
         layers = {f"{name}.{i}": layer for name, head in named.items() for i, layer in enumerate(head.parameters())}
         return {**layers, "grid.table": self.grid.table, "affine.alpha": self.alpha, "affine.beta": self.beta}
