@@ -91,6 +91,8 @@ def test_words_that_do_not_fit(capture, tmp_path, capsys):
         (["blocks", "plan", str(capture), *out, "--views", "x.json"], "--views"),
         (["blocks", "plan", str(capture), *out, "--train=--seeed 3"], "seeed"),
         (["blocks", "plan", str(capture), *out, "--train=--seed -1"], "--seed from 0"),
+        (["blocks", "plan", str(capture), *out, "--blocks", "0"], "--blocks of at least 1"),
+        (["blocks", "plan", str(capture), *out, "--margin", "-1"], "--margin of at least 0"),
         (["blocks", "plan", str(capture), *out, "--iterations", "100", "--train=--batch 8"], "--batch 8 divides"),
         (["blocks", "plan", str(capture), *out, "--blocks", "300"], "same coordinate; give smaller --blocks"),
         (["blocks", "plan", str(capture), *out, "--train=--seed '3"], "--train"),
