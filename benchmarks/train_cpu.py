@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/train_cpu.py CAPTURES/fox CAPTURES/fern --recipes scaffold-gs scene-experts --iterations 7000
 
-What else the machine does meets all recipes alike. The trainings share one random generator, so their scenes are not those of runs. The
+A recipe may have flags: "moe-gs --scene.decoder.router margin". What else the machine does meets all recipes alike. The trainings share one random generator, so their scenes are not those of runs. The
 table has the CPU time of the iterations (without loading and saving), its ratio to the first recipe, the 10 % and 90 % quantiles of that
 ratio over the slices, and what is drawn at the end. --out gets the CPU seconds of each slice as it ends; a stopped script starts again.
 """
@@ -20,10 +20,10 @@ import torch
 from scene_experts.data.capture import Capture, load
 from scene_experts.data.settings import Data
 from scene_experts.render import choose
+from scene_experts.reproduce.variants import read_line
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Event, Stepped
 from scene_experts.training.loop import Job, train
-from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 
 
@@ -54,7 +54,7 @@ class Runner:
 
 def start(recipe: str, folder: Path, capture: Capture, args: argparse.Namespace) -> Runner:
     """Begin the training of a recipe; nothing is computed yet."""
-    cfg = replace(RECIPES[recipe][1], iterations=args.iterations)
+    cfg = replace(read_line(recipe), iterations=args.iterations)
     begun: list[Training] = []
     run = Job(RunConfig(cfg, Data(folder)), begin=begun.append)
     return Runner(recipe, train(cfg, run, capture, choose("auto", "cpu")), begun)

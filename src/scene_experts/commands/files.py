@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from scene_experts.arguments import docs
 from scene_experts.arguments.help import columns
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
@@ -62,7 +63,7 @@ class ImportCommand:
 def export(args: list[str]) -> int:
     """Write a run to one or more files and print what was written."""
     standard = "Files without networks are standard files of plain Gaussians: other scenes are baked for them, which takes minutes."
-    text = f"{ExportCommand.__doc__}\n\n{formats_help()}\n\n{standard}"
+    text = f"{docs.of_class(ExportCommand)}\n\n{formats_help()}\n\n{standard}"
     command = parse(ExportCommand, Command(f"{PROG} export", ("run",), about=text), args)
 
     from rich.console import Console
@@ -104,7 +105,7 @@ def export(args: list[str]) -> int:
 
 def import_(args: list[str]) -> int:
     """Make a run folder of a result folder or a file and print where it is."""
-    text = f"{ImportCommand.__doc__}\n\n{formats_help()}"
+    text = f"{docs.of_class(ImportCommand)}\n\n{formats_help()}"
     brought = {"data.normalise": defaults_in(args).normalise}
     command = parse(ImportCommand, Command(f"{PROG} import", ("source",), FIRST, text, brought), args)
 

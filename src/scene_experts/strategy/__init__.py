@@ -44,7 +44,7 @@ class Strategy(Part, Generic[S], ABC):
     """What the rule grows; `SceneConfig.grown_as` of its scenes."""
 
     max_anchors: CountOrNone = 0
-    """Never more rows than this; 0 is no cap."""
+    """Maximum number of rows; 0 means no limit. Rows with the largest gradients are created first."""
     enabled: bool = True
     """Whether rows are added and removed at all."""
 

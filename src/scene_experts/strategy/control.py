@@ -62,9 +62,6 @@ class AnchorControl(Strategy[L]):
     """Iterations at which Gaussians are masked."""
     mask_views: CountOrNone = 0
     """Number of random training views that a mask looks at; 0 means all."""
-    max_anchors: CountOrNone = 0
-    """Maximum number of anchors; 0 means no limit. Anchors with the largest gradients are created
-    first."""
     bounds: tuple[float, ...] = ()
     """Corners (low x, y, z, high x, y, z) of the box in which anchors are created, in trained world
     units; empty means everywhere. Blocks of a large capture use it."""

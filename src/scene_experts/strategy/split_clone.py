@@ -17,7 +17,7 @@ from typing import Annotated, Literal, Self
 import torch
 from torch import Tensor
 
-from scene_experts.core.fields import Count, CountOrNone, Range
+from scene_experts.core.fields import Count, Range
 from scene_experts.core.parts import register
 from scene_experts.core.random import generator_on
 from scene_experts.core.schedule import Every
@@ -57,9 +57,6 @@ class SplitClone(Strategy[GaussianScene]):
     """Minimum number of iterations between resets, however short the training is."""
     reset_opacity: Annotated[float, Range(above=0, below=1)] = 0.01
     """Upper bound of the opacities after a reset."""
-    max_anchors: CountOrNone = 0
-    """Maximum number of Gaussians; 0 means no limit. Gaussians with the largest gradients are added
-    first."""
 
     @property
     def absolute(self) -> bool:

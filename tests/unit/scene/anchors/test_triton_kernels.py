@@ -37,13 +37,14 @@ def head(a, k, E):
     return triton_decode._head(a, weights, False, F, K).sizes
 
 target = int(sys.argv[1])
-common = {"B": 16, "EP": 16, "FP": 16, "KP": 2, "K": K, "MARGIN": True, "LEAST": 1e-4}
+common = {"B": 16, "EP": 16, "FP": 16, "KP": 2, "K": K}
 check("place", common, target)
 check("place_backward", common, target)
 check("route", {**common, "F": F, "E": E, "TOP": 2, "BIAS": True, "POSITION": True, "PRECISION": "ieee"}, target)
 for a, k, experts in (("opacity", 2, E), ("color", None, E), ("cov", 0, 1)):
     for kernel in ("head_forward", "head_backward", "weight_backward"):
-        check(kernel, {**common, "POSITION": k == 2, **head(a, k, experts)}, target)
+        check(kernel, {**common, "POSITION": k == 2, "OUTSIDE": False, **head(a, k, experts)}, target)
+check("head_backward", {**common, "POSITION": False, "OUTSIDE": True, **head("cov", 2, E)}, target)
 print("compiled")
 """
 
