@@ -2,9 +2,11 @@
 
     OMP_NUM_THREADS=1 python benchmarks/train_cpu.py CAPTURES/fox CAPTURES/fern --recipes scaffold-gs scene-experts --iterations 7000
 
-A recipe may have flags: "moe-gs --scene.decoder.router margin". What else the machine does meets all recipes alike. The trainings share one random generator, so their scenes are not those of runs. The
-table has the CPU time of the iterations (without loading and saving), its ratio to the first recipe, the 10 % and 90 % quantiles of that
-ratio over the slices, and what is drawn at the end. --out gets the CPU seconds of each slice as it ends; a stopped script starts again.
+A recipe may have flags: "moe-gs --scene.decoder.router margin". What else the machine does meets
+all recipes alike. The trainings share one random generator, so their scenes are not those of runs.
+The table has the CPU time of the iterations (without loading and saving), its ratio to the first
+recipe, the 10 % and 90 % quantiles of that ratio over the slices, and what is drawn at the end.
+--out gets the CPU seconds of each slice as it ends; a stopped script starts again.
 """
 
 from __future__ import annotations
