@@ -2,7 +2,7 @@
 
 Every row has a number: its place in the whole table, in the order in which one process would hold
 the rows. A process holds its rows in the order of their numbers. The initial rows and later the new
-ones are dealt to the processes in turn, so that all hold about equally many.
+ones go to the processes in turn, so that all hold about equally many.
 """
 
 from __future__ import annotations
