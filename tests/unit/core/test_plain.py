@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.plain import UnknownPart, differences, from_json, to_json
+from scene_experts.core.plain import UnknownPart, differences, from_json, lean, to_json
 from scene_experts.data.settings import Data
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.recipes import RECIPES
@@ -52,3 +52,10 @@ def test_an_unknown_part_is_told_from_a_wrong_value():
 def test_differences_are_named():
     old, new = {"a": 1, "b": {"c": [1, 2], "d": 3}}, {"a": 1, "b": {"c": [1, 2], "d": 4}}
     assert differences(old, new) == ["b.d was 3, is now 4"] and differences(old, old) == []
+
+
+@pytest.mark.parametrize("name", list(RECIPES))
+def test_what_differs_from_the_defaults_says_everything(name):
+    cfg = RECIPES[name][1]
+    short = json.loads(json.dumps(lean(cfg)))
+    assert from_json(Train, short) == cfg and len(json.dumps(short)) < len(json.dumps(to_json(cfg))) / 3
