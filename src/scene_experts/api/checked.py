@@ -58,7 +58,7 @@ def _of_type(kind: Any, name: str, value: Any) -> Any:
         return None
     if typing.get_origin(inner[0]) is tuple:
         wanted = typing.get_args(inner[0])
-        if not isinstance(value, (tuple, list)) or len(value) != len(wanted):
+        if not isinstance(value, (tuple, list, np.ndarray)) or len(value) != len(wanted):
             raise InputError(f"expected {name} as {len(wanted)} numbers, found {value!r}; correct it")
         return tuple(_of_type(each, name, part) for each, part in zip(wanted, value))
     if inner[0] is str and not isinstance(value, str):

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from scene_experts.core.errors import InputError, nearest
+from scene_experts.core.fields import Chosen, note, notes_of
+from scene_experts.core.parts import Part, become, choice, choices
 from scene_experts.core.plain import from_json, to_json
 from scene_experts.training.config import Train, check
 from scene_experts.training.recipes import RECIPES
@@ -39,7 +41,7 @@ def recipe(name: str | Recipe, /, **numbers: Any) -> Recipe:
             range.
     """
     value = find_recipe(name) if isinstance(name, str) else name
-    for place, number in flat(numbers):
+    for place, number in sorted(flat(numbers), key=lambda each: each[0].count(".")):  # a part before its numbers
         value = with_number(value, place.split("."), place, number, value)
     check(value)
     return value
@@ -80,12 +82,22 @@ def has_number(part: Any, name: str) -> bool:
 def fitting(part: Any, field: str, name: str, value: Any) -> Any:
     """`value` as the type of a field has it. Raises InputError for another type."""
     plain = value.item() if isinstance(value, np.generic) else value
+    if isinstance(plain, str) and note(type(part), field, Chosen) is not None:
+        return named_part(getattr(part, field), notes_of(type(part))[field][0], name, plain)
     kind = typing.get_type_hints(type(part))[field]
     try:
         found = from_json(kind, to_json(plain), name)
     except InputError:
         raise InputError(f"expected {name} of the type of {getattr(part, field)!r}, found {value!r}; correct the value") from None
     return plain if dataclasses.is_dataclass(plain) else found
+
+
+def named_part(old: Part, kind: type[Part], name: str, wanted: str) -> Part:
+    """Return the part that the command line calls `wanted`, with the settings that it shares with
+    the `old` one. Raises InputError if there is none."""
+    if (found := choice(wanted, kind)) is None:
+        raise InputError(f"expected {name} among {', '.join(choices(kind))}, found {wanted!r}; choose one of those")
+    return old if type(old) is found else become(old, found)
 
 
 def names(part: Any, above: str = "") -> list[str]:

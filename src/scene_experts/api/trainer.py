@@ -89,13 +89,13 @@ class Trainer:
             InputError: A setting is invalid, the capture cannot be used, or the folder cannot hold
                 the run.
         """
-        if max_memory > 0:
-            forget_peak()
         self.recipe = recipe(method)
         folder = None if out is None else Path(out)
         if folder is None and (resume or overwrite or tensorboard):
             raise InputError("expected a run folder `out` for resume, overwrite or tensorboard, found None; name one")
         options = checked.fields(TrainOptions, locals())
+        if options.max_memory > 0:
+            forget_peak()
         where = device_of(options.device, options.rasterizer)
         rasterize = choose(options.rasterizer, where, antialias=self.recipe.antialias, deterministic=options.deterministic)
         loaded = capture if isinstance(capture, Capture) else load_capture(capture, seed=self.recipe.seed)

@@ -129,8 +129,10 @@ def describe(row: Row) -> str:
     if text and row.within and _is_small(row):
         above = docs.of_field(*row.within).partition(". ")[0].removesuffix(".")
         text = f"{above}: {text[0].lower()}{text[1:]}" if above else text
-    if choices := list_choices(row.kind):
-        text = f"{text} One of {choices}.".strip()
+    if row.part is not None:
+        text = " ".join([text, *(f"{name}: {docs.title(kind)}." for name, kind in row.parts.items())])
+    elif words := list_choices(row.kind):
+        text = f"{text} One of {words}.".strip()
     limits = note(row.owner, row.place[-1], Range)
     inside = str(limits).removeprefix("of ") if limits is not None and limits.two_sided else ""
     plain = row.required or row.default is None or row.default is False or row.default == ()

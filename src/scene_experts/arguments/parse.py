@@ -143,7 +143,16 @@ class _Reader:
         known = [each for each in self.by_name if each.startswith("--")]
         parts = [each for each in known if each.rpartition(".")[2] == name.removeprefix("--")]  # --top-k for --scene.decoder.top-k
         close = f"did you mean {' or '.join(map(repr, parts[:3]))}?" if parts else nearest(name, known).removeprefix("; ")
-        return self.command.elsewhere(name) or close or f"`{self.command.name} {HELP_ALL}` lists them"
+        return self._owner(name) or self.command.elsewhere(name) or close or f"`{self.command.name} {HELP_ALL}` lists them"
+
+    def _owner(self, name: str) -> str:
+        """Say with which part an option exists that the chosen part does not have."""
+        above, _, last = name.rpartition(".")
+        row = self.by_name.get(above)
+        if row is None or row.part is None:
+            return ""
+        found = [each for each, kind in row.parts.items() if last.replace("-", "_") in kind.__dataclass_fields__]
+        return f"it belongs to {' or '.join(f'{above} {each}' for each in found)}" if found else ""
 
 
 def is_name(word: str) -> bool:

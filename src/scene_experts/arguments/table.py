@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from scene_experts.arguments.option import Option
 from scene_experts.core.fields import Chosen, note, notes_of
-from scene_experts.core.parts import Part, become, choices
+from scene_experts.core.parts import Part, become, choice, choices
 
 Place = tuple[str, ...]
 """Field names from the root to a value, for example ("cfg", "scene", "voxel_size")."""
@@ -37,6 +37,11 @@ class Row:
     """The dataclass and field that hold the owner; None at the root."""
     part: Part | None = None
     """The default part, where the option chooses another one by its name."""
+
+    @property
+    def parts(self) -> dict[str, type[Part]]:
+        """The parts that the option chooses among, by name; empty for other options."""
+        return choices(notes_of(self.owner)[self.place[-1]][0]) if self.part is not None else {}
 
     @property
     def required(self) -> bool:
@@ -96,8 +101,7 @@ def choose_parts(kind: type, defaults: Mapping[str, Any], chosen: Callable[[Row]
         name = chosen(row) if row.part is not None else None
         if row.part is None or name is None or name == row.part.name:  # type: ignore[attr-defined]
             continue
-        base = notes_of(row.owner)[row.place[-1]][0]
-        part = choices(base).get(name)
+        part = choice(name, notes_of(row.owner)[row.place[-1]][0])
         if part is not None:
             found[".".join(row.place)] = become(row.part, part)
     return found

@@ -11,7 +11,7 @@ from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import HELP, HELP_ALL, Command, HelpAsked, parse
 from scene_experts.commands import PROG
 from scene_experts.core.errors import InputError, nearest
-from scene_experts.core.fields import Count, CountOrNone, NotNegative, flag_of
+from scene_experts.core.fields import Count, CountOrNone, NotNegative, Pace, flag_of, marked
 from scene_experts.data.fetch.catalog import defaults_in, defaults_of
 from scene_experts.data.settings import Data
 
@@ -132,7 +132,8 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]], every: int =
     few = options(max_anchors=command.coarse_anchors) if command.coarse_anchors else []
     cfg = parse_train([*train[2:], *options(out=coarse, iterations=total)]).cfg
     until = max(1, total // 3, cfg.scaled_scene().dense_until)  # a scene is divided among experts before it is cut into blocks
-    own = flags_of(cfg, [("scene.decoder.router.speed", 0), *(changes(cfg.scene, cfg.scene.of_views(every), "scene.") or [])])
+    still = [(place, 0) for place in marked(cfg, Pace)]
+    own = flags_of(cfg, [*still, *(changes(cfg.scene, cfg.scene.of_views(every), "scene.") or [])])
     block = [PROG, "train", command.recipe, *data, *without(more, own[::2])]
     same = [*options(**{"rates.networks": 0}), *own]  # what all anchors share stays equal in all blocks
     lines = [[*train, *options(out=coarse, iterations=total, stop_at=until), *few, *memory]]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import typing
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -42,12 +43,12 @@ class Range:
         return (self.low is not None or self.above is not None) and (self.high is not None or self.below is not None)
 
     def too_small(self, value: float) -> bool:
-        """Whether `value` is below the range, or NaN."""
-        return not ((self.low is None or value >= self.low) and (self.above is None or value > self.above))
+        """Whether `value` is below the range."""
+        return (self.low is not None and value < self.low) or (self.above is not None and value <= self.above)
 
     def too_large(self, value: float) -> bool:
         """Whether `value` is above the range."""
-        return not ((self.high is None or value <= self.high) and (self.below is None or value < self.below))
+        return (self.high is not None and value > self.high) or (self.below is not None and value >= self.below)
 
     def __str__(self) -> str:
         """The range in words, for example "of at least 1" or "from 0 to below 1"."""
@@ -76,13 +77,21 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Needs:
-    """Marks a setting that has an effect only on scenes with `what` (`SceneConfig.has`)."""
+    """Marks a setting, or a part, that has an effect only on scenes with `what`
+    (`SceneConfig.has`)."""
 
     what: str
 
 
+@dataclass(frozen=True)
+class Pace:
+    """Marks how fast something changes that no gradient moves; 0 stops it. Trainings of blocks stop
+    it, so that what all anchors share stays equal in all of them."""
+
+
 SCALES = Scales()
 CHOSEN = Chosen()
+PACE = Pace()
 Share = Annotated[float, Range(0, 1)]
 NotNegative = Annotated[float, Range(0)]
 Positive = Annotated[float, Range(above=0)]
@@ -107,13 +116,16 @@ def note(kind: type, name: str, of: type[T]) -> T | None:
 
 
 def check_value(owner: type, name: str, value: Any, flag: str) -> None:
-    """Raise InputError, which names the flag, if `value` is not in the `Range` or among the words
-    of the field `name` of `owner`."""
+    """Raise InputError, which names the flag, if `value` is not finite, not in the `Range` or not
+    among the words of the field `name` of `owner`."""
     limits, many = note(owner, name, Range), value if isinstance(value, tuple) else (value,)
     if words := _words(notes_of(owner)[name][0]):
         for each in many:
             if each is not None and each not in words:
                 raise InputError(f"expected {flag} among {', '.join(map(str, words))}, found {each!r}; choose one of those")
+    for each in many:
+        if isinstance(each, float) and not math.isfinite(each):
+            raise InputError(f"expected {flag} as a finite number, found {each}; correct it or leave it out")
     if limits is None:
         return
     for each in many:
@@ -167,9 +179,19 @@ def changed_without(value: Any, has: frozenset[str], place: str = "") -> Iterato
     for field in dataclasses.fields(value):
         inner, here = getattr(value, field.name), f"{place}.{field.name}".lstrip(".")
         need = note(type(value), field.name, Needs)
-        if dataclasses.is_dataclass(inner):
+        if need is not None and need.what not in has and inner != default_of(field):
+            yield here
+        elif dataclasses.is_dataclass(inner):
             yield from changed_without(inner, has, here)
-        elif need is not None and need.what not in has and inner != default_of(field):
+
+
+def marked(value: Any, mark: type, place: str = "") -> Iterator[str]:
+    """Yield the dotted paths of settings that have an annotation of the class `mark`."""
+    for name, inner in _fields(value):
+        here = f"{place}.{name}".lstrip(".")
+        if dataclasses.is_dataclass(inner):
+            yield from marked(inner, mark, here)
+        elif note(type(value), name, mark) is not None:
             yield here
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import types as pytypes
 import typing
 from pathlib import Path
@@ -35,13 +36,13 @@ def lean(value: Any) -> Any:
     """Convert nested dataclasses to plain JSON values without the settings that have the default of
     their dataclass.
 
-    `from_json` reads the result back. A part with `changes` has their number under "version".
+    `from_json` reads the result back. A part with `changes` has `Part.version` under "version".
     """
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         return to_json(value)
     own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
     kept = {f.name: lean(own[f.name]) for f in dataclasses.fields(value) if own[f.name] != default_of(f) or versions_of(own[f.name])}
-    version = {"version": len(value.changes)} if isinstance(value, Part) and value.changes else {}
+    version = {"version": value.version()} if isinstance(value, Part) and value.version() else {}
     return {"type": type(value).__name__, **version, **kept}
 
 
@@ -49,7 +50,7 @@ def versions_of(value: Any) -> bool:
     """Whether a dataclass or one in it is a part with `changes`."""
     if not dataclasses.is_dataclass(value):
         return False
-    changed = isinstance(value, Part) and bool(value.changes)
+    changed = isinstance(value, Part) and value.version() > 0
     return changed or any(versions_of(getattr(value, f.name)) for f in dataclasses.fields(value))
 
 
@@ -117,13 +118,19 @@ def _from_union(args: tuple[Any, ...], value: Any, where: str) -> Any:
 
 def _from_object(kind: Any, value: Any, where: str) -> Any:
     _expect(isinstance(value, dict), "an object", where, value)
-    hints = typing.get_type_hints(kind)  # without the annotations for the command line
+    hints = _hints(kind)
     known = {f.name for f in dataclasses.fields(kind)}
     unknown = set(value) - known - {"type", "version"}
     _expect(not unknown, f"only the keys {sorted(known)}", where, sorted(unknown))
     needed = [f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING]
     _expect(not set(needed) - set(value), f"the keys {needed}", where, sorted(set(value) - {"type"}))
     return kind(**{name: from_json(hints[name], item, f"{where}.{name}") for name, item in value.items() if name in known})
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    """Return the types of a dataclass's fields, without their annotations."""
+    return typing.get_type_hints(kind)
 
 
 def _expect(fits: bool, what: str, where: str, found: Any) -> None:

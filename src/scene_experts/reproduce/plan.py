@@ -15,7 +15,7 @@ from typing import Any
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.fields import flag_of
-from scene_experts.core.plain import lean
+from scene_experts.core.plain import from_json, lean, to_json
 from scene_experts.data.fetch import catalog
 from scene_experts.data.fetch.obtain import is_present
 from scene_experts.data.images import check_policy
@@ -144,7 +144,8 @@ def identity(scene: str, train: Train, data: Data, code: str = "", start: Path |
     packages (`code_of`), and the name of the run whose scene it started from."""
     more = [code] if code else []
     more += [f"from {start.name}"] if start else []
-    text = json.dumps([scene, lean(train), data.settings(), *more], sort_keys=True)
+    as_read = from_json(Train, to_json(train))  # 2 in place of 2.0 is the same setting
+    text = json.dumps([scene, lean(as_read), data.settings(), *more], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

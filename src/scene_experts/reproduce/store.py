@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 import re
 from collections.abc import Sequence
@@ -21,7 +22,7 @@ from typing import Any
 
 from scene_experts.core.errors import InputError, few
 from scene_experts.core.io import read_json, waiting, write_bytes
-from scene_experts.core.plain import from_json, lean
+from scene_experts.core.plain import UnknownPart, from_json, lean
 from scene_experts.core.reading.budget import JSON, RUN, Damaged
 from scene_experts.core.reading.plain import read_json_lines
 from scene_experts.core.reading.source import guarding
@@ -33,10 +34,14 @@ from scene_experts.reproduce.plan import Spec, identity
 from scene_experts.training.config import RunConfig
 from scene_experts.training.run_folder import read_config
 
+log: logging.Logger = logging.getLogger(__name__)
 FORMAT = 3
 DIGITS = 6  # decimals of numbers
 SAMPLES = 60  # the most iterations whose PSNR counts in `Record.fit`
 POINTS = 30  # the most points of a training curve
+FILE = "file of records"
+PARTS = ("key", "recipe", "seed", "config", "results", "per_view", "curves", "fit", "sha256")
+"""What each run of a file has."""
 CURVES = {"step": 0, "seconds": 1, "psnr": 3, "anchors": 0, "scene_routing": 3}
 """Columns of a curve, and their decimals."""
 MEANS = ("psnr", "ssim", "lpips", "lpips_3dgs")
@@ -173,7 +178,7 @@ def write(store: Path, record: Record) -> Path:
     path = record_path(store, record.scene)
     path.parent.mkdir(parents=True, exist_ok=True)
     with waiting(path.with_name(f".{path.name}.lock")):
-        found = {each["key"]: each for each in _read_file(path)} if path.is_file() else {}
+        found = {each["key"]: each for each in _read_runs(path)[1]} if path.is_file() else {}
         found[record.key] = pack(record)
         lines = (text(each, 0) for each in sorted(found.values(), key=lambda each: (each["recipe"], each["seed"], each["key"])))
         body = ",\n".join(lines)
@@ -228,28 +233,42 @@ def without_places(results: dict[str, Any]) -> dict[str, Any]:
 
 def read(path: Path) -> list[Record]:
     """Read the records of a file, without those of parts that compute something else by now
-    (`Part.changes`).
+    (`Part.changes`), and, with a warning, without those of parts that are not installed.
 
     Raises InputError where it is something else or was edited by hand.
     """
-    with guarding(path, JSON, "records of runs"):
-        values = _read_file(path)
-        found = [_unpack(path, value) for value in values]
-        return [record for record, value in zip(found, values) if record.key == value["key"]]
+    with guarding(path, JSON, FILE):
+        found, unknown = [], []
+        scene, runs = _read_runs(path)
+        for value in runs:
+            try:
+                record = _unpack(path, scene, value)
+            except UnknownPart as error:
+                unknown.append(error)
+                continue
+            if record.key == value["key"]:
+                found.append(record)
+        if unknown:
+            log.warning("left out %d of the records in %s: %s", len(unknown), path, unknown[0])
+        return found
 
 
-def _read_file(path: Path) -> list[dict[str, Any]]:
-    value = read_json(path, "records of runs")
-    if not isinstance(value, dict) or value.get("format") != FORMAT or not isinstance(value.get("runs"), list):
-        raise InputError(f"expected records of runs (format {FORMAT}) in {path}, found something else; remove it and reproduce again")
-    return [{**run, "scene": value.get("scene")} if isinstance(run, dict) else {} for run in value["runs"]]
+def _read_runs(path: Path) -> tuple[str, list[dict[str, Any]]]:
+    """Return the name of the capture and the JSON of its runs."""
+    value = read_json(path, FILE)
+    if not isinstance(value, dict) or value.get("format") != FORMAT or not isinstance(value.get("scene"), str):
+        raise InputError(f"expected a {FILE} (format {FORMAT}) in {path}, found something else; remove it and reproduce again")
+    if not isinstance(value.get("runs"), list):
+        raise Damaged("no list of runs")
+    for run in value["runs"]:
+        missing = [name for name in PARTS if not isinstance(run, dict) or name not in run]
+        if missing:
+            raise InputError(f"expected a {FILE} in {path}, found a run without {missing[0]}; remove it and reproduce again")
+    return value["scene"], value["runs"]
 
 
-def _unpack(path: Path, value: dict[str, Any]) -> Record:
-    parts = ("key", "config", "results", "per_view", "curves", "fit", "sha256")
-    if not all(part in value for part in parts) or not isinstance(value["scene"], str):
-        raise Damaged(f"a run without {next((part for part in parts if part not in value), 'scene')}")
-    own = {name: each for name, each in value.items() if name not in ("scene", "sha256")}
+def _unpack(path: Path, scene: str, value: dict[str, Any]) -> Record:
+    own = {name: each for name, each in value.items() if name != "sha256"}
     if digest(own) != value["sha256"]:
         raise InputError(f"expected a run with its recorded checksum in {path}, found edited values; remove it and reproduce again")
     try:
@@ -262,7 +281,7 @@ def _unpack(path: Path, value: dict[str, Any]) -> Record:
     if not (isinstance(results, dict) and isinstance(fit, (float, int, type(None))) and isinstance(code, str)):
         raise Damaged("results or a fit of another form")
     check_means(results, per_view, f"in {path}", "remove it and reproduce again")
-    return Record(value["scene"], from_json(RunConfig, value["config"]), results, per_view, points, fit, code)
+    return Record(scene, from_json(RunConfig, value["config"]), results, per_view, points, fit, code)
 
 
 def load(store: Path) -> list[Record]:

@@ -23,6 +23,7 @@ Cull = Callable[[Tensor, Tensor, Camera], Tensor]
 """The rasteriser's visibility test: means [n, 3], scales [n, 3], camera -> [n] bool."""
 OPACITY = "an opacity network"
 ROUTERS = "routers that losses train"
+EXPERTS = "several experts"
 EXPLICIT = "explicit Gaussians"
 Draws = Callable[[Camera, int, Mode, Cull], Decoded]
 """Signature of a scene's forward pass: (camera, step, mode, cull) -> Decoded."""
@@ -214,7 +215,7 @@ class SceneConfig(Part, ABC):
 
     @property
     def has(self) -> frozenset[str]:
-        """What the scene has of OPACITY, ROUTERS and EXPLICIT. Settings that need another have no
+        """What the scene has of OPACITY, ROUTERS, EXPERTS and EXPLICIT. Settings that need another have no
         effect; a training warns about them."""
         return frozenset()
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from scene_experts.core.parts import load_with
 from scene_experts.scene.anchors.balance import Balanced
 from scene_experts.scene.anchors.experts import Experts
 from scene_experts.scene.anchors.features import FeatureBank
@@ -147,3 +148,4 @@ OWN: dict[str, Recipe] = {
 
 RECIPES = RecipeBook(OWN)
 """All recipes by name: a one-sentence description and the value of each."""
+load_with(RECIPES.load)

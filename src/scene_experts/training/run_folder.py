@@ -22,10 +22,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+import scene_experts.training.recipes  # noqa: F401  registers the parts of this package, and finds those of others
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError, few
 from scene_experts.core.io import locked, read_json, write_json
-from scene_experts.core.plain import MOST_DIFFERENCES, UnknownPart, differences, from_json, to_json
+from scene_experts.core.plain import MOST_DIFFERENCES, differences, from_json, to_json
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding
 from scene_experts.core.version import __version__
@@ -38,7 +39,6 @@ from scene_experts.scene.fit import restore_foreign
 from scene_experts.training import capture_place
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig
-from scene_experts.training.recipes import RECIPES
 
 FORMAT = 1
 PICTURES = ("renders", "gt", "errors", "side_by_side", "masks", "experts")  # folders with the images of an evaluation
@@ -222,11 +222,7 @@ def read_config(run: Path) -> RunConfig:
         raise InputError(f"expected a run configuration of format {FORMAT} in {run}, found another; train it again with this version")
     relative = value.pop(capture_place.KEY, None)
     with guarding(run / "config.json", RUN, "run configuration"):
-        try:
-            config = from_json(RunConfig, value)
-        except UnknownPart:  # another package may define the part
-            RECIPES.load()
-            config = from_json(RunConfig, value)
+        config = from_json(RunConfig, value)
         config.train.scaled_scene()
     path = capture_place.find(run, config.data.path, relative if isinstance(relative, str) else None)
     return replace(config, data=replace(config.data, path=path))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import scene_experts as se
+from scene_experts.scene.anchors.balance import Balanced
 from scene_experts.training.recipes import RECIPES
 
 
@@ -38,6 +39,7 @@ def test_numbers_go_where_their_names_say():
         ("moe-gs", {"scene.add_dist": "color"}, "scene.add_dist"),
         ("moe-gs", {"iterations": 0}, "iterations"),
         ("moe-gs", {"seed": -1}, "seed"),
+        ("moe-gs", {"rates.mix.first": float("inf")}, "--rates.mix.first as a finite number"),
         ("3dgs", {"scene.voxel_size": 0.1}, "'3dgs' has no"),
     ],
 )
@@ -45,3 +47,10 @@ def test_what_does_not_fit_is_told_in_a_sentence(name, numbers, said):
     with pytest.raises(se.InputError, match=said) as error:
         se.recipe(name, **numbers)
     assert "\n" not in str(error.value)
+
+
+def test_a_part_is_chosen_by_the_name_of_the_command_line_before_its_numbers_are_set():
+    made = se.recipe("moe-gs-posrouter", **{"scene.decoder.router.speed": 0.1, "scene.decoder.router": "balanced"})
+    assert made.scene.decoder.router == Balanced(input_pos=True, speed=0.1)  # type: ignore[union-attr]
+    with pytest.raises(se.InputError, match=r"scene.decoder.router among linear, margin.*'balance'"):
+        se.recipe("moe-gs", scene={"decoder": {"router": "balance"}})

@@ -6,6 +6,7 @@ import pytest
 
 from scene_experts import cli
 from scene_experts.commands.train import parse_train
+from scene_experts.scene.anchors.balance import Balanced
 from scene_experts.scene.anchors.few_views import find_weight
 from scene_experts.training.config import check
 from support.captures import load
@@ -68,7 +69,9 @@ def test_blocks_leave_what_all_anchors_share_as_it_is(options, capture, tmp_path
     loaded.images.close()
     rates = {name: cfg.rates.at(name, 1, 100, 1.0) for name in scene.rate_groups()}
     assert {name for name, rate in rates.items() if rate} == {"feature", "offsets", "log_scaling"}
-    assert getattr(cfg.scene.decoder, "speed", 0) == 0  # of the biases that balance the experts
+    router = getattr(cfg.scene.decoder, "router", None)
+    assert getattr(router, "speed", 0) == 0  # of the biases that balance the experts
+    assert isinstance(router, Balanced) == options.startswith("moe-gs-balance")
 
 
 @pytest.mark.parametrize(("few", "weight"), [(3, 0.0), (4, 0.25), (7, 1.0)])  # of 7 views

@@ -36,7 +36,7 @@ class Settings:
     [
         ({"share": 1.0}, "expected --part.share from 0 to below 1, found 1.0; give a smaller number or leave it out"),
         ({"share": -0.1}, "expected --part.share from 0 to below 1, found -0.1; give a larger number or leave it out"),
-        ({"share": float("nan")}, "expected --part.share from 0 to below 1, found nan; give a larger number or leave it out"),
+        ({"share": float("nan")}, "expected --part.share as a finite number, found nan; correct it or leave it out"),
         ({"power": 0.0}, "expected --part.power above 0 and at most 1, found 0.0; give a larger number or leave it out"),
         ({"only": (3, 10)}, "expected --part.only from 1 to 9, found 10; give a smaller number or leave it out"),
         ({"kind": "ceil"}, "expected --part.kind among round, floor, found 'ceil'; choose one of those"),

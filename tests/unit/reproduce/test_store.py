@@ -14,7 +14,7 @@ from scene_experts.core.plain import to_json
 from scene_experts.data import capture as captures
 from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import OWN, CaptureSpec, Scale, Spec, drop_repeated
-from scene_experts.reproduce.store import POINTS, SAMPLES, check_captures, find, find_all, load, read, read_curves, read_run, write
+from scene_experts.reproduce.store import POINTS, SAMPLES, check_captures, digest, find, find_all, load, read, read_curves, read_run, write
 from scene_experts.strategy.grow import GrowAnchors
 from support.messages import naming
 from support.records import record
@@ -260,3 +260,39 @@ def test_a_run_counts_for_every_recipe_of_the_same_numbers(tmp_path):
     found = find_all(load(tmp_path), pair)
     assert [r.recipe for r in found] == ["moe-gs", "moe-gs-e5-top2"] and [r.key for r in found] == [s.key for s in pair]
     assert find(load(tmp_path), Spec(scene, "moe-gs-e5-top1", 0, Scale(iterations=3000))) is None
+
+
+def test_a_file_keeps_the_lines_of_its_other_runs(tmp_path):
+    first = write(tmp_path, record(seed=1)).read_text().splitlines()[1]
+    lines = write(tmp_path, record(seed=2)).read_text().splitlines()[1:]
+    assert lines[0] == first + "," and all(json.loads(line.rstrip(","))["seed"] for line in lines[:2])
+
+
+@pytest.mark.parametrize("name", ["key", "recipe", "seed", "sha256"])
+def test_a_run_without_a_part_is_named_also_before_another_is_added(tmp_path, name):
+    path = write(tmp_path, record())
+    whole = json.loads(path.read_text())
+    del whole["runs"][0][name]
+    write_json(path, whole)
+    for act in (lambda: read(path), lambda: write(tmp_path, record(seed=1))):
+        with pytest.raises(InputError, match=f"found a run without {name}; remove it"):
+            act()
+
+
+def test_the_record_of_a_part_that_is_not_installed_leaves_the_others(tmp_path, caplog):
+    path = write(tmp_path, record(seed=1))
+    write(tmp_path, record(seed=2))
+    whole = json.loads(path.read_text())
+    run = whole["runs"][0]
+    run["config"]["train"]["scene"] = {"type": "TheirScene"}
+    run["sha256"] = digest({part: value for part, value in run.items() if part != "sha256"})
+    write_json(path, whole)
+    assert [each.seed for each in read(path)] == [2]
+    assert "left out 1 of the records" in caplog.text and "TheirScene" in caplog.text
+
+
+def test_a_whole_number_is_the_number_that_a_record_gives_back(tmp_path):
+    made = record()
+    whole = replace(made, config=replace(made.config, train=replace(made.config.train, loss=replace(made.config.train.loss, opacity=2))))
+    (back,) = read(write(tmp_path, whole))
+    assert back.key == whole.key and isinstance(back.config.train.loss.opacity, float)

@@ -38,7 +38,7 @@ def test_every_ablation_of_the_paper_has_a_recipe():
 def defaults_of(kind):
     """The number of a part's changes, and the default of each of its settings."""
     fields = {f.name: lean(default_of(f)) for f in dataclasses.fields(kind) if default_of(f) is not dataclasses.MISSING}
-    return {"changes": len(getattr(kind, "changes", ())), **json.loads(json.dumps(fields))}
+    return {"changes": kind.version() if issubclass(kind, Part) else 0, **json.loads(json.dumps(fields))}
 
 
 OURS = [Train, *(kind for name in names_of(Part) if (kind := find(name, Part)) and kind.__module__.startswith("scene_experts."))]

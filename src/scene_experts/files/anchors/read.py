@@ -262,7 +262,8 @@ def check_networks(networks: dict[str, Network], where: str) -> None:
         (E, H, _), out = n["w1"].shape, n["w2"].shape[1]
         shapes = {"b1": (E, H), "w2": (E, out, H), "b2": (E, out), "router_b": (E,)}
         wrong = [name for name, shape in shapes.items() if name in n and n[name].shape != shape]
-        if wrong or (E > 1 and ("router_w" not in n or len(n["router_w"]) != E)):
+        router = [name for name in n if name.startswith("router_")]
+        if wrong or (E > 1 and not router) or ("router_w" in n and len(n["router_w"]) != E):
             raise InputError(
                 f"expected {attribute} networks of {E} experts that fit together in {where}, found others; write the file again"
             )

@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
 
-from scene_experts.core.fields import NotNegative
+from scene_experts.core.fields import PACE, NotNegative
 from scene_experts.core.parts import register
 from scene_experts.core.types import Mode
 from scene_experts.scene.anchors.routers import Linear, LinearModule, top_k
@@ -29,7 +30,7 @@ class Balanced(Linear):
 
     name = "balanced"
 
-    speed: NotNegative = 0.001
+    speed: Annotated[NotNegative, PACE] = 0.001
     """Change of a bias per iteration. Gates are between 0 and 1."""
 
     def build(self, experts: int, feature: int) -> BalancedModule:

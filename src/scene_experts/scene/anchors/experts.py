@@ -25,7 +25,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.fields import CHOSEN, SCALES, Count, Flag, Needs, Range
 from scene_experts.core.parts import register
 from scene_experts.core.types import Mode, Routing
-from scene_experts.scene import ROUTERS
+from scene_experts.scene import EXPERTS, ROUTERS
 from scene_experts.scene.anchors.mlp import ACTIVATIONS, ATTRIBUTES, MLP, Attribute, Decoder, HeadWeights, linear_init
 from scene_experts.scene.anchors.routers import Companions, Linear, Router, RouterModule
 
@@ -50,7 +50,7 @@ class Experts(Decoder):
     """independent: initialise each expert on its own. clone_jitter: copies of one network with
     small noise. variance: independent, with the last layers times sqrt(num), so that the outputs of
     the dense mixture vary as much as those of one network."""
-    router: Annotated[Router, CHOSEN] = Linear()
+    router: Annotated[Router, CHOSEN, Needs(EXPERTS)] = Linear()
     """How experts are chosen and weighed."""
 
     @property
@@ -63,7 +63,9 @@ class Experts(Decoder):
 
     @property
     def has(self) -> frozenset[str]:
-        return frozenset({ROUTERS}) if self.router.learns else frozenset()
+        if self.num == 1 or not self.attributes:
+            return frozenset()
+        return frozenset({EXPERTS, ROUTERS} if self.router.learns else {EXPERTS})
 
     def check(self, flag: Flag) -> None:
         if self.top_k is not None and self.top_k > self.num:

@@ -82,7 +82,7 @@ class Router(Part, ABC):
 @register
 @dataclass(frozen=True)
 class Linear(Router):
-    """The paper's "simple linear layer": g = softmax(W f + b) (eq. 3). Top-k takes the largest
+    """The paper's "simple linear layer". g = softmax(W f + b) (eq. 3); Top-k takes the largest
     logits, and w_i = g_i / sum of the chosen g_j (eq. 5)."""
 
     name = "linear"

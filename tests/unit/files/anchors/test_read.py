@@ -339,3 +339,15 @@ def test_networks_for_the_trained_unit():
     assert networks["color"]["w1"].min() == 1, "the file's tensors stay as they are"
     with pytest.raises(InputError, match=naming(4, 3)):
         for_trained_unit({"feature_bank": {"w1": torch.zeros(1, 32, 3)}}, (), 2, 4.0)
+
+
+def test_the_networks_of_a_router_of_another_form_are_read():
+    networks = experts()
+    for attribute in networks.values():
+        attribute["router_directions"] = attribute.pop("router_w")
+        attribute.pop("router_b")
+    check_networks(networks, "there")
+    for attribute in networks.values():
+        del attribute["router_directions"]
+    with pytest.raises(InputError, match="experts that fit together"):
+        check_networks(networks, "there")

@@ -17,6 +17,7 @@ from scene_experts.scene.anchors.experts import Experts
 from scene_experts.scene.anchors.mlp import ATTRIBUTES
 from scene_experts.scene.anchors.places import Places
 from scene_experts.scene.anchors.routers import Linear, Margin, Router, RouterModule, top_k
+from scene_experts.training.config import find_unused
 from scene_experts.training.recipes import RECIPES
 from support.scenes import CAMERA, start_scene
 
@@ -174,9 +175,9 @@ def test_a_flag_chooses_the_router():
     assert chosen_by("--scene.decoder.router.sharpness", "9", "--scene.decoder.router", "cosine-of-test").router == CosineOfTest(9.0)
     assert chosen_by("--scene.decoder.router", "margin", recipe="moe-gs-posrouter").router == Margin(input_pos=True)  # a setting of both
     assert chosen_by("--scene.decoder.router", "places", recipe="scene-experts").router == Places()
-    with pytest.raises(InputError, match="linear, margin, balanced, places"):
+    with pytest.raises(InputError, match=r"linear, margin.*found 'cosin'"):
         chosen_by("--scene.decoder.router", "cosin")
-    with pytest.raises(InputError, match="speed"):
+    with pytest.raises(InputError, match=r"speed; it belongs to --scene.decoder.router balanced$"):
         chosen_by("--scene.decoder.router.speed", "0.01")  # a linear router has none
 
 
@@ -184,3 +185,10 @@ def test_training_says_which_decode_runs():
     assert scene_with(Linear(), "auto").describe_decode(1) == "fused (compiled)"
     assert "routed in torch (opacity, cov, color" in scene_with(CosineOfTest(), "auto").describe_decode(1)
     assert "--scene.decode composed" in scene_with(Linear(), "composed").describe_decode(1)
+
+
+def test_a_router_among_one_expert_has_no_effect_and_is_named():
+    train = RECIPES["moe-gs"][1]
+    alone = replace(train, scene=replace(train.scene, decoder=Experts(num=1, top_k=None, router=Margin())))
+    assert "--scene.decoder.router" in find_unused(alone) and "--loss.load" in find_unused(alone)
+    assert find_unused(replace(train, scene=replace(train.scene, decoder=Experts(router=Margin())))) == []
