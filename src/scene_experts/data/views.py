@@ -172,8 +172,8 @@ def same_poses(one: object, other: object) -> bool:
     """Return whether two texts of `Capture.poses` agree.
 
     Centres may differ by a thousandth of the largest distance between the cameras, and entries of
-    the axes by 0.001. A value that is no such text agrees with every other, as checkpoints of
-    earlier versions have none.
+    the axes by 0.001. A value that is no such text agrees with every other: imported scenes
+    have none.
     """
     ours, theirs = _parse_poses(one), _parse_poses(other)
     if ours is None or theirs is None:

@@ -7,8 +7,7 @@ import os
 from pathlib import Path
 
 KEY = "capture_from_run"
-"""Key of config.json: the capture's path relative to the run folder. Earlier runs do not have
-it."""
+"""Key of config.json: the capture's path relative to the run folder."""
 
 
 def absolute(path: Path) -> Path:
@@ -28,20 +27,13 @@ def from_run(run: Path, path: Path) -> str | None:
 def find(run: Path, path: Path, relative: str | None) -> Path:
     """Return the folder of a run's capture.
 
-    An absolute path is tried first, then the path relative to the run folder. Earlier runs store
-    the path as it was given on the command line. If that path is relative, it is tried from the
-    current folder, the run folder and each parent of the run folder.
-
     Args:
         run: The run folder.
-        path: Path of the capture in config.json.
+        path: Absolute path of the capture in config.json; tried first.
         relative: Path of the capture relative to the run folder in config.json, or None.
 
     Returns:
         The first path that exists, as an absolute path, or `path` if none exists.
     """
-    here = absolute(run)
-    places = [path] if path.is_absolute() else [path, *(folder / path for folder in (here, *here.parents))]
-    if relative is not None:
-        places.append(here / relative)
+    places = [path] if relative is None else [path, absolute(run) / relative]
     return next((absolute(place) for place in places if place.exists()), path)

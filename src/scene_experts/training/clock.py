@@ -24,11 +24,11 @@ class Clock:
     seconds: float = 0.0
     """Wall time, s."""
     cpu_seconds: float | None = 0.0
-    """User and system time of all threads of this process, s. None: an older checkpoint, which does
-    not say."""
+    """User and system time of all threads of this process, s. None: unknown, for an
+    imported or merged scene."""
     load: dict[str, float | None] = field(default_factory=lambda: {"cores": os.cpu_count(), "start": load_average()})
     """`cores` of the machine, and its load averages at the `start` and the `end` of the training;
-    empty for an older checkpoint."""
+    empty for an imported or merged scene."""
 
     @contextmanager
     def running(self) -> Iterator[None]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated, Literal, Protocol
 
 import torch
@@ -48,6 +49,12 @@ class HeadWeights:
     def routed_outside(self) -> bool:
         """Whether the kernels need the mixture weights of each anchor."""
         return self.router_w is None and len(self.w1) > 1
+
+
+Outside = Mapping[str, tuple[Routing, Tensor]]
+"""Routing and mixture weights ([A, k], or [A, E] while dense) by attribute, for the heads that are
+`HeadWeights.routed_outside`."""
+NOT_ROUTED: Outside = MappingProxyType({})
 
 
 class Head(Protocol):

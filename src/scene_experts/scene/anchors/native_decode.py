@@ -12,7 +12,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -22,12 +21,11 @@ from scene_experts.core.types import Gaussians, Routing
 from scene_experts.native import api
 from scene_experts.native import library as native
 from scene_experts.native.api import SeDecode
-from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, HeadWeights
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, NOT_ROUTED, HeadWeights, Outside
 
 WHAT = "the decode"
 TENSORS = api.HEAD_TENSORS
 T = len(TENSORS)
-NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ def decode(
     heads: dict[str, HeadWeights],
     with_dist: dict[str, bool],
     extent: float = 1.0,
-    outside: Mapping[str, tuple[Routing, Tensor]] = NOTHING,
+    outside: Outside = NOT_ROUTED,
 ) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
     """Decode anchors into Gaussians.
 
@@ -109,7 +107,7 @@ def decode(
     return Gaussians(means, quats, scales, opacities, colors, source), raw, routing
 
 
-def check_outside(heads: Mapping[str, HeadWeights], outside: Mapping[str, tuple[Routing, Tensor]], A: int) -> None:
+def check_outside(heads: Mapping[str, HeadWeights], outside: Outside, A: int) -> None:
     """Raise ValueError unless `outside` has weights of the right shape for each head that is routed
     outside, IndexError for experts that do not exist."""
     for a, h in heads.items():

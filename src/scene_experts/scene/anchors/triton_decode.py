@@ -11,9 +11,8 @@ device, the same inputs give the same bits. Symbols as in `types.py`.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType, ModuleType
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -21,7 +20,7 @@ from torch import Tensor
 
 from scene_experts.core.types import Gaussians, Routing
 from scene_experts.native import triton
-from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, HeadWeights
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, NOT_ROUTED, HeadWeights, Outside
 
 ACTIVATION = {"opacity": 0, "cov": 1, "color": 2}  # TANH, NONE, SIGMOID of triton_kernels.py
 TENSORS = ("router_w", "router_b", "w1", "b1", "w2", "b2")
@@ -29,7 +28,6 @@ PRECISION = "ieee"  # of matrix products: "ieee" is float32, "tf32x3" is nearly 
 BLOCK = 32  # anchors per program; with the paper's sizes, the largest block whose tiles fit in registers
 BLOCK_WEIGHTS = 16  # anchors per step of `weight_backward`, which also keeps the gradient of a network in registers
 MOST_EXPERTS = 30  # a set of experts is stored as the bits of an int32
-NOTHING: Mapping[str, Any] = MappingProxyType({})
 WIDEST = 256  # largest padded number of outputs
 
 
@@ -85,7 +83,7 @@ def decode(
     heads: dict[str, HeadWeights],
     with_dist: dict[str, bool],
     extent: float = 1.0,
-    outside: Mapping[str, tuple[Routing, Tensor]] = NOTHING,
+    outside: Outside = NOT_ROUTED,
 ) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
     """Decode anchors into Gaussians.
 
@@ -242,7 +240,7 @@ class Routes:
         heads: dict[str, HeadWeights],
         with_dist: dict[str, bool],
         extent: float,
-        outside: Mapping[str, tuple[Routing, Tensor]] = NOTHING,
+        outside: Outside = NOT_ROUTED,
     ) -> None:
         """xyz [N, 3]; columns: feature [N, F], log_scaling [N, 6], offsets [N, K, 3], all
         contiguous. Other arguments: see `decode`."""

@@ -8,6 +8,7 @@ import torch
 from scene_experts.core.types import Routing
 from scene_experts.native import library as native
 from scene_experts.scene.anchors import native_decode
+from scene_experts.scene.anchors.mlp import NOT_ROUTED
 from support.decoding import CASES, EXTENT, OUTSIDE, compare, leaves, objective, oracle, problem, single_precision, without_routers
 from support.messages import naming
 
@@ -15,7 +16,7 @@ pytestmark = pytest.mark.skipif(native.load() is None, reason="no compiled libra
 LEVELS = [level for level in native.list_levels() if native.find(level)]
 
 
-def run_native(rows, columns, camera, heads, with_dist, seed=5, outside=native_decode.NOTHING):
+def run_native(rows, columns, camera, heads, with_dist, seed=5, outside=NOT_ROUTED):
     columns, heads, named = leaves(*single_precision(columns, heads))
     given = [columns[name] for name in ("xyz", "feature", "log_scaling", "offsets")]
     gaussians, raw, routing = native_decode.decode(rows, *given, camera.float(), heads, with_dist, EXTENT, outside)

@@ -11,7 +11,7 @@ from scene_experts.native.triton import explain_missing
 from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors import scene as anchors
 from scene_experts.scene.anchors.experts import Experts
-from scene_experts.scene.anchors.mlp import HeadWeights, Plain
+from scene_experts.scene.anchors.mlp import NOT_ROUTED, HeadWeights, Plain
 from scene_experts.scene.anchors.routers import Linear
 from scene_experts.scene.anchors.scene import ATTRIBUTES, Anchors, AnchorScene
 from support.decoding import CASES, EXTENT, OUTSIDE, compare, leaves, objective, oracle, problem, single_precision, without_routers
@@ -41,12 +41,12 @@ def moved(columns, heads, device=DEVICE):
     return {n: v.to(device) for n, v in columns.items()}, {a: replace(h, **tensors(h)) for a, h in heads.items()}
 
 
-def call(rows, columns, camera, heads, with_dist, outside=triton_decode.NOTHING):
+def call(rows, columns, camera, heads, with_dist, outside=NOT_ROUTED):
     c = [columns[n] for n in ("xyz", "feature", "log_scaling", "offsets")]
     return triton_decode.decode(rows.to(DEVICE), *c, camera.float().to(DEVICE), heads, with_dist, EXTENT, outside)
 
 
-def run(rows, columns, camera, heads, with_dist, outside=triton_decode.NOTHING):
+def run(rows, columns, camera, heads, with_dist, outside=NOT_ROUTED):
     """Outputs and gradients, on the CPU."""
     columns, heads, named = leaves(*moved(columns, heads))
     gaussians, raw, routing = call(rows, columns, camera, heads, with_dist, outside)
