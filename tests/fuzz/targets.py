@@ -23,6 +23,7 @@ from scene_experts.core.io import write_json
 from scene_experts.data import capture
 from scene_experts.data.images import FrameSource, decode, probe
 from scene_experts.data.lens import Lens
+from scene_experts.data.masks import Mask
 from scene_experts.data.settings import Data
 from scene_experts.evaluate import results
 from scene_experts.evaluate.lpips import tensor_shapes
@@ -248,8 +249,8 @@ def _picture(format: str, **options: Any) -> Callable[[Path], None]:
 
 
 def _read_picture(folder: Path) -> Any:
-    size, _ = probe(folder / "photo")
-    return decode(FrameSource(folder / "photo", Lens("PINHOLE", *size, (9, 9, 8, 6)), (8, 6), folder / "mask", True, (1.0, 1.0, 1.0)))
+    size = probe(folder / "photo").size
+    return decode(FrameSource(folder / "photo", Lens("PINHOLE", *size, (9, 9, 8, 6)), (8, 6), Mask(folder / "mask"), True, (1.0, 1.0, 1.0)))
 
 
 def _path(folder: Path) -> None:

@@ -90,19 +90,6 @@ def test_view(moved, monkeypatch):
     assert [Path(root).resolve() for root in seen] == [(moved / "box").resolve()]
 
 
-@pytest.mark.parametrize("beside", [True, False])
-def test_a_run_of_an_earlier_version_keeps_a_relative_path(beside, moved, monkeypatch):
-    config = json.loads((moved / "runs/one/config.json").read_text())
-    config.pop("capture_from_run")
-    config["data"]["path"] = "box"
-    (moved / "runs/one/config.json").write_text(json.dumps(config))
-    if not beside:
-        (moved / "runs").rename(moved.parent / "runs")
-        monkeypatch.chdir(moved)
-    run = moved / "runs/one" if beside else moved.parent / "runs/one"
-    assert cli.main(["eval", str(run), "--no-lpips"]) == 0
-
-
 def test_a_capture_that_is_gone_is_asked_for(moved, capsys):
     shutil.rmtree(moved / "box")
     assert cli.main(["eval", str(moved / "runs/one"), "--no-lpips"]) == 2

@@ -7,7 +7,6 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from scene_experts.core.errors import InputError, few, nearest
@@ -18,10 +17,13 @@ from scene_experts.core.reading.source import guarding, sentence
 from scene_experts.core.types import Camera
 from scene_experts.data import prepare
 from scene_experts.data.blocks import read_view_names
-from scene_experts.data.images import FrameSource, check_policy, fits, probe
-from scene_experts.data.lens import Lens, centre_principal_point, to_pinhole
+from scene_experts.data.colour import find_white
+from scene_experts.data.images import FrameSource, check_policy, probe
+from scene_experts.data.lens import centre_principal_point, to_pinhole
+from scene_experts.data.masks import find_masks
 from scene_experts.data.match import to_relative_name
-from scene_experts.data.readers import PosedImage, RawCapture, ReadOptions, find_reader, tell_others, unrecognised_error
+from scene_experts.data.orientation import fit_lenses
+from scene_experts.data.readers import RawCapture, ReadOptions, find_reader, tell_others, unrecognised_error
 from scene_experts.data.settings import Data
 from scene_experts.data.store import ImageStore
 from scene_experts.data.views import Capture, Frame, Vector, View, World
@@ -118,15 +120,21 @@ def _assemble(root: Path, kind: str, raw: RawCapture, centred: bool, background:
     twice = next((b for a, b in pairwise(posed) if a.name == b.name), None)
     if twice is not None:
         raise InputError(f"expected images with different names in {root}, found two called {twice.name}; rename one of them")
-    for i, image in enumerate(posed):
-        lens, turn = _fit_lens(image)
+    headers = [probe(image.path) for image in posed]
+    lenses, notes = fit_lenses(posed, headers, raw.points)
+    white, dark = find_white([(image.path, header.mode) for image, header in zip(posed, headers)])
+    inside = (image.path.relative_to(root).parts[0] for image in posed if image.path.is_relative_to(root))
+    folders = [root, *(root / name for name in sorted(set(inside)))]
+    stated = {image.name: image.mask for image in posed if image.mask is not None}
+    masks = find_masks({image.name: image.path for image in posed}, folders, stated=stated)
+    for i, (image, (lens, turn)) in enumerate(zip(posed, lenses)):
         if centred:
             lens = centre_principal_point(lens)
         flat = to_pinhole(lens)
         K = torch.tensor([[flat.fx, 0, flat.cx], [0, flat.fy, flat.cy], [0, 0, 1]], dtype=torch.float64)
         camera = Camera(torch.from_numpy(image.world_to_cam), K, flat.width, flat.height, id=i)
         views.append(View(image.name, camera, image.path))
-        sources.append(FrameSource(image.path, lens, (flat.width, flat.height), image.mask, turn, raw.alpha_over))
+        sources.append(FrameSource(image.path, lens, (flat.width, flat.height), masks.masks.get(image.name), turn, raw.alpha_over, white))
     train, test = (tuple(i for i, image in enumerate(posed) if image.test == held) for held in (False, True))
     return Capture(
         name=root.resolve().name,
@@ -142,26 +150,9 @@ def _assemble(root: Path, kind: str, raw: RawCapture, centred: bool, background:
         resolution="as-is",
         split="none",
         background=background or raw.alpha_over or (0.0, 0.0, 0.0),
-        warnings=tuple(raw.warnings),
+        warnings=(*raw.warnings, *notes, *dark, *masks.warnings),
         states_split=raw.states_split,
         bounds=raw.bounds,
-    )
-
-
-def _fit_lens(image: PosedImage) -> tuple[Lens, bool]:
-    """Return the lens at the size of the image file, and whether the file must be rotated by its
-    EXIF orientation to fit."""
-    stored, turned = probe(image.path)
-    if image.lens is None:
-        w, h = stored
-        f = 0.5 * w / np.tan(0.5 * image.angle)
-        return Lens("SIMPLE_PINHOLE", w, h, (f, w / 2, h / 2)), False
-    for size in dict.fromkeys((stored, turned)):
-        if fits(size, (image.lens.width, image.lens.height)):
-            return image.lens.resize(*size), size != stored
-    raise InputError(
-        f"expected {image.path} with the aspect ratio of its camera ({image.lens.width}x{image.lens.height}), found "
-        f"{stored[0]}x{stored[1]}; use the photographs that the cameras were reconstructed from"
     )
 
 

@@ -1,10 +1,8 @@
 """Turns a photograph file into the pixels that training sees: decode, rotate, undistort, resize,
 composite, mask.
 
-Structure-from-motion tools work on the stored pixels, so the EXIF orientation is not applied. The
-exception is a photograph that has the size of its camera model only after rotation: then the tool
-applied the orientation, too. Masks come from alpha channels and mask files. As in COLMAP, black
-pixels do not count.
+`orientation` says whether the EXIF orientation is applied. Masks come from alpha channels and mask
+files (`masks`).
 """
 
 from __future__ import annotations
@@ -20,9 +18,11 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.reading.budget import MASK, PHOTOGRAPH
+from scene_experts.core.reading.budget import PHOTOGRAPH
 from scene_experts.core.reading.pictures import opening_picture
+from scene_experts.data.colour import White, to_8_bit
 from scene_experts.data.lens import Lens, to_pinhole
+from scene_experts.data.masks import Mask, read_mask
 
 Size = tuple[int, int]  # width, height
 _ORIENTATION = 0x0112  # EXIF tag; 5 to 8 swap the axes
@@ -35,9 +35,10 @@ class FrameSource:
     path: Path
     lens: Lens  # of the rotated image, at the resolution of the file
     size: Size  # the resolution that training sees
-    mask: Path | None = None
+    mask: Mask | None = None
     turn: bool = False  # apply the EXIF orientation
     background: tuple[float, float, float] | None = None  # composite alpha over this RGB in [0, 1]; None: alpha is a mask
+    white: White = White()  # of deep photographs
 
     @property
     def bytes(self) -> int:
@@ -45,13 +46,26 @@ class FrameSource:
         return self.size[0] * self.size[1] * 4
 
 
-def probe(path: Path) -> tuple[Size, Size]:
-    """Return the stored size of the image at `path`, and its size with the EXIF orientation
-    applied. Reads only the header."""
+@dataclass(frozen=True)
+class PhotoHeader:
+    """What the header of a photograph says."""
+
+    size: Size  # as stored
+    orientation: int  # from EXIF, 1 to 8
+    mode: str = "RGB"  # Pillow's
+
+    @property
+    def turned(self) -> Size:
+        """The size with the EXIF orientation applied."""
+        return (self.size[1], self.size[0]) if self.orientation >= 5 else self.size
+
+
+def probe(path: Path) -> PhotoHeader:
+    """Read the header of the image at `path`."""
     with opening_picture(path, PHOTOGRAPH) as image:
-        size = image.size
-        turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)  # PNG stores EXIF after the pixels: a truncated file fails here
-    return size, (size[1], size[0]) if turned else size
+        size, mode = image.size, image.mode
+        orientation = image.getexif().get(_ORIENTATION, 1)  # PNG stores EXIF after the pixels: a truncated file fails here
+    return PhotoHeader(size, orientation if orientation in range(1, 9) else 1, mode)
 
 
 def target_size(policy: str, size: Size) -> Size:
@@ -153,7 +167,7 @@ def _load_pixels(source: FrameSource) -> Image.Image:
     """Load the photograph as 8-bit L, RGB or RGBA, rotated if `source.turn`."""
     with opening_picture(source.path, PHOTOGRAPH) as image:
         image.load()
-        out = to_8_bit(ImageOps.exif_transpose(image) if source.turn else image)
+        out = to_8_bit(ImageOps.exif_transpose(image) if source.turn else image, source.white)
     expected = (source.lens.width, source.lens.height)
     if out.size != expected:
         raise InputError(
@@ -162,36 +176,23 @@ def _load_pixels(source: FrameSource) -> Image.Image:
     return out
 
 
-def to_8_bit(image: Image.Image) -> Image.Image:
-    """Convert a Pillow image of any mode to L, RGB or RGBA."""
-    if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey: Pillow's own conversion clips at 255
-        deep, out = np.asarray(image), np.empty(image.size[::-1], np.uint8)
-        for top in range(0, len(deep), 256):  # strips keep the float64 temporaries small
-            strip = np.nan_to_num(deep[top : top + 256].astype(np.float64))
-            out[top : top + 256] = np.clip(np.rint(strip / 257), 0, 255)
-        return Image.fromarray(out)
-    if image.mode in ("L", "RGB", "RGBA"):
-        return image
-    return image.convert("RGBA" if "transparency" in image.info or image.mode in ("LA", "PA", "La", "RGBa") else "RGB")
-
-
 def _load_mask(source: FrameSource) -> Image.Image | None:
     """Load the mask file as L, at its own size. Raises InputError if it has another aspect ratio
     than the photograph.
 
-    If the photograph was rotated and the mask was not, the mask is rotated by its own EXIF
-    orientation or by the photograph's.
+    If the photograph was rotated, so is a mask with an EXIF orientation of its own, and by the
+    photograph's a mask that has its shape only then.
     """
     if source.mask is None:
         return None
-    with opening_picture(source.mask, MASK) as image:
-        out = to_mask(image)
-    if source.turn and (out.width > out.height) != (source.lens.width > source.lens.height):
-        out = _turn_mask(source, out)
+    out = read_mask(source.mask)
+    shaped = (out.width > out.height) == (source.lens.width > source.lens.height)
+    if source.turn and (not shaped or (out.getexif().get(_ORIENTATION, 1) in (2, 3, 4) or out.width == out.height)):
+        out = _turn_mask(source, out, shaped)
     if not fits(out.size, (source.lens.width, source.lens.height)):
         raise InputError(
-            f"expected the mask {source.mask} with the aspect ratio of its photograph ({source.lens.width}x{source.lens.height}), found "
-            f"{out.width}x{out.height}; make it of the photograph's pixels as they are stored"
+            f"expected the mask {source.mask.path} with the aspect ratio of its photograph ({source.lens.width}x{source.lens.height}), "
+            f"found {out.width}x{out.height}; make it of the photograph's pixels as they are stored"
         )
     return out
 
@@ -203,18 +204,12 @@ def fits(size: Size, whole: Size) -> bool:
     return abs(w * height - h * width) <= max(w, h, width, height, 0.01 * w * height)
 
 
-def _turn_mask(source: FrameSource, out: Image.Image) -> Image.Image:
+def _turn_mask(source: FrameSource, out: Image.Image, shaped: bool) -> Image.Image:
     exif = out.getexif()
-    if exif.get(_ORIENTATION, 1) == 1:
+    if exif.get(_ORIENTATION, 1) == 1 and not shaped:
         with opening_picture(source.path, PHOTOGRAPH) as photograph:
             exif[_ORIENTATION] = photograph.getexif().get(_ORIENTATION, 1)
     return ImageOps.exif_transpose(out)
-
-
-def to_mask(image: Image.Image) -> Image.Image:
-    """Convert a mask file to L (255 = counts): its alpha if every colour is black, otherwise its
-    brightness."""
-    return image.getchannel("A") if image.mode == "RGBA" and image.convert("L").getextrema() == (0, 0) else image.convert("L")
 
 
 @functools.lru_cache(maxsize=2)  # neighbouring views share their camera

@@ -1,4 +1,4 @@
-"""Finds the photographs and masks that the files of a capture name. Files are matched by name,
+"""Finds the photographs that the files of a capture name. Files are matched by name,
 never by sorted position."""
 
 from __future__ import annotations
@@ -77,15 +77,3 @@ def absent_error(folder: Path, names: Sequence[str], absent: Sequence[str]) -> I
         f"expected {len(names)} images in {folder}, but {len(absent)} are absent (first: {absent[0]}); copy them there, name their folder "
         f"with --images, or train without them with --missing drop"
     )
-
-
-def find_mask(root: Path, name: str, image: Path) -> Path | None:
-    """Return the mask file of view `name`, or None.
-
-    A mask is masks/NAME, masks/NAME.png or masks/STEM.png in `root`, or STEM.mask.png or
-    STEM_mask.png beside the photograph.
-    """
-    stem = PurePosixPath(name).with_suffix("").as_posix()
-    candidates = [root / "masks" / part for part in (name, f"{name}.png", f"{stem}.png")]
-    candidates += [image.with_name(f"{image.stem}{ending}") for ending in (".mask.png", "_mask.png")]
-    return next((path for path in candidates if path.is_file() and path != image), None)

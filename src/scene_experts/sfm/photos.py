@@ -6,25 +6,25 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 from PIL import Image, ImageOps
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, few
 from scene_experts.core.io import read_json, write_atomic, write_json
 from scene_experts.core.reading.budget import CAPTURED
 from scene_experts.core.reading.pictures import opening_picture
-from scene_experts.data.images import to_8_bit
+from scene_experts.data.colour import White, find_white, is_deep, to_8_bit
+from scene_experts.data.masks import Found, Mask, find_masks, may_be_mask, read_mask
 from scene_experts.data.match import EXTENSIONS
 
 FEWEST = 3  # photographs needed for a reconstruction
 UNSUPPORTED = (".dng", ".cr2", ".cr3", ".nef", ".arw")  # photographs that Pillow does not read
 HEIC = (".heic", ".heif")  # read with pillow-heif, if it is installed
 COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "BMP", "TIFF")  # what COLMAP reads
-MASK_ENDINGS = (".mask.png", "_mask.png")  # after the stem of a photograph in the same folder
 _LONGEST_FACT = 256  # characters of what EXIF says about a camera
 COPIED = "copied.json"
 _MAKE, _MODEL, _ORIENTATION, _EXIF, _FOCAL, _LENS = 0x010F, 0x0110, 0x0112, 0x8769, 0x920A, 0xA434
@@ -39,8 +39,10 @@ class Photo:
     camera: tuple[str, ...] = ()  # maker, model, lens and focal length from EXIF
     orientation: int = 1  # from EXIF, 1 to 8
     suffix: str = ""  # extension to convert the file to because COLMAP does not read it; "": no conversion
-    stamp: tuple[int, ...] = (0, 0)  # bytes and modification time of the file, then of its mask
-    mask: str = ""  # name of the mask file beside it
+    stamp: tuple[float, ...] = (0, 0)  # bytes and modification time of the file, then of its mask, and how both are read
+    mask: Mask | None = None
+    mode: str = "RGB"  # Pillow's
+    white: White = White()  # of deep photographs
 
     @property
     def stored(self) -> str:
@@ -58,31 +60,74 @@ class Photo:
         return Photo(self.stored, size, self.camera, stamp=self.stamp)
 
 
-def find_photos(folder: Path, exclude: Path | None = None) -> list[Photo]:
+def find_photos(folder: Path, exclude: Path | None = None, say: Callable[[str], None] = lambda _: None) -> list[Photo]:
     """Return the photographs in `folder` and its subfolders except `exclude`, sorted so that
     "2.jpg" precedes "10.jpg".
 
     Every photograph is decoded at an eighth of its size to verify it. A HEIC file beside a
-    photograph of the same name is left out. Raises InputError if there are too few, if one is
-    damaged or its name cannot be used, or if HEIC files cannot be read.
+    photograph of the same name is left out, and so are masks (`data.masks`).
+
+    say: Called with what was found beside photographs.
+
+    Raises InputError if there are too few, if some are damaged or a name cannot be used, or if HEIC
+    files cannot be read.
     """
     files = list_files(folder, exclude)
     paths = [path for path in files if path.suffix.lower() in EXTENSIONS]
     paths += find_heic(files, {path.with_suffix("") for path in paths}, folder)
-    names = sorted((path.relative_to(folder).as_posix() for path in paths), key=natural_key)
-    masks = find_masks_beside(names)
-    names = [name for name in names if name not in masks.values()]
+    every = {path.relative_to(folder).as_posix(): path for path in paths}
+    found = find_masks({name: path for name, path in every.items() if not may_be_mask(name)}, [folder], [folder.parent])
+    names = sorted((name for name, path in every.items() if path not in found.files), key=natural_key)
     if len(names) < FEWEST:
         raw = sorted({path.suffix.lower() for path in files} & set(UNSUPPORTED))
         advice = f"save the {', '.join(raw)} files as JPEG" if raw else "take dozens that overlap strongly"
         raise InputError(f"expected at least {FEWEST} photographs ({', '.join(EXTENSIONS)}) in {folder}, found {len(names)}; {advice}")
-    found = [inspect_photo(folder, name, masks.get(name, "")) for name in names]
-    for one, other in pairwise(sorted(found, key=lambda photo: photo.stored)):
+    for line in describe_rest(found, names, sorted(set(files) - set(paths)), folder):
+        say(line)
+    photos = inspect_photos(folder, names, found)
+    white, notes = find_white([(folder / photo.name, photo.mode) for photo in photos])
+    for line in notes:
+        say(f"warning: {line}")
+    photos = [
+        replace(photo, white=white, stamp=(*photo.stamp, white.integer, white.real)) if is_deep(photo.mode) else photo for photo in photos
+    ]
+    for one, other in pairwise(sorted(photos, key=lambda photo: photo.stored)):
         if one.stored == other.stored:
             raise InputError(
                 f"expected names in {folder} that differ not only in blanks or extension, found '{one.name}' and '{other.name}'; rename one"
             )
-    return found
+    return photos
+
+
+def describe_rest(found: Found, names: Sequence[str], others: Sequence[Path], folder: Path) -> list[str]:
+    """Return lines about the masks of photographs and about files that are neither."""
+    lines = []
+    if found.masks:
+        first = os.path.relpath(next(iter(found.masks.values())).path, folder)
+        lines.append(f"{len(found.masks)} of {len(names)} photographs have a mask (first: {first})")
+    lines += [f"warning: {warning}" for warning in found.warnings]
+    ignored = [path.relative_to(folder).as_posix() for path in others if path.suffix.lower() not in HEIC]
+    if ignored:
+        lines.append(f"ignored {len(ignored)} file{'s' if len(ignored) > 1 else ''} that are no photographs: {few(ignored)}")
+    return lines
+
+
+def inspect_photos(folder: Path, names: Sequence[str], found: Found) -> list[Photo]:
+    """Inspect photographs. Raises InputError that names all that cannot be read."""
+    photos, bad = list[Photo](), list[tuple[str, InputError]]()
+    for name in names:
+        try:
+            photos.append(inspect_photo(folder, name, found.masks.get(name)))
+        except InputError as error:
+            bad.append((name, error))
+    if len(bad) > 1:
+        raise InputError(
+            f"expected photographs in {folder}, found {len(bad)} files that cannot be read: {few([name for name, _ in bad], 8)}; "
+            "replace or remove them"
+        )
+    if bad:
+        raise bad[0][1]
+    return photos
 
 
 def find_heic(files: Sequence[Path], others: set[Path], folder: Path) -> list[Path]:
@@ -124,15 +169,7 @@ def natural_key(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name)]
 
 
-def find_masks_beside(names: Sequence[str]) -> dict[str, str]:
-    """Return the names of masks in the same folder as their photographs, by the name of the
-    photograph."""
-    there = set(names)
-    stems = ((name, str(PurePosixPath(name).with_suffix(""))) for name in names)
-    return {name: f"{stem}{ending}" for name, stem in stems for ending in MASK_ENDINGS if f"{stem}{ending}" in there}
-
-
-def inspect_photo(folder: Path, name: str, mask: str) -> Photo:
+def inspect_photo(folder: Path, name: str, mask: Mask | None) -> Photo:
     """Read the size and EXIF data of a photograph. Raises InputError if it is damaged or its name
     is not UTF-8."""
     path = folder / name
@@ -141,7 +178,7 @@ def inspect_photo(folder: Path, name: str, mask: str) -> Photo:
     except UnicodeEncodeError:
         raise InputError(f"expected names in UTF-8 in {folder}, found {name!r}; rename the file") from None
     with opening_picture(path, CAPTURED, heic=True) as image:
-        size, deep = image.size, is_deep(image)
+        size, mode, deep = image.size, image.mode, is_deep(image.mode)
         readable, lossless = image.format in COLMAP_FORMATS and not deep, "A" in image.getbands() or deep
         exif = image.getexif()
         inner = exif.get_ifd(_EXIF)
@@ -156,14 +193,10 @@ def inspect_photo(folder: Path, name: str, mask: str) -> Photo:
         camera,
         orientation if orientation in range(1, 9) else 1,
         "" if readable else ".png" if lossless else ".jpg",
-        file_stamp(path) + (file_stamp(folder / mask) if mask else ()),
+        file_stamp(path) + ((*file_stamp(mask.path), mask.labels, mask.inverted) if mask else ()),
         mask,
+        mode,
     )
-
-
-def is_deep(image: Image.Image) -> bool:
-    """Return whether an image is grey with more than 8 bits, which COLMAP does not read."""
-    return image.mode.startswith("I") or image.mode == "F"
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
@@ -196,43 +229,62 @@ def copy_photos(photos: Sequence[Photo], source: Path, target: Path) -> list[Pho
     pixels, and a scene of sideways photographs would lie on its side. Existing copies are kept.
     """
     note = target.with_name(COPIED)
-    kept: dict[str, list[int]] = read_json(note, "list of copies") if note.is_file() else {}
+    kept: dict[str, list[float]] = read_json(note, "list of copies") if note.is_file() else {}
     wanted = {photo.stored: photo for photo in photos}
-    masks = {photo.stored: _mask_copy(photo, target) for photo in photos if photo.mask}
+    masks = {photo.stored: target / f"{PurePosixPath(photo.stored).with_suffix('')}_mask.png" for photo in photos if photo.mask}
     for path in [path for path in target.rglob("*") if path.is_file()]:
         if path.relative_to(target).as_posix() not in wanted and path not in masks.values():
             path.unlink()
     for name, photo in wanted.items():
         new = target / name
         if not new.is_file() or tuple(kept.get(name, ())) != photo.stamp:
-            transfer(source / photo.name, new, photo.orientation, photo.suffix)
+            transfer(source / photo.name, new, photo.orientation, photo.suffix, photo.white)
             if photo.mask:
-                transfer(source / photo.mask, masks[name], photo.orientation)
+                copy_mask(photo, masks[name])
             kept[name] = list(photo.stamp)
     write_json(note, {name: stamp for name, stamp in kept.items() if name in wanted})
-    return [photo.upright for photo in photos]
+    return [replace(photo.upright, mask=Mask(masks[photo.stored]) if photo.mask else None) for photo in photos]
 
 
-def _mask_copy(photo: Photo, target: Path) -> Path:
-    ending = next(end for end in MASK_ENDINGS if photo.mask.endswith(end))
-    return target / f"{PurePosixPath(photo.stored).with_suffix('')}{ending}"
+def copy_mask(photo: Photo, new: Path) -> None:
+    """Write the mask of `photo` upright, 255 where pixels count."""
+    mask = read_stored_mask(photo)
+    mask.getexif()[_ORIENTATION] = photo.orientation
+    upright = ImageOps.exif_transpose(mask)
+    upright.getexif().clear()
+    write_atomic(new, lambda temporary: upright.save(temporary, "PNG"))
 
 
-def transfer(old: Path, new: Path, orientation: int, suffix: str = "") -> None:
-    """Copy an image file, or rewrite it rotated upright (`orientation` as in EXIF) or in another
-    format (`suffix`)."""
+def read_stored_mask(photo: Photo) -> Image.Image:
+    """Read the mask of `photo` in the orientation of the stored photograph, 255 where pixels count.
+
+    A mask that is upright although EXIF rotates its photograph is rotated back. Raises InputError
+    if the file is unreadable.
+    """
+    assert photo.mask is not None
+    mask, (width, height) = read_mask(photo.mask), photo.size
+    if photo.orientation in (5, 6, 7, 8) and (mask.width > mask.height) != (width > height):
+        mask.getexif()[_ORIENTATION] = {6: 8, 8: 6}.get(photo.orientation, photo.orientation)
+        mask = ImageOps.exif_transpose(mask)
+    return mask
+
+
+def transfer(old: Path, new: Path, orientation: int, suffix: str = "", white: White | None = None) -> None:
+    """Copy a photograph, or rewrite it rotated upright (`orientation` as in EXIF) or in another
+    format (`suffix`). Its colour profile is kept."""
     new.parent.mkdir(parents=True, exist_ok=True)
     if orientation == 1 and not suffix:
         write_atomic(new, lambda temporary: shutil.copyfile(old, temporary))
         return
     with opening_picture(old, CAPTURED, heic=True) as image:
         form = {".jpg": "JPEG", ".png": "PNG"}.get(suffix) or ("JPEG" if image.format == "MPO" else image.format)
-        image.getexif()[_ORIENTATION] = orientation  # that of the photograph, for its mask too
+        image.getexif()[_ORIENTATION] = orientation
         upright = ImageOps.exif_transpose(image)
-        exif, upright = upright.getexif(), to_8_bit(upright) if is_deep(upright) else upright
+        exif, upright = upright.getexif(), to_8_bit(upright, white) if is_deep(upright.mode) else upright
+        profile = None if is_deep(image.mode) else image.info.get("icc_profile")
     if form == "JPEG":
         upright = upright if upright.mode in ("L", "RGB", "CMYK") else upright.convert("RGB")
         options = {"quality": 96, "subsampling": 0}
     else:
         options = {}
-    write_atomic(new, lambda temporary: upright.save(temporary, form, exif=exif, **options))
+    write_atomic(new, lambda temporary: upright.save(temporary, form, exif=exif, icc_profile=profile, **options))

@@ -60,7 +60,7 @@ def reconstruct(
         RunError: if COLMAP fails.
     """
     check_request(source, out, overwrite)
-    found = [] if source.is_file() else photos.find_photos(source, exclude=out)
+    found = [] if source.is_file() else photos.find_photos(source, exclude=out, say=say)
     with work.open_work_folder(out) as folder:
         check_request(source, out, overwrite)  # again: results of a killed process may just have been published
         own = source.resolve() == (out / "images").resolve()

@@ -10,8 +10,9 @@ import torch
 from PIL import Image
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.images import FrameSource, check_policy, decode, probe, target_size
+from scene_experts.data.images import FrameSource, PhotoHeader, check_policy, decode, probe, target_size
 from scene_experts.data.lens import Lens, to_pinhole
+from scene_experts.data.masks import Mask
 from support.messages import naming
 from support.synthetic import look_at, picture
 
@@ -84,17 +85,17 @@ def test_mask_files_multiply_with_alpha_and_follow_the_size(tmp_path: Path) -> N
     stencil = np.zeros((8, 6), np.uint8)
     stencil[:, 3:] = 255
     Image.fromarray(stencil).save(tmp_path / "m.png")
-    _, mask = decode(source(tmp_path / "a.png", pixels, mask=tmp_path / "m.png"))
+    _, mask = decode(source(tmp_path / "a.png", pixels, mask=Mask(tmp_path / "m.png")))
     np.testing.assert_array_equal(mask, np.where(stencil > 0, pixels[..., 3], 0))
     Image.fromarray(stencil).resize((12, 16), 0).save(tmp_path / "m.png")  # a mask at another resolution
-    _, mask = decode(source(tmp_path / "b.png", noise(8, 6), mask=tmp_path / "m.png", size=(3, 4)))
+    _, mask = decode(source(tmp_path / "b.png", noise(8, 6), mask=Mask(tmp_path / "m.png"), size=(3, 4)))
     assert mask is not None and mask.shape == (4, 3) and mask[:, 0].max() == 0 and mask[:, 2].min() == 255
 
 
 @pytest.mark.parametrize(("size", "fine"), [((8, 6), True), ((15, 11), True), ((64, 48), True), ((6, 8), False), ((20, 3), False)])
 def test_a_mask_of_another_shape_is_refused(tmp_path: Path, size: tuple[int, int], fine: bool) -> None:
     Image.new("L", size).save(tmp_path / "m.png")  # of a rotated or of another photograph: stretched, it would hide what counts
-    made = source(tmp_path / "a.png", noise(48, 64), mask=tmp_path / "m.png")
+    made = source(tmp_path / "a.png", noise(48, 64), mask=Mask(tmp_path / "m.png"))
     if fine:
         mask = decode(made)[1]
         assert mask is not None and mask.shape == (48, 64)
@@ -109,7 +110,7 @@ def test_exif_is_applied_only_on_request(name: str, tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(pixels).save(tmp_path / name, exif=exif)
-    assert probe(tmp_path / name) == ((16, 10), (10, 16))
+    assert probe(tmp_path / name) == PhotoHeader((16, 10), 6) and PhotoHeader((16, 10), 6).turned == (10, 16)
     rgb, _ = decode(FrameSource(tmp_path / name, pinhole(16, 10), (16, 10)))
     np.testing.assert_array_equal(rgb, pixels)
     rgb, _ = decode(FrameSource(tmp_path / name, pinhole(10, 16), (10, 16), turn=True))
@@ -118,7 +119,7 @@ def test_exif_is_applied_only_on_request(name: str, tmp_path: Path) -> None:
     stencil[:3] = 255
     for mask in (stencil, np.ascontiguousarray(np.rot90(stencil, -1))):  # a mask of the stored pixels, or of the rotated ones
         Image.fromarray(mask).save(tmp_path / "m.png")
-        found = decode(FrameSource(tmp_path / name, pinhole(10, 16), (10, 16), mask=tmp_path / "m.png", turn=True))[1]
+        found = decode(FrameSource(tmp_path / name, pinhole(10, 16), (10, 16), mask=Mask(tmp_path / "m.png"), turn=True))[1]
         np.testing.assert_array_equal(found, np.rot90(stencil, -1))
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from scene_experts.data.match import absent_error, find_mask, match_images, to_relative_name
+from scene_experts.data.match import absent_error, match_images, to_relative_name
 
 
 def touch(root: Path, *names: str) -> None:
@@ -62,12 +62,3 @@ def test_an_absent_image_is_reported(tmp_path: Path) -> None:
     assert match.absent == ("a.jpg",)
     text = str(absent_error(tmp_path, ["a.jpg", "b.jpg"], match.absent))
     assert "2" in text and "a.jpg" in text and "--images" in text
-
-
-@pytest.mark.parametrize("mask", ["masks/s/a.jpg", "masks/s/a.jpg.png", "masks/s/a.png", "images/s/a.mask.png", "images/s/a_mask.png"])
-def test_masks_are_found_under_every_name(tmp_path: Path, mask: str) -> None:
-    touch(tmp_path, "images/s/a.jpg")
-    image = tmp_path / "images/s/a.jpg"
-    assert find_mask(tmp_path, "s/a.jpg", image) is None
-    touch(tmp_path, mask)
-    assert find_mask(tmp_path, "s/a.jpg", image) == tmp_path / mask

@@ -12,7 +12,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import CAPTURE
 from scene_experts.core.reading.source import guarding
 from scene_experts.core.types import Points
-from scene_experts.data.match import absent_error, find_mask, match_images
+from scene_experts.data.match import absent_error, match_images
 from scene_experts.data.readers.colmap_model import find_model, read_model
 from scene_experts.data.readers.reader import PosedImage, RawCapture, ReadOptions
 
@@ -27,7 +27,7 @@ class ColmapReader:
         return find_model(folder) is not None
 
     def read(self, folder: Path, options: ReadOptions) -> RawCapture:
-        """Read poses, points and masks.
+        """Read poses and points.
 
         Raises InputError if a file of the reconstruction is damaged, an image is listed twice, or
         photographs are absent (with `options.missing == "drop"`: if all are).
@@ -55,9 +55,7 @@ class ColmapReader:
         images = []
         for image in sorted(model.images, key=lambda i: i.name):
             if image.name in match.found:
-                path = match.found[image.name]
-                mask = find_mask(folder, image.name, path)
-                images.append(PosedImage(image.name, path, model.cameras[image.camera_id], image.world_to_cam(), mask))
+                images.append(PosedImage(image.name, match.found[image.name], model.cameras[image.camera_id], image.world_to_cam()))
         points = Points(torch.from_numpy(model.xyz), torch.from_numpy(model.rgb)) if len(model.xyz) else None
         return RawCapture(images, points, warnings, points_source="points3D.bin or points3D.txt")
 

@@ -9,7 +9,6 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import CAPTURE
 from scene_experts.core.reading.numbers import shown
 from scene_experts.core.reading.source import guarding
-from scene_experts.data.match import find_mask
 from scene_experts.data.readers import transforms
 from scene_experts.data.readers.reader import PosedImage, RawCapture, ReadOptions
 
@@ -47,7 +46,7 @@ class NerfstudioReader:
             name, image = transforms.find_image(folder, stated, options.images)
             lens = transforms.read_lens(meta, frame, path, image)
             given = folder / str(frame["mask_path"]) if frame.get("mask_path") else None
-            mask = given if given and given.is_file() else image and find_mask(folder, name.partition("/")[2] or name, image)
+            mask = given if given and given.is_file() else None
             if given and image and not mask:
                 unmasked.append(str(frame["mask_path"]))
             angle = transforms.read_angle(meta, frame, path) if lens is None else 0.0
@@ -56,7 +55,7 @@ class NerfstudioReader:
             images.append(image and PosedImage(name, image, lens, pose, mask, angle, transforms.to_pure(stated) in held))
         kept = transforms.drop_absent(folder, images, names, warnings)
         if unmasked:
-            warnings.append(f"{len(unmasked)} of {len(kept)} frames are used whole, because their masks are absent (first: {unmasked[0]})")
+            warnings.append(f"{len(unmasked)} masks that transforms.json names are absent (first: {unmasked[0]}); restore them")
         points = transforms.read_points(folder, meta.get("ply_file_path"))
         return RawCapture(kept, points, warnings, points_source="the file that ply_file_path names")
 

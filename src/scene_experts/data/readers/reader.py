@@ -31,7 +31,7 @@ class PosedImage:
     path: Path
     lens: Lens | None  # None: only the horizontal field of view is known, see `angle`
     world_to_cam: NDArray[np.float64]  # [4, 4], OpenCV axes (x right, y down, z forward)
-    mask: Path | None = None  # image file; black pixels do not count
+    mask: Path | None = None  # file that the capture names as its mask; others are found by their names
     angle: float = 0.0  # horizontal field of view in radians, used if `lens` is None
     test: bool = False  # the files name it as a test view
 

@@ -143,7 +143,7 @@ def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path, image: Pa
     if not given:
         if image is None or not (model == "OPENCV_FISHEYE" or any(both.get(name) for name in _BESIDE_FOCAL)):
             return None
-        both = dict(zip("wh", probe(image)[0])) | both
+        both = dict(zip("wh", probe(image).size)) | both
     try:
         width, height = int(both["w"]), int(both["h"])
         fx = float(both["fl_x"]) if given else 0.5 * width / math.tan(0.5 * read_angle(meta, frame, path))
