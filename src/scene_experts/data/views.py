@@ -15,6 +15,8 @@ from scene_experts.core.types import Camera, Points
 from scene_experts.data.store import ImageStore
 
 Vector = tuple[float, float, float]
+_FLOAT32 = 2.0**-23  # step of float32, relative
+_FINEST = 1e-5  # step of float32 that positions may have, relative to the extent
 SAMPLED = 4  # views whose poses identify those of a capture
 
 
@@ -76,6 +78,24 @@ class World:
         pose = camera.world_to_cam.double()
         shift = torch.tensor(self.shift, dtype=torch.float64, device=pose.device)
         return _with_translation(camera, pose[:3, 3] / self.scale + pose[:3, :3] @ shift, 1 / self.scale)
+
+    def local_origin(self, extent: float) -> Vector:
+        """Return a place of whole numbers in the capture's own frame, near the trained world, from
+        which float32 holds positions; 0 where it holds them as they are.
+
+        A file whose positions are float32 is written relative to it. extent: Of the cameras,
+        trained units.
+        """
+        centre = tuple(-value for value in self.shift)
+        if max(map(abs, centre)) * _FLOAT32 <= _FINEST * extent / self.scale:
+            return 0.0, 0.0, 0.0
+        x, y, z = (float(round(value)) for value in centre)
+        return x, y, z
+
+    def seen_from(self, origin: Vector) -> World:
+        """Return this world for points relative to `origin`, a place in the capture's own frame."""
+        x, y, z = (a + b for a, b in zip(self.shift, origin))
+        return World(self.scale, (x, y, z))
 
     def then(self, shift: Vector, scale: float) -> World:
         """Return this world followed by another transform, `(trained + shift) * scale`."""

@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from scene_experts.core.io import write_json
-from scene_experts.data.views import Capture, View, World
+from scene_experts.data.views import Capture, Vector, View, World
 
 
 def camera_entries(views: Iterable[View], world: World) -> list[dict[str, Any]]:
@@ -40,7 +40,8 @@ def camera_entries(views: Iterable[View], world: World) -> list[dict[str, Any]]:
     return out
 
 
-def write_cameras(path: Path, capture: Capture) -> None:
-    """Write the views of a capture, those held out first, then those trained on."""
+def write_cameras(path: Path, capture: Capture, origin: Vector = (0.0, 0.0, 0.0)) -> None:
+    """Write the views of a capture, those held out first, then those trained on, relative to
+    `origin`."""
     views = [capture.views[i] for i in (*capture.test, *capture.train)]
-    write_json(path, camera_entries(views, capture.world))
+    write_json(path, camera_entries(views, capture.world.seen_from(origin)))

@@ -12,7 +12,7 @@ from scene_experts.data.views import World
 from scene_experts.files.measure import Tell, capture_if_there, cost
 from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
 from scene_experts.files.registry import GAUSSIANS, Family, Format, family_named, format_named, format_names, formats_of
-from scene_experts.files.scene_folder import trained_in, width_in, world_of, write_scene_folder
+from scene_experts.files.scene_folder import origin_note, tell_origin, trained_in, width_in, world_of, write_scene_folder
 from scene_experts.files.standard import ExportTask, Made, Written, export_gaussians
 from scene_experts.render import Rasterizer
 from scene_experts.training.run_folder import OpenRun
@@ -160,11 +160,12 @@ def _export_scene(work: ExportTask, out: Path | None) -> Written:
             f"use --format {next(iter(own), 'ply')}"
         )
     _expect_unused(work.options, work.name)
-    world = world_of(run)
+    trained = world_of(run)
     if format.is_folder:
-        return _export_folder(work, family, world, out or run.path)
+        return _export_folder(work, family, trained, out or run.path)
     path = file_path(run.path, work.name, format, out)
-    about = family.describe(run, world) | trained_in(run)
+    origin = trained.local_origin(run.scene.extent)
+    about, world = family.describe(run, trained) | trained_in(run) | origin_note(origin), trained.seen_from(origin)
     detail = format.write(path, family.contents(run, world, about), {})  # type: ignore[misc]
     rows, size = len(run.scene.positions), path.stat().st_size
     said = f"{rows:,} {traits.rows}, {size / 1e6:.2f} MB with networks" + (f", {detail}" if detail is not None else "")
@@ -184,6 +185,8 @@ def _export_folder(work: ExportTask, family: Family, world: World, out: Path) ->
         write_bytes(out / "cameras.json", cameras.read_bytes())
     size, rows = sum(p.stat().st_size for p in folder.iterdir()), len(run.scene.positions)
     said = f"{rows:,} {run.scene.traits.rows}, {size / 1e6:.2f} MB with networks, in the capture's own frame"
+    origin = world.local_origin(run.scene.extent)
+    said += f", {tell_origin(origin)}" if any(origin) else ""
     return Written(folder, size, rows, (f"wrote {folder}", said, *family.warnings(run)))
 
 

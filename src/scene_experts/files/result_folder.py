@@ -8,6 +8,7 @@ unit.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import FARTHEST, number, whole_number
 from scene_experts.core.reading.plain import parse_namespace
 from scene_experts.core.reading.source import guarding, opening
-from scene_experts.data.views import World
+from scene_experts.data.views import Vector, World
 
 DESCRIPTION, DESCRIPTION_FORMAT = "scene.json", 1
 SETTINGS = "cfg_args"
@@ -88,6 +89,7 @@ def check_description(value: dict[str, Any]) -> None:
     if len(lengths) != 2 or len(shift) != 3:
         raise Damaged("another number of lengths in voxel_size and world")
     number(world.get("scale"), "the scale of the world", 1e-15, FARTHEST)
+    origin_in(value)
     number(value.get("extent", 1), "the extent", 1e-15, FARTHEST)
     whole_number(value.get("step", 0), "step", 0, MOST_STEPS)
     whole_number(value["K"], "K", 0, 1 << 16)
@@ -100,6 +102,21 @@ def world_in(about: dict[str, Any]) -> World:
     """The world that a description states."""
     x, y, z = (float(v) for v in about["world"]["shift"])
     return World(float(about["world"]["scale"]), (x, y, z))
+
+
+def origin_in(about: Mapping[str, Any]) -> Vector:
+    """The place in the capture's own frame that the positions of a file are relative to, as its
+    description states it."""
+    found = about.get("origin", [0.0, 0.0, 0.0])
+    if not isinstance(found, list) or len(found) != 3:
+        raise Damaged("an origin of another form")
+    x, y, z = (number(value, "the origin", -FARTHEST, FARTHEST) for value in found)
+    return x, y, z
+
+
+def file_world(about: dict[str, Any]) -> World:
+    """The world that a description states, for positions as the files beside it hold them."""
+    return world_in(about).seen_from(origin_in(about))
 
 
 def expect_world(trained: World, found: World) -> None:

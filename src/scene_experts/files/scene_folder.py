@@ -3,6 +3,7 @@ description of it, cfg_args and cameras.json above it. `result_folder.py` reads 
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,13 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json, write_bytes, write_json
 from scene_experts.core.plain import to_json
 from scene_experts.data.settings import Data
-from scene_experts.data.views import Capture, World
+from scene_experts.data.views import Capture, Vector, World
 from scene_experts.files.cameras import write_cameras
 from scene_experts.files.registry import Family, family_named
 from scene_experts.files.result_folder import DESCRIPTION
 from scene_experts.training.run_folder import OpenRun, capture_of
+
+log: logging.Logger = logging.getLogger(__name__)
 
 
 def write_result_folder(run: OpenRun, capture: Capture, out: Path | None = None) -> Path:
@@ -28,8 +31,21 @@ def write_result_folder(run: OpenRun, capture: Capture, out: Path | None = None)
     family = family_named(run.scene.traits.family)
     width = capture.views[0].camera.width
     folder = out if family is None else write_scene_folder(run, family, capture.world, out, width)
-    write_cameras(out / "cameras.json", capture)
+    origin = capture.world.local_origin(run.scene.extent)
+    write_cameras(out / "cameras.json", capture, origin)
+    if any(origin):
+        log.warning("%s and cameras.json hold positions %s", folder, tell_origin(origin))
     return folder
+
+
+def origin_note(origin: Vector) -> dict[str, Any]:
+    """The entry of a description about a local origin; empty where it is 0."""
+    return {"origin": list(origin)} if any(origin) else {}
+
+
+def tell_origin(origin: Vector) -> str:
+    """Say what positions are relative to, for a terminal."""
+    return f"relative to ({', '.join(f'{v:.0f}' for v in origin)}) of the capture's frame, because float32 cannot hold them otherwise"
 
 
 def result_warnings(run: OpenRun) -> list[str]:
@@ -45,8 +61,9 @@ def write_scene_folder(run: OpenRun, family: Family, world: World, out: Path, wi
     width: Of the views trained on, in px; None if it is unknown.
     """
     folder = out / "point_cloud" / f"iteration_{run.step}"
-    about = family.describe(run, world) | trained_in(run)
-    settings = family.write(run, world, folder, about)
+    origin = world.local_origin(run.scene.extent)
+    about = family.describe(run, world) | trained_in(run) | origin_note(origin)
+    settings = family.write(run, world.seen_from(origin), folder, about)
     if settings:
         every = settings | capture_settings(run.config.data, width)
         text = ", ".join(f"{name}={value!r}" for name, value in every.items())

@@ -78,7 +78,7 @@ def find_subject(capture: Capture) -> tuple[Tensor, float]:
 def crop(contents: Splats, how: Crop, capture: Capture, world: World) -> Splats:
     """Return the Gaussians inside a crop. world: the frame of `contents`. Raises InputError where
     none is inside."""
-    own = contents.means if world == capture.world else capture.world.to_input(contents.means.double())
+    own = contents.means if world == capture.world else capture.world.to_input(world.from_input(contents.means.double()))
     inside = how.contains(own, capture)
     if not bool(inside.any()):
         centre, distance = find_subject(capture)

@@ -31,7 +31,7 @@ from scene_experts.files.anchors.write import BANK_DISTANCE, LEVEL_COLUMNS, MOE_
 from scene_experts.files.formats.ply import numbered_names, property_names, read_vertices, stack
 from scene_experts.files.registry import Imported
 from scene_experts.files.registry import read as read_file
-from scene_experts.files.result_folder import expect_world, world_in
+from scene_experts.files.result_folder import expect_world, file_world, world_in
 from scene_experts.scene import Scene, restore_scene
 from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, Attribute
@@ -75,7 +75,8 @@ def _read(source: Path, data: Data) -> Imported:
         meta, voxel = dict(about.get("scene", {})), float(about["voxel_size"]["trained"])
         cfg = from_json(Train, about["train"], "train") if "train" in about else recipe_of(found)
     levels = Levels.from_meta(meta["levels"]) if "levels" in meta else None
-    tensors = tensors_of(found, networks, capture.world, voxel, levels, exact=about is not None)
+    world = capture.world if about is None else file_world(about)
+    tensors = tensors_of(found, networks, world, voxel, levels, exact=about is not None)
     meta |= {
         "voxel": levels.size(levels.count - 1) if levels else voxel,
         "extent": float((about or {}).get("extent", capture.extent)),
@@ -179,7 +180,7 @@ def _read_folder(folder: Path) -> AnchorData:
         return AnchorData(columns, flat, about, None, float(voxel or 0.0), add_dist=add_dist, step=step, settings=settings).checked()
     origin = (0.0, 0.0, 0.0)
     if about is not None:
-        world = world_in(about)
+        world = file_world(about)
         x, y, z = world.shift
         voxel, origin = float(about["voxel_size"]["trained"]) / world.scale, (-x, -y, -z)
     else:

@@ -15,6 +15,7 @@ import html as markup
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -22,11 +23,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.numbers import FARTHEST as LARGEST
 from scene_experts.core.reading.numbers import number
 from scene_experts.core.reading.plain import parse_json
 from scene_experts.core.reading.source import opening
@@ -52,7 +55,9 @@ Pose = dict[str, Any]
 def write(path: Path, splats: Splats, note: dict[str, Any]) -> str | None:
     """Write the page. Returns a warning about sizes that it cannot hold, or None. Raises InputError
     for invalid cameras in the note."""
-    settings, scene = page_settings(splats, note), scaled(splats, unit_of(splats))
+    centre = splats.means.double().median(0).values if len(splats) else torch.zeros(3, dtype=torch.float64)
+    splats = replace(splats, means=(splats.means.double() - centre).float())
+    settings, scene = page_settings(splats, note, centre), scaled(splats, unit_of(splats))
     code = (ASSETS / "viewer.min.js.gz").read_bytes()
     page = Template((ASSETS / "page.html").read_text()).substitute(
         title=markup.escape(str(note.get("title", "scene-experts"))),
@@ -77,9 +82,14 @@ def read(path: Path) -> Splats:
             scene = base64.b64decode(content, validate=True)
         except ValueError:
             raise Damaged("a scene that is not base64") from None
-        unit = _settings(page).get("unit", 1.0)  # older pages have none
+        settings = _settings(page)
+        unit, centre = settings.get("unit", 1.0), settings.get("centre", [0.0, 0.0, 0.0])  # older pages have none
         number(unit, "the unit of lengths", 2.0**-_MOST, 2.0**_MOST)
-        return scaled(decode(scene, source), 1 / unit).checked(path)
+        if not isinstance(centre, list) or len(centre) != 3:
+            raise Damaged("a centre of another form")
+        place = torch.tensor([number(value, "the centre", -LARGEST, LARGEST) for value in centre], dtype=torch.float64)
+        found = scaled(decode(scene, source), 1 / unit)
+        return replace(found, means=(found.means.double() + place).float()).checked(path)
 
 
 def unit_of(splats: Splats) -> float:
@@ -135,13 +145,16 @@ def view_note(capture: Capture, world: World) -> dict[str, Any]:
     }
 
 
-def page_settings(splats: Splats, note: Mapping[str, Any]) -> dict[str, Any]:
+def page_settings(splats: Splats, note: Mapping[str, Any], centre: Tensor | None = None) -> dict[str, Any]:
     """The settings of the page's script: poses, up direction, distances, background.
 
-    The camera stays within `reach` of the poses; None does not limit it."""
+    The camera stays within `reach` of the poses; None does not limit it. splats: Relative to
+    `centre` [3], a place in the frame of the note; None: its origin.
+    """
+    centre = torch.zeros(3, dtype=torch.float64) if centre is None else centre
     means = splats.means.double().numpy()
-    poses = [_pose(entry) for entry in note.get("cameras") or []]
-    first = _pose(note["camera"]) if note.get("camera") else poses[0] if poses else _from_outside(means)
+    poses = [_pose(entry, centre) for entry in note.get("cameras") or []]
+    first = _pose(note["camera"], centre) if note.get("camera") else poses[0] if poses else _from_outside(means)
     poses = poses or [first]
     up = estimate_up(torch.tensor([pose["rotation"] for pose in poses], dtype=torch.float64))
     distance = _distance(means, first)
@@ -149,9 +162,10 @@ def page_settings(splats: Splats, note: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "count": len(splats),
         "unit": unit_of(splats),
+        "centre": centre.tolist(),
         "pose": first,
         "poses": poses,
-        "flight": [_pose(entry) for entry in note.get("flight") or []],
+        "flight": [_pose(entry, centre) for entry in note.get("flight") or []],
         "index": poses.index(first) if first in poses else 0,
         "fov": first["fov"],
         "up": up.tolist(),
@@ -165,9 +179,9 @@ def page_settings(splats: Splats, note: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _pose(entry: Mapping[str, Any]) -> Pose:
+def _pose(entry: Mapping[str, Any], centre: Tensor) -> Pose:
     try:
-        position = np.array(entry["position"], np.float64).reshape(3)
+        position = np.array(entry["position"], np.float64).reshape(3) - centre.numpy()
         rotation = np.array(entry["rotation"], np.float64).reshape(3, 3)
         fov = float(entry["fov"]) if "fov" in entry else math.degrees(2 * math.atan(entry["height"] / (2 * entry["fy"])))
         if not (np.isfinite(position).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and 0 < fov < 180):

@@ -19,13 +19,14 @@ from scene_experts.core.reading.source import guarding
 from scene_experts.core.table import Table
 from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
-from scene_experts.data.views import World
+from scene_experts.data.views import Capture, World
 from scene_experts.files import result_folder
-from scene_experts.files.formats.ply import property_names
+from scene_experts.files.formats.ply import property_names, read_note
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.gaussians.write import KIND
 from scene_experts.files.registry import Imported, recognise
 from scene_experts.files.registry import read as read_file
+from scene_experts.files.scene_folder import tell_origin
 from scene_experts.scene import Scene
 from scene_experts.scene.gaussians import Explicit, GaussianScene
 from scene_experts.training.config import Train
@@ -61,7 +62,8 @@ def read(source: Path, data: Data, iteration: int | None) -> Imported:
             source,
             capture.root,
         )
-    columns = table_columns(read_splats(source), capture.world)
+    splats = read_splats(source)
+    columns = table_columns(splats, file_world(source, splats, capture))
     step = about.get("step") or iteration or result_folder.iteration_of(source.parent) or 0
     degree = math.isqrt(columns["sh_rest"].shape[1] + 1) - 1
     cfg = replace(gs_3d, scene=Explicit(sh_degree=degree), iterations=step or gs_3d.iterations, antialias=antialias)
@@ -75,6 +77,28 @@ def read(source: Path, data: Data, iteration: int | None) -> Imported:
             ) from None
     tensors = {f"params.{name}": value for name, value in columns.items()}
     return Imported(cfg, data, capture, tensors, {"extent": capture.extent}, step)
+
+
+def file_world(source: Path, splats: Splats, capture: Capture) -> World:
+    """The capture's world for positions as a file holds them.
+
+    The description of its result folder, the one beside it (FILE.json) or the note of a PLY states
+    their origin. Where none does and float32 cannot hold positions of the capture, the origin is
+    that of our own files if the Gaussians lie nearer to the cameras from there, which a warning
+    tells.
+    """
+    note = read_note(source) if source.suffix == ".ply" else {}
+    for about in (result_folder.read_description(source.parent) or {}, beside(source), note):
+        if "origin" in about:
+            with guarding(source, budget.JSON, "description of a file"):
+                return capture.world.seen_from(result_folder.origin_in(about))
+    origin = capture.world.local_origin(capture.extent)
+    middle = splats.means.double().median(0).values
+    away = [float(world.from_input(middle).norm()) for world in (capture.world.seen_from(origin), capture.world)]
+    if not any(origin) or away[1] <= away[0]:
+        return capture.world
+    log.warning("the positions in %s are taken %s", source, tell_origin(origin))
+    return capture.world.seen_from(origin)
 
 
 def read_splats(path: Path) -> Splats:

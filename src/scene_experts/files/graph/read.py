@@ -27,7 +27,7 @@ from scene_experts.files import result_folder
 from scene_experts.files.formats.ply import property_names, read_vertices
 from scene_experts.files.graph.write import KIND, NETWORKS
 from scene_experts.files.registry import Imported
-from scene_experts.files.result_folder import expect_world, world_in
+from scene_experts.files.result_folder import expect_world, file_world, world_in
 from scene_experts.geometry.voxel import coarsen
 from scene_experts.scene.graph.scene import CHANNELS, HALF
 from scene_experts.training.config import Train
@@ -64,7 +64,7 @@ def _read(source: Path, data: Data) -> Imported:
     capture.images.close()
     expect_world(world, capture.world)
     voxel = float(about["voxel_size"]["trained"])
-    tensors = {**rows(source / "point_cloud.ply", world, voxel), **networks(source / NETWORKS, world.scale)}
+    tensors = {**rows(source / "point_cloud.ply", file_world(about), voxel), **networks(source / NETWORKS, world.scale)}
     return Imported(cfg, data, replace(capture, world=world), tensors, meta(about, world, voxel), int(about["step"]))
 
 
