@@ -53,15 +53,17 @@ class Source:
         """Open the file for reading. The caller closes it."""
         return self.path.open("rb")
 
-    def part(self, name: object) -> bytes:
+    def part(self, name: object, limit: int | None = None) -> bytes:
         """Return the bytes of another file of the same scene, which this file names: a name inside
         its folder. Its size widens the budget of bytes and time. Raises Damaged for other names and
-        InputError for an absent file."""
+        for more than `limit` bytes, and InputError for an absent file."""
         path = inside(self.path.parent, name)
         key = os.path.realpath(path)
         if key not in self._parts:  # each file once, whatever it is called
             self.spend_items(1)
             with opening(path, self.budget, f"part of {self.path.name}") as other:
+                if limit is not None and other.size > limit:
+                    raise Damaged(f"{other.size:,} bytes where at most {limit:,} are expected")
                 self._parts[key] = other.read()
             self.size += other.size
             self._end += other.size / BYTES_PER_SECOND

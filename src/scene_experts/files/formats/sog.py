@@ -133,7 +133,7 @@ def _opened(path: Path) -> Iterator[tuple[Source, Any, Part]]:
                 raise _streamed_error(path)
             if source.size > _META_LIMIT:
                 raise Damaged(f"a description of {source.size:,} bytes")
-            yield source, parse_json(source.read()), source.part
+            yield source, parse_json(source.read()), lambda name: source.part(name, _FILE_LIMIT)
             return
         with open_zip(source) as archive:
             found = _descriptions(archive.names)

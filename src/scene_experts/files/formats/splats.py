@@ -72,16 +72,16 @@ class Splats:
         return self if self.degree <= degree else replace(self, sh=self.sh[:, : (degree + 1) ** 2])
 
     def usable(self, where: Path) -> Splats:
-        """The Gaussians of the file `where` with finite values for infinite ones that mean
-        something: an opacity of 1 or 0 has the logit 20 or -20, and a length of 0 the logarithm of
-        1e-30. Gaussians whose quaternion has no length are left out, and a warning counts them.
+        """The Gaussians of the file `where` with usable values for infinite ones, and for the largest
+        floats, that mean something: an opacity of 1 or 0 has the logit 20 or -20, and a length of 0
+        the logarithm of 1e-30. Gaussians whose quaternion has no length are left out, and a warning counts them.
 
         Raises InputError where none is left.
         """
         found = self
-        if bool((endless := self.opacity_logit.isinf()).any()):
+        if bool((endless := self.opacity_logit.abs() > LARGEST).any()):
             found = replace(found, opacity_logit=self.opacity_logit.clamp(-_SURE, _SURE).where(endless, self.opacity_logit))
-        if bool((points := self.log_scales == -math.inf).any()):
+        if bool((points := self.log_scales < -LARGEST).any()):
             found = replace(found, log_scales=self.log_scales.masked_fill(points, _SHORTEST))
         empty = self.quats.abs().amax(1) < _NO_LENGTH if len(self) else self.quats.new_zeros(0, dtype=torch.bool)  # False for NaN
         count = int(empty.sum())

@@ -54,7 +54,8 @@ def _unpacked(path: Path) -> Iterator[tuple[Path, Format]]:
             count = f"{len(names):,} among {len(visible):,} files"
             raise InputError(f"expected one scene ({', '.join(SCENES)}) in {path}, found {count} ({shown}); {_UNPACK}")
         base = names[0].rpartition("/")[2]
-        inner = Path(folder) / (base if re.fullmatch(r"[\w() -][\w.() -]{0,99}", base) else f"scene{Path(base).suffix}")
+        inner = Path(folder) / path.name / (base if re.fullmatch(r"[\w() -][\w.() -]{0,99}", base) else f"scene{Path(base).suffix}")
+        inner.parent.mkdir()  # named after the zip, for the warnings of readers
         archive.unpack(names[0], inner)
         try:
             name, format = recognise(inner)

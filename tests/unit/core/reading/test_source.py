@@ -118,6 +118,9 @@ def test_parts_of_a_scene_are_files_in_its_folder_and_widen_its_budget(tmp_path)
         assert source.size == 91 and source.items == 1
         with pytest.raises(InputError, match=naming("part of a", "no such file")):
             source.part("c")
+        (tmp_path / "d").write_bytes(b"z" * 11)
+        with pytest.raises(InputError, match=naming("part of a", 11, 10)):
+            source.part("d", 10)
         for name in ("../a", "/etc/hosts", 3):
             with pytest.raises(Damaged):
                 source.part(name)

@@ -48,6 +48,9 @@ def test_infinite_values_that_mean_something_become_finite():
     found = s.checked(Path("there"))
     assert len(found) == 6 and found.opacity_logit[1:3].tolist() == [20, -20] and found.opacity_logit.sigmoid()[1] == 1
     assert found.log_scales[3, 1] == pytest.approx(math.log(1e-30)) and torch.equal(found.log_scales[:3], s.log_scales[:3])
+    s.opacity_logit[1:3] = torch.tensor([3e38, -3e38])  # the largest floats, which some programs write for infinity
+    s.log_scales[3, 1] = -3e38
+    assert torch.equal(s.checked(Path("there")).opacity_logit, found.opacity_logit) and s.checked(Path("there")).log_scales[3, 1] > -70
     plain = splats(6)
     assert torch.equal(plain.checked(Path("there")).opacity_logit, plain.opacity_logit)
 

@@ -54,7 +54,11 @@ def test_what_is_refused(tmp_path):
 
 def test_bombs(tmp_path):
     head = b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999\nproperty float x\nend_header\n"
-    for name, data in (("a.ply", head + bytes(1 << 28)), ("a.sog", b"PK\x03\x04" + bytes(1 << 24)), ("a.spz", b"\x1f\x8b" + bytes(1 << 24))):
+    for name, data in (
+        ("a.ply", head + bytes(1 << 28)),
+        ("a.sog", b"PK\x03\x04" + bytes(1 << 24)),
+        ("a.spz", b"\x1f\x8b" + bytes(1 << 24)),
+    ):
         (tmp_path / "a.zip").write_bytes(foreign.zipped({name: data}, deflate=True))
         with pytest.raises(InputError, match=naming("a.zip", "unpack to")):
             read(tmp_path / "a.zip")
