@@ -56,6 +56,7 @@ PALETTE = 1 << 16
 _COLUMNS = 64  # palette rows next to each other in a line of the picture
 _COEFFICIENTS = (0, 3, 8, 15)
 _META, _STREAMED = "meta.json", "lod-meta.json"
+_ENCODING = "quaternion_packed"  # of rotations, in version 1
 _META_LIMIT, _FILE_LIMIT = 1 << 20, 1 << 30
 Part = Callable[[Any], bytes]
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # a fixed date: equal scenes give equal bytes
@@ -133,7 +134,10 @@ def _opened(path: Path) -> Iterator[tuple[Source, Any, Part]]:
                 raise _streamed_error(path)
             if source.size > _META_LIMIT:
                 raise Damaged(f"a description of {source.size:,} bytes")
-            yield source, parse_json(source.read()), lambda name: source.part(name, _FILE_LIMIT)
+            meta = parse_json(source.read())
+            if "lodLevels" in meta:
+                raise _streamed_error(path)
+            yield source, meta, lambda name: source.part(name, _FILE_LIMIT)
             return
         with open_zip(source) as archive:
             found = _descriptions(archive.names)
@@ -158,9 +162,11 @@ def _streamed_error(path: Path) -> InputError:
 
 
 def _decode(source: Source, meta: dict[str, Any], file: Part) -> Splats:
-    if meta.get("version", 2) != 2:
+    first = meta.get("version", 1) == 1 and "shape" in meta["means"]
+    if not first and meta["version"] != 2:
         raise Damaged(f"version {shown(meta['version'])}")
-    first = "version" not in meta
+    if meta["quats"].get("encoding", _ENCODING) != _ENCODING:
+        raise Damaged(f"rotations in the encoding {shown(meta['quats']['encoding'])}")
     n = whole_number(meta["means"]["shape"][0] if first else meta["count"], "the number of Gaussians", 1, MAX_GAUSSIANS)
     rows, bands = _palette(meta["shN"], file, first) if meta.get("shN") else (np.zeros((1, 0, 4), np.uint8), 0)
     check_count(source, n, decoded_bytes(bands))

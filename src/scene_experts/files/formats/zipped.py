@@ -49,6 +49,7 @@ def _unpacked(path: Path) -> Iterator[tuple[Path, Format]]:
     ):
         visible = [name for name in archive.names if not name.startswith("__MACOSX/") and not name.endswith("/")]
         names = [name for name in visible if name.lower().endswith(SCENES)]
+        names = [name for name in names if name.endswith("point_cloud.ply")] or names  # beside the points of a result folder
         if len(names) != 1:
             shown = ", ".join(shorten(name, 40) for name in (names or visible)[:3])
             count = f"{len(names):,} among {len(visible):,} files"

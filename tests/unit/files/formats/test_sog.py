@@ -159,6 +159,7 @@ def test_a_zip_of_the_folder_around_the_files(tmp_path):
 def test_damaged_first_versions(tmp_path):
     files = foreign.sogs_1(foreign.gaussians(100, 1))
     for part, entry, value, fact in (
+        ("quats", "encoding", "other", "other"),
         ("means", "shape", [0, 3], "0"),
         ("means", "shape", [10**9, 3], "1000000000"),
         ("means", "shape", [500, 3], "means"),
@@ -188,6 +189,7 @@ def test_streamed_scenes_are_refused_with_a_way_that_works(tmp_path):
     text = json.dumps({"version": 1, "lodLevels": 2, "filenames": ["0_0/meta.json"], "tree": {}}).encode()
     foreign.folder(tmp_path / "a", {"lod-meta.json": text})
     (tmp_path / "a.zip").write_bytes(foreign.zipped({"b/lod-meta.json": text, "b/0_0/meta.json": b"{}"}))
-    for path in (tmp_path / "a", tmp_path / "a" / "lod-meta.json", tmp_path / "a.zip"):
+    (tmp_path / "renamed.json").write_bytes(text)
+    for path in (tmp_path / "renamed.json", tmp_path / "a", tmp_path / "a" / "lod-meta.json", tmp_path / "a.zip"):
         with pytest.raises(InputError, match=naming("lod-meta.json", "0_*/meta.json")):
             registry.read(path)

@@ -29,6 +29,17 @@ def test_one_scene(tmp_path, format, deflate):
     assert zipped.is_antialiased(path) is (says is not None and says(inner))
 
 
+def test_a_result_folder_with_its_points(tmp_path):
+    scene, points = made(tmp_path, "ply"), {name: torch.zeros(3).numpy() for name in "xyz"}
+    foreign.ply(tmp_path / "input.ply", points)
+    files = {"a/point_cloud/iteration_7/point_cloud.ply": scene.read_bytes(), "a/input.ply": (tmp_path / "input.ply").read_bytes()}
+    (tmp_path / "a.zip").write_bytes(foreign.zipped(files))
+    assert len(read(tmp_path / "a.zip")) == 50
+    (tmp_path / "a.zip").write_bytes(foreign.zipped(files | {"a/point_cloud/iteration_9/point_cloud.ply": b""}))
+    with pytest.raises(InputError, match=naming("a.zip", "2 among 3")):
+        read(tmp_path / "a.zip")
+
+
 def test_a_ksplat_file(tmp_path):
     (tmp_path / "a.zip").write_bytes(foreign.zipped({"x.ksplat": foreign.ksplat(foreign.gaussians(30), 2)}))
     assert len(read(tmp_path / "a.zip")) == 30
