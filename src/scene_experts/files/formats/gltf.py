@@ -21,7 +21,7 @@ from scene_experts.files.formats.pack import Floats
 
 MAGIC, JSON, BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
@@ -38,7 +38,7 @@ class GltfFile:
         folder."""
         number = whole_number(index, "a buffer")
         if number not in self._buffers:
-            uri = self.scene["buffers"][number].get("uri")
+            uri = self.scene.get("buffers", [{}])[number].get("uri")
             if uri is None and number == 0 and self._body:
                 self._buffers[number] = self._body
             elif not isinstance(uri, str):
@@ -83,7 +83,7 @@ class GltfFile:
             raise Damaged(f"accessor {index} without data, which another extension may hold ({needed or 'none is named'})")
         view = self.view(accessor["bufferView"])
         data = self.buffer(view.get("buffer", 0))
-        item, width = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
+        item, width = np.dtype(_TYPES[accessor["componentType"]]), WIDTHS[accessor["type"]]
         count = whole_number(accessor["count"], f"the count of accessor {index}")
         stride = whole_number(view.get("byteStride", item.itemsize * width), f"a stride of accessor {index}", item.itemsize * width)
         start = sum(whole_number(part.get("byteOffset", 0), f"an offset of accessor {index}") for part in (view, accessor))

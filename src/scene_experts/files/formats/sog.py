@@ -199,12 +199,13 @@ def _decode(source: Source, meta: dict[str, Any], file: Part) -> Splats:
         scales = levels("scales", pixels("scales")[:, :3])
         color = levels("sh0", colors if first else colors[:, :3])
         sh[:, 0] = color[:, :3]
-        logits = color[:, 3] if first else byte_logits(colors[:, 3])
+        logits = color[:, 3].copy() if first else byte_logits(colors[:, 3])
+        del color  # the harmonics take its memory
         if bands:
             bits = whole_number(meta["shN"].get("quantization", 8), "bits of the palette", 1, 8) if first else 8
             index = _labels(pixels("shN", 1), len(rows) if first else meta["shN"]["count"], len(rows))
             for i in range(sh.shape[1] - 1):
-                sh[:, 1 + i] = levels("shN", rows[:, i, :3], bits)[index]
+                sh[:, 1 + i] = levels("shN", rows[:, i, :3], bits).astype(np.float32)[index]
     if not all(np.isfinite(part).all() for part in (means, scales, sh, logits)):
         raise Damaged("values that are not finite")
     return Splats(tensor(means), tensor(scales), tensor(quats), tensor(logits), torch.from_numpy(sh))
