@@ -125,11 +125,11 @@ def write_compact(path: Path, size: int, allowance: int) -> None:
 
 def write_glb(path: Path, size: int, allowance: int) -> None:
     """Accessors that all name the same bytes."""
-    from scene_experts.files.formats import glb
+    from scene_experts.files.formats import glb, gltf
 
     names = {"POSITION": "VEC3", f"{glb.NAME}:SCALE": "VEC3", f"{glb.NAME}:ROTATION": "VEC4", f"{glb.NAME}:OPACITY": "SCALAR"}
     names |= {f"{glb.NAME}:SH_DEGREE_{d}_COEF_{i}": "VEC3" for d in range(4) for i in range(2 * d + 1)}
-    count = min(allowance // (8 * sum(glb._WIDTHS[kind] for kind in names.values())), (size - 8192) // 4)
+    count = min(allowance // (8 * sum(gltf.WIDTHS[kind] for kind in names.values())), (size - 8192) // 4)
     accessors = [{"bufferView": 0, "componentType": 5121, "normalized": True, "count": count, "type": kind} for kind in names.values()]
     primitive = {"attributes": {name: i for i, name in enumerate(names)}, "mode": 0, "extensions": {glb.NAME: {}}}
     scene = {"asset": {"version": "2.0"}, "meshes": [{"primitives": [primitive]}], "accessors": accessors, "bufferViews": [{"buffer": 0}]}

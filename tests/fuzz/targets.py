@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import math
@@ -16,7 +17,7 @@ import torch
 from PIL import Image
 
 from fuzz import containers
-from fuzz.mutate import mutate
+from fuzz.mutate import mutate, mutate_json
 from fuzz.structure import mutate_structure
 from scene_experts.core import checkpoint
 from scene_experts.core.io import write_json
@@ -33,11 +34,13 @@ from scene_experts.files.anchors import compact, torchscript
 from scene_experts.files.anchors.read import read_folder
 from scene_experts.files.anchors.write import contents, describe
 from scene_experts.files.archive.torch_archive import read_tensors
+from scene_experts.files.formats.spz import spz_bytes
 from scene_experts.report import page
 from scene_experts.reproduce import store
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.training.run_folder import open_run, read_config
 from scene_experts.view.path_files import read_path
+from support import foreign
 from support.evaluated import make_run
 from support.files import run_in_memory
 from support.records import record
@@ -130,6 +133,64 @@ def _ply_texts(folder: Path) -> None:
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {name}\n" for name in names) + "end_header\n"
     (folder / "scene.ply").write_text(head + "".join(" ".join(f"{i + j / 7:.4f}" for j in range(len(names))) + "\n" for i in range(3)))
+
+
+def _foreign(name: str, make: Callable[[dict[str, Any]], bytes]) -> Callable[[Path], None]:
+    """A file as another program writes it."""
+
+    def write(folder: Path) -> None:
+        (folder / name).write_bytes(make(foreign.gaussians(40, 1)))
+
+    return write
+
+
+def _sog_folder(folder: Path) -> None:
+    foreign.folder(folder, foreign.sogs_1(foreign.gaussians(40, 2)))
+
+
+def _ply_of_others(folder: Path) -> None:
+    """Colours in place of harmonics, and the two scales of 2DGS; one opacity is infinite and one row is empty."""
+    columns = {name: values.copy() for name, values in foreign.ply_columns(foreign.gaussians(20, 1)).items()}
+    columns = {name: values for name, values in columns.items() if not name.startswith("f_dc") and name != "scale_2"}
+    columns["opacity"][3] = np.inf
+    for values in columns.values():
+        values[7] = 0
+    foreign.ply(folder / "scene.ply", columns | {name: np.arange(20, dtype=np.uint8) for name in ("red", "green", "blue")})
+
+
+def _compressed_1(folder: Path) -> None:
+    foreign.compressed_ply_before_2(folder / "scene.ply", foreign.gaussians(300, 1))
+
+
+def _gltf(folder: Path) -> None:
+    """An SPZ file inside the JSON and one beside it."""
+    data = spz_bytes(splats(20, 2))
+    scene = foreign.with_spz(20, len(data), "KHR_gaussian_splatting_compression_spz_2")
+    scene["meshes"].append({"primitives": [{"attributes": {}, "extensions": {"KHR_spz_gaussian_splats_compression": {"bufferView": 1}}}]})
+    scene["bufferViews"].append({"buffer": 1, "byteLength": len(data)})
+    buffers = [
+        {"byteLength": len(data), "uri": "data:;base64," + base64.b64encode(data).decode()},
+        {"byteLength": len(data), "uri": "x.bin"},
+    ]
+    (folder / "scene.gltf").write_text(json.dumps(scene | {"buffers": buffers}))
+    (folder / "x.bin").write_bytes(data)
+
+
+def _gltf_plain(folder: Path) -> None:
+    registry.format_named("glb").write(folder / "scene.glb", splats(20, 1), {})
+    data = (folder / "scene.glb").read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    scene = json.loads(data[20 : 20 + size])
+    scene["buffers"][0]["uri"] = "x.bin"
+    (folder / "scene.gltf").write_text(json.dumps(scene))
+    (folder / "x.bin").write_bytes(data[28 + size :])
+    (folder / "scene.glb").unlink()
+
+
+def _zip(folder: Path) -> None:
+    registry.format_named("ply").write(folder / "scene.ply", splats(20, 1), {})
+    (folder / "scene.zip").write_bytes(foreign.zipped({"a/scene.ply": (folder / "scene.ply").read_bytes()}, deflate=True))
+    (folder / "scene.ply").unlink()
 
 
 def _compact(folder: Path) -> None:
@@ -303,6 +364,7 @@ def _scene_of_compact(folder: Path) -> Any:
     return data, scene
 
 
+_JSON = {".json": mutate_json, ".gltf": mutate_json}
 _TENSORS = {".safetensors": containers.tensors, ".compact": containers.tensors}
 TARGETS: dict[str, Target] = {
     "ply": Target(_gaussians("ply"), _read_only_file),
@@ -313,6 +375,15 @@ TARGETS: dict[str, Target] = {
     "sog": Target(_gaussians("sog"), _read_only_file, packs={".sog": containers.zipped}),
     "glb": Target(_gaussians("glb"), _read_only_file, packs={".glb": containers.glb}),
     "html": Target(_gaussians("html"), _read_only_file),
+    "ply-others": Target(_ply_of_others, _read_only_file),
+    "compressed-ply-1": Target(_compressed_1, _read_only_file),
+    "sog-1": Target(_foreign("scene.sog", lambda s: foreign.zipped(foreign.sogs_1(s))), _read_only_file, packs={".sog": containers.zipped}),
+    "sog-folder": Target(_sog_folder, registry.read, packs=_JSON),
+    "gltf": Target(_gltf_plain, lambda folder: registry.read(folder / "scene.gltf"), packs=_JSON),
+    "gltf-spz": Target(_gltf, lambda folder: registry.read(folder / "scene.gltf"), packs=_JSON),
+    "ksplat": Target(_foreign("scene.ksplat", lambda s: foreign.ksplat(s, 2, 8, sections=2)), _read_only_file),
+    "ksplat-0": Target(_foreign("scene.ksplat", lambda s: foreign.ksplat(s, 0)), _read_only_file),
+    "zip": Target(_zip, _read_only_file, packs={".zip": containers.zipped}),
     "compact": Target(_compact, _scene_of_compact, packs=_TENSORS),
     "networks": Target(_networks, lambda folder: read_tensors(folder / "net.pt"), packs={".pt": containers.zipped}),
     "torchscript": Target(_traces, lambda folder: read_tensors(folder / "net.pt"), packs={".pt": containers.zipped}),

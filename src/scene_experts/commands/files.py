@@ -16,7 +16,7 @@ from scene_experts.commands import PROG
 from scene_experts.data.fetch.catalog import defaults_in
 from scene_experts.data.settings import Data
 from scene_experts.files.options import Options
-from scene_experts.files.registry import GAUSSIANS, about, format_named, format_names
+from scene_experts.files.registry import GAUSSIANS, READ_ONLY, about, format_named, format_names
 
 FIRST = ("data", "out", "iteration", "images", "resolution", "split")
 """The options of `import` that people use first, for --help."""
@@ -105,7 +105,7 @@ def export(args: list[str]) -> int:
 
 def import_(args: list[str]) -> int:
     """Make a run folder of a result folder or a file and print where it is."""
-    text = f"{docs.of_class(ImportCommand)}\n\n{formats_help()}"
+    text = f"{docs.of_class(ImportCommand)}\n\n{formats_help(*READ_ONLY)}"
     brought = {"data.normalise": defaults_in(args).normalise}
     command = parse(ImportCommand, Command(f"{PROG} import", ("source",), FIRST, text, brought), args)
 
@@ -117,6 +117,6 @@ def import_(args: list[str]) -> int:
     return 0
 
 
-def formats_help() -> str:
-    """The list of all formats for a help text."""
-    return "\n".join(["Formats:", *(line for name in format_names() for line in columns(f"  {name}", about(name)))])
+def formats_help(*others: str) -> str:
+    """The list of all formats, and of others, for a help text."""
+    return "\n".join(["Formats:", *(line for name in (*format_names(), *others) for line in columns(f"  {name}", about(name)))])

@@ -10,7 +10,7 @@ from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import guarding
 from scene_experts.data.settings import Data
 from scene_experts.files.formats.ply import read_vertices
-from scene_experts.files.registry import FAMILIES, Family, family_named, recognise
+from scene_experts.files.registry import FAMILIES, Family, family_named, recognise, scene_file
 from scene_experts.files.result_folder import is_result, iteration_folder
 from scene_experts.files.scene_folder import write_result_folder
 from scene_experts.scene.fit import restore_foreign
@@ -22,8 +22,8 @@ def import_files(source: Path, data: Data, out: Path, iteration: int | None = No
     """Make a run folder of a published result folder, of one of ours, or of a file in any format
     that has a reader.
 
-    source: result folder of Scaffold-GS, Octree-GS or 3DGS (with point_cloud/iteration_N), or a
-    file that `export` writes. data: the capture that it belongs to; its frame and unit are those of
+    source: result folder of Scaffold-GS, Octree-GS or 3DGS (with point_cloud/iteration_N), a folder
+    of SOG (with meta.json), or a file that `export` writes. data: the capture that it belongs to; its frame and unit are those of
     the file.  out: new run folder. iteration: of a result folder; None: the newest. Where a lone
     file does not say how long it was trained, this number counts. Returns `out`, with
     configuration, checkpoint and result folder, ready for `eval`, `render` and `export`. Raises
@@ -48,6 +48,8 @@ def import_files(source: Path, data: Data, out: Path, iteration: int | None = No
 def owner(source: Path, iteration: int | None) -> tuple[Family, Path]:
     """The family that reads `source`, and the file or folder that it reads. Raises InputError where
     no family does."""
+    if not is_result(source):
+        source = scene_file(source)
     if source.is_file():
         family = family_named(recognise(source)[1].family)
         assert family is not None

@@ -48,6 +48,12 @@ FORMATS = {
 }
 """Name on the command line -> module that states the format as `FORMAT`."""
 
+READ_ONLY = {
+    "ksplat": "scene_experts.files.formats.ksplat",
+    "zip": "scene_experts.files.formats.zipped",
+}
+"""Formats of other programs that are read and not written."""
+
 FAMILIES = {
     "anchors": "scene_experts.files.anchors",
     "gaussians": "scene_experts.files.gaussians",
@@ -210,7 +216,7 @@ def _module(name: str) -> str:
 def about(name: str) -> str:
     """What a format is, in one sentence: the first of its module's docstring, read without
     importing the module."""
-    root, *below = _module(name).split(".")
+    root, *below = (READ_ONLY.get(name) or _module(name)).split(".")
     spec = find_spec(root)
     for part in below:  # `find_spec` of the whole name would import the packages above the module
         spec = spec and PathFinder.find_spec(f"{spec.name}.{part}", spec.submodule_search_locations)
@@ -231,6 +237,13 @@ def formats_of(family: str, names: Iterable[str] | None = None) -> dict[str, For
     return {name: format for name, format in found.items() if format.family == family}
 
 
+def scene_file(path: Path) -> Path:
+    """The file of the scene at `path`: the description in a folder of SOG, else `path` itself."""
+    if path.is_dir():
+        return next((path / name for name in ("lod-meta.json", "meta.json") if (path / name).is_file()), path)
+    return path
+
+
 def recognise(path: Path) -> tuple[str, Format]:
     """The format of a file, by its first bytes; formats without a signature by whatever they look
     at, last.
@@ -239,7 +252,7 @@ def recognise(path: Path) -> tuple[str, Format]:
     """
     with opening(path, budget.HEAD) as source:
         head = source.head(HEAD)
-    found = {name: format_named(name) for name in format_names()}
+    found = {name: format_named(name) for name in format_names()} | {name: import_module(at).FORMAT for name, at in READ_ONLY.items()}
     for name, format in sorted(found.items(), key=lambda item: not item[1].marks):  # stable: signatures first
         if format.read is None or not (format.marks or format.looks_like):
             continue
@@ -250,12 +263,13 @@ def recognise(path: Path) -> tuple[str, Format]:
 
 
 def read(path: Path) -> Any:
-    """The contents of a file of any format that has a reader. Raises InputError for others and for
+    """The contents of a file of any format that has a reader, or of a folder of SOG. Raises InputError for others and for
     damaged files."""
-    format = recognise(Path(path))[1]
+    path = scene_file(Path(path))
+    format = recognise(path)[1]
     assert format.read is not None
     with guarding(path, budget.HEAD):  # a format of another package may raise anything
-        return format.read(Path(path))
+        return format.read(path)
 
 
 def exported_files(folder: Path) -> list[Path]:

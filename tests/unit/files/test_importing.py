@@ -10,6 +10,7 @@ from scene_experts.files.formats.ply import write_vertices
 from scene_experts.files.gaussians import FAMILY as GAUSSIANS
 from scene_experts.files.importing import import_files, owner
 from scene_experts.files.registry import format_named
+from support import foreign
 from support.messages import naming
 from support.splats import splats
 
@@ -40,3 +41,10 @@ def test_nothing_is_written_for_a_source_that_cannot_be_read(tmp_path):
         with pytest.raises(InputError, match=source):
             import_files(tmp_path / source, Data(tmp_path), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_of_sog_belongs_to_its_description(tmp_path):
+    foreign.folder(tmp_path / "a", foreign.sogs_1(foreign.gaussians(30)))
+    assert owner(tmp_path / "a", None) == (GAUSSIANS, tmp_path / "a" / "meta.json")
+    with pytest.raises(InputError, match=naming(tmp_path)):
+        owner(tmp_path, None)

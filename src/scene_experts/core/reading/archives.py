@@ -6,8 +6,9 @@ import re
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
-from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.budget import CutShort, Damaged
 from scene_experts.core.reading.source import Source
 
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -26,20 +27,42 @@ class Archive:
     def read(self, name: object, limit: int) -> bytes:
         """Return the bytes of one member. Raises Damaged if it is absent, has more than `limit`
         bytes, or is beyond the budget."""
-        if not isinstance(name, str) or name not in self._archive.NameToInfo:
-            raise Damaged(f"no member {name!r:.60}")
-        info = self._archive.getinfo(name)
+        info = self._info(name)
         if info.file_size > limit:
             raise Damaged(f"{info.file_size:,} bytes of {name!r:.60} where at most {limit:,} are expected")
-        if info.compress_type not in _METHODS or info.flag_bits & 1:
-            raise Damaged(f"{name!r:.60} in a compression that is not used here")
         self.source.spend_bytes(info.file_size)
-        self.source.check_time()
         with self._archive.open(info) as stream:
             data = stream.read(info.file_size + 1)
         if len(data) != info.file_size:
-            raise Damaged(f"{len(data):,} bytes of {name!r:.60} where {info.file_size:,} are declared")
+            raise CutShort(f"{len(data):,} bytes of {name!r:.60} where {info.file_size:,} are declared")
         return data
+
+    def unpack(self, name: object, path: Path) -> None:
+        """Write one member to `path`. Raises Damaged if it is absent or beyond the budget."""
+        info = self._info(name)
+        self.source.spend_bytes(info.file_size)
+        left = info.file_size
+        with self._archive.open(info) as stream, path.open("wb") as out:
+            while part := stream.read(min(left + 1, 1 << 20)):
+                left -= len(part)
+                if left < 0:
+                    break
+                out.write(part)
+                self.source.check_time()
+        if left:
+            raise CutShort(f"another length of {name!r:.60} than the {info.file_size:,} bytes that are declared")
+
+    def _info(self, name: object) -> zipfile.ZipInfo:
+        """The entry of a member. Raises Damaged if it is absent or cannot be unpacked here."""
+        if not isinstance(name, str) or name not in self._archive.NameToInfo:
+            raise Damaged(f"no member {name!r:.60}")
+        info = self._archive.getinfo(name)
+        if info.flag_bits & 1:
+            raise Damaged(f"{name!r:.60} behind a password")
+        if info.compress_type not in _METHODS:
+            raise Damaged(f"{name!r:.60} in a compression that is not used here")
+        self.source.check_time()
+        return info
 
 
 @contextmanager

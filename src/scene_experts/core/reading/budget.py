@@ -24,6 +24,13 @@ class Damaged(ValueError):
     at PATH, found ..."."""
 
 
+class CutShort(Damaged):
+    """Bytes of a file are missing: another copy of it may be whole."""
+
+
+CONVERT = "convert it to PLY (SuperSplat and splat-transform do that) or write it again"
+
+
 @dataclass(frozen=True)
 class Budget:
     """Limits of one format.
@@ -39,6 +46,8 @@ class Budget:
         seconds: Processor time that a small file may take; see BYTES_PER_SECOND. Readers check it
             between their steps.
         advice: What the user can do about a damaged file.
+        other: What the user can do about a file whose bytes are all there, but whose content this
+            version does not read; empty: `advice`.
     """
 
     what: str
@@ -49,6 +58,7 @@ class Budget:
     depth: int = 32
     seconds: float = 4.0
     advice: str = "copy it again or write it again"
+    other: str = ""
 
     def allowance(self, size: int) -> int:
         """Return how many bytes a file of `size` bytes may take in memory."""
@@ -71,8 +81,8 @@ NOTE = Budget("note", 1 * MIB)
 # --- captures -----------------------------------------------------------------------------------------------------------------------------
 
 CAPTURE = Budget("capture", 1 << 60, advice="restore its files")
-COLMAP = Budget("COLMAP file", 32 * GIB, advice="copy it again")
-POINTS = Budget("PLY file of points", 16 * GIB, items=4_096, advice="copy it again")
+COLMAP = Budget("COLMAP file", 32 * GIB, advice="copy it again", other="export the reconstruction again")
+POINTS = Budget("PLY file of points", 16 * GIB, items=4_096, advice="copy it again", other="export the points again")
 PHOTOGRAPH = Budget("image", 2 * GIB, floor=192 * MIB, ratio=40, advice="replace it or remove it from the capture")
 CAPTURED = Budget("photograph or mask", 2 * GIB, floor=512 * MIB, ratio=40, advice="replace or remove it")  # before a reconstruction
 MASK = Budget("mask", 1 * GIB, floor=512 * MIB, ratio=40, advice="replace or remove it")
@@ -80,16 +90,18 @@ PICTURE = Budget("picture", 1 * GIB, floor=160 * MIB, ratio=40, advice="evaluate
 
 # --- scenes -------------------------------------------------------------------------------------------------------------------------------
 
-HEAD = Budget("file", 1 << 50)  # the first bytes, by which formats are recognised
-PLY = Budget("PLY file", 256 * GIB, items=4_096)
-COMPRESSED_PLY = Budget("compressed PLY file", 64 * GIB, items=4_096)
-SPLAT = Budget(".splat file", 64 * GIB)
-SPZ = Budget("SPZ file", 16 * GIB, ratio=32)
-SOG = Budget("SOG file", 16 * GIB, ratio=40, items=256)
-GLB = Budget("glTF file", 64 * GIB, floor=64 * MIB, ratio=10, items=20_000)
-USD = Budget("OpenUSD file", 64 * GIB)
-HTML = Budget("html page", 16 * GIB, ratio=32)
-COMPACT = Budget("compact scene", 64 * GIB)
+HEAD = Budget("file", 1 << 50, other=CONVERT)  # the first bytes, by which formats are recognised
+PLY = Budget("PLY file", 256 * GIB, items=4_096, other="write it again with the columns of 3DGS (SuperSplat and splat-transform do that)")
+COMPRESSED_PLY = Budget("compressed PLY file", 64 * GIB, items=4_096, other=CONVERT)
+SPLAT = Budget(".splat file", 64 * GIB, other=CONVERT)
+KSPLAT = Budget(".ksplat file", 64 * GIB, items=4_096, other=CONVERT)
+SPZ = Budget("SPZ file", 16 * GIB, ratio=32, other=CONVERT)
+SOG = Budget("SOG file", 16 * GIB, ratio=40, items=256, other=CONVERT)
+GLB = Budget("glTF file", 64 * GIB, floor=64 * MIB, ratio=10, items=20_000, other=CONVERT)
+USD = Budget("OpenUSD file", 64 * GIB, other=CONVERT)
+HTML = Budget("html page", 16 * GIB, ratio=32, other=CONVERT)
+ZIP = Budget("zip file", 64 * GIB, floor=32 * MIB, ratio=4, items=20_000, other="unpack it and give the file or folder of the scene")
+COMPACT = Budget("compact scene", 64 * GIB, other="export it again")
 RUN = Budget("run folder", 1 << 60, advice="restore its files or train again")
 CHECKPOINT = Budget("checkpoint", 1 << 40, items=100_000, advice="use an older one or copy it again")
 NETWORK = Budget("network file", 16 * GIB, floor=128 * MIB, ratio=4, items=200_000, depth=50, advice="get it again")

@@ -52,10 +52,10 @@ def keep_as_stored(image: Image.Image) -> None:
         image._size = image.im.size  # pyright: ignore[reportPrivateUsage]
 
 
-def decode_picture(data: bytes, pixels: int, format: str) -> Image.Image:
-    """Decode a picture of one format that is a part of another file. Raises Damaged for more than
-    `pixels` pixels."""
-    with Image.open(io.BytesIO(data), formats=[format]) as image:
+def decode_picture(data: bytes, pixels: int, *formats: str) -> Image.Image:
+    """Decode a picture of one of the formats that is a part of another file. Raises Damaged for
+    more than `pixels` pixels."""
+    with Image.open(io.BytesIO(data), formats=formats) as image:
         if image.width * image.height > pixels or max(image.size) > SIDE_LIMIT:
             raise Damaged(f"a picture of {image.width} x {image.height} pixels")
         image.load()

@@ -15,6 +15,8 @@ from scene_experts.core.reading import budget as budgets
 from scene_experts.core.reading.budget import Budget, Damaged
 from scene_experts.core.reading.source import opening
 
+JSON_STARTS = (b"{", b"\xef\xbb\xbf{", b" ", b"\t", b"\r", b"\n")
+"""First bytes of a JSON file that may hold an object."""
 _BITS = 64  # of an integer
 _LONGEST_VALUE = 4096  # characters of a Python literal
 

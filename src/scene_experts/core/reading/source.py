@@ -3,17 +3,21 @@ InputError."""
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import stat
+import struct
 import time
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
 from scene_experts.core.errors import InputError, RunError
-from scene_experts.core.reading.budget import Budget, Damaged
+from scene_experts.core.reading.budget import BYTES_PER_SECOND, Budget, CutShort, Damaged
 
 log: logging.Logger = logging.getLogger(__name__)
 _LONGEST, _LONGEST_SENTENCE = 160, 2000  # characters of a cause in an error message, and of a message
@@ -29,6 +33,7 @@ class Source:
     def __init__(self, path: Path, budget: Budget, size: int) -> None:
         self.path, self.budget, self.size = path, budget, size
         self.memory = self.items = 0
+        self._parts: dict[str, bytes] = {}
         self._end = time.thread_time() + budget.time_limit(size)
 
     def read(self) -> bytes:
@@ -36,7 +41,7 @@ class Source:
         with self.path.open("rb") as stream:
             data = stream.read(self.size + 1)
         if len(data) > self.size:
-            raise Damaged("a file that grows while it is read")
+            raise CutShort("a file that grows while it is read")
         return data
 
     def head(self, most: int) -> bytes:
@@ -47,6 +52,23 @@ class Source:
     def stream(self) -> IO[bytes]:
         """Open the file for reading. The caller closes it."""
         return self.path.open("rb")
+
+    def part(self, name: object, limit: int | None = None) -> bytes:
+        """Return the bytes of another file of the same scene, which this file names: a name inside
+        its folder. Its size widens the budget of bytes and time. Raises Damaged for other names and
+        for more than `limit` bytes, and InputError for an absent file."""
+        path = inside(self.path.parent, name)
+        key = os.path.realpath(path)
+        if key not in self._parts:  # each file once, whatever it is called
+            self.spend_items(1)
+            with opening(path, self.budget, f"part of {self.path.name}") as other:
+                if limit is not None and other.size > limit:
+                    raise Damaged(f"{other.size:,} bytes where at most {limit:,} are expected")
+                self._parts[key] = other.read()
+            self.size += other.size
+            self._end += other.size / BYTES_PER_SECOND
+            self.spend_bytes(other.size)
+        return self._parts[key]
 
     def spend_bytes(self, count: float) -> None:
         """Announce that the reader will take `count` more bytes of memory. Raises Damaged beyond
@@ -105,23 +127,36 @@ def guarding(path: Path | str, budget: Budget, what: str | None = None) -> Itera
         raise
     except OSError as error:
         if error.errno is None:  # raised by a decoder for damaged content, not by the system
-            raise damaged_error(path, budget, describe(error), what) from error
+            raise damaged_error(path, budget, error, what) from error
         raise InputError(f"cannot read {path}: {error.strerror or error}; check the file and its permissions") from error
     except Exception as error:
         if type(error).__name__ == "OutOfMemoryError":  # of a GPU: the file is not at fault
             raise
         if not isinstance(error, Damaged):
             log.debug("could not read %s", path, exc_info=True)
-        raise damaged_error(path, budget, describe(error), what) from error
+        raise damaged_error(path, budget, error, what) from error
     except BaseException as error:
         if type(error).__name__ != "PanicException":  # a failed assertion in a library written in Rust
             raise
-        raise damaged_error(path, budget, describe(error), what) from error
+        raise damaged_error(path, budget, error, what) from error
 
 
-def damaged_error(path: Path | str, budget: Budget, found: str, what: str | None = None) -> InputError:
-    """Return the error for a file whose content does not fit its format."""
-    return InputError(f"expected {article('whole ' + (what or budget.what))} at {path}, found {found}; {budget.advice}")
+def damaged_error(path: Path | str, budget: Budget, error: BaseException, what: str | None = None) -> InputError:
+    """Return the error for a file whose content does not fit its format. Only a file that may lack
+    bytes is called not whole."""
+    name, found = what or budget.what, describe(error)
+    if is_cut(error) or not budget.other:
+        return InputError(f"expected {article('whole ' + name)} at {path}, found {found}; {budget.advice}")
+    return InputError(f"expected {article(name)} that this version reads at {path}, found {found}; {budget.other}")
+
+
+def is_cut(error: BaseException) -> bool:
+    """Return whether a failure is that of a file that lacks bytes or has lost some: another copy
+    may help."""
+    if isinstance(error, json.JSONDecodeError):
+        return error.msg.startswith("Unterminated") or not error.doc[error.pos :].strip()
+    names = ("SafetensorError", "ZstdError")  # of libraries that this module does not import
+    return isinstance(error, (CutShort, EOFError, OSError, struct.error, zlib.error, zipfile.BadZipFile)) or type(error).__name__ in names
 
 
 def describe(error: BaseException) -> str:
@@ -133,6 +168,8 @@ def describe(error: BaseException) -> str:
     text = shorten(str(error).strip())
     if isinstance(error, Damaged):
         return text
+    if isinstance(error, KeyError) and error.args and isinstance(error.args[0], str):
+        return f"content without {text}"
     return f"content that does not fit together ({text or type(error).__name__})"
 
 
@@ -153,7 +190,7 @@ def shorten(text: str, most: int = _LONGEST) -> str:
 
 def article(noun: str) -> str:
     """Return the noun with its indefinite article."""
-    return f"{'an' if noun[:1].lower() in 'aeiou' or noun[:3] in ('SPZ', 'SOG') else 'a'} {noun}"
+    return f"{'an' if noun[:1].lower() in 'aeiou' or noun[:3] in ('SPZ', 'SOG', 'htm') else 'a'} {noun}"
 
 
 def inside(folder: Path, name: object) -> Path:

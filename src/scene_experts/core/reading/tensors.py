@@ -8,7 +8,7 @@ from pathlib import Path
 from safetensors import safe_open
 from torch import Tensor
 
-from scene_experts.core.reading.budget import Budget, Damaged
+from scene_experts.core.reading.budget import Budget, CutShort
 from scene_experts.core.reading.numbers import all_finite
 from scene_experts.core.reading.source import Source, opening
 
@@ -43,7 +43,7 @@ def check_header(source: Source) -> None:
     """Raise Damaged for a header that is longer than the file or than any honest one."""
     size = int.from_bytes(source.head(8), "little")
     if not 2 <= size <= min(source.size - 8, _HEADER_LIMIT):
-        raise Damaged(f"a header of {size:,} bytes in a file of {source.size:,}")
+        raise CutShort(f"a header of {size:,} bytes in a file of {source.size:,}")
 
 
 def find_not_finite(tensors: dict[str, Tensor], prefixes: tuple[str, ...]) -> str | None:

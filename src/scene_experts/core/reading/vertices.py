@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.budget import CutShort, Damaged
 from scene_experts.core.reading.source import Source
 
 HEADER_LIMIT = 1 << 20
@@ -92,7 +92,7 @@ def read_table(source: Source, header: Header) -> NDArray[Any]:
     row = header.row
     room = max(0, source.size - header.start) // row.itemsize
     if room < header.count:
-        raise Damaged(f"{room:,} vertices where {header.count:,} are declared: the file was cut short")
+        raise CutShort(f"{room:,} vertices where {header.count:,} are declared: the file was cut short")
     return np.fromfile(source.path, row, header.count, offset=header.start)
 
 
@@ -100,7 +100,7 @@ def read_ascii(source: Source, header: Header) -> NDArray[np.float64]:
     """Return the numbers [N, C] of an ascii file."""
     width = len(header.fields)
     if header.count * (2 * width) > source.size - header.start + 1:  # a digit and a separator each
-        raise Damaged(f"fewer vertices than the {header.count:,} that are declared: the file was cut short")
+        raise CutShort(f"fewer vertices than the {header.count:,} that are declared: the file was cut short")
     out = np.empty((header.count, width), np.float64)
     with source.stream() as stream:
         stream.seek(header.start)
@@ -110,7 +110,7 @@ def read_ascii(source: Source, header: Header) -> NDArray[np.float64]:
             while len(lines) < want:
                 line = stream.readline(64 * width + 64)
                 if not line:
-                    raise Damaged(f"{done + len(lines):,} vertices where {header.count:,} are declared: the file was cut short")
+                    raise CutShort(f"{done + len(lines):,} vertices where {header.count:,} are declared: the file was cut short")
                 if line.strip():
                     lines.append(line.decode("ascii"))
             part = np.loadtxt(io.StringIO("".join(lines)), np.float64, comments=None, ndmin=2)

@@ -1,14 +1,15 @@
 """SuperSplat's compressed PLY, 16 to 61 bytes per Gaussian.
 
 Gaussians are stored in chunks of 256. A chunk stores the minimum and maximum of position, log scale
-and colour. A Gaussian stores position and log scale in 11-10-11 bits within those ranges, the
-smallest three components of its quaternion in 10 bits each with the index of the largest, and
-colour and opacity in 8-8-8-8 bits. Harmonics above the constant are bytes over [-4, 4]. Sorting
-along the Morton curve keeps the ranges small.
+and colour; files of SuperSplat before 2.0 have no ranges of colours. A Gaussian stores position and
+log scale in 11-10-11 bits within those ranges, the smallest three components of its quaternion in
+10 bits each with the index of the largest, and colour and opacity in 8-8-8-8 bits. Harmonics above
+the constant are bytes over [-4, 4]. Sorting along the Morton curve keeps the ranges small.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,9 @@ from numpy.typing import NDArray
 
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
-from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.budget import CutShort, Damaged
 from scene_experts.core.reading.source import Source, opening
-from scene_experts.core.reading.vertices import HEADER_LIMIT, parse_count
+from scene_experts.core.reading.vertices import HEADER_LIMIT, TYPES, parse_count
 from scene_experts.files.formats.pack import (
     Floats,
     alphas,
@@ -77,15 +78,15 @@ def read(path: Path) -> Splats:
     """The Gaussians of a file. Raises InputError for other or damaged files."""
     with opening(path, budget.COMPRESSED_PLY) as source:
         data = source.read()
-        end = data[:HEADER_LIMIT].find(b"\nend_header\n")
-        if end < 0:
-            raise Damaged("no end of the header")
-        elements = _elements(data[:end].decode("ascii", "replace"), source)
+        match = re.search(rb"\nend_header[ \t]*\r?\n", data[:HEADER_LIMIT])
+        if match is None:
+            raise CutShort("no end of the header")
+        elements = _elements(data[: match.start()].decode("ascii", "replace"), source)
         tables: dict[str, NDArray[Any]] = {}
-        offset = end + len(b"\nend_header\n")
+        offset = match.end()
         for name, (count, row) in elements.items():
             if offset + count * row.itemsize > len(data):
-                raise Damaged(f"{len(data):,} bytes where the header declares more")
+                raise CutShort(f"{len(data):,} bytes where the header declares more")
             tables[name] = np.frombuffer(data, row, count, offset)
             offset += count * row.itemsize
         return _decode(tables).checked(path)
@@ -96,7 +97,8 @@ def _decode(tables: dict[str, NDArray[Any]]) -> Splats:
     n = len(vertex)
     if len(chunk) != -(-n // CHUNK):
         raise Damaged(f"{len(chunk):,} chunks for {n:,} Gaussians")
-    column = np.stack([chunk[name] for name in _RANGES], 1).astype(np.float64) if len(chunk) else np.zeros((0, 18))
+    names = _RANGES[: len(chunk.dtype.names or ())]
+    column = np.stack([chunk[name] for name in names], 1).astype(np.float64) if len(chunk) else np.zeros((0, len(names)))
     if not np.isfinite(column).all():
         raise Damaged("ranges that are not finite")
     columns = np.repeat(column, CHUNK, 0)[:n]
@@ -105,7 +107,9 @@ def _decode(tables: dict[str, NDArray[Any]]) -> Splats:
         _unpack_11_10_11(vertex["packed_scale"]),
         np.stack([vertex["packed_color"] >> shift & 255 for shift in (24, 16, 8)], 1) / 255,
     )
-    values = [columns[:, 6 * i : 6 * i + 3] * (1 - t) + columns[:, 6 * i + 3 : 6 * i + 6] * t for i, t in enumerate(steps)]
+    ends = [columns[:, i : i + 3] for i in range(0, len(names), 3)]
+    values = [low * (1 - t) + high * t for low, high, t in zip(ends[::2], ends[1::2], steps)]
+    values += steps[len(values) :]  # without a range, colours are from 0 to 1
     dc = (values[2] - 0.5) / C0
     sh = dc[:, None]
     if "sh" in tables:
@@ -121,7 +125,7 @@ def _decode(tables: dict[str, NDArray[Any]]) -> Splats:
 def _elements(text: str, source: Source) -> dict[str, tuple[int, np.dtype[Any]]]:
     """Number of rows and row type of chunk, vertex and sh, in the order of the header."""
     found: dict[str, tuple[int, list[tuple[str, str]]]] = {}
-    types, name = {"float": "<f4", "uint": "<u4", "uchar": "u1"}, ""
+    name = ""
     try:
         for words in (line.split() for line in text.splitlines()):
             if words[:1] == ["element"]:
@@ -131,24 +135,24 @@ def _elements(text: str, source: Source) -> dict[str, tuple[int, np.dtype[Any]]]
                 found[name] = (parse_count(count), [])
             elif words[:1] == ["property"]:
                 source.spend_items(1)
-                found[name][1].append((words[2], types[words[1]]))
-        order, widths = list(found), {key: [column for column, _ in columns] for key, (_, columns) in found.items()}
+                found[name][1].append((words[2], "<" + TYPES[words[1]]))
+        widths = {key: [column for column, _ in columns] for key, (_, columns) in found.items()}
         kinds = {key: {kind for _, kind in columns} for key, (_, columns) in found.items()}
         if (
-            order not in (["chunk", "vertex"], ["chunk", "vertex", "sh"])
+            set(found) - {"sh"} != {"chunk", "vertex"}
             or "format binary_little_endian" not in text
-            or widths["chunk"] != _RANGES
-            or widths["vertex"] != _PACKED
+            or sorted(widths["chunk"]) not in (sorted(_RANGES), sorted(_RANGES[:12]))
+            or sorted(widths["vertex"]) != sorted(_PACKED)
             or kinds["chunk"] != {"<f4"}
             or kinds["vertex"] != {"<u4"}
-            or not kinds.get("sh", set()) <= {"u1"}
+            or not kinds.get("sh", set()) <= {"<u1"}
             or sorted(widths.get("sh", [])) != sorted(f"f_rest_{i}" for i in range(len(widths.get("sh", []))))
             or len(widths.get("sh", [])) not in (0, 9, 24, 45)
             or ("sh" in found and found["sh"][0] != found["vertex"][0])
         ):
             raise ValueError
     except (ValueError, KeyError, IndexError):
-        raise Damaged("a header of another layout") from None
+        raise Damaged("another layout of chunks and packed columns") from None
     return {key: (count, np.dtype(columns)) for key, (count, columns) in found.items() if columns}
 
 

@@ -2,7 +2,8 @@
 
 Scales and opacities are stored directly (no logarithms or logits), quaternions as (x, y, z, w),
 harmonics in one accessor per coefficient. +Y is up: half a turn about z from ours. COLOR_0 shows
-the points in viewers without the extension.
+the points in viewers without the extension. Text files (.gltf) with their buffers inside or beside
+them are read too, and so are Gaussians that are packed as SPZ.
 """
 
 from __future__ import annotations
@@ -20,20 +21,21 @@ from numpy.typing import NDArray
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import Damaged
-from scene_experts.core.reading.numbers import shown, whole_number
-from scene_experts.core.reading.plain import parse_json
+from scene_experts.core.reading.numbers import shown
+from scene_experts.core.reading.plain import JSON_STARTS
 from scene_experts.core.reading.source import Source, opening
+from scene_experts.files.formats.gltf import BIN, JSON, MAGIC, GltfFile
 from scene_experts.files.formats.pack import Floats, alphas, logits, tensor, to_bytes, turn, unit_quats, warn_of_transforms
 from scene_experts.files.formats.splats import Splats
+from scene_experts.files.formats.spz import decode
 from scene_experts.files.registry import Format
 from scene_experts.geometry.sh import C0
 
 log: logging.Logger = logging.getLogger(__name__)
 NAME = "KHR_gaussian_splatting"
 SETTINGS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective", "sortingMethod": "cameraDistance"}
-_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
-_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_SPZ = re.compile(r"KHR_(gaussian_splatting_compression_spz(_\d+)?|spz_gaussian_splats_compression|spz_compression)")
+"""The extensions that name an SPZ file in a buffer view: the present one, and its earlier names."""
 _STILL = {  # the transform of a node, by name, that changes nothing
     "translation": [0, 0, 0],
     "rotation": [0, 0, 0, 1],
@@ -78,10 +80,10 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
         scene = {name: scene[name] for name in ("asset", "extensionsUsed", "scene", "scenes")} | {"scenes": [{}]}
     text = json.dumps(scene, separators=(",", ":"), allow_nan=False, default=str).encode()
     text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<II", len(text), _JSON) + text
+    chunks = struct.pack("<II", len(text), JSON) + text
     if len(splats):
-        chunks += struct.pack("<II", offset, _BIN) + b"".join(parts)
-    write_bytes(path, struct.pack("<III", _MAGIC, 2, 12 + len(chunks)) + chunks)
+        chunks += struct.pack("<II", offset, BIN) + b"".join(parts)
+    write_bytes(path, struct.pack("<III", MAGIC, 2, 12 + len(chunks)) + chunks)
 
 
 def read(path: Path) -> Splats:
@@ -91,25 +93,24 @@ def read(path: Path) -> Splats:
     Raises InputError for damaged files and for files without such a primitive.
     """
     with opening(path, budget.GLB) as source:
-        scene, data = _parse(source)
-        primitives = [p for mesh in scene.get("meshes", []) for p in mesh["primitives"] if NAME in p.get("extensions", {})]
-        found = [_read_primitive(source, scene, data, p["attributes"]) for p in primitives]
+        file = GltfFile(source)
+        primitives = [p for mesh in file.scene.get("meshes", []) for p in mesh["primitives"] if _is_gaussians(p)]
+        spz = Source(path, budget.SPZ, source.size)  # one budget for all that is packed
+        found: list[Splats] = []
+        for p in primitives:
+            view = _packed_in(p)
+            found.append(_read_primitive(file, p["attributes"]) if view is None else _unpack(file.content(view), spz, source.size))
         if not found:
-            if NAME in scene.get("extensionsUsed", []):
+            if NAME in file.scene.get("extensionsUsed", []):
                 return _splats(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3)))
             raise Damaged(f"no primitive with {NAME}")
-        if _has_transforms(scene):
+        if _has_transforms(file.scene):
             warn_of_transforms(path)
         for name in ("kernel", "colorSpace"):
-            others = {shown(p["extensions"][NAME].get(name, SETTINGS[name])) for p in primitives} - {repr(SETTINGS[name])}
+            others = {shown(p["extensions"].get(NAME, {}).get(name, SETTINGS[name])) for p in primitives} - {repr(SETTINGS[name])}
             if others:
                 log.warning("%s has Gaussians of the %s %s, which are read as %r", path, name, ", ".join(sorted(others)), SETTINGS[name])
-        coefficients = min(part[4].shape[1] for part in found)
-        join = lambda parts: parts[0] if len(parts) == 1 else np.concatenate(parts)  # noqa: E731
-        means, scales, quats, opacity = (join([part[i] for part in found]) for i in range(4))
-        sh = join([part[4][:, :coefficients] for part in found])
-        found.clear()  # the copies below are as large
-        return _splats(means, scales, quats, opacity, sh).checked(path)
+        return Splats.joined(found).checked(path)
 
 
 def _has_transforms(scene: dict[str, Any]) -> bool:
@@ -128,7 +129,26 @@ def _has_transforms(scene: dict[str, Any]) -> bool:
 
 
 def _has_gaussians(mesh: dict[str, Any]) -> bool:
-    return any(NAME in p.get("extensions", {}) for p in mesh["primitives"])
+    return any(_is_gaussians(p) for p in mesh["primitives"])
+
+
+def _is_gaussians(primitive: dict[str, Any]) -> bool:
+    extensions = primitive.get("extensions", {})
+    return NAME in extensions or any(_SPZ.fullmatch(name) for name in extensions)
+
+
+def _unpack(data: bytes, spz: Source, size: int) -> Splats:
+    """The Gaussians of an SPZ file inside a file of `size` bytes, in our frame: its own is glTF's by
+    half a turn about y."""
+    spz.size = size
+    return decode(data, spz)
+
+
+def _packed_in(primitive: dict[str, Any]) -> Any:
+    """The buffer view that holds a primitive's Gaussians as SPZ; None for other primitives."""
+    extensions = primitive["extensions"]
+    every = extensions | extensions.get(NAME, {}).get("extensions", {})
+    return next((entry["bufferView"] for name, entry in every.items() if _SPZ.fullmatch(name)), None)
 
 
 def _columns(splats: Splats) -> dict[str, NDArray[Any]]:
@@ -149,7 +169,7 @@ def _columns(splats: Splats) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def _splats(means: Floats, scales: Floats, quats: Floats, opacity: Floats, sh: Floats) -> Splats:
+def _splats(means: Floats, scales: Floats, quats: Floats, opacity: Floats, sh: NDArray[Any]) -> Splats:
     """From the frame and units of glTF to ours."""
     wxyz = quats[:, [3, 0, 1, 2]] @ _HALF_TURN  # its transpose undoes the turn
     turned_wrong = turn(
@@ -158,32 +178,10 @@ def _splats(means: Floats, scales: Floats, quats: Floats, opacity: Floats, sh: F
     return Splats(turned_wrong.means, turned_wrong.log_scales, tensor(wxyz), turned_wrong.opacity_logit, turned_wrong.sh)
 
 
-def _parse(source: Source) -> tuple[dict[str, Any], memoryview]:
-    """The JSON and the binary chunk of a .glb file."""
-    data = memoryview(source.read())
-    if len(data) < 20 or struct.unpack_from("<II", data) != (_MAGIC, 2):
-        raise Damaged("another header")
-    length = struct.unpack_from("<I", data, 8)[0]
-    size, kind = struct.unpack_from("<II", data, 12)
-    if length > len(data) or kind != _JSON or 20 + size > len(data):
-        raise Damaged(f"{len(data):,} bytes where the header declares {length:,}")
-    scene = parse_json(bytes(data[20 : 20 + size]))
-    if not isinstance(scene, dict):
-        raise Damaged("a description that is not an object")
-    start = 20 + size
-    if len(data) < start + 8:
-        return scene, memoryview(b"")
-    size, kind = struct.unpack_from("<II", data, start)
-    body = data[start + 8 : start + 8 + size]
-    if kind != _BIN or len(body) != size:
-        raise Damaged("a binary chunk that was cut short")
-    return scene, body
-
-
-def _read_primitive(source: Source, scene: dict[str, Any], data: memoryview, attributes: dict[str, int]) -> tuple[NDArray[Any], ...]:
-    """Means, scales, quaternions (x, y, z, w), opacities and harmonics of one primitive."""
-    get = lambda name: _accessor(source, scene, data, attributes[name])  # noqa: E731
-    degree = max(int(m[1]) for name in attributes if (m := re.fullmatch(NAME + r":SH_DEGREE_(\d)_COEF_0", name)))
+def _read_primitive(file: GltfFile, attributes: dict[str, int]) -> Splats:
+    """The Gaussians of one primitive, in our frame."""
+    get = lambda name: file.accessor(attributes[name])  # noqa: E731
+    degree = max((int(m[1]) for name in attributes if (m := re.fullmatch(NAME + r":SH_DEGREE_(\d)_COEF_0", name))), default=0)
     names = [f"{NAME}:SH_DEGREE_{d}_COEF_{i}" for d in range(min(degree, 3) + 1) for i in range(2 * d + 1)]
     small = (get("POSITION"), get(f"{NAME}:SCALE"), get(f"{NAME}:ROTATION"), get(f"{NAME}:OPACITY")[:, 0])
     sh = np.empty((len(small[0]), len(names), 3), np.float32)  # one after the other: most of the memory of a file is here
@@ -196,32 +194,19 @@ def _read_primitive(source: Source, scene: dict[str, Any], data: memoryview, att
     shapes = (out[0].shape[1:], out[1].shape[1:], out[2].shape[1:], out[4].shape[2:])
     if len({len(part) for part in out}) != 1 or shapes != ((3,), (3,), (4,), (3,)) or not all(np.isfinite(part).all() for part in out):
         raise Damaged("columns of different lengths or other widths, or values that are not finite")
-    return out
+    return _splats(*out)
 
 
-def _accessor(source: Source, scene: dict[str, Any], data: memoryview, index: Any) -> Floats:
-    """The values [N, C] of an accessor; normalised integers become fractions."""
-    accessor = scene["accessors"][whole_number(index, "an accessor")]
-    view = scene["bufferViews"][whole_number(accessor["bufferView"], "a buffer view")]
-    item, width = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
-    count = whole_number(accessor["count"], f"the count of accessor {index}")
-    stride = whole_number(view.get("byteStride", item.itemsize * width), f"a stride of accessor {index}", item.itemsize * width)
-    start = sum(whole_number(part.get("byteOffset", 0), f"an offset of accessor {index}") for part in (view, accessor))
-    last = start + stride * (count - 1) + item.itemsize * width if count else start
-    if view.get("buffer", 0) != 0 or last > len(data) or "sparse" in accessor:
-        raise Damaged(f"accessor {index}, which reaches beyond the file")
-    source.spend_items(1)
-    source.spend_bytes(8 * count * width)  # several accessors may name the same bytes
-    rows = np.ndarray((count, width), item, data, start, (stride, item.itemsize))
-    if accessor.get("normalized"):
-        return np.maximum(rows / float(np.iinfo(item).max), -1.0)
-    with np.errstate(invalid="ignore"):  # the caller refuses values that are not finite
-        return rows.astype(np.float64)
+def looks_like(path: Path, head: bytes) -> bool:
+    """Whether a file is binary glTF, or JSON with the entries of glTF."""
+    names = (b'"asset"', b'"accessors"', b'"bufferViews"', b'"meshes"', b'"extensionsUsed"')
+    return head.startswith(b"glTF") or path.suffix.lower() == ".gltf" or any(name in head for name in names)
 
 
 FORMAT = Format(
     suffix=".glb",
     write=write,
     read=read,
-    marks=(b"glTF",),
+    marks=(b"glTF", *JSON_STARTS),
+    looks_like=looks_like,
 )

@@ -28,7 +28,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
-from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.budget import CutShort, Damaged
 from scene_experts.core.reading.numbers import FARTHEST as LARGEST
 from scene_experts.core.reading.numbers import number
 from scene_experts.core.reading.plain import parse_json
@@ -77,7 +77,7 @@ def read(path: Path) -> Splats:
         page = source.read()
         content = _script(page, _SCENE)
         if content is None:
-            raise Damaged("no scene")
+            raise CutShort("no scene")
         try:
             scene = base64.b64decode(content, validate=True)
         except ValueError:

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +29,16 @@ from scene_experts.core.reading.source import guarding, opening
 from scene_experts.core.reading.vertices import HEADER_LIMIT, read_header, read_table
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import Format
+from scene_experts.geometry.sh import C0
 
 log: logging.Logger = logging.getLogger(__name__)
 Columns = dict[str, NDArray[np.generic]]
 
 NOTE_MARK = "scene-experts"
 _FILTER = "filter_3D"  # column of Mip-Splatting: by how much each Gaussian is smoothed when it is drawn
+_COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_BRIGHTEST = 8.0  # of colours in [0, 1]; harmonics may be brighter than 1
+_THIN = math.log(1e-6)  # third log scale of 2DGS's discs, as its authors propose
 _NOTE_LIMIT = 1 << 16  # other readers hold header lines in small buffers
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
 
@@ -173,23 +178,50 @@ def write(path: Path, splats: Splats, note: Mapping[str, Any], normals: bool = T
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of 3DGS's file. The smoothing filter of Mip-Splatting is not applied; a warning
-    tells of it. Raises InputError for other or damaged files, and for anchors, whose networks are
-    elsewhere."""
+    """The Gaussians of 3DGS's file, with two scales (2DGS) or with plain colours too: see
+    `as_3dgs`. The smoothing filter of Mip-Splatting is not applied; a warning tells of it. Raises
+    InputError for other or damaged files, and for anchors, whose networks are elsewhere."""
     columns = read_vertices(path)
     if "f_offset_0" in columns:
         raise InputError(
             f"expected Gaussians in {path}, found anchors without their networks; give the result folder with point_cloud/iteration_N"
         )
-    if "f_dc_0" not in columns:
-        raise InputError(f"expected Gaussians of 3DGS (f_dc_*) in {path}, found {', '.join(list(columns)[:8])}; give another file")
+    if not has_gaussians(columns):
+        kind = ", a point cloud" if {"x", "y", "z"} <= columns.keys() and not any(name.startswith("f_") for name in columns) else ""
+        raise InputError(f"expected Gaussians of 3DGS (f_dc_*) in {path}, found {', '.join(list(columns)[:8])}{kind}; give another file")
     rest_names = numbered_names(columns, "f_rest_")
     if len(rest_names) not in (0, 9, 24, 45):
         raise InputError(f"expected 0, 9, 24 or 45 f_rest columns in {path}, found {len(rest_names)}; write the file again")
     if _FILTER in columns:
         log.warning("%s has a smoothing filter (%s), which is not applied: fuse it (create_fused_ply.py) before the import", path, _FILTER)
     with guarding(path, budget.PLY):
-        return splats_in(columns, rest_names, path).checked(path)
+        return splats_in(as_3dgs(columns, path), rest_names, path).checked(path)
+
+
+def has_gaussians(names: Iterable[str]) -> bool:
+    """Whether these are columns of Gaussians: with harmonics, or with opacities, scales and
+    colours."""
+    found = set(names)
+    return "f_dc_0" in found or ({"opacity", "scale_0"} <= found and any(set(colour) <= found for colour in _COLOURS))
+
+
+def as_3dgs(columns: Columns, path: Path) -> Columns:
+    """The columns with those of 3DGS that other programs leave out; a warning tells of each.
+
+    Colours (red, green, blue: integers of 8 or 16 bits, or floats up to 1 or 255, by the largest
+    value) become f_dc. Two scales, as in 2DGS, get a third one of 1e-6."""
+    added: Columns = {}
+    if "f_dc_0" not in columns:
+        names = next(colour for colour in _COLOURS if set(colour) <= columns.keys())
+        most = max(float(np.fmax.reduce(columns[name], initial=0)) for name in names)
+        whole = columns[names[0]].dtype.kind in "iu"
+        full = (255 if most <= 255 else 65535) if whole else (1 if most <= _BRIGHTEST else 255)
+        added |= {f"f_dc_{i}": (np.asarray(columns[name], np.float64) / full - 0.5) / C0 for i, name in enumerate(names)}
+        log.warning("%s has colours (%s) in place of harmonics: they are read as colours from 0 to %d", path, ", ".join(names), full)
+    if "scale_2" not in columns and {"scale_0", "scale_1"} <= columns.keys():
+        added["scale_2"] = np.full(len(columns["scale_0"]), _THIN, np.float32)
+        log.warning("%s has two scales per Gaussian, as 2DGS writes them: its discs are read as Gaussians 1e-6 units thick", path)
+    return columns | added
 
 
 def splats_in(columns: Columns, rest_names: list[str], path: Path) -> Splats:

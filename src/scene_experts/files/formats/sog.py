@@ -4,7 +4,9 @@ Version 2 is a zip of lossless WebP pictures with one or two bytes per value, an
 harmonics. Positions are 16 bits of sign(x) ln(1 + |x|) within the range of each axis. Log scales
 and colours are indices into 256 levels. Rotations are the smallest three components in a byte each.
 Harmonics above the constant are one of at most 65,536 rows of indices into 256 levels. Gaussians
-are sorted along the Morton curve and fill the pictures row by row.
+are sorted along the Morton curve and fill the pictures row by row. Version 1 (SOGS), which is only
+read, has even levels between the ends of each channel in place of codebooks. Both versions also
+exist as a folder of meta.json and pictures.
 """
 
 from __future__ import annotations
@@ -12,6 +14,8 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +27,11 @@ from PIL import Image
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
-from scene_experts.core.reading.archives import Archive, open_zip, zip_names
+from scene_experts.core.reading.archives import open_zip, zip_names
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import FARTHEST, expect_range, shown, whole_number
 from scene_experts.core.reading.pictures import decode_picture
-from scene_experts.core.reading.plain import parse_json
+from scene_experts.core.reading.plain import JSON_STARTS, parse_json
 from scene_experts.core.reading.source import Source, opening
 from scene_experts.files.formats.clusters import codebook, nearest_levels, palette
 from scene_experts.files.formats.pack import (
@@ -51,7 +55,10 @@ from scene_experts.files.registry import Format
 PALETTE = 1 << 16
 _COLUMNS = 64  # palette rows next to each other in a line of the picture
 _COEFFICIENTS = (0, 3, 8, 15)
+_META, _STREAMED = "meta.json", "lod-meta.json"
+_ENCODING = "quaternion_packed"  # of rotations, in version 1
 _META_LIMIT, _FILE_LIMIT = 1 << 20, 1 << 30
+Part = Callable[[Any], bytes]
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # a fixed date: equal scenes give equal bytes
 
 
@@ -105,34 +112,79 @@ def sog_bytes(splats: Splats, note: dict[str, Any]) -> bytes:
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of a file of version 2. Raises InputError for other or damaged files."""
-    with opening(path, budget.SOG) as source, open_zip(source) as archive:
-        return _decode(source, archive).checked(path)
+    """The Gaussians of a file or a meta.json of version 1 or 2. Raises InputError for other or
+    damaged files."""
+    with _opened(path) as (source, meta, part):
+        return _decode(source, meta, part).checked(path)
 
 
 def is_antialiased(path: Path) -> bool:
     """Whether a file says that it is drawn with antialiasing. Raises InputError for a damaged
     file."""
-    with opening(path, budget.SOG) as source, open_zip(source) as archive:
-        return parse_json(archive.read("meta.json", _META_LIMIT)).get("antialias") is True
+    with _opened(path) as (_, meta, _):
+        return meta.get("antialias") is True
 
 
-def _decode(source: Source, archive: Archive) -> Splats:
-    meta = parse_json(archive.read("meta.json", _META_LIMIT))
-    n = whole_number(meta["count"], "the number of Gaussians", 1, MAX_GAUSSIANS)
-    if meta["version"] != 2:
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Source, Any, Part]]:
+    """The description in a zip or in a meta.json, and what returns the files that it names."""
+    with opening(path, budget.SOG) as source:
+        if not source.head(2).startswith(b"PK"):
+            if path.name == _STREAMED:
+                raise _streamed_error(path)
+            if source.size > _META_LIMIT:
+                raise Damaged(f"a description of {source.size:,} bytes")
+            meta = parse_json(source.read())
+            if "lodLevels" in meta:
+                raise _streamed_error(path)
+            yield source, meta, lambda name: source.part(name, _FILE_LIMIT)
+            return
+        with open_zip(source) as archive:
+            found = _descriptions(archive.names)
+            if not found or found[0].endswith(_STREAMED):
+                raise _streamed_error(path) if found else Damaged(f"no member {_META}")
+            place = found[0].removesuffix(_META)
+            yield source, parse_json(archive.read(found[0], _META_LIMIT)), lambda name: archive.read(f"{place}{name}", _FILE_LIMIT)
+
+
+def _descriptions(names: list[str]) -> list[str]:
+    """The descriptions among the members of a zip, the outermost first: some programs pack the
+    folder around the files too."""
+    found = [name for name in names if name.rpartition("/")[2] in (_META, _STREAMED) and not name.startswith("__MACOSX/")]
+    return sorted(found, key=lambda name: (name.count("/"), name))
+
+
+def _streamed_error(path: Path) -> InputError:
+    return InputError(
+        f"expected one SOG scene at {path}, found one in parts and levels of detail ({_STREAMED}); join the parts of its finest level "
+        "first (splat-transform 0_*/meta.json scene.ply in that folder), or give the meta.json of one part"
+    )
+
+
+def _decode(source: Source, meta: dict[str, Any], file: Part) -> Splats:
+    first = meta.get("version", 1) == 1 and "shape" in meta["means"]
+    if not first and meta["version"] != 2:
         raise Damaged(f"version {shown(meta['version'])}")
-    bands = whole_number(meta["shN"]["bands"], "the bands of harmonics", 1, 3) if meta.get("shN") else 0
+    if meta["quats"].get("encoding", _ENCODING) != _ENCODING:
+        raise Damaged(f"rotations in the encoding {shown(meta['quats']['encoding'])}")
+    n = whole_number(meta["means"]["shape"][0] if first else meta["count"], "the number of Gaussians", 1, MAX_GAUSSIANS)
+    rows, bands = _palette(meta["shN"], file, first) if meta.get("shN") else (np.zeros((1, 0, 4), np.uint8), 0)
     check_count(source, n, decoded_bytes(bands))
 
     def pixels(part: str, i: int = 0) -> Bytes:
-        picture = _picture(archive.read(meta[part]["files"][i], _FILE_LIMIT), 4 * n + 65536)
+        picture = _picture(file(meta[part]["files"][i]), 4 * n + 65536)
         source.check_time()
         if picture.shape[0] * picture.shape[1] < n:
             raise Damaged(f"a picture of {part} with too few pixels")
         return picture.reshape(-1, 4)[:n]
 
-    book = lambda part: np.array(meta[part]["codebook"], np.float64).reshape(-1)  # noqa: E731
+    def levels(part: str, index: Bytes, bits: int = 8) -> NDArray[Any]:
+        """The values of indices [N, C]: from the codebook, or between the ends of each channel."""
+        if not first:
+            return np.array(meta[part]["codebook"], np.float64).reshape(-1)[index]
+        low, high = (np.broadcast_to(np.array(meta[part][end], np.float64), index.shape[1]) for end in ("mins", "maxs"))
+        return low + (high - low) * (index / float((1 << bits) - 1))
+
     mins, maxs = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
     level = pixels("means", 0)[:, :3].astype(np.int64) + (pixels("means", 1)[:, :3].astype(np.int64) << 8)
     farthest = float(_squeeze(np.array(FARTHEST)))
@@ -142,15 +194,21 @@ def _decode(source: Source, archive: Archive) -> Splats:
     if (rest[:, 3] < 252).any():
         raise Damaged("rotations of another kind")
     quats = from_smallest_three(rest[:, 3] - 252, (rest[:, :3] / 255 - 0.5) * np.sqrt(2))
-    scales = book("scales")[pixels("scales")[:, :3]]
     sh = np.empty((n, (bands + 1) ** 2, 3), np.float32)  # in place: most of the memory of a file is here
-    with np.errstate(over="ignore"):  # refused below
-        sh[:, 0] = book("sh0")[colors[:, :3]]
+    with np.errstate(over="ignore", invalid="ignore"):  # refused below
+        scales = levels("scales", pixels("scales")[:, :3])
+        color = levels("sh0", colors if first else colors[:, :3])
+        sh[:, 0] = color[:, :3]
+        logits = color[:, 3].copy() if first else byte_logits(colors[:, 3])
+        del color  # the harmonics take its memory
         if bands:
-            _read_harmonics(meta["shN"], pixels("shN", 1), archive, book("shN").astype(np.float32), sh[:, 1:])
-    if not all(np.isfinite(part).all() for part in (means, scales, sh)):
+            bits = whole_number(meta["shN"].get("quantization", 8), "bits of the palette", 1, 8) if first else 8
+            index = _labels(pixels("shN", 1), len(rows) if first else meta["shN"]["count"], len(rows))
+            for i in range(sh.shape[1] - 1):
+                sh[:, 1 + i] = levels("shN", rows[:, i, :3], bits).astype(np.float32)[index]
+    if not all(np.isfinite(part).all() for part in (means, scales, sh, logits)):
         raise Damaged("values that are not finite")
-    return Splats(tensor(means), tensor(scales), tensor(quats), tensor(byte_logits(colors[:, 3])), torch.from_numpy(sh))
+    return Splats(tensor(means), tensor(scales), tensor(quats), tensor(logits), torch.from_numpy(sh))
 
 
 def _harmonics(splats: Splats) -> tuple[dict[str, Any], bytes, NDArray[Any]]:
@@ -172,17 +230,28 @@ def _harmonics(splats: Splats) -> tuple[dict[str, Any], bytes, NDArray[Any]]:
     return meta, _webp(pixels, _COLUMNS * coefficients, lines), np.stack([index & 255, index >> 8, np.zeros_like(index)], 1)
 
 
-def _read_harmonics(meta: dict[str, Any], labels: Bytes, archive: Archive, book: NDArray[np.float32], out: NDArray[np.float32]) -> None:
-    """Write the harmonics above the constant into `out` [N, C, 3]."""
-    coefficients, count = _COEFFICIENTS[meta["bands"]], whole_number(meta["count"], "the rows of the palette", 1, PALETTE)
-    picture = _picture(archive.read(meta["files"][0], _FILE_LIMIT), PALETTE * coefficients + 65536)
-    rows = picture.shape[0] * _COLUMNS
-    index = labels[:, 0].astype(np.int64) + (labels[:, 1].astype(np.int64) << 8)
-    if picture.shape[1] != _COLUMNS * coefficients or count > rows or index.max() >= count:
+def _palette(meta: dict[str, Any], file: Part, first: bool) -> tuple[Bytes, int]:
+    """The palette's rows [M, C, 4] of levels, and the degree of the harmonics. Version 1 states the
+    latter by the number of columns, if at all, and else the picture's width does."""
+    picture = _picture(file(meta["files"][0]), PALETTE * _COEFFICIENTS[-1] + 65536)
+    wide = picture.shape[1] // _COLUMNS
+    if first:
+        shape = meta.get("shape")
+        stated = whole_number(shape[-1], "the columns of harmonics") // 3 if shape else wide
+        bands = _COEFFICIENTS.index(min(wide, stated)) if min(wide, stated) in _COEFFICIENTS[1:] else 0
+    else:
+        bands = whole_number(meta["bands"], "the bands of harmonics", 1, 3)
+    if not bands or picture.shape[1] % _COLUMNS or (wide != _COEFFICIENTS[bands] and not first):
         raise Damaged("a palette of another size")
-    levels = picture.reshape(rows, coefficients, 4)
-    for i in range(coefficients):
-        out[:, i] = book[levels[:, i, :3][index]]
+    return picture.reshape(-1, wide, 4)[:, : _COEFFICIENTS[bands]], bands
+
+
+def _labels(pixels: Bytes, count: Any, rows: int) -> NDArray[np.int64]:
+    """The palette row [N] of each Gaussian."""
+    index = pixels[:, 0].astype(np.int64) + (pixels[:, 1].astype(np.int64) << 8)
+    if whole_number(count, "the rows of the palette", 1, PALETTE) > rows or index.max() >= count:
+        raise Damaged("a palette of another size")
+    return index
 
 
 def _squeeze(x: Floats) -> Floats:
@@ -205,8 +274,8 @@ def _webp(values: NDArray[Any], width: int, height: int) -> bytes:
 
 
 def _picture(data: bytes, limit: int) -> Bytes:
-    """Pixels [H, W, 4] of a WebP picture of at most `limit` pixels."""
-    return np.asarray(decode_picture(data, limit, "WEBP").convert("RGBA"))
+    """Pixels [H, W, 4] of a WebP or PNG picture of at most `limit` pixels."""
+    return np.asarray(decode_picture(data, limit, "WEBP", "PNG").convert("RGBA"))
 
 
 def _zip(files: dict[str, bytes]) -> bytes:
@@ -218,20 +287,22 @@ def _zip(files: dict[str, bytes]) -> bytes:
 
 
 def looks_like(path: Path, head: bytes) -> bool:
-    """Whether a zip has the description of a SOG file. A damaged zip counts as one, so that `read`
-    explains the damage."""
+    """Whether a zip, or a JSON file, has the description of a SOG scene. A damaged zip counts as
+    one, so that `read` explains the damage."""
+    if head.startswith(JSON_STARTS):
+        return path.name in (_META, _STREAMED) or b'"means"' in head or b'"lodLevels"' in head
     try:
         with opening(path, budget.SOG) as source:
-            return "meta.json" in zip_names(source)
+            return bool(_descriptions(zip_names(source)))
     except InputError:
-        return True
+        return path.suffix.lower() != ".zip"
 
 
 FORMAT = Format(
     suffix=".sog",
     write=write,
     read=read,
-    marks=(b"PK\x03\x04",),
+    marks=(b"PK\x03\x04", *JSON_STARTS),
     looks_like=looks_like,
     antialias=True,
     is_antialiased=is_antialiased,

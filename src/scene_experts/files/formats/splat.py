@@ -14,7 +14,7 @@ import numpy as np
 
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
-from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.budget import CutShort, Damaged
 from scene_experts.core.reading.source import opening
 from scene_experts.files.formats.pack import alphas, byte_logits, tensor, to_bytes, unit_quats
 from scene_experts.files.formats.splats import Splats
@@ -42,7 +42,7 @@ def read(path: Path) -> Splats:
     with opening(path, budget.SPLAT) as source:
         data = source.read()
         if len(data) % ROW.itemsize:
-            raise Damaged(f"{len(data):,} bytes, which is not a multiple of {ROW.itemsize}")
+            raise CutShort(f"{len(data):,} bytes, which is not a multiple of {ROW.itemsize}")
         table = np.frombuffer(data, ROW)
         scales = table["scales"].astype(np.float64)
         if not (np.isfinite(table["means"]).all() and np.isfinite(scales).all() and (scales >= 0).all()):

@@ -8,16 +8,24 @@ OpenCV axes). A format with another frame or unit converts in its own module.
 
 from __future__ import annotations
 
+import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading.numbers import FARTHEST, LARGEST, LARGEST_LOG, all_finite, expect_range
 
+log: logging.Logger = logging.getLogger(__name__)
 NAMES = ("means", "log_scales", "quats", "opacity_logit", "sh")
+
+_SURE = 20.0  # logit of an opacity of 1: 1 - 2e-9
+_SHORTEST = math.log(1e-30)
+_NO_LENGTH = 1e-12  # of a quaternion; renderers divide by its length, or by this if that is less
 
 
 @dataclass(frozen=True)
@@ -39,6 +47,14 @@ class Splats:
                 f"expected one row of each attribute per Gaussian and 1, 4, 9 or 16 harmonics, found {found}; write the file again"
             )
 
+    @classmethod
+    def joined(cls, parts: Sequence[Splats]) -> Splats:
+        """All Gaussians of one or more parts, with the harmonics that every part has."""
+        if len(parts) == 1:
+            return parts[0]
+        cut = [part.up_to_degree(min(p.degree for p in parts)) for part in parts]
+        return cls(*(torch.cat([getattr(part, name) for part in cut]) for name in NAMES))
+
     def __len__(self) -> int:
         return len(self.means)
 
@@ -55,20 +71,44 @@ class Splats:
         """The Gaussians without the harmonics above a degree."""
         return self if self.degree <= degree else replace(self, sh=self.sh[:, : (degree + 1) ** 2])
 
+    def usable(self, where: Path) -> Splats:
+        """The Gaussians of the file `where` with usable values for infinite ones, and for the largest
+        floats, that mean something: an opacity of 1 or 0 has the logit 20 or -20, and a length of 0
+        the logarithm of 1e-30. Gaussians whose quaternion has no length are left out, and a warning counts them.
+
+        Raises InputError where none is left.
+        """
+        found = self
+        if bool((endless := self.opacity_logit.abs() > LARGEST).any()):
+            found = replace(found, opacity_logit=self.opacity_logit.clamp(-_SURE, _SURE).where(endless, self.opacity_logit))
+        if bool((points := self.log_scales < -LARGEST).any()):
+            found = replace(found, log_scales=self.log_scales.masked_fill(points, _SHORTEST))
+        empty = self.quats.abs().amax(1) < _NO_LENGTH if len(self) else self.quats.new_zeros(0, dtype=torch.bool)  # False for NaN
+        count = int(empty.sum())
+        if not count:
+            return found
+        if count == len(self):
+            raise InputError(f"expected Gaussians with rotations in {where}, found {count:,} without any (all zero); write the file again")
+        log.warning("left out %s of %s Gaussians of %s, whose rotations are all zero", f"{count:,}", f"{len(self):,}", where)
+        return found.rows(~empty)
+
     def expect_finite(self, where: str) -> None:
         """Raises InputError, naming `where`, for values that are not finite."""
         for name in NAMES:
             value = getattr(self, name)
             if not all_finite(value):
                 bad = int((~value.isfinite()).reshape(len(value), -1).any(1).sum())
-                raise InputError(f"expected finite {name} in {where}, found {bad:,} Gaussians with others; make it again")
+                kind = " or ".join(name for name, of in (("NaN", value.isnan()), ("infinite values", value.isinf())) if bool(of.any()))
+                raise InputError(f"expected finite {name} in {where}, found {bad:,} Gaussians with {kind}; remove them or make it again")
 
     def checked(self, where: Path) -> Splats:
-        """These Gaussians. Raises InputError, naming the file `where`, for values that are not
-        finite, and Damaged for positions and scales that no computation in float32 can bear."""
-        self.expect_finite(str(where))
-        expect_range(self.means, "positions", -FARTHEST, FARTHEST)
-        expect_range(self.log_scales, "logarithms of scales", -LARGEST, LARGEST_LOG)
+        """The Gaussians that are `usable`. Raises InputError, naming the file `where`, for values
+        that are not finite, and Damaged for positions and scales that no computation in float32 can
+        bear."""
+        found = self.usable(where)
+        found.expect_finite(str(where))
+        expect_range(found.means, "positions", -FARTHEST, FARTHEST)
+        expect_range(found.log_scales, "logarithms of scales", -LARGEST, LARGEST_LOG)
         for name in ("quats", "opacity_logit", "sh"):
-            expect_range(getattr(self, name), f"values of {name}")
-        return self
+            expect_range(getattr(found, name), f"values of {name}")
+        return found

@@ -24,7 +24,7 @@ from torch import Tensor
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
-from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.budget import CutShort, Damaged
 from scene_experts.core.reading.source import Source, opening
 from scene_experts.files.formats.pack import (
     Bytes,
@@ -190,14 +190,15 @@ def _streams_gzip(data: bytes, source: Source) -> tuple[int, int, int, int, byte
     machine = zlib.decompressobj(31)
     head = machine.decompress(data, HEADER.size)
     if len(head) < HEADER.size:
-        raise Damaged("no whole header")
+        raise CutShort("no whole header")
     magic, version, n, degree, bits, flags, _ = HEADER.unpack(head)
     _check_header(source, magic, version, n, degree, bits, range(1, 4))
     sizes = _sizes(version, n, degree)
     total = sum(sizes.values())
     body = machine.decompress(machine.unconsumed_tail, total + (_RECORDS if flags & EXTENDED else 1))
     if len(body) < total or (len(body) > total and not flags & EXTENDED):
-        raise Damaged(f"{len(body):,} bytes of attributes where {total:,} are expected")
+        kind = CutShort if len(body) < total else Damaged
+        raise kind(f"{len(body):,} bytes of attributes where {total:,} are expected")
     ends = np.cumsum([0, *sizes.values()])
     flat = np.frombuffer(body, np.uint8)
     return version, n, degree, bits, body[total:], {name: flat[ends[i] : ends[i + 1]] for i, name in enumerate(_STREAMS)}
@@ -213,7 +214,7 @@ def _streams_v4(data: bytes, source: Source) -> tuple[int, int, int, int, bytes,
             f"expected the package zstandard to read {source.path} (SPZ version 4), found none; pip install zstandard"
         ) from None
     if len(data) < V4_HEADER.size:
-        raise Damaged("no whole header")
+        raise CutShort("no whole header")
     magic, version, n, degree, bits, flags, count, table = V4_HEADER.unpack_from(data)
     _check_header(source, magic, version, n, degree, bits, range(4, 5))
     sizes = {name: size for name, size in _sizes(version, n, degree).items() if size or count == len(_STREAMS)}
@@ -225,7 +226,9 @@ def _streams_v4(data: bytes, source: Source) -> tuple[int, int, int, int, bytes,
         packed, raw = struct.unpack_from("<QQ", data, table + 16 * i)
         part = data[offset : offset + packed]
         offset += packed
-        if raw != size or len(part) != packed:
+        if len(part) != packed:
+            raise CutShort(f"{len(part):,} bytes of a stream of {name} of {packed:,}")
+        if raw != size:
             raise Damaged(f"a stream of {name} that is not {size:,} bytes long")
         out[name] = np.frombuffer(_unpack_zstd(zstandard, part, size), np.uint8)
     records = data[V4_HEADER.size : table] if flags & EXTENDED else b""

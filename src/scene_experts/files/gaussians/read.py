@@ -21,7 +21,7 @@ from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.data.views import Capture, World
 from scene_experts.files import result_folder
-from scene_experts.files.formats.ply import property_names, read_note
+from scene_experts.files.formats.ply import has_gaussians, property_names, read_note
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.gaussians.write import KIND
 from scene_experts.files.registry import Imported, recognise
@@ -40,7 +40,7 @@ DRAWN_AT = 3  # the step to draw scenes of `scene_of` at: all their harmonics ar
 def find(source: Path, iteration: int | None) -> Path | None:
     """The PLY of a result folder with Gaussians; None for other scenes."""
     path = result_folder.iteration_folder(source, iteration) / "point_cloud.ply"
-    return path if "f_dc_0" in property_names(path) else None
+    return path if has_gaussians(property_names(path)) else None
 
 
 def read(source: Path, data: Data, iteration: int | None) -> Imported:

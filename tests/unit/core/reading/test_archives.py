@@ -1,12 +1,13 @@
 """Members of zip archives: limits on their number, their bytes and their compression."""
 
+import random
 import zipfile
 
 import pytest
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading.archives import open_zip, zip_names
-from scene_experts.core.reading.budget import Budget
+from scene_experts.core.reading.budget import Budget, Damaged
 from scene_experts.core.reading.source import opening
 from support.messages import naming
 
@@ -55,3 +56,18 @@ def test_a_file_that_declares_other_sizes(tmp_path):
         (tmp_path / "b").write_bytes(broken)
         with pytest.raises(InputError, match=naming("b", "test archive")):
             member(tmp_path / "b")
+
+
+def test_members_are_unpacked_within_the_budget(tmp_path):
+    zeros, noise = bytes(1 << 20), random.Random(0).randbytes(1 << 20)
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("zeros", zeros)
+        archive.writestr("noise", noise)
+    with opening(tmp_path / "a.zip", Budget("zip", 1 << 30, floor=1 << 20, ratio=1)) as source, open_zip(source) as archive:
+        archive.unpack("zeros", tmp_path / "out")
+        assert (tmp_path / "out").read_bytes() == zeros
+        archive.unpack("noise", tmp_path / "out")
+        assert (tmp_path / "out").read_bytes() == noise
+        for name in ("zeros", "absent", 3):
+            with pytest.raises(Damaged):
+                archive.unpack(name, tmp_path / "out")

@@ -1,11 +1,13 @@
 """Opening files within a budget: absent, special and growing files, and one sentence for every failure."""
 
+import json
 import os
+import zlib
 
 import pytest
 
 from scene_experts.core.errors import InputError, RunError
-from scene_experts.core.reading.budget import Budget, Damaged
+from scene_experts.core.reading.budget import Budget, CutShort, Damaged
 from scene_experts.core.reading.source import describe, guarding, inside, opening, shorten
 from support.messages import naming
 
@@ -81,3 +83,44 @@ def test_names_stay_inside_their_folder(tmp_path):
     for name in ("../a", "/etc/passwd", "out/a", "a/../../b", "", None, 3, "a\0"):
         with pytest.raises(Damaged):
             inside(tmp_path / "run", name)
+
+
+READ = Budget("test file", bytes_in=100, other="convert it")
+
+
+@pytest.mark.parametrize(
+    ("error", "cut"),
+    [
+        (CutShort("3 bytes"), True),
+        (EOFError(), True),
+        (zlib.error("incomplete"), True),
+        (json.JSONDecodeError("Expecting value", "[1, ", 4), True),
+        (json.JSONDecodeError("Expecting value", "[1, x]", 4), False),
+        (Damaged("version 9"), False),
+        (KeyError("count"), False),
+        (TypeError("list"), False),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_only_a_file_that_lacks_bytes_is_to_be_copied_again(error, cut):
+    with pytest.raises(InputError, match="there") as found, guarding("there", READ):
+        raise error
+    assert ("copy it again" in str(found.value)) is cut and ("convert it" in str(found.value)) is not cut
+    assert "'count'" in str(found.value) or not isinstance(error, KeyError)
+
+
+def test_parts_of_a_scene_are_files_in_its_folder_and_widen_its_budget(tmp_path):
+    (tmp_path / "a").write_bytes(b"x")
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "b").write_bytes(b"y" * 90)
+    with opening(tmp_path / "a", READ) as source:
+        assert source.part("sub/b") == b"y" * 90 and source.part("sub/../sub/b") is source.part("sub/b")
+        assert source.size == 91 and source.items == 1
+        with pytest.raises(InputError, match=naming("part of a", "no such file")):
+            source.part("c")
+        (tmp_path / "d").write_bytes(b"z" * 11)
+        with pytest.raises(InputError, match=naming("part of a", 11, 10)):
+            source.part("d", 10)
+        for name in ("../a", "/etc/hosts", 3):
+            with pytest.raises(Damaged):
+                source.part(name)

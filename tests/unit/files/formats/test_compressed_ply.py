@@ -1,5 +1,6 @@
 """Compressed PLY: within the quantum of each chunk's ranges, with its note, and damaged files in one sentence."""
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import example, given, settings
@@ -10,6 +11,8 @@ from scene_experts.core.errors import InputError
 from scene_experts.files.formats.compressed_ply import read, write
 from scene_experts.files.formats.ply import read_note
 from scene_experts.files.formats.splats import Splats
+from scene_experts.files.registry import recognise
+from support import foreign
 from support.messages import naming
 from support.splat_quanta import check, scene
 
@@ -60,3 +63,46 @@ def test_damaged_files(tmp_path):
         path.write_bytes(data)
         with pytest.raises(InputError, match=naming(path)):
             read(path)
+
+
+@pytest.mark.parametrize(("n", "degree"), [(1, 0), (256, 1), (600, 0), (600, 2), (300, 3)])
+def test_files_of_supersplat_before_2(tmp_path, n, degree):
+    """No ranges of colours: the bytes are the colours."""
+    path, s = tmp_path / "old.compressed.ply", foreign.gaussians(n, degree)
+    foreign.compressed_ply_before_2(path, s)
+    found = read(path)
+    assert recognise(path)[0] == "compressed-ply" and found.degree == degree
+    assert np.abs(found.means.numpy() - s["means"]).max() < 0.005  # 1/1023 of 8 units, and half of it
+    assert np.abs(found.log_scales.numpy() - s["log_scales"]).max() < 0.0025
+    assert np.abs(found.opacity_logit.double().sigmoid().numpy() - 1 / (1 + np.exp(-s["logits"]))).max() < 0.51 / 255
+    assert np.abs(found.sh[:, 0].numpy() - s["sh"][:, 0]).max() < 0.51 / 255 / foreign.C0 + 1e-6
+    assert np.abs(found.sh[:, 1:].numpy() - s["sh"][:, 1:]).max(initial=0) < 0.51 * 8 / 256
+    assert np.abs(np.abs((found.quats.numpy() * s["quats"]).sum(1)) - 1).max() < 1e-5
+
+
+def test_other_spellings_of_the_header(tmp_path):
+    path, s = tmp_path / "a.ply", foreign.gaussians(300, 1)
+    foreign.compressed_ply_before_2(path, s)
+    good, wanted = path.read_bytes(), read(path)
+    head, body = good.split(b"end_header\n", 1)
+    for old, new in (
+        (b"property float ", b"property float32 "),
+        (b"property uint ", b"property uint32 "),
+        (b"property uchar ", b"property uint8 "),
+    ):
+        head = head.replace(old, new)
+    path.write_bytes(head + b"end_header\n" + body)
+    assert torch.equal(read(path).means, wanted.means)
+    path.write_bytes(head.replace(b"\n", b"\r\n") + b"end_header\r\n" + body)
+    assert torch.equal(read(path).sh, wanted.sh)
+
+
+def test_only_a_file_that_was_cut_is_to_be_copied_again(tmp_path):
+    path = tmp_path / "a.ply"
+    write(path, scene(300, 1), {})
+    good = path.read_bytes()
+    for data, copied in ((good[:-1], True), (good.replace(b"property float min_x", b"property float min_q"), False)):
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=naming(path)) as error:
+            read(path)
+        assert ("copy it" in str(error.value)) is copied

@@ -1,5 +1,6 @@
 """glTF: exact, as a plain glTF parser sees it in glTF's own frame, and damaged files in one sentence."""
 
+import base64
 import json
 import struct
 
@@ -10,9 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scene_experts.core.errors import InputError
-from scene_experts.files.formats import glb
+from scene_experts.files.formats import glb, spz
+from scene_experts.files.registry import read, recognise
 from scene_experts.geometry.rotation import covariance
 from scene_experts.geometry.sh import sh_to_rgb
+from support import foreign
 from support.gltf import column, parsed
 from support.messages import naming
 from support.splat_quanta import check, scene
@@ -143,3 +146,110 @@ def test_damaged_files(tmp_path):
         refused(fact)
     rebuilt(path, [1], body)
     refused()
+
+
+# --- packed as SPZ, and text files --------------------------------------------------------------------------------------------------------
+
+EXTENSIONS = (
+    "KHR_gaussian_splatting_compression_spz_2",
+    "KHR_gaussian_splatting_compression_spz",
+    "KHR_spz_gaussian_splats_compression",
+    "KHR_spz_compression",
+)
+
+
+def same(a, b):
+    return all(torch.equal(x, y) for x, y in zip(vars(a).values(), vars(b).values()))
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+@pytest.mark.parametrize("uri", [None, "data", "x.bin", "sub/my%20x.bin"])
+def test_an_spz_file_inside(tmp_path, extension, uri):
+    """The Gaussians are those of the SPZ file alone: its frame is glTF's, turned about y."""
+    data = spz.spz_bytes(scene(40, 2))
+    (tmp_path / "in.spz").write_bytes(data)
+    name = "data:application/octet-stream;base64," + base64.b64encode(data).decode() if uri == "data" else uri
+    if uri not in (None, "data"):
+        place = tmp_path / uri.replace("%20", " ")
+        place.parent.mkdir(exist_ok=True)
+        place.write_bytes(data)
+    path = tmp_path / f"a.{'glb' if uri is None else 'gltf'}"
+    path.write_bytes(foreign.gltf_of(foreign.with_spz(40, len(data), extension), data, name))
+    assert recognise(path)[0] == "glb" and same(read(path), read(tmp_path / "in.spz"))
+
+
+def test_plain_and_packed_primitives_together(tmp_path):
+    path, data = tmp_path / "a.glb", spz.spz_bytes(scene(30, 3))
+    glb.write(path, scene(20, 1), {})
+    doc, body = parsed(path)
+    body += b"\0" * (-len(body) % 4)
+    doc["bufferViews"].append({"buffer": 0, "byteOffset": len(body), "byteLength": len(data)})
+    packed = {"KHR_gaussian_splatting": {"extensions": {EXTENSIONS[0]: {"bufferView": len(doc["bufferViews"]) - 1}}}}
+    doc["meshes"][0]["primitives"].append({"attributes": {}, "mode": 0, "extensions": packed})
+    doc["buffers"][0]["byteLength"] = len(body) + len(data)
+    rebuilt(path, doc, body + data)
+    found = glb.read(path)
+    assert len(found) == 50 and found.degree == 1
+
+
+@pytest.mark.parametrize("inside", [False, True])
+@pytest.mark.parametrize("start", ["", "\ufeff", "\n  "])
+def test_text_files_are_as_exact_as_binary_ones(tmp_path, inside, start):
+    s = scene(30, 2)
+    glb.write(tmp_path / "a.glb", s, {})
+    doc, body = parsed(tmp_path / "a.glb")
+    (tmp_path / "a b.bin").write_bytes(body)
+    doc["buffers"][0]["uri"] = "data:application/gltf-buffer;base64," + base64.b64encode(body).decode() if inside else "a%20b.bin"
+    (tmp_path / "a.gltf").write_text(start + json.dumps(doc, indent=1), "utf-8")
+    check("glb", read(tmp_path / "a.gltf"), s)
+
+
+def test_what_text_files_may_not_name(tmp_path):
+    glb.write(tmp_path / "a.glb", scene(10, 0), {})
+    doc, body = parsed(tmp_path / "a.glb")
+    (tmp_path / "x.bin").write_bytes(body)
+    path = tmp_path / "folder" / "a.gltf"
+    path.parent.mkdir()
+    (path.parent / "link.bin").symlink_to(tmp_path / "x.bin")
+    (path.parent / "short.bin").write_bytes(body[:-1])
+    for uri, fact in (
+        ("../x.bin", "leads out"),
+        ("%2e%2e/x.bin", "leads out"),
+        (str(tmp_path / "x.bin"), "leads out"),
+        ("link.bin", "leads out"),
+        ("https://example.org/x.bin", "https://example.org/x.bin"),
+        ("absent.bin", "no such file"),
+        ("short.bin", "copy it again"),
+        ("data:text/plain,abc", "base64"),
+        ("data:;base64,???", ""),
+        (None, "buffer 0"),
+        (7, "buffer 0"),
+    ):
+        doc["buffers"][0]["uri"] = uri
+        path.write_text(json.dumps(doc))
+        with pytest.raises(InputError, match=naming("folder", fact)):
+            glb.read(path)
+
+
+def test_what_packed_files_are_refused_for(tmp_path):
+    path, data = tmp_path / "a.glb", spz.spz_bytes(scene(40, 0))
+    good = foreign.with_spz(40, len(data), EXTENSIONS[0])
+
+    def refused(change, fact, copied=False):
+        doc = json.loads(json.dumps(good))
+        change(doc)
+        path.write_bytes(foreign.gltf_of(doc, data))
+        with pytest.raises(InputError, match=naming(path, fact)) as error:
+            glb.read(path)
+        assert ("copy it" in str(error.value)) is copied
+
+    def unknown(doc):
+        inner = doc["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["extensions"]
+        inner["KHR_other_packing"] = inner.pop(EXTENSIONS[0])
+        doc["extensionsUsed"] = ["KHR_gaussian_splatting", "KHR_other_packing"]
+
+    refused(unknown, "KHR_other_packing")
+    refused(lambda d: d["bufferViews"][0].update(byteLength=10**6), "buffer view 0", copied=True)
+    refused(lambda d: d["bufferViews"][0].update(extensions={"EXT_meshopt_compression": {}}), "EXT_meshopt_compression")
+    refused(lambda d: d["bufferViews"][0].pop("byteLength"), "'byteLength'")
+    refused(lambda d: d.update(bufferViews=[]), "")

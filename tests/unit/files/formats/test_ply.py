@@ -9,6 +9,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.files.anchors.read import read_anchors
 from scene_experts.files.formats import ply
 from scene_experts.files.formats.splats import Splats
+from support import foreign
 from support.files import write_anchor_ply
 from support.messages import naming
 from support.splats import splats
@@ -217,3 +218,83 @@ def test_the_filter_of_mip_splatting_is_told(tmp_path, caplog):
     ply.write_vertices(tmp_path / "b.ply", columns)
     assert len(ply.read(tmp_path / "b.ply")) == 4
     assert str(tmp_path / "b.ply") in caplog.text and "filter_3D" in caplog.text and "not applied" in caplog.text
+
+
+# --- columns of other programs ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian", "ascii"])
+def test_2dgs_gets_a_thin_third_scale(tmp_path, caplog, form):
+    s = foreign.gaussians(20, 1)
+    columns = foreign.ply_columns(s)
+    del columns["scale_2"]
+    foreign.ply(tmp_path / "a.ply", columns, form)
+    found = ply.read(tmp_path / "a.ply")
+    assert np.array_equal(found.log_scales[:, :2].numpy(), s["log_scales"][:, :2]) and "2DGS" in caplog.text
+    np.testing.assert_allclose(found.log_scales[:, 2], np.log(1e-6), rtol=1e-6)
+    assert np.array_equal(found.sh.numpy(), s["sh"])
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+@pytest.mark.parametrize(
+    ("kind", "full", "names"),
+    [
+        ("u1", 255, ("red", "green", "blue")),
+        ("u2", 65535, ("red", "green", "blue")),
+        ("u2", 255, ("red", "green", "blue")),
+        ("f4", 1, ("red", "green", "blue")),
+        ("f4", 255, ("r", "g", "b")),
+        ("f8", 1, ("diffuse_red", "diffuse_green", "diffuse_blue")),
+    ],
+)
+def test_colours_become_harmonics_of_degree_0(tmp_path, caplog, kind, full, names, form):
+    s = foreign.gaussians(50)
+    columns = {name: values for name, values in foreign.ply_columns(s).items() if not name.startswith("f_dc")}
+    colour = np.random.default_rng(1).uniform(0, 1.2 if full == 1 else 1, (50, 3))  # harmonics may be brighter than 1
+    stored = (np.rint(colour * full) if kind.startswith("u") else colour * full).astype(kind)
+    foreign.ply(tmp_path / "a.ply", columns | {name: stored[:, i] for i, name in enumerate(names)}, form)
+    found = ply.read(tmp_path / "a.ply")
+    assert found.degree == 0 and str(tmp_path / "a.ply") in caplog.text and names[0] in caplog.text
+    np.testing.assert_allclose(found.sh[:, 0], (stored.astype(np.float64) / full - 0.5) / foreign.C0, atol=1e-5)
+    assert np.array_equal(found.opacity_logit.numpy(), s["logits"])
+
+
+def test_harmonics_go_before_colours(tmp_path, caplog):
+    s = foreign.gaussians(20)
+    foreign.ply(tmp_path / "a.ply", foreign.ply_columns(s) | {name: np.zeros(20, np.uint8) for name in ("red", "green", "blue")})
+    assert np.array_equal(ply.read(tmp_path / "a.ply").sh.numpy(), s["sh"]) and not caplog.records
+
+
+def test_zero_rows_are_left_out_and_infinite_opacities_kept(tmp_path, caplog):
+    s = foreign.gaussians(40, 1)
+    columns = {name: values.copy() for name, values in foreign.ply_columns(s).items()}
+    for values in columns.values():
+        values[25:] = 0
+    columns["opacity"][3], columns["opacity"][4], columns["scale_1"][5] = np.inf, -np.inf, -np.inf
+    foreign.ply(tmp_path / "a.ply", columns)
+    found = ply.read(tmp_path / "a.ply")
+    assert len(found) == 25 and "15 of 40" in caplog.text
+    assert found.opacity_logit.sigmoid()[3:5].tolist() == [1, pytest.approx(0, abs=1e-8)] and found.log_scales[5, 1] < -69
+    for values in columns.values():
+        values[:] = 0
+    foreign.ply(tmp_path / "a.ply", columns)
+    with pytest.raises(InputError, match=naming("a.ply", 40)):
+        ply.read(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("name", ["opacity", "red"])
+def test_what_stays_refused(tmp_path, name):
+    columns = {k: v.copy() for k, v in foreign.ply_columns(foreign.gaussians(20)).items() if not k.startswith("f_dc")}
+    columns |= {k: np.full(20, 0.5, np.float32) for k in ("red", "green", "blue")}
+    columns[name][7] = np.nan
+    foreign.ply(tmp_path / "a.ply", columns)
+    with pytest.raises(InputError, match=naming("a.ply", "NaN", 1)):
+        ply.read(tmp_path / "a.ply")
+
+
+def test_a_point_cloud_is_called_one(tmp_path):
+    foreign.ply(
+        tmp_path / "a.ply", {n: np.zeros(3, np.float32) for n in "xyz"} | {n: np.zeros(3, np.uint8) for n in ("red", "green", "blue")}
+    )
+    with pytest.raises(InputError, match=naming("a.ply", "point cloud", "red")):
+        ply.read(tmp_path / "a.ply")

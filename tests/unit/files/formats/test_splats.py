@@ -1,11 +1,14 @@
 """Standard Gaussians: shapes and values are checked."""
 
 import dataclasses
+import math
+from pathlib import Path
 
 import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.files.formats.splats import Splats
 from support.messages import naming
 from support.splats import splats
 
@@ -37,3 +40,44 @@ def test_values_that_are_not_finite_are_counted():
     with pytest.raises(InputError, match=naming("sh", "there", 2)):
         s.expect_finite("there")
     splats(0).expect_finite("there")
+
+
+def test_infinite_values_that_mean_something_become_finite():
+    s = splats(6)
+    s.opacity_logit[1], s.opacity_logit[2], s.log_scales[3, 1] = float("inf"), float("-inf"), float("-inf")
+    found = s.checked(Path("there"))
+    assert len(found) == 6 and found.opacity_logit[1:3].tolist() == [20, -20] and found.opacity_logit.sigmoid()[1] == 1
+    assert found.log_scales[3, 1] == pytest.approx(math.log(1e-30)) and torch.equal(found.log_scales[:3], s.log_scales[:3])
+    s.opacity_logit[1:3] = torch.tensor([3e38, -3e38])  # the largest floats, which some programs write for infinity
+    s.log_scales[3, 1] = -3e38
+    assert torch.equal(s.checked(Path("there")).opacity_logit, found.opacity_logit) and s.checked(Path("there")).log_scales[3, 1] > -70
+    plain = splats(6)
+    assert torch.equal(plain.checked(Path("there")).opacity_logit, plain.opacity_logit)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "word"),
+    [("opacity_logit", "nan", "NaN"), ("log_scales", "inf", "infinite"), ("sh", "-inf", "infinite"), ("quats", "nan", "NaN")],
+)
+def test_others_are_refused_with_what_they_are(name, value, word):
+    s = splats(6)
+    getattr(s, name).view(6, -1)[4, 0] = float(value)
+    with pytest.raises(InputError, match=naming(name, "there", 1, word)):
+        s.checked(Path("there"))
+
+
+def test_gaussians_without_a_rotation_are_left_out_and_counted(caplog):
+    s = splats(6)
+    s.quats[[0, 4]] = torch.tensor([0.0, 1e-20, 0, 0])
+    found = s.checked(Path("there"))
+    assert torch.equal(found.means, s.means[[1, 2, 3, 5]]) and "2 of 6" in caplog.text and "there" in caplog.text
+    s.quats[:] = 0
+    with pytest.raises(InputError, match=naming("there", 6)):
+        s.checked(Path("there"))
+
+
+def test_parts_are_joined_with_the_harmonics_that_all_have():
+    a, b = splats(3, 2), splats(2, 1, seed=1)
+    found = Splats.joined([a, b])
+    assert len(found) == 5 and found.degree == 1 and torch.equal(found.sh[:3], a.sh[:, :4]) and torch.equal(found.quats[3:], b.quats)
+    assert Splats.joined([a]) is a
