@@ -410,7 +410,13 @@ def open_run(
 
 
 def import_run(
-    source: str | Path, capture: Capture | str | Path, out: str | Path, *, iteration: int | None = None, device: Device = "auto"
+    source: str | Path,
+    capture: Capture | str | Path,
+    out: str | Path,
+    *,
+    iteration: int | None = None,
+    transform: str | Path | None = None,
+    device: Device = "auto",
 ) -> Run:
     """Make a run folder of a published result, or of a file that `Run.export` wrote.
 
@@ -421,6 +427,8 @@ def import_run(
         capture: The capture that it was trained on, or its folder.
         out: Run folder to write.
         iteration: Which iteration of a result folder. Default: the newest.
+        transform: How Gaussians came into the frame of their file, if it is not the capture's:
+            nerfstudio's dataparser_transforms.json.
         device: As in `open_run`.
 
     Raises:
@@ -428,5 +436,5 @@ def import_run(
             else.
     """
     known = capture if isinstance(capture, Capture) else load_capture(capture)
-    import_files(Path(source), known.data, Path(out), iteration)
+    import_files(Path(source), known.data, Path(out), iteration, None if transform is None else Path(transform))
     return open_run(out, device=device)

@@ -58,6 +58,9 @@ class ImportCommand:
     """Run folder to write."""
     iteration: int | None = None
     """Iteration of the result folder; by default the newest."""
+    transform: Annotated[Path | None, Option(value="FILE")] = None
+    """How Gaussians came into the frame of their file, if it is not the capture's: nerfstudio's
+    dataparser_transforms.json."""
 
 
 def export(args: list[str]) -> int:
@@ -112,7 +115,7 @@ def import_(args: list[str]) -> int:
     from scene_experts.files.importing import import_files
     from scene_experts.training.run_folder import named
 
-    print(f"wrote {import_files(command.source, named(command.data), command.out, command.iteration)}")
+    print(f"wrote {import_files(command.source, named(command.data), command.out, command.iteration, command.transform)}")
     print(f"next: {shlex.join([PROG, 'eval', str(command.out)])}")
     return 0
 

@@ -199,7 +199,7 @@ def read_anchors(path: Path) -> dict[str, Tensor]:
     if "f_offset_0" not in columns:
         what = "Gaussians of 3DGS" if "f_dc_0" in columns else f"only {', '.join(list(columns)[:8])}"
         raise InputError(f"expected anchors (x, f_offset_*, f_anchor_feat_*, scale_*) in {path}, found {what}; give a Scaffold-GS result")
-    out = {"xyz": stack(columns, ["x", "y", "z"], path)}
+    out = {"xyz": stack(columns, ["x", "y", "z"], path, exact=True)}
     flat = stack(columns, numbered_names(columns, "f_offset_"), path)
     if flat.shape[1] % 3:
         raise InputError(f"expected three f_offset columns per Gaussian in {path}, found {flat.shape[1]} in all; write the file again")

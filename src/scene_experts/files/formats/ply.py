@@ -99,12 +99,14 @@ def numbered_names(columns: Columns, prefix: str) -> list[str]:
     return sorted(found, key=lambda name: int(name[len(prefix) :]))
 
 
-def stack(columns: Columns, names: list[str], path: Path) -> Tensor:
-    """The named columns as one tensor [N, C] float32. Raises InputError naming the missing ones."""
+def stack(columns: Columns, names: list[str], path: Path, exact: bool = False) -> Tensor:
+    """The named columns as one tensor [N, C] float32; float64 where `exact` and a column is.
+    Raises InputError naming the missing ones."""
     absent = [name for name in names if name not in columns]
     if absent or not names:
         raise InputError(f"expected the columns {', '.join(absent) or 'of a scene'} in {path}, found none; write the file again")
-    out = np.empty((len(columns[names[0]]), len(names)), np.float32)
+    double = exact and any(columns[name].dtype == np.float64 for name in names)
+    out = np.empty((len(columns[names[0]]), len(names)), np.float64 if double else np.float32)
     with np.errstate(over="ignore"):  # callers refuse values that are not finite
         for i, name in enumerate(names):
             out[:, i] = columns[name]
@@ -229,7 +231,7 @@ def splats_in(columns: Columns, rest_names: list[str], path: Path) -> Splats:
     dc = stack(columns, ["f_dc_0", "f_dc_1", "f_dc_2"], path)[:, None]
     rest = stack(columns, rest_names, path) if rest_names else dc.new_zeros(len(dc), 0)
     return Splats(
-        means=stack(columns, ["x", "y", "z"], path),
+        means=stack(columns, ["x", "y", "z"], path, exact=True),
         sh=torch.cat([dc, rest.reshape(len(dc), 3, len(rest_names) // 3).transpose(1, 2)], dim=1),
         opacity_logit=stack(columns, ["opacity"], path)[:, 0],
         log_scales=stack(columns, [f"scale_{i}" for i in range(3)], path),

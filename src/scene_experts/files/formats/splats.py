@@ -30,9 +30,9 @@ _NO_LENGTH = 1e-12  # of a quaternion; renderers divide by its length, or by thi
 
 @dataclass(frozen=True)
 class Splats:
-    """N Gaussians of one file, float32 on the CPU. Raises InputError for shapes that disagree."""
+    """N Gaussians of one file, float32 on the CPU; positions may be float64. Raises InputError for shapes that disagree."""
 
-    means: Tensor  # [N, 3]
+    means: Tensor  # [N, 3]; float64 where the file holds doubles
     log_scales: Tensor  # [N, 3], natural logarithms of standard deviations
     quats: Tensor  # [N, 4] w, x, y, z; any length above 0
     opacity_logit: Tensor  # [N]

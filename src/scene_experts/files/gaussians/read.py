@@ -27,6 +27,7 @@ from scene_experts.files.gaussians.write import KIND
 from scene_experts.files.registry import Imported, recognise
 from scene_experts.files.registry import read as read_file
 from scene_experts.files.scene_folder import tell_origin
+from scene_experts.files.transform import read_transform
 from scene_experts.scene import Scene
 from scene_experts.scene.gaussians import Explicit, GaussianScene
 from scene_experts.training.config import Train
@@ -43,11 +44,11 @@ def find(source: Path, iteration: int | None) -> Path | None:
     return path if has_gaussians(property_names(path)) else None
 
 
-def read(source: Path, data: Data, iteration: int | None) -> Imported:
+def read(source: Path, data: Data, iteration: int | None, transform: Path | None = None) -> Imported:
     """The run in a file of Gaussians, published or ours, in the frame and unit of the capture.
 
     The recipe is 3DGS and the step 0, or `iteration`, unless the description or the name of its
-    folder says otherwise. Whether it is drawn with antialiasing, the description beside it
+    folder says otherwise. transform: `transform.read_transform`. Whether it is drawn with antialiasing, the description beside it
     (FILE.json) or the file says. Raises InputError where the former says that the file is in
     another frame.
     """
@@ -63,7 +64,10 @@ def read(source: Path, data: Data, iteration: int | None) -> Imported:
             capture.root,
         )
     splats = read_splats(source)
-    columns = table_columns(splats, file_world(source, splats, capture))
+    if transform is not None:
+        columns = table_columns(read_transform(transform, capture).applied(splats), capture.world)
+    else:
+        columns = table_columns(splats, file_world(source, splats, capture))
     step = about.get("step") or iteration or result_folder.iteration_of(source.parent) or 0
     degree = math.isqrt(columns["sh_rest"].shape[1] + 1) - 1
     cfg = replace(gs_3d, scene=Explicit(sh_degree=degree), iterations=step or gs_3d.iterations, antialias=antialias)
