@@ -21,6 +21,7 @@ __all__ = [
     "RawCapture",
     "ReadOptions",
     "Reader",
+    "choose_reader",
     "find_reader",
     "is_capture",
     "register",
@@ -34,6 +35,7 @@ READERS = (  # module:object, imported on first use; the first reader that recog
     "scene_experts.data.readers.blender:READER",
     "scene_experts.data.readers.nerfstudio:READER",
 )
+_BY_SUFFIX = {".json": "nerfstudio"}
 _registered: list[Reader] = []
 
 
@@ -69,6 +71,21 @@ def find_reader(folder: Path) -> Reader | None:
             if reader.recognise(folder):
                 return reader
     return None
+
+
+def choose_reader(folder: Path, model: Path | None) -> Reader | None:
+    """Return the reader of `model`, a reconstruction or a file of poses in `folder`; without it,
+    that which recognises `folder`, or None. Raises InputError if nothing reads `model`."""
+    if model is None:
+        return find_reader(folder)
+    kind = "colmap" if model.is_dir() else _BY_SUFFIX.get(model.suffix.lower())
+    reader = next((reader for reader in _load_built_in() if reader.name == kind), None)
+    if reader is None or not model.exists():
+        raise InputError(
+            f"expected a folder such as sparse/1, or a file of poses ({', '.join(_BY_SUFFIX)}), in {folder} for --model, "
+            f"found {model.name if model.exists() else 'nothing'} at {model}; correct --model"
+        )
+    return reader
 
 
 def tell_others(folder: Path, reader: Reader) -> list[str]:
