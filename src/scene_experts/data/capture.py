@@ -62,7 +62,7 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
         if data.normalise == "extent":
             capture = prepare.normalise(capture)
         capture = prepare.drop_outliers(capture)
-        if data.init == "random" or (capture.points is None and capture.bounds is not None):
+        if data.init == "random" or (capture.points is None and (capture.bounds is not None or raw.random_points)):
             capture = _add_random_points(capture, seed, warn=data.init != "random")
         elif capture.points is None:
             capture = _check_no_points(capture, raw.points_source, allow_no_points)

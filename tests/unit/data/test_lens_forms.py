@@ -31,7 +31,7 @@ def test_the_enhanced_unified_model(alpha: float, beta: float) -> None:
 
 
 def test_rays_beyond_88_degrees_are_clamped() -> None:
-    wide = np.array([1.2]), np.array([0.0])
+    wide = np.array([1.8]), np.array([0.0])
     assert forms.undistort_unified(0.6, 1.2, *wide)[0][0] == pytest.approx(np.tan(forms.LARGEST_ANGLE), rel=1e-6)
     assert forms.undistort_fov(1.5, *wide)[0][0] > 10
 

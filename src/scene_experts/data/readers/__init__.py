@@ -34,8 +34,12 @@ READERS = (  # module:object, imported on first use; the first reader that recog
     "scene_experts.data.readers.colmap:READER",
     "scene_experts.data.readers.blender:READER",
     "scene_experts.data.readers.nerfstudio:READER",
+    "scene_experts.data.readers.realitycapture:READER",
+    "scene_experts.data.readers.metashape:READER",
+    "scene_experts.data.readers.bundler:READER",
+    "scene_experts.data.readers.polycam:READER",
 )
-_BY_SUFFIX = {".json": "nerfstudio"}
+_BY_SUFFIX = {".json": "nerfstudio", ".csv": "realitycapture", ".xml": "metashape", ".out": "bundler"}
 _registered: list[Reader] = []
 
 
@@ -94,7 +98,8 @@ def tell_others(folder: Path, reader: Reader) -> list[str]:
     built_in = _load_built_in()
     later = built_in[built_in.index(reader) + 1 :] if reader in built_in else ()
     return [
-        f"the folder is read as {reader.files}, and also holds {other.files}; move the files of the first away to read the second"
+        f"the folder is read as {reader.files}, and also holds {other.files}; choose a file of poses with --model, or move the files "
+        f"of the first away, to read the second"
         for other in later
         if other.recognise(folder)
     ][:1]

@@ -52,6 +52,7 @@ class RawCapture:
     alpha_over: Vector | None = None  # composite transparent pixels over this colour; None: use alpha as a mask
     points_source: str = "the capture's files"  # named in the error message if there are no points
     states_split: bool = False  # the format divides the views into training and test views
+    random_points: bool = False  # the format has no points: without others, training starts from random ones
     cloud: Path | None = None  # the file of points, if nothing says that its frame is that of the cameras
     model: Path | None = None  # folder of the reconstruction, if it is not that of the capture
     bounds: tuple[Vector, Vector] | None = None  # lower and upper corner of the scene; random points fill it if there are none
