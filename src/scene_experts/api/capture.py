@@ -225,8 +225,8 @@ def load_capture(
     background: tuple[float, float, float] | None = None,
     seed: int = 0,
 ) -> Capture:
-    """Load a capture: a COLMAP folder (images/, sparse/0/), or a folder with transforms.json or
-    transforms_train.json.
+    """Load a capture: a COLMAP folder (images/, sparse/0/), or a folder with transforms.json,
+    transforms_train.json or the poses of RealityCapture, Metashape, Bundler or Polycam.
 
     Args:
         path: Folder of the capture, or "catalog:SCENE" for a scene that `scene-experts download`

@@ -35,8 +35,8 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
     """Load the capture that `data` describes.
 
     The kind is recognised by its files: COLMAP (sparse/0 and images), NeRF-synthetic
-    (transforms_train.json), nerfstudio (transforms.json), or a kind whose reader was registered
-    (see `data.readers`).
+    (transforms_train.json), nerfstudio (transforms.json), files of poses of other programs, or a
+    kind whose reader was registered (see `data.readers`).
 
     Args:
         seed: Seed of random points.

@@ -18,7 +18,8 @@ class Data:
 
     path: Annotated[Path, Option(name="data", short="-s", value="CAPTURE")]
     """Folder of the capture: a COLMAP folder (images/ and sparse/0/), a folder with
-    transforms*.json, or catalog:SCENE for a scene that `scene-experts download` downloaded."""
+    transforms*.json or with the poses of another program, or catalog:SCENE for a scene that
+    `scene-experts download` downloaded."""
     images: Annotated[str | None, Option(value="FOLDER")] = None
     """Image folder inside the capture, for example images_4."""
     resolution: Annotated[str, Option(short="-r", value="POLICY")] = "auto"
@@ -27,8 +28,8 @@ class Data:
     folder images_N) or auto (cap1600)."""
     split: Annotated[str, Option(value="RULE")] = "auto"
     """Which views are held out: mod8 (every 8th), mod:N (every Nth), fold:K/N (every Nth from the
-    Kth), first:N, none, files (as the capture's files say, or a test.txt or
-    test_list.txt beside them) or auto (files if they say it, else mod8)."""
+    Kth), first:N, none, files (as the capture's files say, or a test.txt or test_list.txt
+    beside them) or auto (files if they say it, else mod8)."""
     missing: Literal["error", "drop"] = "error"
     """What to do if the photograph of a view is missing: stop, or drop the view."""
     normalise: Literal["extent", "none"] = "extent"

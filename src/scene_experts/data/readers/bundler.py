@@ -8,7 +8,9 @@ picture. Many programs write this format.
 from __future__ import annotations
 
 import re
+from collections import deque
 from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -95,8 +97,10 @@ def _read(source: Source, warnings: list[str], want_points: bool) -> tuple[list[
     rows = np.empty((int(counts[1]), 6))
     for row in rows:
         row[:] = take(6)
-        for _ in range(4 * int(take(1)[0])):  # the views of the point
-            next(words, "")
+        (views,) = take(1)
+        if views % 1 or not 0 <= 8 * views <= source.size:
+            raise Damaged(f"a point with {views:g} views")
+        deque(islice(words, 4 * int(views)), maxlen=0)  # skips them
     rows = rows[usable_rows(rows[:, :3], source.path)]
     rgb, notes = to_bytes(np.clip(rows[:, 3:], 0, 255), source.path)
     warnings += notes

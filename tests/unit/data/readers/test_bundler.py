@@ -68,6 +68,8 @@ def test_files_that_do_not_fit(tmp_path: Path) -> None:
         (whole.replace("4 40", "4000000000000 40", 1), ["bundle.out"]),
         (whole.replace("4 40", "4 9000", 1), ["bundle.out"]),
         (whole.replace("4 40", "4 -1", 1), ["bundle.out"]),
+        (whole.replace("2 0 5 1.5", "2000000000000 0 5 1.5", 1), ["bundle.out", "views"]),
+        (whole.replace("2 0 5 1.5", "-2 0 5 1.5", 1), ["bundle.out", "views"]),
         (whole.replace(" 0.01 ", " nan ", 1), ["bundle.out"]),
     ):
         path.write_text(text)
