@@ -28,7 +28,7 @@ from scene_experts.data.readers import poses
 from scene_experts.data.readers.colours import to_bytes
 from scene_experts.data.readers.reader import RawCapture, ReadOptions
 
-_MAGIC = b"# Bundle file"
+_MAGIC = "# Bundle file"
 _FOCAL = re.compile(r"\s+-?\d+\s+[-+.\deE]+$")  # after a name in the list: a flag and a focal length
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 

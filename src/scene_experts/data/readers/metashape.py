@@ -55,7 +55,7 @@ class MetashapeReader:
 
 
 def _find(folder: Path) -> list[Path]:
-    return poses.find_files(folder, "*.xml", lambda head: b"<document" in head and b"<chunk" in head)
+    return poses.find_files(folder, "*.xml", lambda head: "<document" in head and "<chunk" in head)
 
 
 def _choose_chunk(root: Element, path: Path, warnings: list[str]) -> Element:

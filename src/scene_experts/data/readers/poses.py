@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import HEAD
 from scene_experts.core.reading.numbers import FARTHEST
+from scene_experts.core.reading.plain import decode_text
 from scene_experts.core.reading.source import opening, shorten
 from scene_experts.core.types import Points
 from scene_experts.data.lens import Lens
@@ -23,14 +24,14 @@ from scene_experts.data.readers.reader import PosedImage, RawCapture, ReadOption
 _HEAD = 4096  # bytes by which a file is recognised
 
 
-def find_files(folder: Path, pattern: str, fits: Callable[[bytes], bool]) -> list[Path]:
+def find_files(folder: Path, pattern: str, fits: Callable[[str], bool]) -> list[Path]:
     """Return the files of `folder` whose name matches `pattern` and whose first bytes fit, the
     largest first. Never raises for unreadable ones."""
     found = []
     for path in sorted(folder.glob(pattern)) if folder.is_dir() else ():
         try:
             with opening(path, HEAD) as source:
-                if fits(source.head(_HEAD)):
+                if fits(decode_text(source.head(_HEAD))):
                     found.append((-source.size, path))
         except InputError:
             continue

@@ -50,7 +50,7 @@ class RealityCaptureReader:
 
 
 def _find(folder: Path) -> list[Path]:
-    return poses.find_files(folder, "*.csv", lambda head: _header(decode_text(head).splitlines()) is not None)
+    return poses.find_files(folder, "*.csv", lambda head: _header(head.splitlines()) is not None)
 
 
 def _header(lines: list[str]) -> tuple[int, str, list[str]] | None:
@@ -89,6 +89,11 @@ def _read_poses(path: Path, warnings: list[str]) -> list[poses.Pose]:
     if any(max(abs(row["px"]), abs(row["py"])) > 0.5 for _, row in rows):  # a share of the side cannot be larger
         unit = _FILM
         warnings.append(f"px and py of {path.name} are read as mm of a side of 36, because they are too large for shares of it")
+    if any(row["k1"] for _, row in rows) and not any(row[name] for _, row in rows for name in _OPTIONAL[3:]):
+        warnings.append(
+            f"{path.name} has k1 alone: if the distortion model is Division, choose Brown3 in the program and export again, because the file "
+            f"does not say so and k1 is read as Brown's"
+        )
     _tell_degrees(path, rows, warnings)
     return [poses.Pose(name, _pose(row), _lens(row, unit)) for name, row in rows]
 

@@ -64,6 +64,16 @@ def test_photographs_beside_the_poses_absent_ones_and_masks(tmp_path: Path, kind
     assert len(load(tmp_path, missing="drop").views) == 3
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("kind", ["realitycapture", "metashape", "bundler"])
+def test_byte_order_marks(tmp_path: Path, kind: str, encoding: str) -> None:
+    MAKERS[kind](tmp_path)
+    for path in tmp_path.iterdir():
+        if path.suffix in (".csv", ".xml", ".out", ".txt"):
+            path.write_bytes(path.read_text().replace('encoding="UTF-8"', "").encode(encoding))
+    assert load(tmp_path).kind == kind
+
+
 def test_several_files_of_poses(tmp_path: Path) -> None:
     make_realitycapture(tmp_path)
     lines = (tmp_path / "cameras.csv").read_text().splitlines()

@@ -86,6 +86,12 @@ def test_principal_points_in_mm_are_told(tmp_path: Path) -> None:
     assert any("mm" in w for w in warnings)
 
 
+@pytest.mark.parametrize(("more", "told"), [("-0.1,0,0,0,0,0", True), ("-0.1,0.02,0,0,0,0", False), ("0,0,0,0,0,0", False)])
+def test_a_lens_that_may_be_a_division_model_is_told(tmp_path: Path, more: str, told: bool) -> None:
+    _, warnings = read(tmp_path, f"a.png,0,0,0,0,0,0,24,0,0,{more}")
+    assert any("Division" in w for w in warnings) == told
+
+
 def test_positions_in_degrees_are_told(tmp_path: Path) -> None:
     make_realitycapture(tmp_path)
     lines = (tmp_path / "cameras.csv").read_text().splitlines()
