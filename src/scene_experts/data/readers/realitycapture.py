@@ -91,8 +91,8 @@ def _read_poses(path: Path, warnings: list[str]) -> list[poses.Pose]:
         warnings.append(f"px and py of {path.name} are read as mm of a side of 36, because they are too large for shares of it")
     if any(row["k1"] for _, row in rows) and not any(row[name] for _, row in rows for name in _OPTIONAL[3:]):
         warnings.append(
-            f"{path.name} has k1 alone: if the distortion model is Division, choose Brown3 in the program and export again, because the file "
-            f"does not say so and k1 is read as Brown's"
+            f"{path.name} has k1 alone, which is read as Brown's: if the distortion model is Division, which the file does not say, choose "
+            f"Brown3 in the program and export again"
         )
     _tell_degrees(path, rows, warnings)
     return [poses.Pose(name, _pose(row), _lens(row, unit)) for name, row in rows]
