@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from scene_experts.core.reading.budget import LIST
 from scene_experts.core.reading.plain import decode_text
 from scene_experts.core.reading.source import opening
+from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers.reader import RawCapture
 
 _TEST = ("test.txt", "test_list.txt")
@@ -59,8 +60,8 @@ def _find(folders: Sequence[Path], names: Sequence[str]) -> Path | None:
 
 
 def _read(path: Path, names: Sequence[str], warnings: list[str]) -> set[str]:
-    """Return the photographs that the lines of a list name: by path, by path without extension, or
-    by a base name that only one photograph has."""
+    """Return the photographs that the lines of a list name: by path, by a path without its first
+    folder or with another extension, or by a base name, if only one photograph has it."""
     exact = {_plain(name): {name} for name in names}
     keys: dict[str, set[str]] = defaultdict(set)
     for name in names:
@@ -74,7 +75,9 @@ def _read(path: Path, names: Sequence[str], warnings: list[str]) -> set[str]:
     out: set[str] = set()
     unknown: list[str] = []
     for line in lines:
-        tries = (line, str(PurePosixPath(*PurePosixPath(line).parts[1:])), PurePosixPath(line).name)
+        pure = PurePosixPath(line)
+        bare = pure.with_suffix("") if pure.suffix.lower() in EXTENSIONS else pure
+        tries = [str(each) for path in (pure, bare) for each in (path, PurePosixPath(*path.parts[1:]), path.name)]
         found = exact.get(line) or next((keys[key] for key in tries if len(keys.get(key, ())) == 1), set())
         out |= found
         unknown += [] if found else [line]

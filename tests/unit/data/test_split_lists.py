@@ -44,10 +44,10 @@ def test_a_list_of_test_photographs(copy: Path, place: str, form: str) -> None:
 
 
 def test_names_without_extension_and_unknown_names(copy: Path) -> None:
-    (copy / "sparse/0/test.txt").write_text("view_002\nview_099.png\nview_003.JPG\n")
+    (copy / "sparse/0/test.txt").write_text("view_002\nview_099.png\nsub/view_003.JPG\nview_004.1\n")
     capture = load(copy)
-    assert held(capture) == ["view_002.png"]
-    assert any("2 of 3 names" in w and "view_099.png" in w for w in capture.warnings)
+    assert held(capture) == ["view_002.png", "view_003.png"]
+    assert any("2 of 4 names" in w and "view_099.png" in w for w in capture.warnings)
 
 
 def test_both_lists_leave_the_others_out(copy: Path) -> None:

@@ -57,6 +57,10 @@ class BundlerReader:
             posed = [poses.Pose(name, *camera) for name, camera in zip(names, cameras) if camera is not None]
             if len(posed) < len(names):
                 warnings.append(f"{len(names) - len(posed)} of {len(names)} photographs have no pose in {path.name}")
+            if options.images is not None and not (folder / "images").is_dir():
+                warnings.append(
+                    f"focal lengths in {path.name} are in pixels of the aligned photographs: those in {options.images} must be of that size"
+                )
             return poses.assemble(folder, path, posed, options, warnings, points=points, own_points=True)
 
 

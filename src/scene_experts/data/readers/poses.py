@@ -51,7 +51,7 @@ def choose_file(folder: Path, found: Sequence[Path], options: ReadOptions, warni
 @dataclass(frozen=True)
 class Pose:
     """A photograph as a file of poses names it: its name or label, and its camera [4, 4], world to
-    camera with OpenCV axes. `lens` gives the lens for the photograph's file."""
+    camera with OpenCV axes. `lens` gives the lens for the photograph as it was aligned."""
 
     name: str
     world_to_cam: NDArray[np.float64]
@@ -101,13 +101,13 @@ def assemble(
             file = match.found[name]
             shown = file.relative_to(usual if file.is_relative_to(usual) else place).as_posix()
             try:
-                lens = pose.lens(file)
+                lens = pose.lens(usual / shown if (usual / shown).is_file() else file)
             except InputError as error:
                 raise InputError(f"{shorten(pose.name)} in {path}: {error}") from None
             posed.append(PosedImage(shown, file, lens, pose.world_to_cam, find_mask(folder, shown, file)))
     cloud = None
     if options.points and not own_points:
-        cloud = find_cloud([folder], warnings) or _only_cloud(folder)
+        cloud = find_cloud(list(dict.fromkeys((path.parent, folder))), warnings) or _only_cloud(folder)
         if cloud is not None:
             points = read_points(cloud, warnings)
             warnings.append(f"the points are those of {cloud.name}; choose others with --points")

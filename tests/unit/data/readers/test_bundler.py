@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.readers.bundler import READER
@@ -58,6 +60,18 @@ def test_other_places_and_names_with_blanks(tmp_path: Path, file: str, names: st
     assert capture.kind == "bundler" and len(capture.views) == 4
     view = next(view for view in capture.views if view.name == "view 1 of 2.png")
     np.testing.assert_allclose(view.camera.world_to_cam, made.model.images[1].world_to_cam(), atol=1e-6)
+
+
+def test_smaller_photographs_keep_the_field_of_view(tmp_path: Path) -> None:
+    """f is in pixels of the photographs in images, whatever folder is read."""
+    made = make_bundler(tmp_path)
+    (tmp_path / "images_2").mkdir()
+    for path in (tmp_path / "images").iterdir():
+        Image.open(path).resize((24, 16)).save(tmp_path / "images_2" / path.name)
+    source = load(tmp_path, images="images_2").images.sources[0]
+    assert (source.lens.width, source.lens.fx) == (24, pytest.approx(made.model.cameras[1].fx / 2))
+    shutil.rmtree(tmp_path / "images")
+    assert any("pixels of the aligned photographs" in w for w in load(tmp_path, images="images_2").warnings)
 
 
 def test_files_that_do_not_fit(tmp_path: Path) -> None:
