@@ -24,8 +24,9 @@ from scene_experts.data.readers import poses
 from scene_experts.data.readers.reader import RawCapture, ReadOptions
 
 Matrix = NDArray[np.float64]
+Frame = tuple[Matrix, Matrix, float]  # rotation, translation, scale
 _FISHEYE = ("fisheye", "equidistant_fisheye")
-_GLOBE = 1e6  # m: a frame whose origin is further away is that of the globe
+_GLOBE = (6.3e6, 6.5e6)  # m: from the middle of the earth to its surface
 
 
 class MetashapeReader:
@@ -75,13 +76,9 @@ def _read_poses(chunk: Element, path: Path, warnings: list[str]) -> list[poses.P
     lenses: dict[str, Lens] = {}
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.findall("sensors/sensor")}
     frames = {c.get("id", ""): _read_frame(c.find("transform"), path) for c in chunk.findall("components/component")}
-    whole = _read_frame(chunk.find("transform"), path)
-    if _on_globe(chunk, [*frames.values(), whole]):
-        frames, whole = {}, None
-        warnings.append(
-            f"{path.name} is georeferenced: the poses stay in the chunk's own frame, which points must be in too; for metres, "
-            f"export it with local coordinates"
-        )
+    frames[""] = _read_frame(chunk.find("transform"), path)
+    if not (chunk.findtext("reference") or "").strip().startswith("LOCAL_CS"):
+        frames = _flatten(frames, path, warnings)
     out, idle, bare = [], 0, 0
     for camera in chunk.findall("cameras//camera"):
         label, transform = camera.get("label") or "", camera.findtext("transform")
@@ -100,7 +97,7 @@ def _read_poses(chunk: Element, path: Path, warnings: list[str]) -> list[poses.P
         numbers = poses.to_numbers(transform.split(), 16, f"the transform of {label}", path)
         pose = np.array(numbers).reshape(4, 4)
         rotation, centre = poses.nearest_rotation(pose[:3, :3], label, path), pose[:3, 3]
-        frame = frames.get(camera.get("component_id", ""), whole) or whole
+        frame = frames.get(camera.get("component_id", "")) or frames[""]
         if frame is not None:
             turn, shift, scale = frame
             rotation, centre = turn @ rotation, scale * (turn @ centre) + shift
@@ -111,7 +108,7 @@ def _read_poses(chunk: Element, path: Path, warnings: list[str]) -> list[poses.P
     return out
 
 
-def _read_frame(element: Element | None, path: Path) -> tuple[Matrix, Matrix, float] | None:
+def _read_frame(element: Element | None, path: Path) -> Frame | None:
     """Return the rotation, translation and scale of a chunk or component, or None without one."""
     if element is None:
         return None
@@ -124,11 +121,32 @@ def _read_frame(element: Element | None, path: Path) -> tuple[Matrix, Matrix, fl
     return poses.nearest_rotation(np.array(turn).reshape(3, 3), "the chunk", path), np.array(shift), scale
 
 
-def _on_globe(chunk: Element, frames: list[tuple[Matrix, Matrix, float] | None]) -> bool:
-    """Return whether the world is that of the whole earth, in which float32 cannot hold a scene."""
-    reference = (chunk.findtext("reference") or "").strip()
-    far = any(frame is not None and float(np.linalg.norm(frame[1])) > _GLOBE for frame in frames)
-    return far or (bool(reference) and not reference.startswith("LOCAL_CS") and any(frame is not None for frame in frames))
+def _flatten(frames: dict[str, Frame | None], path: Path, warnings: list[str]) -> dict[str, Frame | None]:
+    """Return frames that map to metres east, north and up of one of them, if they map to the globe
+    (geocentric metres on WGS 84); otherwise the frames as they are. Adds a note."""
+    far = [frame for frame in frames.values() if frame is not None and _GLOBE[0] < float(np.linalg.norm(frame[1])) < _GLOBE[1]]
+    if not far:
+        return frames
+    origin = far[0][1]
+    longitude, latitude = _place(origin)
+    (cl, cp), (sl, sp) = np.cos((longitude, latitude)), np.sin((longitude, latitude))
+    local = np.array([[-sl, cl, 0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])  # rows: east, north, up
+    warnings.append(
+        f"{path.name} is georeferenced: positions are in metres east, north and up of {np.rad2deg(latitude):.6f} degrees north, "
+        f"{np.rad2deg(longitude):.6f} east, which points must be too"
+    )
+    return {key: frame and (local @ frame[0], local @ (frame[1] - origin), frame[2]) for key, frame in frames.items()}
+
+
+def _place(xyz: Matrix) -> tuple[float, float]:
+    """Return the longitude and latitude, in radians, of a geocentric position on WGS 84."""
+    squashed = 1 / 298.257223563
+    eccentric, across = squashed * (2 - squashed), float(np.hypot(xyz[0], xyz[1]))
+    latitude = np.arctan2(xyz[2], across * (1 - eccentric))
+    for _ in range(10):
+        normal = 6378137.0 / np.sqrt(1 - eccentric * np.sin(latitude) ** 2)
+        latitude = np.arctan2(xyz[2] + eccentric * normal * np.sin(latitude), across)
+    return float(np.arctan2(xyz[1], xyz[0])), float(latitude)
 
 
 def _read_lens(sensor: Element, path: Path) -> Lens:
