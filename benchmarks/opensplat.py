@@ -25,7 +25,7 @@ from PIL import Image
 
 from scene_experts.data.capture import load
 from scene_experts.data.lens import Lens
-from scene_experts.data.readers.colmap_model import find_model, read_model, write_model
+from scene_experts.data.readers.colmap_model import find_models, read_model, write_model
 from scene_experts.data.settings import Data
 
 LIMIT = 6 * 3600  # seconds of one program
@@ -33,7 +33,7 @@ LIMIT = 6 * 3600  # seconds of one program
 
 def write_training_views(capture: Path, side: int, out: Path) -> int:
     """Write the training views, resized, as a COLMAP folder in the capture's own frame. Returns their number."""
-    small, found = load(Data(capture, resolution=f"longest:{side}")), find_model(capture)
+    small, found = load(Data(capture, resolution=f"longest:{side}")), next(iter(find_models(capture)), None)
     if found is None:
         raise SystemExit(f"expected a COLMAP folder, found none in {capture}; give one with sparse/0")
     model = read_model(found)

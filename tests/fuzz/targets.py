@@ -43,6 +43,7 @@ from scene_experts.view.path_files import read_path
 from support import foreign
 from support.evaluated import make_run
 from support.files import run_in_memory
+from support.foreign_poses import make_bundler, make_metashape, make_polycam, make_realitycapture
 from support.records import record
 from support.scenes import CAMERA
 from support.splats import splats
@@ -287,6 +288,23 @@ def _nerfstudio(folder: Path) -> None:
     make_nerfstudio(folder, views=4, size=(16, 12), points=30)
 
 
+def _points(folder: Path) -> None:
+    make_capture(folder, 3, (16, 12), points=20)
+    make_nerfstudio(folder / "cloud", views=2, size=(16, 12), points=30)
+    (folder / "cloud/sparse_pc.ply").rename(folder / "lidar.ply")
+    (folder / "sparse/0/test.txt").write_text("view_001.png\n")
+
+
+def _read_own_points(folder: Path) -> Any:
+    found = capture.load(Data(folder, points=folder / "lidar.ply", model="sparse/0"))
+    found.images.close()
+    return found.views, found.points, found.world, found.extent
+
+
+def _poses(make: Callable[[Path, int, tuple[int, int], int], Any]) -> Callable[[Path], None]:
+    return lambda folder: make(folder, 3, (16, 12), 10) and None
+
+
 def _blender(folder: Path) -> None:
     make_blender(folder, 4, 12)
 
@@ -397,6 +415,11 @@ TARGETS: dict[str, Target] = {
     "colmap-text": Target(_capture_text, _read_capture, ("*.txt",)),
     "colmap-lens": Target(_capture_lens, _read_capture, ("cameras.bin", "images.bin")),
     "nerfstudio": Target(_nerfstudio, _read_capture, ("*.json", "*.ply")),
+    "points": Target(_points, _read_own_points, ("lidar.ply", "test.txt")),
+    "realitycapture": Target(_poses(make_realitycapture), _read_capture, ("*.csv", "*.ply")),
+    "metashape": Target(_poses(make_metashape), _read_capture, ("*.xml", "*.ply")),
+    "bundler": Target(_poses(make_bundler), _read_capture, ("*.out", "*.txt")),
+    "polycam": Target(_poses(make_polycam), _read_capture, ("*.json",)),
     "blender": Target(_blender, _read_capture, ("*.json", "*.png")),
     "png": Target(_picture("PNG"), _read_picture),
     "jpeg": Target(_picture("JPEG"), _read_picture),

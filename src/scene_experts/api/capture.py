@@ -217,14 +217,16 @@ def load_capture(
     missing: Literal["error", "drop"] = "error",
     normalise: Literal["extent", "none"] | None = None,
     init: Literal["points", "random"] = "points",
+    points: str | Path | None = None,
+    model: str | None = None,
     max_views: int | None = None,
     near: float | None = None,
     ignore_principal_point: bool = False,
     background: tuple[float, float, float] | None = None,
     seed: int = 0,
 ) -> Capture:
-    """Load a capture: a COLMAP folder (images/, sparse/0/), or a folder with transforms.json or
-    transforms_train.json.
+    """Load a capture: a COLMAP folder (images/, sparse/0/), or a folder with transforms.json,
+    transforms_train.json or the poses of RealityCapture, Metashape, Bundler or Polycam.
 
     Args:
         path: Folder of the capture, or "catalog:SCENE" for a scene that `scene-experts download`
@@ -240,6 +242,10 @@ def load_capture(
             capture's own unit. Default: "none" for a scene of the catalog, else "extent".
             Everything that the API returns is in the capture's own unit either way.
         init: Start from the capture's 3D "points", or from "random" ones.
+        points: File of points to start from instead: PLY, or COLMAP's points3D.bin or points3D.txt,
+            in the frame of the capture's poses.
+        model: Which reconstruction of the capture is read if it has several: a folder ("sparse/1")
+            or a file of poses inside it. Default: that with the most photographs.
         max_views: Use at most this many views, evenly spread.
         near: Near plane, trained units, above 0. Default: the smaller of 0.2 and 0.02 times the
             camera extent.
@@ -253,7 +259,8 @@ def load_capture(
         InputError: The folder holds no usable capture, or an argument is invalid.
     """
     brought = defaults_of(path)
-    data = checked.fields(Data, {**locals(), "path": Path(path), "normalise": normalise or brought.normalise})
+    cloud = None if points is None else Path(points)
+    data = checked.fields(Data, {**locals(), "path": Path(path), "points": cloud, "normalise": normalise or brought.normalise})
     seed = checked.integer("seed", seed, 0)
     data = run_folder.named(data)
     return Capture(data, captures.load(data, seed), seed, brought.numbers)

@@ -23,8 +23,10 @@ from scene_experts.data.lens import centre_principal_point, to_pinhole
 from scene_experts.data.masks import find_masks
 from scene_experts.data.match import to_relative_name
 from scene_experts.data.orientation import fit_lenses
-from scene_experts.data.readers import RawCapture, ReadOptions, find_reader, tell_others, unrecognised_error
+from scene_experts.data.points import check_frame, read_points
+from scene_experts.data.readers import RawCapture, ReadOptions, choose_reader, tell_others, unrecognised_error
 from scene_experts.data.settings import Data
+from scene_experts.data.split_lists import apply_lists
 from scene_experts.data.store import ImageStore
 from scene_experts.data.views import Capture, Frame, Vector, View, World
 
@@ -35,8 +37,8 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
     """Load the capture that `data` describes.
 
     The kind is recognised by its files: COLMAP (sparse/0 and images), NeRF-synthetic
-    (transforms_train.json), nerfstudio (transforms.json), or a kind whose reader was registered
-    (see `data.readers`).
+    (transforms_train.json), nerfstudio (transforms.json), files of poses of other programs, or a
+    kind whose reader was registered (see `data.readers`).
 
     Args:
         seed: Seed of random points.
@@ -51,6 +53,9 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
     root, policy = data.path, check_policy(data.resolution)
     with guarding(root, CAPTURE):  # a reader of another package may raise anything
         raw, capture = _read(data, policy, cache_bytes)
+        if raw.cloud is not None and raw.points is not None:
+            notes = check_frame(raw.points, [view.camera for view in capture.views], raw.cloud)
+            capture = replace(capture, warnings=(*capture.warnings, *notes))
         if data.max_views is not None:
             capture = prepare.limit_views(capture, data.max_views)
         capture = prepare.drop_outlier_views(capture)
@@ -59,7 +64,7 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
         if data.normalise == "extent":
             capture = prepare.normalise(capture)
         capture = prepare.drop_outliers(capture)
-        if data.init == "random" or (capture.points is None and capture.bounds is not None):
+        if data.init == "random" or (capture.points is None and (capture.bounds is not None or raw.random_points)):
             capture = _add_random_points(capture, seed, warn=data.init != "random")
         elif capture.points is None:
             capture = _check_no_points(capture, raw.points_source, allow_no_points)
@@ -86,12 +91,21 @@ def choose_views(capture: Capture, path: Path) -> Capture:
 def _read(data: Data, policy: str, cache_bytes: int | None) -> tuple[RawCapture, Capture]:
     """Read a capture in its own frame, at the resolution of its files."""
     root, background = data.path, data.background
-    options = ReadOptions(_find_image_folder(root, data.images, policy), background, data.missing)
-    reader = find_reader(root)
+    images = _find_image_folder(root, data.images, policy)
+    model = None if data.model is None else root / data.model
+    if data.points is not None and data.init == "random":
+        raise InputError("expected --points or --init random, found both; leave one of them out")
+    reader = choose_reader(root, model)
     if reader is None:
         raise unrecognised_error(root)
-    raw = reader.read(root, options)
-    raw = replace(raw, warnings=[*raw.warnings, *tell_others(root, reader)])
+    raw = reader.read(root, ReadOptions(images, background, data.missing, model, points=data.points is None))
+    warnings = [*raw.warnings, *([] if model else tell_others(root, reader))]
+    if data.points is not None:
+        cloud = data.points if not (root / data.points).is_file() else root / data.points
+        raw = replace(raw, points=read_points(cloud, warnings), points_source=str(cloud), cloud=cloud)
+    raw = replace(raw, warnings=warnings)
+    if data.split in ("auto", "files"):
+        raw = apply_lists(root, raw)
     return raw, _assemble(root, reader.name, raw, data.ignore_principal_point, background, cache_bytes)
 
 
@@ -166,8 +180,11 @@ def _add_random_points(capture: Capture, seed: int, warn: bool) -> Capture:
 def _check_no_points(capture: Capture, source: str, allow: bool) -> Capture:
     """Add a warning to a capture without points. Raises InputError unless `allow`."""
     if not allow:
-        raise InputError(f"expected 3D points in {source} of {capture.root}, found none; start from random points with --init random")
-    return replace(capture, warnings=(*capture.warnings, "no 3D points: train with --init random"))
+        raise InputError(
+            f"expected 3D points in {source} of {capture.root}, found none; give some with --points FILE or start from random ones with "
+            f"--init random"
+        )
+    return replace(capture, warnings=(*capture.warnings, "no 3D points: train with --points FILE or --init random"))
 
 
 def _finish(capture: Capture) -> Capture:

@@ -1,4 +1,4 @@
-"""Camera lenses: the eleven classic COLMAP camera models, their distortion, and the pinhole camera
+"""Camera lenses: the camera models of COLMAP and Brown's, their distortion, and the pinhole camera
 that each is undistorted to.
 
 (u, v) are normalised pinhole coordinates x/z, y/z. Pixel coordinates are COLMAP's: the centre of
@@ -15,10 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_experts.core.errors import InputError
+from scene_experts.data import lens_forms as forms
+from scene_experts.data.lens_forms import LARGEST_ANGLE
 
 Array = NDArray[np.floating]
 
-# In the order of COLMAP's model ids. "f" stands for fx = fy.
+# COLMAP's models in the order of their ids, then ours. "f" stands for fx = fy. The coefficients of RAD_TAN_THIN_PRISM_FISHEYE, which
+# COLMAP numbers from 0, are named like those of the other models.
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -31,11 +34,19 @@ MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
     "THIN_PRISM_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ("fx", "fy", "cx", "cy", *(f"k{i}" for i in range(1, 7)), "p2", "p1", "sx1", "sx2", "sy1", "sy2"),
+    "SIMPLE_DIVISION": ("f", "cx", "cy", "k"),
+    "DIVISION": ("fx", "fy", "cx", "cy", "k"),
+    "SIMPLE_FISHEYE": ("f", "cx", "cy"),
+    "FISHEYE": ("fx", "fy", "cx", "cy"),
+    "EUCM": ("fx", "fy", "cx", "cy", "alpha", "beta"),
+    "BROWN": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "skew"),  # skew: of v in u
 }
+COLMAP_MODELS = tuple(name for name in MODELS if name != "BROWN")
 FISHEYE = frozenset(name for name in MODELS if name.endswith("FISHEYE"))
+DIVISION = ("SIMPLE_DIVISION", "DIVISION")
 _LARGEST, _LONGEST = 1e9, 1 << 20  # of a parameter, and of a side in pixels
 _SHORTEST = 1e-6  # px, of a focal length: powers of shorter ones overflow
-_LARGEST_ANGLE = math.radians(88.0)  # rays further from the axis are not usable on a flat image
 
 
 @dataclass(frozen=True)
@@ -53,7 +64,7 @@ class Lens:
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
-            raise InputError(f"expected a camera model among {', '.join(MODELS)}, found {self.model!r}; convert the model to one of those")
+            raise InputError(unreadable_model(self.model))
         if len(self.params) != len(MODELS[self.model]):
             raise InputError(
                 f"expected {len(MODELS[self.model])} parameters for camera model {self.model}, found {len(self.params)}; restore the file"
@@ -91,6 +102,8 @@ class Lens:
         """Whether straight lines appear bent: always for a fisheye lens, otherwise if a distortion
         coefficient is not 0."""
         geometric = {"f", "fx", "fy", "cx", "cy"}
+        if self.model == "EUCM":
+            return self.value("alpha") != 0
         return self.model in FISHEYE or any(p != 0 for n, p in zip(MODELS[self.model], self.params) if n not in geometric)
 
     def resize(self, width: int, height: int) -> Lens:
@@ -117,7 +130,11 @@ class Lens:
         """Map normalised pinhole coordinates to normalised distorted ones (u', v'); the pixel is
         (fx u' + cx, fy v' + cy)."""
         if self.model == "FOV":
-            return _distort_fov(self.value("omega"), u, v)
+            return forms.distort_fov(self.value("omega"), u, v)
+        if self.model in DIVISION:
+            return forms.distort_division(self.value("k"), u, v)
+        if self.model == "EUCM":
+            return forms.distort_unified(self.value("alpha"), self.value("beta"), u, v)
         if self.model in FISHEYE:  # equidistant projection first: |(u, v)| = angle from the axis
             r = np.hypot(u, v)
             s = np.where(r > 1e-8, np.arctan(r) / np.maximum(r, 1e-8), 1.0)
@@ -132,15 +149,19 @@ class Lens:
         corners of a photograph whose polynomial was fitted to its middle.
         """
         if self.model == "FOV":
-            return _undistort_fov(self.value("omega"), u, v)
-        a, b = self._undistort_polynomial(u, v)
+            return forms.undistort_fov(self.value("omega"), u, v)
+        if self.model in DIVISION:
+            return forms.undistort_division(self.value("k"), u, v)
+        if self.model == "EUCM":
+            return forms.undistort_unified(self.value("alpha"), self.value("beta"), u, v)
         with np.errstate(all="ignore"):  # where Newton's method diverges
+            a, b = self._undistort_polynomial(u, v)
             x, y = self._distort_polynomial(a, b)
             found = (np.hypot(x - u, y - v) <= 1e-6 * (1 + np.hypot(u, v))) & (np.hypot(a, b) <= self.find_fold())
         a, b = np.where(found, a, np.nan), np.where(found, b, np.nan)
         if self.model in FISHEYE:
             theta = np.hypot(a, b)
-            s = np.where(theta > 1e-8, np.tan(np.minimum(theta, _LARGEST_ANGLE)) / np.maximum(theta, 1e-8), 1.0)
+            s = np.where(theta > 1e-8, np.tan(np.minimum(theta, LARGEST_ANGLE)) / np.maximum(theta, 1e-8), 1.0)
             a, b = a * s, b * s
         return a, b
 
@@ -150,9 +171,11 @@ class Lens:
 
         The radius is that of (u, v), and the angle from the axis in radians for a fisheye lens.
         """
+        if self.model in DIVISION:
+            return 0.5 / math.sqrt(self.value("k")) if self.value("k") > 0 else math.inf
         k = [self.value(n) for n in ("k1", "k2", "k3", "k4", "k5", "k6")]
         full, x = self.model == "FULL_OPENCV", np.polynomial.Polynomial([0.0, 1.0])  # x = radius squared
-        above = np.polynomial.Polynomial([1.0, *(k[:3] if full else k[:4])])
+        above = np.polynomial.Polynomial([1.0, *(k[:3] if full else k)])
         below = np.polynomial.Polynomial([1.0, *k[3:]] if full else [1.0])
         slope = (above + 2 * x * above.deriv()) * below - 2 * x * above * below.deriv()  # of radius * above / below, times below squared
         roots = np.concatenate([part.trim().roots() for part in (slope, below)])
@@ -169,17 +192,19 @@ class Lens:
         """Apply the radial, tangential and thin-prism terms, the polynomial part of every model
         (formulas of OpenCV and COLMAP)."""
         k = [self.value(n) for n in ("k1", "k2", "k3", "k4", "k5", "k6")]
-        p1, p2, sx, sy = (self.value(n) for n in ("p1", "p2", "sx1", "sy1"))
+        p1, p2, sx, sx2, sy, sy2 = (self.value(n) for n in ("p1", "p2", "sx1", "sx2", "sy1", "sy2"))
         r2 = u * u + v * v
         if self.model == "FULL_OPENCV":
             radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]))) / (1 + r2 * (k[3] + r2 * (k[4] + r2 * k[5])))
         else:
-            radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * (k[2] + r2 * k[3])))
+            radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * (k[2] + r2 * (k[3] + r2 * (k[4] + r2 * k[5])))))
+        if self.model == "RAD_TAN_THIN_PRISM_FISHEYE":  # its other terms act on what the radial term has moved
+            u, v, radial = u * radial, v * radial, 1.0
+            r2 = u * u + v * v
         uv = u * v
-        return (
-            u * radial + 2 * p1 * uv + p2 * (r2 + 2 * u * u) + sx * r2,
-            v * radial + 2 * p2 * uv + p1 * (r2 + 2 * v * v) + sy * r2,
-        )
+        x = u * radial + 2 * p1 * uv + p2 * (r2 + 2 * u * u) + r2 * (sx + r2 * sx2)
+        y = v * radial + 2 * p2 * uv + p1 * (r2 + 2 * v * v) + r2 * (sy + r2 * sy2)
+        return x + self.value("skew") * y, y
 
     def _undistort_polynomial(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Solve `_distort_polynomial(a, b) = (u, v)` by Newton's method with central differences,
@@ -207,27 +232,21 @@ _TWO_FOCALS = {
     "RADIAL": "OPENCV",
     "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
     "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "SIMPLE_FISHEYE": "FISHEYE",
+    "SIMPLE_DIVISION": "DIVISION",
 }
 
 
-def _distort_fov(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
-    """Apply the field-of-view model of Devernay and Faugeras: r' = atan(2 r tan(omega/2)) /
-    omega."""
-    if abs(omega) < 1e-9:
-        return u, v
-    r = np.hypot(u, v)
-    c = 2 * math.tan(omega / 2)
-    s = np.where(r > 1e-8, np.arctan(c * r) / np.maximum(omega * r, 1e-12), c / omega)
-    return u * s, v * s
-
-
-def _undistort_fov(omega: float, u: Array, v: Array) -> tuple[Array, Array]:
-    if abs(omega) < 1e-9:
-        return u, v
-    r = np.hypot(u, v)
-    c = 2 * math.tan(omega / 2)
-    s = np.where(r > 1e-8, np.tan(np.minimum(omega * r, _LARGEST_ANGLE)) / np.maximum(c * r, 1e-12), omega / c)
-    return u * s, v * s
+def unreadable_model(found: str | int) -> str:
+    """Return what to do about a camera model, by its name or COLMAP's id, that is not read."""
+    if found in ("EQUIRECTANGULAR", len(COLMAP_MODELS)):
+        return (
+            "expected photographs with one direction of view, found 360 degree ones (EQUIRECTANGULAR); cut them into perspective pictures"
+        )
+    return (
+        f"expected a camera model among {', '.join(COLMAP_MODELS)}, found {found!r}; undistort the photographs with "
+        f"`colmap image_undistorter`, which writes PINHOLE"
+    )
 
 
 def to_pinhole(lens: Lens) -> Lens:
@@ -248,7 +267,9 @@ def to_pinhole(lens: Lens) -> Lens:
         return u * lens.fx + lens.cx, v * lens.fy + lens.cy
 
     fold = lens.find_fold()
-    reach = math.tan(min(fold, _LARGEST_ANGLE)) if lens.model in FISHEYE else fold
+    reach = math.tan(min(fold, LARGEST_ANGLE)) if lens.model in FISHEYE else fold
+    if lens.model in DIVISION or lens.model == "EUCM":
+        reach = min(fold, math.tan(LARGEST_ANGLE))
 
     def innermost(side: Array, choose: Callable[[Array], np.floating], farthest: float) -> float:
         reached = side[np.isfinite(side)]
@@ -261,8 +282,8 @@ def to_pinhole(lens: Lens) -> Lens:
     bottom = innermost(border(cols, np.full(w, h - 0.5))[1], np.min, lens.cy + reach * lens.fy)
     # The principal point keeps its fraction of the image, hence the larger (stricter) of the two
     # ratios.
-    scale_x = 1 / max(lens.cx / max(lens.cx - left, 1e-9), (w - 0.5 - lens.cx) / max(right - lens.cx, 1e-9))
-    scale_y = 1 / max(lens.cy / max(lens.cy - top, 1e-9), (h - 0.5 - lens.cy) / max(bottom - lens.cy, 1e-9))
+    scale_x = 1 / max(lens.cx / max(lens.cx - left, 1e-9), (w - 0.5 - lens.cx) / max(right - lens.cx, 1e-9), 1e-9)
+    scale_y = 1 / max(lens.cy / max(lens.cy - top, 1e-9), (h - 0.5 - lens.cy) / max(bottom - lens.cy, 1e-9), 1e-9)
     width, height = (max(1, int(min(max(s, 0.2), 2.0) * n)) for s, n in ((scale_x, w), (scale_y, h)))
     return Lens("PINHOLE", width, height, (lens.fx, lens.fy, lens.cx * width / w, lens.cy * height / h))
 

@@ -3,6 +3,7 @@ never by sorted position."""
 
 from __future__ import annotations
 
+import unicodedata
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,25 +37,31 @@ def to_relative_name(name: str) -> str:
 def match_images(folder: Path, names: Sequence[str]) -> Match:
     """Find the file in `folder` for each of `names` (relative, "/" between folders).
 
-    The exact path is tried first, then the only file with the same stem and another extension, then
+    The exact path is tried first, then the path under Unicode's composed form (macOS unpacks names
+    decomposed), then the only file with the same stem and another extension, then
     the only file anywhere in `folder` with that base name. The last two require that no other name
     shares the stem or base name. `warnings` reports every match that is not exact.
     """
     files = [path for path in folder.rglob("*") if path.suffix.lower() in EXTENSIONS] if folder.is_dir() else []
-    by_stem, by_base = defaultdict(list), defaultdict(list)
+    by_name, by_stem, by_base = defaultdict(list), defaultdict(list), defaultdict(list)
     for path in sorted(files):
-        by_stem[path.relative_to(folder).with_suffix("").as_posix()].append(path)
-        by_base[path.stem].append(path)
+        name = _compose(path.relative_to(folder).as_posix())
+        by_name[name].append(path)
+        by_stem[PurePosixPath(name).with_suffix("").as_posix()].append(path)
+        by_base[PurePosixPath(name).stem].append(path)
     stems, bases = defaultdict(int), defaultdict(int)
-    for name in names:
+    for name in map(_compose, names):
         stems[PurePosixPath(name).with_suffix("").as_posix()] += 1
         bases[PurePosixPath(name).stem] += 1
     found, absent, other, moved = {}, [], [], []
     for name in names:
-        stem, base = PurePosixPath(name).with_suffix("").as_posix(), PurePosixPath(name).stem
+        composed = _compose(name)
+        stem, base = PurePosixPath(composed).with_suffix("").as_posix(), PurePosixPath(composed).stem
         same_stem, same_base = by_stem[stem], by_base[base]
         if (folder / name).is_file():
             found[name] = folder / name
+        elif len(by_name[composed]) == 1:
+            found[name] = by_name[composed][0]
         elif len(same_stem) == 1 and stems[stem] == 1:
             found[name] = same_stem[0]
             other.append(f"{name} -> {same_stem[0].name}")
@@ -69,6 +76,29 @@ def match_images(folder: Path, names: Sequence[str]) -> Match:
     if moved:
         notes.append(f"{len(moved)} images are in another folder than named (first: {moved[0]})")
     return Match(found, tuple(absent), tuple(notes))
+
+
+def find_file(root: Path, name: str) -> Path | None:
+    """Return the file `name` in `root`, or None. A name beyond ASCII may be written in another form
+    of Unicode on the disk."""
+    if (root / name).is_file():
+        return root / name
+    if name.isascii():
+        return None
+    folder = (root / name).parent
+    for part in PurePosixPath(name).parent.parts if not folder.is_dir() else ():
+        root = next((p for p in _list(root) if _compose(p.name) == _compose(part)), root / part)
+    folder = folder if folder.is_dir() else root
+    wanted = _compose(PurePosixPath(name).name)
+    return next((p for p in _list(folder) if _compose(p.name) == wanted and p.is_file()), None)
+
+
+def _list(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir()) if folder.is_dir() else []
+
+
+def _compose(name: str) -> str:
+    return unicodedata.normalize("NFC", name)
 
 
 def absent_error(folder: Path, names: Sequence[str], absent: Sequence[str]) -> InputError:

@@ -18,7 +18,8 @@ class Data:
 
     path: Annotated[Path, Option(name="data", short="-s", value="CAPTURE")]
     """Folder of the capture: a COLMAP folder (images/ and sparse/0/), a folder with
-    transforms*.json, or catalog:SCENE for a scene that `scene-experts download` downloaded."""
+    transforms*.json or with the poses of another program, or catalog:SCENE for a scene that
+    `scene-experts download` downloaded."""
     images: Annotated[str | None, Option(value="FOLDER")] = None
     """Image folder inside the capture, for example images_4."""
     resolution: Annotated[str, Option(short="-r", value="POLICY")] = "auto"
@@ -27,8 +28,8 @@ class Data:
     folder images_N) or auto (cap1600)."""
     split: Annotated[str, Option(value="RULE")] = "auto"
     """Which views are held out: mod8 (every 8th), mod:N (every Nth), fold:K/N (every Nth from the
-    Kth), first:N, none, files (as the capture's files say) or auto (files if they say it, else
-    mod8)."""
+    Kth), first:N, none, files (as the capture's files say, or a test.txt or test_list.txt
+    beside them) or auto (files if they say it, else mod8)."""
     missing: Literal["error", "drop"] = "error"
     """What to do if the photograph of a view is missing: stop, or drop the view."""
     normalise: Literal["extent", "none"] = "extent"
@@ -36,6 +37,12 @@ class Data:
     scaled back. none: train in the capture's own units."""
     init: Literal["points", "random"] = "points"
     """Start from the capture's 3D points, or from random points."""
+    points: Annotated[Path | None, Option(value="FILE")] = None
+    """Start from the points of this file instead: a PLY file, or points3D.bin or points3D.txt of
+    COLMAP, in the frame of the capture's poses."""
+    model: Annotated[str | None, Option(value="PATH")] = None
+    """Which reconstruction of the capture is read if it has several: a folder (sparse/1) or a file
+    of poses (cameras.xml) inside it. By default that with the most photographs."""
     max_views: Annotated[int | None, Range(1)] = None
     """Use at most this many views, evenly spread."""
     near: Annotated[float | None, Range(above=0, below=math.inf)] = None

@@ -233,7 +233,17 @@ def named(data: Data) -> Data:
     replaced with that of the paper."""
     path, resolution, split = resolve(data.path, data.resolution, data.split)
     views = None if data.views is None else data.views.absolute()
-    return replace(data, path=path, resolution=resolution, split=split, views=views)
+    points = None if data.points is None else _settle(data.points, path)
+    return replace(data, path=path, resolution=resolution, split=split, views=views, points=points)
+
+
+def _settle(file: Path, capture: Path) -> Path:
+    """Return where a file of the user is: relative to the capture if it lies inside, so that both
+    may move, else absolute."""
+    inside = file.absolute()
+    if not inside.is_file() and (capture / file).is_file():
+        return file
+    return inside.relative_to(capture.absolute()) if inside.is_relative_to(capture.absolute()) else inside
 
 
 def capture_of(run: OpenRun, data: Path | None = None) -> Capture:

@@ -1,13 +1,15 @@
 """Captures as the Python API shows them."""
 
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import scene_experts as se
-from scene_experts.data.readers.colmap_model import read_model
+from scene_experts.data.readers.colmap_model import read_model, write_model
 from support.messages import naming
 
 
@@ -21,6 +23,19 @@ def test_a_capture_is_in_its_own_frame_and_unit(folder, capture):
     assert len(capture.train_cameras) == 7 and [c.view for c in capture.test_cameras] == [0, 8]
     assert capture.name == "balls" and capture.path == folder and capture.background == (0.0, 0.0, 0.0)
     assert "7 training views" in repr(capture)
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_points_of_another_file_and_another_reconstruction(folder, tmp_path, kind):
+    model = read_model(folder / "sparse" / "0")
+    few = replace(model, ids=model.ids[:9], xyz=model.xyz[:9], rgb=model.rgb[:9], error=model.error[:9], images=model.images[:4])
+    shutil.copytree(folder, tmp_path / "balls")
+    write_model(tmp_path / "balls/sparse/1", few)
+    assert len(se.load_capture(tmp_path / "balls", model="sparse/1").cameras) == 4
+    xyz, _ = se.load_capture(tmp_path / "balls", points=kind(tmp_path / "balls/sparse/1/points3D.bin")).points
+    assert np.allclose(xyz, few.xyz)
+    with pytest.raises(se.InputError, match="nowhere"):
+        se.load_capture(folder, points=kind("nowhere.ply"))
 
 
 def test_photographs_are_the_files(folder, capture):

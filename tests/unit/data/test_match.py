@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import unicodedata
 from pathlib import Path
 
 import pytest
 
-from scene_experts.data.match import absent_error, match_images, to_relative_name
+from scene_experts.data.match import absent_error, find_file, match_images, to_relative_name
 
 
 def touch(root: Path, *names: str) -> None:
@@ -27,6 +28,26 @@ def test_another_extension_when_there_is_one_choice(tmp_path: Path) -> None:
     match = match_images(tmp_path, ["a.JPG", "b.JPG"])
     assert match.found == {"a.JPG": tmp_path / "a.png"} and match.absent == ("b.JPG",)
     assert len(match.warnings) == 1 and "a.JPG" in match.warnings[0] and "a.png" in match.warnings[0]
+
+
+@pytest.mark.parametrize(("named", "stored"), [("NFC", "NFD"), ("NFD", "NFC")])
+def test_names_in_another_form_of_unicode(tmp_path: Path, named: str, stored: str) -> None:
+    """macOS unpacks names decomposed, which look the same."""
+    names = [unicodedata.normalize(named, f"Caf\u00e9/K\u00fcche {i}.jpg") for i in range(2)]
+    files = [unicodedata.normalize(stored, name) for name in names]
+    touch(tmp_path, *files)
+    match = match_images(tmp_path, names)
+    assert match.found == {name: tmp_path / file for name, file in zip(names, files)} and not match.absent and not match.warnings
+    assert [find_file(tmp_path, name) for name in names] == [tmp_path / file for file in files]
+    assert match_images(tmp_path, [names[0].replace(".jpg", ".png")]).found == {names[0].replace(".jpg", ".png"): tmp_path / files[0]}
+    assert find_file(tmp_path, names[0] + "x") is None and find_file(tmp_path, "none/\u00e9.jpg") is None
+
+
+def test_the_exact_form_comes_first(tmp_path: Path) -> None:
+    both = [unicodedata.normalize(form, "K\u00fcche.jpg") for form in ("NFC", "NFD")]
+    touch(tmp_path, *both)
+    if len(list(tmp_path.iterdir())) == 2:  # not on file systems that compare names under one form
+        assert match_images(tmp_path, both).found == {name: tmp_path / name for name in both}
 
 
 def test_one_photograph_is_not_two_views(tmp_path: Path) -> None:

@@ -23,6 +23,22 @@ CFG = replace(RECIPES["moe-gs"][1], iterations=300)
 CONFIG = RunConfig(CFG, Data(Path("capture").absolute()))
 
 
+def test_points_inside_the_capture_move_with_it(tmp_path, monkeypatch):
+    (tmp_path / "box").mkdir()
+    for path in ("box/inside.ply", "outside.ply"):
+        (tmp_path / path).touch()
+    monkeypatch.chdir(tmp_path)
+    box = Path("box")
+    for given, settled in (
+        (box / "inside.ply", Path("inside.ply")),
+        (tmp_path / "box/inside.ply", Path("inside.ply")),
+        (Path("inside.ply"), Path("inside.ply")),
+        (Path("outside.ply"), tmp_path / "outside.ply"),
+    ):
+        assert run_folder.named(Data(box, points=given)).points == settled
+        assert run_folder.named(Data(box, points=settled)).points == settled
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Training:
     capture = load(make_capture(tmp_path_factory.mktemp("capture"), views=4, size=(24, 16), points=60).folder)

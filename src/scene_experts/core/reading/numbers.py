@@ -41,6 +41,15 @@ def whole_number(value: Any, what: str, low: int = 0, high: int = 1 << 53) -> in
     return value
 
 
+def to_size(value: Any) -> int:
+    """Return a number of pixels, which some programs write as 1920.0. Raises ValueError unless it
+    is a whole number."""
+    size = int(value) if isinstance(value, (int, str)) and "." not in str(value) else float(value)
+    if size != size // 1:  # True for NaN and infinity
+        raise ValueError(f"{shown(value)} as a size")
+    return int(size)
+
+
 def shown(value: Any) -> str:
     """Return a short text for a value in an error message."""
     if isinstance(value, (int, float, str, bool, type(None))):

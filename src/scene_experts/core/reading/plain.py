@@ -21,6 +21,14 @@ _BITS = 64  # of an integer
 _LONGEST_VALUE = 4096  # characters of a Python literal
 
 
+def decode_text(data: bytes) -> str:
+    """Return the text of a file: UTF-8, with or without a byte order mark, or UTF-16 with one.
+    Bytes that are no UTF-8 become surrogates."""
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return data.decode("utf-16", "replace")
+    return data.decode("utf-8-sig", "surrogateescape")
+
+
 def read_json(path: Path, what: str) -> Any:
     """Read the JSON file `path`: UTF-8 in every locale, with or without a byte order mark.
 

@@ -21,6 +21,7 @@ __all__ = [
     "RawCapture",
     "ReadOptions",
     "Reader",
+    "choose_reader",
     "find_reader",
     "is_capture",
     "register",
@@ -33,7 +34,12 @@ READERS = (  # module:object, imported on first use; the first reader that recog
     "scene_experts.data.readers.colmap:READER",
     "scene_experts.data.readers.blender:READER",
     "scene_experts.data.readers.nerfstudio:READER",
+    "scene_experts.data.readers.realitycapture:READER",
+    "scene_experts.data.readers.metashape:READER",
+    "scene_experts.data.readers.bundler:READER",
+    "scene_experts.data.readers.polycam:READER",
 )
+_BY_SUFFIX = {".json": "nerfstudio", ".csv": "realitycapture", ".xml": "metashape", ".out": "bundler"}
 _registered: list[Reader] = []
 
 
@@ -71,13 +77,29 @@ def find_reader(folder: Path) -> Reader | None:
     return None
 
 
+def choose_reader(folder: Path, model: Path | None) -> Reader | None:
+    """Return the reader of `model`, a reconstruction or a file of poses in `folder`; without it,
+    that which recognises `folder`, or None. Raises InputError if nothing reads `model`."""
+    if model is None:
+        return find_reader(folder)
+    kind = "colmap" if model.is_dir() else _BY_SUFFIX.get(model.suffix.lower())
+    reader = next((reader for reader in _load_built_in() if reader.name == kind), None)
+    if reader is None or not model.exists():
+        raise InputError(
+            f"expected a folder such as sparse/1, or a file of poses ({', '.join(_BY_SUFFIX)}), in {folder} for --model, "
+            f"found {model.name if model.exists() else 'nothing'} at {model}; correct --model"
+        )
+    return reader
+
+
 def tell_others(folder: Path, reader: Reader) -> list[str]:
     """Return a warning if `folder` also holds a capture of a kind that a later built-in reader
     reads."""
     built_in = _load_built_in()
     later = built_in[built_in.index(reader) + 1 :] if reader in built_in else ()
     return [
-        f"the folder is read as {reader.files}, and also holds {other.files}; move the files of the first away to read the second"
+        f"the folder is read as {reader.files}, and also holds {other.files}; choose a file of poses with --model, or move the files "
+        f"of the first away, to read the second"
         for other in later
         if other.recognise(folder)
     ][:1]

@@ -60,12 +60,14 @@ class BlenderReader:
             warnings.append(
                 "transparent pixels are composited over white; choose another colour with --background (Scaffold-GS evaluates on black)"
             )
+        points, cloud = transforms.read_points(folder, None, warnings) if options.points else (None, None)
         return RawCapture(
             kept,
-            transforms.read_points(folder, None),
+            points,
             warnings,
             alpha_over=WHITE if options.background is None else options.background,
-            points_source=transforms.PLY_NAMES[0],
+            points_source="points3d.ply",
+            cloud=cloud,
             states_split=True,
             bounds=BOUNDS,
         )

@@ -6,28 +6,29 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
-import torch
-
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import CAPTURE
 from scene_experts.core.reading.source import guarding
 from scene_experts.core.types import Points
 from scene_experts.data.match import absent_error, match_images
-from scene_experts.data.readers.colmap_model import find_model, read_model
+from scene_experts.data.points import find_cloud, from_arrays, read_points
+from scene_experts.data.readers.colmap_model import Model, count_images, find_models, holds_model, read_model
+from scene_experts.data.readers.ply import count_points
 from scene_experts.data.readers.reader import PosedImage, RawCapture, ReadOptions
 
 
 class ColmapReader:
-    """Reads the first reconstruction of a COLMAP workspace, in binary or text form."""
+    """Reads the largest reconstruction of a COLMAP workspace, in binary or text form."""
 
     name = "colmap"
     files = "sparse/0 beside images (COLMAP)"
 
     def recognise(self, folder: Path) -> bool:
-        return find_model(folder) is not None
+        return bool(find_models(folder))
 
     def read(self, folder: Path, options: ReadOptions) -> RawCapture:
-        """Read poses and points.
+        """Read poses and points of the reconstruction with the most photographs, or of
+        `options.model`.
 
         Raises InputError if a file of the reconstruction is damaged, an image is listed twice, or
         photographs are absent (with `options.missing == "drop"`: if all are).
@@ -36,9 +37,8 @@ class ColmapReader:
             return self._read(folder, options)
 
     def _read(self, folder: Path, options: ReadOptions) -> RawCapture:
-        place = find_model(folder)
-        assert place is not None
-        model = read_model(place)
+        place, warnings = _choose(folder, options.model)
+        model = read_model(place, points=options.points)
         names = sorted(image.name for image in model.images)
         twice = next((a for a, b in pairwise(names) if a == b), None)
         if twice is not None:
@@ -46,18 +46,18 @@ class ColmapReader:
         photographs = folder / (options.images or "images")
         _check_whole(folder, place, options.images or "images")
         match = match_images(photographs, names)
-        warnings = list(match.warnings)
+        warnings += match.warnings
         if match.absent and (options.missing == "error" or not match.found):
             raise absent_error(photographs, names, match.absent)
         if match.absent:
             warnings.append(f"dropped {len(match.absent)} of {len(names)} views because their image is absent (first: {match.absent[0]})")
-        warnings += _other_reconstructions(place)
         images = []
         for image in sorted(model.images, key=lambda i: i.name):
             if image.name in match.found:
                 images.append(PosedImage(image.name, match.found[image.name], model.cameras[image.camera_id], image.world_to_cam()))
-        points = Points(torch.from_numpy(model.xyz), torch.from_numpy(model.rgb)) if len(model.xyz) else None
-        return RawCapture(images, points, warnings, points_source="points3D.bin or points3D.txt")
+        points, cloud = _read_points(folder, place, model, warnings) if options.points else (None, None)
+        source = "points3D.bin, points3D.txt or points3D.ply"
+        return RawCapture(images, points, warnings, points_source=source, cloud=cloud, model=place)
 
 
 def _check_whole(folder: Path, place: Path, images: str) -> None:
@@ -70,13 +70,55 @@ def _check_whole(folder: Path, place: Path, images: str) -> None:
         )
 
 
-def _other_reconstructions(place: Path) -> list[str]:
-    """Return a warning if COLMAP split the photographs into several reconstructions."""
-    if place.name != "0":
-        return []
-    others = [p for p in place.parent.iterdir() if p.is_dir() and p.name.isdecimal() and p.name != "0"]
-    note = f"{place.parent.name}/ holds {len(others) + 1} reconstructions that COLMAP could not join; only 0 is used"
-    return [note] if others else []
+def _choose(folder: Path, model: Path | None) -> tuple[Path, list[str]]:
+    """Return the folder of the reconstruction that is read, and a warning if there are others.
+
+    Raises InputError if `model` holds none.
+    """
+    found = find_models(folder)
+    if model is not None:
+        if not holds_model(model):
+            have = ", ".join(_name(folder, place) for place in found) or "none"
+            raise InputError(f"expected a reconstruction in {model}, found none; choose one of {folder} with --model (it has: {have})")
+        return model, []
+    if len(found) == 1:
+        return found[0], []
+    counts = [count_images(place) for place in found]
+    best = counts.index(max(counts))
+    sizes = ", ".join(f"{_name(folder, place)} has {count} photographs" for place, count in zip(found, counts))
+    others = _name(folder, found[1 if best == 0 else 0])
+    chosen = _name(folder, found[best])
+    note = f"the folder holds {len(found)} reconstructions ({sizes}); {chosen} is read; choose another with --model {others}"
+    return found[best], [note]
+
+
+def _name(folder: Path, place: Path) -> str:
+    return place.relative_to(folder).as_posix()
+
+
+def _read_points(folder: Path, place: Path, model: Model, warnings: list[str]) -> tuple[Points | None, Path | None]:
+    """Return the points of the model's own file, or without any, those of a PLY file in its folder
+    or in that of the capture, and that file."""
+    own = model.points_file
+    if len(model.xyz):
+        cloud = find_cloud([place], [])
+        count = None if cloud is None else count_points(cloud)
+        if cloud is not None and own is not None and count is not None and count != len(model.xyz):
+            warnings.append(
+                f"the points are those of {own.name} ({len(model.xyz):,}), not of {cloud.name} ({count:,}); choose the others with "
+                f"--points {cloud}"
+            )
+        warnings += model.notes
+        return from_arrays(model.xyz, model.rgb), None
+    cloud = find_cloud([place, folder], warnings)
+    if cloud is None:
+        return None, None
+    points = read_points(cloud, warnings)
+    why = f"{own.name} is empty" if own else "points3D.bin and points3D.txt are absent"
+    warnings.append(
+        f"the points are those of {cloud.name} ({0 if points is None else len(points.xyz):,}): {why}; choose others with --points"
+    )
+    return points, cloud
 
 
 READER = ColmapReader()

@@ -34,7 +34,7 @@ class NerfstudioReader:
             return self._read(folder, options)
 
     def _read(self, folder: Path, options: ReadOptions) -> RawCapture:
-        path = folder / "transforms.json"
+        path = options.model or folder / "transforms.json"
         meta = transforms.read_meta(path)
         warnings: list[str] = []
         held = _held_out(meta, path, warnings)
@@ -56,8 +56,8 @@ class NerfstudioReader:
         kept = transforms.drop_absent(folder, images, names, warnings)
         if unmasked:
             warnings.append(f"{len(unmasked)} masks that transforms.json names are absent (first: {unmasked[0]}); restore them")
-        points = transforms.read_points(folder, meta.get("ply_file_path"))
-        return RawCapture(kept, points, warnings, points_source="the file that ply_file_path names")
+        points, cloud = transforms.read_points(folder, meta.get("ply_file_path"), warnings) if options.points else (None, None)
+        return RawCapture(kept, points, warnings, points_source="the file that ply_file_path names, or pointcloud.ply,", cloud=cloud)
 
 
 def _held_out(meta: dict[str, Any], path: Path, warnings: list[str]) -> set[PurePosixPath]:

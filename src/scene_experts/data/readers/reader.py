@@ -21,6 +21,8 @@ class ReadOptions:
     images: str | None = None  # folder of the photographs, relative to the capture; None: the folder that the files state
     background: Vector | None = None  # RGB in [0, 1]; None: the default of the format
     missing: Literal["error", "drop"] = "error"  # what to do if photographs are absent
+    model: Path | None = None  # the reconstruction or file of poses to read; None: the reader chooses
+    points: bool = True  # False: the points are not used and need not be read
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,9 @@ class RawCapture:
     alpha_over: Vector | None = None  # composite transparent pixels over this colour; None: use alpha as a mask
     points_source: str = "the capture's files"  # named in the error message if there are no points
     states_split: bool = False  # the format divides the views into training and test views
+    random_points: bool = False  # the format has no points: without others, training starts from random ones
+    cloud: Path | None = None  # the file of points, if nothing says that its frame is that of the cameras
+    model: Path | None = None  # folder of the reconstruction, if it is not that of the capture
     bounds: tuple[Vector, Vector] | None = None  # lower and upper corner of the scene; random points fill it if there are none
 
 

@@ -13,21 +13,20 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json
-from scene_experts.core.reading.numbers import FARTHEST, shown
+from scene_experts.core.reading.numbers import FARTHEST, shown, to_size
 from scene_experts.core.reading.source import describe, shorten
 from scene_experts.core.types import Points
 from scene_experts.data.images import probe
 from scene_experts.data.lens import Lens
-from scene_experts.data.match import EXTENSIONS
-from scene_experts.data.readers import ply
+from scene_experts.data.match import EXTENSIONS, find_file
+from scene_experts.data.points import find_cloud
+from scene_experts.data.points import read_points as read_cloud
 from scene_experts.data.readers.reader import PosedImage
 
-PLY_NAMES = ("points3d.ply", "sparse_pc.ply", "points3D.ply")
 _PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "")
 _BESIDE_FOCAL = ("cx", "cy", "fl_y", "camera_angle_y", *(f"k{i}" for i in range(1, 7)), "p1", "p2")
 _MODELS = ("OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL", *_PINHOLES)
@@ -80,8 +79,8 @@ def find_image(root: Path, file_path: str, images: str | None) -> tuple[str, Pat
         parts = [images, *parts[1:]] if len(parts) > 1 else [images, *parts]
     name = "/".join(parts)
     for candidate in (name, *(name + ending for ending in EXTENSIONS)):
-        if (root / candidate).is_file():
-            return candidate, root / candidate
+        if path := find_file(root, candidate):
+            return candidate, path
     return name, None
 
 
@@ -140,12 +139,12 @@ def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path, image: Pa
     if model not in _MODELS:
         raise InputError(f"expected camera_model OPENCV, OPENCV_FISHEYE or PINHOLE in {path}, found {shown(model)}; convert the capture")
     given = "fl_x" in both
-    if not given:
-        if image is None or not (model == "OPENCV_FISHEYE" or any(both.get(name) for name in _BESIDE_FOCAL)):
-            return None
-        both = dict(zip("wh", probe(image).size)) | both
+    if not given and (image is None or not (model == "OPENCV_FISHEYE" or any(both.get(name) for name in _BESIDE_FOCAL))):
+        return None
+    if image is not None and not (both.get("w") and both.get("h")):
+        both |= dict(zip("wh", _measure(image, both)))
     try:
-        width, height = int(both["w"]), int(both["h"])
+        width, height = to_size(both["w"]), to_size(both["h"])
         fx = float(both["fl_x"]) if given else 0.5 * width / math.tan(0.5 * read_angle(meta, frame, path))
         fy = float(both.get("fl_y", fx))
         if not given and "fl_y" not in both and both.get("camera_angle_y") is not None:
@@ -173,16 +172,25 @@ def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path, image: Pa
     return None if plain and not given else lens
 
 
-def read_points(root: Path, named: object) -> Points | None:
-    """Read the points from the PLY file `named`, or from a file with a usual name. Returns None if
-    there are no points.
+def _measure(image: Path, values: dict[str, Any]) -> tuple[int, int]:
+    """Return the size of a photograph whose frame states none: as stored, or turned by its EXIF
+    orientation if the principal point is nearer to that middle."""
+
+    def away(size: tuple[int, int]) -> float:
+        return sum(abs(float(values[name]) - side / 2) for name, side in zip(("cx", "cy"), size) if values.get(name) is not None)
+
+    header = probe(image)
+    return min((header.size, header.turned), key=away)  # the first of equals
+
+
+def read_points(root: Path, named: object, warnings: list[str]) -> tuple[Points | None, Path | None]:
+    """Return the points of the PLY file `named`, or of a file with a usual name, and that file if
+    it is not named. Adds warnings about a choice of files and about colours.
 
     Raises InputError if the named file is absent or the file is damaged.
     """
-    if isinstance(named, str) and not (root / named).is_file():
-        raise InputError(f"expected the points of {root} in {shorten(named)}, found no such file; restore it or start with --init random")
-    for name in (named,) if isinstance(named, str) else PLY_NAMES:
-        if (root / name).is_file():
-            xyz, rgb = ply.read_points(root / name)
-            return Points(torch.from_numpy(xyz), torch.from_numpy(rgb)) if len(xyz) else None
-    return None
+    path = root / named if isinstance(named, str) else find_cloud([root], warnings)
+    if path is not None and not path.is_file():
+        raise InputError(f"expected the points of {root} in {shorten(str(named))}, found no such file; restore it or give --points FILE")
+    points = None if path is None else read_cloud(path, warnings)
+    return points, None if isinstance(named, str) else path

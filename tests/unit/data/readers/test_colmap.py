@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -63,8 +64,80 @@ def test_the_same_image_twice(copy: Path) -> None:
 
 
 def test_several_reconstructions(copy: Path) -> None:
-    shutil.copytree(copy / "sparse/0", copy / "sparse/1")
-    assert any("2 reconstructions" in w for w in load(copy).warnings)
+    """The one with the most photographs is read, whatever its number, and the counts are told."""
+    whole = read_model(copy / "sparse/0")
+    for text in (False, True):
+        shutil.rmtree(copy / "sparse")
+        write_model(copy / "sparse/0", replace(whole, images=whole.images[:2]), text=text)
+        write_model(copy / "sparse/7", whole, text=text)
+        capture = load(copy)
+        assert len(capture.views) == 10
+        told = next(w for w in capture.warnings if "reconstructions" in w)
+        assert all(part in told for part in ("sparse/0 has 2", "sparse/7 has 10", "sparse/7 is read", "--model sparse/0"))
+        assert len(load(copy, model="sparse/0").views) == 2
+        assert len(load(copy, model=str(copy / "sparse/7")).views) == 10
+    (copy / "sparse/7/images.txt").write_text("no model\n")
+    assert len(load(copy).views) == 2
+    with pytest.raises(InputError, match=naming("sparse/3", "--model")):
+        load(copy, model="sparse/3")
+    with pytest.raises(InputError, match=naming("sparse/0", "sparse/7", "--model")):
+        load(copy, model="images")
+
+
+@pytest.mark.parametrize("place", ["sparse/1", "sparse/aligned", "colmap/sparse/2", "sparse"])
+def test_a_reconstruction_of_another_number(made: Synthetic, copy: Path, place: str) -> None:
+    model = read_model(copy / "sparse/0")
+    shutil.rmtree(copy / "sparse")
+    write_model(copy / place, model)
+    capture = load(copy)
+    assert len(capture.views) == 10 and not any("reconstructions" in w for w in capture.warnings)
+
+
+def test_the_first_of_equal_reconstructions(copy: Path) -> None:
+    shutil.copytree(copy / "sparse/0", copy / "sparse/10")
+    shutil.copytree(copy / "sparse/0", copy / "sparse/2")
+    told = next(w for w in load(copy).warnings if "reconstructions" in w)
+    assert told.index("sparse/2") < told.index("sparse/10") and "sparse/0 is read" in told
+
+
+def write_cloud(path: Path, count: int, colours: bool = True) -> None:
+    """Write a binary PLY of doubles: points on a line through the scene, red."""
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n" + "".join(f"property double {a}\n" for a in "xyz")
+    head += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue") if colours) + "end_header\n"
+    rows = np.zeros(count, np.dtype([("p", "<f8", 3), ("c", "u1", 3)] if colours else [("p", "<f8", 3)]))
+    rows["p"][:, 0] = np.linspace(-1, 1, count)
+    if colours:
+        rows["c"] = (200, 10, 20)
+    path.write_bytes(head.encode() + rows.tobytes())
+
+
+@pytest.mark.parametrize("name", ["points3D.ply", "points3d.ply", "PointCloud.ply"])
+@pytest.mark.parametrize("place", ["sparse/0", "."])
+def test_points_in_a_ply_file_alone(copy: Path, name: str, place: str) -> None:
+    (copy / "sparse/0/points3D.bin").unlink()
+    write_cloud(copy / place / name, 40)
+    capture = load(copy)
+    assert capture.points is not None and len(capture.points.xyz) == 40
+    assert capture.points.rgb.tolist() == [[200, 10, 20]] * 40
+    assert any(name in w and "40" in w and "--points" in w for w in capture.warnings)
+
+
+def test_an_empty_points_file_gives_way_to_a_ply_file(copy: Path) -> None:
+    model = read_model(copy / "sparse/0")
+    write_model(copy / "sparse/0", replace(model, ids=model.ids[:0], xyz=model.xyz[:0], rgb=model.rgb[:0], error=model.error[:0]))
+    write_cloud(copy / "sparse/0/points3D.ply", 40)
+    capture = load(copy)
+    assert capture.points is not None and len(capture.points.xyz) == 40
+    assert any("points3D.bin is empty" in w for w in capture.warnings)
+
+
+def test_a_ply_file_of_another_count_is_told(copy: Path) -> None:
+    write_cloud(copy / "sparse/0/points3D.ply", 300)
+    assert not any("points3D.ply" in w for w in load(copy).warnings)
+    write_cloud(copy / "sparse/0/points3D.ply", 40)
+    capture = load(copy)
+    assert capture.points is not None and len(capture.points.xyz) == 300
+    assert any(all(part in w for part in ("points3D.bin (300)", "points3D.ply (40)", "--points")) for w in capture.warnings)
 
 
 @pytest.mark.parametrize("part", ["cameras.bin", "images.bin", "points3D.bin"])

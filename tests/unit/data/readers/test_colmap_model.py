@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.readers.colmap_model import ColmapImage, Model, find_model, read_model, write_model
+from scene_experts.data.readers.colmap_model import ColmapImage, Model, find_models, read_model, write_model
 from support.lenses import LENSES
 from support.messages import naming
 
@@ -114,11 +114,11 @@ def test_75_thousand_points_are_read_within_two_seconds(tmp_path: Path) -> None:
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
 def test_models_are_found(tmp_path: Path, place: str) -> None:
     write_model(tmp_path / place, model())
-    assert find_model(tmp_path) == tmp_path / place
+    assert find_models(tmp_path) == [tmp_path / place]
 
 
 def test_no_model(tmp_path: Path) -> None:
-    assert find_model(tmp_path) is None
+    assert find_models(tmp_path) == []
 
 
 @pytest.mark.parametrize("name", ["cameras", "images"])
@@ -175,6 +175,47 @@ def test_unknown_model_name(tmp_path: Path) -> None:
     (tmp_path / "cameras.txt").write_text("3 WIBBLE 64 48 50 32 24\n")
     with pytest.raises(InputError, match="WIBBLE"):
         read_model(tmp_path)
+
+
+@pytest.mark.parametrize(("number", "name"), [(17, "EQUIRECTANGULAR"), (99, "colmap image_undistorter")])
+def test_the_refusal_of_a_model_says_what_to_do(tmp_path: Path, number: int, name: str) -> None:
+    with_tracks(tmp_path)
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 7, number, 640, 480, 500.0, 501.0, 320.5, 240.25))
+    with pytest.raises(InputError, match=name):
+        read_model(tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_text_with_a_byte_order_mark(tmp_path: Path, encoding: str) -> None:
+    write_model(tmp_path, model(), text=True)
+    before = read_model(tmp_path)
+    for path in tmp_path.glob("*.txt"):
+        path.write_bytes(path.read_text().replace("\n", "\r\n").encode(encoding))
+    after = read_model(tmp_path)
+    assert (after.cameras, after.images) == (before.cameras, before.images)
+    np.testing.assert_array_equal(after.xyz, before.xyz)
+
+
+def test_sizes_as_decimals(tmp_path: Path) -> None:
+    write_model(tmp_path, model(), text=True)
+    path = tmp_path / "cameras.txt"
+    whole, lens = path.read_text(), read_model(tmp_path).cameras[3]
+    path.write_text(whole.replace(f" {lens.width} {lens.height} ", f" {lens.width}.0 {lens.height}.000000 "))
+    assert read_model(tmp_path).cameras[3] == lens
+    path.write_text(whole.replace(f" {lens.width} {lens.height} ", f" {lens.width}.5 {lens.height} "))
+    with pytest.raises(InputError, match="cameras"):
+        read_model(tmp_path)
+
+
+def test_colours_of_text_as_fractions(tmp_path: Path) -> None:
+    write_model(tmp_path, model(), text=True)
+    before = read_model(tmp_path)
+    rows = [f"{i} {x} {y} {z} {r / 255:.6f} {g / 255:.6f} {b / 255:.6f} 0.5" for i, ((x, y, z), (r, g, b)) in
+            enumerate(zip(before.xyz.tolist(), before.rgb.tolist()))]  # fmt: skip
+    (tmp_path / "points3D.txt").write_text("\n".join(rows) + "\n")
+    after = read_model(tmp_path)
+    np.testing.assert_array_equal(after.rgb, before.rgb)
+    assert "fractions of 1" in after.notes[0]
 
 
 def test_no_cameras_and_no_images(tmp_path: Path) -> None:

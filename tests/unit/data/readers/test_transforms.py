@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from scene_experts.core.errors import InputError
 from support.captures import load
@@ -53,6 +54,45 @@ def test_shared_intrinsics_and_an_angle_of_view(tmp_path: Path) -> None:
     edit(path, angle)
     camera = load(tmp_path).views[0].camera
     assert camera.fx == pytest.approx(24 / np.tan(0.6), rel=1e-6) and camera.cx == 24
+
+
+@pytest.mark.parametrize("given", [{}, {"w": None, "h": 0}, {"w": 48.0, "h": "32.0"}])
+def test_frames_without_a_size_have_that_of_the_photograph(tmp_path: Path, given: dict) -> None:
+    make_nerfstudio(tmp_path, views=3, size=(48, 32), points=50, mixed_sizes=False)
+    path = tmp_path / "transforms.json"
+    before = load(tmp_path)
+
+    def forget(meta: dict) -> None:
+        for frame in meta["frames"]:
+            frame.pop("w"), frame.pop("h")
+            frame.update(given)
+
+    edit(path, forget)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())  # a byte order mark
+    after = load(tmp_path)
+    assert all(torch.equal(a.camera.K, b.camera.K) and a.camera.width == b.camera.width for a, b in zip(before.views, after.views))
+
+
+def test_a_size_of_an_upright_photograph_that_is_stored_on_its_side(tmp_path: Path) -> None:
+    """The principal point tells whether the poses are those of the stored or of the upright picture."""
+    make_nerfstudio(tmp_path, views=2, size=(24, 48), points=50, mixed_sizes=False)
+    before = load(tmp_path)
+    rgb = before.images.get(0)[0]
+    edit(tmp_path / "transforms.json", lambda meta: [(frame.pop("w"), frame.pop("h")) for frame in meta["frames"]])
+    for path in (tmp_path / "images").iterdir():
+        picture, exif = Image.open(path).transpose(Image.Transpose.ROTATE_90), Image.Exif()
+        exif[0x0112] = 6
+        picture.save(path, exif=exif)
+    after = load(tmp_path)
+    assert [(v.camera.width, v.camera.height) for v in after.views] == [(v.camera.width, v.camera.height) for v in before.views]
+    assert torch.equal(after.images.get(0)[0], rgb)
+
+
+def test_a_size_that_is_no_whole_number(tmp_path: Path) -> None:
+    make_nerfstudio(tmp_path, views=2, size=(24, 16), points=50)
+    edit(tmp_path / "transforms.json", lambda meta: meta["frames"][0].update(w=24.5))
+    with pytest.raises(InputError, match=r"24\.5"):
+        load(tmp_path)
 
 
 def test_the_fisheye_of_instant_ngp(tmp_path: Path) -> None:
@@ -109,7 +149,7 @@ def test_an_angle_of_view_keeps_the_centre_and_the_distortion(tmp_path: Path, si
         (lambda m: m["frames"][0].pop("file_path"), "file_path"),
         (lambda m: m["frames"][0].update(camera_model="EQUIRECTANGULAR"), "camera_model"),
         (lambda m: m["frames"][0].update(fl_x="wide"), ""),
-        (lambda m: m["frames"][0].pop("w"), ""),
+        (lambda m: m["frames"][0].update(w="wide"), "wide"),
         (lambda m: m["frames"][0].update(w=float("inf")), ""),
         (lambda m: m["frames"][0].pop("fl_x"), "fl_x"),
         (lambda m: (m["frames"][0].pop("fl_x"), m.update(camera_angle_x="wide")), "camera_angle_x.*wide"),

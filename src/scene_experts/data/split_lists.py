@@ -1,0 +1,90 @@
+"""Finds the lists of training and test photographs that programs write beside a reconstruction."""
+
+from __future__ import annotations
+
+import os
+import unicodedata
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+from scene_experts.core.reading.budget import LIST
+from scene_experts.core.reading.plain import decode_text
+from scene_experts.core.reading.source import opening
+from scene_experts.data.match import EXTENSIONS
+from scene_experts.data.readers.reader import RawCapture
+
+_TEST = ("test.txt", "test_list.txt")
+_TRAIN = ("train.txt", "train_list.txt")
+
+
+def apply_lists(root: Path, raw: RawCapture) -> RawCapture:
+    """Return the capture with the split of test.txt, test_list.txt, train.txt and train_list.txt in
+    the folder of the reconstruction, else in `root`.
+
+    A list of test photographs holds those out. With a list of training photographs as well, those
+    in neither are left out; alone, it holds out all others. A split that the capture's own files
+    state is kept. What was decided, and names of no photograph, are told in the warnings.
+    """
+    folders = [folder for folder in dict.fromkeys((raw.model, root)) if folder is not None]
+    test, train = (_find(folders, names) for names in (_TEST, _TRAIN))
+    first = test or train
+    if first is None:
+        return raw
+    if raw.states_split or any(image.test for image in raw.images):
+        note = f"{first.name} is not used, because the capture's own file of poses states the split; choose another with --split"
+        return replace(raw, warnings=[*raw.warnings, note])
+    warnings: list[str] = []
+    names = [image.name for image in raw.images]
+    held = _read(test, names, warnings) if test else None
+    kept = _read(train, names, warnings) if train else None
+    if not held and (test or not kept):
+        warnings.append(f"{first.name} names no photograph of the capture and is not used; choose the held-out ones with --split")
+        return replace(raw, warnings=[*raw.warnings, *warnings])
+    if held is None and kept is not None:
+        held = set(names) - kept
+    held = held or set()
+    if kept and (both := held & kept):
+        warnings.append(f"{len(both)} photographs are in both lists and are held out (first: {min(both)})")
+    images = [replace(image, test=image.name in held) for image in raw.images if kept is None or image.name in held | kept]
+    files = " and ".join(os.path.relpath(path, root).replace(os.sep, "/") for path in (test, train) if path)
+    note = f"split as in {files}: holds out {len(held)} of {len(names)} photographs; choose others with --split"
+    if len(images) < len(names):
+        note += f"; {len(names) - len(images)} in neither list are left out"
+    return replace(raw, images=images, states_split=True, warnings=[*raw.warnings, *warnings, note])
+
+
+def _find(folders: Sequence[Path], names: Sequence[str]) -> Path | None:
+    return next((folder / name for folder in folders for name in names if (folder / name).is_file()), None)
+
+
+def _read(path: Path, names: Sequence[str], warnings: list[str]) -> set[str]:
+    """Return the photographs that the lines of a list name: by path, by a path without its first
+    folder or with another extension, or by a base name, if only one photograph has it."""
+    exact = {_plain(name): {name} for name in names}
+    keys: dict[str, set[str]] = defaultdict(set)
+    for name in names:
+        pure = PurePosixPath(_plain(name))
+        for key in {str(pure), str(pure.with_suffix("")), pure.name, pure.stem}:
+            keys[key].add(name)
+    with opening(path, LIST) as source:
+        lines = [_plain(line) for line in decode_text(source.read()).splitlines()]
+        lines = [line for line in lines if line and not line.startswith("#")]
+        source.spend_items(len(lines))
+    out: set[str] = set()
+    unknown: list[str] = []
+    for line in lines:
+        pure = PurePosixPath(line)
+        bare = pure.with_suffix("") if pure.suffix.lower() in EXTENSIONS else pure
+        tries = [str(each) for path in (pure, bare) for each in (path, PurePosixPath(*path.parts[1:]), path.name)]
+        found = exact.get(line) or next((keys[key] for key in tries if len(keys.get(key, ())) == 1), set())
+        out |= found
+        unknown += [] if found else [line]
+    if unknown:
+        warnings.append(f"{len(unknown)} of {len(lines)} names in {path.name} are of no photograph (first: {unknown[0]})")
+    return out
+
+
+def _plain(name: str) -> str:
+    return unicodedata.normalize("NFC", name.strip().replace("\\", "/").removeprefix("./"))
