@@ -167,6 +167,7 @@ def _assemble(root: Path, kind: str, raw: RawCapture, centred: bool, background:
         warnings=(*raw.warnings, *notes, *dark, *masks.warnings),
         states_split=raw.states_split,
         bounds=raw.bounds,
+        applied=raw.applied,
     )
 
 

@@ -69,7 +69,7 @@ def read_transform(path: Path, capture: Capture) -> Similarity:
 
     path: JSON with `transform`, rows of a 3 x 4 matrix, and `scale`, as nerfstudio writes
     dataparser_transforms.json: a point p of the reconstruction is at scale * (transform p) in the
-    file. The poses in a transforms.json are turned by its applied_transform first.
+    file. The poses of a capture may have been turned first (`Capture.applied`).
 
     Raises InputError for another file and for a matrix without a rotation.
     """
@@ -80,12 +80,10 @@ def read_transform(path: Path, capture: Capture) -> Similarity:
         scale = number(found.get("scale", 1.0), "the scale", 1e-15, FARTHEST)
         turn = _matrix(found["transform"])
         to_file = Similarity(turn.rotation, scale * turn.shift, scale)
-    meta = capture.root / "transforms.json"
-    applied: Any = read_json(meta, "capture").get("applied_transform") if capture.kind == "nerfstudio" and meta.is_file() else None
-    if applied is None:
+    if capture.applied is None:
         return to_file.inverse
-    with guarding(meta, budget.JSON, "capture"):
-        return to_file.inverse.then(_matrix(applied))
+    with guarding(capture.root, budget.JSON, "capture"):
+        return to_file.inverse.then(_matrix(capture.applied))
 
 
 def _matrix(rows: Any) -> Similarity:

@@ -79,7 +79,7 @@ def test_every_command_reads_a_scene_alike(
     assert se.Trainer(se.recipe("scaffold-gs"), capture).recipe.scene.voxel_size == 0  # a recipe is used as it is
     assert se.Trainer("scaffold-gs", capture.path).recipe.scene.voxel_size == 0
     asked = []
-    monkeypatch.setattr("scene_experts.files.importing.import_files", lambda source, data, out, iteration: asked.append(data))
+    monkeypatch.setattr("scene_experts.files.importing.import_files", lambda source, data, out, *_: asked.append(data))
     assert cli.main(["import", "a.ply", "--data", "catalog:truck", "--out", str(tmp_path / "imported")]) == 0
     assert asked == [capture.data]
 

@@ -57,15 +57,14 @@ def written(path: Path, content: Any) -> Path:
 
 
 def test_the_map_of_nerfstudio(tmp_path: Path) -> None:
-    """A point p of the reconstruction lies at scale * (R p + t) in the file. A transforms.json is
-    turned by its applied_transform."""
+    """A point p of the reconstruction lies at scale * (R p + t) in the file. The capture may
+    have been turned."""
     R, t, p = turn(), random(3), random(3)
     path = written(tmp_path / "d.json", {"transform": torch.cat((R, t[:, None]), 1).tolist(), "scale": 0.25})
-    capture: Any = SimpleNamespace(root=tmp_path, kind="colmap")
+    capture: Any = SimpleNamespace(root=tmp_path, applied=None)
     back = read_transform(path, capture)
     torch.testing.assert_close(back.scale * back.rotation @ (0.25 * (R @ p + t)) + back.shift, p)
-    written(tmp_path / "transforms.json", {"applied_transform": [[0, 1, 0, 0], [1, 0, 0, 2], [0, 0, -1, 0]]})
-    capture.kind = "nerfstudio"
+    capture.applied = [[0, 1, 0, 0], [1, 0, 0, 2], [0, 0, -1, 0]]
     back = read_transform(path, capture)
     torch.testing.assert_close(back.scale * back.rotation @ (0.25 * (R @ p + t)) + back.shift, torch.stack((p[1], p[0] + 2, -p[2])))
 
@@ -79,4 +78,4 @@ BAD = (
 @pytest.mark.parametrize("content", BAD)
 def test_other_files_are_refused(tmp_path: Path, content: Any) -> None:
     with pytest.raises(InputError, match=r"d\.json"):
-        read_transform(written(tmp_path / "d.json", content), SimpleNamespace(root=tmp_path, kind="colmap"))  # type: ignore[arg-type]
+        read_transform(written(tmp_path / "d.json", content), SimpleNamespace(root=tmp_path, applied=None))  # type: ignore[arg-type]

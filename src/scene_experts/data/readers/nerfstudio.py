@@ -57,7 +57,8 @@ class NerfstudioReader:
         if unmasked:
             warnings.append(f"{len(unmasked)} masks that transforms.json names are absent (first: {unmasked[0]}); restore them")
         points, cloud = transforms.read_points(folder, meta.get("ply_file_path"), warnings) if options.points else (None, None)
-        return RawCapture(kept, points, warnings, points_source="the file that ply_file_path names, or pointcloud.ply,", cloud=cloud)
+        source = "the file that ply_file_path names, or pointcloud.ply,"
+        return RawCapture(kept, points, warnings, points_source=source, cloud=cloud, applied=meta.get("applied_transform"))
 
 
 def _held_out(meta: dict[str, Any], path: Path, warnings: list[str]) -> set[PurePosixPath]:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.data.readers import find_reader, poses
+from scene_experts.data.readers import poses
 from scene_experts.data.readers.reader import ReadOptions
 from support.captures import load
 from support.foreign_poses import make_bundler, make_metashape, make_polycam, make_realitycapture
@@ -55,9 +55,7 @@ def test_photographs_beside_the_poses_absent_ones_and_masks(tmp_path: Path, kind
     (tmp_path / "images").rmdir()
     (tmp_path / "masks").mkdir()
     shutil.copy(tmp_path / "view_001.png", tmp_path / "masks")
-    reader = find_reader(tmp_path)
-    assert reader is not None
-    assert [image.mask is not None for image in reader.read(tmp_path, ReadOptions()).images] == [False, True, False, False]
+    assert [source.mask is not None for source in load(tmp_path).images.sources] == [False, True, False, False]
     (tmp_path / "view_002.png").unlink()
     with pytest.raises(InputError, match=naming("view_002", "--missing drop")):
         load(tmp_path)
