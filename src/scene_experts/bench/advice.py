@@ -4,11 +4,18 @@ its time."""
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 
 import torch
 
 from scene_experts.bench import raster, step
+from scene_experts.bench.machine import read_processor_name
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.io import cache_dir, read_json, write_json
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.numbers import number
+from scene_experts.core.version import __version__
 from scene_experts.render import choose
 
 LIMIT = 8.0  # minutes, so that a capture of few photographs, its training, scores and page take a quarter of an hour together
@@ -52,6 +59,21 @@ def measure_picture() -> float:
         return min(sum(raster.time_draw(rasterize, picture, time.process_time)) for _ in range(8))
 
 
+def recall_picture() -> float:
+    """The least that `measure_picture` has found on this machine, so that two commands in a row
+    estimate the same. It is measured where the user's cache does not say it."""
+    place, machine = cache_dir() / "speed.json", f"{read_processor_name()}, scene-experts {__version__}"
+    try:
+        known = read_json(place, "measured speed")
+        return number(known[machine], "a measured speed", 1e-6, 1e3)  # type: ignore[index]
+    except (InputError, Damaged, LookupError, TypeError):
+        found = measure_picture()
+    with suppress(RunError, OSError):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        write_json(place, {machine: found})
+    return found
+
+
 def estimate_minutes(width: int, height: int, iterations: int, picture: float, threads: int) -> float:
     """Minutes of a training. picture: see `measure_picture`."""
     gain = 1 / (SERIAL + (1 - SERIAL) / threads)
@@ -65,12 +87,12 @@ def suggest(width: int, height: int, views: int, picture: float | None = None) -
     With FEW photographs or less, at most FEW_ITERATIONS: a longer training fits them better and
     what lies between them worse.
 
-    views: number of photographs. picture: seconds from `measure_picture`, which is called by
+    views: number of photographs. picture: seconds from `measure_picture`; `recall_picture` by
     default.
     """
     if torch.cuda.is_available() and choose("auto", "cuda").name != "reference":
         return Advice(0, 30_000, None)
-    picture, threads = picture or measure_picture(), torch.get_num_threads()
+    picture, threads = picture or recall_picture(), torch.get_num_threads()
     advice = Advice(0, SIDES[-1][1], 0.0)
     for side, iterations in SIDES:
         iterations = min(iterations, FEW_ITERATIONS) if views <= FEW else iterations

@@ -14,6 +14,7 @@ from scene_experts.core.signals import handled
 from scene_experts.sfm.options import SfmOptions
 
 MOST_REASONS = 8  # lines about photographs without a pose
+LEAST = 12  # fewer photographs with a pose get a warning
 FEW = 0.9  # a smaller share of photographs with a pose gets a warning
 
 
@@ -88,4 +89,6 @@ def summarise(note: dict[str, Any]) -> list[str]:
     if have < FEW * all_:
         more = "" if note["all_compared"] else "; --matching exhaustive --overwrite may find more poses"
         lines.append(f"warning: every part of the scene should be sharp in at least three photographs from different positions{more}")
+    if have < LEAST:
+        lines.append(f"warning: {have} photographs show a small part of a scene; take 30 or more that overlap strongly")
     return lines

@@ -52,9 +52,12 @@ def evaluate(args: list[str]) -> int:
     if not group.first:
         return 0
     print_results(results, Console(markup=False, highlight=False), command.run)
-    if not command.options.suffix:  # the page shows the held-out views
+    if results["views"] == "test" and not command.options.suffix:  # the page shows the held-out views
         print(f"wrote {page.write([command.run])}, with the pictures and what each score means")
-        print(f"next: {shlex.join([PROG, 'export', str(command.run), '--format', 'html', '--out', str(command.run / 'scene.html')])}")
+    if command.options == EvalOptions():
+        place = str(command.run / "scene.html")
+        print(f"next: {shlex.join([PROG, 'export', str(command.run), '--format', 'html', '--title', results['capture'], '--out', place])}")
+        print(f"next: {shlex.join([PROG, 'render', str(command.run), '--out', str(command.run / 'flight.mp4')])}")
     return 0
 
 

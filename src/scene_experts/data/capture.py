@@ -59,8 +59,10 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
         if data.max_views is not None:
             capture = prepare.limit_views(capture, data.max_views)
         capture = prepare.drop_outlier_views(capture)
-        auto = "files" if capture.states_split or capture.test else "mod8"
-        capture = prepare.measure_extent(prepare.hold_out(capture, auto if data.split == "auto" else data.split))
+        capture = prepare.measure_extent(prepare.hold_out(capture, choose_split(capture) if data.split == "auto" else data.split))
+        if data.split == "auto" and capture.split == "none":
+            note = f"all of {len(capture.views)} photographs are trained on; with so few, scores need --split fold:1/5 to fold:5/5, or mod8"
+            capture = replace(capture, warnings=(*capture.warnings, note))
         if data.normalise == "extent":
             capture = prepare.normalise(capture)
         capture = prepare.drop_outliers(capture)
@@ -74,6 +76,11 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
     if data.near is None:
         return capture
     return replace(capture, views=tuple(replace(v, camera=replace(v.camera, near=data.near)) for v in capture.views))
+
+
+def choose_split(capture: Capture) -> str:
+    """Return the split that "auto" stands for."""
+    return "files" if capture.states_split or capture.test else "none" if len(capture.views) < prepare.FEW else "mod8"
 
 
 def choose_views(capture: Capture, path: Path) -> Capture:
@@ -199,7 +206,7 @@ def _finish(capture: Capture) -> Capture:
     number(capture.extent, "the extent of the cameras", 1e-12, FARTHEST)
     notes = list(capture.warnings)
     if 0 < len(capture.test) < 5:
-        notes.append(f"only {len(capture.test)} test views: mean scores are unreliable")
+        notes.append(f"only {len(capture.test)} test view{'s' if len(capture.test) > 1 else ''}: mean scores are unreliable")
     sizes = {(v.camera.width, v.camera.height) for v in views}
     if len(sizes) > 1:
         notes.append(f"views of {len(sizes)} sizes")

@@ -23,6 +23,7 @@ from scene_experts.data.store import ImageStore
 from scene_experts.data.views import Capture, Vector, View, World
 
 RANDOM_POINTS = 10_000  # as 3DGS for NeRF-synthetic scenes
+FEW = 12  # with fewer views, all are trained on unless the user holds some out
 NORMAL_EXTENT = 5.0  # extent of a capture in a normalised world
 _FAR_VIEW = 50.0  # a camera further from the median camera than this many median distances is mislocated
 _FAR_POINT = (50.0, 20.0)  # a point further from the cameras than both 50 extents and 20 median distances is noise

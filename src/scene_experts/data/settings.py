@@ -29,7 +29,7 @@ class Data:
     split: Annotated[str, Option(value="RULE")] = "auto"
     """Which views are held out: mod8 (every 8th), mod:N (every Nth), fold:K/N (every Nth from the
     Kth), first:N, none, files (as the capture's files say, or a test.txt or test_list.txt
-    beside them) or auto (files if they say it, else mod8)."""
+    beside them) or auto (files if they say it, none with fewer than 12 views, else mod8)."""
     missing: Literal["error", "drop"] = "error"
     """What to do if the photograph of a view is missing: stop, or drop the view."""
     normalise: Literal["extent", "none"] = "extent"

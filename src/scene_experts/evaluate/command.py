@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ from scene_experts.render import Rasterizer, as_trained
 from scene_experts.training import run_folder
 from scene_experts.training.progress import ProgressBar
 from scene_experts.training.run_folder import OpenRun
+
+log: logging.Logger = logging.getLogger(__name__)
 
 
 def evaluate_run(
@@ -39,6 +43,12 @@ def evaluate_run(
     opened = group.agree(lambda: run_folder.open_run(run, device, step))
     rasterize = as_trained(rasterize, opened.config.train.antialias)
     capture = group.agree(lambda: run_folder.capture_of(opened, data))
+    if options.views == "test" and options.appearance == "rule" and not capture.test and capture.train:
+        options = replace(options, views="train")
+        if group.first:
+            log.warning(
+                "no view is held out: these are scores of the %d training views, which other views do not reach", len(capture.train)
+            )
     facts: dict[str, Any] = {"step": opened.step, "about": about(opened), "group": group}
     try:
         with ProgressBar(Console(stderr=True, markup=False, quiet=not group.first)) as tell:

@@ -25,6 +25,11 @@ FEWEST = 3  # photographs needed for a reconstruction
 UNSUPPORTED = (".dng", ".cr2", ".cr3", ".nef", ".arw")  # photographs that Pillow does not read
 HEIC = (".heic", ".heif")  # read with pillow-heif, if it is installed
 COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "BMP", "TIFF")  # what COLMAP reads
+PANORAMA = (
+    "which are taken as perspective pictures here: cut views of 90 degrees out of each first, for example by "
+    "ffmpeg -i PANORAMA -vf v360=e:flat:yaw=0:h_fov=90:v_fov=90:w=1200:h=1200 VIEW.jpg with yaw 0, 45, 90, ..."
+)
+_SMALLEST_ROUND = 2000  # px; width of a panorama
 _LONGEST_FACT = 256  # characters of what EXIF says about a camera
 COPIED = "copied.json"
 _MAKE, _MODEL, _ORIENTATION, _EXIF, _FOCAL, _LENS = 0x010F, 0x0110, 0x0112, 0x8769, 0x920A, 0xA434
@@ -43,6 +48,7 @@ class Photo:
     mask: Mask | None = None
     mode: str = "RGB"  # Pillow's
     white: White = White()  # of deep photographs
+    round: bool = False  # a 360 degree panorama, by its XMP data or by a shape of 2:1
 
     @property
     def stored(self) -> str:
@@ -85,6 +91,8 @@ def find_photos(folder: Path, exclude: Path | None = None, say: Callable[[str], 
     for line in describe_rest(found, names, sorted(set(files) - set(paths)), folder):
         say(line)
     photos = inspect_photos(folder, names, found)
+    if turned := [photo.name for photo in photos if photo.round]:
+        say(f"warning: {len(turned)} photographs look like 360 degree panoramas ({few(turned)}), {PANORAMA}")
     white, notes = find_white([(folder / photo.name, photo.mode) for photo in photos])
     for line in notes:
         say(f"warning: {line}")
@@ -178,6 +186,8 @@ def inspect_photo(folder: Path, name: str, mask: Mask | None) -> Photo:
     except UnicodeEncodeError:
         raise InputError(f"expected names in UTF-8 in {folder}, found {name!r}; rename the file") from None
     with opening_picture(path, CAPTURED, heic=True) as image:
+        xmp = image.info.get("xmp", b"")
+        round = b"equirectangular" in xmp.lower() if isinstance(xmp, bytes) else False
         size, mode, deep = image.size, image.mode, is_deep(image.mode)
         readable, lossless = image.format in COLMAP_FORMATS and not deep, "A" in image.getbands() or deep
         exif = image.getexif()
@@ -196,6 +206,7 @@ def inspect_photo(folder: Path, name: str, mask: Mask | None) -> Photo:
         file_stamp(path) + ((*file_stamp(mask.path), mask.labels, mask.inverted) if mask else ()),
         mask,
         mode,
+        round=round or (size[0] == 2 * size[1] and size[0] >= _SMALLEST_ROUND),
     )
 
 

@@ -133,7 +133,7 @@ def _check_same(out: Path, found: RunConfig, config: RunConfig) -> None:
     if other:
         raise InputError(
             f"expected the settings that the run in {out} began with, found other settings: {few(other, MOST_DIFFERENCES)}; "
-            f"resume with the run's own flags, or choose another --out"
+            f"resume with the run's own flags; to go on with others, train into another --out with --init-from {out}"
         )
     if config.init_from is not None and _place(config.init_from) != _place(found.init_from):
         raise InputError(

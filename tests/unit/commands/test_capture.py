@@ -19,8 +19,9 @@ NOTE = {
 
 
 def test_what_was_found_and_what_to_do():
-    (line,) = summarise(NOTE)
+    line, advice = summarise(NOTE)
     assert all(fact in line for fact in ("3 of 3", "1,200", "400", "0.51 px", "global", "1:01"))
+    assert "take 30 or more" in advice and len(summarise({**NOTE, "with_pose": 12, "photographs": 12})) == 1
     few = summarise({**NOTE, "photographs": 30, "without_pose": [f"{i}.jpg" for i in range(27)], "apart": [2], "all_compared": False})
     assert "0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, 5.jpg, 6.jpg, 7.jpg" in few[1] and "19" in few[1] and "8.jpg" not in few[1]
     assert "2" in few[2] and "--matching exhaustive --overwrite" in few[3]
@@ -38,7 +39,7 @@ def test_a_capture_and_the_next_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("scene_experts.sfm.reconstruct.run_worker", fake_worker(**said))
     assert cli.main(["capture", str(write_black(tmp_path / "photos")), "--out", str(tmp_path / "box")]) == 0
     out = capsys.readouterr().out
-    assert "3 photographs" in out and f"scene-experts train scene-experts --data {tmp_path / 'box'} --out RUN" in out
+    assert "3 photographs" in out and f"scene-experts train scaffold-gs --data {tmp_path / 'box'} --out RUN" in out
 
 
 def test_unusable_input_is_told(tmp_path, capsys):

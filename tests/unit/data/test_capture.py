@@ -204,3 +204,13 @@ def test_paths_without_a_capture(made: Synthetic, tmp_path: Path) -> None:
     for part in ("images", "sparse"):
         with pytest.raises(InputError, match=naming(made.folder)):
             load(made.folder / part)
+
+
+def test_few_photographs_are_all_trained_on(made: Synthetic, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scene_experts.data.prepare.FEW", 12)
+    capture = load(made.folder)
+    assert len(capture.train) == 10 and not capture.test and capture.split == "none"
+    assert any("all of 10 photographs are trained on" in line and "--split" in line for line in capture.warnings)
+    assert load(made.folder, split="mod8").test == (0, 8)
+    monkeypatch.setattr("scene_experts.data.prepare.FEW", 10)
+    assert load(made.folder).test == (0, 8)

@@ -163,3 +163,55 @@ def test_only_known_decoders_see_photographs(tmp_path, form, monkeypatch):
     Image.new("RGB", (64, 48)).save(tmp_path / "a.png", form)
     with pytest.raises(InputError, match=r"a\.png"):
         find_photos(tmp_path)
+
+
+def said(folder):
+    lines = []
+    return find_photos(folder, say=lines.append), "\n".join(lines)
+
+
+def test_what_else_is_in_the_folder_is_told(tmp_path):
+    for i in range(3):
+        write_photo(tmp_path / "a" / f"{i}.jpg")
+        Image.new("L", (40, 30), 1).save(tmp_path / "a" / f"{i}.jpg.mask.png")
+    (tmp_path / "a" / "notes.txt").write_text("no photograph")
+    found, lines = said(tmp_path / "a")
+    assert [photo.name for photo in found] == ["0.jpg", "1.jpg", "2.jpg"] and all(photo.mask for photo in found)
+    assert "3 of 3 photographs have a mask" in lines and "every value but 0 counts" in lines
+    assert "ignored 1 file that are no photographs: notes.txt" in lines
+    there = copy_photos(found, tmp_path / "a", tmp_path / "out" / "images")
+    with Image.open(there[0].mask.path) as mask:
+        assert mask.getextrema() == (255, 255)
+
+
+@pytest.mark.parametrize("place", ["photos/masks", "masks"])
+def test_masks_in_a_folder_of_their_own_are_no_photographs(tmp_path, place):
+    for name in ("a/0.jpg", "1.jpg", "2.jpg"):
+        write_photo(tmp_path / "photos" / name)
+        path = (tmp_path / place / name).with_suffix(".png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (40, 30), 255).save(path)
+    found, lines = said(tmp_path / "photos")
+    assert [photo.name for photo in found] == ["1.jpg", "2.jpg", "a/0.jpg"] and all(photo.mask for photo in found), lines
+
+
+def test_all_unreadable_photographs_are_named_at_once(tmp_path):
+    for i in range(4):
+        write_photo(tmp_path / f"{i}.jpg")
+    for i in (1, 3):
+        (tmp_path / f"{i}.jpg").write_text("no picture")
+    with pytest.raises(InputError, match=r"2 files that cannot be read: 1\.jpg, 3\.jpg"):
+        find_photos(tmp_path)
+    write_photo(tmp_path / "3.jpg")
+    with pytest.raises(InputError, match="content that is no picture of a known format"):
+        find_photos(tmp_path)
+
+
+def test_panoramas_are_told(tmp_path):
+    for i in range(3):
+        write_photo(tmp_path / f"{i}.jpg")
+    assert "360" not in said(tmp_path)[1]
+    Image.new("RGB", (2000, 1000)).save(tmp_path / "2.jpg")
+    assert "1 photographs look like 360 degree panoramas (2.jpg)" in said(tmp_path)[1] and "v360" in said(tmp_path)[1]
+    Image.new("RGB", (100, 60)).save(tmp_path / "2.jpg", xmp=b'<x GPano:ProjectionType="equirectangular"/>')
+    assert "2.jpg" in said(tmp_path)[1]

@@ -165,6 +165,8 @@ def describe(error: BaseException) -> str:
         return "content that takes more memory than there is"
     if isinstance(error, RecursionError):
         return "content that is nested too deeply"
+    if type(error).__name__ == "UnidentifiedImageError":
+        return "content that is no picture of a known format"
     text = shorten(str(error).strip())
     if isinstance(error, Damaged):
         return text

@@ -47,13 +47,14 @@ ASSETS = files("scene_experts.files.formats") / "assets"
 MARK = b'<meta name="generator" content="scene-experts">'
 _SCENE, _SETTINGS = b'<script type="text/plain" id="scene">', b'<script type="application/json" id="settings">'
 _MOST = 60  # the unit of the scene lies within 2 to the power of this
+_HARMLESS = 0.01  # share of Gaussians whose clipped sizes nobody sees
 FLIGHT = 48  # poses of the flight, between which the page interpolates
 _FOV = 50.0  # degrees, without a camera
 Pose = dict[str, Any]
 
 
 def write(path: Path, splats: Splats, note: dict[str, Any]) -> str | None:
-    """Write the page. Returns a warning about sizes that it cannot hold, or None. Raises InputError
+    """Write the page. Returns a warning where it cannot hold the sizes of many Gaussians, or None. Raises InputError
     for invalid cameras in the note."""
     centre = splats.means.double().median(0).values if len(splats) else torch.zeros(3, dtype=torch.float64)
     splats = replace(splats, means=(splats.means.double() - centre).float())
@@ -68,7 +69,8 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> str | None:
         code=base64.b64encode(code).decode(),
     )
     write_bytes(path, page.encode())
-    return size_warning(scene)
+    clipped = float(out_of_range(scene).float().mean()) if len(scene) else 0.0
+    return size_warning(scene) if clipped > _HARMLESS else None
 
 
 def read(path: Path) -> Splats:
