@@ -11,7 +11,7 @@ import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from PIL import Image, ImageChops
 
 from scene_experts.core.reading.budget import MASK
 from scene_experts.core.reading.pictures import opening_picture
-from scene_experts.data.match import EXTENSIONS
+from scene_experts.data.match import is_picture, list_pictures
 
 FOLDERS = ("masks", "mask")
 ENDINGS = (".mask", "_mask", "-mask")  # between the name of the photograph, with or without extension, and that of the mask
@@ -73,16 +73,17 @@ def find_masks(
     found: dict[str, Mask] = {name: Mask(path) for name, path in (stated or {}).items()}
     said = set(found)
     taken, strange, twice = set[Path](), defaultdict[Path, list[str]](list), list[str]()
-    own = set(photographs.values())
+    own = set(map(str, photographs.values()))
     sure = {folder / name for folder in (*folders, *index.near) for name in FOLDERS}
     places = [place for place in sorted({*sure, *(folder / name for folder in maybe for name in FOLDERS)}) if place.is_dir()]
-    lists = [(place, True, sorted(p for p in place.rglob("*") if _is_picture(p) and p not in own)) for place in places]
-    lists += [(place, False, [p for p in sorted(place.iterdir()) if _is_picture(p) and p not in own]) for place in index.beside(places)]
+    lists = [(place, True, _without(own, place, list_pictures(place))) for place in places]
+    lists += [(place, False, _without(own, place, list_pictures(place, deep=False))) for place in index.beside(places)]
     for place, only_masks, files in lists:
-        for path, names, inverted in sorted(
-            ((path, *index.owners(place, path, only_masks)) for path in files), key=lambda one: (not one[1], one[2], len(one[0].name))
+        for file, names, inverted in sorted(
+            ((file, *index.owners(place, file, only_masks)) for file in files), key=lambda one: (not one[1], one[2], len(one[0]))
         ):
             if names:
+                path = place / file
                 taken.add(path)
                 for name in names:
                     if name in found and name not in said:
@@ -90,7 +91,7 @@ def find_masks(
                     elif name not in found:
                         found[name] = Mask(path, inverted)
             elif only_masks and place in sure:
-                strange[place].append(path.relative_to(place).as_posix())
+                strange[place].append(file)
     strange = {place: left for place, names in strange.items() if (left := index.without_others(place, names))}
     warnings = [_tell_strange(place, names, next(iter(photographs), "NAME.jpg")) for place, names in strange.items()]
     if twice:
@@ -100,7 +101,7 @@ def find_masks(
         warnings.append(f"{len(whole)} of {len(photographs)} photographs have no mask and count fully (first: {whole[0]})")
     masks, notes = decide(found)
     used = [place for place in places if any(path.is_relative_to(place) for path in taken)]
-    inside = {path for place, only_masks, files in lists if only_masks and place in used for path in files}
+    inside = {path for place, only_masks, files in lists if only_masks and place in used for path in (place / file for file in files)}
     return Found(masks, (*warnings, *notes), frozenset(taken | inside))
 
 
@@ -115,8 +116,10 @@ def _short(path: Path) -> str:
     return f"{path.parent.name}/{path.name}"
 
 
-def _is_picture(path: Path) -> bool:
-    return path.suffix.lower() in EXTENSIONS
+def _without(own: set[str], place: Path, files: list[str]) -> list[str]:
+    """Return the `files` in `place` that are not photographs."""
+    top = f"{place}{os.sep}"
+    return [file for file in files if top + file.replace("/", os.sep) not in own]
 
 
 class _Index:
@@ -144,20 +147,20 @@ class _Index:
     def without_others(self, place: Path, names: Sequence[str]) -> list[str]:
         """Return those of the masks `names` in `place` that belong to no picture at all, such as a
         photograph without a pose."""
-        others = {path.as_posix(): path for folder in self.near for path in folder.iterdir() if _is_picture(path)}
-        index = _Index(others)
-        return [name for name in names if not index.owners(place, place / name, True)[0]]
+        index = _Index({(folder / name).as_posix(): folder / name for folder in self.near for name in list_pictures(folder, deep=False)})
+        return [name for name in names if not index.owners(place, name, True)[0]]
 
-    def owners(self, place: Path, path: Path, only_masks: bool) -> tuple[list[str], bool]:
-        """Return the names of the photographs that the picture `path` in `place` is a mask of, and
+    def owners(self, place: Path, file: str, only_masks: bool) -> tuple[list[str], bool]:
+        """Return the names of the photographs that the picture `file` in `place` is a mask of, and
         whether it is inverted."""
-        key = _key(path.relative_to(place).as_posix())
+        key = _key(file)
         tries = [(key, False), *_readings(key)] if only_masks else [one for one in _readings(key) if one[0] != _stem(key)]
-        if not only_masks and path.suffix.lower() == ".png" and _stem(key) in self.near[place]:
+        if not only_masks and key.lower().endswith(".png") and _stem(key) in self.near[place]:
             return [self.near[place][_stem(key)]], False  # NAME.png, as COLMAP calls it
-        here = self.near.get(place.parent if only_masks else place, {})
+        folder = place.parent if only_masks else place
+        here, stems = self.near.get(folder, {}), self.near_stems.get(folder, {})
         for name, inverted in tries:
-            names = [here[name]] if name in here else self.near_stems[place.parent if only_masks else place].get(name, [])
+            names = [here[name]] if name in here else stems.get(name, [])
             if not names and only_masks:
                 names = self._anywhere(name) or (self._anywhere(name.partition("/")[2], name) if "/" in name else [])
             if names:
@@ -182,10 +185,11 @@ def _readings(key: str) -> list[tuple[str, bool]]:
     """Return what a mask's path may say about the path of its photograph, and whether it is
     inverted: the path without extension, and without the words that make it a mask."""
     folder, slash, name = _stem(key).rpartition("/")
-    out = [(name, False)]
+    out, lower = [(name, False)], name.lower()
+    if "mask" not in lower:
+        return [(folder + slash + name, False)]
     for prefix in ("", *PREFIXES):
         for ending in ("", *ENDINGS):
-            lower = name.lower()
             if (prefix or ending) and lower.startswith(prefix) and lower.endswith(ending) and len(name) > len(prefix + ending):
                 out.append((name[len(prefix) : len(name) - len(ending)], prefix == INVERTED))
     return [(folder + slash + rest, inverted) for rest, inverted in out]
@@ -201,12 +205,12 @@ def _nearest(owners: Sequence[tuple[int, str]]) -> list[str]:
 
 
 def _key(name: str) -> str:
-    return unicodedata.normalize("NFC", name)
+    return name if name.isascii() else unicodedata.normalize("NFC", name)
 
 
 def _stem(name: str) -> str:
     """Return a path without the extension of a picture."""
-    return str(PurePosixPath(name).with_suffix("")) if os.path.splitext(name)[1].lower() in EXTENSIONS else name
+    return name[: name.rfind(".")] if is_picture(name) else name
 
 
 def decide(masks: Mapping[str, Mask]) -> tuple[dict[str, Mask], list[str]]:

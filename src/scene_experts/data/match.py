@@ -3,6 +3,7 @@ never by sorted position."""
 
 from __future__ import annotations
 
+import os
 import unicodedata
 from collections import defaultdict
 from collections.abc import Sequence
@@ -42,32 +43,35 @@ def match_images(folder: Path, names: Sequence[str]) -> Match:
     the only file anywhere in `folder` with that base name. The last two require that no other name
     shares the stem or base name. `warnings` reports every match that is not exact.
     """
-    files = [path for path in folder.rglob("*") if path.suffix.lower() in EXTENSIONS] if folder.is_dir() else []
+    there = list_pictures(folder)
+    exact = set(there)
     by_name, by_stem, by_base = defaultdict(list), defaultdict(list), defaultdict(list)
-    for path in sorted(files):
-        name = _compose(path.relative_to(folder).as_posix())
-        by_name[name].append(path)
-        by_stem[PurePosixPath(name).with_suffix("").as_posix()].append(path)
-        by_base[PurePosixPath(name).stem].append(path)
+    for file in there:
+        name = _compose(file)
+        stem = _stem(name)
+        by_name[name].append(file)
+        by_stem[stem].append(file)
+        by_base[stem.rpartition("/")[2]].append(file)
     stems, bases = defaultdict(int), defaultdict(int)
-    for name in map(_compose, names):
-        stems[PurePosixPath(name).with_suffix("").as_posix()] += 1
-        bases[PurePosixPath(name).stem] += 1
+    for stem in map(_stem, map(_compose, names)):
+        stems[stem] += 1
+        bases[stem.rpartition("/")[2]] += 1
     found, absent, other, moved = {}, [], [], []
     for name in names:
         composed = _compose(name)
-        stem, base = PurePosixPath(composed).with_suffix("").as_posix(), PurePosixPath(composed).stem
+        stem = _stem(composed)
+        base = stem.rpartition("/")[2]
         same_stem, same_base = by_stem[stem], by_base[base]
-        if (folder / name).is_file():
+        if name in exact or (folder / name).is_file():
             found[name] = folder / name
         elif len(by_name[composed]) == 1:
-            found[name] = by_name[composed][0]
+            found[name] = folder / by_name[composed][0]
         elif len(same_stem) == 1 and stems[stem] == 1:
-            found[name] = same_stem[0]
-            other.append(f"{name} -> {same_stem[0].name}")
+            found[name] = folder / same_stem[0]
+            other.append(f"{name} -> {same_stem[0].rpartition('/')[2]}")
         elif not same_stem and len(same_base) == 1 and bases[base] == 1:
-            found[name] = same_base[0]
-            moved.append(f"{name} -> {same_base[0].relative_to(folder).as_posix()}")
+            found[name] = folder / same_base[0]
+            moved.append(f"{name} -> {same_base[0]}")
         else:
             absent.append(name)
     notes = []
@@ -76,6 +80,29 @@ def match_images(folder: Path, names: Sequence[str]) -> Match:
     if moved:
         notes.append(f"{len(moved)} images are in another folder than named (first: {moved[0]})")
     return Match(found, tuple(absent), tuple(notes))
+
+
+def list_pictures(folder: Path, deep: bool = True) -> list[str]:
+    """Return the paths of the pictures in `folder`, and if `deep` in its subfolders, relative to it
+    with "/" between folders, sorted; empty if there is no such folder."""
+    top, out = str(folder), []
+    for place, folders, files in os.walk(top):
+        inner = place[len(top) :].replace(os.sep, "/").strip("/")
+        out += [f"{inner}/{name}" if inner else name for name in files if is_picture(name)]
+        if not deep:
+            folders.clear()
+    return sorted(out)
+
+
+def is_picture(name: str) -> bool:
+    """Return whether a file is a picture by its name."""
+    return name[name.rfind(".") :].lower() in EXTENSIONS
+
+
+def _stem(name: str) -> str:
+    """Return a relative path without its last extension."""
+    dot = name.rfind(".")
+    return name[:dot] if dot > name.rfind("/") + 1 else name
 
 
 def find_file(root: Path, name: str) -> Path | None:
