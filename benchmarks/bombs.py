@@ -173,7 +173,7 @@ def read_photograph(path: Path) -> Any:
     from scene_experts.data.images import FrameSource, decode, probe
     from scene_experts.data.lens import Lens
 
-    (width, height), _ = probe(path)
+    width, height = probe(path).size
     return decode(FrameSource(path, Lens("PINHOLE", width, height, (9.0, 9.0, 4.0, 4.0)), (160, 160)))
 
 

@@ -21,7 +21,7 @@ from support.synthetic import make_capture
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> Path:
-    return make_capture(tmp_path_factory.mktemp("capture"), views=9, size=(48, 32), points=300).folder
+    return make_capture(tmp_path_factory.mktemp("capture"), views=12, size=(48, 32), points=300).folder
 
 
 def arguments(capture: Path, out: Path, *more: object) -> list[str]:

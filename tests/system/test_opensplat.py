@@ -23,7 +23,7 @@ shutil.copy("{ply}", sys.argv[sys.argv.index("-o") + 1])
 
 @pytest.mark.slow
 def test_the_race(tmp_path):
-    capture = make_capture(tmp_path / "capture", views=8, size=(48, 32), points=200)
+    capture = make_capture(tmp_path / "capture", views=12, size=(48, 32), points=200)
     run = tmp_path / "3dgs"
     assert cli.main(["train", "3dgs", "--data", str(capture.folder), "--out", str(run), "--iterations", "10", "--device", "cpu"]) == 0
     assert cli.main(["export", str(run), "--format", "ply", "--out", str(tmp_path / "scene.ply")]) == 0

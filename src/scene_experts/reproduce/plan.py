@@ -8,6 +8,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any
 from scene_experts.core.errors import InputError
 from scene_experts.core.fields import flag_of
 from scene_experts.core.plain import from_json, lean, to_json
+from scene_experts.data import capture as captures_
 from scene_experts.data.fetch import catalog
 from scene_experts.data.fetch.obtain import is_present
 from scene_experts.data.images import check_policy
@@ -189,7 +191,19 @@ def find_own_scenes(captures: Sequence[Path]) -> list[CaptureSpec]:
             raise InputError(f"expected a capture folder at {scene.path}, found none; correct --captures")
         if sum(other.name == scene.name for other in scenes) > 1:
             raise InputError(f"expected captures with different names, found several called '{scene.name}'; rename one of them")
-    return scenes
+    return [replace(scene, options=held_out(scene.path)) for scene in scenes]
+
+
+def held_out(path: Path) -> dict[str, Any]:
+    """Return the options of a capture's reading: those that hold views out for the scores where few
+    photographs would all be trained on."""
+    if not is_capture(path):
+        return {}  # `check_folders` says so
+    with suppress(InputError):  # the runs say what is wrong
+        capture = captures_.load(Data(path), allow_no_points=True)
+        capture.images.close()
+        return {"split": "mod8"} if capture.split == "none" else {}
+    return {}
 
 
 def check_folders(scenes: Sequence[CaptureSpec]) -> None:

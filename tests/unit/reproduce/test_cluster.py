@@ -130,7 +130,7 @@ def training_of(folder: Path) -> int | None:
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the worker of a training is found in /proc")
 def test_runs_with_a_worker_killed_half_way_equal_local_ones(tmp_path):
-    specs = specs_of(make_capture(tmp_path / "box", views=9, size=(48, 32), points=300).folder)
+    specs = specs_of(make_capture(tmp_path / "box", views=12, size=(48, 32), points=300).folder)
     said, killed = [], []
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "host": "127.0.0.1", "silence_logs": 50}
     with distributed.LocalCluster(**options, local_directory=str(tmp_path / "dask")) as workers:

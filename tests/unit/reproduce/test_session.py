@@ -13,7 +13,7 @@ pytest.importorskip("matplotlib")
 
 @pytest.mark.slow
 def test_runs_tables_and_figures_and_nothing_twice(tmp_path, capsys):
-    capture = make_capture(tmp_path / "box", views=9, size=(48, 32), points=300).folder
+    capture = make_capture(tmp_path / "box", views=12, size=(48, 32), points=300).folder
     args = [
         "--captures",
         str(capture),

@@ -61,6 +61,7 @@ NAMED = {
     "bench/step.py",
     "commands/train.py",
     "commands/blocks.py",
+    "commands/next_step.py",
 }
 
 
