@@ -131,6 +131,7 @@ class Capture:
     states_split: bool = False  # the files divide the views into training and test views, even if no test view is left
     bounds: tuple[Vector, Vector] | None = None  # lower and upper corner of the scene in the capture's own frame; None: unknown
 
+    omitted: tuple[str, ...] = ()  # names of the photographs that --leave-out leaves out; they have no views
     left_out: tuple[int, ...] = ()  # indices of training views that --views leaves out; they still identify the capture
 
     @property
