@@ -214,6 +214,7 @@ def load_capture(
     images: str | None = None,
     resolution: str = "auto",
     split: str = "auto",
+    leave_out: Sequence[str] = (),
     missing: Literal["error", "drop"] = "error",
     normalise: Literal["extent", "none"] | None = None,
     init: Literal["points", "random"] = "points",
@@ -237,6 +238,8 @@ def load_capture(
             folder images_N), or "auto": the paper's for a scene of the catalog, else cap1600.
         split: Which views are held out: "mod8" (every 8th), "modN", "first:N", "none", "files" (as
             the files of the capture state), or "auto": "files" if they state it, else "mod8".
+        leave_out: Names of photographs that are neither trained on nor held out, for example
+            ["DSC_0423.JPG"]. Folder and extension may be omitted where a name stays unambiguous.
         missing: "drop" leaves out views without a photograph instead of raising InputError.
         normalise: "extent" trains in a world that is scaled to a camera extent of 5, "none" in the
             capture's own unit. Default: "none" for a scene of the catalog, else "extent".

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from typing import Any, TypeVar
 
@@ -58,6 +58,10 @@ def _of_type(kind: Any, name: str, value: Any) -> Any:
         return None
     if typing.get_origin(inner[0]) is tuple:
         wanted = typing.get_args(inner[0])
+        if wanted[1:] == (Ellipsis,):
+            if isinstance(value, str) or not isinstance(value, Sequence):
+                raise InputError(f"expected {name} as a list, found {value!r}; write it in brackets")
+            return tuple(_of_type(wanted[0], name, part) for part in value)
         if not isinstance(value, (tuple, list, np.ndarray)) or len(value) != len(wanted):
             raise InputError(f"expected {name} as {len(wanted)} numbers, found {value!r}; correct it")
         return tuple(_of_type(each, name, part) for each, part in zip(wanted, value))

@@ -21,7 +21,7 @@ from scene_experts.data.colour import find_white
 from scene_experts.data.images import FrameSource, check_policy, probe
 from scene_experts.data.lens import centre_principal_point, to_pinhole
 from scene_experts.data.masks import find_masks
-from scene_experts.data.match import to_relative_name
+from scene_experts.data.match import NameIndex, to_relative_name
 from scene_experts.data.orientation import fit_lenses
 from scene_experts.data.points import check_frame, read_points
 from scene_experts.data.readers import RawCapture, ReadOptions, choose_reader, tell_others, unrecognised_error
@@ -113,7 +113,31 @@ def _read(data: Data, policy: str, cache_bytes: int | None) -> tuple[RawCapture,
     raw = replace(raw, warnings=warnings)
     if data.split in ("auto", "files"):
         raw = apply_lists(root, raw)
-    return raw, _assemble(root, reader.name, raw, data.ignore_principal_point, background, cache_bytes)
+    raw, omitted = _leave_out(root, raw, data.leave_out)
+    capture = _assemble(root, reader.name, raw, data.ignore_principal_point, background, cache_bytes)
+    return raw, replace(capture, omitted=omitted)
+
+
+def _leave_out(root: Path, raw: RawCapture, written: tuple[str, ...]) -> tuple[RawCapture, tuple[str, ...]]:
+    """Return the capture without the photographs that are `written` after --leave-out, and their
+    full names. Raises InputError for an unknown or ambiguous name, and if no photograph is left."""
+    if not written:
+        return raw, ()
+    names = [to_relative_name(image.name) for image in raw.images]
+    index, omitted = NameIndex(names), set()
+    for word in written:
+        found = sorted(index.find(word))
+        if not found:
+            hint = nearest(word, dict.fromkeys(key for name in sorted(names) for key in (name, Path(name).name, Path(name).stem)))
+            hint = hint or f"; they are {few(sorted(names))}"
+            raise InputError(f"expected names of photographs of {root} after --leave-out, found {word!r}{hint}")
+        if len(found) > 1:
+            raise InputError(f"expected one photograph for --leave-out {word}, found {len(found)} ({few(found)}); write its folder too")
+        omitted.add(found[0])
+    kept = [image for image, name in zip(raw.images, names) if name not in omitted]
+    if not kept:
+        raise InputError(f"expected photographs of {root} beside those of --leave-out, found none; leave out fewer")
+    return replace(raw, images=kept), tuple(sorted(omitted))
 
 
 def _find_image_folder(root: Path, images: str | None, policy: str) -> str | None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import unicodedata
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -105,6 +105,37 @@ def _stem(name: str) -> str:
     return name[:dot] if dot > name.rfind("/") + 1 else name
 
 
+class NameIndex:
+    """Finds names of photographs as people and other programs write them."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._exact: dict[str, str] = {}
+        self._keys: dict[str, set[str]] = defaultdict(set)
+        for name in names:
+            pure = PurePosixPath(_plain(name))
+            self._exact[str(pure)] = name
+            for key in {str(pure), str(pure.with_suffix("")), pure.name, pure.stem}:
+                self._keys[key].add(name)
+
+    def find(self, written: str) -> set[str]:
+        """Return the names that `written` may stand for: by path, by a path without its first
+        folder or with another or no extension, or by a base name.
+
+        The set has one name if `written` is unambiguous, and none if it is unknown.
+        """
+        pure = PurePosixPath(_plain(written))
+        if str(pure) in self._exact:
+            return {self._exact[str(pure)]}
+        bare = pure.with_suffix("") if pure.suffix.lower() in EXTENSIONS else pure
+        tries = [str(each) for path in (pure, bare) for each in (path, PurePosixPath(*path.parts[1:]), path.name)]
+        groups = [self._keys[key] for key in tries if key in self._keys]
+        return next((group for group in groups if len(group) == 1), groups[0] if groups else set())
+
+
+def _plain(name: str) -> str:
+    return _compose(name.strip().replace("\\", "/").removeprefix("./"))
+
+
 def find_file(root: Path, name: str) -> Path | None:
     """Return the file `name` in `root`, or None. A name beyond ASCII may be written in another form
     of Unicode on the disk."""
@@ -132,5 +163,5 @@ def absent_error(folder: Path, names: Sequence[str], absent: Sequence[str]) -> I
     """Return the error for images that are absent."""
     return InputError(
         f"expected {len(names)} images in {folder}, but {len(absent)} are absent (first: {absent[0]}); copy them there, name their folder "
-        f"with --images, or train without them with --missing drop"
+        f"with --images, or train without them with --missing drop (--leave-out NAME leaves out photographs that are there)"
     )

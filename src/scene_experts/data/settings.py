@@ -30,6 +30,9 @@ class Data:
     """Which views are held out: mod8 (every 8th), mod:N (every Nth), fold:K/N (every Nth from the
     Kth), first:N, none, files (as the capture's files say, or a test.txt or test_list.txt
     beside them) or auto (files if they say it, none with fewer than 12 views, else mod8)."""
+    leave_out: Annotated[tuple[str, ...], Option(value="NAME")] = ()
+    """Leave out these photographs: neither train on them nor hold them out. Their folder and
+    extension may be omitted where the name stays unambiguous."""
     missing: Literal["error", "drop"] = "error"
     """What to do if the photograph of a view is missing: stop, or drop the view."""
     normalise: Literal["extent", "none"] = "extent"

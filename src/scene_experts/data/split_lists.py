@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import os
-import unicodedata
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from scene_experts.core.reading.budget import LIST
 from scene_experts.core.reading.plain import decode_text
 from scene_experts.core.reading.source import opening
-from scene_experts.data.match import EXTENSIONS
+from scene_experts.data.match import NameIndex
 from scene_experts.data.readers.reader import RawCapture
 
 _TEST = ("test.txt", "test_list.txt")
@@ -62,29 +60,17 @@ def _find(folders: Sequence[Path], names: Sequence[str]) -> Path | None:
 def _read(path: Path, names: Sequence[str], warnings: list[str]) -> set[str]:
     """Return the photographs that the lines of a list name: by path, by a path without its first
     folder or with another extension, or by a base name, if only one photograph has it."""
-    exact = {_plain(name): {name} for name in names}
-    keys: dict[str, set[str]] = defaultdict(set)
-    for name in names:
-        pure = PurePosixPath(_plain(name))
-        for key in {str(pure), str(pure.with_suffix("")), pure.name, pure.stem}:
-            keys[key].add(name)
+    index = NameIndex(names)
     with opening(path, LIST) as source:
-        lines = [_plain(line) for line in decode_text(source.read()).splitlines()]
+        lines = [line.strip() for line in decode_text(source.read()).splitlines()]
         lines = [line for line in lines if line and not line.startswith("#")]
         source.spend_items(len(lines))
     out: set[str] = set()
     unknown: list[str] = []
     for line in lines:
-        pure = PurePosixPath(line)
-        bare = pure.with_suffix("") if pure.suffix.lower() in EXTENSIONS else pure
-        tries = [str(each) for path in (pure, bare) for each in (path, PurePosixPath(*path.parts[1:]), path.name)]
-        found = exact.get(line) or next((keys[key] for key in tries if len(keys.get(key, ())) == 1), set())
-        out |= found
-        unknown += [] if found else [line]
+        found = index.find(line)
+        out |= found if len(found) == 1 else set()
+        unknown += [] if len(found) == 1 else [line]
     if unknown:
         warnings.append(f"{len(unknown)} of {len(lines)} names in {path.name} are of no photograph (first: {unknown[0]})")
     return out
-
-
-def _plain(name: str) -> str:
-    return unicodedata.normalize("NFC", name.strip().replace("\\", "/").removeprefix("./"))

@@ -32,6 +32,7 @@ PROTOCOL = {  # what must agree before scores may be compared: key in results.js
     "capture": ("capture", "data"),
     "resolution": ("resolution", "resolution"),
     "split": ("split", "split"),
+    "left_out": ("photographs left out", "leave_out"),
     "views": ("views", "views"),
     "view_count": ("number of views", "max_views"),
     "mean_pixels": ("picture size", "resolution"),  # after the views: those of another split may have other sizes
@@ -39,7 +40,7 @@ PROTOCOL = {  # what must agree before scores may be compared: key in results.js
     "masked": ("use of masks", "data"),
     "background": ("background of transparent photographs", "background"),
 }
-DEFAULTS = {"appearance": "rule"}  # the meaning of a results file without the key
+DEFAULTS = {"appearance": "rule", "left_out": []}  # the meaning of a results file without the key
 MAY_LACK = ("background",)  # a results file without one of these agrees with every other
 
 
@@ -116,6 +117,7 @@ def describe_views(capture: Capture, cameras: Sequence[Camera], options: EvalOpt
         **({"appearance": "half"} if options.appearance == "half" else {}),
         "view_count": len(cameras),
         "split": capture.split,
+        **({"left_out": list(capture.omitted)} if capture.omitted else {}),
         "resolution": capture.resolution,
         "mean_pixels": round(sum(c.width * c.height for c in cameras) / len(cameras)),
         **({} if capture.alpha_over is None else {"background": list(capture.alpha_over)}),

@@ -48,6 +48,15 @@ def test_photographs_are_the_files(folder, capture):
             capture.photo(wrong)
 
 
+def test_photographs_are_left_out_by_name(folder, capture):
+    left = se.load_capture(folder, leave_out=["view_002", "view_000.png"])
+    assert left.names == [name for name in capture.names if name not in ("view_000.png", "view_002.png")]
+    assert left.data.leave_out == ("view_002", "view_000.png")
+    for wrong in ("view_002", [2], {"view_002"}):
+        with pytest.raises(se.InputError, match="leave_out"):
+            se.load_capture(folder, leave_out=wrong)
+
+
 def test_masks_are_between_0_and_1(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "masked")
     name = "view_001"

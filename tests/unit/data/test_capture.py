@@ -160,6 +160,35 @@ def test_fewer_views(made: Synthetic) -> None:
     assert [v.name for v in capture.views] == [f"view_{i:03d}.png" for i in (0, 2, 5, 7)] and capture.test == (0,)
 
 
+def test_photographs_left_out_by_name_are_in_no_part(made: Synthetic, copy: Path) -> None:
+    whole = load(made.folder)
+    (copy / "images" / "view_003.png").write_bytes(b"no picture")  # it need not even be readable
+    capture = load(copy, leave_out=("view_003", "images/view_000.png"))
+    left = [name for name in sorted(made.images) if name not in ("view_000.png", "view_003.png")]
+    assert [view.name for view in capture.views] == left and capture.omitted == ("view_000.png", "view_003.png")
+    assert sorted(capture.train + capture.test) == list(range(8)) and capture.test == (0,)  # the split is that of the others
+    assert capture.views[0].name == "view_001.png" and capture.fingerprint() != whole.fingerprint()
+    with pytest.raises(InputError, match=naming("--leave-out", "view_01", "view_001")):
+        load(made.folder, leave_out=("view_01",))
+    with pytest.raises(InputError, match=naming("DSC_0423.JPG", "view_000.png, view_001.png, view_002.png and 7 more")):
+        load(made.folder, leave_out=("DSC_0423.JPG",))
+    with pytest.raises(InputError, match=naming("--leave-out", "none")):
+        load(made.folder, leave_out=tuple(made.images))
+
+
+def test_a_name_of_two_photographs_is_refused(copy: Path) -> None:
+    model = read_model(copy / "sparse" / "0")
+    first, second, *others = model.images
+    for folder, image in (("a", first), ("b", second)):
+        (copy / "images" / folder).mkdir()
+        shutil.move(copy / "images" / image.name, copy / "images" / folder / "one.png")
+    images = (replace(first, name="a/one.png"), replace(second, name="b/one.png"), *others)
+    write_model(copy / "sparse" / "0", replace(model, images=images))
+    assert load(copy, leave_out=("b/one",)).omitted == ("b/one.png",)
+    with pytest.raises(InputError, match=naming("a/one.png, b/one.png", "folder")):
+        load(copy, leave_out=("one",))
+
+
 def test_images_of_another_shape(copy: Path) -> None:
     Image.new("RGB", (48, 48)).save(copy / "images/view_000.png")
     with pytest.raises(InputError, match=r"view_000\.png.*48x32"):

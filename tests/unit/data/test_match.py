@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scene_experts.data.match import absent_error, find_file, match_images, to_relative_name
+from scene_experts.data.match import NameIndex, absent_error, find_file, match_images, to_relative_name
 
 
 def touch(root: Path, *names: str) -> None:
@@ -76,6 +76,17 @@ def test_flattened_folders_when_base_names_are_unique(tmp_path: Path) -> None:
     match = match_images(tmp_path, ["images/a.jpg", "x/b.jpg", "y/b.jpg"])
     assert match.found == {"images/a.jpg": tmp_path / "a.jpg"} and match.absent == ("x/b.jpg", "y/b.jpg")
     assert "another folder" in match.warnings[0]
+
+
+def test_names_as_people_write_them() -> None:
+    index = NameIndex(["a/one.JPG", "b/one.JPG", "two.jpg", "two.png", "c/caf\u00e9.jpg"])
+    for written in ("a/one.JPG", "a/one", "a\\one.jpg", "./a/one.png", "photos/a/one.JPG"):
+        assert index.find(written) == {"a/one.JPG"}, written
+    assert index.find("cafe\u0301") == {"c/caf\u00e9.jpg"}
+    assert index.find("two.png") == {"two.png"}
+    assert index.find("one") == index.find("one.JPG") == {"a/one.JPG", "b/one.JPG"}
+    assert index.find("two") == {"two.jpg", "two.png"}
+    assert index.find("three") == index.find("") == set()
 
 
 def test_an_absent_image_is_reported(tmp_path: Path) -> None:

@@ -64,6 +64,13 @@ def test_the_first_difference_in_the_protocol_is_named():
     )
 
 
+def test_runs_without_the_same_photographs_are_not_compared():
+    one = {"capture": "fox"}
+    check_protocol(["a", "b"], [one, {**one, "left_out": []}])
+    with pytest.raises(InputError, match=naming("photographs left out", "b.png", "--leave-out")):
+        check_protocol(["a", "b"], [one, {**one, "left_out": ["b.png"]}])
+
+
 def test_photographs_over_other_backgrounds_are_not_compared():
     old = {"split": "mod8"}
     white, black = ({**old, "background": [value] * 3} for value in (1.0, 0.0))

@@ -85,7 +85,7 @@ COLMAP = Budget("COLMAP file", 32 * GIB, advice="copy it again", other="export t
 LIST = Budget("list of photographs", 64 * MIB)
 POSES = Budget("file of poses", 1 * GIB, items=20_000_000, advice="export it again")
 POINTS = Budget("PLY file of points", 16 * GIB, items=4_096, advice="copy it again", other="export the points again")
-PHOTOGRAPH = Budget("image", 2 * GIB, floor=192 * MIB, ratio=40, advice="replace it or remove it from the capture")
+PHOTOGRAPH = Budget("image", 2 * GIB, floor=192 * MIB, ratio=40, advice="replace it, or leave it out with --leave-out")
 CAPTURED = Budget("photograph or mask", 2 * GIB, floor=512 * MIB, ratio=40, advice="replace or remove it")  # before a reconstruction
 MASK = Budget("mask", 1 * GIB, floor=512 * MIB, ratio=40, advice="replace or remove it")
 PICTURE = Budget("picture", 1 * GIB, floor=160 * MIB, ratio=40, advice="evaluate the run again")
