@@ -23,6 +23,7 @@ from scene_experts.core import types
 from scene_experts.core.errors import InputError, expect_among, expect_words
 from scene_experts.evaluate.command import about
 from scene_experts.evaluate.options import EvalOptions
+from scene_experts.evaluate.photographs import score_training_views
 from scene_experts.evaluate.pictures import to_8bit
 from scene_experts.evaluate.score import evaluate
 from scene_experts.files import export as exporting
@@ -249,6 +250,8 @@ class Run:
         options = EvalOptions(views, appearance, lpips, None if lpips_weights is None else Path(lpips_weights), download_lpips)
         with self._folder() as folder:
             details = evaluate(self.scene, self.capture.loaded, self._rasterize, folder, options, step=self.step, about=about(self._now()))
+            if not options.suffix:  # the report lists all photographs
+                score_training_views(self.scene, self.capture.loaded, self._rasterize, folder, self.step)
             per_view = run_folder.read_json(folder / f"per_view{options.suffix}.json", "scores by view")
         return Scores(details["psnr"], details["ssim"], details["lpips"], per_view, details)  # type: ignore[arg-type]
 

@@ -18,7 +18,8 @@ from scene_experts.evaluate.options import EvalOptions
 class EvalCommand:
     """Render the held-out views of a run, save them as 8-bit pictures and score these.
 
-    Writes RUN/results.json, RUN/per_view.json, the pictures in RUN/test and RUN/report.html.
+    Writes RUN/results.json, RUN/per_view.json, RUN/training_views.json, the pictures in RUN/test and
+    RUN/training_views, and RUN/report.html.
     """
 
     run: Annotated[Path, Option(value="RUN")]
@@ -42,6 +43,7 @@ def evaluate(args: list[str]) -> int:
     from scene_experts.api.backend import backend, device_of
     from scene_experts.core.group import join
     from scene_experts.evaluate.command import evaluate_run
+    from scene_experts.evaluate.photographs import describe_outliers, read_photographs
     from scene_experts.evaluate.tables import print_results
     from scene_experts.report import page
 
@@ -52,7 +54,10 @@ def evaluate(args: list[str]) -> int:
     if not group.first:
         return 0
     print_results(results, Console(markup=False, highlight=False), command.run)
-    if results["views"] == "test" and not command.options.suffix:  # the page shows the held-out views
+    if not command.options.suffix:  # the page shows the held-out views, and all photographs
+        for line in describe_outliers(read_photographs(command.run)):
+            print(f"warning: {line}")
+    if results["views"] == "test" and not command.options.suffix:
         print(f"wrote {page.write([command.run])}, with the pictures and what each score means")
     if command.options == EvalOptions():
         place = str(command.run / "scene.html")

@@ -140,6 +140,18 @@ def downscale(capture: Capture, policy: str) -> Capture:
     return replace(capture, views=tuple(views), images=ImageStore(sources, capture.images.cache_bytes), resolution=policy)
 
 
+def limit_size(capture: Capture, longest: int, cache_bytes: int) -> Capture:
+    """Resize the views whose longer side exceeds `longest` px. The frames have a cache of their
+    own, of at most `cache_bytes`."""
+    views, sources = [], []
+    for view, source in zip(capture.views, capture.images.sources):
+        size = target_size(f"longest:{longest}", source.size)
+        sources.append(replace(source, size=size))
+        views.append(replace(view, camera=_resize_camera(view.camera, size)))
+    store = ImageStore(sources, min(cache_bytes, capture.images.cache_bytes))
+    return replace(capture, views=tuple(views), images=store)
+
+
 def _resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:
     ratio = torch.tensor([[size[0] / camera.width], [size[1] / camera.height], [1.0]], dtype=torch.float64)
     return replace(camera, K=(camera.K.double() * ratio).to(camera.K.dtype), width=size[0], height=size[1])

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from scene_experts.core.group import Alone
 from scene_experts.evaluate.options import EvalOptions
+from scene_experts.evaluate.photographs import score_training_views
 from scene_experts.evaluate.results import About
 from scene_experts.evaluate.score import evaluate
 from scene_experts.render import Rasterizer, as_trained
@@ -52,7 +53,10 @@ def evaluate_run(
     facts: dict[str, Any] = {"step": opened.step, "about": about(opened), "group": group}
     try:
         with ProgressBar(Console(stderr=True, markup=False, quiet=not group.first)) as tell:
-            return evaluate(opened.scene, capture, rasterize, run, options, **facts, progress=tell)
+            found = evaluate(opened.scene, capture, rasterize, run, options, **facts, progress=tell)
+            if not options.suffix:  # the report lists all photographs
+                score_training_views(opened.scene, capture, rasterize, run, opened.step, tell, group)
+            return found
     finally:
         capture.images.close()
 

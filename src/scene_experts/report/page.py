@@ -17,10 +17,12 @@ from scene_experts.core.io import write_bytes
 from scene_experts.core.plain import to_json
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding, inside
+from scene_experts.evaluate.photographs import WORST
 from scene_experts.evaluate.results import describe_failed, find_difference, find_failed, find_outdated
 from scene_experts.evaluate.tables import ResultTable, explain, make_table
 from scene_experts.report import chart
 from scene_experts.report.chart import Line
+from scene_experts.report.photographs import list_photographs
 from scene_experts.report.source import ShownRun, group_by_capture, read_run, tell_apart
 from scene_experts.report.views import encode_picture, show_captures
 
@@ -81,6 +83,11 @@ def build_page(sources: Sequence[ShownRun]) -> str:
         show_experts(sources),
         "<h2>Scores by view</h2>",
         *((f"<h3>{escape(capture)}</h3>" if len(groups) > 1 else "") + format_scores(group) for capture, group in groups.items()),
+        "<h2>Photographs</h2>",
+        *(
+            (f"<p><b>{escape(s.name)}</b></p>" if len(sources) > 1 else "") + list_photographs(s, WORST // min(len(sources), 4))
+            for s in sources
+        ),
         "<h2>Command and configuration</h2>",
         *(show_command(s) for s in sources),
         f"<script>const pictures = {json.dumps(pictures)};</script>",

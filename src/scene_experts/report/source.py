@@ -13,6 +13,7 @@ from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.plain import read_json_lines
 from scene_experts.core.reading.source import guarding, inside
 from scene_experts.data.views import same_poses
+from scene_experts.evaluate.photographs import Photograph, read_photographs
 from scene_experts.evaluate.results import load_results
 from scene_experts.evaluate.tables import distinguish_runs
 from scene_experts.training import run_folder
@@ -30,6 +31,7 @@ class ShownRun:
     results: dict[str, Any]
     per_view: dict[str, dict[str, Any]]
     metrics: list[dict[str, Any]]
+    photographs: list[Photograph]
 
 
 def read_run(run: Path) -> ShownRun:
@@ -43,7 +45,7 @@ def read_run(run: Path) -> ShownRun:
     with guarding(path, RUN, "file of scores by view"):
         for facts in per_view.values():
             inside(run / "test" / "gt", facts["file"])
-    return ShownRun(config.train.recipe, run, config, results, per_view, read_metrics(run / "metrics.jsonl"))
+    return ShownRun(config.train.recipe, run, config, results, per_view, read_metrics(run / "metrics.jsonl"), read_photographs(run))
 
 
 def tell_apart(sources: list[ShownRun]) -> list[ShownRun]:

@@ -176,10 +176,10 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False,
         (out / "metrics.jsonl").unlink(missing_ok=True)  # a run with --init-from keeps the lines up to its start
     if overwrite:
         results = [out / f"{name}{suffix}.json" for name in ("results", "per_view") for suffix in ("", "_train", "_half")]
-        others = [*exported, out / "report.html", out / "config.json"]
+        others = [*exported, out / "training_views.json", out / "report.html", out / "config.json"]
         for old in [*(out / "checkpoints").glob("ckpt_*.safetensors"), *(out / "previews").glob("*.png"), *results, *others]:
             old.unlink(missing_ok=True)
-        for scored in (out / f"{views}{half}" for views in ("test", "train") for half in ("", "_half")):
+        for scored in (out / name for name in ("test", "train", "test_half", "train_half", "training_views")):
             for pictures in PICTURES:  # and nothing else that may lie there
                 shutil.rmtree(scored / pictures, ignore_errors=True)
         for sidecar in (out / "point_cloud").glob("iteration_*/scene.json"):  # a later iteration's would be taken for the new run's
