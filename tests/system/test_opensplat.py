@@ -16,7 +16,7 @@ from scene_experts.data.capture import load
 from scene_experts.data.settings import Data
 assert sys.argv[2:4] == ["-n", "20"] and "--keep-crs" in sys.argv
 capture = load(Data(Path(sys.argv[1]), split="none"))
-assert len(capture.views) == 7 and all(max(v.camera.width, v.camera.height) <= 32 for v in capture.views)
+assert len(capture.views) == 10 and all(max(v.camera.width, v.camera.height) <= 32 for v in capture.views)
 shutil.copy("{ply}", sys.argv[sys.argv.index("-o") + 1])
 """
 
