@@ -39,5 +39,5 @@ def test_the_race(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
-    assert lines[0].startswith("7 training views") and lines[2].startswith("moe-gs, 20") and lines[3].startswith("OpenSplat, 20")
+    assert lines[0].startswith("10 training views") and lines[2].startswith("moe-gs, 20") and lines[3].startswith("OpenSplat, 20")
     assert all(float(line.split()[-2]) > 5 for line in lines[2:])

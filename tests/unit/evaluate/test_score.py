@@ -47,6 +47,7 @@ class FakeCapture:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     alpha_over: tuple[float, float, float] | None = None
     points: Any = None
+    omitted: tuple[str, ...] = ()
 
     @property
     def images(self) -> Any:
