@@ -13,7 +13,7 @@ LONGEST = 360  # px; the pictures of the list are at most this large
 ABOUT = (
     "Every photograph of the run; those that lie furthest below the median of their part of the split come first, because held-out views "
     "always score lower than training views. Training views are drawn at a reduced size. Photographs that fit far worse than the others "
-    "are marked: one that is blurred, has another exposure or shows a finger can be left out of a new training with --leave-out NAME."
+    "are marked: one with another exposure, a finger or a wrong pose can be left out of a new training with --leave-out NAME."
 )
 
 
