@@ -34,6 +34,7 @@ from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
 from scene_experts.data.settings import Data
+from scene_experts.data.views import Vector
 from scene_experts.scene import Scene
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.training import capture_place
@@ -42,6 +43,22 @@ from scene_experts.training.config import RunConfig
 
 FORMAT = 1
 PICTURES = ("renders", "gt", "errors", "side_by_side", "masks", "experts")  # folders with the images of an evaluation
+
+
+@dataclass(frozen=True)
+class Lone:
+    """What a scene has that was opened from a file and not from a run folder."""
+
+    source: Path
+    """What was read: a file, or an iteration's folder of a result folder."""
+    name: str
+    """Of the files that it is exported to, without a suffix."""
+    capture: Capture | None
+    """Cameras without photographs, in place of the capture; None where a capture was given."""
+    origin: Vector
+    """Place in the frame of the scene's capture that the positions of the file are relative to."""
+    note: dict[str, Any]
+    """Facts of its description that a file written from it keeps."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +72,12 @@ class OpenRun:
     clock: Clock  # of the training
     capture: str = ""  # fingerprint of the capture that the run was trained on; empty if unknown
     poses: str = ""  # of that capture, see `Capture.poses`; empty if unknown
+    lone: Lone | None = None  # for a scene of a file; None for a run folder
+
+    @property
+    def cameras(self) -> Capture | None:
+        """The cameras in place of a capture; None for a scene that has one."""
+        return None if self.lone is None else self.lone.capture
 
 
 def versions() -> dict[str, str]:
@@ -250,8 +273,10 @@ def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
     """Load the capture that a run was trained on. `data` is its new location if it has moved.
 
     Raises InputError, which names --data, if the capture does not exist or has other views. Other
-    views would define another world frame.
+    views would define another world frame. A scene without a capture has `OpenRun.cameras`.
     """
+    if run.cameras is not None:
+        return run.cameras
     where = named(run.config.data if data is None else replace(run.config.data, path=data))
     if data is None and not where.path.exists():
         raise InputError(f"expected the run's capture at {where.path}, found nothing there; say where it is with --data")
