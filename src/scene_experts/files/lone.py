@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from scene_experts.core.errors import InputError
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import guarding
 from scene_experts.data.settings import Data
@@ -30,7 +31,11 @@ def open_scene(path: Path, device: str = "cpu", step: int | None = None, data: P
     photographs (`OpenRun.cameras`). Raises InputError for what cannot be read.
     """
     is_run = (path / "config.json").is_file() or (path / "checkpoints").is_dir()
-    if is_run or not (path.is_file() or is_result(path) or scene_file(path).is_file()):
+    if not is_run and not (is_result(path) or scene_file(path).is_file()):
+        raise InputError(
+            f"expected a run folder with config.json, or a file or result folder of a scene, at {path}, found none; check the path"
+        )
+    if is_run:
         return run_folder.with_capture(run_folder.open_run(path, device, step), data)
     family, found = owner(path, step)
     capture = None if data is None else run_folder.named(Data(data))

@@ -57,7 +57,7 @@ def place_cameras(
         kind, cameras = AROUND, _rings(positions)
     views = tuple(View(name, replace(camera, id=i), Path(name)) for i, (name, camera) in enumerate(cameras.items()))
     capture = Capture(
-        name=source.name if source.is_dir() else source.name.partition(".")[0],
+        name=folder.resolve().name if source.is_dir() else source.name.partition(".")[0],
         root=folder,
         kind=kind,
         views=views,
