@@ -66,7 +66,8 @@ def view(args: list[str]) -> int:
         draws=opened.scene.frozen(opened.step),
     )
     if opened.cameras is not None:
-        viewer.panel.hide_photographs(stay=opened.cameras.kind == PHOTOGRAPHED)
+        viewer.panel.wipe.visible = False
+        viewer.panel.near.value = viewer.panel.near.visible = opened.cameras.kind == PHOTOGRAPHED
     if viewer.moved:
         print(f"warning: port {command.port} is taken, the scene is shown on another", file=sys.stderr)
     if not is_local(command.host):

@@ -16,9 +16,10 @@ from scene_experts.files.registry import format_named, format_names, scene_file
 from scene_experts.files.result_folder import DESCRIPTION, is_result, read_description
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.training import run_folder
+from scene_experts.training.capture_place import Lone
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig
-from scene_experts.training.run_folder import Lone, OpenRun
+from scene_experts.training.run_folder import OpenRun
 
 _CARRIED = {"recipe": str, "step": int, "capture": str}  # entries of a note that stay true of a converted file
 

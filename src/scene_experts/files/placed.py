@@ -21,7 +21,7 @@ from scene_experts.data.prepare import camera_extent, near_plane
 from scene_experts.data.store import ImageStore
 from scene_experts.data.views import Capture, Vector, View, World
 from scene_experts.files.result_folder import iteration_of
-from scene_experts.geometry.poses import look_at, make_pose
+from scene_experts.geometry.poses import FREE, look_at, make_pose
 from scene_experts.view.path_files import check_pose, check_size
 
 log: logging.Logger = logging.getLogger(__name__)
@@ -38,12 +38,13 @@ _PROBES = 2000  # positions that say whether cameras look at the scene
 def place_cameras(
     source: Path, positions: Tensor, world: World, origin: Vector = (0.0, 0.0, 0.0), background: Vector | None = None
 ) -> Capture:
-    """A capture without photographs for the scene in `source`, all of its views for training.
+    """A capture without photographs for the scene in `source`, all of its views for training and
+    with free cameras, which have no appearance codes of their own.
 
     source: file or folder of the scene. positions: [N, 3] float64 of its rows, trained world. world:
     how that follows from the frame of the scene's capture. origin: place in the latter that the file
-    and the cameras.json beside it are relative to. background: None: black. A cameras.json whose cameras mostly see nothing of
-    the scene is left aside with a warning. Raises InputError for a damaged one.
+    and the cameras.json beside it are relative to. background: None: black. A cameras.json most of whose cameras see nothing
+    of the scene is left aside with a warning. Raises InputError for a damaged one.
     """
     folder = source if source.is_dir() else source.parent
     folder = folder.parent.parent if iteration_of(folder) is not None else folder
@@ -55,7 +56,7 @@ def place_cameras(
         cameras = {}
     if not cameras:
         kind, cameras = AROUND, _rings(positions)
-    views = tuple(View(name, replace(camera, id=i), Path(name)) for i, (name, camera) in enumerate(cameras.items()))
+    views = tuple(View(name, camera, Path(name)) for name, camera in cameras.items())
     capture = Capture(
         name=folder.resolve().name if source.is_dir() else source.name.partition(".")[0],
         root=folder,
@@ -120,7 +121,7 @@ def _read_cameras(path: Path, world: World) -> dict[str, Camera]:
 
 def _camera(pose: Tensor, fx: float, fy: float, size: tuple[int, int], middle: list[float] | None = None) -> Camera:
     cx, cy = middle or [side / 2 for side in size]
-    return Camera(pose.float(), torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), *size)
+    return Camera(pose.float(), torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), *size, id=FREE)
 
 
 def _mostly_see(cameras: list[Camera], positions: Tensor) -> bool:

@@ -34,31 +34,15 @@ from scene_experts.data import capture as captures
 from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
 from scene_experts.data.settings import Data
-from scene_experts.data.views import Vector
 from scene_experts.scene import Scene
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.training import capture_place
+from scene_experts.training.capture_place import Lone
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig
 
 FORMAT = 1
 PICTURES = ("renders", "gt", "errors", "side_by_side", "masks", "experts")  # folders with the images of an evaluation
-
-
-@dataclass(frozen=True)
-class Lone:
-    """What a scene has that was opened from a file and not from a run folder."""
-
-    source: Path
-    """What was read: a file, or an iteration's folder of a result folder."""
-    name: str
-    """Of the files that it is exported to, without a suffix."""
-    capture: Capture | None
-    """Cameras without photographs, in place of the capture; None where a capture was given."""
-    origin: Vector
-    """Place in the frame of the scene's capture that the positions of the file are relative to."""
-    note: dict[str, Any]
-    """Facts of its description that a file written from it keeps."""
 
 
 @dataclass(frozen=True)

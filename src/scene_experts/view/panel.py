@@ -160,12 +160,6 @@ class Panel:
         rows.on_update(lambda _: self.queue("rows", lambda: self.show_rows(rows.value)))
         self.chosen, self.names = chosen, names
 
-    def hide_photographs(self, stay: bool) -> None:
-        """Take away what needs photographs. stay: they were taken from the views, and pictures are
-        drawn only near them."""
-        self.wipe.visible = False
-        self.near.value = self.near.visible = stay
-
     def add_crop_controls(self, scene: Scene) -> None:
         """Add a crop box in the capture's units. Its sliders span the central 99 % of the rows
         along each axis."""
