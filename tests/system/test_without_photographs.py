@@ -122,7 +122,7 @@ def test_a_splat_has_the_pictures_of_degree_0(room: Path, tmp_path: Path) -> Non
     assert found >= 45
 
 
-def test_anchors_keep_their_networks_and_are_baked_for_other_viewers(room: Path, tmp_path: Path) -> None:
+def test_anchors_keep_their_networks_or_are_baked(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = room / "mail/statue.compact"
     assert export(file, "--format", "anchors", "--out", str(tmp_path / "folder")) == 0
     assert export(tmp_path / "folder", "--format", "compact", "--out", str(tmp_path / "b.compact")) == 0
@@ -130,6 +130,7 @@ def test_anchors_keep_their_networks_and_are_baked_for_other_viewers(room: Path,
     for made in (tmp_path / "folder", tmp_path / "b.compact"):
         assert nearness(room, "moe-gs", made, file) >= 70
     assert export(file, "--format", "spz", "--refine", "0", "--out", str(tmp_path / "c.spz")) == 0
+    assert "from cameras around the scene" in capsys.readouterr().out
     shutil.copytree(room / "moe-gs/point_cloud", tmp_path / "result/point_cloud")
     shutil.copy(room / "moe-gs/cameras.json", tmp_path / "result")
     opened = open_scene(tmp_path / "result")

@@ -122,7 +122,8 @@ def export_gaussians(
         about = _describe(work, contents, level) | one.about | origin_note(origin)
         note = {name: value for name, value in about.items() if name != "antialias" or format.antialias}
         views = {} if format.view_note is None or capture is None else format.view_note(capture, world)
-        if run.cameras is not None and run.cameras.kind == AROUND:
+        around = run.cameras is not None and run.cameras.kind == AROUND
+        if around:
             views.pop("cameras", None)  # nothing was photographed from there
         titled = {} if options.title is None else {"title": options.title}
         told = format.write(path, contents, note | views | titled)
@@ -132,6 +133,7 @@ def export_gaussians(
         frame += f", {tell_origin(origin)}" if any(origin) else ""
         said = f"{len(contents):,} Gaussians, {facts['bytes'] / 1e6:.2f} MB, harmonics of degree {contents.degree}, in {frame}"
         how = f"; baked in {format_duration(one.seconds)}" if fresh else "; of the same bake"
+        how += " from cameras around the scene" if around else ""
         lines = (f"wrote {path}", said + (how if bake else ""), *one.lines, *([str(told)] if told is not None else []))
         written = Written(path, facts["bytes"], len(contents), lines)
         if options.measure and format.read is not None and not options.crop:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -49,3 +50,13 @@ def test_what_is_no_scene_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["a.b.ply", "a.b.compressed.ply", "a.b.zip", "a.b.sog"])
 def test_the_name_of_a_scene(tmp_path: Path, name: str) -> None:
     assert name_of(tmp_path / name) == "a.b"
+
+
+def test_zips_and_folders_of_sog_are_files_too(file: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "mail.zip", "w") as archive:
+        archive.write(file, "garden.ply")
+    (made,) = export(open_scene(tmp_path / "mail.zip"), "sog", tmp_path / "a.sog")
+    with zipfile.ZipFile(made.path) as archive:
+        archive.extractall(tmp_path / "folder")
+    (page,) = export(open_scene(tmp_path / "folder"), "html", tmp_path / "pages")
+    assert page.path == tmp_path / "pages/folder.html" and page.rows == 50
