@@ -27,11 +27,12 @@ class ExportCommand:
     """Write a trained scene to a file that viewers or later runs open."""
 
     run: Annotated[Path, Option(value="RUN")]
-    """Run folder."""
+    """Run folder, or a file or result folder of any format that `import` reads; that needs no
+    capture."""
     format: Annotated[tuple[str, ...], Option(value="FORMAT")] = ("compact",)
     """File formats, from the list above. Several standard files share one bake."""
     out: Path | None = None
-    """File or folder to write; by default in the run folder. A name without a suffix is a folder;
+    """File or folder to write; by default in the run folder or beside the file. A name without a suffix is a folder;
     several formats need one."""
     hub: Annotated[Path | None, Option(value="FOLDER")] = None
     """Write a folder for a model hub: compact and spz (or --format), a picture and a card
@@ -41,7 +42,8 @@ class ExportCommand:
     step: int | None = None
     """Iteration of the checkpoint to export; by default the newest."""
     data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
-    """Folder of the capture, if it has moved. Standard files and measurements need the capture."""
+    """Folder of the capture, if a run's has moved, or to measure a file. Measurements, and standard
+    files of runs, need the capture."""
     options: Annotated[Options, Option(name="")] = Options()
 
 
@@ -74,15 +76,17 @@ def export(args: list[str]) -> int:
     from scene_experts.core.errors import InputError
     from scene_experts.files import hub
     from scene_experts.files.export import export_several
+    from scene_experts.files.lone import open_scene
     from scene_experts.training.memory import reuse_freed
     from scene_experts.training.progress import ProgressBar
-    from scene_experts.training.run_folder import open_run, with_capture
 
     if command.hub is not None and command.out is not None:
         raise InputError(f"expected --hub or --out, found both; leave --out {command.out} out")
     if command.licence is not None and command.hub is None:
         raise InputError(f"expected --licence with --hub, found it alone; leave --licence {command.licence} out or name a folder by --hub")
-    run = with_capture(open_run(command.run, "cpu", command.step), command.data)
+    run = open_scene(command.run, "cpu", command.step, command.data)
+    if run.lone is not None and command.hub is not None:
+        raise InputError(f"expected a run folder for --hub, found {command.run}; make one with `{PROG} import`")
     bakes = command.hub is not None or any(format_named(name).family == GAUSSIANS for name in command.format)
     if bakes:
         reuse_freed()

@@ -15,18 +15,19 @@ from scene_experts.core.choices import Device, Raster
 
 @dataclass(frozen=True)
 class ViewCommand:
-    """Show a run in a browser. The pictures are rendered on this machine, so the browser needs no
+    """Show a run or a file in a browser. The pictures are rendered on this machine, so the browser needs no
     GPU."""
 
     run: Annotated[Path, Option(value="RUN")]
-    """Run folder."""
+    """Run folder, or a file or result folder of any format that `import` reads; that needs no
+    capture."""
     port: int = 8080
     """Port to listen on."""
     host: str = "127.0.0.1"
     """Address to listen on. 0.0.0.0 accepts other machines that know the token in the printed
     address."""
     data: Annotated[Path | None, Option(short="-s", value="CAPTURE")] = None
-    """Folder of the capture, if it has moved."""
+    """Folder of the capture, if a run's has moved, or that of a file."""
     step: int | None = None
     """Iteration of the checkpoint to show; by default the newest."""
     device: Device = "auto"
@@ -39,6 +40,8 @@ def view(args: list[str]) -> int:
     command = parse(ViewCommand, Command(f"{PROG} view", ("run",)), args)
 
     from scene_experts.api.backend import backend
+    from scene_experts.files.lone import open_scene
+    from scene_experts.files.placed import PHOTOGRAPHED
     from scene_experts.render import as_trained
     from scene_experts.training import run_folder
     from scene_experts.view.gate import is_local
@@ -48,10 +51,10 @@ def view(args: list[str]) -> int:
     check_host(command.host)
     import_viser()  # reports a missing package before anything is read
     device, rasterize = backend(command.device, command.rasterizer, False, False)
-    opened = run_folder.open_run(command.run, device, command.step)
+    opened = open_scene(command.run, device, command.step, command.data)
     rasterize = as_trained(rasterize, opened.config.train.antialias)
     capture = run_folder.capture_of(opened, command.data)
-    label = f"{opened.config.train.recipe} on {capture.name}"
+    label = capture.name if opened.cameras is not None else f"{opened.config.train.recipe} on {capture.name}"
     viewer = Viewer(
         capture,
         lambda: (opened.scene, opened.step),
@@ -59,9 +62,12 @@ def view(args: list[str]) -> int:
         command.host,
         command.port,
         label,
-        paths=command.run / "paths",
+        paths=opened.path / "paths",
         draws=opened.scene.frozen(opened.step),
     )
+    if opened.cameras is not None:
+        viewer.panel.wipe.visible = False
+        viewer.panel.near.value = viewer.panel.near.visible = opened.cameras.kind == PHOTOGRAPHED
     if viewer.moved:
         print(f"warning: port {command.port} is taken, the scene is shown on another", file=sys.stderr)
     if not is_local(command.host):

@@ -11,8 +11,9 @@ from scene_experts.core.io import check_writable, write_bytes
 from scene_experts.data.views import World
 from scene_experts.files.measure import Tell, capture_if_there, cost
 from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
+from scene_experts.files.placed import AROUND
 from scene_experts.files.registry import GAUSSIANS, Family, Format, family_named, format_named, format_names, formats_of
-from scene_experts.files.scene_folder import origin_note, tell_origin, trained_in, width_in, world_of, write_scene_folder
+from scene_experts.files.scene_folder import origin_note, origin_of, tell_origin, trained_in, width_in, world_of, write_scene_folder
 from scene_experts.files.standard import ExportTask, Made, Written, export_gaussians
 from scene_experts.render import Rasterizer
 from scene_experts.training.run_folder import OpenRun
@@ -37,7 +38,7 @@ def export(
     it, which takes minutes and needs the capture.
 
     Args:
-        run: The run, on the CPU. `run_folder.with_capture` says where its capture is if it moved.
+        run: The run, or a file that `lone.open_scene` opened, on the CPU. `run_folder.with_capture` says where its capture is if it moved.
         format: Name of the format.
         out: File, or folder for it; a name without a suffix is a folder. Default: scene.SUFFIX in
             the run folder. With `options.levels`, one file per level of detail beside it.
@@ -74,6 +75,7 @@ def export_several(
     `export`.
     """
     _check(options)
+    _expect_for_file(run, formats, out, options)
     if len(formats) > 1 and out is not None:
         if not out.is_dir() and (out.exists() or out.suffix):
             raise InputError(f"expected a folder as --out for several formats, found {out}; name a folder")
@@ -85,7 +87,7 @@ def export_several(
             if not work.is_direct:  # it will be baked
                 work = replace(work, options=replace(options, sh_degree=min(options.sh_degree, work.format.sh_degree)))
             standard.append(work)
-            places.append(file_path(run.path, work.name, work.format, out))
+            places.append(place_of(run, work.name, work.format, out))
             check_writable(places[-1])
             if work.format.needs is not None:
                 work.format.needs()
@@ -101,8 +103,24 @@ def export_several(
     return written
 
 
-def file_path(run: Path, name: str, format: Format, out: Path | None) -> Path:
-    """Where a file of a format goes: `out`, or scene.SUFFIX in the folder `out` or `run`. A name
+def place_of(run: OpenRun, name: str, format: Format, out: Path | None) -> Path:
+    """`file_path` for a run; a scene of a file goes beside it under its name.
+
+    Raises InputError also for the file that the scene was read from, and, unless it is named, for a
+    file that `export` did not write.
+    """
+    if run.lone is None:
+        return file_path(run.path, name, format, out)
+    path = file_path(run.path, name, format, out, run.lone.name)
+    if path.exists() and path.samefile(run.lone.source):
+        raise InputError(f"expected another file to write than the one that is read, found {path} for both; name one with --out")
+    if out is None and path.exists() and not path.with_name(path.name + ".json").exists():
+        raise InputError(f"expected no file at {path}, or one that export wrote, found another; name a file with --out")
+    return path
+
+
+def file_path(run: Path, name: str, format: Format, out: Path | None, called: str = NAME) -> Path:
+    """Where a file of a format goes: `out`, or CALLED.SUFFIX in the folder `out` or `run`. A name
     without a suffix is a folder.
 
     Raises InputError for a name with another suffix than the format's, because programs go by it,
@@ -113,7 +131,7 @@ def file_path(run: Path, name: str, format: Format, out: Path | None) -> Path:
             raise InputError(
                 f"expected a folder, or a name that ends in {format.suffix}, as --out, found the file {out}; choose another name"
             )
-        return (out or run) / f"{NAME}{format.suffix}"
+        return (out or run) / f"{called}{format.suffix}"
     own = (format.suffix, *format.other_suffixes)
     every = (*own, *(format_named(other).suffix for other in format_names()))
     found = max((suffix for suffix in every if suffix and out.name.lower().endswith(suffix)), key=len, default=None)
@@ -121,6 +139,20 @@ def file_path(run: Path, name: str, format: Format, out: Path | None) -> Path:
         endings = " or ".join(own)
         raise InputError(f"expected a name that ends in {endings} for --format {name}, found {out.name}; correct --out or --format")
     return out
+
+
+def _expect_for_file(run: OpenRun, formats: Sequence[str], out: Path | None, options: Options) -> None:
+    """Raises InputError for what a scene of a file does not have: a folder for a result, and
+    photographs that support its Gaussians."""
+    if run.lone is None:
+        return
+    folders = [name for name in formats if format_named(name).is_folder]
+    if folders and out is None:
+        raise InputError(f"expected a folder for --format {folders[0]} of {run.lone.source}, found none; name one with --out")
+    if folders and out is not None and out.resolve() in run.lone.source.resolve().parents and run.lone.source.is_dir():
+        raise InputError(f"expected another folder to write than the one that is read, found {out} for both; name one with --out")
+    if options.floaters == "remove" and run.cameras is not None and run.cameras.kind == AROUND:
+        raise InputError("expected photographs' cameras for --floaters remove, found a scene without any; give its capture with --data")
 
 
 def _check(options: Options) -> None:
@@ -163,8 +195,8 @@ def _export_scene(work: ExportTask, out: Path | None) -> Written:
     trained = world_of(run)
     if format.is_folder:
         return _export_folder(work, family, trained, out or run.path)
-    path = file_path(run.path, work.name, format, out)
-    origin = trained.local_origin(run.scene.extent)
+    path = place_of(run, work.name, format, out)
+    origin = origin_of(run, trained)
     about, world = family.describe(run, trained) | trained_in(run) | origin_note(origin), trained.seen_from(origin)
     detail = format.write(path, family.contents(run, world, about), {})  # type: ignore[misc]
     rows, size = len(run.scene.positions), path.stat().st_size
@@ -185,7 +217,7 @@ def _export_folder(work: ExportTask, family: Family, world: World, out: Path) ->
         write_bytes(out / "cameras.json", cameras.read_bytes())
     size, rows = sum(p.stat().st_size for p in folder.iterdir()), len(run.scene.positions)
     said = f"{rows:,} {run.scene.traits.rows}, {size / 1e6:.2f} MB with networks, in the capture's own frame"
-    origin = world.local_origin(run.scene.extent)
+    origin = origin_of(run, world)
     said += f", {tell_origin(origin)}" if any(origin) else ""
     return Written(folder, size, rows, (f"wrote {folder}", said, *family.warnings(run)))
 

@@ -89,6 +89,8 @@ def cost(
     and "bake" lie before it. capture: None where it is gone.  rasterize: None for the fastest one
     on this CPU.
     """
+    if run.cameras is not None:
+        return Cost(lines=("no capture was given (--data): what the file costs in PSNR was not measured",))
     views = [] if capture is None else scored_views(capture)
     if capture is None or not views:
         where = f"the capture is not at {run.config.data.path} (say where it is with --data)"
@@ -114,8 +116,11 @@ def cost(
 
 @contextmanager
 def capture_if_there(run: OpenRun, needed: bool) -> Iterator[Capture | None]:
-    """The capture of a run; None where it is gone and not needed. Raises InputError where it is
+    """The capture of a run, or the cameras in its place; None where it is gone and not needed. Raises InputError where it is
     needed and gone, and for another one."""
+    if run.cameras is not None:
+        yield run.cameras
+        return
     path = run.config.data.path
     if not path.exists():
         if needed:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from scene_experts.data.settings import Data
-    from scene_experts.data.views import Capture, World
+    from scene_experts.data.views import Capture, Vector, World
     from scene_experts.scene import Scene
     from scene_experts.training.config import Train
     from scene_experts.training.run_folder import OpenRun
@@ -129,6 +129,8 @@ class Imported:
     """The values of `Scene.meta`."""
     step: int
     """Iterations trained; 0 where the file does not say."""
+    origin: Vector = (0.0, 0.0, 0.0)
+    """Place in the capture's own frame that the positions of the file are relative to."""
 
 
 class Family(Protocol):
@@ -163,9 +165,10 @@ class Family(Protocol):
         another family."""
         ...
 
-    def read(self, source: Path, data: Data, iteration: int | None) -> Imported:
+    def read(self, source: Path, data: Data | None, iteration: int | None) -> Imported:
         """The run in `source`: what `find` returned, or a file of one of the family's formats.
-        data: the capture that it belongs to.
+        data: the capture that it belongs to; None: it is not here, and `placed.place_cameras` makes
+        one without photographs.
 
         Raises InputError for damaged files and for a capture that does not fit.
         """

@@ -14,11 +14,13 @@ from typing import Any
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json
+from scene_experts.core.plain import from_json
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import FARTHEST, number, whole_number
 from scene_experts.core.reading.plain import parse_namespace
 from scene_experts.core.reading.source import guarding, opening
+from scene_experts.data.settings import Data
 from scene_experts.data.views import Vector, World
 
 DESCRIPTION, DESCRIPTION_FORMAT = "scene.json", 1
@@ -96,6 +98,11 @@ def check_description(value: dict[str, Any]) -> None:
     whole_number(value["F"], "F", 0, 1 << 16)
     if not isinstance(value.get("scene", {}), dict) or not isinstance(value["recipe"], str):
         raise Damaged("a recipe or a scene of another form")
+
+
+def data_in(about: Mapping[str, Any]) -> Data:
+    """How the capture was read, as far as a description says it; without the capture's path."""
+    return from_json(Data, {**about.get("data", {}), "path": ""}, "data")
 
 
 def world_in(about: dict[str, Any]) -> World:

@@ -38,6 +38,12 @@ def write_result_folder(run: OpenRun, capture: Capture, out: Path | None = None)
     return folder
 
 
+def origin_of(run: OpenRun, world: World) -> Vector:
+    """The place in the capture's own frame that files of a run are relative to: that of the file
+    which it was opened from, else `World.local_origin`. world: of the run."""
+    return run.lone.origin if run.lone is not None and run.lone.capture is not None else world.local_origin(run.scene.extent)
+
+
 def origin_note(origin: Vector) -> dict[str, Any]:
     """The entry of a description about a local origin; empty where it is 0."""
     return {"origin": list(origin)} if any(origin) else {}
@@ -61,7 +67,7 @@ def write_scene_folder(run: OpenRun, family: Family, world: World, out: Path, wi
     width: Of the views trained on, in px; None if it is unknown.
     """
     folder = out / "point_cloud" / f"iteration_{run.step}"
-    origin = world.local_origin(run.scene.extent)
+    origin = origin_of(run, world)
     about = family.describe(run, world) | trained_in(run) | origin_note(origin)
     settings = family.write(run, world.seen_from(origin), folder, about)
     if settings:
@@ -120,6 +126,8 @@ def capture_settings(data: Data, width: int | None = None) -> dict[str, Any]:
 def world_of(run: OpenRun) -> World:
     """The world that a run was trained in: from a description in its result folder, else from its
     capture."""
+    if run.cameras is not None:
+        return run.cameras.world
     data = trained_in(run)["data"]
     for path in sorted((run.path / "point_cloud").glob(f"iteration_*/{DESCRIPTION}"), key=lambda p: p.stat().st_mtime, reverse=True):
         try:

@@ -15,8 +15,9 @@ from scene_experts.data.views import Capture, World
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.measure import Painter, Tell, cost
 from scene_experts.files.options import Options
+from scene_experts.files.placed import AROUND
 from scene_experts.files.registry import GAUSSIANS, Format, family_named
-from scene_experts.files.scene_folder import origin_note, tell_origin, world_of
+from scene_experts.files.scene_folder import origin_note, origin_of, tell_origin, world_of
 from scene_experts.render import Rasterizer
 from scene_experts.scene import Scene
 from scene_experts.training.progress import format_duration
@@ -110,7 +111,7 @@ def export_gaussians(
     run, options, format, gaussians = work.run, work.options, work.format, family_named(GAUSSIANS)
     assert gaussians is not None and format.write is not None
     world = World() if options.frame == "trained" else world_of(run) if capture is None else capture.world
-    origin = world.local_origin(run.scene.extent)
+    origin = (0.0, 0.0, 0.0) if options.frame == "trained" else origin_of(run, world)
     world, key = world.seen_from(origin), (level, options.sh_degree)
     with nullcontext() if level is None else run.scene.at_level(level):
         fresh = key not in made
@@ -121,13 +122,18 @@ def export_gaussians(
         about = _describe(work, contents, level) | one.about | origin_note(origin)
         note = {name: value for name, value in about.items() if name != "antialias" or format.antialias}
         views = {} if format.view_note is None or capture is None else format.view_note(capture, world)
+        around = run.cameras is not None and run.cameras.kind == AROUND
+        if around:
+            views.pop("cameras", None)  # nothing was photographed from there
         titled = {} if options.title is None else {"title": options.title}
         told = format.write(path, contents, note | views | titled)
         facts: dict[str, Any] = {"file": path.name, "bytes": path.stat().st_size, "seconds": round(one.seconds, 1), "psnr": {}}
-        frame = "the capture's own frame" if options.frame == "capture" else "the trained world"
+        whose = "the capture's" if run.lone is None else "the file's"
+        frame = f"{whose} own frame" if options.frame == "capture" else "the trained world"
         frame += f", {tell_origin(origin)}" if any(origin) else ""
         said = f"{len(contents):,} Gaussians, {facts['bytes'] / 1e6:.2f} MB, harmonics of degree {contents.degree}, in {frame}"
         how = f"; baked in {format_duration(one.seconds)}" if fresh else "; of the same bake"
+        how += " from cameras around the scene" if around else ""
         lines = (f"wrote {path}", said + (how if bake else ""), *one.lines, *([str(told)] if told is not None else []))
         written = Written(path, facts["bytes"], len(contents), lines)
         if options.measure and format.read is not None and not options.crop:
@@ -170,4 +176,5 @@ def _describe(work: ExportTask, contents: Any, level: int | None) -> dict[str, A
         "gaussians": len(contents),
         "sh_degree": contents.degree,
         **({} if level is None else {"level": level}),
+        **({} if run.lone is None else run.lone.note),
     }

@@ -1,13 +1,33 @@
 """Store the location of a run's capture. The run finds the capture from any folder, also after both
-have moved together."""
+have moved together. `Lone` is for scenes that were opened without a run folder."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from scene_experts.data.views import Capture, Vector
 
 KEY = "capture_from_run"
 """Key of config.json: the capture's path relative to the run folder."""
+
+
+@dataclass(frozen=True)
+class Lone:
+    """What a scene has that was opened from a file and not from a run folder."""
+
+    source: Path
+    """What was read: a file, or an iteration's folder of a result folder."""
+    name: str
+    """Of the files that it is exported to, without a suffix."""
+    capture: Capture | None
+    """Cameras without photographs, in place of the capture; None where a capture was given."""
+    origin: Vector
+    """Place in the frame of the scene's capture that the positions of the file are relative to."""
+    note: dict[str, Any]
+    """Facts of its description that a file written from it keeps."""
 
 
 def absolute(path: Path) -> Path:

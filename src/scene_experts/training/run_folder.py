@@ -37,6 +37,7 @@ from scene_experts.data.settings import Data
 from scene_experts.scene import Scene
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.training import capture_place
+from scene_experts.training.capture_place import Lone
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig
 
@@ -55,6 +56,12 @@ class OpenRun:
     clock: Clock  # of the training
     capture: str = ""  # fingerprint of the capture that the run was trained on; empty if unknown
     poses: str = ""  # of that capture, see `Capture.poses`; empty if unknown
+    lone: Lone | None = None  # for a scene of a file; None for a run folder
+
+    @property
+    def cameras(self) -> Capture | None:
+        """The cameras in place of a capture; None for a scene that has one."""
+        return None if self.lone is None else self.lone.capture
 
 
 def versions() -> dict[str, str]:
@@ -250,8 +257,10 @@ def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
     """Load the capture that a run was trained on. `data` is its new location if it has moved.
 
     Raises InputError, which names --data, if the capture does not exist or has other views. Other
-    views would define another world frame.
+    views would define another world frame. A scene without a capture has `OpenRun.cameras`.
     """
+    if run.cameras is not None:
+        return run.cameras
     where = named(run.config.data if data is None else replace(run.config.data, path=data))
     if data is None and not where.path.exists():
         raise InputError(f"expected the run's capture at {where.path}, found nothing there; say where it is with --data")

@@ -32,7 +32,7 @@ class AnchorFiles:
 
         return find(source, iteration)
 
-    def read(self, source: Path, data: Data, iteration: int | None) -> Imported:
+    def read(self, source: Path, data: Data | None, iteration: int | None) -> Imported:
         from scene_experts.files.anchors.read import read
 
         return read(source, data, iteration)

@@ -14,6 +14,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera
 from scene_experts.data.views import Capture
 from scene_experts.files.anchors.data import AnchorData
+from scene_experts.files.placed import AROUND, PHOTOGRAPHED
 from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.scene.anchors.levels import LevelRule, Levels, centres
 from scene_experts.scene.anchors.mlp import Plain
@@ -97,6 +98,8 @@ def meta_of(data: AnchorData, capture: Capture) -> dict[str, Any]:
         out["levels"] = levels_of(data.columns, [capture.views[i].camera for i in capture.train], data.settings).meta()
     if "appearance.table" in data.networks:
         codes = len(data.networks["appearance.table"])
+        if capture.kind in (AROUND, PHOTOGRAPHED):  # no view of the training has a number there
+            return out | {"views": list(range(codes))}
         if codes != len(capture.train):
             raise InputError(
                 f"expected {codes} training views, one per appearance code, found {len(capture.train)}; choose another --split"

@@ -29,9 +29,10 @@ from scene_experts.files.anchors.data import AnchorData, Network, by_attribute, 
 from scene_experts.files.anchors.published import cells_of, meta_of, recipe_of, recover_voxel
 from scene_experts.files.anchors.write import BANK_DISTANCE, LEVEL_COLUMNS, MOE_FILE, MOE_FORMAT, MOE_KIND, SLOT_BITS, SLOTS, unpack_slots
 from scene_experts.files.formats.ply import numbered_names, property_names, read_vertices, stack
+from scene_experts.files.placed import place_cameras
 from scene_experts.files.registry import Imported
 from scene_experts.files.registry import read as read_file
-from scene_experts.files.result_folder import expect_world, file_world, world_in
+from scene_experts.files.result_folder import data_in, expect_world, file_world, origin_in, world_in
 from scene_experts.scene import Scene, restore_scene
 from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, Attribute
@@ -47,7 +48,7 @@ def find(source: Path, iteration: int | None) -> Path | None:
     return folder if "f_offset_0" in property_names(folder / "point_cloud.ply") else None
 
 
-def read(source: Path, data: Data, iteration: int | None) -> Imported:
+def read(source: Path, data: Data | None, iteration: int | None) -> Imported:
     """The run in an iteration's folder or in a file of anchors.
 
     A published result is in its capture's own unit, so its capture is read with --normalise none. A
@@ -58,18 +59,25 @@ def read(source: Path, data: Data, iteration: int | None) -> Imported:
         return _read(source, data)
 
 
-def _read(source: Path, data: Data) -> Imported:
+def _read(source: Path, data: Data | None) -> Imported:
     found = read_folder(source) if source.is_dir() else read_file(source)
     networks = by_attribute(found.networks)
     check_networks(networks, str(source))
     about = found.about
-    data = data if about is not None else replace(data, normalise="none")
-    capture = captures.load(data)
-    capture.images.close()
+    if about is not None:
+        result_folder.check_description(about)
+    origin = origin_in(about or {})
+    if data is None:
+        data, world = data_in(about or {"data": {"normalise": "none"}}), World() if about is None else world_in(about)
+        places = world.seen_from(origin).from_input(found.columns["xyz"].double())
+        capture = place_cameras(source, places, world, origin, data.background)
+    else:
+        data = data if about is not None else replace(data, normalise="none")
+        capture = captures.load(data)
+        capture.images.close()
     if about is None:
         meta, voxel, cfg = meta_of(found, capture), found.voxel, recipe_of(found)
     else:
-        result_folder.check_description(about)
         expect_world(world_in(about), capture.world)
         capture = replace(capture, world=world_in(about))
         meta, voxel = dict(about.get("scene", {})), float(about["voxel_size"]["trained"])
@@ -81,7 +89,7 @@ def _read(source: Path, data: Data) -> Imported:
         "voxel": levels.size(levels.count - 1) if levels else voxel,
         "extent": float((about or {}).get("extent", capture.extent)),
     }
-    return Imported(cfg, data, capture, tensors, meta, found.step)
+    return Imported(cfg, data, capture, tensors, meta, found.step, origin)
 
 
 def scene(run: OpenRun, contents: AnchorData, world: World) -> tuple[Scene, int]:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
@@ -19,11 +20,12 @@ from scene_experts.core.reading.source import guarding
 from scene_experts.core.table import Table
 from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
-from scene_experts.data.views import Capture, World
+from scene_experts.data.views import Capture, Vector, World
 from scene_experts.files import result_folder
 from scene_experts.files.formats.ply import has_gaussians, property_names, read_note
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.gaussians.write import KIND
+from scene_experts.files.placed import place_cameras
 from scene_experts.files.registry import Imported, recognise
 from scene_experts.files.registry import read as read_file
 from scene_experts.files.scene_folder import tell_origin
@@ -44,30 +46,38 @@ def find(source: Path, iteration: int | None) -> Path | None:
     return path if has_gaussians(property_names(path)) else None
 
 
-def read(source: Path, data: Data, iteration: int | None, transform: Path | None = None) -> Imported:
+def read(source: Path, data: Data | None, iteration: int | None, transform: Path | None = None) -> Imported:
     """The run in a file of Gaussians, published or ours, in the frame and unit of the capture.
 
     The recipe is 3DGS and the step 0, or `iteration`, unless the description or the name of its
     folder says otherwise. transform: `transform.read_transform`. Whether it is drawn with antialiasing, the description beside it
-    (FILE.json) or the file says. Raises InputError where the former says that the file is in
-    another frame.
+    (FILE.json) or the file says. data: None for a scene without its capture, whose frame is then that
+    of the file. Raises InputError where the description says that the file is in another frame.
     """
     antialias = is_antialiased(source)
     about = result_folder.read_description(source.parent) or {}
-    capture = captures.load(data)
-    capture.images.close()
-    made_on = beside(source).get("capture")
-    if made_on not in (None, "", capture.fingerprint()):
-        log.warning(
-            "%s was made with other views than those of %s; check that it is the same capture (and --split, --resolution)",
-            source,
-            capture.root,
-        )
-    splats = read_splats(source)
+    if data is None:
+        data, splats, noted = result_folder.data_in(about), read_splats(source), noted_origin(source)
+        x, y, z = origin = far_origin(splats) if noted is None else noted
+        world = World(1.0, (-x, -y, -z))
+        placed = world.seen_from(noted or (0.0, 0.0, 0.0))
+        capture = place_cameras(source, placed.from_input(splats.means.double()), world, noted or (0.0, 0.0, 0.0), data.background)
+    else:
+        capture = captures.load(data)
+        capture.images.close()
+        made_on = beside(source).get("capture")
+        if made_on not in (None, "", capture.fingerprint()):
+            log.warning(
+                "%s was made with other views than those of %s; check that it is the same capture (and --split, --resolution)",
+                source,
+                capture.root,
+            )
+        splats, origin = read_splats(source), (0.0, 0.0, 0.0)
+        placed = capture.world if transform is not None else file_world(source, splats, capture)
     if transform is not None:
         columns = table_columns(read_transform(transform, capture).applied(splats), capture.world)
     else:
-        columns = table_columns(splats, file_world(source, splats, capture))
+        columns = table_columns(splats, placed)
     step = about.get("step") or iteration or result_folder.iteration_of(source.parent) or 0
     degree = math.isqrt(columns["sh_rest"].shape[1] + 1) - 1
     cfg = replace(gs_3d, scene=Explicit(sh_degree=degree), iterations=step or gs_3d.iterations, antialias=antialias)
@@ -80,7 +90,7 @@ def read(source: Path, data: Data, iteration: int | None, transform: Path | None
                 f"expected the recipe of a scene of Gaussians in the description beside {source}, found '{cfg.recipe}'; remove it"
             ) from None
     tensors = {f"params.{name}": value for name, value in columns.items()}
-    return Imported(cfg, data, capture, tensors, {"extent": capture.extent}, step)
+    return Imported(cfg, data, capture, tensors, {"extent": capture.extent}, step, origin)
 
 
 def file_world(source: Path, splats: Splats, capture: Capture) -> World:
@@ -91,11 +101,8 @@ def file_world(source: Path, splats: Splats, capture: Capture) -> World:
     that of our own files if the Gaussians lie nearer to the cameras from there, which a warning
     tells.
     """
-    note = read_note(source) if source.suffix == ".ply" else {}
-    for about in (result_folder.read_description(source.parent) or {}, beside(source), note):
-        if "origin" in about:
-            with guarding(source, budget.JSON, "description of a file"):
-                return capture.world.seen_from(result_folder.origin_in(about))
+    if (noted := noted_origin(source)) is not None:
+        return capture.world.seen_from(noted)
     origin = capture.world.local_origin(capture.extent)
     middle = splats.means.double().median(0).values
     away = [float(world.from_input(middle).norm()) for world in (capture.world.seen_from(origin), capture.world)]
@@ -103,6 +110,24 @@ def file_world(source: Path, splats: Splats, capture: Capture) -> World:
         return capture.world
     log.warning("the positions in %s are taken %s", source, tell_origin(origin))
     return capture.world.seen_from(origin)
+
+
+def noted_origin(source: Path) -> Vector | None:
+    """The origin that the description of the result folder of a file, the one beside it (FILE.json)
+    or the note of a PLY states; None where none does."""
+    note = read_note(source) if source.suffix == ".ply" else {}
+    for about in (result_folder.read_description(source.parent) or {}, beside(source), note):
+        if "origin" in about:
+            with guarding(source, budget.JSON, "description of a file"):
+                return result_folder.origin_in(about)
+    return None
+
+
+def far_origin(splats: Splats) -> Vector:
+    """A place of whole numbers near Gaussians whose positions float32 cannot hold; 0 where it can."""
+    x, y, z = splats.means.double().median(0).values.tolist()
+    away = (splats.means.double() - torch.tensor((x, y, z), dtype=torch.float64)).norm(dim=1)
+    return World(1.0, (-x, -y, -z)).local_origin(float(away.median()))
 
 
 def read_splats(path: Path) -> Splats:

@@ -31,7 +31,7 @@ class GraphFiles:
 
         return find(source, iteration)
 
-    def read(self, source: Path, data: Data, iteration: int | None) -> Imported:
+    def read(self, source: Path, data: Data | None, iteration: int | None) -> Imported:
         from scene_experts.files.graph.read import read
 
         return read(source, data, iteration)

@@ -26,8 +26,9 @@ from scene_experts.data.views import World
 from scene_experts.files import result_folder
 from scene_experts.files.formats.ply import property_names, read_vertices
 from scene_experts.files.graph.write import KIND, NETWORKS
+from scene_experts.files.placed import place_cameras
 from scene_experts.files.registry import Imported
-from scene_experts.files.result_folder import expect_world, file_world, world_in
+from scene_experts.files.result_folder import data_in, expect_world, file_world, origin_in, world_in
 from scene_experts.geometry.voxel import coarsen
 from scene_experts.scene.graph.scene import CHANNELS, HALF
 from scene_experts.training.config import Train
@@ -48,24 +49,29 @@ def find(source: Path, iteration: int | None) -> Path | None:
     return None
 
 
-def read(source: Path, data: Data, iteration: int | None) -> Imported:
+def read(source: Path, data: Data | None, iteration: int | None) -> Imported:
     """The run in an iteration's folder. Raises InputError for missing or damaged files and for a
     capture in another world."""
     with guarding(source, budget.HEAD, "scene of graph points"):
         return _read(source, data)
 
 
-def _read(source: Path, data: Data) -> Imported:
+def _read(source: Path, data: Data | None) -> Imported:
     about = result_folder.read_description(source) or {}
     if absent := {"grid", "extent", "step", "train"} - about.keys():
         raise InputError(f"expected {', '.join(sorted(absent))} in {source / result_folder.DESCRIPTION}, found none; copy the whole folder")
     world, cfg = world_in(about), from_json(Train, about.get("train"), "train")
-    capture = captures.load(data)
-    capture.images.close()
-    expect_world(world, capture.world)
     voxel = float(about["voxel_size"]["trained"])
     tensors = {**rows(source / "point_cloud.ply", file_world(about), voxel), **networks(source / NETWORKS, world.scale)}
-    return Imported(cfg, data, replace(capture, world=world), tensors, meta(about, world, voxel), int(about["step"]))
+    if data is None:
+        data = data_in(about)
+        capture = place_cameras(source, tensors["facts.xyz"].double(), world, origin_in(about), data.background)
+    else:
+        capture = captures.load(data)
+        capture.images.close()
+        expect_world(world, capture.world)
+    found = replace(capture, world=world)
+    return Imported(cfg, data, found, tensors, meta(about, world, voxel), int(about["step"]), origin_in(about))
 
 
 def meta(about: dict[str, Any], world: World, voxel: float) -> dict[str, Any]:

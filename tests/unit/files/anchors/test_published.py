@@ -8,6 +8,7 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.anchors.published import cells_of, levels_of, meta_of, recipe_of, recover_voxel
+from scene_experts.files.placed import AROUND
 from support.messages import naming
 
 
@@ -63,6 +64,7 @@ def test_the_recipe_has_the_numbers_of_the_files():
 def test_codes_need_as_many_training_views():
     found = data()
     found.networks["appearance.table"] = torch.zeros(3, 4)
-    assert meta_of(found, SimpleNamespace(train=(1, 2, 5)))["views"] == [1, 2, 5]
+    assert meta_of(found, SimpleNamespace(train=(1, 2, 5), kind="colmap"))["views"] == [1, 2, 5]
     with pytest.raises(InputError, match=naming(3, 2, "--split")):
-        meta_of(found, SimpleNamespace(train=(1, 2)))
+        meta_of(found, SimpleNamespace(train=(1, 2), kind="colmap"))
+    assert meta_of(found, SimpleNamespace(train=(0, 1), kind=AROUND))["views"] == [0, 1, 2]  # without a capture
