@@ -32,8 +32,8 @@ class ExportCommand:
     format: Annotated[tuple[str, ...], Option(value="FORMAT")] = ("compact",)
     """File formats, from the list above. Several standard files share one bake."""
     out: Path | None = None
-    """File or folder to write; by default in the run folder or beside the file. A name without a suffix is a folder;
-    several formats need one."""
+    """File or folder to write; by default in the run folder or beside the file. A name without a
+    suffix is a folder; several formats need one."""
     hub: Annotated[Path | None, Option(value="FOLDER")] = None
     """Write a folder for a model hub: compact and spz (or --format), a picture and a card
     (README.md)."""

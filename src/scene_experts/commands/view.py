@@ -15,8 +15,8 @@ from scene_experts.core.choices import Device, Raster
 
 @dataclass(frozen=True)
 class ViewCommand:
-    """Show a run or a file in a browser. The pictures are rendered on this machine, so the browser needs no
-    GPU."""
+    """Show a run or a file in a browser. The pictures are rendered on this machine, so the browser
+    needs no GPU."""
 
     run: Annotated[Path, Option(value="RUN")]
     """Run folder, or a file or result folder of any format that `import` reads; that needs no

@@ -28,7 +28,7 @@ from scene_experts.data.readers import RawCapture, ReadOptions, choose_reader, t
 from scene_experts.data.settings import Data
 from scene_experts.data.split_lists import apply_lists
 from scene_experts.data.store import ImageStore
-from scene_experts.data.views import Capture, Frame, Vector, View, World
+from scene_experts.data.views import FINEST, Capture, Frame, Vector, View, World
 
 __all__ = ["Capture", "Frame", "View", "World", "load"]
 
@@ -231,6 +231,11 @@ def _finish(capture: Capture) -> Capture:
     notes = list(capture.warnings)
     if 0 < len(capture.test) < 5:
         notes.append(f"only {len(capture.test)} test view{'s' if len(capture.test) > 1 else ''}: mean scores are unreliable")
+    far = max(float(v.camera.position.abs().max()) for v in views)
+    if far * 2.0**-23 > FINEST * capture.extent:
+        notes.append(
+            f"the cameras are up to {far:,.0f} from the origin, where float32 cannot hold what they see; leave --normalise none out"
+        )
     sizes = {(v.camera.width, v.camera.height) for v in views}
     if len(sizes) > 1:
         notes.append(f"views of {len(sizes)} sizes")

@@ -43,12 +43,17 @@ def find_white(photographs: Sequence[tuple[Path, str]]) -> tuple[White, list[str
         photographs: Path and Pillow mode of each.
 
     Raises:
-        InputError: for floats that go neither to 1 nor to 255 nor to 65535.
+        InputError: for integers above 65535, and for floats that go neither to 1 nor to 255 nor to
+            65535.
     """
     white, notes = White(), list[str]()
     for kind in ("I", "F"):
         deep = _spread([path for path, mode in photographs if mode.startswith(kind)], LOOKED_AT[0])
         most = max((_largest(path) for path in deep), default=0.0)
+        if kind == "I" and most > DEPTHS[-1]:
+            raise InputError(
+                f"expected integers of at most 16 bits in the photographs beside {deep[0]}, found {most:,.0f}; save them with 16"
+            )
         if kind == "I" and 0 < most <= DEPTHS[-2]:
             white = White(next(level for level in DEPTHS if most <= level), white.real)
             notes.append(

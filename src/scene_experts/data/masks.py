@@ -229,14 +229,16 @@ def decide(masks: Mapping[str, Mask]) -> tuple[dict[str, Mask], list[str]]:
             one = np.asarray(to_levels(image).histogram(), np.int64)
         counts += one
         levels.append(int((one > 0).sum()))
+    inverted = any(mask.inverted for mask in masks.values())
     if not counts[1:].any():
-        return dict(masks), [f"the masks are black: no pixel counts (first: {masks[names[0]].path.name})"] if names else []
+        black = [f"the masks are black: no pixel counts (first: {masks[names[0]].path.name})"] if names and not inverted else []
+        return dict(masks), black
     most = int(counts.nonzero()[0].max())
     labels = most < 128 or (most < WHITE and max(levels) <= FEWEST_LEVELS)
     out = {name: replace(mask, labels=labels) for name, mask in masks.items()}
     weights = (np.arange(256) > 0) if labels else np.arange(256) / 255
     mean, dark = float((counts * weights).sum() / counts.sum()), float(counts[1:128].sum() / counts[1:].sum())
-    mean = 1 - mean if any(mask.inverted for mask in out.values()) else mean
+    mean = 1 - mean if inverted else mean
     notes = []
     if labels:
         notes.append("the masks have no white pixel: every value but 0 counts; to weigh pixels, write 255 where they count fully")

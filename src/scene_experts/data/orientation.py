@@ -44,11 +44,14 @@ def fit_lenses(
     for i, (image, header, (stored, _)) in enumerate(zip(images, headers, both)):
         turned = turn if i in decided else not stored
         size = header.turned if turned else header.size
-        out.append((_lens_at(image, size), turned))
+        out.append((_lens_at(image, size, turned), turned))
     return out, notes
 
 
-def _lens_at(image: PosedImage, size: Size) -> Lens:
+def _lens_at(image: PosedImage, size: Size, turned: bool) -> Lens:
+    """Return the lens of a photograph that has `size` when it is read as it is stored or `turned`."""
+    if turned and image.turned is not None:
+        return image.turned.resize(*size)
     if image.lens is None:
         w, h = size
         f = 0.5 * w / np.tan(0.5 * image.angle)
@@ -60,7 +63,8 @@ def _which_fit(image: PosedImage, header: PhotoHeader) -> tuple[bool, bool]:
     """Return whether the camera fits the photograph as it is stored, and as it is turned."""
     if image.lens is None:
         return True, header.turned == header.size
-    stored, turned = (fits(size, (image.lens.width, image.lens.height)) for size in (header.size, header.turned))
+    lens = image.turned or image.lens
+    stored, turned = fits(header.size, (image.lens.width, image.lens.height)), fits(header.turned, (lens.width, lens.height))
     if not stored and not turned:
         raise InputError(
             f"expected {image.path} with the aspect ratio of its camera ({image.lens.width}x{image.lens.height}), found "
@@ -77,8 +81,9 @@ def _decide(
     points: Points | None,
 ) -> tuple[bool, list[str]]:
     """Return whether photographs that fit stored and turned are turned, and why."""
-    what = f"{len(unclear)} photographs have an EXIF orientation that does not change their size (first: {images[unclear[0]].name})"
-    only_turned, only_stored = (False, True) in both, (True, False) in both
+    what = f"{len(unclear)} photographs fit their cameras with and without their EXIF orientation (first: {images[unclear[0]].name})"
+    sure = [fit for image, fit in zip(images, both) if image.lens is not None]  # an angle of view fits as stored whatever is right
+    only_turned, only_stored = (False, True) in sure, (True, False) in sure
     if only_turned != only_stored:
         way = "turned by it" if only_turned else "read as stored"
         return only_turned, [f"{what}: {way}, as the others of the capture must be"]
@@ -110,8 +115,8 @@ def compare_colours(
         small.thumbnail((SIDE, SIDE))
         small.getexif()[ORIENTATION] = exif.get(ORIENTATION, 1)
         found = []
-        for pixels, size in ((small, header.size), (ImageOps.exif_transpose(small), header.turned)):
-            uv, seen = _project(xyz, image, _lens_at(image, size))
+        for pixels, size, turned in ((small, header.size, False), (ImageOps.exif_transpose(small), header.turned, True)):
+            uv, seen = _project(xyz, image, _lens_at(image, size, turned))
             found.append((_look_up(pixels, uv / np.asarray(size)), seen))
         seen = found[0][1] & found[1][1]
         sums += [float(np.abs(colours[seen] - rgb[seen]).mean(1).sum()) for colours, _ in found]
@@ -122,6 +127,7 @@ def compare_colours(
 def _project(xyz: NDArray[np.float64], image: PosedImage, lens: Lens) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the pixels [P, 2] that points project to, and which of them are in the photograph."""
     local = xyz @ image.world_to_cam[:3, :3].T + image.world_to_cam[:3, 3]
+    local[~np.isfinite(local).all(1)] = -1.0  # behind the camera
     ahead = local[:, 2] > 1e-9
     x, y = (local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None]).T
     u, v = lens.distort(x, y)

@@ -16,7 +16,7 @@ from scene_experts.data.store import ImageStore
 
 Vector = tuple[float, float, float]
 _FLOAT32 = 2.0**-23  # step of float32, relative
-_FINEST = 1e-5  # step of float32 that positions may have, relative to the extent
+FINEST = 1e-5  # step of float32 that positions may have, relative to the extent
 SAMPLED = 4  # views whose poses identify those of a capture
 
 
@@ -87,7 +87,7 @@ class World:
         trained units.
         """
         centre = tuple(-value for value in self.shift)
-        if max(map(abs, centre)) * _FLOAT32 <= _FINEST * extent / self.scale:
+        if max(map(abs, centre)) * _FLOAT32 <= FINEST * extent / self.scale:
             return 0.0, 0.0, 0.0
         x, y, z = (float(round(value)) for value in centre)
         return x, y, z

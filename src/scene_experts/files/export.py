@@ -38,7 +38,8 @@ def export(
     it, which takes minutes and needs the capture.
 
     Args:
-        run: The run, or a file that `lone.open_scene` opened, on the CPU. `run_folder.with_capture` says where its capture is if it moved.
+        run: The run, or a file that `lone.open_scene` opened, on the CPU. `run_folder.with_capture`
+            says where its capture is if it moved.
         format: Name of the format.
         out: File, or folder for it; a name without a suffix is a folder. Default: scene.SUFFIX in
             the run folder. With `options.levels`, one file per level of detail beside it.

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image, ImageOps
 
+from scene_experts.core.types import Points
+from scene_experts.data.images import probe
+from scene_experts.data.orientation import compare_colours
 from scene_experts.data.readers.colmap_model import read_model, write_model
+from scene_experts.data.readers.reader import PosedImage
 from support.captures import load
+from support.foreign_poses import make_bundler, make_realitycapture
 from support.synthetic import Synthetic, make_capture
 
 SIDEWAYS = {2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}  # the orientation that undoes each
@@ -80,3 +87,29 @@ def test_a_photograph_that_fits_only_turned_settles_it(made: Synthetic, copy: Pa
     np.testing.assert_array_equal(capture.frame(0).rgb, made.images[names[0]][::-1, ::-1])
     np.testing.assert_array_equal(capture.frame(1).rgb, made.images[names[1]])
     assert any("as the others of the capture must be" in line for line in capture.warnings)
+
+
+@pytest.mark.parametrize("store_turned", [True, False])
+@pytest.mark.parametrize("make", [make_realitycapture, make_bundler])
+def test_files_of_poses_that_do_not_state_a_size(tmp_path: Path, make: Callable[..., Synthetic], store_turned: bool) -> None:
+    """The lens follows from the size of the photograph, which fits as it is stored and turned."""
+    made = make(tmp_path, views=4, size=(40, 48), points=2000)
+    for name, orientation in zip(sorted(made.images), (6, 8, 3)):
+        tag(tmp_path / "images" / name, orientation, store_turned)
+    capture = load(tmp_path)
+    assert [source.turn for source in capture.images.sources] == [store_turned] * 3 + [False]
+    for i, name in enumerate(sorted(made.images)) if make is make_realitycapture else ():  # the other has a distorted lens
+        np.testing.assert_array_equal(capture.frame(i).rgb, made.images[name], err_msg=name)
+    assert any("turned by it" if store_turned else "read as stored" in line for line in capture.warnings)
+
+
+def test_points_that_are_not_finite_do_not_count(made: Synthetic, copy: Path) -> None:
+    model = read_model(copy / "sparse/0")
+    tag(copy / "images" / min(made.images), 2, True)
+    images = [PosedImage(i.name, copy / "images" / i.name, model.cameras[i.camera_id], i.world_to_cam()) for i in model.images]
+    xyz = np.concatenate((model.xyz, [[np.nan] * 3, [np.inf, 0, 0]]))
+    points = Points(torch.from_numpy(xyz), torch.from_numpy(np.concatenate((model.rgb, np.zeros((2, 3), np.uint8)))))
+    headers = [probe(image.path) for image in images]
+    with np.errstate(all="raise"):
+        found = compare_colours(images, headers, [0], points)
+    assert found == compare_colours(images, headers, [0], Points(points.xyz[:-2], points.rgb[:-2])) and found[1] < found[0]

@@ -21,7 +21,7 @@ from scene_experts.core.reading.numbers import usable_rows
 from scene_experts.core.reading.plain import decode_text
 from scene_experts.core.reading.source import Source, guarding, opening
 from scene_experts.core.types import Points
-from scene_experts.data.images import probe
+from scene_experts.data.images import Size
 from scene_experts.data.lens import Lens
 from scene_experts.data.points import from_arrays
 from scene_experts.data.readers import poses
@@ -111,9 +111,9 @@ def _read(source: Source, warnings: list[str], want_points: bool) -> tuple[list[
     return cameras, from_arrays(np.ascontiguousarray(rows[:, :3]), rgb)
 
 
-def _lens(f: float, k1: float, k2: float) -> Callable[[Path], Lens]:
-    def lens(image: Path) -> Lens:
-        width, height = probe(image).size
+def _lens(f: float, k1: float, k2: float) -> Callable[[Size], Lens]:
+    def lens(size: Size) -> Lens:
+        width, height = size
         return Lens("RADIAL", width, height, (f, width / 2, height / 2, k1, k2))
 
     return lens

@@ -16,6 +16,7 @@ from scene_experts.core.reading.numbers import FARTHEST
 from scene_experts.core.reading.plain import decode_text
 from scene_experts.core.reading.source import opening, shorten
 from scene_experts.core.types import Points
+from scene_experts.data.images import Size, probe
 from scene_experts.data.lens import Lens
 from scene_experts.data.match import EXTENSIONS, absent_error, match_images, to_relative_name
 from scene_experts.data.points import find_cloud, read_points
@@ -51,11 +52,12 @@ def choose_file(folder: Path, found: Sequence[Path], options: ReadOptions, warni
 @dataclass(frozen=True)
 class Pose:
     """A photograph as a file of poses names it: its name or label, and its camera [4, 4], world to
-    camera with OpenCV axes. `lens` gives the lens for the photograph as it was aligned."""
+    camera with OpenCV axes. `lens` gives the lens for the size in px that the photograph had when
+    it was aligned."""
 
     name: str
     world_to_cam: NDArray[np.float64]
-    lens: Callable[[Path], Lens] = field(repr=False)
+    lens: Callable[[Size], Lens] = field(repr=False)
 
 
 def assemble(
@@ -100,11 +102,12 @@ def assemble(
         if name in match.found:
             file = match.found[name]
             shown = file.relative_to(usual if file.is_relative_to(usual) else place).as_posix()
+            header = probe(usual / shown if (usual / shown).is_file() else file)
             try:
-                lens = pose.lens(usual / shown if (usual / shown).is_file() else file)
+                lens, turned = pose.lens(header.size), pose.lens(header.turned)
             except InputError as error:
                 raise InputError(f"{shorten(pose.name)} in {path}: {error}") from None
-            posed.append(PosedImage(shown, file, lens, pose.world_to_cam))
+            posed.append(PosedImage(shown, file, lens, pose.world_to_cam, turned=None if turned == lens else turned))
     cloud = None
     if options.points and not own_points:
         cloud = find_cloud(list(dict.fromkeys((path.parent, folder))), warnings) or _only_cloud(folder)

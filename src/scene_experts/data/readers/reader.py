@@ -36,6 +36,7 @@ class PosedImage:
     mask: Path | None = None  # file that the capture names as its mask; others are found by their names
     angle: float = 0.0  # horizontal field of view in radians, used if `lens` is None
     test: bool = False  # the files name it as a test view
+    turned: Lens | None = None  # the lens if the program has turned the photograph by its EXIF orientation, where the files do not say
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import CAPTURE, POSES
 from scene_experts.core.reading.plain import decode_text
 from scene_experts.core.reading.source import guarding, opening
-from scene_experts.data.images import probe
+from scene_experts.data.images import Size
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers import poses
 from scene_experts.data.readers.reader import RawCapture, ReadOptions
@@ -109,9 +109,9 @@ def _pose(row: dict[str, float]) -> np.ndarray:
     return poses.to_world_to_cam(axes * (1.0, -1.0, -1.0), np.array([row["x"], row["y"], row["alt"]]))
 
 
-def _lens(row: dict[str, float], unit: float) -> Callable[[Path], Lens]:
-    def lens(image: Path) -> Lens:
-        width, height = probe(image).size
+def _lens(row: dict[str, float], unit: float) -> Callable[[Size], Lens]:
+    def lens(size: Size) -> Lens:
+        width, height = size
         side = max(width, height)
         f = row["f"] / _FILM * side
         centre = (width / 2 + row["px"] / unit * side, height / 2 + row["py"] / unit * side)

@@ -52,6 +52,8 @@ class Splats:
         """All Gaussians of one or more parts, with the harmonics that every part has."""
         if len(parts) == 1:
             return parts[0]
+        if len({part.degree for part in parts}) > 1:
+            log.warning("parts have harmonics of different degrees: those above degree %d are left out", min(p.degree for p in parts))
         cut = [part.up_to_degree(min(p.degree for p in parts)) for part in parts]
         return cls(*(torch.cat([getattr(part, name) for part in cut]) for name in NAMES))
 
