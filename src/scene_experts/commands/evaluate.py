@@ -57,7 +57,6 @@ def evaluate(args: list[str]) -> int:
     if not command.options.suffix:  # the page shows the held-out views, and all photographs
         for line in describe_outliers(read_photographs(command.run)):
             print(f"warning: {line}")
-    if results["views"] == "test" and not command.options.suffix:
         print(f"wrote {page.write([command.run])}, with the pictures and what each score means")
     if command.options == EvalOptions():
         place = str(command.run / "scene.html")

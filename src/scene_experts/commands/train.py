@@ -56,6 +56,7 @@ FIRST = (
 )
 """The options that people use first, for --help."""
 
+OTHERS = "Other recipes"
 GROUPS = {
     "Methods": "scene-experts|scaffold-gs|moe-gs|3dgs|3dgs-mcmc|octree-gs|octree-moe-gs|sags",
     "Controls of scene-experts": "scene-experts-.*",
@@ -63,7 +64,7 @@ GROUPS = {
     "MoE-GS with other numbers of experts (Figure 6)": "moe-gs-e[2-5]-(top[12]|dense)",
     "Variants of Scaffold-GS": "scaffold-gs-(?!depth).*",
     "Scaffold-GS with deeper networks (Figure 7)": "scaffold-gs-depth.*",
-    "Other recipes": ".*",
+    OTHERS: ".*",
 }
 """Headings of the recipes in the help, each with a pattern of the recipes' names; the first that
 fits counts."""
@@ -158,7 +159,7 @@ def parse_train(args: list[str]) -> TrainCommand:
         if name in RECIPES.broken:
             raise InputError(f"expected a recipe '{name}' that loads, found an error in it: {RECIPES.broken[name]}; correct the package")
         if any(arg in (*HELP, HELP_ALL) for arg in args):
-            raise HelpAsked(help_of_recipes())
+            raise HelpAsked(help_of_recipes(HELP_ALL in args))
         raise InputError(no_recipe(args))
     text, cfg = RECIPES[name]
     brought = defaults_in(args)  # a scene of the catalog brings its units and numbers; options have the last word
@@ -188,19 +189,24 @@ def other_recipes(flag: str) -> str:
     return f"this recipe does not have it ({few(found)} {'has' if len(found) == 1 else 'have'} it)" if found else ""
 
 
-def help_of_recipes() -> str:
-    """The help without a recipe: the recipes in groups, and examples."""
+def help_of_recipes(everything: bool) -> str:
+    """The help without a recipe: the methods and recipes of other packages, with `everything` also
+    the controls and the variants of the papers, and examples."""
     left = dict(RECIPES)
     parts = [
         f"usage: {PROG} train RECIPE --data CAPTURE --out RUN [options]",
         "Train a scene on a capture. A recipe is a method with its numbers.",
     ]
     for title, pattern in GROUPS.items():
+        if len(parts) > 2 and not everything and title != OTHERS:
+            left = {name: text for name, text in left.items() if not re.fullmatch(pattern, name)}
+            continue
         names = [name for name in left if re.fullmatch(pattern, name)]
         lines = [line for name in names for line in columns(f"  {name}", left.pop(name)[0])]
         parts += ["\n".join([f"{title}:", *lines])] if names else []
     parts.append("\n".join(["Examples:", *(f"  {PROG} train {example}" for example in EXAMPLES)]))
-    return "\n\n".join([*parts, f"`{PROG} train RECIPE --help` shows the options of a recipe."])
+    asks = [] if everything else [f"`{PROG} train --help-all` also lists controls and variants of the papers."]
+    return "\n\n".join([*parts, "\n".join([*asks, f"`{PROG} train RECIPE --help` shows the options of a recipe."])])
 
 
 def follow(command: TrainCommand, run: Job, capture: Capture, rasterize: Rasterizer, console: Console) -> int:

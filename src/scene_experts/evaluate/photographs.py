@@ -55,10 +55,7 @@ class Photograph:
     median: float
     outlier: bool
 
-    @property
-    def folder(self) -> str:
-        """The folder of its pictures in the run folder."""
-        return "test" if self.part == "held out" else NAME
+    folder: str  # of its pictures in the run folder
 
 
 Shown = dict[str, tuple[np.ndarray, np.ndarray]]
@@ -118,8 +115,10 @@ def read_photographs(run: Path) -> list[Photograph]:
 
     Raises InputError for files that are not those of an evaluation.
     """
-    parts = {"held out": run / "per_view.json", "training": run / f"{NAME}.json"}
-    found = [each for part, path in parts.items() for each in _rank(part, _read(path))]
+    parts = [("held out", "per_view.json", "test"), ("training", f"{NAME}.json", NAME)]
+    if not any((run / file).is_file() for _, file, _ in parts):  # a run that holds none out
+        parts = [("training", "per_view_train.json", "train")]
+    found = [each for part, file, folder in parts for each in _rank(part, folder, _read(run / file))]
     return sorted(found, key=lambda each: each.psnr - each.median)
 
 
@@ -145,11 +144,11 @@ def _read(path: Path) -> dict[str, dict[str, Any]]:
     return value
 
 
-def _rank(part: str, views: dict[str, dict[str, Any]]) -> list[Photograph]:
+def _rank(part: str, folder: str, views: dict[str, dict[str, Any]]) -> list[Photograph]:
     scored = {name: facts for name, facts in views.items() if isinstance(facts.get("psnr"), (int, float))}
     if not scored:
         return []
     middle = median(facts["psnr"] for facts in scored.values())
     spread = 1.4826 * median(abs(facts["psnr"] - middle) for facts in scored.values())  # as the deviation of a normal distribution
     limit = middle - max(LEAST, FAR * spread) if len(scored) >= ENOUGH else float("-inf")
-    return [Photograph(name, part, facts["file"], facts["psnr"], middle, facts["psnr"] < limit) for name, facts in scored.items()]
+    return [Photograph(name, part, facts["file"], facts["psnr"], middle, facts["psnr"] < limit, folder) for name, facts in scored.items()]

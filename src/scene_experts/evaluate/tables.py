@@ -37,6 +37,7 @@ class ResultColumn:
     best: int = 0  # 1: larger is better; -1: smaller is better; 0: neither
     counted: bool = False  # 0 means unknown, e.g. for a file of another program
     about: str = ""  # what it is, in a sentence for people who do not know it
+    research: bool = False  # for comparisons of methods: left out of the terminal's table of one run
 
     def value(self, results: dict[str, Any]) -> float | None:
         """Return the value in `results`, or None if it is absent."""
@@ -62,20 +63,27 @@ COLUMNS = (
         "LPIPS", ("lpips",), 3, best=-1,
         about="difference as a network (VGG) perceives it; 0 is equal. Lower is better. It punishes blur more than PSNR does.",
     ),
-    ResultColumn("LPIPS (3DGS)", ("lpips_3dgs",), 3, best=-1, about="LPIPS as the code of 3DGS computes it, for comparison with papers."),
-    ResultColumn("LPIPS (Alex)", ("lpips_alex",), 3, best=-1, about="LPIPS with another network (AlexNet)."),
+    ResultColumn(
+        "LPIPS (3DGS)", ("lpips_3dgs",), 3, best=-1, research=True,
+        about="LPIPS as the code of 3DGS computes it, for comparison with papers.",
+    ),
+    ResultColumn("LPIPS (Alex)", ("lpips_alex",), 3, best=-1, research=True, about="LPIPS with another network (AlexNet)."),
     ResultColumn("MB", ("size", "MB"), 1, best=-1, about="size of the scene with its networks, in millions of bytes."),
     ResultColumn("anchors", ("anchors",), about="elements that the scene stores. A network turns each anchor into several Gaussians."),
-    ResultColumn("active %", ("activation_ratio",), 1, 100.0, about="share of the decoded Gaussians whose opacity is positive."),
+    ResultColumn(
+        "active %", ("activation_ratio",), 1, 100.0, research=True, about="share of the decoded Gaussians whose opacity is positive."
+    ),
     ResultColumn("sharpness", ("sharpness", "ratio"), 2, about="fine detail of the renders relative to the photographs; 1 is as sharp."),
     ResultColumn("FPS", ("fps", "fps"), 1, best=1, about="pictures drawn per second on the machine that scored the run."),
     ResultColumn("iterations", ("step",), counted=True, about="training steps until the scored checkpoint."),
     ResultColumn(
-        "of schedule", ("iterations",), counted=True,  # fewer iterations mean an interrupted training
+        "of schedule", ("iterations",), counted=True, research=True,  # fewer iterations mean an interrupted training
         about="training steps that were planned.",
     ),
     ResultColumn("train s", ("train_seconds",), counted=True, about="wall time of the training in seconds."),
-    ResultColumn("CPU s", ("cpu_seconds",), counted=True, about="processor time of the training in seconds, over all threads."),
+    ResultColumn(
+        "CPU s", ("cpu_seconds",), counted=True, research=True, about="processor time of the training in seconds, over all threads."
+    ),
 )  # fmt: skip
 
 
@@ -238,14 +246,15 @@ def compare_runs(runs: Sequence[Path], format: Format, mixed: bool, console: Con
 
 
 def print_results(results: dict[str, Any], console: Console, run: Path) -> None:
-    """Print the results of an evaluation and where its pictures are."""
+    """Print the results of an evaluation and where its pictures are. What only comparisons of
+    methods need is in results.json, in the report and in `compare`."""
 
     def say(line: str) -> None:
         console.print(line, markup=False, soft_wrap=True)
 
     half = "_half" if results.get("appearance") == "half" else ""
     suffix = half or ("" if results["views"] == "test" else f"_{results['views']}")
-    made = make_table([str(results.get("recipe") or run.name)], [results])
+    made = make_table([str(results.get("recipe") or run.name)], [results], [column for column in COLUMNS if not column.research])
     say(_describe_protocol(results))
     console.print(to_rich(made, console.width), crop=False)
     for note in made.notes:
@@ -253,11 +262,6 @@ def print_results(results: dict[str, Any], console: Console, run: Path) -> None:
     path = run / f"per_view{suffix}.json"
     if failed := describe_failed(read_json(path, "scores by view")) if path.is_file() else "":
         say(f"warning: {failed}")
-    for attribute, shares in results["experts"].items():
-        named, values = ("share", shares["share"]) if shares["share"] else ("mean gate", shares["mean_gate"])
-        say(f"experts, {attribute}: {named} {' '.join(f'{v:.0%}' for v in values)}, gate entropy {shares['entropy']:.2f}")
-    fps = results["fps"]
-    say(f"drawing: {fps['decode_ms']:.1f} ms decode + {fps['raster_ms']:.1f} ms raster on {fps['device']}")
     say(f"wrote {run / f'results{suffix}.json'} and pictures in {run / (results['views'] + half) / 'side_by_side'}")
 
 

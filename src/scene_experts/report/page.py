@@ -71,9 +71,7 @@ def build_page(sources: Sequence[ShownRun]) -> str:
         *(f"<p><b>{escape(line)}.</b></p>" for line in find_outdated(names, [s.path for s in sources], results)),
         f"<p><b>Do not compare these scores:</b> expected {escape(other[0])}.</p>" if other else "",
         *(f"<p class='warn'>{escape(line)}.</p>" for line in find_failures(sources)),
-        "<h2>Held-out views</h2>",
-        "<p class='soft'>Photographs that the training did not use, the best view and the worst view first. "
-        "Move the pointer over a picture, or drag the slider.</p>",
+        *explain_views(sources),
         views,
         "<h2>Scores</h2>",
         format_table(replace(scores, best=frozenset()) if other else scores),
@@ -94,6 +92,18 @@ def build_page(sources: Sequence[ShownRun]) -> str:
     ]
     template = Template(files("scene_experts.report").joinpath("page.html").read_text())
     return template.safe_substitute(title=escape(title), body="\n".join(parts))
+
+
+def explain_views(sources: Sequence[ShownRun]) -> tuple[str, str]:
+    """Return the heading of the shown views, and what they are."""
+    held = all(s.views == "test" for s in sources)
+    which = (
+        "Photographs that the training did not use"
+        if held
+        else "Photographs that were trained on, because none was held out: other views look worse"
+    )
+    how = "the best view and the worst view first. Move the pointer over a picture, or drag the slider."
+    return f"<h2>{'Held-out' if held else 'Training'} views</h2>", f"<p class='soft'>{which}; {how}</p>"
 
 
 def describe_scores(r: dict[str, Any]) -> str:
@@ -204,7 +214,7 @@ def show_experts(sources: Sequence[ShownRun]) -> str:
 def show_strips(s: ShownRun) -> str:
     """Show one held-out view by the anchors of each expert: colour open, other attributes folded.
     Empty without such pictures."""
-    folder = s.path / "test" / "experts"
+    folder = s.pictures / "experts"
     found = {a: inside(folder, f"{a}.png") for a in s.results.get("experts") or {}}
     present = sorted((a for a, path in found.items() if path.is_file()), key=lambda a: a != "color")
     if not present:

@@ -32,20 +32,28 @@ class ShownRun:
     per_view: dict[str, dict[str, Any]]
     metrics: list[dict[str, Any]]
     photographs: list[Photograph]
+    views: str = "test"  # those that are shown: "train" for a run that holds none out
+
+    @property
+    def pictures(self) -> Path:
+        """The folder of the pictures of the shown views."""
+        return self.path / self.views
 
 
 def read_run(run: Path) -> ShownRun:
-    """Read a run folder. Raises InputError if it is not evaluated or its scores by view are
-    invalid."""
-    config, results = run_folder.read_config(run), load_results(run)
-    path = run / "per_view.json"
+    """Read a run folder: the scores of its held-out views, or of its training views if only these
+    were scored. Raises InputError if it is not evaluated or its scores by view are invalid."""
+    views = "train" if not (run / "results.json").is_file() and (run / "results_train.json").is_file() else "test"
+    config, results = run_folder.read_config(run), load_results(run, views)
+    path = run / ("per_view.json" if views == "test" else "per_view_train.json")
     per_view = read_json(path, "scores by view") if path.is_file() else {}
     if not isinstance(per_view, dict) or not all(isinstance(v, dict) and isinstance(v.get("file"), str) for v in per_view.values()):
         raise InputError(f"expected scores by view in {path}, found something else; run `scene-experts eval {run}` again")
     with guarding(path, RUN, "file of scores by view"):
         for facts in per_view.values():
-            inside(run / "test" / "gt", facts["file"])
-    return ShownRun(config.train.recipe, run, config, results, per_view, read_metrics(run / "metrics.jsonl"), read_photographs(run))
+            inside(run / views / "gt", facts["file"])
+    metrics = read_metrics(run / "metrics.jsonl")
+    return ShownRun(config.train.recipe, run, config, results, per_view, metrics, read_photographs(run), views)
 
 
 def tell_apart(sources: list[ShownRun]) -> list[ShownRun]:

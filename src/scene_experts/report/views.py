@@ -29,7 +29,7 @@ def show_captures(groups: dict[str, list[ShownRun]]) -> tuple[str, dict[str, str
         pictures |= shown
         if len(groups) > 1:
             parts.append(f"<h3>{escape(capture)}</h3>")
-        why = "no pictures in the run folder" if find_common_views(group) else "no view that all of these runs held out"
+        why = "no pictures in the run folder" if find_common_views(group) else "no view that all of these runs were scored on"
         parts.append(f"<div class='views'>{views}</div>" if views else f"<p>{why}</p>")
     return "\n".join(parts), pictures
 
@@ -41,9 +41,9 @@ def show_views(sources: Sequence[ShownRun], prefix: str) -> tuple[str, dict[str,
     blocks = []
     names = find_common_views(sources)
     for n, (name, tag) in enumerate(choose_shown(sources, names)):
-        options = [("photograph", sources[0].path / "test" / "gt" / sources[0].per_view[name]["file"])]
-        options += [(s.name, s.path / "test" / "renders" / s.per_view[name]["file"]) for s in sources]
-        options += [(f"{s.name}, error", s.path / "test" / "errors" / s.per_view[name]["file"]) for s in sources]
+        options = [("photograph", sources[0].pictures / "gt" / sources[0].per_view[name]["file"])]
+        options += [(s.name, s.pictures / "renders" / s.per_view[name]["file"]) for s in sources]
+        options += [(f"{s.name}, error", s.pictures / "errors" / s.per_view[name]["file"]) for s in sources]
         present = [(label, path) for label, path in options if path.is_file()]
         if len(present) < 2:
             continue

@@ -46,8 +46,9 @@ class Train:
     average: Average = Average()
     """An average of the weights, which is evaluated and exported in place of the last weights."""
     iterations: Count = SCHEDULE
-    """Number of training iterations. Another number rescales the whole schedule (learning rates,
-    densification, warm-up)."""
+    """Number of training iterations. `info` proposes one that takes minutes; the default is that of
+    the papers. Another number rescales the whole schedule (learning rates, densification,
+    warm-up)."""
     batch: Count = 1
     """Training views per optimiser step. Iterations count views, so N iterations make N / batch
     steps. Several processes (torchrun) share the views of a batch."""

@@ -30,7 +30,7 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
     closed: list[bool] = []
     seen: dict[str, Any] = {}
     opened = SimpleNamespace(
-        config=config, scene="scene", step=250, clock=Clock(9.0, 17.0, {"cores": 2}), capture="a", poses="four", path=tmp_path
+        config=config, scene="scene", step=250, clock=Clock(9.0, 17.0, {"cores": 2}), capture="a", poses="four", path=tmp_path, cameras=None
     )
     capture = SimpleNamespace(
         root="new",

@@ -14,5 +14,5 @@ def test_all_have_a_row_and_the_worst_have_pictures(tmp_path):
     assert text.count("<figure>") == 2 and text.count("data:image/jpeg") == 4 and text.count("<tr") == 4
     assert "Evaluate the run again" in text
     code = "<script>alert(1)</script>"
-    text = list_photographs(replace(source, photographs=[Photograph(code, "training", "absent.png", 10.0, 20.0, True)]))
+    text = list_photographs(replace(source, photographs=[Photograph(code, "training", "absent.png", 10.0, 20.0, True, "training_views")]))
     assert code not in text and "<figure>" not in text and "class=bad" in text and "Evaluate" not in text
