@@ -327,9 +327,19 @@ def _picture(format: str, **options: Any) -> Callable[[Path], None]:
     return make
 
 
+def _exr(folder: Path) -> None:
+    import OpenEXR
+
+    _picture("PNG")(folder)
+    (folder / "photo").unlink()
+    pixels = np.random.default_rng(0).random((12, 16, 4)).astype(np.float32)
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {"RGBA": pixels}).write(str(folder / "photo.exr"))
+
+
 def _read_picture(folder: Path) -> Any:
-    size = probe(folder / "photo").size
-    return decode(FrameSource(folder / "photo", Lens("PINHOLE", *size, (9, 9, 8, 6)), (8, 6), Mask(folder / "mask"), True, (1.0, 1.0, 1.0)))
+    photo = next(folder.glob("photo*"))
+    size = probe(photo).size
+    return decode(FrameSource(photo, Lens("PINHOLE", *size, (9, 9, 8, 6)), (8, 6), Mask(folder / "mask"), True, (1.0, 1.0, 1.0)))
 
 
 def _path(folder: Path) -> None:
@@ -421,6 +431,7 @@ TARGETS: dict[str, Target] = {
     "bundler": Target(_poses(make_bundler), _read_capture, ("*.out", "*.txt")),
     "polycam": Target(_poses(make_polycam), _read_capture, ("*.json",)),
     "blender": Target(_blender, _read_capture, ("*.json", "*.png")),
+    "exr": Target(_exr, _read_picture),
     "png": Target(_picture("PNG"), _read_picture),
     "jpeg": Target(_picture("JPEG"), _read_picture),
     "webp": Target(_picture("WEBP", lossless=True), _read_picture),

@@ -20,6 +20,7 @@ from scene_experts.native import library as native
 PIN = "keep torch as it is with `pip install -c constraints.txt ...`, run in the project's folder"
 EXTRAS = {
     "sfm": ("pycolmap", "camera poses of photographs and videos (capture)"),
+    "exr": ("OpenEXR", "EXR photographs"),
     "heic": ("pillow_heif", "HEIC photographs of phones (capture)"),
     "viewer": ("viser", "the viewer (view, train --viewer)"),
     "video": ("imageio_ffmpeg", "videos (render --out FILE.mp4, capture VIDEO)"),

@@ -62,6 +62,9 @@ def find_white(photographs: Sequence[tuple[Path, str]]) -> tuple[White, list[str
             )
         elif kind == "F" and most > 0:
             white = White(white.integer, _white_of_floats(most, deep[0]))
+    linear = sum(path.suffix.lower() == ".exr" for path, _ in photographs)
+    if linear:
+        notes.append(f"{linear} EXR photographs are read as linear light: they get the curve of sRGB, and values from 1 on are white")
     plain = _spread([path for path, mode in photographs], LOOKED_AT[1])
     dark = [path.name for path in plain if _is_dark(path, white)]
     if dark:

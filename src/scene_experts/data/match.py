@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 
 from scene_experts.core.errors import InputError
 
-EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr")
 
 
 @dataclass(frozen=True)

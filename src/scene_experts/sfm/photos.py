@@ -22,7 +22,7 @@ from scene_experts.data.masks import Found, Mask, find_masks, may_be_mask, read_
 from scene_experts.data.match import EXTENSIONS
 
 FEWEST = 3  # photographs needed for a reconstruction
-UNSUPPORTED = (".dng", ".cr2", ".cr3", ".nef", ".arw")  # photographs that Pillow does not read
+UNSUPPORTED = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".hdr")  # photographs that Pillow does not read
 HEIC = (".heic", ".heif")  # read with pillow-heif, if it is installed
 COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "BMP", "TIFF")  # what COLMAP reads
 PANORAMA = (

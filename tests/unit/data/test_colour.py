@@ -1,6 +1,8 @@
 """Values of photographs: deep and floating-point ones, colour profiles, nearly black pictures."""
 
 import struct
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ from PIL import Image, ImageCms
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.colour import White, find_white, to_8_bit, to_srgb
+from scene_experts.data.readers.colmap_model import read_model, write_model
 from support.captures import load
 from support.synthetic import Synthetic, make_capture
 
@@ -124,3 +127,39 @@ def test_a_photograph_alone_is_read_by_its_own_values() -> None:
     assert np.asarray(to_8_bit(Image.fromarray(np.array([[0, 0.5, 1.0]], np.float32))))[0].tolist() == [0, 128, 255]
     assert np.asarray(to_8_bit(Image.fromarray(np.array([[0, 128, 255]], np.float32))))[0].tolist() == [0, 128, 255]
     assert find_white([]) == (White(), [])
+
+
+def test_exr_photographs_are_linear_light(made: Synthetic) -> None:
+    OpenEXR = pytest.importorskip("OpenEXR")
+    for name, rgb in sorted(made.images.items()):
+        value = rgb / 255.0
+        light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+        light[0, 0] = 7.0  # brighter than white
+        (made.folder / "images" / name).unlink()
+        pixels = {"RGB": light} if name != "view_001.png" else {"RGBA": np.dstack((light, np.full(light.shape[:2], 0.5, np.float32)))}
+        OpenEXR.File({}, pixels).write(str((made.folder / "images" / name).with_suffix(".exr")))
+    capture = load(made.folder)
+    assert "9 EXR photographs are read as linear light" in str(capture.warnings)
+    for i, (_, rgb) in enumerate(sorted(made.images.items())):
+        found = capture.frame(i)
+        rgb[0, 0] = 255
+        assert np.abs(found.rgb.numpy().astype(int) - rgb).max() <= 1
+        assert (found.mask is None) == (i != 1) and (found.mask is None or abs(float(found.mask.mean()) - 0.5) < 0.01)
+
+
+def test_exr_photographs_that_cannot_be_read(made: Synthetic, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("OpenEXR")
+    path = made.folder / "images/view_000.exr"
+    (made.folder / "images/view_000.png").unlink()
+    path.write_bytes(b"v/1\x01" + bytes(40))
+    with pytest.raises(InputError, match=r"view_000\.exr"):
+        load(made.folder)
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    with pytest.raises(InputError, match=r"package OpenEXR .*scene-experts\[exr\]"):
+        load(made.folder)
+    path.rename(made.folder / "images/view_000.hdr")
+    model = read_model(made.folder / "sparse/0")
+    images = tuple(replace(image, name=image.name.replace("000.png", "000.hdr")) for image in model.images)
+    write_model(made.folder / "sparse/0", replace(model, images=images))
+    with pytest.raises(InputError, match=r"view_000\.hdr, found content that is no picture of a known format"):
+        load(made.folder)

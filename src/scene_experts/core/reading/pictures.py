@@ -10,6 +10,7 @@ from pathlib import Path
 from PIL import Image
 
 from scene_experts.core.reading import budget as budgets
+from scene_experts.core.reading import exr
 from scene_experts.core.reading.budget import Budget, Damaged
 from scene_experts.core.reading.source import Source, opening
 
@@ -27,11 +28,15 @@ def opening_picture(path: Path, budget: Budget = budgets.PICTURE, heic: bool = F
     """Open the picture at `path` without decoding it. The block decodes it to the pixels as they
     are stored, whatever its EXIF orientation.
 
-    `heic` admits HEIC photographs where pillow-heif reads them.
+    `heic` admits HEIC photographs where pillow-heif reads them. Files that end in .exr are read with
+    the package OpenEXR.
     Raises InputError if it is absent, damaged, of another format or beyond the budget, or if the
     block fails.
     """
     formats = (*FORMATS, HEIC) if heic and HEIC in Image.OPEN else FORMATS
+    if path.suffix.lower() == exr.SUFFIX:
+        exr.register(path)
+        formats = (*formats, exr.FORMAT)
     with opening(path, budget) as source, source.stream() as stream, Image.open(stream, formats=formats) as image:
         check_size(source, image)
         keep_as_stored(image)
