@@ -59,12 +59,14 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
         if data.max_views is not None:
             capture = prepare.limit_views(capture, data.max_views)
         capture = prepare.drop_outlier_views(capture)
-        capture = prepare.measure_extent(prepare.hold_out(capture, choose_split(capture) if data.split == "auto" else data.split))
+        capture = prepare.hold_out(capture, choose_split(capture) if data.split == "auto" else data.split)
         if data.split == "auto" and capture.split == "none":
             note = f"all of {len(capture.views)} photographs are trained on; with so few, scores need --split fold:1/5 to fold:5/5, or mod8"
             capture = replace(capture, warnings=(*capture.warnings, note))
         if data.normalise == "extent":
-            capture = prepare.normalise(capture)
+            capture = prepare.normalise(replace(capture, extent=prepare.camera_extent(capture)))
+        else:
+            capture = prepare.measure_extent(capture)
         capture = prepare.drop_outliers(capture)
         if data.init == "random" or (capture.points is None and (capture.bounds is not None or raw.random_points)):
             capture = _add_random_points(capture, seed, warn=data.init != "random")
@@ -231,7 +233,7 @@ def _finish(capture: Capture) -> Capture:
     notes = list(capture.warnings)
     if 0 < len(capture.test) < 5:
         notes.append(f"only {len(capture.test)} test view{'s' if len(capture.test) > 1 else ''}: mean scores are unreliable")
-    far = max(float(v.camera.position.abs().max()) for v in views)
+    far = max(float(v.camera.position.abs().max()) for v in views) if capture.world.identity else 0.0  # else they are around the origin
     if far * 2.0**-23 > FINEST * capture.extent:
         notes.append(
             f"the cameras are up to {far:,.0f} from the origin, where float32 cannot hold what they see; leave --normalise none out"

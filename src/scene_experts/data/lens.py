@@ -7,6 +7,7 @@ the first pixel is (0.5, 0.5).
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -249,6 +250,7 @@ def unreadable_model(found: str | int) -> str:
     )
 
 
+@functools.lru_cache(maxsize=64)  # views share their cameras
 def to_pinhole(lens: Lens) -> Lens:
     """Return the pinhole camera that `lens` is undistorted to: the same focal lengths and the
     largest size without empty pixels.

@@ -160,11 +160,16 @@ def _resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:
 def transform(capture: Capture, shift: Vector, scale: float) -> Capture:
     """Map cameras, points, extent and near planes by `(trained + shift) * scale`, and extend
     `world` by that step."""
+    return _with_near(_move(capture, shift, scale))
+
+
+def _move(capture: Capture, shift: Vector, scale: float) -> Capture:
+    """`transform` without the near planes."""
     step = World(scale, shift)
     views = tuple(replace(v, camera=step.camera_from_input(v.camera)) for v in capture.views)
     points = capture.points and Points(step.from_input(capture.points.xyz), capture.points.rgb)
     world = capture.world.then(shift, scale)
-    return _with_near(replace(capture, views=views, points=points, world=world, extent=capture.extent * scale))
+    return replace(capture, views=views, points=points, world=world, extent=capture.extent * scale)
 
 
 def scale(capture: Capture, factor: float) -> Capture:
@@ -176,7 +181,7 @@ def normalise(capture: Capture) -> Capture:
     """Move the origin to the mean training camera and scale the extent to 5, whatever the unit of
     the capture is."""
     x, y, z = (-camera_centres([capture.views[i] for i in capture.train]).mean(0)).tolist()
-    out = transform(capture, (x, y, z), NORMAL_EXTENT / capture.extent)
+    out = _move(capture, (x, y, z), NORMAL_EXTENT / capture.extent)
     return _with_near(replace(out, extent=NORMAL_EXTENT))  # exactly 5, so that captures in different units agree to the last bit
 
 
