@@ -68,7 +68,8 @@ def import_files(source: Path, data: Data, out: Path, iteration: int | None = No
 @torch.no_grad()
 def compare_with_photographs(run: OpenRun, capture: Capture) -> str | None:
     """Return what a user should know where the scene shows nothing of the photographs: its pictures
-    of all of up to three training views are no nearer to the photographs than their mean colours."""
+    of all of up to three training views are no nearer to the photographs than their mean
+    colours."""
     painter = Painter.of(run.scene, run.step, None, run.config.train.antialias)
     background = torch.tensor(capture.background)
     ours, plain = list[float](), list[float]()

@@ -116,8 +116,8 @@ def cost(
 
 @contextmanager
 def capture_if_there(run: OpenRun, needed: bool) -> Iterator[Capture | None]:
-    """The capture of a run, or the cameras in its place; None where it is gone and not needed. Raises InputError where it is
-    needed and gone, and for another one."""
+    """The capture of a run, or the cameras in its place; None where it is gone and not needed.
+    Raises InputError where it is needed and gone, and for another one."""
     if run.cameras is not None:
         yield run.cameras
         return

@@ -42,9 +42,10 @@ def place_cameras(
     with free cameras, which have no appearance codes of their own.
 
     source: file or folder of the scene. positions: [N, 3] float64 of its rows, trained world. world:
-    how that follows from the frame of the scene's capture. origin: place in the latter that the file
-    and the cameras.json beside it are relative to. background: None: black. A cameras.json most of whose cameras see nothing
-    of the scene is left aside with a warning. Raises InputError for a damaged one.
+    how that follows from the frame of the scene's capture. origin: place in the latter that the
+    file and the cameras.json beside it are relative to. background: None: black. A cameras.json
+    most of whose cameras see nothing of the scene is left aside with a warning. Raises InputError
+    for a damaged one.
     """
     folder = source if source.is_dir() else source.parent
     folder = folder.parent.parent if iteration_of(folder) is not None else folder

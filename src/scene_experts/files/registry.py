@@ -266,8 +266,8 @@ def recognise(path: Path) -> tuple[str, Format]:
 
 
 def read(path: Path) -> Any:
-    """The contents of a file of any format that has a reader, or of a folder of SOG. Raises InputError for others and for
-    damaged files."""
+    """The contents of a file of any format that has a reader, or of a folder of SOG. Raises
+    InputError for others and for damaged files."""
     path = scene_file(Path(path))
     format = recognise(path)[1]
     assert format.read is not None

@@ -54,8 +54,8 @@ Pose = dict[str, Any]
 
 
 def write(path: Path, splats: Splats, note: dict[str, Any]) -> str | None:
-    """Write the page. Returns a warning where it cannot hold the sizes of many Gaussians, or None. Raises InputError
-    for invalid cameras in the note."""
+    """Write the page. Returns a warning where it cannot hold the sizes of many Gaussians, or None.
+    Raises InputError for invalid cameras in the note."""
     centre = splats.means.double().median(0).values if len(splats) else torch.zeros(3, dtype=torch.float64)
     splats = replace(splats, means=(splats.means.double() - centre).float())
     settings, scene = page_settings(splats, note, centre), scaled(splats, unit_of(splats))

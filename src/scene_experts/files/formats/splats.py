@@ -30,7 +30,8 @@ _NO_LENGTH = 1e-12  # of a quaternion; renderers divide by its length, or by thi
 
 @dataclass(frozen=True)
 class Splats:
-    """N Gaussians of one file, float32 on the CPU; positions may be float64. Raises InputError for shapes that disagree."""
+    """N Gaussians of one file, float32 on the CPU; positions may be float64. Raises InputError for
+    shapes that disagree."""
 
     means: Tensor  # [N, 3]; float64 where the file holds doubles
     log_scales: Tensor  # [N, 3], natural logarithms of standard deviations
@@ -74,9 +75,10 @@ class Splats:
         return self if self.degree <= degree else replace(self, sh=self.sh[:, : (degree + 1) ** 2])
 
     def usable(self, where: Path) -> Splats:
-        """The Gaussians of the file `where` with usable values for infinite ones, and for the largest
-        floats, that mean something: an opacity of 1 or 0 has the logit 20 or -20, and a length of 0
-        the logarithm of 1e-30. Gaussians whose quaternion has no length are left out, and a warning counts them.
+        """The Gaussians of the file `where` with usable values for infinite ones, and for the
+        largest floats, that mean something: an opacity of 1 or 0 has the logit 20 or -20, and a
+        length of 0 the logarithm of 1e-30. Gaussians whose quaternion has no length are left out,
+        and a warning counts them.
 
         Raises InputError where none is left.
         """

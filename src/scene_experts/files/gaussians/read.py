@@ -50,10 +50,10 @@ def read(source: Path, data: Data | None, iteration: int | None, transform: Path
     """The run in a file of Gaussians, published or ours, in the frame and unit of the capture.
 
     The recipe is 3DGS and the step 0, or `iteration`, unless the description or the name of its
-    folder says otherwise. transform: `transform.read_transform`. Whether it is drawn with antialiasing, the description beside it
-    (FILE.json) or the file says. data: None for a scene without its capture, whose frame is then that
-    of the file. Raises InputError where the description says that the file is in another frame.
-    """
+    folder says otherwise. transform: `transform.read_transform`. Whether it is drawn with
+    antialiasing, the description beside it (FILE.json) or the file says. data: None for a scene
+    without its capture, whose frame is then that of the file. Raises InputError where the
+    description says that the file is in another frame."""
     antialias = is_antialiased(source)
     about = result_folder.read_description(source.parent) or {}
     if data is None:
@@ -124,7 +124,8 @@ def noted_origin(source: Path) -> Vector | None:
 
 
 def far_origin(splats: Splats) -> Vector:
-    """A place of whole numbers near Gaussians whose positions float32 cannot hold; 0 where it can."""
+    """A place of whole numbers near Gaussians whose positions float32 cannot hold; 0 where it
+    can."""
     x, y, z = splats.means.double().median(0).values.tolist()
     away = (splats.means.double() - torch.tensor((x, y, z), dtype=torch.float64)).norm(dim=1)
     return World(1.0, (-x, -y, -z)).local_origin(float(away.median()))
