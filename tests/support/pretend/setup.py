@@ -71,7 +71,7 @@ def prepare() -> None:
 
 def load_small(longest: int = 32, every: int = 1000) -> Capture:
     """The shipped capture with six small views and every so many of its points."""
-    capture = load(DEMO / "buddha", resolution=f"longest:{longest}", max_views=6)
+    capture = load(DEMO / "buddha", resolution=f"longest:{longest}", max_views=6, split="mod8")
     assert capture.points is not None
     return replace(capture, points=Points(capture.points.xyz[::every], capture.points.rgb[::every]))
 

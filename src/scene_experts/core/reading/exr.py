@@ -3,7 +3,10 @@ sRGB is applied. Values from 1 on are white."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import tempfile
+import threading
 from pathlib import Path
 from typing import IO, Any
 
@@ -16,6 +19,7 @@ from scene_experts.core.reading.budget import Damaged
 
 FORMAT, MAGIC, SUFFIX = "EXR", b"v/1\x01", ".exr"
 _MOST = 1 << 28  # pixels
+_told = threading.Lock()
 _LAYERS = (("R", "G", "B", "A"), ("R", "G", "B"), ("Y", "A"), ("Y",))
 
 
@@ -42,7 +46,10 @@ def _open(stream: IO[bytes], _: object) -> Image.Image:
             low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
             if (high < low).any() or int(np.prod(high - low + 1)) > _MOST:
                 raise Damaged(f"a picture from {low.tolist()} to {high.tolist()}")
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        # The library leaves out a part that it cannot read, and only prints why.
+        with _told, contextlib.redirect_stdout(io.StringIO()) as said, OpenEXR.File(str(path), separate_channels=True) as file:
+            if said.getvalue():
+                raise Damaged(said.getvalue().strip().rpartition(" - ")[2])
             found: dict[str, Any] = {name: channel.pixels for name, channel in file.channels().items()}
     layers = next((names for names in _LAYERS if all(name in found for name in names)), None)
     if layers is None:

@@ -52,3 +52,15 @@ def test_other_channels_and_damaged_files_are_refused(tmp_path: Path) -> None:
     path.write_bytes(data[: at + 8] + (2**20).to_bytes(4, "little") * 2 + data[at + 16 :])  # a bomb
     with pytest.raises(InputError, match=r"a\.exr"):
         read(path)
+
+
+def test_a_damaged_first_part_is_told_and_no_other_part_is_read_for_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ramp = np.arange(64 * 64, dtype=np.float32).reshape(64, 64)  # is compressed, so that damage shows
+    parts = [OpenEXR.Part({}, {"Y": ramp}, "left"), OpenEXR.Part({}, {"Y": ramp * 0}, "right")]
+    OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
+    data = (tmp_path / "a.exr").read_bytes()
+    damaged = data[: len(data) // 3] + bytes(100) + data[len(data) // 3 + 100 :]
+    (tmp_path / "a.exr").write_bytes(damaged)
+    with pytest.raises(InputError, match=r"a\.exr"):
+        read(tmp_path / "a.exr")
+    assert not capsys.readouterr().out
