@@ -13,7 +13,7 @@ import torch
 from scene_experts.core.choices import Device, Raster
 from scene_experts.core.errors import InputError
 from scene_experts.render import Rasterizer, choose
-from scene_experts.render.gsplat import explain_missing
+from scene_experts.render.gsplat_install import explain_missing
 
 
 def backend(device: Device, raster: Raster, antialias: bool, deterministic: bool) -> tuple[str, Rasterizer]:

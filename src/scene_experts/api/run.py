@@ -190,7 +190,7 @@ class Run:
         """Render cameras to a video or to numbered PNG files.
 
         Args:
-            out: FILE.mp4, .mov, .mkv or .webm (needs `pip install 'scene-experts[video]'`), or a
+            out: FILE.mp4, .mov, .mkv or .webm (needs `pip install imageio-ffmpeg`), or a
                 folder for PNG files.
             cameras: One for each frame, all of one size for a video.
             fps: Frames per second, above 0.

@@ -83,7 +83,7 @@ class Trainer:
             max_memory: GiB that the process may reach before growth stops, resident or reserved on
                 the GPU; 0 for no limit.
             tensorboard: Write `out`/tensorboard too (needs `pip install
-                'scene-experts[tensorboard]'`).
+                tensorboard`).
 
         Raises:
             InputError: A setting is invalid, the capture cannot be used, or the folder cannot hold

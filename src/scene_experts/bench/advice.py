@@ -16,7 +16,7 @@ from scene_experts.core.io import cache_dir, read_json, write_json
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import number
 from scene_experts.core.version import __version__
-from scene_experts.render import choose
+from scene_experts.render import choose, gsplat_install
 
 LIMIT = 8.0  # minutes, so that a capture of few photographs, its training, scores and page take a quarter of an hour together
 SIDES = ((0, 7000), (1200, 7000), (800, 7000), (800, 4000), (600, 4000), (600, 3000), (600, 2000), (400, 2000))
@@ -90,7 +90,7 @@ def suggest(width: int, height: int, views: int, picture: float | None = None) -
     views: number of photographs. picture: seconds from `measure_picture`; `recall_picture` by
     default.
     """
-    if torch.cuda.is_available() and choose("auto", "cuda").name != "reference":
+    if gsplat_install.is_likely():
         return Advice(0, 30_000, None)
     picture, threads = picture or recall_picture(), torch.get_num_threads()
     advice = Advice(0, SIDES[-1][1], 0.0)

@@ -14,6 +14,7 @@ from functools import partial
 import torch
 from rich.console import Console
 
+from scene_experts.core.extras import install_line
 from scene_experts.data.store import available_bytes
 from scene_experts.native import library as native
 
@@ -114,10 +115,12 @@ def pytorch() -> Check:
 
 
 def cuda() -> Check:
+    if torch.version.hip is not None:
+        return Check("CUDA", False, f"this torch is built for AMD's ROCm {torch.version.hip}, where no kernel here runs: the CPU is used")
     if torch.cuda.is_available():
         names = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
         return Check("CUDA", True, "; ".join(f"{p.name}, {p.total_memory / 2**30:.0f} GiB" for p in names))
-    if torch.version.cuda is None and torch.version.hip is None:
+    if torch.version.cuda is None:
         fix = f"only for an NVIDIA GPU: install a CUDA build of torch {torch.__version__.split('+')[0]}"
         return Check("CUDA", False, "this build of torch does not support it", fix)
     found = f"torch supports CUDA {torch.version.cuda}, but finds no device"
@@ -137,17 +140,18 @@ def gsplat() -> Check:
     if version is None:
         if not torch.cuda.is_available():
             return Check("gsplat", False, "not installed (it only runs on CUDA)")
-        return Check("gsplat", False, "not installed", f"pip install 'scene-experts[cuda]' for training on this GPU; {PIN}")
+        return Check("gsplat", False, "not installed", f"{install_line('cuda')} for training on this GPU; {PIN}")
     if not torch.cuda.is_available():
         return Check("gsplat", False, f"{version} is installed, but it needs a CUDA device", "use the CPU library: --rasterizer cpu")
     try:
-        from scene_experts.render import gsplat as adapter
+        from scene_experts.render import gsplat_install
 
-        reason = adapter.explain_missing()
+        gsplat_install.try_again()
+        reason = gsplat_install.explain_missing()
     except Exception as error:  # a broken compiled extension may raise anything when imported
         reason = f"{type(error).__name__}: {error}"
-    found = version if reason is None else f"{version}: {reason}"
-    return Check("gsplat", reason is None, found, "reinstall it for this version of torch and CUDA")
+    why, _, fix = (reason or "").rpartition(": ")
+    return Check("gsplat", reason is None, version if reason is None else f"{version}: {why}", fix)
 
 
 def triton() -> Check:
@@ -193,7 +197,7 @@ def extra(name: str) -> Check:
     version = _version(module)
     if version is not None:
         return Check(name, True, f"{module} {version}: {purpose}")
-    return Check(name, False, f"{module} is not installed: {purpose}", f"pip install 'scene-experts[{name}]'")
+    return Check(name, False, f"{module} is not installed: {purpose}", install_line(name))
 
 
 def _version(name: str) -> str | None:

@@ -93,8 +93,7 @@ class TrainCommand:
     """Divide the anchors among the processes of torchrun, so that each needs less memory. The
     results are those without it, up to rounding (docs/scaling.md)."""
     viewer: bool = False
-    """Show the training in a browser while it runs (needs `pip install
-    'scene-experts[viewer]'`)."""
+    """Show the training in a browser while it runs (needs `pip install viser`)."""
     port: int = 8080
     """Port of the viewer. It only accepts connections from this machine."""
 

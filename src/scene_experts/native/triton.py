@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
@@ -19,11 +20,14 @@ def explain_missing() -> str | None:
 
     Without a CUDA device, only the import is checked.
     """
+    if torch.version.hip is not None:
+        return "the Triton kernels are for NVIDIA GPUs, and this torch is for AMD's ROCm: plain torch runs instead"
     try:
         importlib.import_module("triton")
     except Exception as error:  # a broken installation can raise any exception
         reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
-        return f"triton cannot be imported ({reason[0]}): install it with `pip install scene-experts[cuda]`; plain torch runs instead"
+        fix = "`pip install triton-windows`, its port" if sys.platform == "win32" else "`pip install triton`"
+        return f"triton cannot be imported ({reason[0]}): install it with {fix}; plain torch runs instead"
     if not torch.cuda.is_available():
         return None
     if torch.cuda.get_device_capability()[0] < 8:

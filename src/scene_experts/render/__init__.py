@@ -94,11 +94,11 @@ def for_growth(rasterize: Rasterizer, absolute: bool) -> Rasterizer:
 
 def _best(device: torch.device) -> str:
     if device.type == "cuda":
-        from scene_experts.render.gsplat import explain_missing
+        from scene_experts.render.gsplat_install import explain_missing
 
         reason = explain_missing()
         if reason is not None:
-            raise InputError(f"{reason}; or use --device cpu")
+            raise InputError(reason)
         return "gsplat"
     if device.type != "cpu":
         _warn(f"no other one draws tensors on {device}")

@@ -13,15 +13,12 @@ gradient has no component along the quaternion. Where the factor without its flo
 below 1/255, nothing is drawn; the reference draws an alpha of at most 0.005. Sums on the GPU are
 not deterministic in the last bits.
 
-gsplat is imported on first use. Without a prebuilt wheel it then compiles its CUDA code once, which
-takes minutes.
+gsplat is imported on first use, see `gsplat_install`.
 """
 
 from __future__ import annotations
 
-import functools
 import importlib
-import inspect
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any
@@ -32,27 +29,9 @@ from torch import Tensor
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.native import triton
+from scene_experts.render.gsplat_install import explain_missing
 from scene_experts.render.project_cuda import find_radii
 from scene_experts.render.reference import BLUR, MIN_COMPENSATION, TILE, project, record_mean2d_grad, visible
-
-
-@functools.cache
-def explain_missing() -> str | None:
-    """Return None if gsplat can draw, otherwise a sentence that says why not and what to do."""
-    if not torch.cuda.is_available():
-        return "gsplat needs a CUDA device and a CUDA build of torch, and torch finds none: use the rasteriser cpu"
-    try:
-        module = importlib.import_module("gsplat")
-        backend = importlib.import_module("gsplat.cuda._backend")
-    except Exception as error:  # a broken CUDA toolkit raises almost any exception while gsplat compiles
-        reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
-        return f"gsplat cannot be imported ({reason[0]}): install it with `pip install scene-experts[cuda]`, or use another rasteriser"
-    if "opacities" not in inspect.signature(module.fully_fused_projection).parameters:
-        found = getattr(module, "__version__", "an older one")
-        return f"gsplat 1.5.3 or newer is required, found {found}: run `pip install -U gsplat`"
-    if getattr(backend, "_C", module) is None:
-        return "gsplat is installed without its CUDA code: install the CUDA toolkit (nvcc) or a prebuilt gsplat wheel"
-    return None
 
 
 @dataclass(frozen=True)

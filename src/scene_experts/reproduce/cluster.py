@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, cast
 from filelock import FileLock
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.extras import install_line
 from scene_experts.core.version import __version__
 from scene_experts.reproduce import store
 from scene_experts.reproduce.plan import Spec
@@ -166,7 +167,7 @@ def connect(address: str) -> Iterator[Client]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise InputError("expected the package distributed for --cluster, found none; pip install 'scene-experts[cluster]'") from error
+        raise InputError(f"expected the package distributed for --cluster, found none; {install_line('cluster')}") from error
 
     class Closing(Client):
         """A client that is closed at once if it cannot connect.

@@ -10,6 +10,7 @@ from typing import Any
 from PIL import Image
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.extras import install_line
 from scene_experts.core.io import write_bytes
 from scene_experts.reproduce.experiments import ROUTINGS, Experiment
 from scene_experts.reproduce.statistics import clock_of, mean, on_common_runs, select
@@ -26,7 +27,7 @@ def canvas(columns: int = 1, width: float = 6.4, height: float = 3.8) -> tuple[A
     try:
         import matplotlib
     except ImportError as error:
-        raise InputError("expected matplotlib to draw figures, found none; pip install 'scene-experts[plots]'") from error
+        raise InputError(f"expected matplotlib to draw figures, found none; {install_line('plots')}") from error
     matplotlib.use("Agg")
     from matplotlib import pyplot
 

@@ -50,7 +50,7 @@ class ReproduceOptions:
     """Indices of the CUDA devices that the workers share."""
     cluster: Annotated[str | None, Option(value="ADDRESS")] = None
     """Train the runs on the workers of the Dask scheduler at this address, e.g. tcp://HOST:8786
-    (needs `pip install 'scene-experts[cluster]'`). All machines must share the folders."""
+    (needs `pip install distributed`). All machines must share the folders."""
     resources: Annotated[tuple[str, ...], Option(value="NAME=AMOUNT")] = ()
     """With --cluster: what a run takes from its worker, e.g. GPU=1; by default one thread. Start
     the workers with `dask worker --resources "GPU=1"`."""

@@ -226,7 +226,7 @@ def build_kernels() -> None:
     that another process runs. Workers that start together would therefore break each other's build.
     """
     if torch.cuda.is_available():
-        code = "from scene_experts.render.gsplat import explain_missing; explain_missing()"
+        code = "from scene_experts.render.gsplat_install import explain_missing; explain_missing()"
         subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.extras import install_line
 from scene_experts.core.io import write_atomic
 from scene_experts.core.progress import Progress
 
@@ -97,6 +98,6 @@ def import_ffmpeg() -> Any:
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise InputError("reading videos requires imageio-ffmpeg: pip install 'scene-experts[video]'") from error
+        raise InputError(f"reading videos requires imageio-ffmpeg: {install_line('video')}") from error
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # it warns about the frame size that is requested here
     return imageio_ffmpeg

@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 from PIL import Image, ImageOps
 
 from scene_experts.core.errors import InputError, few
+from scene_experts.core.extras import install_line
 from scene_experts.core.io import read_json, write_atomic, write_json
 from scene_experts.core.reading.budget import CAPTURED
 from scene_experts.core.reading.pictures import opening_picture
@@ -151,7 +152,7 @@ def find_heic(files: Sequence[Path], others: set[Path], folder: Path) -> list[Pa
         except ImportError:
             raise InputError(
                 f"expected the package pillow-heif to read the {len(found)} HEIC photographs in {folder}, found none; "
-                "pip install 'scene-experts[heic]', or save them as JPEG"
+                f"{install_line('heic')}, or save them as JPEG"
             ) from None
         register_heif_opener()
     return found

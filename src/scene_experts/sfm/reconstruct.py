@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.extras import install_line
 from scene_experts.core.io import read_json, write_bytes, write_json
 from scene_experts.core.progress import Progress
 from scene_experts.data.match import EXTENSIONS
@@ -30,7 +31,6 @@ from scene_experts.sfm.options import Matching, SfmOptions
 from scene_experts.sfm.photos import Photo
 
 LOG, NOTE, VIDEO = "colmap.log", "capture.json", "video.txt"
-INSTALL = "pip install 'scene-experts[sfm]'"
 MOST_EXHAUSTIVE = 300  # photographs that are all matched with each other: 44,850 pairs, about ten minutes on two cores
 NEIGHBOURS = 10  # following photographs that each photograph is matched with
 
@@ -117,7 +117,7 @@ def check_request(source: Path, out: Path, overwrite: bool) -> None:
     if source.is_file() and source.suffix.lower() in EXTENSIONS:
         raise InputError(f"expected a folder of photographs or a video, found the single photograph {source}; give its folder")
     if importlib.util.find_spec("pycolmap") is None:
-        raise InputError(f"finding camera poses requires pycolmap: {INSTALL}")
+        raise InputError(f"finding camera poses requires pycolmap: {install_line('sfm')}")
     if source.is_file():
         frames.import_ffmpeg()
     here, images = source.resolve(), (out / "images").resolve()
@@ -222,7 +222,7 @@ def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress)
             with suppress(BrokenPipeError):
                 process.stdin.close()
     if last.get("step") == "missing":
-        raise InputError(f"pycolmap cannot be imported ({last['why']}): {INSTALL}")
+        raise InputError(f"pycolmap cannot be imported ({last['why']}): {install_line('sfm')}")
     if code != 0 or last.get("step") != "done":
         check_space(log.parent)
         raise RunError(f"COLMAP failed with exit code {code}: {last_log_line(log)}; its log is {log}")

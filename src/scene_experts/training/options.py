@@ -39,4 +39,4 @@ class TrainOptions:
     """Stop densification at this memory of the process in GiB, resident or reserved on the GPU; 0
     means no limit."""
     tensorboard: bool = False
-    """Also write RUN/tensorboard (needs `pip install 'scene-experts[tensorboard]'`)."""
+    """Also write RUN/tensorboard (needs `pip install tensorboard`)."""

@@ -11,6 +11,7 @@ from typing import Any
 from PIL import Image
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.extras import install_line
 from scene_experts.core.io import write_atomic
 from scene_experts.training.events import Densified, Event, Previewed, Started, Stepped
 
@@ -36,7 +37,7 @@ class Recorder:
             try:
                 from torch.utils.tensorboard import SummaryWriter
             except ImportError as error:
-                raise InputError("--tensorboard requires TensorBoard: pip install 'scene-experts[tensorboard]'") from error
+                raise InputError(f"--tensorboard requires TensorBoard: {install_line('tensorboard')}") from error
             self.writer = SummaryWriter
 
     def __enter__(self) -> Recorder:

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.extras import install_line
 from scene_experts.core.types import Camera
 from scene_experts.data.capture import Capture
 from scene_experts.evaluate.pictures import to_8bit
@@ -50,7 +51,7 @@ def import_viser() -> Any:
     try:
         import viser as module
     except ImportError as error:
-        raise InputError("showing scenes in a browser requires viser: pip install 'scene-experts[viewer]'") from error
+        raise InputError(f"showing scenes in a browser requires viser: {install_line('viewer')}") from error
     return module
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.extras import install_line
 from scene_experts.core.io import read_json, write_atomic, write_json
 from scene_experts.evaluate import pictures
 
@@ -29,7 +30,7 @@ def import_ffmpeg() -> Any:
         import imageio_ffmpeg
     except ImportError as error:
         raise InputError(
-            "writing videos requires imageio-ffmpeg: pip install 'scene-experts[video]', or write PNG files with --out FOLDER"
+            f"writing videos requires imageio-ffmpeg: {install_line('video')}, or write PNG files with --out FOLDER"
         ) from error
     return imageio_ffmpeg
 

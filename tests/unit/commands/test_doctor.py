@@ -12,6 +12,7 @@ from rich.console import Console
 
 from scene_experts.commands import doctor
 from scene_experts.commands.doctor import Check
+from scene_experts.core.extras import install_line
 from scene_experts.native import library as native
 from support.places import ROOT
 
@@ -64,7 +65,7 @@ def test_absent_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
     for name, (_, purpose) in doctor.EXTRAS.items():
         check = doctor.extra(name)
-        assert not check.ok and f"scene-experts[{name}]" in check.fix and purpose in check.found
+        assert not check.ok and check.fix == install_line(name) and purpose in check.found
 
 
 def test_every_extra_of_the_project_is_listed() -> None:

@@ -11,7 +11,7 @@ from support.messages import naming
 
 def test_without_viser_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(InputError, match="viewer"):
+    with pytest.raises(InputError, match=r"pip install .viser"):
         command.view(["run"])
 
 

@@ -10,7 +10,7 @@ from scene_experts import render
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Gaussians
 from scene_experts.native import library as native
-from scene_experts.render import NAMES, as_trained, choose, for_growth, gsplat
+from scene_experts.render import NAMES, as_trained, choose, for_growth, gsplat_install
 from support.messages import naming
 
 
@@ -34,8 +34,8 @@ def test_auto_on_a_device_without_a_fast_one_takes_the_reference():
 
 
 def test_auto_on_cuda_without_gsplat_stops_and_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(gsplat, "explain_missing", lambda: "gsplat is missing: run `pip install scene-experts[cuda]`")
-    with pytest.raises(InputError, match=naming("scene-experts[cuda]", "--device cpu")):
+    monkeypatch.setattr(gsplat_install, "explain_missing", lambda: "gsplat is missing: run `pip install gsplat`, or use --device cpu")
+    with pytest.raises(InputError, match=naming("pip install gsplat", "--device cpu")):
         choose("auto", "cuda")
 
 

@@ -49,7 +49,7 @@ def test_heic_photographs_are_read_where_pillow_heif_is_installed(tmp_path, monk
     with Image.open(tmp_path / "work" / "images" / "IMG_1.jpg") as picture:
         assert picture.format == "JPEG" and picture.size == (64, 48)
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(InputError, match=naming(2, "scene-experts[heic]")):
+    with pytest.raises(InputError, match=naming(2, "pip install 'pillow-heif")):
         find_photos(source)
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.extras import install_line
 from scene_experts.core.reading.budget import Damaged
 
 FORMAT, MAGIC, SUFFIX = "EXR", b"v/1\x01", ".exr"
@@ -30,7 +31,7 @@ def register(path: Path) -> None:
         import OpenEXR  # noqa: F401
     except ImportError:
         raise InputError(
-            f"expected the package OpenEXR to read {path}, found none; pip install 'scene-experts[exr]', or save the photographs as PNG"
+            f"expected the package OpenEXR to read {path}, found none; {install_line('exr')}, or save the photographs as PNG"
         ) from None
     Image.register_open(FORMAT, _open, lambda head: head.startswith(MAGIC))  # pyright: ignore[reportArgumentType]  # any Image will do
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.extras import install_line
 from scene_experts.core.io import write_atomic
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import Damaged
@@ -107,7 +108,7 @@ def read(path: Path) -> Splats:
 def expect_library() -> None:
     """Raises InputError where usd-core is missing."""
     if find_spec("pxr") is None:
-        raise InputError("expected the package usd-core for OpenUSD files, found none; install it: pip install 'scene-experts[usd]'")
+        raise InputError(f"expected the package usd-core for OpenUSD files, found none; install it: {install_line('usd')}")
 
 
 def _prim(source: Source, data: Any, number: int) -> tuple[Floats, ...]:
