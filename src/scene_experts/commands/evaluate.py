@@ -60,7 +60,8 @@ def evaluate(args: list[str]) -> int:
         print(f"wrote {page.write([command.run])}, with the pictures and what each score means")
     if command.options == EvalOptions():
         place = str(command.run / "scene.html")
-        print(f"next: {shlex.join([PROG, 'export', str(command.run), '--format', 'html', '--title', results['capture'], '--out', place])}")
+        words = [PROG, "export", str(command.run), "--format", "html", "--title", results["capture"], "--out", place]
+        print(f"next: {shlex.join(words)}  # or --format ply")
         print(f"next: {shlex.join([PROG, 'render', str(command.run), '--out', str(command.run / 'flight.mp4')])}")
     return 0
 

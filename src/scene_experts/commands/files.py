@@ -20,6 +20,7 @@ from scene_experts.files.registry import GAUSSIANS, READ_ONLY, about, format_nam
 
 FIRST = ("data", "out", "iteration", "images", "resolution", "split")
 """The options of `import` that people use first, for --help."""
+HEAVY = 20_000_000  # bytes that are many for a page
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,9 @@ def export(args: list[str]) -> int:
         print("\n".join(file.lines))
     if command.hub is None and "html" in command.format:
         print("next: open the page in a browser; smaller pages, pages of your own, other viewers: docs/how-to.md")
+        page = max(file.bytes for file in written if file.path.suffix == ".html")
+        if page > HEAVY:
+            print(f"hint: {page / 1e6:.0f} MB load slowly for others; --max-gaussians 200000 makes a smaller page")
     if command.hub is not None:
         print(f"wrote {command.hub / hub.CARD}")
         if command.licence is None:

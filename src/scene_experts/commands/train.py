@@ -70,9 +70,9 @@ GROUPS = {
 fits counts."""
 
 EXAMPLES = (
-    "moe-gs --data demo/buddha --out runs/buddha",
-    "scaffold-gs --data CAPTURE --out RUN --iterations 7000",
-    "moe-gs --data CAPTURE --out RUN --resume",
+    "scaffold-gs --data demo/buddha --out runs/buddha",
+    "scene-experts --data CAPTURE --out RUN --iterations 7000",
+    "scaffold-gs --data CAPTURE --out RUN --resume",
     "moe-gs --data catalog:bonsai --out RUN",
 )
 
@@ -177,7 +177,7 @@ def no_recipe(args: list[str]) -> str:
     name = args[0] if args else ""
     if name and not name.startswith("-"):
         return f"expected a recipe, found '{name}'{nearest(name, RECIPES) or f'; `{PROG} train --help` lists them'}"
-    like = next((arg for arg in args if arg in RECIPES), "moe-gs")
+    like = next((arg for arg in args if arg in RECIPES), "scaffold-gs")
     rest = "..." if args else "--data CAPTURE --out RUN"
     return f"expected a recipe after `{PROG} train`, found {name or 'none'}; write for example {PROG} train {like} {rest}"
 

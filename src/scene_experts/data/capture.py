@@ -18,6 +18,7 @@ from scene_experts.core.types import Camera
 from scene_experts.data import prepare
 from scene_experts.data.blocks import read_view_names
 from scene_experts.data.colour import find_white
+from scene_experts.data.copies import tell_copies
 from scene_experts.data.images import FrameSource, check_policy, probe
 from scene_experts.data.lens import centre_principal_point, to_pinhole
 from scene_experts.data.masks import find_masks
@@ -232,7 +233,9 @@ def _finish(capture: Capture) -> Capture:
     number(capture.extent, "the extent of the cameras", 1e-12, FARTHEST)
     notes = list(capture.warnings)
     if 0 < len(capture.test) < 5:
-        notes.append(f"only {len(capture.test)} test view{'s' if len(capture.test) > 1 else ''}: mean scores are unreliable")
+        held = f"only {len(capture.test)} held-out view{'s' if len(capture.test) > 1 else ''}"
+        notes.append(f"{held}: their mean says little; trainings with --split fold:1/5 to fold:5/5 score every photograph")
+    notes += tell_copies(views)
     far = max(float(v.camera.position.abs().max()) for v in views) if capture.world.identity else 0.0  # else they are around the origin
     if far * 2.0**-23 > FINEST * capture.extent:
         notes.append(

@@ -6,7 +6,7 @@ from __future__ import annotations
 import functools
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,8 @@ from PIL import Image, ImageCms
 
 from scene_experts.core.errors import InputError, few
 from scene_experts.core.reading.budget import PHOTOGRAPH
-from scene_experts.core.reading.pictures import opening_picture
+from scene_experts.core.reading.deep_colors import COLOR16, describe_mode, read_deep_colors
+from scene_experts.core.reading.pictures import ORIENTATION, opening_picture
 
 DEPTHS = (255.0, 1023.0, 4095.0, 16383.0, 65535.0)  # white of integers with 8, 10, 12, 14 and 16 bits
 LOOKED_AT = (16, 4)  # photographs of more than 8 bits, and others, that are looked at
@@ -24,10 +25,12 @@ SIDE = 256  # px; photographs of 8 bits are looked at from about this size on
 
 @dataclass(frozen=True)
 class White:
-    """The values of deep grey photographs that are white in a capture."""
+    """The values of deep photographs that are white in a capture: of grey integers, of grey floats,
+    and of colours with 16 bits."""
 
     integer: float = 65535.0
     real: float = 1.0
+    color: float = 65535.0
 
 
 def is_deep(mode: str) -> bool:
@@ -35,12 +38,24 @@ def is_deep(mode: str) -> bool:
     return mode.startswith("I") or mode == "F"
 
 
+def lift(image: Image.Image, white: White) -> Image.Image:
+    """Return a picture that is not decoded yet, with the 8 bits that matter where the colours of a
+    capture fill a part of 16."""
+    if white.color >= DEPTHS[-1] or not describe_mode(image).endswith(COLOR16):
+        return image
+    values = np.clip(np.rint(read_deep_colors(image) * (255 / white.color)), 0, 255).astype(np.uint8)
+    out = Image.fromarray(values, image.mode)
+    out.getexif()[ORIENTATION] = image.getexif().get(ORIENTATION, 1)
+    out.info = {key: value for key, value in image.info.items() if key == "icc_profile"}
+    return out
+
+
 def find_white(photographs: Sequence[tuple[Path, str]]) -> tuple[White, list[str]]:
     """Return the white of a capture's deep photographs, and what a user should know about it and
     about photographs that are nearly black.
 
     Args:
-        photographs: Path and Pillow mode of each.
+        photographs: Path and `describe_mode` of each.
 
     Raises:
         InputError: for integers above 65535, and for floats that go neither to 1 nor to 255 nor to
@@ -55,13 +70,21 @@ def find_white(photographs: Sequence[tuple[Path, str]]) -> tuple[White, list[str
                 f"expected integers of at most 16 bits in the photographs beside {deep[0]}, found {most:,.0f}; save them with 16"
             )
         if kind == "I" and 0 < most <= DEPTHS[-2]:
-            white = White(next(level for level in DEPTHS if most <= level), white.real)
+            white = replace(white, integer=next(level for level in DEPTHS if most <= level))
             notes.append(
                 f"the 16-bit photographs have values up to {most:,.0f}: {white.integer:,.0f} is read as white; save them with 8 bits if "
                 f"they are meant to be that dark"
             )
         elif kind == "F" and most > 0:
-            white = White(white.integer, _white_of_floats(most, deep[0]))
+            white = replace(white, real=_white_of_floats(most, deep[0]))
+    deep = _spread([path for path, mode in photographs if mode.endswith(COLOR16)], LOOKED_AT[0])
+    most = max((_largest_color(path) for path in deep), default=0.0)
+    if 0 < most <= DEPTHS[-2]:
+        white = replace(white, color=next(level for level in DEPTHS if most <= level))
+        notes.append(
+            f"the photographs with 16-bit colours have values up to {most:,.0f}: {white.color:,.0f} is read as white; save them with "
+            f"8 bits if they are meant to be that dark"
+        )
     linear = sum(path.suffix.lower() == ".exr" for path, _ in photographs)
     if linear:
         notes.append(f"{linear} EXR photographs are read as linear light: they get the curve of sRGB, and values from 1 on are white")
@@ -92,8 +115,17 @@ def _largest(path: Path) -> float:
     return float(np.nan_to_num(values.astype(np.float64), posinf=0.0).max())
 
 
+def _largest_color(path: Path) -> float:
+    """Return the largest value of colours with 16 bits, exact where it is below a quarter of the
+    range."""
+    with opening_picture(path, PHOTOGRAPH) as image, opening_picture(path, PHOTOGRAPH) as whole:
+        upper = int(np.asarray(image)[..., :3].max())
+        return float(read_deep_colors(whole)[..., :3].max()) if upper < 64 else 256.0 * upper
+
+
 def _is_dark(path: Path, white: White) -> bool:
     with opening_picture(path, PHOTOGRAPH, heic=True) as image:
+        image = lift(image, white)
         image.draft(None, (SIDE, SIDE))
         grey = image if is_deep(image.mode) else image.convert("L").reduce(max(1, min(image.size) // SIDE))
         return float(np.percentile(np.asarray(to_8_bit(grey, white)), 99)) < DARK

@@ -19,8 +19,9 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import PHOTOGRAPH
+from scene_experts.core.reading.deep_colors import describe_mode
 from scene_experts.core.reading.pictures import opening_picture
-from scene_experts.data.colour import White, to_8_bit
+from scene_experts.data.colour import White, lift, to_8_bit
 from scene_experts.data.lens import Lens, to_pinhole
 from scene_experts.data.masks import Mask, read_mask
 
@@ -52,7 +53,7 @@ class PhotoHeader:
 
     size: Size  # as stored
     orientation: int  # from EXIF, 1 to 8
-    mode: str = "RGB"  # Pillow's
+    mode: str = "RGB"  # of `describe_mode`
 
     @property
     def turned(self) -> Size:
@@ -63,9 +64,15 @@ class PhotoHeader:
 def probe(path: Path) -> PhotoHeader:
     """Read the header of the image at `path`."""
     with opening_picture(path, PHOTOGRAPH) as image:
-        size, mode = image.size, image.mode
+        size, mode = image.size, describe_mode(image)
         orientation = image.getexif().get(_ORIENTATION, 1)  # PNG stores EXIF after the pixels: a truncated file fails here
     return PhotoHeader(size, orientation if orientation in range(1, 9) else 1, mode)
+
+
+def has_alpha(path: Path) -> bool:
+    """Return whether the image at `path` has an alpha channel or a transparent colour."""
+    with opening_picture(path, PHOTOGRAPH) as image:
+        return "A" in image.getbands() or "transparency" in image.info
 
 
 def target_size(policy: str, size: Size) -> Size:
@@ -166,6 +173,7 @@ def _resize_mask(mask: Image.Image, size: Size) -> Image.Image:
 def _load_pixels(source: FrameSource) -> Image.Image:
     """Load the photograph as 8-bit L, RGB or RGBA, rotated if `source.turn`."""
     with opening_picture(source.path, PHOTOGRAPH) as image:
+        image = lift(image, source.white)
         image.load()
         out = to_8_bit(ImageOps.exif_transpose(image) if source.turn else image, source.white)
     expected = (source.lens.width, source.lens.height)

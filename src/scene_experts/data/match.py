@@ -38,7 +38,7 @@ def to_relative_name(name: str) -> str:
 def match_images(folder: Path, names: Sequence[str]) -> Match:
     """Find the file in `folder` for each of `names` (relative, "/" between folders).
 
-    The exact path is tried first, then the path under Unicode's composed form (macOS unpacks names
+    The exact path is tried first, then the path with "/" for "\\\\" (Windows) and under Unicode's composed form (macOS unpacks names
     decomposed), then the only file with the same stem and another extension, then
     the only file anywhere in `folder` with that base name. The last two require that no other name
     shares the stem or base name. `warnings` reports every match that is not exact.
@@ -156,7 +156,7 @@ def _list(folder: Path) -> list[Path]:
 
 
 def _compose(name: str) -> str:
-    return unicodedata.normalize("NFC", name)
+    return unicodedata.normalize("NFC", name.replace("\\", "/"))
 
 
 def absent_error(folder: Path, names: Sequence[str], absent: Sequence[str]) -> InputError:

@@ -7,6 +7,7 @@ not modify their argument.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -223,18 +224,31 @@ def drop_outliers(capture: Capture) -> Capture:
     return replace(capture, points=Points(xyz[keep], capture.points.rgb[keep]), warnings=(*capture.warnings, note))
 
 
+def _is_looked_at(corners: Tensor, views: Sequence[View]) -> bool:
+    """Whether most cameras see the centre of a box, from outside and from at most ten times its
+    half diagonal."""
+    centre, reach = corners.mean(0), float((corners[1] - corners[0]).norm()) / 2
+    seeing = 0
+    for view in views:
+        camera = view.camera.to(dtype=torch.float64)
+        x, y, z = (camera.world_to_cam[:3, :3] @ centre + camera.world_to_cam[:3, 3]).tolist()
+        u, v = (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy) if z > 0 else (-1.0, -1.0)
+        distance = math.sqrt(x * x + y * y + z * z)
+        seeing += 0 <= u <= camera.width and 0 <= v <= camera.height and reach < distance < 10 * reach
+    return seeing * 4 >= len(views) * 3
+
+
 def add_random_points(capture: Capture, count: int = RANDOM_POINTS, seed: int = 0) -> Capture:
     """Replace the points by `count` uniformly distributed, nearly grey points.
 
-    They fill `capture.bounds` if that is known, as 3DGS does for NeRF-synthetic scenes. Otherwise
-    they fill the box of the training cameras and of the places 1.5 extents in front of them, which
+    They fill `capture.bounds` if that is known and the cameras look at it from around, as 3DGS does
+    for NeRF-synthetic scenes. Otherwise they fill the box of the training cameras and of the places 1.5 extents in front of them, which
     holds the subject of inward-facing and of forward-facing captures.
     """
     rng = np.random.default_rng(seed)
-    if capture.bounds is not None:
-        corners = capture.world.from_input(torch.tensor(capture.bounds, dtype=torch.float64))
-    else:
-        views = [capture.views[i] for i in capture.train]
+    views = [capture.views[i] for i in capture.train]
+    corners = None if capture.bounds is None else capture.world.from_input(torch.tensor(capture.bounds, dtype=torch.float64))
+    if corners is None or not _is_looked_at(corners, views):
         eyes = camera_centres(views)
         ahead = torch.stack([v.camera.world_to_cam[2, :3].double() for v in views])
         both = torch.cat((eyes, eyes + 1.5 * capture.extent * ahead))

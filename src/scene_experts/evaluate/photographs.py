@@ -40,6 +40,7 @@ WORST = 12  # photographs whose pictures are kept and shown
 CACHE = 64 << 20  # bytes for decoded frames
 FAR, LEAST = 3.0, 3.0  # an outlier is more standard deviations and more dB than these below the median
 ENOUGH = 5  # views of a part that have a median worth comparing with
+MANY = 5  # more outliers than one in so many photographs are no slips
 NAMED = 5  # outliers that the terminal names
 
 
@@ -123,8 +124,13 @@ def read_photographs(run: Path) -> list[Photograph]:
 
 
 def describe_outliers(found: list[Photograph]) -> list[str]:
-    """Return a line for each photograph that fits far worse than the others, at most NAMED."""
+    """Return a line for each photograph that fits far worse than the others, at most NAMED; one
+    line for all of them if there are many."""
     bad = [each for each in found if each.outlier]
+    if len(bad) > 2 and len(bad) * MANY > len(found):  # then no single one is to blame
+        names = ", ".join(each.name for each in bad[:NAMED]) + (", ..." if len(bad) > NAMED else "")
+        said = f"{len(bad)} of {len(found)} photographs fit the others badly ({names}): what they show is hard to match, or few show it"
+        return [sentence(f"{said}; more photographs of it help, leaving them out does not; report.html lists them")]
     lines = [
         f"{each.name} fits the others badly ({each.psnr:.1f} dB, median {each.median:.1f}): look at it in report.html; "
         f"leave it out with --leave-out {shlex.quote(each.name)}"

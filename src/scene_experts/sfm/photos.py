@@ -17,8 +17,9 @@ from scene_experts.core.errors import InputError, few
 from scene_experts.core.extras import install_line
 from scene_experts.core.io import read_json, write_atomic, write_json
 from scene_experts.core.reading.budget import CAPTURED
+from scene_experts.core.reading.deep_colors import COLOR16, describe_mode
 from scene_experts.core.reading.pictures import opening_picture
-from scene_experts.data.colour import White, find_white, is_deep, to_8_bit
+from scene_experts.data.colour import White, find_white, is_deep, lift, to_8_bit
 from scene_experts.data.masks import Found, Mask, find_masks, may_be_mask, read_mask
 from scene_experts.data.match import EXTENSIONS
 
@@ -47,7 +48,7 @@ class Photo:
     suffix: str = ""  # extension to convert the file to because COLMAP does not read it; "": no conversion
     stamp: tuple[float, ...] = (0, 0)  # bytes and modification time of the file, then of its mask, and how both are read
     mask: Mask | None = None
-    mode: str = "RGB"  # Pillow's
+    mode: str = "RGB"  # of `describe_mode`
     white: White = White()  # of deep photographs
     round: bool = False  # a 360 degree panorama, by its XMP data or by a shape of 2:1
 
@@ -98,7 +99,12 @@ def find_photos(folder: Path, exclude: Path | None = None, say: Callable[[str], 
     for line in notes:
         say(f"warning: {line}")
     photos = [
-        replace(photo, white=white, stamp=(*photo.stamp, white.integer, white.real)) if is_deep(photo.mode) else photo for photo in photos
+        replace(photo, white=white, stamp=(*photo.stamp, white.integer, white.real))
+        if is_deep(photo.mode)
+        else replace(photo, white=white, suffix=".png", stamp=(*photo.stamp, white.color))
+        if photo.mode.endswith(COLOR16) and white.color != White.color
+        else photo
+        for photo in photos
     ]
     for one, other in pairwise(sorted(photos, key=lambda photo: photo.stored)):
         if one.stored == other.stored:
@@ -189,7 +195,7 @@ def inspect_photo(folder: Path, name: str, mask: Mask | None) -> Photo:
     with opening_picture(path, CAPTURED, heic=True) as image:
         xmp = image.info.get("xmp", b"")
         round = b"equirectangular" in xmp.lower() if isinstance(xmp, bytes) else False
-        size, mode, deep = image.size, image.mode, is_deep(image.mode)
+        size, mode, deep = image.size, describe_mode(image), is_deep(image.mode)
         readable, lossless = image.format in COLMAP_FORMATS and not deep, "A" in image.getbands() or deep
         exif = image.getexif()
         inner = exif.get_ifd(_EXIF)
@@ -290,6 +296,7 @@ def transfer(old: Path, new: Path, orientation: int, suffix: str = "", white: Wh
         return
     with opening_picture(old, CAPTURED, heic=True) as image:
         form = {".jpg": "JPEG", ".png": "PNG"}.get(suffix) or ("JPEG" if image.format == "MPO" else image.format)
+        image = image if white is None else lift(image, white)
         image.getexif()[_ORIENTATION] = orientation
         upright = ImageOps.exif_transpose(image)
         exif, upright = upright.getexif(), to_8_bit(upright, white) if is_deep(upright.mode) else upright

@@ -120,6 +120,12 @@ def check_request(source: Path, out: Path, overwrite: bool) -> None:
         raise InputError(f"finding camera poses requires pycolmap: {install_line('sfm')}")
     if source.is_file():
         frames.import_ffmpeg()
+    if out.exists() and not out.is_dir():
+        raise InputError(f"expected a folder for --out, found the file {out}; choose another name")
+    if (source / "config.json").is_file() and ((source / "checkpoints").is_dir() or (source / "test").is_dir()):
+        raise InputError(f"expected a folder of photographs, found the run {source}, with renders and error maps; give its photographs")
+    if (source / "images").is_dir() and source.resolve() != out.resolve() and is_capture(source):
+        raise InputError(f"expected a folder of photographs, found the capture {source}; train on it, or give {source / 'images'}")
     here, images = source.resolve(), (out / "images").resolve()
     if here == out.resolve():
         raise InputError(

@@ -132,7 +132,9 @@ def test_an_option_of_another_recipe_says_whose_it_is():
     assert "octree-moe-gs" in str(error.value)
 
 
-@pytest.mark.parametrize(("args", "fact"), [([], "moe-gs --data"), (["--data", "x"], "--data"), (["--data", "x", "sags"], "train sags")])
+@pytest.mark.parametrize(
+    ("args", "fact"), [([], "scaffold-gs --data"), (["--data", "x"], "--data"), (["--data", "x", "sags"], "train sags")]
+)
 def test_a_missing_recipe(args, fact):
     with pytest.raises(InputError, match=naming(fact)):
         parse_train(args)

@@ -147,7 +147,7 @@ def test_the_summary_is_json_and_true(made: Synthetic) -> None:
     assert capture.points is not None
     d = torch.cdist(capture.points.xyz, capture.points.xyz).fill_diagonal_(9e9).amin(1).median()
     assert said["median_neighbour_distance"] == pytest.approx(float(d), rel=1e-6)
-    assert any("2" in w and "test" in w for w in said["warnings"]) and any("3" in w and "size" in w for w in said["warnings"])
+    assert any("2" in w and "held-out" in w for w in said["warnings"]) and any("3" in w and "size" in w for w in said["warnings"])
 
 
 def test_neighbour_distances_of_many_points_are_sampled() -> None:

@@ -13,6 +13,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.data.colour import White, find_white, to_8_bit, to_srgb
 from scene_experts.data.readers.colmap_model import read_model, write_model
 from support.captures import load
+from support.deep import write_png16, write_tiff16
 from support.synthetic import Synthetic, make_capture
 
 
@@ -155,7 +156,7 @@ def test_exr_photographs_that_cannot_be_read(made: Synthetic, monkeypatch: pytes
     with pytest.raises(InputError, match=r"view_000\.exr"):
         load(made.folder)
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(InputError, match=r"package OpenEXR .*scene-experts\[exr\]"):
+    with pytest.raises(InputError, match=r"package OpenEXR .*pip install .OpenEXR"):
         load(made.folder)
     path.rename(made.folder / "images/view_000.hdr")
     model = read_model(made.folder / "sparse/0")
@@ -163,3 +164,23 @@ def test_exr_photographs_that_cannot_be_read(made: Synthetic, monkeypatch: pytes
     write_model(made.folder / "sparse/0", replace(model, images=images))
     with pytest.raises(InputError, match=r"view_000\.hdr, found content that is no picture of a known format"):
         load(made.folder)
+
+
+@pytest.mark.parametrize("form", ["png", "png with alpha", "tiff <", "tiff >"])
+@pytest.mark.parametrize(("most", "told"), [(65535, ""), (4095, "4,095 is read as white"), (1023, "1,023 is read as white")])
+def test_colours_of_16_bits_that_fill_a_part_of_their_range(made: Synthetic, form: str, most: int, told: str) -> None:
+    for name, rgb in made.images.items():
+        path = made.folder / "images" / name
+        path.unlink()
+        values = np.rint(rgb.astype(np.float64) * most / 255)
+        if form == "png with alpha":
+            values = np.concatenate([values, np.full((*values.shape[:2], 1), most)], 2)
+        if form.startswith("png"):
+            write_png16(path.with_suffix(".png"), values, 6 if "alpha" in form else 2)
+        else:
+            write_tiff16(path.with_suffix(".tif"), values, form[-1])
+    capture = load(made.folder)
+    for i, (_, rgb) in enumerate(sorted(made.images.items())):
+        frame = capture.frame(i)
+        assert np.abs(frame.rgb.numpy().astype(int) - rgb).max() <= 1 and frame.mask is None
+    assert (told in str(capture.warnings)) and ("16-bit colours" in str(capture.warnings)) == bool(told)

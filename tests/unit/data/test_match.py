@@ -43,6 +43,12 @@ def test_names_in_another_form_of_unicode(tmp_path: Path, named: str, stored: st
     assert find_file(tmp_path, names[0] + "x") is None and find_file(tmp_path, "none/\u00e9.jpg") is None
 
 
+def test_names_of_windows(tmp_path: Path) -> None:
+    touch(tmp_path, "cam0/a.jpg", "cam1/a.jpg")
+    match = match_images(tmp_path, ["cam0\\a.jpg", "cam1\\a.jpg"])
+    assert match.found == {f"cam{i}\\a.jpg": tmp_path / f"cam{i}/a.jpg" for i in (0, 1)} and not match.absent
+
+
 def test_the_exact_form_comes_first(tmp_path: Path) -> None:
     both = [unicodedata.normalize(form, "K\u00fcche.jpg") for form in ("NFC", "NFD")]
     touch(tmp_path, *both)

@@ -36,9 +36,15 @@ def test_little_or_usual_differences_are_no_outliers(tmp_path: Path, values: tup
 
 
 def test_many_outliers_are_few_lines(tmp_path: Path) -> None:
-    write_json(tmp_path / "training_views.json", scores(*[30.0] * 20, *[10.0] * 8))
+    write_json(tmp_path / "training_views.json", scores(*[30.0] * 100, *[10.0] * 8))
     lines = describe_outliers(read_photographs(tmp_path))
     assert len(lines) == NAMED + 1 and lines[-1].startswith("3 more")
+
+
+def test_a_part_of_the_scene_that_fits_badly_is_no_slip_to_leave_out(tmp_path: Path) -> None:
+    write_json(tmp_path / "training_views.json", scores(*[30.0, 30.5, 29.5] * 5, *[20.0] * 5))
+    (line,) = describe_outliers(read_photographs(tmp_path))
+    assert line.startswith("5 of 20 photographs fit the others badly (15.png, ") and "--leave-out" not in line
 
 
 @pytest.mark.parametrize("wrong", [[1], {"a.png": {}}, {"a.png": {"file": "../../a.png", "psnr": 1.0}}])

@@ -85,7 +85,7 @@ def test_a_client_that_cannot_connect_is_closed_before_the_garbage_collector_com
 
 def test_without_distributed_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match=r"scene-experts\[cluster\]"), module.connect("tcp://127.0.0.1:9"):
+    with pytest.raises(InputError, match=r"pip install .distributed"), module.connect("tcp://127.0.0.1:9"):
         pass
 
 

@@ -21,6 +21,7 @@ from support.captures import load
 from support.messages import naming
 from support.photos import fake_worker, write_black, write_photo
 from support.places import DEMO
+from support.synthetic import make_capture
 
 BUDDHA = DEMO / "buddha"
 TOGETHER = ["008.jpg", "009.jpg", "017.jpg", "018.jpg", "025.jpg", "043.jpg", "053.jpg", "067.jpg"]  # they overlap strongly
@@ -210,8 +211,11 @@ def test_a_source_that_is_neither_folder_nor_video_is_reported(tmp_path, monkeyp
         make(write_photo(tmp_path / "1.jpg"), tmp_path / "out")
     with pytest.raises(InputError, match=naming(tmp_path / "none")):
         make(tmp_path / "none", tmp_path / "out")
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match=naming("--out", tmp_path / "file")):
+        make(write_black(tmp_path / "photos"), tmp_path / "file")
     monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pycolmap.*scene-experts\[sfm\]"):
+    with pytest.raises(InputError, match=r"pycolmap.*pip install .pycolmap"):
         make(write_black(tmp_path / "photos"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -243,3 +247,14 @@ def test_sequential_is_the_next_ones_and_powers_of_two(count):
     steps = {1, 2, 3, 4, 8, 16, 32}
     expected = {(i, j) for i in range(count) for j in range(i + 1, count) if j - i in steps}
     assert set(run.choose_pairs(count, "sequential", neighbours=3)) == expected
+
+
+def test_a_run_and_a_capture_are_no_folders_of_photographs(tmp_path):
+    write_black(tmp_path / "run" / "test" / "renders")
+    (tmp_path / "run" / "config.json").write_text("{}")
+    with pytest.raises(InputError, match=naming("the run", tmp_path / "run")):
+        make(tmp_path / "run", tmp_path / "out")
+    made = make_capture(tmp_path / "made", views=3, size=(48, 32)).folder
+    with pytest.raises(InputError, match=naming("the capture", made, made / "images")):
+        make(made, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -6,8 +6,9 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from scene_experts.core.reading import budget as budgets
 from scene_experts.core.reading import exr
@@ -18,6 +19,7 @@ FORMATS = ("BMP", "GIF", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
 """The formats that are read, by their content. Pillow's others are not: each decoder is a way
 in."""
 HEIC = "HEIF"  # read too where pillow-heif has registered it, by those who pass `heic`
+HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1")
 SIDE_LIMIT = 1 << 17  # px
 ORIENTATION = 0x0112  # tag of EXIF and TIFF
 _STORED = 4  # bytes per pixel in Pillow's memory, at most
@@ -37,10 +39,21 @@ def opening_picture(path: Path, budget: Budget = budgets.PICTURE, heic: bool = F
     if path.suffix.lower() == exr.SUFFIX:
         exr.register(path)
         formats = (*formats, exr.FORMAT)
-    with opening(path, budget) as source, source.stream() as stream, Image.open(stream, formats=formats) as image:
+    with opening(path, budget) as source, source.stream() as stream, _identify(stream, formats) as image:
         check_size(source, image)
         keep_as_stored(image)
         yield image
+
+
+def _identify(stream: IO[bytes], formats: tuple[str, ...]) -> Image.Image:
+    try:
+        return Image.open(stream, formats=formats)
+    except UnidentifiedImageError:
+        stream.seek(0)
+        head = stream.read(12)
+        if head[4:8] == b"ftyp" and head[8:] in HEIC_BRANDS:
+            raise Damaged("a HEIC photograph, whatever its name says; rename it to .heic, from which `capture` makes a JPEG") from None
+        raise
 
 
 def keep_as_stored(image: Image.Image) -> None:

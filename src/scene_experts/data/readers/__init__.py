@@ -121,7 +121,9 @@ def unrecognised_error(folder: Path) -> InputError:
         photos = sum(p.suffix.lower() in EXTENSIONS for p in place.iterdir()) if place.is_dir() else 0
         if photos:
             out = "CAPTURE" if place == folder else str(folder)
-            return InputError(f"{expected} {photos} photographs without camera poses; run `scene-experts capture {place} --out {out}`")
+            return InputError(
+                f"expected camera poses in {folder}, found only {photos} photographs; run `scene-experts capture {place} --out {out}`"
+            )
     if (folder / ".capture").is_dir():
         return InputError(f"{expected} an unfinished one; run its `scene-experts capture PHOTOS --out {folder}` again")
     return InputError(f"{expected} none of these; give the folder that contains them")

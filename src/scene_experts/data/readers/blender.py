@@ -8,6 +8,7 @@ from pathlib import Path
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import CAPTURE
 from scene_experts.core.reading.source import guarding
+from scene_experts.data.images import has_alpha
 from scene_experts.data.readers import transforms
 from scene_experts.data.readers.reader import PosedImage, RawCapture, ReadOptions
 
@@ -27,7 +28,7 @@ class BlenderReader:
 
     def read(self, folder: Path, options: ReadOptions) -> RawCapture:
         """Read poses, the split and, if there are any, points. Alpha is composited over
-        `options.background` (default white).
+        `options.background` (default white, where a photograph has alpha).
 
         Frames without an image are dropped with a warning. Raises InputError if a file is damaged,
         if no frame is left, and for `options.images`: each file path names its folder.
@@ -56,7 +57,9 @@ class BlenderReader:
                     names.append(name)
                     images.append(image and PosedImage(name, image, lens, pose, None, angle, part == "test"))
         kept = transforms.drop_absent(folder, images, names, warnings)
-        if options.background is None:
+        over = options.background
+        if over is None and any(has_alpha(image.path) for image in kept):
+            over = WHITE
             warnings.append(
                 "transparent pixels are composited over white; choose another colour with --background (Scaffold-GS evaluates on black)"
             )
@@ -65,7 +68,7 @@ class BlenderReader:
             kept,
             points,
             warnings,
-            alpha_over=WHITE if options.background is None else options.background,
+            alpha_over=over,
             points_source="points3d.ply",
             cloud=cloud,
             states_split=True,

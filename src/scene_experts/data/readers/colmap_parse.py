@@ -137,7 +137,7 @@ def read_points_bin(source: Source) -> NDArray:
 
 def _read_lines(source: Source) -> list[str]:
     text = decode_text(source.read()).replace("\r\n", "\n").replace("\r", "\n")
-    return [line for line in text.split("\n") if not line.startswith("#")]
+    return [line for line in text.split("\n") if not line.lstrip().startswith("#")]
 
 
 def _bad_line_error(path: Path, line: str) -> InputError:

@@ -78,7 +78,7 @@ def find_image(root: Path, file_path: str, images: str | None) -> tuple[str, Pat
     if images is not None:
         parts = [images, *parts[1:]] if len(parts) > 1 else [images, *parts]
     name = "/".join(parts)
-    for candidate in (name, *(name + ending for ending in EXTENSIONS)):
+    for candidate in (name, *(name + ending for lower in EXTENSIONS for ending in (lower, lower.upper()))):
         if path := find_file(root, candidate):
             return candidate, path
     return name, None

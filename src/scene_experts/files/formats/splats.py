@@ -25,6 +25,7 @@ NAMES = ("means", "log_scales", "quats", "opacity_logit", "sh")
 
 _SURE = 20.0  # logit of an opacity of 1: 1 - 2e-9
 _SHORTEST = math.log(1e-30)
+BROKEN = 100  # a file with more than one Gaussian in so many that is not finite is damaged
 _NO_LENGTH = 1e-12  # of a quaternion; renderers divide by its length, or by this if that is less
 
 
@@ -78,7 +79,8 @@ class Splats:
         """The Gaussians of the file `where` with usable values for infinite ones, and for the
         largest floats, that mean something: an opacity of 1 or 0 has the logit 20 or -20, and a
         length of 0 the logarithm of 1e-30. Gaussians whose quaternion has no length are left out,
-        and a warning counts them.
+        and those with other values that are not finite if they are at most one in BROKEN; a warning
+        counts them.
 
         Raises InputError where none is left.
         """
@@ -87,14 +89,27 @@ class Splats:
             found = replace(found, opacity_logit=self.opacity_logit.clamp(-_SURE, _SURE).where(endless, self.opacity_logit))
         if bool((points := self.log_scales < -LARGEST).any()):
             found = replace(found, log_scales=self.log_scales.masked_fill(points, _SHORTEST))
-        empty = self.quats.abs().amax(1) < _NO_LENGTH if len(self) else self.quats.new_zeros(0, dtype=torch.bool)  # False for NaN
+        found = found._without_broken(where)
+        empty = found.quats.abs().amax(1) < _NO_LENGTH if len(found) else found.quats.new_zeros(0, dtype=torch.bool)  # False for NaN
         count = int(empty.sum())
         if not count:
             return found
-        if count == len(self):
+        if count == len(found):
             raise InputError(f"expected Gaussians with rotations in {where}, found {count:,} without any (all zero); write the file again")
-        log.warning("left out %s of %s Gaussians of %s, whose rotations are all zero", f"{count:,}", f"{len(self):,}", where)
+        log.warning("left out %s of %s Gaussians of %s, whose rotations are all zero", f"{count:,}", f"{len(found):,}", where)
         return found.rows(~empty)
+
+    def _without_broken(self, where: Path) -> Splats:
+        """Leave out the few Gaussians with values that are not finite, which a training that
+        diverged in places leaves behind."""
+        if all(all_finite(getattr(self, name)) for name in NAMES):
+            return self
+        broken = torch.stack([~getattr(self, name).isfinite().reshape(len(self), -1).all(1) for name in NAMES]).any(0)
+        count = int(broken.sum())
+        if count * BROKEN > len(self):
+            return self
+        log.warning("left out %s of %s Gaussians of %s, with values that are not finite", f"{count:,}", f"{len(self):,}", where)
+        return self.rows(~broken)
 
     def expect_finite(self, where: str) -> None:
         """Raises InputError, naming `where`, for values that are not finite."""

@@ -68,7 +68,7 @@ def read(source: Path, data: Data | None, iteration: int | None, transform: Path
         made_on = beside(source).get("capture")
         if made_on not in (None, "", capture.fingerprint()):
             log.warning(
-                "%s was made with other views than those of %s; check that it is the same capture (and --split, --resolution)",
+                "%s was made with other views or another --resolution than those of %s; check that it is the same capture (and --split)",
                 source,
                 capture.root,
             )

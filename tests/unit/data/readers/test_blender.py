@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.lens import Lens
@@ -56,3 +58,27 @@ def test_broken_json(tmp_path: Path) -> None:
     (tmp_path / "transforms_train.json").write_text("{")
     with pytest.raises(InputError, match="JSON"):
         load(tmp_path, init="random")
+
+
+def test_opaque_photographs_are_on_the_background_of_other_captures(tmp_path: Path) -> None:
+    make_blender(tmp_path)
+    for path in tmp_path.glob("t*/*.png"):
+        Image.open(path).convert("RGB").save(path)
+    capture = load(tmp_path, init="random")
+    assert capture.background == (0.0, 0.0, 0.0) and not any("--background" in w for w in capture.warnings)
+    assert load(tmp_path, init="random", background=(1.0, 1.0, 1.0)).background == (1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("away", [(30.0, 0.0, 0.0), (0.0, -8.0, 2.0)])
+def test_random_points_lie_before_cameras_that_look_elsewhere(tmp_path: Path, away: tuple[float, float, float]) -> None:
+    """Then the cube at the origin is not where the subject is."""
+    make_blender(tmp_path)
+    for path in tmp_path.glob("transforms_*.json"):
+        meta = json.loads(path.read_text())
+        for frame in meta["frames"]:
+            for axis in range(3):
+                frame["transform_matrix"][axis][3] += away[axis]
+        path.write_text(json.dumps(meta))
+    capture = load(tmp_path, init="random")
+    xyz = capture.world.to_input(capture.points.xyz)
+    assert np.abs(xyz.mean(0).numpy() - away).max() < 2.5

@@ -75,7 +75,7 @@ def test_tracks_are_read_or_skipped(tmp_path: Path) -> None:
 
 
 def test_text_with_observations_and_blank_lines(tmp_path: Path) -> None:
-    (tmp_path / "cameras.txt").write_text("# comment\n1 SIMPLE_RADIAL 64 48 50 32 24 0.1\n")
+    (tmp_path / "cameras.txt").write_text("# comment\n  # another\n1 SIMPLE_RADIAL 64 48 50 32 24 0.1\n")
     (tmp_path / "images.txt").write_text("# c\n1 1 0 0 0 0 0 1 1 a b.png\n1.5 2.5 9 3 4 -1\n2 1 0 0 0 0 0 2 1 c.png\n\n")
     (tmp_path / "points3D.txt").write_text("9 1 2 3 255 0 7 0.5 1 0 2 0\n")
     got = read_model(tmp_path, observations=True)

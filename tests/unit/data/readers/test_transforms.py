@@ -33,6 +33,19 @@ def test_frames_without_a_file_are_dropped_and_counted(tmp_path: Path) -> None:
         load(tmp_path)
 
 
+def test_names_without_an_extension_and_one_in_capitals(tmp_path: Path) -> None:
+    make_nerfstudio(tmp_path, views=3, size=(48, 32), points=50)
+    for path in (tmp_path / "images").iterdir():
+        path.rename(path.with_suffix(".PNG"))
+
+    def cut(meta: dict) -> None:
+        for frame in meta["frames"]:
+            frame["file_path"] = frame["file_path"].removesuffix(".png")
+
+    edit(tmp_path / "transforms.json", cut)
+    assert [view.path.suffix for view in load(tmp_path).views] == [".PNG"] * 3
+
+
 def test_shared_intrinsics_and_an_angle_of_view(tmp_path: Path) -> None:
     make_nerfstudio(tmp_path, views=3, size=(48, 32), points=50, mixed_sizes=False, principal_point_offset=False)
     path = tmp_path / "transforms.json"

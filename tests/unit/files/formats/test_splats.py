@@ -66,6 +66,16 @@ def test_others_are_refused_with_what_they_are(name, value, word):
         s.checked(Path("there"))
 
 
+def test_a_few_that_are_not_finite_are_left_out_and_counted(caplog):
+    s = splats(200)
+    s.means[7, 1], s.log_scales[150, 0] = float("nan"), float("inf")
+    found = s.checked(Path("there"))
+    assert len(found) == 198 and "2 of 200" in caplog.text and "there" in caplog.text
+    s.sh[3, 0, 0] = float("nan")
+    with pytest.raises(InputError, match=naming("there", 1, "NaN")):
+        s.checked(Path("there"))
+
+
 def test_gaussians_without_a_rotation_are_left_out_and_counted(caplog):
     s = splats(6)
     s.quats[[0, 4]] = torch.tensor([0.0, 1e-20, 0, 0])
