@@ -52,7 +52,7 @@ class Camera:
     near: float = 0.2  # world units; Gaussians closer than this along z are not rendered
     id: int = 0  # index of the view in its capture
 
-    @property
+    @functools.cached_property
     def position(self) -> Tensor:
         """Camera centre in world coordinates, [3]."""
         R, t = self.world_to_cam[:3, :3], self.world_to_cam[:3, 3]
@@ -87,7 +87,14 @@ class Camera:
         return 2.0 * math.atan(self.height / (2.0 * self.fy))
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
-        """Return the camera with its tensors on `device` and with `dtype`."""
+        """Return the camera with its tensors on `device` and with `dtype`. One on a GPU is made
+        once."""
+        known = self.__dict__.setdefault("moved", {}) if device is not None and torch.device(device).type == "cuda" else {}
+        if (device, dtype) not in known:
+            known[device, dtype] = self._move(device, dtype)
+        return known[device, dtype]
+
+    def _move(self, device: torch.device | str | None, dtype: torch.dtype | None) -> Camera:
         K = self.K.to(dtype=dtype)
         known = self.pinhole if K.dtype == self.K.dtype else replace(self, K=K).pinhole
         moved = replace(self, world_to_cam=upload(self.world_to_cam, device, dtype), K=upload(K, device))

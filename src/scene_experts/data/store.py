@@ -207,8 +207,10 @@ class ImageStore:
         if not wanted:
             return
         with self._cache.changed:
-            self._cache.wanted = deque(wanted)
             self._cache.ahead = set(wanted)
+            self._cache.wanted = deque(index for index in wanted if index not in self._cache.frames)
+            if not self._cache.wanted:  # no thread need be woken
+                return
             self._cache.changed.notify_all()
         if not self._threads and not self._cache.stopped:
             weakref.finalize(self, _stop, self._cache, self._threads)  # also runs at exit

@@ -53,8 +53,55 @@ def guard(device: torch.device) -> AbstractContextManager[Any]:
 
 
 def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **sizes: Any) -> None:
-    """Launch a kernel on the device of its first tensor. `sizes` are the compile-time constants."""
+    """Launch a kernel on the device of its first tensor. `sizes` are the compile-time constants and
+    options.
+
+    The compiled kernel is kept and launched with addresses, by the same call that Triton's own
+    launch ends with. That takes a third of the time of Triton's, which binds the arguments anew.
+    """
     first = next(a for a in arguments if isinstance(a, Tensor))
-    run: Callable[..., Any] = kernel[grid]
-    with guard(first.device):
-        run(*arguments, **sizes)
+    if not _is_compiled(kernel):  # Triton's interpreter
+        with guard(first.device):
+            kernel[grid](*arguments, **sizes)
+        return
+    free, values, kinds = _free_numbers(kernel), [], []
+    for place, a in enumerate(arguments):
+        if isinstance(a, Tensor):
+            address = a.data_ptr()
+            values.append(address)
+            kinds.append((a.dtype, address & 15 == 0))
+        else:
+            values.append(a)
+            kinds.append((type(a), -(2**31) <= a < 2**31 if place in free else a) if isinstance(a, int) else type(a))
+    device = first.device.index
+    key = (kernel, device, *kinds, *sizes.values())
+    kept = _kept.get(key)
+    with torch.cuda.device(device) if torch.cuda.current_device() != device else nullcontext():
+        if kept is None:
+            made = kernel[grid](*arguments, **sizes)
+            constants = [sizes[name] for name in kernel.arg_names if name in sizes]
+            _kept[key] = made.run, made.function, made.packed_metadata, constants
+            return
+        run, function, metadata, constants = kept
+        sides = (*grid, 1, 1)[:3]
+        run(*sides, _stream_of(device), function, metadata, None, None, None, *values, *constants)
+
+
+def _stream_of(device: int) -> int:
+    """The address of the current stream, by the call that Triton makes."""
+    return torch._C._cuda_getCurrentRawStream(device)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+_kept: dict[tuple[Any, ...], tuple[Callable[..., Any], Any, Any, list[Any]]] = {}
+"""Compiled kernels by all that Triton compiles them for."""
+
+
+@functools.cache
+def _is_compiled(kernel: Any) -> bool:
+    return hasattr(kernel, "device_caches")
+
+
+@functools.cache
+def _free_numbers(kernel: Any) -> frozenset[int]:
+    """Return the places of arguments whose values a kernel is not compiled for."""
+    return frozenset(i for i, p in enumerate(kernel.params) if p.do_not_specialize)

@@ -82,9 +82,11 @@ def as_trained(rasterize: Rasterizer, antialias: bool) -> Rasterizer:
     return rasterize
 
 
-def for_growth(rasterize: Rasterizer, absolute: bool) -> Rasterizer:
-    """Return the rasteriser whose `mean2d_grad` holds sums of absolute values if `absolute`. Raises
-    InputError if it has none."""
+def for_training(rasterize: Rasterizer, absolute: bool) -> Rasterizer:
+    """Return the rasteriser without the depth, where it can leave it out, and whose `mean2d_grad`
+    holds sums of absolute values if `absolute`. Raises InputError if it has none."""
+    if hasattr(rasterize, "depth"):
+        rasterize = replace(rasterize, depth=False)  # type: ignore[type-var]
     if not absolute:
         return rasterize
     if not hasattr(rasterize, "absolute"):

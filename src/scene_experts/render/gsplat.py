@@ -3,8 +3,8 @@ defines.
 
 The adapter uses the near plane and blur of the reference. `radii` follow the 3 sigma rule, and
 Gaussians without a radius are not drawn, whatever extent gsplat sorts with (since 1.5 it is smaller
-for faint Gaussians and empty below opacity 1/255). Depth is a fourth colour channel over a
-background of 0. The gradient of the 2D mean is converted from px to NDC. The antialiasing factor is
+for faint Gaussians and empty below opacity 1/255). Depth, where it is wanted, is a fourth colour
+channel over a background of 0. The gradient of the 2D mean is converted from px to NDC. The antialiasing factor is
 at least 0.005.
 
 These differences remain with gsplat 1.5.3: alpha is clamped at 0.999 instead of 0.99 (since 1.6 at
@@ -41,6 +41,8 @@ class GsplatRasterizer:
     antialias: bool = False
     name: str = field(default="gsplat", init=False)
     absolute: bool = False
+    depth: bool = True
+    """Whether the depth is drawn, as a fourth colour; training does without."""
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
         """Draw M Gaussians over `background` [3], see `types.Render`. Raises InputError if gsplat
@@ -71,9 +73,10 @@ class GsplatRasterizer:
         instead = (lambda: centres.absgrad[0]) if self.absolute else None  # gsplat's backward pass sets `absgrad`
         grad = record_mean2d_grad(mean2d, (g.scales, g.quats, g.opacities, g.colors), camera, len(g), slice(None), instead)
         centres: Any = mean2d[None]
-        colors = torch.cat([g.colors, depths[0, :, None]], dim=1)[None]  # [1, M, 4]
+        colors = (torch.cat([g.colors, depths[0, :, None]], dim=1) if self.depth else g.colors)[None]  # [1, M, 3 or 4]
         picture, alpha = _rasterize(library, centres, conics, colors, opacities, extents, depths, camera, background, self.absolute)
-        return Render(picture[..., :3], alpha, picture[..., 3], radii, grad)
+        depth = picture[..., 3] if self.depth else torch.zeros_like(alpha)
+        return Render(picture[..., :3], alpha, depth, radii, grad)
 
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
         """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] are
@@ -120,8 +123,8 @@ def _rasterize(
     background: Tensor,
     absolute: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Sort into tiles and blend one view. Returns the picture [H, W, 4] (colour and depth) and
-    alpha [H, W].
+    """Sort into tiles and blend one view. Returns the picture [H, W, 3 or 4] (colour, and depth
+    where the colours have it) and alpha [H, W].
 
     `absolute`: the backward pass sets `means2d.absgrad` to the sums of the absolute values of the
     pixels' gradients.
@@ -129,7 +132,9 @@ def _rasterize(
     across, down = -(-camera.width // TILE), -(-camera.height // TILE)
     _, keys, order = library.isect_tiles(means2d, extents, depths, TILE, across, down)
     offsets = library.isect_offset_encode(keys, 1, across, down).reshape(1, down, across)
-    behind = torch.cat([background.to(colors), colors.new_zeros(1)])[None]  # the background has depth 0
+    behind = background.to(colors)[None]
+    if colors.shape[-1] > 3:
+        behind = torch.cat([behind, colors.new_zeros(1, 1)], dim=1)  # the background has depth 0
     asked = {"absgrad": True} if absolute else {}
     picture, alpha = library.rasterize_to_pixels(
         means2d, conics, colors, opacities, camera.width, camera.height, TILE, offsets, order, backgrounds=behind, **asked

@@ -16,10 +16,9 @@ from torch import Tensor
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.group import Alone
 from scene_experts.core.schedule import passes
-from scene_experts.core.transfer import upload
 from scene_experts.core.types import Decoded, Mode, Render, Routing
 from scene_experts.data.capture import Capture
-from scene_experts.render import Rasterizer, for_growth
+from scene_experts.render import Rasterizer, for_training
 from scene_experts.scene import Scene
 from scene_experts.strategy import Edit
 from scene_experts.strategy.survey import Survey, TrainingPhoto
@@ -30,12 +29,12 @@ from scene_experts.training.guard import explain, find_broken
 from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
 from scene_experts.training.memory import anchor_cap, give_back, peak_bytes
 from scene_experts.training.options import TrainOptions
+from scene_experts.training.resident import AHEAD, Resident
 from scene_experts.training.shards import Sharded, check_shard
 from scene_experts.training.state import Training, resume, save
 from scene_experts.training.trial import fit_memory
 
 log: logging.Logger = logging.getLogger(__name__)
-AHEAD = 3  # photographs that are read before they are needed; on a GPU each in a thread of its own, as the cores are free
 ROUTED = 16_384  # anchors sampled for the routing statistics; the shares are within 0.5 % of those of all anchors
 
 
@@ -95,7 +94,7 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
     """
     cfg = cfg.scaled()
     folder = run.out / "checkpoints" if run.out else None
-    rasterize = for_growth(rasterize, cfg.growth.absolute)
+    rasterize = for_training(rasterize, cfg.growth.absolute)
     training = run.group.agree(lambda: begin(cfg, run, capture, folder, rasterize))
     exchange = start_exchange(training, run)
     total = last_iteration(cfg, run)
@@ -204,9 +203,10 @@ def iterate(training: Training, run: Job, capture: Capture, rasterize: Rasterize
     batch, numbers = training.next_batch(capture.train), training.views_of(training.step)
     mine = range(run.group.rank, cfg.batch, run.group.size)
     upcoming = [batch[place][0] for place in mine] + training.queue[run.group.rank :: run.group.size]
+    photographs = resident_of(training, run, capture)
     done = None
     for turn, place in enumerate(mine, 1):
-        capture.images.prefetch(upcoming[turn : turn + AHEAD], threads=1 if run.device == "cpu" else AHEAD)
+        photographs.prefetch(upcoming[turn : turn + AHEAD])
         done = None  # frees the memory of the previous view
         turn_views = range(place - run.group.rank, place - run.group.rank + run.group.size)
         cameras = [capture.views[batch[other][0]].camera.to(run.device, run.dtype) for other in turn_views]
@@ -257,13 +257,11 @@ def see_view(
     """
     cfg, scene = training.cfg, scene or training.scene
     camera = capture.views[index].camera.to(run.device, run.dtype)
-    frame = capture.frame(index)
-    target = upload(frame.rgb, run.device, run.dtype).div_(255.0)
-    mask = None if frame.mask is None else upload(frame.mask, run.device, run.dtype)
-    background = torch.tensor(capture.background) if color is None else color
+    photographs = resident_of(training, run, capture)
+    target, mask = photographs.see(index)
     training.seed_view(number)
     decoded = scene(camera, number, Mode.TRAIN, rasterize.visible)
-    render = rasterize(decoded.gaussians, camera, upload(background, run.device, run.dtype))
+    render = rasterize(decoded.gaussians, camera, photographs.background(color))
     parts = compute_terms(Sample(decoded, render, target, mask, number), cfg.loss)
     loss = torch.stack(list(parts.values())).sum()
     if loss.requires_grad:
@@ -273,14 +271,20 @@ def see_view(
     return Iteration(decoded, render, parts, target, mask)
 
 
+def resident_of(training: Training, run: Job, capture: Capture) -> Resident:
+    """Return the photographs of the training. Where --max-memory limits it, none are kept on the
+    device."""
+    known = training.resident
+    if known is None or known.capture is not capture or known.dtype != run.dtype:
+        known = training.resident = Resident(capture, run.device, run.dtype, 0 if run.max_memory > 0 else None)
+    return known
+
+
 def survey_of(training: Training, run: Job, capture: Capture, rasterize: Rasterizer) -> Survey:
     """Return the training views as densification can look at them."""
 
     def photo(index: int) -> TrainingPhoto:
-        frame = capture.frame(index)
-        mask = None if frame.mask is None else upload(frame.mask, run.device, run.dtype)
-        image = upload(frame.rgb, run.device, run.dtype).div_(255.0)
-        return TrainingPhoto(capture.views[index].camera.to(run.device, run.dtype), image, mask)
+        return TrainingPhoto(capture.views[index].camera.to(run.device, run.dtype), *resident_of(training, run, capture).see(index))
 
     return Survey(capture.train, photo, rasterize, torch.tensor(capture.background))
 

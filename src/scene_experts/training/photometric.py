@@ -129,8 +129,8 @@ class _Photometric(torch.autograd.Function):
         return out, None, None
 
 
-TILE, BLOCK = 64, 1024  # pixels along a side of a tile of the first kernel, values per program of the second
-PRECISION = "tf32x3"  # of the windows' products: nearly float32 on tensor cores
+TILE, WARPS, BLOCK = 32, 4, 1024  # pixels along a side of a tile of the first kernel and its warps, values per program of the second
+PRECISION = "ieee"  # of the windows' products: float32; with this tile 0.50 ms for 800x533 on an H100, tf32x3 0.70, 64 and tf32x3 1.16
 
 
 class _PhotometricCuda(torch.autograd.Function):
@@ -148,7 +148,7 @@ class _PhotometricCuda(torch.autograd.Function):
         scale, reach = 1 / (2 * SIGMA * SIGMA), TAPS // 2
         norm = sum(math.exp(-scale * t * t) for t in range(-reach, reach + 1))
         sizes = {"R": reach, "SCALE": scale, "NORM": norm, "C1": C1, "C2": C2, "T": TILE, "WANTED": wanted, "PRECISION": PRECISION}
-        triton.launch(_kernels().forward, grid, x, y, gradient, sums, H, W, *weights, **sizes, num_warps=8)
+        triton.launch(_kernels().forward, grid, x, y, gradient, sums, H, W, *weights, **sizes, num_warps=WARPS)
         ctx.l1_weight = weights[0]
         if wanted:
             ctx.save_for_backward(x, y, gradient)

@@ -27,6 +27,7 @@ from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.guard import check_state
 from scene_experts.training.memory import Largest
+from scene_experts.training.resident import Resident
 from scene_experts.training.run_folder import read_config
 
 log: logging.Logger = logging.getLogger(__name__)
@@ -48,6 +49,7 @@ class Training:
         self.cfg, self.scene = cfg, scene
         self.step = 0
         self.largest = Largest()
+        self.resident: Resident | None = None  # made by the loop
         self.clock = Clock()
         self.queue: list[int] = []
         self.capture_id = self.poses = ""  # fingerprint and poses of the capture

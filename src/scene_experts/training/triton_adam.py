@@ -11,13 +11,14 @@ COLUMNS = tl.constexpr(10)
 
 
 @triton.jit(do_not_specialize=["count"])
-def step(table, count, beta1, beta2, eps, B: tl.constexpr):
+def step(table, count, beta2, rest1, rest2, eps, B: tl.constexpr):
     """Update B values of the tensor that this program belongs to.
 
     `table` [count, 10] int64 has one row per tensor: the addresses of value, gradient, first and
     second moment and rows (0: all rows), the number of values and of values per row, the first
     program, and the bits of two float64 numbers: the step size, and the root of the second bias
-    correction.
+    correction. `rest1` and `rest2` are 1 - beta, formed in float64: from a beta in float32 they
+    would be 1e-5 off.
     """
     program, mine = tl.program_id(0), 0
     for i in range(count):
@@ -35,8 +36,8 @@ def step(table, count, beta1, beta2, eps, B: tl.constexpr):
     at = tl.where(address != 0, row * width + at % width, at)
     g = tl.load(gradient + at, mask=inside, other=0.0)
     m, v = tl.load(first + at, mask=inside, other=0.0), tl.load(second + at, mask=inside, other=0.0)
-    m = m + (g - m) * (1.0 - beta1)
-    v = v * beta2 + (1.0 - beta2) * g * g
+    m = m + (g - m) * rest1
+    v = v * beta2 + rest2 * g * g
     p = tl.load(value + at, mask=inside, other=0.0)
     tl.store(first + at, m, mask=inside)
     tl.store(second + at, v, mask=inside)

@@ -41,7 +41,7 @@ class Steps:
 
     def __init__(self, training: Training, capture: Capture, device: str, draw: Rasterizer, moves: bool = True) -> None:
         self.capture, self.training, self.run = capture, training, run_of(training.cfg, device)
-        self.draw = loop.for_growth(draw, training.cfg.growth.absolute)
+        self.draw = loop.for_training(draw, training.cfg.growth.absolute)
         self.gradients: list[torch.Tensor] = []
         training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
         step = training.optimizer_step

@@ -19,8 +19,8 @@ from scene_experts.data.capture import Capture
 from scene_experts.data.settings import Data
 from scene_experts.evaluate import score, timing
 from scene_experts.native import triton
-from scene_experts.render import gsplat
-from scene_experts.training import loop
+from scene_experts.render import gsplat, gsplat_install
+from scene_experts.training import loop, photometric
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.optim import FusedAdam
 from scene_experts.training.options import TrainOptions
@@ -59,7 +59,8 @@ def run_of(cfg: Train, device: str) -> loop.Job:
 
 def prepare() -> None:
     """Change the package so that it finds gsplat and Triton, and counts their kernels."""
-    gsplat.explain_missing = lambda: None
+    gsplat.explain_missing = gsplat_install.explain_missing = lambda: None
+    photometric.TILE = 64  # the interpreter takes as long for a program of any size
     random.torch = SimpleNamespace(randint=torch.randint, Generator=lambda device: torch.Generator())
     triton.launch = launch
     launch_adam = FusedAdam._launch

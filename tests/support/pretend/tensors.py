@@ -279,6 +279,7 @@ def install() -> None:
         "is_available": lambda: True,
         "memory_reserved": lambda device=None: 0,
         "max_memory_allocated": lambda device=None: 0,
+        "mem_get_info": lambda device=None: (1 << 33, 1 << 34),
         "reset_peak_memory_stats": lambda device=None: None,
         "empty_cache": lambda: None,
         "current_device": lambda: 0,

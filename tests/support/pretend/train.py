@@ -58,7 +58,7 @@ def try_recipe(capture: Capture, word: str) -> dict[str, Any]:
     if decode == "sparse":
         cfg = replace(cfg, sparse_adam=True)
     run, draw = run_of(cfg, "cuda"), GsplatRasterizer(antialias=cfg.antialias)
-    draw = loop.for_growth(draw, cfg.growth.absolute)
+    draw = loop.for_training(draw, cfg.growth.absolute)
     found: dict[str, Any] = {"edits": 0}
     edited = False
     training = Training.start(cfg, capture, "cuda")

@@ -10,7 +10,7 @@ from scene_experts import render
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Gaussians
 from scene_experts.native import library as native
-from scene_experts.render import NAMES, as_trained, choose, for_growth, gsplat_install
+from scene_experts.render import NAMES, as_trained, choose, for_training, gsplat_install
 from support.messages import naming
 
 
@@ -82,9 +82,9 @@ def test_a_rasteriser_is_as_the_run_was_trained():
 
 def test_growth_asks_for_absolute_gradients():
     draw = choose("reference", "cpu")
-    assert for_growth(draw, False) is draw and for_growth(draw, True) == replace(draw, absolute=True)  # type: ignore[type-var]
+    assert for_training(draw, False) is draw and for_training(draw, True) == replace(draw, absolute=True)  # type: ignore[type-var]
     with pytest.raises(InputError, match=r"--growth\.gradient"):
-        for_growth(SimpleNamespace(name="mine"), True)  # type: ignore[arg-type]
+        for_training(SimpleNamespace(name="mine"), True)  # type: ignore[arg-type]
 
 
 def test_gsplat_says_that_it_is_not_deterministic():

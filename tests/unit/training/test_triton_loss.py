@@ -47,9 +47,9 @@ def test_equal_images_and_no_gradient():
 def test_a_tile_s_size_does_not_matter(monkeypatch):
     image, target = (t.to(DEVICE) for t in pair(40, 33))
     with torch.no_grad():
-        large = _PhotometricCuda.apply(image, target, 0.5)
-        monkeypatch.setattr(module, "TILE", 32)
         small = _PhotometricCuda.apply(image, target, 0.5)
+        monkeypatch.setattr(module, "TILE", 64)
+        large = _PhotometricCuda.apply(image, target, 0.5)
     torch.testing.assert_close(large, small, rtol=1e-6, atol=0)
 
 
@@ -59,5 +59,5 @@ def test_the_kernels_compile(target):
     images = dict.fromkeys(("image", "target", "gradient", "sums", "by_l1", "by_dssim", "out"), "*fp32")
     types, sizes = images | {"H": "i32", "W": "i32", "count": "i32"}, {"R": 5, "SCALE": 0.2, "NORM": 3.76, "C1": 1e-4, "C2": 9e-4}
     sizes |= {"T": module.TILE, "WANTED": True, "PRECISION": module.PRECISION}
-    compile_for_gpu("scene_experts.training.triton_loss", "forward", types, sizes, target, num_warps=8)
+    compile_for_gpu("scene_experts.training.triton_loss", "forward", types, sizes, target, num_warps=module.WARPS)
     compile_for_gpu("scene_experts.training.triton_loss", "backward", types, {"B": 1024}, target)

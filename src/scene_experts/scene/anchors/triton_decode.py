@@ -27,6 +27,10 @@ TENSORS = ("router_w", "router_b", "w1", "b1", "w2", "b2")
 PRECISION = "ieee"  # of matrix products: "ieee" is float32, "tf32x3" is nearly float32 on tensor cores, "tf32" is less precise
 BLOCK = 32  # anchors per program; with the paper's sizes, the largest block whose tiles fit in registers
 BLOCK_WEIGHTS = 16  # anchors per step of `weight_backward`, which also keeps the gradient of a network in registers
+WARPS_BACKWARD = {16: 4, 32: 4, 64: 8}
+"""Warps of `head_backward` by padded hidden width. Measured on an H100, as WARPS_WEIGHTS: there 8 is
+four times as fast as 4."""
+WARPS_WEIGHTS = 8
 MOST_EXPERTS = 30  # a set of experts is stored as the bits of an int32
 WIDEST = 256  # largest padded number of outputs
 
@@ -199,12 +203,13 @@ class _Decode(torch.autograd.Function):
             given = (plan.rows, columns[2], columns[1], cov, dst, quats, d_means, d_quats, d_scales, d_opacities, d_raw)
             grid = (-(-A // BLOCK),)
             triton.launch(_kernels().place_backward, grid, *given, d_offsets, d_log_scaling, d_cov, d_all, A, K=K, B=BLOCK, KP=pad(K, 1))
+        wanted = ctx.needs_input_grad[2:]
         d_weights: list[Tensor | None] = []
         d_mixed: list[Tensor | None] = []
         for i, d_out in enumerate((d_all, d_cov, d_colors)):
-            own, mixed = _backward(plan, i, routes[i], columns[0], weights, dst, d_out, d_gates[i], d_feature)
+            trained = any(wanted[3 + 6 * i : 5 + 6 * i])
+            own, mixed = _backward(plan, i, routes[i], columns[0], weights, dst, d_out, d_gates[i], d_feature, trained)
             d_weights, d_mixed = d_weights + own, [*d_mixed, mixed]
-        wanted = ctx.needs_input_grad[2:]
         return None, None, *(g if want else None for g, want in zip([d_feature, d_log_scaling, d_offsets, *d_weights, *d_mixed], wanted))
 
 
@@ -324,10 +329,19 @@ def _forward(plan: _Plan, i: int, routes: Any, feature: Tensor, weights: Any, ds
 
 
 def _backward(
-    plan: _Plan, i: int, route: Any, feature: Tensor, weights: Any, dst: Tensor, d_out: Tensor, d_gates: Tensor | None, d_feature: Tensor
+    plan: _Plan,
+    i: int,
+    route: Any,
+    feature: Tensor,
+    weights: Any,
+    dst: Tensor,
+    d_out: Tensor,
+    d_gates: Tensor | None,
+    d_feature: Tensor,
+    router: bool,
 ) -> tuple[list[Tensor | None], Tensor | None]:
     """Return the gradients of the six tensors of attribute i and of given mixture weights, and add
-    its part to `d_feature`."""
+    its part to `d_feature`. `router`: whether those of the router are wanted."""
     head, own, A = plan.heads[i], weights[6 * i : 6 * i + 6], len(plan.rows)
     gates, weight, _, keys, order = route
     if not A:
@@ -346,14 +360,17 @@ def _backward(
         EP=pad(head.E),
         POSITION=head.position,
         OUTSIDE=head.outside,
+        num_warps=WARPS_BACKWARD[head.sizes["HP"]],
     )
     blocks = -(-A // BLOCK_WEIGHTS)
     parts = [t.new_empty(_parts(t.device, head.E, blocks), *t.shape) for t in own[2:]]
     arguments = [*shared, plan.xyz, feature, plan.camera, *own[2:], dst, d_out, *parts]
     given = (plan.rows if t is None else t for t in arguments)
-    triton.launch(_kernels().weight_backward, (head.E, len(parts[0])), *given, A, blocks, **head.sizes, B=BLOCK_WEIGHTS)
+    triton.launch(
+        _kernels().weight_backward, (head.E, len(parts[0])), *given, A, blocks, **head.sizes, B=BLOCK_WEIGHTS, num_warps=WARPS_WEIGHTS
+    )
     found: list[Tensor | None] = [None, None]
-    if d_logits is not None and not head.outside:
+    if router and d_logits is not None and not head.outside:
         seen = feature.index_select(0, plan.rows)
         if head.position:
             seen = torch.cat([seen, plan.xyz.index_select(0, plan.rows) / plan.extent], dim=1)

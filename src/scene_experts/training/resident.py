@@ -1,0 +1,60 @@
+"""The photographs of a training on its device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from scene_experts.core.transfer import upload
+from scene_experts.data.capture import Capture
+
+SHARE = 4  # of the memory that is free on a GPU when a training begins, photographs may take one part in so many
+AHEAD = 3  # threads that decode photographs for a GPU, as the cores are free
+
+
+class Resident:
+    """Photographs as a training sees them. On a GPU they stay there, 3 bytes a pixel, as far as the
+    budget allows; the others are decoded ahead and copied each time.
+
+    A view is seen in random order and only ever dropped with the object, so keeping the first ones
+    that are seen is as good as any other choice.
+    """
+
+    def __init__(self, capture: Capture, device: str, dtype: torch.dtype, budget: int | None = None) -> None:
+        """budget: Bytes of the device. None is a quarter of its free memory, and 0 on the CPU."""
+        self.capture, self.device, self.dtype = capture, torch.device(device), dtype
+        gpu = self.device.type == "cuda"
+        self.threads = AHEAD if gpu else 1
+        self.budget = budget if budget is not None else torch.cuda.mem_get_info(self.device)[0] // SHARE if gpu else 0
+        self.used = 0
+        self.kept: dict[int, tuple[Tensor, Tensor | None]] = {}
+        self.backgrounds: dict[tuple[float, ...], Tensor] = {}
+
+    def see(self, index: int) -> tuple[Tensor, Tensor | None]:
+        """Return the photograph [H, W, 3] in [0, 1] and its mask [H, W] or None, as the device and
+        dtype want them. Raises InputError if its file cannot be read."""
+        pixels = self.kept.get(index)
+        if pixels is None:
+            frame = self.capture.frame(index)
+            pixels = upload(frame.rgb, self.device), None if frame.mask is None else upload(frame.mask, self.device, self.dtype)
+            size = sum(t.numel() * t.element_size() for t in pixels if t is not None)
+            if self.used + size <= self.budget:
+                self.kept[index], self.used = pixels, self.used + size
+        rgb, mask = pixels
+        return rgb.to(self.dtype).div_(255.0), mask
+
+    def background(self, color: Tensor | None) -> Tensor:
+        """Return a background [3] on the device; None is that of the capture."""
+        if color is not None:
+            return upload(color, self.device, self.dtype)
+        found = self.backgrounds.get(self.capture.background)
+        if found is None:
+            found = upload(torch.tensor(self.capture.background), self.device, self.dtype)
+            self.backgrounds[self.capture.background] = found
+        return found
+
+    def prefetch(self, indices: Iterable[int]) -> None:
+        """Decode in the background those of these photographs, in this order, that are not here."""
+        self.capture.images.prefetch([index for index in indices if index not in self.kept], self.threads)

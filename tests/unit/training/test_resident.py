@@ -1,0 +1,43 @@
+"""Photographs that stay on the device of a training."""
+
+import pytest
+import torch
+
+from scene_experts.training.resident import Resident
+from support.captures import load
+from support.synthetic import make_capture
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory):
+    return load(make_capture(tmp_path_factory.mktemp("resident"), views=5, size=(24, 16)).folder)
+
+
+SIZE = 24 * 16 * 3
+
+
+def test_a_photograph_is_the_same_kept_or_not(capture) -> None:
+    none, two = Resident(capture, "cpu", torch.float32), Resident(capture, "cpu", torch.float32, budget=2 * SIZE)
+    for _ in range(2):
+        for index in (3, 0, 1):
+            rgb, mask = two.see(index)
+            assert torch.equal(rgb, capture.frame(index).rgb.float() / 255) and mask is None
+            assert torch.equal(none.see(index)[0], rgb)
+            rgb.zero_()  # the caller's own
+    assert set(two.kept) == {3, 0} and two.used == 2 * SIZE and not none.kept
+
+
+def test_only_photographs_that_are_not_kept_are_decoded_ahead(capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr(capture.images, "prefetch", lambda indices, threads: asked.append((indices, threads)))
+    some = Resident(capture, "cpu", torch.float64, budget=SIZE)
+    assert some.see(2)[0].dtype == torch.float64
+    some.prefetch([2, 4])
+    assert asked == [([4], 1)]
+
+
+def test_the_background_is_that_of_the_view_or_of_the_capture(capture) -> None:
+    photographs = Resident(capture, "cpu", torch.float32)
+    assert photographs.background(None) is photographs.background(None)
+    assert torch.equal(photographs.background(None), torch.tensor(capture.background))
+    assert torch.equal(photographs.background(torch.ones(3)), torch.ones(3))
