@@ -21,12 +21,12 @@ from scene_experts.core.reading.plain import read_json as read_json
 log: logging.Logger = logging.getLogger(__name__)
 
 
-def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
+def write_atomic(path: Path, write: Callable[[Path], object], sync: bool = True) -> None:
     """Write a file atomically: `write(temporary)` writes to a temporary file beside `path`, which
     then replaces `path`.
 
-    The data is synced to disk first, so after a crash or a power failure `path` is either the old
-    file or the new one. Raises RunError if the disk is full or not writable. The old file is then
+    The data is synced to disk first (unless not `sync`), so after a crash or a power failure `path`
+    is either the old file or the new one. Raises RunError if the disk is full or not writable. The old file is then
     unchanged and the temporary file is removed.
     """
     path = Path(path)
@@ -39,8 +39,9 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     temporary = Path(name)
     try:
         write(temporary)
-        with temporary.open("rb+") as stream:
-            os.fsync(stream.fileno())
+        if sync:
+            with temporary.open("rb+") as stream:
+                os.fsync(stream.fileno())
         temporary.chmod(new_file_mode(0o666))
         os.replace(temporary, path)
     except OSError as error:

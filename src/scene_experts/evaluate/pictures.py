@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
@@ -17,8 +19,10 @@ from torch import Tensor
 from scene_experts.core.io import write_atomic
 from scene_experts.core.reading.budget import PICTURE
 from scene_experts.core.reading.pictures import opening_picture
+from scene_experts.native.library import count_cores
 from scene_experts.training.run_folder import PICTURES
 
+MOST_THREADS, PENDING = 8, 16  # that encode pictures, and views that wait for them
 WORST = 0.25  # mean absolute error over RGB at the bright end of the error map, the same for all views
 GAP, BAR, TYPE = 4, 22, 13  # px: gap between pictures, height of the caption bar, font size
 PAGE = 1200  # px; wider rows are likely shown at this width, so their captions are larger
@@ -78,9 +82,34 @@ def replacing(folder: Path, first: bool = True) -> Iterator[Path]:
             shutil.rmtree(new, ignore_errors=True)
 
 
-def write_picture(path: Path, pixels: np.ndarray) -> None:
-    """Write uint8 pixels [H, W, 3] or [H, W] as a PNG file, atomically."""
-    write_atomic(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG", compress_level=3))
+def write_picture(path: Path, pixels: np.ndarray, sync: bool = True) -> None:
+    """Write uint8 pixels [H, W, 3] or [H, W] as a PNG file, atomically; `sync`: to the disk."""
+    write_atomic(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG", compress_level=3), sync)
+
+
+class Writer:
+    """Context manager that draws, encodes and writes pictures in threads, at most PENDING views
+    ahead. Raises what a thread raised, at a later call or at the end."""
+
+    def __init__(self) -> None:
+        self._threads = ThreadPoolExecutor(min(MOST_THREADS, count_cores()), "scene-experts pictures")
+        self._pending: deque[Future[None]] = deque()
+
+    def __enter__(self) -> Writer:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            while kind is None and self._pending:
+                self._pending.popleft().result()
+        finally:
+            self._threads.shutdown(cancel_futures=True)
+
+    def submit(self, work: Callable[[], None]) -> None:
+        """Call `work`, which writes pictures, in a thread."""
+        if len(self._pending) >= PENDING:
+            self._pending.popleft().result()
+        self._pending.append(self._threads.submit(work))
 
 
 def read_picture(path: Path, mode: str = "RGB") -> np.ndarray:

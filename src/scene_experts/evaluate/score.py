@@ -1,5 +1,5 @@
-"""Evaluates a trained scene: renders views to disk, scores the 8-bit files, and states everything
-that the scores depend on.
+"""Evaluates a trained scene: renders views, scores their 8-bit pixels, which it also writes to
+disk, and states everything that the scores depend on.
 
 OUT/test/{renders,gt,errors,side_by_side}/<view name>.png    pictures of each view; masks/ if the
 capture has masks OUT/test/experts/<attribute>.png                             the first view drawn
@@ -16,9 +16,11 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -89,9 +91,9 @@ def evaluate(
     if options.appearance == "half":
         fitting: Callable[[int, int], None] = lambda done, total: tell("fitting appearance codes", done, total)  # noqa: E731
         fitted = halves.fitted_codes(scene, capture, rasterize, [chosen[n] for n in mine], step, background, fitting)
-    with fitted, pictures.replacing(out / options.folder, group.first) as folder:
+    with fitted, pictures.replacing(out / options.folder, group.first) as folder, pictures.Writer() as writer:
         group.wait()
-        drawing = Drawing(scene.frozen(step), rasterize, step, background, folder, options.appearance == "half")
+        drawing = Drawing(scene.frozen(step), rasterize, step, background, options.appearance == "half")
 
         def score_mine() -> dict[int, dict[str, Any]]:
             found = {}
@@ -99,9 +101,9 @@ def evaluate(
                 index = chosen[n]
                 capture.images.prefetch([chosen[later] for later in mine if later > n][:2])
                 name = capture.views[index].name
-                facts = drawing.draw(capture, index, cameras[n], files[name])
-                scores = score_files(folder, files[name], perceptual, device)
-                write_comparison(folder, files[name], scores)
+                shown, facts = drawing.draw(capture, index, cameras[n])
+                scores = shown.score(perceptual, device)
+                writer.submit(partial(shown.write, folder, files[name], scores))
                 found[n] = {"file": files[name], **scores, **facts}
                 tell("rendering and scoring", n + 1, len(chosen))
             return found
@@ -156,20 +158,50 @@ def load_perceptual(options: EvalOptions, device: torch.device, tell: Progress) 
 
 
 @dataclass(frozen=True)
+class Shown:
+    """A view as 8-bit pixels: what is scored and written."""
+
+    render: np.ndarray  # [H, W, 3]
+    photo: np.ndarray  # [H, W, 3]
+    mask: np.ndarray | None  # [H, W]
+
+    def score(self, perceptual: Perceptual, device: torch.device | str = "cpu") -> dict[str, Any]:
+        """Return the scores. They are empty if the mask excludes every pixel."""
+        if self.mask is not None and not self.mask.any():
+            return {}
+        render, photo = (pictures.from_8bit(pixels).to(device) for pixels in (self.render, self.photo))
+        mask = None if self.mask is None else pictures.from_8bit(self.mask).to(device)
+        return {**score(render, photo, mask, perceptual), "masked": mask is not None}
+
+    def write(self, folder: Path, file: str, scores: dict[str, Any]) -> None:
+        """Write render, photograph, mask and error map, and all but the mask beside each other with
+        their scores, into a folder that only counts once it is whole."""
+        parts = ["render"]
+        if scores:
+            parts += [f"{scores['psnr']:.2f} dB", f"SSIM {scores['ssim']:.3f}"]
+            parts += [f"LPIPS {scores['lpips']:.3f}"] if "lpips" in scores else []
+        captions = ("photograph", "  ".join(parts), f"error, 0 to {pictures.WORST:g}")
+        errors = pictures.draw_error_map(self.render, self.photo, self.mask)
+        sheet = pictures.compose_comparison(self.photo, self.render, errors, captions)
+        kinds = {"renders": self.render, "gt": self.photo, "masks": self.mask, "errors": errors, "side_by_side": sheet}
+        for kind, pixels in kinds.items():
+            if pixels is not None:
+                pictures.write_picture(folder / kind / file, pixels, sync=False)
+
+
+@dataclass(frozen=True)
 class Drawing:
-    """Draws views of a scene and writes them beside their photographs."""
+    """Draws views of a scene beside their photographs."""
 
     draws: Draws
     rasterize: Rasterizer
     step: int
     background: Tensor  # [3]
-    folder: Path
     half: bool  # score only the right half of each view
 
     @torch.no_grad()
-    def draw(self, capture: Capture, index: int, camera: Camera, file: str) -> dict[str, Any]:
-        """Draw view `index`, write the render, the photograph and the mask, and return the counts
-        of the view."""
+    def draw(self, capture: Capture, index: int, camera: Camera) -> tuple[Shown, dict[str, Any]]:
+        """Draw view `index`. Returns its pixels and the counts of the view."""
         frame = capture.frame(index)
         decoded = self.draws(camera, self.step, Mode.DRAW, self.rasterize.visible)
         render = self.rasterize(decoded.gaussians, camera, self.background)
@@ -179,12 +211,9 @@ class Drawing:
                 f"expected {capture.views[index].name} with {drawn.shape[1]} x {drawn.shape[0]} px, found "
                 f"{photo.shape[1]} x {photo.shape[0]} px; load the capture again"
             )
-        pictures.write_picture(self.folder / "renders" / file, drawn)
-        pictures.write_picture(self.folder / "gt" / file, photo)
         mask = halves.right_half(frame.mask, *photo.shape[:2]) if self.half else frame.mask
-        if mask is not None:
-            pictures.write_picture(self.folder / "masks" / file, (mask.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy())
-        return count_gaussians(decoded, render)
+        levels = None if mask is None else (mask.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+        return Shown(drawn, photo, levels), count_gaussians(decoded, render)
 
 
 def count_gaussians(decoded: Decoded, render: Render) -> dict[str, Any]:
@@ -197,29 +226,3 @@ def count_gaussians(decoded: Decoded, render: Render) -> dict[str, Any]:
         "gaussians_rendered": int((render.radii > 0).sum()),
         "activation_ratio": None if raw is None else float((raw > 0).double().mean()) if raw.numel() else 0.0,
     }
-
-
-def score_files(folder: Path, file: str, perceptual: Perceptual, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Return the scores of one view from its 8-bit files. The result is empty if the mask excludes
-    every pixel."""
-    render, photo = (pictures.from_8bit(pictures.read_picture(folder / kind / file)).to(device) for kind in ("renders", "gt"))
-    path = folder / "masks" / file
-    mask = pictures.from_8bit(pictures.read_picture(path, "L")).to(device) if path.is_file() else None
-    if mask is not None and not mask.any():
-        return {}
-    return {**score(render, photo, mask, perceptual), "masked": mask is not None}
-
-
-def write_comparison(folder: Path, file: str, scores: dict[str, Any]) -> None:
-    """Write the error map, and photograph, render and error map beside each other with their
-    scores."""
-    render, photo = pictures.read_picture(folder / "renders" / file), pictures.read_picture(folder / "gt" / file)
-    mask = folder / "masks" / file
-    errors = pictures.draw_error_map(render, photo, pictures.read_picture(mask, "L") if mask.is_file() else None)
-    parts = ["render"]
-    if scores:
-        parts += [f"{scores['psnr']:.2f} dB", f"SSIM {scores['ssim']:.3f}"]
-        parts += [f"LPIPS {scores['lpips']:.3f}"] if "lpips" in scores else []
-    captions = ("photograph", "  ".join(parts), f"error, 0 to {pictures.WORST:g}")
-    pictures.write_picture(folder / "errors" / file, errors)
-    pictures.write_picture(folder / "side_by_side" / file, pictures.compose_comparison(photo, render, errors, captions))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, RunError
 from scene_experts.evaluate import pictures
 
 
@@ -106,3 +107,14 @@ def test_limiting_the_width_keeps_narrow_pictures():
     part = np.full((30, 60, 3), 7, np.uint8)
     assert pictures.limit_width(part, 60) is part
     assert pictures.limit_width(part, 20).shape == (10, 20, 3) and (pictures.limit_width(part, 20) == 7).all()
+
+
+def test_a_writer_does_all_work_and_raises_what_a_thread_raised(tmp_path: Path) -> None:
+    pixels = np.zeros((4, 6, 3), np.uint8)
+    with pictures.Writer() as writer:
+        for i in range(2 * pictures.PENDING):
+            writer.submit(partial(pictures.write_picture, tmp_path / f"{i}.png", pixels + i, sync=False))
+    assert all(np.array_equal(pictures.read_picture(tmp_path / f"{i}.png"), pixels + i) for i in range(2 * pictures.PENDING))
+    (tmp_path / "file").touch()
+    with pytest.raises(RunError, match="file"), pictures.Writer() as writer:
+        writer.submit(partial(pictures.write_picture, tmp_path / "file" / "a.png", pixels))
