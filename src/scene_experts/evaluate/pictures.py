@@ -84,7 +84,7 @@ def replacing(folder: Path, first: bool = True) -> Iterator[Path]:
 
 def write_picture(path: Path, pixels: np.ndarray, sync: bool = True) -> None:
     """Write uint8 pixels [H, W, 3] or [H, W] as a PNG file, atomically; `sync`: to the disk."""
-    write_atomic(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG", compress_level=3), sync)
+    write_atomic(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG", compress_level=1), sync)
 
 
 class Writer:
