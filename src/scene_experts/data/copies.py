@@ -6,10 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
 
 from scene_experts.core.errors import InputError, few
 from scene_experts.core.reading.budget import PHOTOGRAPH
@@ -19,7 +17,7 @@ from scene_experts.data.views import View
 
 NEAR, ALIKE = 0.05, 0.9999  # of the median distance to the nearest view; cosine of the angle between two views (0.8 degrees)
 SIDE, DIFFERENT = 48, 6.0  # px of the pictures that are compared, and their mean difference of 255 from which they are not copies
-ROWS = 256  # views whose distances to all others are in memory together
+ROWS = 32  # views whose distances to all others are in memory together
 MOST = 64  # pairs that are looked at
 
 
@@ -28,8 +26,8 @@ def tell_copies(views: Sequence[View]) -> list[str]:
     the same. Only such pairs are decoded."""
     if len(views) < 3:
         return []
-    poses = torch.stack([view.camera.world_to_cam for view in views]).double()
-    centres = -torch.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    poses = np.stack([view.camera.world_to_cam.double().numpy() for view in views])
+    centres = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
     pairs = [(a, b) for a, b in _find_near(centres) if float(poses[a, 2, :3] @ poses[b, 2, :3]) > ALIKE]
     copies = sorted({views[b].name: views[a].name for a, b in pairs[:MOST] if _same(views[a], views[b])}.items())
     if not copies:
@@ -38,16 +36,20 @@ def tell_copies(views: Sequence[View]) -> list[str]:
     return [f"{len(copies)} photographs are copies of others ({named}): a held-out copy scores too well; leave them out with --leave-out"]
 
 
-def _find_near(centres: Tensor) -> list[tuple[int, int]]:
+def _find_near(centres: NDArray[np.float64]) -> list[tuple[int, int]]:
     """Return pairs of places that are much nearer to each other than places usually are."""
-    near, reach = [], torch.empty(len(centres), dtype=torch.float64)
-    for rows in torch.arange(len(centres)).split(ROWS):
-        distance = torch.cdist(centres[rows], centres, compute_mode="donot_use_mm_for_euclid_dist")
-        distance[torch.arange(len(rows)), rows] = torch.inf
-        reach[rows], nearest = distance.min(1)
-        near += zip(rows.tolist(), nearest.tolist(), reach[rows].tolist())
-    limit = NEAR * float(reach.median())
-    return sorted({(min(a, b), max(a, b)) for a, b, d in near if d <= limit})
+    count = len(centres)
+    reach, nearest = np.empty(count), np.empty(count, np.int64)
+    for top in range(0, count, ROWS):
+        rows = np.arange(top, min(top + ROWS, count))
+        square = np.zeros((len(rows), count))
+        for axis in centres.T:
+            square += (axis[rows, None] - axis[None]) ** 2
+        square[rows - top, rows] = np.inf
+        nearest[rows] = square.argmin(1)
+        reach[rows] = np.sqrt(square[rows - top, nearest[rows]])
+    close = np.nonzero(reach <= NEAR * np.median(reach))[0]
+    return sorted({(min(a, b), max(a, b)) for a, b in zip(close.tolist(), nearest[close].tolist())})
 
 
 def _same(a: View, b: View) -> bool:
