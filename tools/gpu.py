@@ -118,6 +118,7 @@ def main(argv: list[str] | None = None) -> int:
     if args.plan:
         print("\n".join(f"{stage.name:14} {' '.join(stage.command)}" for stage in stages))
         return 0
+    os.environ["SCENE_EXPERTS_GPU"] = "1"  # tests see the card
     args.out.mkdir(parents=True, exist_ok=True)
     if args.wheels is not None and (missing := [n for n in ("gsplat", "triton") if importlib.util.find_spec(n) is None]):
         subprocess.run([sys.executable, "-m", "pip", "install", "-q", "--no-index", "--find-links", str(args.wheels), *missing], check=True)
