@@ -25,9 +25,9 @@ def write_atomic(path: Path, write: Callable[[Path], object], sync: bool = True)
     """Write a file atomically: `write(temporary)` writes to a temporary file beside `path`, which
     then replaces `path`.
 
-    The data is synced to disk first (unless not `sync`), so after a crash or a power failure `path`
-    is either the old file or the new one. Raises RunError if the disk is full or not writable. The old file is then
-    unchanged and the temporary file is removed.
+    With `sync` the data is synced to disk first, so after a crash or a power failure `path` is
+    either the old file or the new one. Raises RunError if the disk is full or not writable. The old
+    file is then unchanged and the temporary file is removed.
     """
     path = Path(path)
     try:

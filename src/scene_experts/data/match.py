@@ -38,10 +38,11 @@ def to_relative_name(name: str) -> str:
 def match_images(folder: Path, names: Sequence[str]) -> Match:
     """Find the file in `folder` for each of `names` (relative, "/" between folders).
 
-    The exact path is tried first, then the path with "/" for "\\\\" (Windows) and under Unicode's composed form (macOS unpacks names
-    decomposed), then the only file with the same stem and another extension, then
-    the only file anywhere in `folder` with that base name. The last two require that no other name
-    shares the stem or base name. `warnings` reports every match that is not exact.
+    The exact path is tried first, then the path with slashes for backslashes (Windows) and under
+    Unicode's composed form (macOS unpacks names decomposed), then the only file with the same stem
+    and another extension, then the only file anywhere in `folder` with that base name. The last two
+    require that no other name shares the stem or base name. `warnings` reports every match that is
+    not exact.
     """
     there = list_pictures(folder)
     exact = set(there)

@@ -35,12 +35,12 @@ ELSE = "or use --device cpu"
 def explain_missing() -> str | None:
     """Return None if gsplat can draw, otherwise a sentence that says why not and what to do. May
     compile gsplat, for minutes."""
-    return _explain_machine() or remember_failure() or _try()
+    return _explain_machine() or recall_failure() or _try()
 
 
 def is_likely() -> bool:
     """Whether gsplat can probably draw. Compiles nothing."""
-    return _explain_machine() is None and remember_failure() is None and _is_installed()
+    return _explain_machine() is None and recall_failure() is None and _is_installed()
 
 
 def try_again() -> None:
@@ -50,7 +50,7 @@ def try_again() -> None:
     explain_missing.cache_clear()
 
 
-def remember_failure() -> str | None:
+def recall_failure() -> str | None:
     """Return the sentence of a build that failed with today's versions and CUDA toolkit, if any."""
     with suppress(InputError, RunError):
         known = read_json(_place(), "remembered build")

@@ -94,7 +94,7 @@ def test_another_failure_is_told_whole_and_not_remembered(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(install.importlib, "import_module", fails)
     assert "(12.4) mismatches the version that was used to compile PyTorch (13.0)" in ask()
-    assert install.remember_failure() is None
+    assert install.recall_failure() is None
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ sRGB is applied. Values from 1 on are white."""
 from __future__ import annotations
 
 import contextlib
-import io
+import sys
 import tempfile
 import threading
 from pathlib import Path
@@ -48,9 +48,9 @@ def _open(stream: IO[bytes], _: object) -> Image.Image:
             if (high < low).any() or int(np.prod(high - low + 1)) > _MOST:
                 raise Damaged(f"a picture from {low.tolist()} to {high.tolist()}")
         # The library leaves out a part that it cannot read, and only prints why.
-        with _told, contextlib.redirect_stdout(io.StringIO()) as said, OpenEXR.File(str(path), separate_channels=True) as file:
-            if said.getvalue():
-                raise Damaged(said.getvalue().strip().rpartition(" - ")[2])
+        with _told, contextlib.redirect_stdout(_Ear()) as ear, OpenEXR.File(str(path), separate_channels=True) as file:
+            if ear.said:
+                raise Damaged(ear.said.strip().rpartition(" - ")[2])
             found: dict[str, Any] = {name: channel.pixels for name, channel in file.channels().items()}
     layers = next((names for names in _LAYERS if all(name in found for name in names)), None)
     if layers is None:
@@ -59,6 +59,25 @@ def _open(stream: IO[bytes], _: object) -> Image.Image:
     image = Image.fromarray(pixels if pixels.shape[2] > 1 else pixels[..., 0])
     image.format = FORMAT
     return image
+
+
+class _Ear:
+    """Standard output that keeps what this thread prints and passes on what others print."""
+
+    def __init__(self) -> None:
+        self.said, self._thread, self._before = "", threading.get_ident(), sys.stdout
+
+    def write(self, text: str) -> int:
+        if threading.get_ident() != self._thread:
+            return self._before.write(text)
+        self.said += text
+        return len(text)
+
+    def flush(self) -> None:
+        self._before.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._before, name)
 
 
 def encode(values: NDArray[Any]) -> NDArray[np.uint8]:

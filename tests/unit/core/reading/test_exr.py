@@ -1,5 +1,8 @@
 """EXR pictures: channels, the curve of sRGB, and files that are refused."""
 
+import contextlib
+import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +55,16 @@ def test_other_channels_and_damaged_files_are_refused(tmp_path: Path) -> None:
     path.write_bytes(data[: at + 8] + (2**20).to_bytes(4, "little") * 2 + data[at + 16 :])  # a bomb
     with pytest.raises(InputError, match=r"a\.exr"):
         read(path)
+
+
+def test_what_other_threads_print_is_no_failure_of_the_file(capsys: pytest.CaptureFixture[str]) -> None:
+    with contextlib.redirect_stdout(exr._Ear()) as ear:
+        print("of the library")
+        other = threading.Thread(target=print, args=("progress",))
+        other.start()
+        other.join()
+        assert not sys.stdout.isatty()
+    assert ear.said == "of the library\n" and capsys.readouterr().out == "progress\n"
 
 
 def test_a_damaged_first_part_is_told_and_no_other_part_is_read_for_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
