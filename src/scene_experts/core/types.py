@@ -19,6 +19,7 @@ from __future__ import annotations
 import enum
 import functools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -156,5 +157,5 @@ class Decoded:
     gaussians: Gaussians
     rows: Tensor  # [A] int64, rows of the table that were decoded
     raw_opacity: Tensor | None  # [A, K] before masking; None for explicit scenes
-    routing: dict[str, Routing]  # by attribute; empty without experts
+    routing: Mapping[str, Routing]  # by attribute; empty without experts
     population: tuple[Tensor, Tensor] | None = None  # explicit scenes: opacity logits [N], log-scales [N, 3] of all Gaussians

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.slopes import GaussianSlopes, PullPicture
 from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.native import library as native
 
@@ -92,6 +93,33 @@ def for_training(rasterize: Rasterizer, absolute: bool) -> Rasterizer:
     if not hasattr(rasterize, "absolute"):
         raise InputError(f"the rasteriser `{rasterize.name}` has no absolute gradients: use --growth.gradient signed")
     return replace(rasterize, absolute=True)  # type: ignore[type-var]
+
+
+def explain_indirect(rasterize: Rasterizer) -> str | None:
+    """Return None if the rasteriser can pull slopes back by itself, else the reason why autograd
+    has to."""
+    explain = getattr(rasterize, "explain_indirect", None)
+    return explain() if explain is not None else f"the rasteriser `{rasterize.name}`"
+
+
+def draw_with_slopes(rasterize: Rasterizer, g: Gaussians, camera: Camera, background: Tensor) -> tuple[Render, PullPicture]:
+    """Draw Gaussians without a graph. Returns the picture with the function that takes the slopes of
+    the picture, and returns those of the Gaussians and fills the picture's `mean2d_grad`.
+
+    A rasteriser that cannot pull slopes back by itself goes through autograd.
+    """
+    direct = getattr(rasterize, "draw_with_slopes", None)
+    if direct is not None and len(g) and explain_indirect(rasterize) is None:
+        return direct(g, camera, background)
+    with torch.enable_grad():
+        leaves = {name: getattr(g, name).detach().requires_grad_() for name in ("means", "quats", "scales", "opacities", "colors")}
+        made = rasterize(replace(g, **leaves), camera, background)
+
+    def pull(d_picture: Tensor) -> GaussianSlopes:
+        found = torch.autograd.grad(made.image, list(leaves.values()), d_picture, allow_unused=True)
+        return GaussianSlopes(*(torch.zeros_like(t) if f is None else f.contiguous() for t, f in zip(leaves.values(), found)))
+
+    return replace(made, image=made.image.detach(), alpha=made.alpha.detach(), depth=made.depth.detach()), pull
 
 
 def _best(device: torch.device) -> str:

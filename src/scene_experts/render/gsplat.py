@@ -27,8 +27,10 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.slopes import PullPicture
 from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.native import triton
+from scene_experts.render import gsplat_direct
 from scene_experts.render.gsplat_install import explain_missing
 from scene_experts.render.project_cuda import find_radii
 from scene_experts.render.reference import BLUR, MIN_COMPENSATION, TILE, project, record_mean2d_grad, visible
@@ -77,6 +79,16 @@ class GsplatRasterizer:
         picture, alpha = _rasterize(library, centres, conics, colors, opacities, extents, depths, camera, background, self.absolute)
         depth = picture[..., 3] if self.depth else torch.zeros_like(alpha)
         return Render(picture[..., :3], alpha, depth, radii, grad)
+
+    def explain_indirect(self) -> str | None:
+        """Return None if `draw_with_slopes` can draw, else the reason."""
+        if self.depth:
+            return "a picture with depth"
+        return triton.explain_missing() or gsplat_direct.explain_unknown()
+
+    def draw_with_slopes(self, g: Gaussians, camera: Camera, background: Tensor) -> tuple[Render, PullPicture]:
+        """See `render.draw_with_slopes`; at least one Gaussian, float32."""
+        return gsplat_direct.draw(g, camera, background, self.antialias, self.absolute)
 
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
         """Return [A] bool: whether unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] are

@@ -6,13 +6,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 import torch
 from torch import Tensor, nn
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.parts import Part
+from scene_experts.core.slopes import PullScene
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Mode, Points, Routing
 
@@ -63,6 +64,15 @@ class Traits:
         return self.sh_degree is None
 
 
+class DirectScene(Protocol):
+    """Draws training views without autograd."""
+
+    def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, PullScene]:
+        """Return the same as `Scene.forward` in `Mode.TRAIN`, without a graph, and the function that
+        adds the slopes of the parameters to their `grad`."""
+        ...
+
+
 class Scene(nn.Module):
     """Rows of a table that decode into Gaussians for a camera. Each family has a subclass.
 
@@ -72,6 +82,7 @@ class Scene(nn.Module):
     table: Table
     extent: float
 
+    dense_until: int = 0  # last iteration of the experts' dense warm-up; 0 without one
     codes: Codes | None  # appearance codes; None where `traits.appearance` is 0
 
     def __init__(self, table: Table, extent: float) -> None:
@@ -146,6 +157,14 @@ class Scene(nn.Module):
         """Say which implementation decodes the scene at `step`, and why not the fastest. Empty for
         a scene with one."""
         return ""
+
+    def direct(self, step: int, load: bool) -> DirectScene | str:
+        """Return what draws training views at `step` without autograd, or why nothing does. It may
+        be used until the rows change or the dense warm-up ends.
+
+        load: whether the loss has the load-balancing term.
+        """
+        return "a scene without kernels"
 
     def end_batch(self, views: int) -> None:
         """Learn what no gradient teaches, once for a batch of `views` views, before the optimiser's

@@ -10,13 +10,17 @@ Statistics of a table:
 
 from __future__ import annotations
 
+import importlib
+
 import torch
 from torch import Tensor
 
 from scene_experts.core.table import Table
 from scene_experts.core.types import Decoded, Render
 from scene_experts.native import library as native
+from scene_experts.native import triton
 
+ANCHORS, DRAWN = 64, 256  # anchors and Gaussians of a program of the Triton kernel
 STATS = ("visits", "opacity", "grad", "count")
 
 
@@ -45,6 +49,8 @@ def observe(table: Table, decoded: Decoded, render: Render) -> None:
     raw, library = decoded.raw_opacity.detach(), native.load()
     columns = [table.stats[name] for name in STATS]
     parts = [*columns, raw, render.mean2d_grad]
+    if triton.covers(*parts):
+        return _launch(table.stats, decoded, render, raw.contiguous())
     if library is None or not all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in parts):
         return _by_torch(table.stats, decoded, render)
     visits, opacity = native.pointer(table.stats["visits"]), native.pointer(table.stats["opacity"])
@@ -59,11 +65,29 @@ def observe_drawn(stats: dict[str, Tensor], decoded: Decoded, render: Render) ->
     other statistics."""
     columns, library = [stats["grad"], stats["count"]], native.load()
     parts = [*columns, render.mean2d_grad]
+    if triton.covers(*parts):
+        return _launch(stats, decoded, render, None)
     if library is None or not all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in parts):
         return _drawn_by_torch(stats, decoded, render)
     radii, source = render.radii.int().contiguous(), decoded.gaussians.source.contiguous()
     drawn = [native.pointer(t) for t in (radii, render.mean2d_grad, source)]
     library.se_observe_drawn(*drawn, len(source), *[native.pointer(t) for t in columns], native.count_threads())
+
+
+def _launch(stats: dict[str, Tensor], decoded: Decoded, render: Render, raw: Tensor | None) -> None:
+    """Triton implementation, one kernel. raw [A, K]: the opacities of the anchors; None: only the
+    drawn slots are counted."""
+    A, M = 0 if raw is None else len(raw), len(decoded.gaussians)
+    K = 1 if raw is None else raw.shape[1]
+    programs = max(-(-A // ANCHORS), -(-M // DRAWN))
+    if not programs:
+        return
+    rows, source = decoded.rows.contiguous(), decoded.gaussians.source.contiguous()
+    seen = (rows, source if raw is None else raw, render.radii.int().contiguous(), render.mean2d_grad.contiguous(), source)
+    of_rows = [stats[name] if raw is not None else source for name in ("visits", "opacity")]
+    kernel = importlib.import_module("scene_experts.strategy.triton_observe").observe
+    sizes = {"ANCHORS": raw is not None, "K": K, "B": ANCHORS, "KP": 1 << max(K - 1, 0).bit_length(), "BM": DRAWN}
+    triton.launch(kernel, (programs,), *seen, *of_rows, stats["grad"], stats["count"], A, M, **sizes)
 
 
 def _by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:

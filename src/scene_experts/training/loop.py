@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from scene_experts.strategy import Edit
 from scene_experts.strategy.survey import Survey, TrainingPhoto
 from scene_experts.training.batch import Direct, check_batch, make_exchange
 from scene_experts.training.config import RunConfig, Train, find_unused
+from scene_experts.training.direct import DirectStep
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.guard import explain, find_broken
 from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
@@ -68,7 +69,7 @@ class Iteration:
 
     decoded: Decoded
     render: Render
-    terms: dict[str, Tensor]
+    terms: Mapping[str, Tensor]  # by name, weighted; computed when they are read where autograd did not need them
     target: Tensor  # [H, W, 3]
     mask: Tensor | None  # [H, W]
     edits: tuple[tuple[int, Edit], ...] = ()  # iteration and result of each densification step
@@ -260,6 +261,11 @@ def see_view(
     photographs = resident_of(training, run, capture)
     target, mask = photographs.see(index)
     training.seed_view(number)
+    direct = direct_of(training, rasterize, scene)
+    if direct is not None:
+        decoded, render, terms = direct.see(scene, camera, number, target, mask, photographs.background(color))
+        training.largest.see(decoded, render)
+        return Iteration(decoded, render, terms, target, mask)
     decoded = scene(camera, number, Mode.TRAIN, rasterize.visible)
     render = rasterize(decoded.gaussians, camera, photographs.background(color))
     parts = compute_terms(Sample(decoded, render, target, mask, number), cfg.loss)
@@ -278,6 +284,17 @@ def resident_of(training: Training, run: Job, capture: Capture) -> Resident:
     if known is None or known.capture is not capture or known.dtype != run.dtype:
         known = training.resident = Resident(capture, run.device, run.dtype, 0 if run.max_memory > 0 else None)
     return known
+
+
+def direct_of(training: Training, rasterize: Rasterizer, scene: Scene) -> DirectStep | None:
+    """Return what draws the views of a training on a GPU without autograd; None where autograd
+    draws them."""
+    if scene is not training.scene or scene.table.device.type != "cuda":
+        return None
+    known = training.direct
+    if known is None or known.rasterize is not rasterize:
+        known = training.direct = DirectStep(rasterize, training.cfg.loss)
+    return None if known.refused else known
 
 
 def survey_of(training: Training, run: Job, capture: Capture, rasterize: Rasterizer) -> Survey:
@@ -303,7 +320,7 @@ def without_graph(value: Any) -> Any:
     return value
 
 
-def check_finite(step: int, parts: dict[str, Tensor]) -> None:
+def check_finite(step: int, parts: Mapping[str, Tensor]) -> None:
     """Check the losses before saving. Raises RunError if one is not finite, so that the last valid
     checkpoint is kept."""
     bad = [name for name, value in parts.items() if not math.isfinite(value)]

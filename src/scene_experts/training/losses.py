@@ -8,7 +8,7 @@ that of 3DGS.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
@@ -84,6 +84,13 @@ class Weights(Part):
         on = step is None or (step >= self.opacity_from and (self.opacity_until is None or step <= self.opacity_until))
         return self.opacity != 0 and on
 
+    def weigh_pixels(self, image: Tensor, target: Tensor, mask: Tensor | None, step: int | None) -> Tensor | None:
+        """Return the weights of the pixels in the photometric terms, [H, W]: `mask`, or less where
+        residuals are large. None: all are 1."""
+        if self.residual_quantile < 1 and (step is None or step >= self.residual_from):
+            return weigh_residuals(image, target, self.residual_quantile, self.residual_weight, mask)
+        return mask
+
     @property
     def regularises(self) -> bool:
         """Whether a loss acts on all Gaussians of a scene of plain Gaussians, drawn or not."""
@@ -102,14 +109,20 @@ def compute_terms(sample: Sample, weights: Weights) -> dict[str, Tensor]:
     return out
 
 
+def compute_scene_terms(decoded: Decoded, step: int | None, weights: Weights) -> dict[str, Tensor]:
+    """Compute the terms that see the decoded scene only, not the picture."""
+    out: dict[str, Tensor] = {}
+    for term in SCENE_TERMS:
+        out |= term(weights, Sample(decoded, None, None, None, step))  # type: ignore[arg-type]
+    return out
+
+
 # --- terms: weights and sample to {name: weighted value} ----------------------------------------------------------------------------------
 
 
 def photometric_terms(w: Weights, sample: Sample) -> dict[str, Tensor]:
     """L1 and 1 - SSIM. Their weights sum to 1."""
-    mask = sample.mask
-    if w.residual_quantile < 1 and (sample.step is None or sample.step >= w.residual_from):
-        mask = weigh_residuals(sample.render.image, sample.target, w.residual_quantile, w.residual_weight, mask)
+    mask = w.weigh_pixels(sample.render.image, sample.target, sample.mask, sample.step)
     l1, dssim = photometric(sample.render.image, sample.target, w.dssim, mask)
     return ({"l1": l1} if w.dssim != 1 else {}) | ({"dssim": dssim} if w.dssim != 0 else {})
 
@@ -147,7 +160,8 @@ def load_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
     return {"load": w.load * load(sample.decoded.routing)} if w.load != 0 and sample.decoded.routing else {}
 
 
-Weights.terms = (photometric_terms, volume_term, hinge_term, mean_opacity_term, mean_size_term, load_term)
+SCENE_TERMS: tuple[Term, ...] = (volume_term, hinge_term, mean_opacity_term, mean_size_term, load_term)
+Weights.terms = (photometric_terms, *SCENE_TERMS)
 
 
 # --- functions that the terms use ---------------------------------------------------------------------------------------------------------
@@ -194,7 +208,7 @@ def load_dense(gates: Tensor) -> Tensor:
     return gates.shape[1] * _mean(gates).square().sum()
 
 
-def load(routing: dict[str, Routing]) -> Tensor:
+def load(routing: Mapping[str, Routing]) -> Tensor:
     """Load-balancing loss, []: the sum over the attributes with experts of eq. 7 while dense, of
     eq. 6 after it.
 

@@ -13,6 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Self
+from weakref import ref
 
 import numpy as np
 import torch
@@ -104,6 +105,7 @@ class FusedAdam(torch.optim.Adam):
         groups = [{"by_row": False, **group} for group in groups]
         every = [p for group in groups for p in group["params"]]
         self._native = all(p.device.type == "cpu" and p.dtype == torch.float32 for p in every) and native.load() is not None
+        self._table: _Table | None = None
         self._triton = bool(every) and triton.covers(*every)
         fused = all(p.device.type in ("cpu", "cuda") and p.dtype == torch.float32 for p in every)
         super().__init__(groups, lr=0.0, betas=betas, eps=eps, fused=fused)
@@ -127,6 +129,9 @@ class FusedAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        if self._triton and rows is None:
+            self._step_all()
+            return loss
         calls = [self._prepared(p, group, rows) for group in self.param_groups for p in group["params"] if p.grad is not None]
         if self._native:
             self._call(calls)
@@ -142,9 +147,7 @@ class FusedAdam(torch.optim.Adam):
         second bias correction, group)."""
         state = self.state[parameter]
         if not state:
-            state["step"] = torch.zeros((), dtype=torch.float32, device="cpu" if self._triton else parameter.device)
-            state["exp_avg"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
-            state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+            self._begin(parameter)
         (beta1, beta2) = group["betas"]
         if self._triton:  # reading a counter on the device would wait for it; a checkpoint may have put it there
             if state["step"].device.type != "cpu":
@@ -157,6 +160,12 @@ class FusedAdam(torch.optim.Adam):
             done = float(state["step"])
         chosen = rows if group["by_row"] else None
         return parameter, chosen, float(group["lr"]) / (1 - beta1**done), (1 - beta2**done) ** 0.5, group
+
+    def _begin(self, parameter: Tensor) -> None:
+        state = self.state[parameter]
+        state["step"] = torch.zeros((), dtype=torch.float32, device="cpu" if self._triton else parameter.device)
+        state["exp_avg"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+        state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
 
     def _call(self, calls: list[tuple[Tensor, Tensor | None, float, float, dict]]) -> None:
         tensors, alive = (SeAdamTensor * len(calls))(), []
@@ -175,29 +184,79 @@ class FusedAdam(torch.optim.Adam):
         self.broken = "" if bad < 0 else str(calls[bad][-1].get("name", bad))
 
     def _launch(self, calls: list[tuple[Tensor, Tensor | None, float, float, dict]]) -> None:
-        """Run the step of all parameters as one kernel."""
-        if not calls:
+        """Run the step of these parameters as one kernel."""
+        table = _Table([(p, p.grad, rows, self.state[p]) for p, rows, *_ in calls if p.grad is not None])
+        table.numbers[:] = [numbers[2:4] for numbers in calls]
+        self._launch_table(table)
+
+    def _step_all(self) -> None:
+        """Count and run the step of all parameters that have a gradient, all of their rows, as one
+        kernel. What stays from step to step is kept: the host is what this takes time of."""
+        used = [(p, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
+        table = self._table
+        if table is None or not table.fits(used, self.state):
+            for parameter, _ in used:
+                if not self.state[parameter]:
+                    self._begin(parameter)
+                elif self.state[parameter]["step"].device.type != "cpu":  # a checkpoint may have put it there
+                    self.state[parameter]["step"] = self.state[parameter]["step"].cpu()
+            table = self._table = _Table([(p, p.grad, None, self.state[p]) for p, _ in used])
+        beta1, beta2 = self.param_groups[0]["betas"]
+        known: dict[float, tuple[float, float]] = {}
+        for place, (counter, (_, group)) in enumerate(zip(table.counters, used)):
+            counter += 1
+            done = float(counter)
+            if done not in known:
+                known[done] = 1 - beta1**done, (1 - beta2**done) ** 0.5
+            first, root = known[done]
+            table.numbers[place, 0], table.numbers[place, 1] = group["lr"] / first, root
+        self._launch_table(table)
+
+    def _launch_table(self, table: _Table) -> None:
+        if not table.programs:
             return
-        places, numbers, alive, programs = [], [], [], 0
-        for parameter, rows, step_size, root, _ in calls:
-            state, gradient = self.state[parameter], parameter.grad
-            assert gradient is not None and parameter.is_contiguous()
+        kernel = importlib.import_module("scene_experts.training.triton_adam").step
+        (beta1, beta2), eps = self.param_groups[0]["betas"], self.param_groups[0]["eps"]
+        on_device = upload(torch.from_numpy(table.values), self.param_groups[0]["params"][0].device)
+        triton.launch(kernel, (table.programs,), on_device, len(table.values), beta2, 1 - beta1, 1 - beta2, eps, B=BLOCK)
+        table.alive = []
+
+
+class _Table:
+    """What the kernel reads about each parameter, see `triton_adam.step`: addresses and sizes, which
+    often stay from step to step, and two numbers, which change. It keeps no tensor alive
+    after its first launch."""
+
+    def __init__(self, items: list[tuple[Tensor, Tensor, Tensor | None, dict[str, Tensor]]]) -> None:
+        """items: parameter, gradient, rows to update (None: all) and state of each."""
+        places, self.programs, self.alive = [], 0, []
+        self.known = [tuple(map(ref, (p, g, state["exp_avg"], state["step"]))) for p, g, _, state in items]
+        self.lasts = all(gradient.is_contiguous() for _, gradient, *_ in items)
+        self.counters = [state["step"].numpy() for *_, state in items]  # a tenth of the time of a tensor's operators
+        for parameter, gradient, rows, state in items:
+            assert parameter.is_contiguous()
             gradient, rows = gradient.contiguous(), None if rows is None else rows.contiguous()
-            alive += [gradient, rows]  # kept alive until the launch
+            self.alive += [gradient, rows]
             width = max(parameter[:1].numel(), 1) if parameter.dim() else 1
             count = parameter.numel() if rows is None else len(rows) * width
             addresses = [t.data_ptr() for t in (parameter, gradient, state["exp_avg"], state["exp_avg_sq"])]
-            places.append([*addresses, 0 if rows is None else rows.data_ptr(), count, width, programs])
-            numbers.append([step_size, root])
-            programs += -(-count // BLOCK)
-        if not programs:
-            return
-        table = np.empty((len(calls), 10), np.int64)
-        table[:, :8], table[:, 8:] = places, np.array(numbers).view(np.int64)
-        kernel = importlib.import_module("scene_experts.training.triton_adam").step
-        (beta1, beta2), eps = self.param_groups[0]["betas"], self.param_groups[0]["eps"]
-        given = (upload(torch.from_numpy(table), calls[0][0].device), len(calls), beta2, 1 - beta1, 1 - beta2, eps)
-        triton.launch(kernel, (programs,), *given, B=BLOCK)
+            places.append([*addresses, 0 if rows is None else rows.data_ptr(), count, width, self.programs])
+            self.programs += -(-count // BLOCK)
+        self.values = np.empty((len(items), 10), np.int64)
+        self.values[:, :8] = np.array(places, np.int64).reshape(-1, 8)
+        self.numbers = self.values[:, 8:].view(np.float64)
+
+    def fits(self, used: list[tuple[Tensor, dict[str, Any]]], state: Any) -> bool:
+        """Whether the parameters, their gradients and their states are those of this table."""
+        if not self.lasts or len(used) != len(self.known):
+            return False
+        for (parameter, _), (own, gradient, first, step) in zip(used, self.known):
+            found = state[parameter]
+            if parameter is not own() or parameter.grad is not gradient() or not found:
+                return False
+            if found["exp_avg"] is not first() or found["step"] is not step():
+                return False
+        return True
 
 
 def _by_torch(parameter: Tensor, state: dict[str, Tensor], rows: Tensor | None, step_size: float, root: float, group: dict) -> None:

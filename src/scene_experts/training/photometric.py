@@ -140,16 +140,9 @@ class _PhotometricCuda(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, lambda_dssim: float) -> tuple[Tensor, Tensor]:
         x, y = image.detach().contiguous(), target.detach().contiguous()
-        H, W, _ = x.shape
-        weights, wanted = ((1 - lambda_dssim) / x.numel(), lambda_dssim / x.numel()), ctx.needs_input_grad[0]
-        gradient = torch.empty_like(x) if wanted else x
-        grid = (-(-W // (TILE - 2 * TAPS + 2)), -(-H // (TILE - 2 * TAPS + 2)), 3)
-        sums = torch.empty(math.prod(grid), 2, dtype=x.dtype, device=x.device)
-        scale, reach = 1 / (2 * SIGMA * SIGMA), TAPS // 2
-        norm = sum(math.exp(-scale * t * t) for t in range(-reach, reach + 1))
-        sizes = {"R": reach, "SCALE": scale, "NORM": norm, "C1": C1, "C2": C2, "T": TILE, "WANTED": wanted, "PRECISION": PRECISION}
-        triton.launch(_kernels().forward, grid, x, y, gradient, sums, H, W, *weights, **sizes, num_warps=WARPS)
-        ctx.l1_weight = weights[0]
+        wanted = ctx.needs_input_grad[0]
+        sums, gradient, l1_weight = _launch_forward(x, y, lambda_dssim, wanted)
+        ctx.l1_weight = l1_weight
         if wanted:
             ctx.save_for_backward(x, y, gradient)
         l1_term, dssim_term = sums.sum(0).unbind(0)
@@ -162,6 +155,41 @@ class _PhotometricCuda(torch.autograd.Function):
         scales = (g.contiguous() for g in upstream)
         triton.launch(_kernels().backward, (-(-n // BLOCK),), x, y, gradient, *scales, out, n, ctx.l1_weight, B=BLOCK)
         return out, None, None
+
+
+def _launch_forward(x: Tensor, y: Tensor, lambda_dssim: float, wanted: bool, both: bool = False) -> tuple[Tensor, Tensor, float]:
+    """Return the parts of both terms [programs, 2], the gradient of 1 - SSIM (or of both terms), if
+    it is wanted, and the weight of a value's L1."""
+    H, W, _ = x.shape
+    weights = ((1 - lambda_dssim) / x.numel(), lambda_dssim / x.numel())
+    gradient = torch.empty_like(x) if wanted else x
+    grid = (-(-W // (TILE - 2 * TAPS + 2)), -(-H // (TILE - 2 * TAPS + 2)), 3)
+    sums = torch.empty(math.prod(grid), 2, dtype=x.dtype, device=x.device)
+    sizes = {**_constants(), "T": TILE, "WANTED": wanted, "BOTH": both, "PRECISION": PRECISION}
+    triton.launch(_kernels().forward, grid, x, y, gradient, sums, H, W, *weights, **sizes, num_warps=WARPS)
+    return sums, gradient, weights[0]
+
+
+@cache
+def _constants() -> dict[str, float]:
+    scale, reach = 1 / (2 * SIGMA * SIGMA), TAPS // 2
+    norm = sum(math.exp(-scale * t * t) for t in range(-reach, reach + 1))
+    return {"R": reach, "SCALE": scale, "NORM": norm, "C1": C1, "C2": C2}
+
+
+def photometric_slopes(image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None) -> Tensor:
+    """Return the gradient [H, W, 3] of the sum of both terms of `photometric` in the image, with
+    its arguments, without a graph. On CUDA it is one Triton kernel."""
+    if not (triton.covers(image, target) and image.numel()):
+        with torch.enable_grad():
+            leaf = image.detach().requires_grad_()
+            (gradient,) = torch.autograd.grad(sum(photometric(leaf, target, lambda_dssim, mask)), leaf)
+        return gradient
+    if mask is None:
+        return _launch_forward(image, target, float(lambda_dssim), True, both=True)[1]
+    weight = mask.to(image.dtype)
+    gradient = _launch_forward(torch.lerp(target, image, weight[..., None]), target, float(lambda_dssim), True, both=True)[1]
+    return gradient.mul_((weight / weight.mean().clamp_min(1e-12))[..., None])
 
 
 def _kernels() -> Any:

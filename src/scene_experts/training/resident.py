@@ -43,6 +43,8 @@ class Resident:
             if self.used + size <= self.budget:
                 self.kept[index], self.used = pixels, self.used + size
         rgb, mask = pixels
+        if self.device.type == "cuda" and self.dtype == torch.float32:
+            return torch.div(rgb, 255.0), mask  # one kernel instead of two
         return rgb.to(self.dtype).div_(255.0), mask
 
     def background(self, color: Tensor | None) -> Tensor:

@@ -25,6 +25,7 @@ from scene_experts.scene.fit import restore_foreign
 from scene_experts.training.average import Averages
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig, Train
+from scene_experts.training.direct import DirectStep
 from scene_experts.training.guard import check_state
 from scene_experts.training.memory import Largest
 from scene_experts.training.resident import Resident
@@ -49,7 +50,8 @@ class Training:
         self.cfg, self.scene = cfg, scene
         self.step = 0
         self.largest = Largest()
-        self.resident: Resident | None = None  # made by the loop
+        self.resident: Resident | None = None  # made by the loop, as `direct`
+        self.direct: DirectStep | None = None
         self.clock = Clock()
         self.queue: list[int] = []
         self.capture_id = self.poses = ""  # fingerprint and poses of the capture

@@ -24,10 +24,10 @@ def blur(m, band, PRECISION: tl.constexpr):
 def forward(
     image, target, gradient, sums, H, W, l1_weight, dssim_weight,
     R: tl.constexpr, SCALE: tl.constexpr, NORM: tl.constexpr, C1: tl.constexpr, C2: tl.constexpr,
-    T: tl.constexpr, WANTED: tl.constexpr, PRECISION: tl.constexpr,
+    T: tl.constexpr, WANTED: tl.constexpr, BOTH: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Write this tile's part of both terms to `sums` [programs, 2] and, if WANTED, the gradient [H,
-    W, 3] of 1 - SSIM.
+    W, 3] of 1 - SSIM, or of both terms (BOTH).
 
     The weights include the division by the number of values. Window: exp(-SCALE t^2) / NORM for |t|
     <= R. Symbols as in `photometric.dissimilarity`: s and d are the sum (minus 1) and the
@@ -60,7 +60,10 @@ def forward(
         by_means, by_vd = tl.where(inside, by_means, 0.0), tl.where(inside, by_vd, 0.0)
         by_ss = tl.where(inside, -0.5 * (1.0 - p) * q / v, 0.0)
         out = blur(by_means, band, PRECISION) + 2.0 * (s * blur(by_ss, band, PRECISION) + d * blur(by_vd, band, PRECISION))
-        tl.store(gradient + at, dssim_weight * out, mask=own)
+        out = dssim_weight * out
+        if BOTH:
+            out += tl.where(d > 0, l1_weight, tl.where(d < 0, -l1_weight, 0.0))
+        tl.store(gradient + at, out, mask=own)
 
 
 @triton.jit(do_not_specialize=["count"])

@@ -132,6 +132,7 @@ class Mixture(nn.Module):
 
     networks: Networks
     router: RouterModule
+    in_two_phases = True
 
     def __init__(self, config: Experts, attribute: str, inputs: int, hidden: int, outputs: int, feature: int) -> None:
         super().__init__()

@@ -61,6 +61,7 @@ class Head(Protocol):
     """Interface of a network that decodes one attribute."""
 
     experts: int  # number of experts; 0 without a mixture
+    in_two_phases: bool  # whether the tensors of `weights` are the same ones up to the end of the dense warm-up, and after it
 
     def __call__(
         self, x: Tensor, feature: Tensor, step: int, position: Tensor | None = None, mode: Mode = Mode.DRAW
@@ -154,6 +155,7 @@ class MLP(nn.Module):
     middle: nn.ModuleList
     w2: nn.Parameter
     b2: nn.Parameter
+    in_two_phases = True
 
     def __init__(self, attribute: str, inputs: int, hidden: int, outputs: int, depth: int = 2) -> None:
         super().__init__()

@@ -32,6 +32,7 @@ from scene_experts.native import triton
 from scene_experts.scene import OPACITY, Cull, Draws, LatticeScene, SceneConfig, Traits
 from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors.appearance import Codes, fold
+from scene_experts.scene.anchors.direct import DirectAnchors, explain_uncovered
 from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
 from scene_experts.scene.anchors.few_views import displace, drop_anchors, find_spacings, find_weight
 from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
@@ -252,21 +253,44 @@ class AnchorScene(LatticeScene):
     def forward(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Decoded:
         """Return the Gaussians visible from `camera` at `step`. `cull(means, scales, camera)` is
         the rasteriser's visibility test."""
-        table = self.table
+        rows, seen_from = self.choose(camera, step, mode, cull)
+        return self.finish(self.decode(rows, seen_from, step, mode), camera, step, mode)
+
+    def choose(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> tuple[Tensor, Camera]:
+        """Return the rows [A] that are decoded for `camera` at `step`, and the camera that they are
+        decoded for."""
         rows, seen_from, config = self.visible(camera, step, mode, cull), camera, self.config
         if config.dropout and self.few_weight and mode is Mode.TRAIN:
             rows = drop_anchors(rows, config.dropout * self.few_weight * min(1.0, step / config.dropout_full))
         if config.view_jitter and self.few_weight and mode is Mode.TRAIN:
             seen_from = displace(camera, config.view_jitter * self.few_weight * self.spacings.get(camera.id, 0.0))
-        decoded = self.decode(rows, seen_from, step, mode)
-        decoded = fade_opacities(decoded, self.select.fade(table, rows, camera, step, mode), len(table), self.K)
+        return rows, seen_from
+
+    def finish(self, decoded: Decoded, camera: Camera, step: int, mode: Mode) -> Decoded:
+        """Apply what acts on decoded Gaussians alone: fading levels, masked slots, smoothing."""
+        table = self.table
+        decoded = fade_opacities(decoded, self.select.fade(table, decoded.rows, camera, step, mode), len(table), self.K)
         decoded = drop_masked(decoded, table.facts.get("slots"))
         return smooth(decoded, table.facts.get("interval"), self.config.smoothing, self.K)
+
+    @property
+    def changes_drawn(self) -> bool:
+        """Whether `finish` may change a view."""
+        return self.select.fades or "slots" in self.table.facts or "interval" in self.table.facts
+
+    def direct(self, step: int, load: bool) -> DirectAnchors | str:
+        weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
+        if why := self.why_composed(weights) or ("--scene.decode composed" if self.config.decode == "composed" else ""):
+            return why
+        if not all(head.in_two_phases for head in self.heads.values()):
+            return "a decoder with phases of its own"
+        return explain_uncovered(weights) or DirectAnchors(self, weights, load)
 
     def visible(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Tensor:
         """Return the rows [A] that `camera` sees at `step`."""
         table = self.table
-        scales = table.params["log_scaling"].detach()[:, :3].contiguous().exp()  # exp takes 7 times as long on a non-contiguous tensor
+        sizes = table.params["log_scaling"].detach()[:, :3]
+        scales = (sizes if sizes.is_cuda else sizes.contiguous()).exp()  # takes 7 times as long on a CPU where they are not contiguous
         return visible_rows(self.select(table, camera, step, mode), table.facts["xyz"], scales, camera, cull)
 
     def with_table(self, table: Table) -> AnchorScene:
@@ -323,7 +347,11 @@ class AnchorScene(LatticeScene):
             return "a feature bank"
         if feature.dtype != torch.float32:
             return f"tensors of {feature.dtype}"
-        wide = [a for a, w in weights.items() if feature.is_cuda and not triton_decode.covers(a, w, self.config.F, self.K)]
+        if not feature.is_cuda:
+            return ""
+        wide = [a for a, w in weights.items() if not triton_decode.covers(a, w, self.config.F, self.K)]
+        if len({w.w1.shape[1] for w in weights.values()}) > 1:
+            return "networks of several widths"
         return f"networks of {wide[0]} that are too deep or too wide for the kernels" if wide else ""
 
     def describe_decode(self, step: int) -> str:

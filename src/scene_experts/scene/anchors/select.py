@@ -37,6 +37,11 @@ class Selector(Protocol):
         """Number of levels of detail; 0 without levels."""
         ...
 
+    @property
+    def fades(self) -> bool:
+        """Whether `fade` may return factors."""
+        ...
+
     def coarse(self, step: int) -> bool:
         """Whether coarse-to-fine training still adds finer levels after `step`."""
         ...
@@ -97,6 +102,10 @@ class AllAnchors(Selection):
     @property
     def count(self) -> int:
         return 0
+
+    @property
+    def fades(self) -> bool:
+        return False
 
     def coarse(self, step: int) -> bool:
         return False
@@ -232,7 +241,7 @@ class LevelSelector:
         return (table.facts["level"] <= whole(asked, self.lattices.rule, self.top(step, mode))).nonzero().squeeze(1)
 
     def fade(self, table: Table, rows: Tensor, camera: Camera, step: int, mode: Mode) -> Tensor | None:
-        if self.lattices.rule != "blend":
+        if not self.fades:
             return None
         xyz, level, extra = (table.facts[name].index_select(0, rows) for name in ("xyz", "level", "extra_level"))
         asked = blend_levels(self.asked(xyz, level, extra, camera), self.top(step, mode))
@@ -253,6 +262,10 @@ class LevelSelector:
     @property
     def count(self) -> int:
         return self.lattices.count
+
+    @property
+    def fades(self) -> bool:
+        return self.lattices.rule == "blend"
 
     def with_cap(self, level: int | None) -> LevelSelector:
         """Return a copy that uses no level finer than `level`. None removes the cap."""

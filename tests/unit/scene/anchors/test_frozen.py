@@ -99,7 +99,7 @@ def test_on_cuda_appearance_codes_are_folded_before_the_routing():
     """Plain networks route nothing, so this needs no kernel."""
     scene = trained(Anchors(appearance=6), n=20)
     weights = {a: scene.heads[a].weights(DONE) for a in scene.heads}
-    assert FrozenCuda(scene, weights, DONE).kept.heads[2].attribute == "color"
+    assert FrozenCuda(scene, weights, DONE).kept.nets.heads[2].shapes[0] == weights["color"].w1[:, :, :-6].shape
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,235 @@
+"""Views of an anchor scene on CUDA without autograd: the halves of `triton_decode` are called one
+after the other, and the slopes of all parameters lie in one array that is kept.
+
+`AnchorScene.forward` with autograd is the reference. What few scenes have, and what acts on drawn
+Gaussians alone (fading levels, masked slots, smoothing), goes through autograd here too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from scene_experts.core.lazy import LazyMapping
+from scene_experts.core.slopes import GaussianSlopes, PullScene, Regularisers
+from scene_experts.core.types import Camera, Decoded, Mode, Routing
+from scene_experts.scene import Cull
+from scene_experts.scene.anchors import triton_decode as fused
+from scene_experts.scene.anchors.appearance import fold
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, HeadWeights
+
+if TYPE_CHECKING:
+    from scene_experts.scene.anchors.scene import AnchorScene
+
+COLUMNS = ("feature", "log_scaling", "offsets")
+PARTS = ("means", "quats", "scales", "opacities", "colors")
+
+
+@dataclass(frozen=True)
+class Own:
+    """A tensor that the kernels take, as some of the leading entries of a parameter."""
+
+    parameter: nn.Parameter
+    first: int
+    count: int
+
+    @classmethod
+    def of(cls, tensor: Tensor) -> Own | None:
+        """Return where a tensor lies, or None if it is computed from parameters."""
+        base = tensor if isinstance(tensor, nn.Parameter) else tensor._base
+        if not isinstance(base, nn.Parameter) or base.shape[1:] != tensor.shape[1:] or not tensor.is_contiguous():
+            return None
+        return cls(base, tensor.storage_offset() // max(base[:1].numel(), 1), len(tensor))
+
+    @property
+    def whole(self) -> bool:
+        return self.count == len(self.parameter)
+
+    def of_whole(self, like: Tensor) -> Tensor:
+        """Return the same entries of a tensor of the parameter's shape."""
+        return like[self.first : self.first + self.count]
+
+
+def explain_uncovered(weights: dict[str, HeadWeights]) -> str:
+    """Return why views of these networks need autograd, or ""."""
+    for attribute, w in weights.items():
+        if w.routed_outside:
+            return f"a router of {attribute} without a kernel"
+        if any(Own.of(t) is None for t in _tensors(w)):
+            return f"networks of {attribute} that are computed from other tensors"
+    return ""
+
+
+def _tensors(w: HeadWeights) -> list[Tensor]:
+    return [t for t in (w.w1, w.b1, w.w2, w.b2, w.router_w, w.router_b) if t is not None]
+
+
+class DirectAnchors:
+    """Draws views of a scene as long as its rows and the phase of its networks do not change."""
+
+    def __init__(self, scene: AnchorScene, weights: dict[str, HeadWeights], load: bool) -> None:
+        """weights: those of the phase, see `explain_uncovered`. load: whether the loss has the
+        load-balancing term."""
+        table, config = scene.table, scene.config
+        self.scene, self.codes, self.color = scene, scene.codes, weights["color"]
+        self.params = [table.params[name] for name in COLUMNS]
+        self.columns = [p.detach() for p in self.params]
+        given = {**weights, "color": fold(weights["color"], self.codes.table[0])} if self.codes else weights
+        with_dist = {a: a in config.add_dist for a in ATTRIBUTES}
+        self.nets = fused.Networks(given, with_dist, config.F, config.K, constant=not load)
+        self.weights = [getattr(weights[a], name).detach() for a in ATTRIBUTES for name in fused.NETWORK]
+        self.routers = [getattr(weights[a], name) for a in ATTRIBUTES for name in ("router_w", "router_b")]
+        sizes = [p.numel() for p in self.params]
+        self.slopes = self.columns[0].new_zeros(sum(sizes) + self.nets.width)
+        *parts, self.flat = self.slopes.split([*sizes, self.nets.width])
+        self.into = [part.view_as(p) for part, p in zip(parts, self.params)]
+        self.grads: list[tuple[nn.Parameter, Tensor]] = list(zip(self.params, self.into))
+        self.larger: list[Tensor] = []  # gradients of parameters of which the kernels take a part
+        self.moves: tuple[list[Tensor], list[Tensor]] = [], []  # their parts, and where the kernels write these
+        self._place(weights)
+        self.kept: tuple[Any, fused.Routed] | None = None  # routing of the table that nothing trains
+
+    def _place(self, weights: dict[str, HeadWeights]) -> None:
+        """Find the gradient of each parameter of the networks."""
+        parts = iter(self.nets.split(self.flat))
+        given = [(getattr(weights[a], name), next(parts)) for a in ATTRIBUTES for name in fused.NETWORK]
+        given += [(t, next(parts)) for t in self.routers if t is not None]
+        folded = (self.color.w1, self.color.b1) if self.codes else ()
+        self.folded = [part for t, part in given if any(t is f for f in folded)]
+        whole: dict[nn.Parameter, Tensor] = {}
+        for tensor, part in given:
+            own = Own.of(tensor)
+            assert own is not None
+            if not own.parameter.requires_grad:
+                continue
+            if own.whole and not any(tensor is f for f in folded):
+                self.grads.append((own.parameter, part))
+                continue
+            whole[own.parameter] = torch.zeros_like(own.parameter)
+            if not any(tensor is f for f in folded):
+                self.moves[0].append(own.of_whole(whole[own.parameter]))
+                self.moves[1].append(part)
+        if self.codes:
+            self.unfolded = [self._part(t, whole) for t in folded]
+            whole[self.codes.table] = self.d_codes = torch.zeros_like(self.codes.table)
+        self.grads += whole.items()
+        self.larger = list(whole.values())
+
+    def _part(self, tensor: Tensor, whole: dict[nn.Parameter, Tensor]) -> Tensor:
+        own = Own.of(tensor)
+        assert own is not None
+        return own.of_whole(whole[own.parameter])
+
+    @torch.no_grad()
+    def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, PullScene]:
+        """Decode a training view, as `AnchorScene.forward` in `Mode.TRAIN`. Returns it with the
+        function that adds the slopes of the parameters to their `grad`."""
+        scene, weights, code = self.scene, self.weights, None
+        rows, seen_from = scene.choose(camera, step, Mode.TRAIN, cull)
+        if self.codes is not None:
+            code = self.codes(camera, Mode.TRAIN).detach()
+            color = fold(self.color, code)
+            weights = [*weights[:8], color.w1.contiguous(), color.b1.contiguous(), *weights[10:]]
+        xyz = scene.table.facts["xyz"]
+        position = seen_from.position.to(xyz.device)
+        view = fused.View(self.nets, rows, xyz, position, self.columns, weights, self.routers, scene.extent)
+        drawn = fused.draw(view, self._route(view))
+        decoded = Decoded(drawn.gaussians, rows, drawn.raw, LazyMapping(lambda: self._find_routing(drawn, step)))
+        shown, graph = self._finish(decoded, camera, step)
+
+        @torch.no_grad()
+        def pull(slopes: GaussianSlopes, terms: Regularisers) -> None:
+            for parameter, gradient in self.grads:  # of an earlier view of the batch
+                if parameter.grad is gradient:
+                    parameter.grad = gradient.clone()
+            self.slopes.zero_()
+            self._pull(drawn, shown, graph, slopes, terms)
+            if self.moves[0]:
+                torch._foreach_copy_(*self.moves)
+            if code is not None:
+                self._unfold(camera, code)
+            for parameter, gradient in self.grads:
+                parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+
+        return shown, pull
+
+    def _route(self, view: fused.View) -> fused.Routed:
+        """Return the routing. Where nothing trains it, it is that of the whole table, made once."""
+        nets = self.nets
+        learned = any(t is not None and t.requires_grad for t in self.routers)
+        if learned or not nets.routed or any(nets.heads[i].kind != fused.LOCAL for i in nets.routed):
+            return fused.route(view)
+        key = [t._version for t in self.routers if t is not None]
+        if self.kept is None or self.kept[0] != key:
+            everyone = torch.arange(len(view.xyz), device=view.xyz.device)
+            made = fused.route(replace(view, rows=everyone))
+            self.kept = key, fused.Routed(made.stride, by_row=True, keys=made.keys)
+        return self.kept[1]
+
+    @torch.no_grad()
+    def _find_routing(self, drawn: fused.Drawn, step: int) -> dict[str, Routing]:
+        """Return the routing of the anchors as the scene's own decode gives it."""
+        view, routed = drawn.view, {ATTRIBUTES[i]: i for i in self.nets.routed}
+        if drawn.routed.gates is not None:
+            return {a: Routing(*drawn.routed.part(self.nets, i, len(view.rows))) for a, i in routed.items()}  # type: ignore[arg-type]
+        feature, position = self.columns[0].index_select(0, view.rows), view.xyz.index_select(0, view.rows) / view.extent
+        found = {a: self.scene.heads[a].route(feature, step, position) for a in ATTRIBUTES if a in routed}
+        return {a: made[0] for a, made in found.items() if made is not None}
+
+    def _finish(self, decoded: Decoded, camera: Camera, step: int) -> tuple[Decoded, tuple[list[Tensor], list[Tensor]] | None]:
+        """Apply to a decoded view what acts on drawn Gaussians alone. Returns it, and the two ends
+        of its graph, or None where there is nothing to apply."""
+        if not self.scene.changes_drawn:
+            return decoded, None
+        assert decoded.raw_opacity is not None
+        with torch.enable_grad():
+            leaves = {name: getattr(decoded.gaussians, name).detach().requires_grad_() for name in PARTS}
+            raw = decoded.raw_opacity.detach().requires_grad_()
+            given = replace(decoded, gaussians=replace(decoded.gaussians, **leaves), raw_opacity=raw)
+            out = self.scene.finish(given, camera, step, Mode.TRAIN)
+        assert out.raw_opacity is not None
+        ends = [*(getattr(out.gaussians, name) for name in PARTS), out.raw_opacity]
+        made = {name: end.detach() for name, end in zip(PARTS, ends)}
+        shown = replace(out, gaussians=replace(out.gaussians, **made), raw_opacity=ends[-1].detach())
+        return shown, ([*leaves.values(), raw], ends)
+
+    def _pull(
+        self,
+        drawn: fused.Drawn,
+        shown: Decoded,
+        graph: tuple[list[Tensor], list[Tensor]] | None,
+        slopes: GaussianSlopes,
+        terms: Regularisers,
+    ) -> None:
+        A, M = len(drawn.view.rows), len(shown.gaussians)
+        volume, hinge = terms.volume / max(M, 1), terms.hinge / max(A * self.nets.K, 1)
+        given, raw = [slopes.means, slopes.quats, slopes.scales, slopes.opacities, slopes.colors], None
+        if graph is not None:
+            leaves, ends = graph
+            sizes, below = shown.gaussians.scales, shown.raw_opacity
+            assert below is not None
+            x, y, z = sizes.unbind(1)
+            given[2] = given[2] + volume * torch.stack([y * z, x * z, x * y], dim=1)
+            up = [*given, torch.where(below < terms.tau, -hinge, 0.0).to(below)]
+            found = torch.autograd.grad(ends, leaves, up, allow_unused=True)
+            *given, raw = [torch.zeros_like(t) if f is None else f.contiguous() for t, f in zip(leaves, found)]
+            volume = hinge = 0.0
+        shared = fused.find_load_slopes(drawn, terms.load) if terms.load and self.nets.groups else None
+        made = fused.Slopes(*given, raw=raw, volume=volume, hinge=hinge, tau=float(terms.tau), shared_gates=shared)
+        fused.pull_back(drawn, made, self.into, self.flat)
+
+    def _unfold(self, camera: Camera, code: Tensor) -> None:
+        """Turn the slopes of the folded first layer of the colour into those of its weights, its
+        bias and the codes."""
+        assert self.codes is not None
+        (d_w1, d_b1), (to_w1, to_b1), D = self.folded, self.unfolded, self.folded[0].shape[2]
+        to_w1[:, :, :D] = d_w1
+        to_w1[:, :, D:] = d_b1[:, :, None] * code
+        to_b1.copy_(d_b1)
+        d_code = torch.einsum("eh,ehc->c", d_b1, self.color.w1.detach()[:, :, D:])
+        row = self.codes.row.get(camera.id)
+        self.d_codes.zero_()
+        self.d_codes[slice(None) if row is None else row] = d_code if row is not None else d_code / len(self.d_codes)

@@ -1,0 +1,98 @@
+"""One view of a training without a graph: each part draws, and then pulls slopes back.
+
+On a GPU the host needs several times as long to build a graph of autograd and to walk through it as
+the device needs for the kernels. Here the parts are called one after the other. Where no kernel
+covers a scene, it goes through autograd, and the picture and the loss are direct all the same. The
+reference is `loop.see_view` with autograd: random numbers, values and gradients are the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from scene_experts.core.lazy import LazyMapping
+from scene_experts.core.slopes import GaussianSlopes, PullScene, Regularisers
+from scene_experts.core.types import Camera, Decoded, Mode, Render
+from scene_experts.render import Rasterizer, draw_with_slopes, explain_indirect
+from scene_experts.scene import Cull, DirectScene, Scene
+from scene_experts.training.losses import Sample, Weights, compute_scene_terms, compute_terms
+from scene_experts.training.photometric import photometric_slopes
+
+PARTS = ("means", "quats", "scales", "opacities", "colors")
+Seen = tuple[Decoded, Render, LazyMapping[Tensor]]
+"""A decoded view, its picture and the terms of its loss, without a graph."""
+
+
+class DirectStep:
+    """Draws the views of a training. It finds out anew what draws the scene when its rows change or
+    its dense warm-up ends."""
+
+    def __init__(self, rasterize: Rasterizer, weights: Weights) -> None:
+        self.rasterize, self.weights = rasterize, weights
+        foreign = weights.terms is not Weights.terms
+        self.refused = "a loss with other terms" if foreign else explain_indirect(rasterize) or ""  # why autograd draws the views
+        self.scene: Scene | None = None
+        self.column: Tensor | None = None
+        self.dense = False
+        self.why = ""  # why the scene goes through autograd; "": it does not
+
+    def prepare(self, scene: Scene, step: int) -> DirectScene:
+        """Return what draws the scene at `step`."""
+        column, dense = next(iter(scene.table.params.values())), step <= scene.dense_until
+        if scene is not self.scene or column is not self.column or dense != self.dense:
+            self.drawing: DirectScene | None = None  # frees the slopes of the rows that were
+            found = scene.direct(step, self.weights.load != 0)
+            self.why, self.drawing = (found, ThroughAutograd(scene, self.weights)) if isinstance(found, str) else ("", found)
+            self.scene, self.column, self.dense = scene, column, dense
+        assert self.drawing is not None
+        return self.drawing
+
+    def see(self, scene: Scene, camera: Camera, number: int, target: Tensor, mask: Tensor | None, background: Tensor) -> Seen:
+        """Draw a training view as iteration `number`, and add the slopes of its loss to the
+        gradients of the parameters.
+
+        target [H, W, 3], mask [H, W] or None and background [3] are on the device of the scene.
+        Returns the decoded view, its picture and the terms of the loss.
+        """
+        w = self.weights
+        decoded, pull_scene = self.prepare(scene, number).draw(camera, number, self.rasterize.visible)
+        render, pull_picture = draw_with_slopes(self.rasterize, decoded.gaussians, camera, background)
+        with torch.no_grad():
+            weight = w.weigh_pixels(render.image, target, mask, number)
+            slopes = pull_picture(photometric_slopes(render.image, target, w.dssim, weight))
+        terms = LazyMapping(lambda: compute_terms(Sample(decoded, render, target, mask, number), w))
+        if w.regularises:  # these see parameters, which the optimiser is about to move
+            dict(terms)
+        pull_scene(slopes, Regularisers(w.scale, w.opacity if w.has_hinge(number) else 0.0, w.tau, w.load))
+        return decoded, render, terms
+
+
+class ThroughAutograd:
+    """Draws a scene by its own `forward`."""
+
+    def __init__(self, scene: Scene, weights: Weights) -> None:
+        self.scene, self.weights = scene, weights
+
+    def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, PullScene]:
+        """See `DirectScene.draw`. The regularisers are computed as terms of the loss."""
+        decoded = self.scene(camera, step, Mode.TRAIN, cull)
+        g, raw, population = decoded.gaussians, decoded.raw_opacity, decoded.population
+        without = replace(
+            decoded,
+            gaussians=replace(g, **{name: getattr(g, name).detach() for name in PARTS}),
+            raw_opacity=None if raw is None else raw.detach(),
+            routing={a: replace(r, gates=r.gates.detach()) for a, r in decoded.routing.items()},
+            population=None if population is None else (population[0].detach(), population[1].detach()),
+        )
+
+        def pull(slopes: GaussianSlopes, terms: Regularisers) -> None:
+            ends = [(getattr(g, name), getattr(slopes, name)) for name in PARTS]
+            ends += [(term, torch.ones_like(term)) for term in compute_scene_terms(decoded, step, self.weights).values()]
+            wanted = [(end, slope) for end, slope in ends if end.requires_grad]
+            if wanted:
+                torch.autograd.backward([end for end, _ in wanted], [slope for _, slope in wanted])
+
+        return without, pull
