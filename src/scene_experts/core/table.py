@@ -15,7 +15,7 @@ class Table(nn.Module):
 
     `params` are learned. `facts` are constant for each row (positions on the lattice, levels).
     `stats` are the statistics for densification. `averages` are averages of the parameters over the
-    training, if there are any. Rows are added only by `append` and removed only by `keep`, which
+    training, if there are any. `version` changes whenever a parameter becomes another object. Rows are added only by `append` and removed only by `keep`, which
     keep all columns and moments aligned.
     """
 
@@ -23,6 +23,8 @@ class Table(nn.Module):
     facts: dict[str, Tensor]
     stats: dict[str, Tensor]
     averages: dict[str, Tensor]
+    version: int
+    """A number that changes whenever a parameter becomes another object or moves."""
 
     def __init__(self, params: dict[str, Tensor], facts: dict[str, Tensor], stats: dict[str, Tensor] | None = None) -> None:
         super().__init__()
@@ -30,13 +32,16 @@ class Table(nn.Module):
         self.facts = dict(facts)
         self.stats = dict(stats or {})
         self.averages = {}
+        self.version = 0
         self._optimizer: torch.optim.Optimizer | None = None
         lengths = {name: value.shape[0] for name, value in self.columns().items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"expected columns of one length, found {lengths}")
 
     def __len__(self) -> int:
-        return next(iter(self.columns().values())).shape[0]
+        for value in self.facts.values():  # quicker than the parameters
+            return value.shape[0]
+        return next(iter(self.params.values())).shape[0]
 
     @property
     def total(self) -> int:
@@ -47,6 +52,7 @@ class Table(nn.Module):
         """Apply `.to(...)` and similar methods to parameters, facts and statistics. Integer columns
         keep their dtype."""
         super()._apply(fn, recurse)
+        self.version += 1
         self.facts = {name: fn(value) for name, value in self.facts.items()}
         self.stats = {name: fn(value) for name, value in self.stats.items()}
         self.averages = {name: fn(value) for name, value in self.averages.items()}
@@ -153,6 +159,7 @@ class Table(nn.Module):
     def _replace(self, name: str, value: Tensor, edit) -> None:
         """Replace a parameter with a new one without gradient. `edit` changes the moments; Adam's
         step counter is kept."""
+        self.version += 1
         old = self.params[name]
         new = nn.Parameter(value)
         self.params[name] = new

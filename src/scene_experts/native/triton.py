@@ -44,7 +44,10 @@ def explain_missing() -> str | None:
 
 def covers(*tensors: Tensor) -> bool:
     """Whether the tensors are float32 on CUDA and Triton kernels can run."""
-    return all(t.device.type == "cuda" and t.dtype == torch.float32 for t in tensors) and explain_missing() is None
+    for t in tensors:
+        if not t.is_cuda or t.dtype != torch.float32:
+            return False
+    return explain_missing() is None
 
 
 def guard(device: torch.device) -> AbstractContextManager[Any]:
@@ -54,37 +57,70 @@ def guard(device: torch.device) -> AbstractContextManager[Any]:
 
 
 def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **sizes: Any) -> None:
-    """Launch a kernel on the device of its first tensor. Tensors come before numbers. `sizes` are
-    the compile-time constants and options.
+    """Launch a kernel once, see `Launch`."""
+    key = (id(kernel), *sizes.items())
+    known = _launches.get(key)
+    if known is None:
+        known = _launches[key] = Launch(kernel, **sizes)
+    known(grid, *arguments)
 
-    The compiled kernel is kept and launched with addresses, by the same call that Triton's own
-    launch ends with. That takes a sixth of the time of Triton's, which binds the arguments anew.
+
+class Launch:
+    """A kernel with its compile-time constants and options, to be launched on the device of its
+    first tensor. Tensors come before numbers.
+
+    A compiled kernel is kept and launched with addresses, by the same call that Triton's own launch
+    ends with. That takes a sixth of the time of Triton's, which binds the arguments anew.
     """
-    if not _is_compiled(kernel):  # Triton's interpreter
-        with guard(arguments[0].device):
-            kernel[grid](*arguments, **sizes)
-        return
-    count, special = _shape_of(kernel, arguments)
-    tensors, numbers = arguments[:count], arguments[count:]
-    addresses = [*map(_address, tensors)]
-    device = tensors[0].get_device()
-    key = (kernel, device, *map(_dtype, tensors), *map(type, numbers), *map(numbers.__getitem__, special), *sizes.values())
-    if functools.reduce(or_, addresses) & 15:
-        key += (tuple(address & 15 for address in addresses),)
-    for number in numbers:
-        if number.__class__ is int and not -(2**31) <= number < 2**31:
-            key += ("wide", *(-(2**31) <= n < 2**31 for n in numbers))
-            break
-    kept = _kept.get(key)
-    with _NOTHING if torch.cuda.current_device() == device else torch.cuda.device(device):
-        if kept is None:
-            made = kernel[grid](*arguments, **sizes)
-            constants = [sizes[name] for name in kernel.arg_names if name in sizes]
-            _kept[key] = made.run, made.function, made.packed_metadata, constants
+
+    def __init__(self, kernel: Any, **sizes: Any) -> None:
+        self.kernel, self.sizes = kernel, sizes
+        self.compiled = hasattr(kernel, "device_caches")  # not in Triton's interpreter
+        self.count = -1  # of the tensors that begin the arguments
+        self.special: tuple[int, ...] = ()  # numbers after them that the kernel is compiled for
+        self.ints: tuple[int, ...] = ()
+        self.kept: dict[Any, tuple[Callable[..., Any], Any, Any, list[Any]]] = {}
+        self.key: tuple[Any, ...] | None = None  # of the last launch, if its addresses were multiples of 16 bytes
+
+    def __call__(self, grid: tuple[int, ...], *arguments: Any) -> None:
+        if not self.compiled:
+            with guard(arguments[0].device):
+                self.kernel[grid](*arguments, **self.sizes)
             return
-        run, function, metadata, constants = kept
-        sides = (*grid, 1, 1)[:3]
-        run(*sides, _stream_of(device), function, metadata, None, None, None, *addresses, *numbers, *constants)
+        if self.count < 0:
+            self._learn(arguments)
+        tensors, numbers = arguments[: self.count], arguments[self.count :]
+        addresses = [*map(_address, tensors)]
+        device = tensors[0].get_device()
+        key = (device, *map(_dtype, tensors), *map(type, numbers), *map(numbers.__getitem__, self.special))
+        if functools.reduce(or_, addresses) & 15:
+            key += (tuple(address & 15 for address in addresses),)
+        for i in self.ints:
+            if not -(2**31) <= numbers[i] < 2**31:
+                key += ("wide", *(-(2**31) <= numbers[i] < 2**31 for i in self.ints))
+                break
+        if key == self.key:  # quicker than a look into the dictionary, which hashes it
+            kept = self.last
+        else:
+            kept = self.kept.get(key)
+            self.key, self.last = key, kept
+        with _NOTHING if torch.cuda.current_device() == device else torch.cuda.device(device):
+            if kept is None:
+                made = self.kernel[grid](*arguments, **self.sizes)
+                constants = [self.sizes[name] for name in self.kernel.arg_names if name in self.sizes]
+                self.kept[key] = self.last = made.run, made.function, made.packed_metadata, constants
+                return
+            run, function, metadata, constants = kept
+            run(*(*grid, 1, 1)[:3], _stream_of(device), function, metadata, None, None, None, *addresses, *numbers, *constants)
+
+    def _learn(self, arguments: tuple[Any, ...]) -> None:
+        self.count = sum(isinstance(a, Tensor) for a in arguments)
+        if not all(isinstance(a, Tensor) for a in arguments[: self.count]):
+            raise TypeError("expected tensors before numbers, found a tensor after a number")
+        numbers = arguments[self.count :]
+        self.ints = tuple(i for i, a in enumerate(numbers) if isinstance(a, int))
+        named = self.kernel.params[self.count : len(arguments)]
+        self.special = tuple(i for i in self.ints if not named[i].do_not_specialize)
 
 
 _address, _dtype = Tensor.data_ptr, attrgetter("dtype")
@@ -96,27 +132,4 @@ def _stream_of(device: int) -> int:
     return torch._C._cuda_getCurrentRawStream(device)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-_kept: dict[tuple[Any, ...], tuple[Callable[..., Any], Any, Any, list[Any]]] = {}
-"""Compiled kernels by all that Triton compiles them for."""
-
-
-@functools.cache
-def _is_compiled(kernel: Any) -> bool:
-    return hasattr(kernel, "device_caches")
-
-
-def _shape_of(kernel: Any, arguments: tuple[Any, ...]) -> tuple[int, tuple[int, ...]]:
-    """Return how many tensors begin the arguments of a kernel, and which of the numbers after them
-    it is compiled for."""
-    known = _shapes.get(kernel)
-    if known is None:
-        count = sum(isinstance(a, Tensor) for a in arguments)
-        if not all(isinstance(a, Tensor) for a in arguments[:count]):
-            raise TypeError("expected tensors before numbers, found a tensor after a number")
-        named = kernel.params[count : len(arguments)]
-        special = tuple(i for i, (p, a) in enumerate(zip(named, arguments[count:])) if isinstance(a, int) and not p.do_not_specialize)
-        known = _shapes[kernel] = count, special
-    return known
-
-
-_shapes: dict[Any, tuple[int, tuple[int, ...]]] = {}
+_launches: dict[tuple[Any, ...], Launch] = {}

@@ -56,14 +56,13 @@ def _no_depths(count: int, device: torch.device) -> Tensor:
 _zeros: dict[torch.device, Tensor] = {}
 
 
-@torch.no_grad()
 def draw(g: Gaussians, camera: Camera, background: Tensor, antialias: bool, absolute: bool) -> tuple[Render, PullPicture]:
     """Draw at least one Gaussian over `background` [3]. See `GsplatRasterizer` for the settings.
 
     Returns the picture without depth (zeros), and the function that takes the slopes of the picture
     and returns those of the Gaussians; it also fills the picture's `mean2d_grad`.
     """
-    library, device = _library(), g.means.device
+    library, device, count = _library(), g.means.device, g.means.shape[0]
     camera = camera.to(device, torch.float32)
     width, height = camera.width, camera.height
     view, K = camera.world_to_cam[None], camera.K[None]
@@ -81,10 +80,9 @@ def draw(g: Gaussians, camera: Camera, background: Tensor, antialias: bool, abso
     offsets = library.intersect_offset(keys, 1, across, down)
     blended = (means2d, conics, colors, opacities, background[None], None, width, height, TILE, offsets, order)
     picture, alpha, last = library.rasterize_to_pixels_3dgs_fwd(*blended)
-    mean2d_grad = g.means.new_empty(len(g), 2)
+    mean2d_grad = g.means.new_empty(count, 2)
     shade = alpha[0, ..., 0]
 
-    @torch.no_grad()
     def pull(d_picture: Tensor) -> GaussianSlopes:
         nothing = _no_alpha(width, height, device)
         sums, d_means2d, d_conics, d_colors, d_opacities = library.rasterize_to_pixels_3dgs_bwd(
@@ -96,7 +94,7 @@ def draw(g: Gaussians, camera: Camera, background: Tensor, antialias: bool, abso
             d_opacities = d_opacities * factors.clamp_min(MIN_COMPENSATION)
         d_means, _, d_quats, d_scales, _ = library.projection_ewa_3dgs_fused_bwd(
             g.means, None, g.quats, g.scales, view, K, *size, model, extents, conics, factors if antialias else None,
-            d_means2d, _no_depths(len(g), device), d_conics, d_factors, False,
+            d_means2d, _no_depths(count, device), d_conics, d_factors, False,
         )  # fmt: skip
         torch.mul((sums if absolute else d_means2d)[0], _half_sides(width, height, device), out=mean2d_grad)
         return GaussianSlopes(d_means, d_quats, d_scales, d_opacities[0], d_colors[0])

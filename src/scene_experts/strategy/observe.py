@@ -11,6 +11,7 @@ Statistics of a table:
 from __future__ import annotations
 
 import importlib
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -85,9 +86,13 @@ def _launch(stats: dict[str, Tensor], decoded: Decoded, render: Render, raw: Ten
     rows, source = decoded.rows.contiguous(), decoded.gaussians.source.contiguous()
     seen = (rows, source if raw is None else raw, render.radii.int().contiguous(), render.mean2d_grad.contiguous(), source)
     of_rows = [stats[name] if raw is not None else source for name in ("visits", "opacity")]
+    _kernel(raw is not None, K)((programs,), *seen, *of_rows, stats["grad"], stats["count"], A, M)
+
+
+@cache
+def _kernel(anchors: bool, K: int) -> triton.Launch:
     kernel = importlib.import_module("scene_experts.strategy.triton_observe").observe
-    sizes = {"ANCHORS": raw is not None, "K": K, "B": ANCHORS, "KP": 1 << max(K - 1, 0).bit_length(), "BM": DRAWN}
-    triton.launch(kernel, (programs,), *seen, *of_rows, stats["grad"], stats["count"], A, M, **sizes)
+    return triton.Launch(kernel, ANCHORS=anchors, K=K, B=ANCHORS, KP=1 << max(K - 1, 0).bit_length(), BM=DRAWN)
 
 
 def _by_torch(stats: dict[str, Tensor], decoded: Decoded, render: Render) -> None:

@@ -35,21 +35,22 @@ class DirectStep:
         foreign = weights.terms is not Weights.terms
         self.refused = "a loss with other terms" if foreign else explain_indirect(rasterize) or ""  # why autograd draws the views
         self.scene: Scene | None = None
-        self.column: Tensor | None = None
+        self.version = -1
         self.dense = False
         self.why = ""  # why the scene goes through autograd; "": it does not
 
     def prepare(self, scene: Scene, step: int) -> DirectScene:
         """Return what draws the scene at `step`."""
-        column, dense = next(iter(scene.table.params.values())), step <= scene.dense_until
-        if scene is not self.scene or column is not self.column or dense != self.dense:
+        version, dense = scene.table.version, step <= scene.dense_until
+        if scene is not self.scene or version != self.version or dense != self.dense:
             self.drawing: DirectScene | None = None  # frees the slopes of the rows that were
             found = scene.direct(step, self.weights.load != 0)
             self.why, self.drawing = (found, ThroughAutograd(scene, self.weights)) if isinstance(found, str) else ("", found)
-            self.scene, self.column, self.dense = scene, column, dense
+            self.scene, self.version, self.dense = scene, version, dense
         assert self.drawing is not None
         return self.drawing
 
+    @torch.no_grad()
     def see(self, scene: Scene, camera: Camera, number: int, target: Tensor, mask: Tensor | None, background: Tensor) -> Seen:
         """Draw a training view as iteration `number`, and add the slopes of its loss to the
         gradients of the parameters.
@@ -60,9 +61,8 @@ class DirectStep:
         w = self.weights
         decoded, pull_scene = self.prepare(scene, number).draw(camera, number, self.rasterize.visible)
         render, pull_picture = draw_with_slopes(self.rasterize, decoded.gaussians, camera, background)
-        with torch.no_grad():
-            weight = w.weigh_pixels(render.image, target, mask, number)
-            slopes = pull_picture(photometric_slopes(render.image, target, w.dssim, weight))
+        weight = w.weigh_pixels(render.image, target, mask, number)
+        slopes = pull_picture(photometric_slopes(render.image, target, w.dssim, weight))
         terms = LazyMapping(lambda: compute_terms(Sample(decoded, render, target, mask, number), w))
         if w.regularises:  # these see parameters, which the optimiser is about to move
             dict(terms)
@@ -78,7 +78,8 @@ class ThroughAutograd:
 
     def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, PullScene]:
         """See `DirectScene.draw`. The regularisers are computed as terms of the loss."""
-        decoded = self.scene(camera, step, Mode.TRAIN, cull)
+        with torch.enable_grad():
+            decoded = self.scene(camera, step, Mode.TRAIN, cull)
         g, raw, population = decoded.gaussians, decoded.raw_opacity, decoded.population
         without = replace(
             decoded,
@@ -90,7 +91,9 @@ class ThroughAutograd:
 
         def pull(slopes: GaussianSlopes, terms: Regularisers) -> None:
             ends = [(getattr(g, name), getattr(slopes, name)) for name in PARTS]
-            ends += [(term, torch.ones_like(term)) for term in compute_scene_terms(decoded, step, self.weights).values()]
+            with torch.enable_grad():
+                terms_of_scene = compute_scene_terms(decoded, step, self.weights)
+            ends += [(term, torch.ones_like(term)) for term in terms_of_scene.values()]
             wanted = [(end, slope) for end, slope in ends if end.requires_grad]
             if wanted:
                 torch.autograd.backward([end for end, _ in wanted], [slope for _, slope in wanted])

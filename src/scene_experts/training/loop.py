@@ -303,7 +303,7 @@ def survey_of(training: Training, run: Job, capture: Capture, rasterize: Rasteri
     def photo(index: int) -> TrainingPhoto:
         return TrainingPhoto(capture.views[index].camera.to(run.device, run.dtype), *resident_of(training, run, capture).see(index))
 
-    return Survey(capture.train, photo, rasterize, torch.tensor(capture.background))
+    return Survey(capture.train, photo, rasterize, resident_of(training, run, capture).background(None))
 
 
 def without_graph(value: Any) -> Any:

@@ -165,16 +165,16 @@ def _launch_forward(x: Tensor, y: Tensor, lambda_dssim: float, wanted: bool, bot
     gradient = torch.empty_like(x) if wanted else x
     grid = (-(-W // (TILE - 2 * TAPS + 2)), -(-H // (TILE - 2 * TAPS + 2)), 3)
     sums = torch.empty(math.prod(grid), 2, dtype=x.dtype, device=x.device)
-    sizes = {**_constants(), "T": TILE, "WANTED": wanted, "BOTH": both, "PRECISION": PRECISION}
-    triton.launch(_kernels().forward, grid, x, y, gradient, sums, H, W, *weights, **sizes, num_warps=WARPS)
+    _forward(TILE, wanted, both, PRECISION, WARPS)(grid, x, y, gradient, sums, H, W, *weights)
     return sums, gradient, weights[0]
 
 
 @cache
-def _constants() -> dict[str, float]:
+def _forward(tile: int, wanted: bool, both: bool, precision: str, warps: int) -> triton.Launch:
     scale, reach = 1 / (2 * SIGMA * SIGMA), TAPS // 2
     norm = sum(math.exp(-scale * t * t) for t in range(-reach, reach + 1))
-    return {"R": reach, "SCALE": scale, "NORM": norm, "C1": C1, "C2": C2}
+    sizes = {"R": reach, "SCALE": scale, "NORM": norm, "C1": C1, "C2": C2, "T": tile, "WANTED": wanted, "BOTH": both}
+    return triton.Launch(_kernels().forward, **sizes, PRECISION=precision, num_warps=warps)
 
 
 def photometric_slopes(image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None) -> Tensor:
@@ -192,5 +192,6 @@ def photometric_slopes(image: Tensor, target: Tensor, lambda_dssim: float, mask:
     return gradient.mul_((weight / weight.mean().clamp_min(1e-12))[..., None])
 
 
+@cache
 def _kernels() -> Any:
     return importlib.import_module("scene_experts.training.triton_loss")

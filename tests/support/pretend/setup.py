@@ -61,6 +61,7 @@ def prepare() -> None:
     photometric.TILE = 64  # the interpreter takes as long for a program of any size
     random.torch = SimpleNamespace(randint=torch.randint, Generator=lambda device: torch.Generator())
     triton.launch = launch
+    triton.Launch.__call__ = lambda self, grid, *arguments: launch(self.kernel, grid, *arguments, **self.sizes)
     launch_adam = FusedAdam._launch_table
     FusedAdam._launch_table = lambda self, table: (count_adam(table), launch_adam(self, table))[1]
     triton.explain_missing = lambda: None

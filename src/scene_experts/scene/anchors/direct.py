@@ -123,10 +123,10 @@ class DirectAnchors:
         assert own is not None
         return own.of_whole(whole[own.parameter])
 
-    @torch.no_grad()
     def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, PullScene]:
         """Decode a training view, as `AnchorScene.forward` in `Mode.TRAIN`. Returns it with the
-        function that adds the slopes of the parameters to their `grad`."""
+        function that adds the slopes of the parameters to their `grad`. Both run without autograd's
+        recording."""
         scene, weights, code = self.scene, self.weights, None
         rows, seen_from = scene.choose(camera, step, Mode.TRAIN, cull)
         if self.codes is not None:
@@ -140,7 +140,6 @@ class DirectAnchors:
         decoded = Decoded(drawn.gaussians, rows, drawn.raw, LazyMapping(lambda: self._find_routing(drawn, step)))
         shown, graph = self._finish(decoded, camera, step)
 
-        @torch.no_grad()
         def pull(slopes: GaussianSlopes, terms: Regularisers) -> None:
             for parameter, gradient in self.grads:  # of an earlier view of the batch
                 if parameter.grad is gradient:
@@ -169,7 +168,6 @@ class DirectAnchors:
             self.kept = key, fused.Routed(made.stride, by_row=True, keys=made.keys)
         return self.kept[1]
 
-    @torch.no_grad()
     def _find_routing(self, drawn: fused.Drawn, step: int) -> dict[str, Routing]:
         """Return the routing of the anchors as the scene's own decode gives it."""
         view, routed = drawn.view, {ATTRIBUTES[i]: i for i in self.nets.routed}

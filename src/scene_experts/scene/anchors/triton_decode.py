@@ -35,10 +35,10 @@ BLOCK = 32  # anchors per program; with the paper's sizes, the largest block who
 BLOCK_WEIGHTS = 16  # anchors per step of `heads_weights`, which also keeps the slopes of a network in registers
 BLOCK_ROUTES = 64  # anchors per program of the routing
 BLOCK_SLOTS = 1024  # slots per program of `number`
-WARPS_BACKWARD = {16: 4, 32: 4, 64: 8}
-"""Warps of `heads_backward` by padded hidden width. Measured on an H100 for one head, as
-WARPS_WEIGHTS: there 8 is four times as fast as 4."""
-WARPS_WEIGHTS = 8
+BLOCK_BACKWARD = 16  # anchors per program of `heads_backward`
+WARPS_BACKWARD = WARPS_WEIGHTS = 8
+"""Warps of `heads_backward` and `heads_weights`: with these blocks, nothing is kept in local memory
+(sm_90). For one head, 8 warps were up to four times as fast as 4 on an H100."""
 MOST_EXPERTS = 30  # a set of experts is stored as the bits of an int32
 MOST_BINS = 64  # keys that the anchors are sorted by counting; more are sorted by torch
 WIDEST = 256  # largest padded number of outputs
@@ -108,6 +108,7 @@ class Networks:
             self.places.append(at)
             at += sum(_count(shape) for shape in h.router)
         self.width = at
+        self.launches: dict[tuple[Any, ...], triton.Launch] = {}
         self._set_constants()
 
     def _set_constants(self) -> None:
@@ -122,9 +123,18 @@ class Networks:
         two = {name: value for name, value in {**kinds, **columns}.items() if name[0] != "O"}
         self.rest = {**two, **size, "EM": self.EM, "ONE_ORDER": self.one_order, "B": BLOCK}
         self.back = {**kinds, **of(("OUT", "outside"), ("POS", "position")), **columns, **size, "EM": self.EM}
-        self.back |= {"EP": pad(self.EM), "B": BLOCK, "num_warps": WARPS_BACKWARD[pad(self.H)]}
+        self.back |= {"EP": pad(self.EM), "B": BLOCK_BACKWARD, "num_warps": WARPS_BACKWARD}
         self.sums = {**kinds, **columns, **size, "EM": self.EM, "ONE_ORDER": self.one_order, "B": BLOCK_WEIGHTS}
         self.sums |= {"C_AT": self.places[1], "R_AT": self.places[2], "WIDTH": self.width, "num_warps": WARPS_WEIGHTS}
+
+    def launch(self, name: str, **extra: Any) -> triton.Launch:
+        """Return a kernel of `triton_kernels` with its constants."""
+        key = (name, *extra.values())
+        found = self.launches.get(key)
+        if found is None:
+            sizes = {"opacity_forward": self.opacity, "shape_and_color_forward": self.rest, "heads_backward": self.back}
+            found = self.launches[key] = triton.Launch(getattr(_kernels(), name), **{**sizes.get(name, self.sums), **extra})
+        return found
 
     def shapes(self) -> list[tuple[int, tuple[int, ...]]]:
         """Return place and shape of each tensor in an array [width]: those of `NETWORK` head by
@@ -342,7 +352,7 @@ def route(view: View, mixed: Sequence[Tensor | None] = (None,) * 3, keys: Sequen
     mixed, keys: for heads that are routed outside, the weights [A, E] and the sets of chosen
     experts [A] int32, as `_spread` returns them.
     """
-    nets, A = view.nets, len(view.rows)
+    nets, A = view.nets, view.rows.shape[0]
     if not nets.routed:
         return Routed()
     stride, EM = _align(A), nets.EM
@@ -394,7 +404,7 @@ def _align(count: int) -> int:
 def arrange(view: View, routed: Routed) -> Tensor | None:
     """Return the indices of the anchors sorted by their keys, [A] or [3, stride]; None where no
     head needs them."""
-    nets, A = view.nets, len(view.rows)
+    nets, A = view.nets, view.rows.shape[0]
     if not nets.sorted or not A or routed.keys is None:
         return None
     blocks, stride = -(-A // BLOCK_ROUTES), routed.stride
@@ -421,30 +431,29 @@ def arrange(view: View, routed: Routed) -> Tensor | None:
 
 def draw(view: View, routed: Routed) -> Drawn:
     """Decode routed anchors."""
-    nets, rows, A = view.nets, view.rows, len(view.rows)
+    nets, rows, A = view.nets, view.rows, view.rows.shape[0]
     feature, log_scaling, offsets = view.columns
-    device, K = feature.device, nets.K
-    new = lambda *shape, dtype=torch.float32: torch.empty(shape, dtype=dtype, device=device)  # noqa: E731
+    K = nets.K
+    new = feature.new_empty
     order = arrange(view, routed)
     raw, grid = new(A, K), (-(-A // BLOCK),)
-    dst = new(A * K, dtype=torch.int32)
+    dst = rows.new_empty(A * K, dtype=torch.int32)
     weight, keys = (rows if t is None else t for t in (routed.weight, routed.keys))
     given = (rows, rows if order is None else order, keys, weight, view.xyz, feature, view.camera)
     M = 0
     if A:
-        positive = new(A * K, dtype=torch.int32)
-        first = nets.opacity
-        triton.launch(_kernels().opacity_forward, grid, *given, *view.weights[:4], raw, positive, A, BY_ROW=routed.by_row, **first)
+        positive = rows.new_empty(A * K, dtype=torch.int32)
+        nets.launch("opacity_forward", BY_ROW=routed.by_row)(grid, *given, *view.weights[:4], raw, positive, A)
         counted = positive.cumsum(0, dtype=torch.int32)
-        triton.launch(_places().number, (-(-A * K // BLOCK_SLOTS),), raw, counted, dst, A * K, B=BLOCK_SLOTS)
+        _place_launch("number", B=BLOCK_SLOTS)((-(-A * K // BLOCK_SLOTS),), raw, counted, dst, A * K)
         M = int(counted[-1])  # the host waits for the device only here
     cov, colors = new(M, 7), new(M, 3)
-    means, quats, scales, opacities, source = new(M, 3), new(M, 4), new(M, 3), new(M), new(M, dtype=torch.int64)
+    means, quats, scales, opacities, source = new(M, 3), new(M, 4), new(M, 3), new(M), rows.new_empty(M)
     if M:
         arguments = (*given, *view.weights[4:], dst, cov, colors, A, routed.stride)
-        triton.launch(_kernels().shape_and_color_forward, (*grid, 2), *arguments, BY_ROW=routed.by_row, **nets.rest)
+        nets.launch("shape_and_color_forward", BY_ROW=routed.by_row)((*grid, 2), *arguments)
         placed = (rows, view.xyz, offsets, log_scaling, raw, cov, dst, means, quats, scales, opacities, source, A)
-        triton.launch(_places().place, grid, *placed, K=K, B=BLOCK, KP=pad(K, 1))
+        _place_launch("place", K=K, B=BLOCK, KP=pad(K, 1))(grid, *placed)
     return Drawn(view, routed, order, Gaussians(means, quats, scales, opacities, colors, source), raw, dst, cov)
 
 
@@ -461,7 +470,7 @@ def pull_back(drawn: Drawn, slopes: Slopes, into: Sequence[Tensor], flat: Tensor
         The slopes of given mixture weights [A, E] by head; None where they were not given.
     """
     view, routed, order, dst = drawn.view, drawn.routed, drawn.order, drawn.dst
-    nets, rows, A = view.nets, view.rows, len(view.rows)
+    nets, rows, A = view.nets, view.rows, view.rows.shape[0]
     feature, log_scaling, offsets = view.columns
     if not A:
         flat.zero_()
@@ -471,16 +480,16 @@ def pull_back(drawn: Drawn, slopes: Slopes, into: Sequence[Tensor], flat: Tensor
     given = (rows, offsets, log_scaling, drawn.raw, drawn.cov, dst, drawn.gaussians.scales, drawn.gaussians.quats)
     by = (slopes.means, slopes.quats, slopes.scales, slopes.opacities, rows if slopes.raw is None else slopes.raw)
     to = (into[2], into[1], d_cov, d_all, A, slopes.volume, slopes.hinge, slopes.tau)
-    sizes = {"RAW": slopes.raw is not None, "TERMS": terms, "K": nets.K, "B": BLOCK, "KP": pad(nets.K, 1)}
+    back = _place_launch("place_backward", RAW=slopes.raw is not None, TERMS=terms, K=nets.K, B=BLOCK, KP=pad(nets.K, 1))
     grid, blocks = (-(-A // BLOCK),), -(-A // BLOCK_WEIGHTS)
-    triton.launch(_places().place_backward, grid, *given, *by, *to, **sizes)
+    back(grid, *given, *by, *to)
     d_logits = _push_features(drawn, slopes, d_all, d_cov, into[0])
     P = _parts(feature.device, nets.EM, blocks)
     parts = feature.new_empty(P, nets.width)
     weight, keys = (rows if t is None else t for t in (routed.weight, routed.keys))
     inputs = (rows, rows if order is None else order, keys, weight, view.xyz, feature, view.camera, *view.weights)
     arguments = (*inputs, dst, d_all, d_cov, slopes.colors, parts, A, routed.stride, blocks)
-    triton.launch(_kernels().heads_weights, (nets.EM, P, 3), *arguments, BY_ROW=routed.by_row, **nets.sums)
+    nets.launch("heads_weights", BY_ROW=routed.by_row)((nets.EM, P, 3), *arguments)
     if d_logits is not None:
         for (E, _, bias, position), heads in nets.groups.items():
             sizes = {f"AT{i}": nets.places[3 + i] for i in range(3)} | {"WIDTH": nets.width, "HEADS": heads, "BIAS": bias}
@@ -500,7 +509,7 @@ def _push_features(drawn: Drawn, slopes: Slopes, d_all: Tensor, d_cov: Tensor, d
     """Write the slopes of the features. Return those of the logits of all heads, or None if there
     are none."""
     view, routed, order = drawn.view, drawn.routed, drawn.order
-    nets, rows, A, stride = view.nets, view.rows, len(view.rows), routed.stride
+    nets, rows, A, stride = view.nets, view.rows, view.rows.shape[0], routed.stride
     with_logits = any(h.kind in (DENSE, SPARSE) for h in nets.heads)
     d_logits = d_all.new_empty(3 * stride * nets.EM) if with_logits else None
     given = [0 if slopes.shared_gates is None and g is None else 1 for g in slopes.gates]
@@ -524,8 +533,8 @@ def _push_features(drawn: Drawn, slopes: Slopes, d_all: Tensor, d_cov: Tensor, d
         own, ordered = rows, False
         if order is not None and any(heads >> i & 1 for i in nets.ordered):
             own, ordered = order if nets.one_order else order[_bits(heads)[0] * stride :], True
-        sizes = {"HEADS": heads, "ORDERED": ordered, "BY_ROW": routed.by_row, "ADD": heads in (2, 4), "WITH_GATES": mode, **nets.back}
-        triton.launch(_kernels().heads_backward, (-(-A // BLOCK),), rows, own, *inputs, *outputs, **sizes)
+        sizes = {"HEADS": heads, "ORDERED": ordered, "BY_ROW": routed.by_row, "ADD": heads in (2, 4), "WITH_GATES": mode}
+        nets.launch("heads_backward", **sizes)((-(-A // BLOCK_BACKWARD),), rows, own, *inputs, *outputs)
     return d_logits
 
 
@@ -601,13 +610,21 @@ class Routes:
         return made.gaussians, made.raw
 
 
+@cache
+def _place_launch(name: str, **sizes: Any) -> triton.Launch:
+    return triton.Launch(getattr(_places(), name), **sizes)
+
+
+@cache
 def _kernels() -> ModuleType:
     return importlib.import_module("scene_experts.scene.anchors.triton_kernels")
 
 
+@cache
 def _places() -> ModuleType:
     return importlib.import_module("scene_experts.scene.anchors.triton_places")
 
 
+@cache
 def _routes() -> ModuleType:
     return importlib.import_module("scene_experts.scene.anchors.triton_routes")
