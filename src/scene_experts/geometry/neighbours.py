@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scene_experts.native import library as native
+
 _CHUNK = 1 << 16  # points whose neighbours are sorted at a time, which limits the memory
 
 
@@ -57,12 +59,13 @@ def _find_near(xyz: np.ndarray, k: int) -> tuple[Tensor, Tensor]:
     """For each place with points, at least k + 1 points that no other is nearer than, [places, m]
     (-1: none); and the place of each point.
 
-    The tree has each place once: duplicates would all be in one leaf of it.
+    The tree has each place once: duplicates would all be in one leaf of it. The number of threads
+    does not change the result.
     """
     from scipy.spatial import KDTree  # takes 0.3 s, and most commands do not need it
 
     places, place, count = np.unique(xyz, axis=0, return_inverse=True, return_counts=True)
-    near = KDTree(places).query(places, min(k + 1, len(places)))[1].reshape(len(places), -1)
+    near = KDTree(places).query(places, min(k + 1, len(places)), workers=native.count_threads())[1].reshape(len(places), -1)
     rank = np.arange(min(k + 1, count.max()))
     start = (count.cumsum() - count)[:, None]
     here = np.where(rank < count[:, None], np.argsort(place, kind="stable")[np.minimum(start + rank, len(xyz) - 1)], -1)

@@ -44,6 +44,14 @@ def test_same_as_all_pairs(kind: str, k: int, monkeypatch: pytest.MonkeyPatch) -
     assert all(torch.equal(a, b) for a, b in zip(find_neighbours(points, k), (d2, index)))
 
 
+def test_the_number_of_threads_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, found = cloud("lattice"), []
+    for threads in (1, 3):
+        monkeypatch.setattr(neighbours.native, "count_threads", lambda threads=threads: threads)
+        found.append(find_neighbours(points, 5))
+    assert all(torch.equal(a, b) for a, b in zip(*found))
+
+
 def test_positions_that_are_not_finite_are_refused() -> None:
     for wrong in (float("nan"), float("inf")):
         with pytest.raises(ValueError, match="finite"):
