@@ -7,12 +7,15 @@ subgraph of the points it sees.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from scene_experts.core.transfer import upload
 from scene_experts.geometry.neighbours import find_neighbours
 from scene_experts.native import library as native
 
@@ -32,11 +35,31 @@ class Graph:
     @classmethod
     def of(cls, xyz: Tensor, k: int) -> Graph:
         """Build the exact graph of points [N, 3] with their k - 1 nearest neighbours. The result
-        depends on the positions only."""
-        d2, others = find_neighbours(xyz, k - 1)
-        me = torch.arange(len(xyz), device=xyz.device)[:, None]
+        depends on the positions only.
+
+        It is built on the CPU. Points on another device are copied to it once, and the graph from
+        it.
+        """
+        here = xyz.detach().cpu()
+        d2, others = find_neighbours(here, k - 1)
+        me = torch.arange(len(here))[:, None]
         close = 1 / d2.sqrt().clamp_min(NEAREST)
-        return cls(torch.cat([me, others], dim=1), torch.cat([d2.new_zeros(len(xyz), 1), close], dim=1).to(xyz.dtype))
+        made = cls(torch.cat([me, others], dim=1), torch.cat([d2.new_zeros(len(here), 1), close], dim=1).to(xyz.dtype))
+        return made.change(lambda t: upload(t, xyz.device))
+
+    def change(self, fn: Callable[[Tensor], Tensor]) -> Graph:
+        """Return the graph with a function applied to its tensors, such as a copy to a device."""
+        return Graph(fn(self.index), fn(self.closeness))
+
+    @cached_property
+    def reverse(self) -> tuple[Tensor, Tensor]:
+        """Edges by the neighbour that they lead to: where the list of each point begins, [N + 1],
+        and the edges u k + j of all lists, ascending in each, [N k], int64.
+
+        Made by three operations on the graph's device, without a wait of the host.
+        """
+        to, known = self.index.reshape(-1).sort(stable=True)
+        return torch.searchsorted(to, torch.arange(len(self.index) + 1, device=to.device)), known
 
     def among(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Subgraph of `rows` [A]: neighbours [A, k] as indices into `rows` (-1 if the neighbour is

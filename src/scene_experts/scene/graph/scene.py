@@ -177,10 +177,14 @@ class GraphScene(LatticeScene):
         self._graph: tuple[Tensor, Graph] | None = None  # the positions and the graph built from them
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move the tensors, as for `.to(...)`, and discard the graph. It is rebuilt on its next
-        use."""
-        self._graph = None
-        return super()._apply(fn, recurse)
+        """Move the tensors, as for `.to(...)`, and the graph with them. If the dtype of the
+        positions changes, the graph is discarded and built on its next use."""
+        before, graph = self.table.facts["xyz"], self._graph
+        super()._apply(fn, recurse)
+        after, self._graph = self.table.facts["xyz"], None
+        if graph is not None and graph[0] is before and after.dtype == before.dtype:
+            self._graph = after, graph[1].change(fn)
+        return self
 
     def meta(self) -> dict[str, Any]:
         return {"voxel": self.voxel, "extent": self.extent, "grid_low": list(self.grid.low), "grid_edge": self.grid.edge}
@@ -206,10 +210,12 @@ class GraphScene(LatticeScene):
             next(reversed(list(self.heads["opacity"].parameters()))).neg_()
 
     def graph(self) -> Graph:
-        """Graph of all points. It is rebuilt after rows are added or removed."""
+        """Graph of all points. It is built on its first use and after rows are added or
+        removed."""
         xyz = self.table.facts["xyz"]
-        if self._graph is None or self._graph[0] is not xyz:
-            self._graph = None  # free the memory before the new graph is built
+        if self._graph is not None and self._graph[0] is not xyz:
+            self._graph = (xyz, self._graph[1]) if _equals(self._graph[0], xyz) else None  # frees its memory before the next is built
+        if self._graph is None:
             self._graph = xyz, Graph.of(xyz, self.config.neighbours)
         return self._graph[1]
 
@@ -304,6 +310,12 @@ class GraphScene(LatticeScene):
         named = {**dict(self.heads.items()), "offsets": self.offsets}
         layers = {f"{name}.{i}": layer for name, head in named.items() for i, layer in enumerate(head.parameters())}
         return {**layers, "grid.table": self.grid.table, "affine.alpha": self.alpha, "affine.beta": self.beta}
+
+
+def _equals(a: Tensor, b: Tensor) -> bool:
+    """Whether two columns of positions are equal. The host waits for the device only if their
+    shapes are."""
+    return a.shape == b.shape and a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
 
 
 @register

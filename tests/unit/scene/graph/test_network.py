@@ -66,6 +66,22 @@ def test_a_graph_is_made_of_places_alone_and_lists_each_point_first():
     torch.testing.assert_close(a.closeness[:, 1:], 1 / torch.cdist(points(), points()).sort(dim=1).values[:, 1:10])
 
 
+@pytest.mark.parametrize("n", [0, 1, 30])
+def test_the_reverse_lists_every_edge_at_the_point_that_it_leads_to(n):
+    graph = Graph.of(points(n), 4)
+    start, known = graph.reverse
+    assert start.shape == (n + 1,) and sorted(known.tolist()) == list(range(graph.index.numel()))
+    for point in range(n):
+        edges = known[start[point] : start[point + 1]].tolist()
+        assert edges == (graph.index.view(-1) == point).nonzero().view(-1).tolist()
+
+
+def test_a_changed_graph_keeps_its_neighbours():
+    graph = Graph.of(points(), 4)
+    single = graph.change(lambda t: t.float() if t.is_floating_point() else t)
+    assert torch.equal(single.index, graph.index) and torch.equal(single.closeness, graph.closeness.float())
+
+
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_few_points(n):
     found, weight = Graph.of(points(n), 10).among(torch.arange(n))

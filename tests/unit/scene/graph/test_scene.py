@@ -146,6 +146,21 @@ def test_the_graph_is_made_again_when_rows_change_and_only_then():
     assert torch.equal(scene.graph().index, again.index) and torch.equal(scene.graph().closeness, again.closeness)
 
 
+def test_the_graph_moves_with_the_scene_and_is_kept_if_no_position_changes(monkeypatch):
+    scene = start_graph(torch.float32)
+    first, built = scene.graph(), []
+    monkeypatch.setattr(Graph, "of", classmethod(lambda cls, xyz, k: built.append(len(xyz)) or first))
+    scene.to("cpu")
+    scene.table.append(scene.new_rows(torch.zeros(0, 3, dtype=torch.int64), 0.8, torch.zeros(0, 32)))
+    assert torch.equal(scene.graph().index, first.index) and scene.graph() is scene.graph() and not built
+    scene.to("meta")
+    assert scene.graph().index.device.type == scene.graph().closeness.device.type == "meta" and not built
+    again = start_graph(torch.float32)
+    built.clear()
+    again.double()
+    assert again.graph() is first and built == [len(again.table)], "other distances"
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_whatever_the_seed_something_is_drawn_at_first(seed):
     torch.manual_seed(seed)
