@@ -94,6 +94,7 @@ def list_stages(data: Path, out: Path, cores: int, sizes: Sizes | None = None) -
 
 KERNEL_TESTS = (
     "tests/unit/scene/anchors/test_triton_decode.py",
+    "tests/unit/scene/graph/test_fused.py",
     "tests/unit/training/test_triton_loss.py",
     "tests/unit/training/test_triton_adam.py",
     "tests/unit/render/test_project_cuda.py",

@@ -28,14 +28,17 @@ from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.geometry.curvature import curvature, find_flat, find_midpoint_pairs
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.voxel import VoxelChoice, choose_voxel_size, coarsen, find_unique_cells, to_lattice
+from scene_experts.native import triton
 from scene_experts.scene import OPACITY, Cull, LatticeScene, LearningRates, SceneConfig, Traits
 from scene_experts.scene.anchors.mlp import CHANNELS
 from scene_experts.scene.anchors.scene import EPS
 from scene_experts.scene.anchors.select import visible_rows
+from scene_experts.scene.graph import fused
 from scene_experts.scene.graph.hash_grid import Grid, HashGrid
 from scene_experts.scene.graph.network import Graph, blend_neighbours
 
 PROBES = 1000  # approximate number of points that `face` evaluates
+VIEW = 4  # columns of the direction and the distance
 HALF = 2  # midpoints lie on a lattice of half the voxel size
 
 
@@ -170,7 +173,7 @@ class GraphScene(LatticeScene):
         self.grid = config.grid.build(corner, edge)
         width = 2 * config.F + config.grid.width
         self.alpha, self.beta = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
-        inner = [width + 4, config.hidden, config.hidden]  # 4: direction and distance
+        inner = [width + VIEW, config.hidden, config.hidden]
         heads = {name: Unbiased([*inner, size]) for name, size in CHANNELS.items()}
         self.heads: Mapping[str, Unbiased] = nn.ModuleDict(heads)  # type: ignore[assignment]
         self.offsets = Unbiased([width, config.offset_hidden, 3])
@@ -232,6 +235,9 @@ class GraphScene(LatticeScene):
         Returns the inputs of each point [A, grid + F] and the shared maximum of the features [F].
         With `told` [P], the inputs are those of `rows[told]` only, [P, grid + F].
         """
+        if self._on_cuda:
+            own, strongest = self._encode_on_cuda(rows, None)
+            return own if told is None else own.index_select(0, told), strongest
         feature = self.table.params["feature"].index_select(0, rows)
         near = blend_neighbours(feature, *self.graph().among(rows), self.config.blend)
         strongest = feature.amax(0) if len(rows) else feature.new_zeros(self.config.F)
@@ -239,15 +245,35 @@ class GraphScene(LatticeScene):
             near, rows = near.index_select(0, told), rows.index_select(0, told)
         return torch.cat([self.grid(self.table.facts["xyz"].index_select(0, rows)), near], dim=1), strongest
 
+    @property
+    def _on_cuda(self) -> bool:
+        return triton.covers(self.table.params["feature"], self.table.facts["xyz"], self.grid.table)
+
+    def _encode_on_cuda(self, rows: Tensor, position: Tensor | None) -> tuple[Tensor, Tensor]:
+        """The inputs [A, grid + F] and the maximum of the features; with the position of a camera,
+        the views [A, 4] in the last columns."""
+        feature, xyz = self.table.params["feature"], self.table.facts["xyz"]
+        return fused.encode(feature, self.grid, self.graph(), xyz, rows, self.config.blend, position)
+
+    def inputs(self, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Inputs of the networks of opacity, colour and covariance [A, grid + F + 4] for the points
+        `rows` [A], and the shared maximum of the features [F]."""
+        if self._on_cuda:
+            return self._encode_on_cuda(rows, camera.position)
+        own, strongest = self.encode(rows)
+        return torch.cat([own, self.view(rows, camera)], dim=1), strongest
+
     def fold(self, weight: Tensor, strongest: Tensor) -> tuple[Tensor, Tensor]:
         """Fold the affine layer and the shared features into a first layer `weight` [H, 2 F + grid
         (+ 4 view channels)].
 
         Returns a weight [H, grid + F (+ 4)] and a bias [H] that give weight ([own, strongest] alpha
         + beta). This avoids scaling tensors of size A, and it multiplies the shared features only
-        once.
+        once. On CUDA the weight has the view channels in any case, 0 if `weight` has none.
         """
         width, own = len(self.alpha), len(self.alpha) - self.config.F
+        if triton.covers(weight, strongest):
+            return fused.fold(weight, self.alpha, self.beta, strongest, own + VIEW)
         encoded = weight[:, :width] * self.alpha
         bias = encoded[:, own:] @ strongest + weight[:, :width] @ self.beta
         return torch.cat([encoded[:, :own], weight[:, width:]], dim=1), bias
@@ -258,31 +284,51 @@ class GraphScene(LatticeScene):
         return head.after_first(functional.linear(x, *self.fold(head.layers[0], strongest))).tanh()
 
     def offset(self, own: Tensor, strongest: Tensor) -> Tensor:
-        """Offsets [A, 3], in units of the scaling, for the inputs own [A, grid + F]."""
-        return functional.linear(own, *self.fold(self.offsets.product(), strongest))
+        """Offsets [A, 3], in units of the scaling, for the inputs own [A, grid + F (+ 4)], without
+        or with the view channels, which do not matter."""
+        weight, bias = self.fold(self.offsets.product(), strongest)
+        if own.shape[1] != weight.shape[1]:
+            columns = min(own.shape[1], weight.shape[1])
+            own, weight = own[:, :columns], weight[:, :columns]
+        return functional.linear(own, weight, bias)
 
     def decode(self, rows: Tensor, camera: Camera) -> Decoded:
         """Decode the given points [A]. Shape and colour are computed only for Gaussians with
         positive opacity."""
-        own, strongest = self.encode(rows)
-        x = torch.cat([own, self.view(rows, camera)], dim=1)
+        x, strongest = self.inputs(rows, camera)
         raw = self.opacity(x, strongest)
         keep = (raw > 0).view(-1).nonzero().squeeze(1)
         x, source = x.index_select(0, keep), rows.index_select(0, keep)
         cov, color = (self.heads[name] for name in ("cov", "color"))
         first = functional.linear(x, *self.fold(torch.cat([cov.layers[0], color.layers[0]]), strongest))  # both in one matrix product
         shape, rgb = (head.after_first(h) for head, h in zip((cov, color), first.chunk(2, dim=1)))
-        scaling = self.table.params["log_scaling"].index_select(0, source).exp()
-        offset = self.offset(x[:, : own.shape[1]], strongest) * scaling[:, :3]
-        gaussians = Gaussians(
-            means=self.table.facts["xyz"].index_select(0, source) + offset,
+        offset = self.offset(x, strongest)
+        return Decoded(self.place(keep, source, offset, shape, rgb, raw), rows, raw, {})
+
+    def place(self, keep: Tensor, source: Tensor, offset: Tensor, shape: Tensor, color: Tensor, raw: Tensor) -> Gaussians:
+        """Gaussians of the drawn points, from the outputs of the networks.
+
+        Args:
+            keep: Indices of the drawn points [M] among the visible ones.
+            source: Their rows [M].
+            offset: Offsets [M, 3] in units of the scaling.
+            shape: Raw scales and quaternions [M, 7].
+            color: Raw colours [M, 3].
+            raw: Opacities [A, 1] of all visible points.
+        """
+        xyz, log_scaling = self.table.facts["xyz"], self.table.params["log_scaling"]
+        if triton.covers(xyz, log_scaling, offset):
+            means, quats, scales, opacities, colors = fused.place(keep, source, xyz, log_scaling, offset, shape, color, raw)
+            return Gaussians(means, quats, scales, opacities, colors, source)
+        scaling = log_scaling.index_select(0, source).exp()
+        return Gaussians(
+            means=xyz.index_select(0, source) + offset * scaling[:, :3],
             quats=functional.normalize(shape[:, 3:], dim=1, eps=EPS),
             scales=scaling[:, 3:] * shape[:, :3].sigmoid(),
             opacities=raw.view(-1).index_select(0, keep),
-            colors=rgb.sigmoid(),
+            colors=color.sigmoid(),
             source=source,
         )
-        return Decoded(gaussians, rows, raw, {})
 
     def view(self, rows: Tensor, camera: Camera) -> Tensor:
         """Unit direction from the camera to each point, and distance, [A, 4]."""
