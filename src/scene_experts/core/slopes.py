@@ -32,6 +32,8 @@ class Regularisers:
     hinge: float = 0.0
     tau: float = 0.0
     load: float = 0.0
+    mean_opacity: float = 0.0
+    mean_size: float = 0.0
 
 
 PullPicture = Callable[[Tensor], GaussianSlopes]

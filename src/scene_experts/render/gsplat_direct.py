@@ -100,4 +100,3 @@ def draw(g: Gaussians, camera: Camera, background: Tensor, antialias: bool, abso
         return GaussianSlopes(d_means, d_quats, d_scales, d_opacities[0], d_colors[0])
 
     return Render(picture[0], shade, _no_alpha(width, height, device)[0, ..., 0], radii, mean2d_grad), pull
-

@@ -26,7 +26,9 @@ from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.sh import MAX_DEGREE, rgb_to_dc
 from scene_experts.geometry.sh_colors import compute_sh_colors
+from scene_experts.native import triton
 from scene_experts.scene import EXPLICIT, Cull, LearningRates, Scene, SceneConfig, Traits
+from scene_experts.scene.gaussians_direct import DirectGaussians
 
 COLUMNS = ("means", "log_scales", "quats", "raw_opacity", "sh_dc", "sh_rest")
 FILE_VALUES = 3 + 3 + 1 + 3 + 4  # position, normal, opacity, scale and rotation in the 3DGS file, without the harmonics
@@ -133,10 +135,20 @@ class GaussianScene(Scene):
         no visible Gaussian is lost.
         """
         p = self.table.params
-        with torch.no_grad():
-            ball = p["log_scales"].amax(1, keepdim=True).exp_().mul_(_ROUND).expand(-1, 3)
-            rows = cull(p["means"].detach(), ball, camera).nonzero().squeeze(1)
-        return replace(self.decode(rows, camera, step), population=(p["raw_opacity"], p["log_scales"]))
+        return replace(self.decode(self.visible(camera, cull), camera, step), population=(p["raw_opacity"], p["log_scales"]))
+
+    @torch.no_grad()
+    def visible(self, camera: Camera, cull: Cull) -> Tensor:
+        """Return the rows [A] that may overlap the image of `camera`."""
+        p = self.table.params
+        ball = p["log_scales"].amax(1, keepdim=True).exp_().mul_(_ROUND).expand(-1, 3)
+        return cull(p["means"].detach(), ball, camera).nonzero().squeeze(1)
+
+    def direct(self, step: int, load: bool) -> DirectGaussians | str:
+        column = self.table.params["means"]
+        if column.dtype != torch.float32:
+            return f"tensors of {column.dtype}"
+        return triton.explain_missing() or DirectGaussians(self)
 
     def decode(self, rows: Tensor, camera: Camera, step: int) -> Decoded:
         """Decode the given rows [A] into Gaussians, with the colours that `camera` sees at

@@ -66,7 +66,8 @@ class DirectStep:
         terms = LazyMapping(lambda: compute_terms(Sample(decoded, render, target, mask, number), w))
         if w.regularises:  # these see parameters, which the optimiser is about to move
             dict(terms)
-        pull_scene(slopes, Regularisers(w.scale, w.opacity if w.has_hinge(number) else 0.0, w.tau, w.load))
+        hinge = w.opacity if w.has_hinge(number) else 0.0
+        pull_scene(slopes, Regularisers(w.scale, hinge, w.tau, w.load, w.mean_opacity, w.mean_size))
         return decoded, render, terms
 
 

@@ -12,7 +12,7 @@ from scene_experts.scene.anchors import triton_decode
 from scene_experts.scene.anchors.routers import Margin
 from scene_experts.scene.anchors.select import Octree
 from scene_experts.training.direct import DirectStep, ThroughAutograd
-from scene_experts.training.losses import Sample, Weights, compute_terms
+from scene_experts.training.losses import Sample, compute_terms
 from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.interpret import DEVICE, kernels
@@ -20,8 +20,11 @@ from support.synthetic import make_capture
 from support.trainings import start_changed
 
 CLOSE = 1e-5  # relative, of losses and of the norm of a gradient
+ROUNDED = (
+    1e-4  # of slopes of explicit Gaussians: their kernels round a last bit otherwise than torch, test_triton_gaussians.py has them alone
+)
 LATE = 20_000  # an iteration after every warm-up
-MANY = dict(dropout=0.3, dropout_full=1, view_jitter=0.5)
+MANY = {"dropout": 0.3, "dropout_full": 1, "view_jitter": 0.5}
 
 pytestmark = pytest.mark.skipif(DEVICE == "cuda", reason="the kernels are compared in the interpreter; a GPU has tests of its own")
 
@@ -41,12 +44,13 @@ def varied(recipe, scene=(), loss=(), decoder=(), growth=()):
     return replace(cfg, scene=replace(cfg.scene, **({"K": 4} if hasattr(cfg.scene, "K") else {}))).scaled()
 
 
+RESIDUALS = {"residual_quantile": 0.7, "residual_weight": 0.2, "residual_from": 0}
 TERMS = {"scale": 0.5, "opacity": 0.3, "tau": 0.1}
 CASES = {
     "scaffold-gs": (varied("scaffold-gs", loss=TERMS), 1, ""),
     "no picture terms but L1": (varied("scaffold-gs", loss={**TERMS, "dssim": 0.0}), 1, ""),
     "a masked photograph": (varied("scaffold-gs", loss=TERMS), 1, ""),
-    "large residuals count less": (varied("scaffold-gs", loss={**TERMS, "residual_quantile": 0.7, "residual_weight": 0.2, "residual_from": 0}), 1, ""),
+    "large residuals count less": (varied("scaffold-gs", loss={**TERMS, **RESIDUALS}), 1, ""),
     "absolute gradients": (varied("scaffold-gs", growth={"gradient": "absolute"}), 1, ""),
     "the distance too": (varied("scaffold-gs-dist", loss=TERMS), 1, ""),
     "distance for one": (varied("scaffold-gs", scene={"add_dist": ("cov",)}), 1, ""),
@@ -71,8 +75,9 @@ CASES = {
     "balanced": (varied("moe-gs-balance"), LATE, "without a kernel"),
     "a bank": (varied("scaffold-gs-bank", loss=TERMS), 1, "bank"),
     "octree-moe-gs": (varied("octree-moe-gs", loss={"load": 0.2}), LATE, ""),
-    "3dgs": (varied("3dgs", scene={"sh_degree": 1}), LATE, "without kernels"),
-    "3dgs-mcmc": (varied("3dgs-mcmc", scene={"sh_degree": 1}), LATE, "without kernels"),
+    "3dgs": (varied("3dgs"), LATE, ""),
+    "3dgs, its first harmonics": (varied("3dgs", loss={"scale": 0.5}), 1, ""),
+    "3dgs-mcmc": (varied("3dgs-mcmc", scene={"sh_degree": 2}), LATE, ""),
     "sags": (varied("sags"), 1, "without kernels"),
 }
 
@@ -123,14 +128,15 @@ def test_a_view_is_that_of_autograd(name, capture, monkeypatch):
     assert found[2].keys() == expected[2].keys()
     for term, value in expected[2].items():
         assert abs(found[2][term] - value) <= CLOSE * abs(value), term
+    close = ROUNDED if name.startswith("3dgs") else CLOSE * 3
     most = max(float(g.norm()) for g in expected[3].values())
     for parameter, gradient in expected[3].items():
         if float(gradient.norm()) > 1e-4 * most:
-            assert distance(found[3][parameter], gradient) < CLOSE * 3, parameter
+            assert distance(found[3][parameter], gradient) < close, parameter
     assert found[3].keys() >= {n for n, g in expected[3].items() if g.any()}
     assert found[4].keys() == expected[4].keys()
     for column, value in expected[4].items():
-        assert distance(found[4][column], value) < CLOSE * 3, column
+        assert distance(found[4][column], value) < close, column
     assert found[0].routing.keys() == expected[0].routing.keys()
     for attribute, r in expected[0].routing.items():
         assert distance(found[0].routing[attribute].gates, r.gates.detach()) < CLOSE

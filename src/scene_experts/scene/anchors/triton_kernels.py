@@ -31,6 +31,7 @@ TANH, NONE, SIGMOID = 0, 1, 2
 PLAIN, DENSE, SPARSE, LOCAL = 0, 1, 2, 3
 EPS = tl.constexpr(1e-12)  # keeps directions and quaternions finite if their length is 0; equals EPS of scene.py
 
+
 @triton.jit
 def activate(y, ACT: tl.constexpr):
     """Activation of the last layer. Near 0, tanh is a polynomial fitted on [0, 0.625] with a
