@@ -1,7 +1,14 @@
-"""The peer of `train_cuda.py`: a fixed number of explicit Gaussians (Kerbl et al. 2023), trained by a minimal loop over gsplat."""
+"""The peer of `train_cuda.py`: a fixed number of explicit Gaussians (Kerbl et al. 2023), trained by a minimal loop over gsplat.
+
+    python benchmarks/explicit_gsplat.py --data CAPTURE --count 857293 --out DIR --seconds 100       # in slices, as train_cuda.py
+
+Its loss, Adam and copies to the device are those of commit da16e27 (`peer_cuda`). `--loss torch` takes torch's convolutions for SSIM, as
+many trainers do; no ratio is formed with it. A finished peer is found again by its count and loss.
+"""
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import math
 import time
@@ -11,15 +18,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from peer_cuda.adam import Adam
+from peer_cuda.device import upload, upload_camera
+from peer_cuda.loss import photometric
 from scene_experts.core import checkpoint
-from scene_experts.core.transfer import upload
 from scene_experts.core.types import Camera
-from scene_experts.data.capture import Capture
+from scene_experts.data.capture import Capture, load
+from scene_experts.data.settings import Data
 from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.sh import rgb_to_dc
-from scene_experts.training.optim import FusedAdam
-from scene_experts.training.photometric import photometric
 
+LOSSES = ("triton", "torch")
 Draw = Callable[[dict[str, Tensor], Camera, int, Tensor], Tensor]
 RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "dc": 2.5e-3, "rest": 2.5e-3 / 20}  # 3DGS's
 DEGREE_EVERY = 1000  # iterations between degrees of the harmonics
@@ -68,15 +77,18 @@ def initialise(capture: Capture, count: int) -> dict[str, Tensor]:
 class Training:
     """The state of the loop, with checkpoints in a folder."""
 
-    def __init__(self, capture: Capture, count: int, iterations: int, folder: Path, device: str, draw: Draw = draw) -> None:
+    def __init__(
+        self, capture: Capture, count: int, iterations: int, folder: Path, device: str, draw: Draw = draw, loss: str = "triton"
+    ) -> None:
         self.capture, self.count, self.iterations, self.folder, self.device, self.draw = capture, count, iterations, folder, device, draw
+        self.loss = loss
         self.step, self.seconds = 0, 0.0
         self.views = torch.Generator().manual_seed(0)
         self.queue: list[int] = []
         newest = checkpoint.latest(folder)
         tensors, meta = checkpoint.load(newest) if newest else (initialise(capture, count), {})
         self.params = {name: tensors[name].to(device).requires_grad_() for name in RATES}
-        self.optimizer = FusedAdam([{"params": [p], "name": name, "lr": RATES[name]} for name, p in self.params.items()])
+        self.optimizer = Adam([{"params": [p], "name": name, "lr": RATES[name]} for name, p in self.params.items()])
         if newest:
             self.step, self.seconds, self.queue = int(meta["step"]), float(meta["seconds"]), list(meta["queue"])
             self.views.set_state(tensors["views"])
@@ -114,7 +126,7 @@ class Training:
         target = upload(frame.rgb, self.device, torch.float32).div_(255.0)
         mask = None if frame.mask is None else upload(frame.mask, self.device)
         image = self.render(self.capture.views[index].camera)
-        l1, dssim = photometric(image, target, 0.2, mask)
+        l1, dssim = photometric(image, target, 0.2, mask, self.loss)
         (l1 + dssim).backward()
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
@@ -122,4 +134,39 @@ class Training:
     def render(self, camera: Camera) -> Tensor:
         degree = min(3, self.step // max(1, round(DEGREE_EVERY * self.iterations / 30_000)))
         background = upload(torch.tensor(self.capture.background), self.device)
-        return self.draw(self.params, camera.to(self.device), degree, background)
+        return self.draw(self.params, upload_camera(camera, self.device), degree, background)
+
+
+def start(capture: Capture, count: int, iterations: int, out: Path, device: str, draw: Draw = draw, loss: str = "triton") -> Training:
+    """Begin or continue a training in its own folder of `out`, after one step that compiles all kernels."""
+    if device == "cuda":
+        Training(capture, 1000, 20, out / "unused", device, draw, loss).iterate()
+        torch.cuda.reset_peak_memory_stats()
+    folder = out / (f"explicit-{count}" if loss == "triton" else f"explicit-{count}-{loss}")
+    return Training(capture, count, iterations, folder, device, draw, loss)
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="a capture")
+    parser.add_argument("--count", type=int, required=True, help="number of Gaussians")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the checkpoint, kept between slices")
+    parser.add_argument("--iterations", type=int, default=30_000)
+    parser.add_argument("--resolution", default="auto")
+    parser.add_argument("--seconds", type=float, default=500.0, help="length of this slice")
+    parser.add_argument("--loss", default="triton", choices=LOSSES)
+    parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
+    args = parser.parse_args(argv)
+    deadline = time.monotonic() + args.seconds
+    capture = load(Data(args.data, resolution=args.resolution))
+    made = start(capture, args.count, args.iterations, args.out, args.device, loss=args.loss)
+    finished = made.run(deadline)
+    capture.images.close()
+    each = f", {1e3 * made.seconds / made.step:.2f} ms each" if made.step else ""
+    print(f"{args.count:,} Gaussians, {args.loss} loss: {made.step} iterations{each}")
+    print("all done" if finished else "to do: the rest; run the same command again")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

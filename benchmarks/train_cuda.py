@@ -3,9 +3,10 @@
     python benchmarks/train_cuda.py --data CAPTURE --out DIR --seconds 500     # again and again until it prints the table
 
 The script works in slices: each call continues where the last one stopped and ends after `--seconds`, including saving, so that it can
-run on a machine that is available for minutes at a time. The peer comes last. It gets as many Gaussians as the scene of the last recipe
-has with positive opacity (mean over the held-out views), or `--count`. Time is that of iterations, with prefetched photographs and
-without compiling, saving and scoring. Peak memory is the peak of torch's allocator.
+run on a machine that is available for minutes at a time. Each recipe is followed by a peer with as many Gaussians as its scene has with
+positive opacity (mean over the held-out views), or `--count`, on the same machine; a finished peer is not trained again. `--torch-loss`
+adds a peer with torch's SSIM, which is shown and not counted. Time is that of iterations, with prefetched photographs and without
+compiling, saving and scoring. Peak memory is the peak of torch's allocator.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import json
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
@@ -38,9 +39,20 @@ from scene_experts.training.options import TrainOptions
 from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training, resume
 
-PEER = "gsplat, explicit"
 SPARE = 25.0  # seconds of a slice reserved for saving
 SCORING = 30.0  # seconds that must remain to start scoring
+
+
+@dataclass(frozen=True)
+class Peer:
+    """So many explicit Gaussians. count 0: not known yet."""
+
+    count: int
+    loss: str = "triton"
+
+    @property
+    def name(self) -> str:
+        return f"gsplat, {self.count:,}" + ("" if self.loss == "triton" else f", {self.loss} loss")
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -51,15 +63,22 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--recipes", nargs="+", default=["scaffold-gs", "moe-gs"], choices=list(RECIPES), metavar="RECIPE")
     parser.add_argument("--iterations", type=int, default=30_000)
     parser.add_argument("--resolution", default="auto")
-    parser.add_argument("--count", type=int, default=0, help="Gaussians of the peer; 0: as many as the last recipe has")
+    parser.add_argument("--count", type=int, default=0, help="Gaussians of the peer; 0: as many as each recipe has")
+    parser.add_argument("--torch-loss", action="store_true", help="also train peers with the loss of plain torch")
     parser.add_argument("--least-anchors", type=int, default=0, help="halve the voxels until a scene starts with so many anchors")
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
     return parser
 
 
-def list_pending(recipes: Sequence[str], results: dict[str, Any]) -> list[str]:
-    """The trainings left to do, in order: the recipes, then the peer, which needs their number of Gaussians."""
-    return [name for name in (*recipes, PEER) if not results.get(name, {}).get("done")]
+def list_pending(recipes: Sequence[str], results: dict[str, Any], count: int = 0, losses: Sequence[str] = ("triton",)) -> list[str | Peer]:
+    """The trainings left to do, in order: each recipe, then its peers, which need its number of Gaussians. count: of all peers."""
+    left: list[str | Peer] = []
+    for recipe in recipes:
+        found = results.get(recipe, {})
+        peers = [Peer(count or found.get("gaussians", 0), loss) for loss in losses]
+        left += [] if found.get("done") else [recipe]
+        left += [peer for peer in peers if peer not in left and not results.get(peer.name, {}).get("done")]
+    return left
 
 
 def main(argv: list[str] | None = None, draw: explicit_gsplat.Draw = explicit_gsplat.draw) -> int:
@@ -71,23 +90,25 @@ def main(argv: list[str] | None = None, draw: explicit_gsplat.Draw = explicit_gs
     results = read_results(args)
     capture = load(Data(args.data, resolution=args.resolution))
     rasterize = choose("auto", args.device)
-    for name in list_pending(args.recipes, results):
-        if time.monotonic() > deadline:
-            break
+    losses = explicit_gsplat.LOSSES if args.torch_loss else ("triton",)
+    while (left := list_pending(args.recipes, results, args.count, losses)) and time.monotonic() < deadline:
+        job = left[0]
+        name = job.name if isinstance(job, Peer) else job
         result = results.setdefault(name, {"peak_bytes": 0})
         if args.device == "cuda":
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats()
-        if name == PEER:
-            count = args.count or results[args.recipes[-1]]["gaussians"]
-            train_peer(capture, count, args, deadline, result, draw)
+        if isinstance(job, Peer):
+            train_peer(capture, job, args, deadline, result, draw)
         else:
-            train_recipe(name, capture, rasterize, args, deadline, result)
+            train_recipe(job, capture, rasterize, args, deadline, result)
         write_results(args, results)
+        if not result.get("done"):  # the slice ends
+            break
     capture.images.close()
-    print(format_table(results))
-    left = list_pending(args.recipes, results)
-    print(f"to do: {', '.join(left)}; run the same command again" if left else "all done")
+    print(format_table(results, args.count))
+    names = [job.name if isinstance(job, Peer) else job for job in left]
+    print(f"to do: {'; '.join(names)}; run the same command again" if left else "all done")
     return 0
 
 
@@ -180,16 +201,13 @@ def compute_psnr(image: torch.Tensor, capture: Capture, index: int) -> float:
 
 
 def train_peer(
-    capture: Capture, count: int, args: argparse.Namespace, deadline: float, result: dict[str, Any], draw: explicit_gsplat.Draw
+    capture: Capture, peer: Peer, args: argparse.Namespace, deadline: float, result: dict[str, Any], draw: explicit_gsplat.Draw
 ) -> None:
     """Continue the training of explicit Gaussians, and score it when it is finished."""
-    if args.device == "cuda":  # compile before timing
-        explicit_gsplat.Training(capture, 1000, 20, args.out / "unused", args.device, draw).iterate()
-        torch.cuda.reset_peak_memory_stats()
-    made = explicit_gsplat.Training(capture, count, args.iterations, args.out / "explicit", args.device, draw)
+    made = explicit_gsplat.start(capture, peer.count, args.iterations, args.out, args.device, draw, peer.loss)
     finished = made.run(deadline)
     record_peak(args, result)
-    result |= {"step": made.step, "seconds": made.seconds, "gaussians": count}
+    result |= {"step": made.step, "seconds": made.seconds, "gaussians": peer.count}
     if not finished:
         return
     psnr, times = [], []
@@ -208,18 +226,18 @@ def train_peer(
     result |= {"psnr": mean(psnr), "fps": 1 / median(times[5:]), "done": True}
 
 
-def format_table(results: dict[str, Any]) -> str:
-    """One line per training; ratios are to the peer, if it has run."""
-    base = results.get(PEER, {})
-    lines = [f"{'':20}{'steps':>8}{'time s':>10}{'ms/step':>9}{'of peer':>9}{'peak MiB':>10}{'FPS':>8}{'PSNR':>8}{'Gaussians':>11}"]
+def format_table(results: dict[str, Any], count: int = 0) -> str:
+    """One line per training; the ratio of a recipe is to the peer with as many Gaussians, or with `count`, if it has run."""
+    lines = [f"{'':32}{'steps':>8}{'time s':>10}{'ms/step':>9}{'of peer':>9}{'peak MiB':>10}{'FPS':>8}{'PSNR':>8}{'Gaussians':>11}"]
     for name, r in results.items():
         if name == "settings" or not r.get("step"):
             continue
         each = 1e3 * r["seconds"] / r["step"]
-        ratio = f"{each / (1e3 * base['seconds'] / base['step']):.2f}" if base.get("step") else ""
+        base = results.get(Peer(count or r.get("gaussians", 0)).name, {})
+        ratio = f"{each / (1e3 * base['seconds'] / base['step']):.2f}" if base.get("done") and "torch loss" not in name else ""
         cells = (r["step"], f"{r['seconds']:.1f}", f"{each:.2f}", ratio, f"{r['peak_bytes'] / 2**20:.0f}")
         late = [f"{r[key]:{form}}" if key in r else "" for key, form in (("fps", ".0f"), ("psnr", ".2f"), ("gaussians", ","))]
-        lines.append(f"{name:20}" + "".join(f"{cell:>{w}}" for cell, w in zip((*cells, *late), (8, 10, 9, 9, 10, 8, 8, 11))))
+        lines.append(f"{name:32}" + "".join(f"{cell:>{w}}" for cell, w in zip((*cells, *late), (8, 10, 9, 9, 10, 8, 8, 11))))
     return "\n".join(lines)
 
 

@@ -28,10 +28,25 @@ def draw(p, camera, degree, background):
     return ReferenceRasterizer()(g, camera, background).image
 
 
-def test_the_plan_ends_with_the_peer():
-    recipes = ["scaffold-gs", "moe-gs"]
-    assert train_cuda.list_pending(recipes, {}) == [*recipes, train_cuda.PEER]
-    assert train_cuda.list_pending(recipes, {"scaffold-gs": {"done": True}, "moe-gs": {"step": 3}}) == ["moe-gs", train_cuda.PEER]
+def test_each_recipe_is_followed_by_a_peer_of_its_size():
+    recipes, Peer = ["scaffold-gs", "moe-gs"], train_cuda.Peer
+    assert train_cuda.list_pending(recipes, {}) == ["scaffold-gs", Peer(0), "moe-gs"]
+    results = {"scaffold-gs": {"done": True, "gaussians": 70}, "moe-gs": {"step": 3}}
+    assert train_cuda.list_pending(recipes, results) == [Peer(70), "moe-gs", Peer(0)]
+    results |= {"moe-gs": {"done": True, "gaussians": 70}, Peer(70).name: {"done": True}}
+    assert train_cuda.list_pending(recipes, results) == []
+    assert train_cuda.list_pending(recipes, results, losses=("triton", "torch")) == [Peer(70, "torch")]
+    assert train_cuda.list_pending(recipes, results, count=80) == [Peer(80)]
+
+
+def test_a_ratio_is_to_the_peer_of_the_same_size():
+    def done(ms, count):
+        return {"step": 100, "seconds": ms / 10, "peak_bytes": 0, "gaussians": count, "done": True}
+
+    results = {"scaffold-gs": done(4, 70), "gsplat, 70": done(5, 70), "gsplat, 70, torch loss": done(9, 70), "moe-gs": done(6, 80)}
+    lines = {line[:32].strip(): line[32:].split() for line in train_cuda.format_table(results).splitlines()}
+    assert lines["scaffold-gs"][3] == "0.80" and lines["gsplat, 70"][3] == "1.00"
+    assert lines["gsplat, 70, torch loss"][3] == lines["moe-gs"][3] == "0"  # the peak memory: no ratio
 
 
 @pytest.mark.slow

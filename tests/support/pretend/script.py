@@ -9,12 +9,14 @@ import os
 import runpy
 import sys
 
-from support.pretend.setup import prepare
+from peer_cuda import device
+from support.pretend.setup import launch, prepare
 from support.pretend.tensors import Pretending
 
 
 def main(words: list[str]) -> None:
     prepare()
+    device.launch = launch
     sys.argv = words
     with Pretending():
         runpy.run_path(words[0], run_name="__main__")
