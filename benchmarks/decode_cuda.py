@@ -117,6 +117,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--seen", type=float, default=0.7, help="share of the table that it sees")
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--copy", type=int, default=512, metavar="MIB", help="size of the copy that measures the bandwidth")
+    parser.add_argument("--forms", nargs="+", default=["composed", "native"], choices=("composed", "native"), help="torch, Triton")
     parser.add_argument("--precision", choices=("ieee", "tf32x3", "tf32"), default="ieee", help="of the kernels' products")
     return parser
 
@@ -133,7 +134,7 @@ def main() -> None:
     rows = torch.randperm(total)[: args.anchors].sort().values.cuda()
     cases: dict[tuple[str, str], Case] = {}
     for kind, config in KINDS.items():
-        for form in ("composed", "native"):  # on CUDA "native" is Triton
+        for form in args.forms:  # on CUDA "native" is Triton
             cases[kind, form] = Case(make_scene(config, total, "cuda"), rows, camera, form)
     for case in (c for _ in range(args.rounds + WARM_UP) for c in cases.values()):
         case.run()
@@ -148,7 +149,7 @@ def format_report(cases: dict[tuple[str, str], Case], total: int, anchors: int, 
     lines = []
     for (kind, form), case in cases.items():
         forward, backward = median(case.forward[WARM_UP:]), median(case.backward[WARM_UP:])
-        config, other = case.scene.config, cases[kind, "composed"]
+        config, other = case.scene.config, cases.get((kind, "composed"), case)
         experts = config.decoder.num if isinstance(config.decoder, Experts) else 1
         least = compute_least_bytes(total, anchors, case.drawn, config.F, config.K, experts)
         shares = [100 * b / (1e-3 * t) / copy for b, t in zip(least, (forward, backward))]

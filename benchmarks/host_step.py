@@ -16,15 +16,14 @@ import gc
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from pretended_cuda import start
 
-BLOCK = 40  # steps of a turn: densification runs every 100
 VIEWS = 20  # of the capture: fewer than a block, so that all photographs are on the device after the first
 
 
@@ -88,41 +87,9 @@ class Meter:
         self.cpu, self.wall, self.busy, self.counted = [], [], [], {}
 
 
-def step_recipe(recipe: str, args: argparse.Namespace, capture: Any, meter: Meter) -> Iterator[object]:
-    """Train in blocks of steps. The training loop is that of the command; it is measured between its calls of `watch`."""
-    from scene_experts.data.settings import Data
-    from scene_experts.render import choose
-    from scene_experts.training import loop
-    from scene_experts.training.config import RunConfig
-    from scene_experts.training.events import Stepped
-    from scene_experts.training.options import TrainOptions
-    from scene_experts.training.recipes import RECIPES
-
-    paused = True
-
-    def begin(training: Any) -> None:
-        training.step = args.begin
-
-    def watch(training: Any) -> None:
-        nonlocal paused
-        if not paused:
-            meter.end()
-        paused = False
-        if training.step >= args.begin + 2 * BLOCK:
-            training.step = args.begin
-        meter.begin()
-
-    cfg = replace(RECIPES[recipe][1], iterations=30_000)
-    options = TrainOptions(preview_every=0, log_every=BLOCK, save_every=10**9)
-    job = loop.Job(RunConfig(cfg, Data(args.data)), device="cuda", options=options, begin=begin, watch=watch)
-    for event in loop.train(cfg, job, capture, choose("auto", "cuda")):
-        if isinstance(event, Stepped):
-            paused = True  # what lies between this step and the next is not one
-            yield event
-
-
-def step_peer(args: argparse.Namespace, capture: Any, meter: Meter) -> Iterator[object]:
+def step_peer(args: argparse.Namespace, capture: Any, meter: Meter) -> Iterator[None]:
     import explicit_gsplat
+    from steps import BLOCK
 
     made = explicit_gsplat.Training(capture, args.count, 30_000, Path("nowhere"), "cuda")
     while True:
@@ -131,7 +98,7 @@ def step_peer(args: argparse.Namespace, capture: Any, meter: Meter) -> Iterator[
             meter.begin()
             made.iterate()
             meter.end()
-        yield None
+        yield
 
 
 def format_table(meters: list[Meter]) -> str:
@@ -155,6 +122,7 @@ def main(argv: list[str] | None = None) -> None:
     start.enter()
     import torch
 
+    import steps
     from pretended_cuda.counts import Device
     from scene_experts.data.capture import load
     from scene_experts.data.settings import Data
@@ -166,14 +134,14 @@ def main(argv: list[str] | None = None) -> None:
     if args.times:
         device.set_times(args.times)
     meters = [Meter(name, device, answers) for name in (*args.recipes, "plain gsplat")]
-    turns: list[Callable[[], object]] = [step_recipe(m.name, args, capture, m).__next__ for m in meters[:-1]]
-    turns.append(step_peer(args, capture, meters[-1]).__next__)
+    turns = [steps.run_blocks(m.name, args.data, capture, args.begin, m.begin, m.end) for m in meters[:-1]]
+    turns.append(step_peer(args, capture, meters[-1]))
     for round in range(args.rounds + 1):
         for place, turn in enumerate(turns):
             device.clear()
-            turn()
+            next(turn)
             if args.kernels and place == 0 and round == args.rounds:
-                print(f"kernels of {BLOCK} steps of {args.recipes[0]}", flush=True)
+                print(f"kernels of {steps.BLOCK} steps of {args.recipes[0]}", flush=True)
                 device.report()
         if round == 0:
             gc.collect()
