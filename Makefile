@@ -10,7 +10,10 @@
 # make crash ROUNDS=200   kill trainings of every family at random moments and compare what is resumed with what was left alone
 # make bench      the benchmarks that need no GPU
 # make wheels     the sdist and wheels for Linux, macOS and Windows in dist, compiled by zig and checked (docs/releasing.md); TARGETS="linux-x86_64"
-# make gpu DATA=CAPTURE   everything that a GPU is needed for, in slices below 9 minutes; repeat until it prints "all done"
+# make gpu OUT=FOLDER   on a machine with a GPU: everything that one is needed for, results in FOLDER; repeat until it prints "all done".
+#                 Builds no environment and fetches nothing. DATA: a capture (.gpu/capture); TRAININGS=FILE: trainings side by side
+# make gpu-parts PY=PYTHON DATA=CAPTURE   before that, without a GPU: what takes long to build, in .gpu, for a Python like that machine's
+# make gpu-rehearsal PY=PYTHON   the stages of make gpu at tiny sizes on a pretended CUDA device, after make gpu-parts
 # make pretend    the CUDA path on tensors that pretend to be on CUDA: mixed devices, and the kernels, waits and bytes of a step
 # make record-errors, make record-flags   record the command line's error sentences, or its flags and the defaults of all parts, anew in tests/golden
 # Every target builds a virtual environment in .venv first. An importable torch of PYTHON is used as it is; otherwise the pinned CPU
@@ -34,7 +37,7 @@ DEMO_FLAGS ?= --iterations $(DEMO_ITERATIONS) --resolution longest:800
 # as the package sets it when it is imported before torch, which the benchmark scripts do not
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: wheels demo view test test-fast fuzz lint record-errors record-flags docs pages bench gpu pretend sanitize crash env lpips clean
+.PHONY: wheels demo view test test-fast fuzz lint record-errors record-flags docs pages bench gpu gpu-parts gpu-rehearsal pretend sanitize crash env lpips clean
 
 env: $(STAMP)
 
@@ -127,8 +130,20 @@ wheels:
 	@$(WHEELS_ENV)/bin/pip install -q $$($(WHEELS_ENV)/bin/python tools/wheels.py --requirements)
 	$(WHEELS_ENV)/bin/python tools/wheels.py $(TARGETS)
 
-gpu: $(STAMP)
-	$(BIN)/python tools/gpu.py --data $(DATA) $(if $(WHEELS),--wheels $(WHEELS))
+PY  ?= $(PYTHON)
+OUT ?= runs/gpu
+GPU_SECONDS ?= 500
+GPU_DATA = $(or $(DATA),.gpu/capture)
+GPU_WORDS = --data $(GPU_DATA) $(if $(TRAININGS),--trainings $(TRAININGS))
+
+gpu:
+	$(PY) tools/gpu.py $(GPU_WORDS) --out $(OUT) --seconds $(GPU_SECONDS)
+
+gpu-parts:
+	$(PY) tools/gpu_parts.py --data $(DATA)
+
+gpu-rehearsal:
+	$(PY) benchmarks/pretended_cuda/start.py tools/gpu.py $(GPU_WORDS) --out build/gpu-rehearsal --seconds 3000 --tiny
 
 clean:
 	rm -rf build dist $(VENV)
