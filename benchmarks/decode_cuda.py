@@ -149,14 +149,14 @@ def format_report(cases: dict[tuple[str, str], Case], total: int, anchors: int, 
     lines = []
     for (kind, form), case in cases.items():
         forward, backward = median(case.forward[WARM_UP:]), median(case.backward[WARM_UP:])
-        config, other = case.scene.config, cases.get((kind, "composed"), case)
+        config, other = case.scene.config, cases.get((kind, "composed"))
         experts = config.decoder.num if isinstance(config.decoder, Experts) else 1
         least = compute_least_bytes(total, anchors, case.drawn, config.F, config.K, experts)
         shares = [100 * b / (1e-3 * t) / copy for b, t in zip(least, (forward, backward))]
-        ratio = (median(other.forward[WARM_UP:]) + median(other.backward[WARM_UP:])) / (forward + backward)
+        ratio = f"{(median(other.forward[WARM_UP:]) + median(other.backward[WARM_UP:])) / (forward + backward):5.2f}" if other else "-"
         lines.append(
             f"{'Triton' if form == 'native' else 'torch':7}{kind:12} forward {forward:7.3f} ms ({shares[0]:3.0f} % of the copy), "
-            f"backward {backward:7.3f} ms ({shares[1]:3.0f} %), {ratio:5.2f}x as fast as torch ({case.drawn} drawn)"
+            f"backward {backward:7.3f} ms ({shares[1]:3.0f} %), {ratio}x as fast as torch ({case.drawn} drawn)"
         )
     return lines
 

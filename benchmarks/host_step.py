@@ -36,7 +36,11 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--rounds", type=int, default=4, help="turns of each training")
     parser.add_argument("--count", type=int, default=545_742, help="Gaussians of the peer")
-    parser.add_argument("--reads", default="4:56000 4:280000 8:1200000", help="BYTES:NUMBER of the copies that the host waits for")
+    parser.add_argument(
+        "--reads",
+        default="4:56000 4:280000 8:1200000 8:0",
+        help="BYTES:NUMBER of the copies that the host waits for; the last of a size repeats",
+    )
     parser.add_argument("--kernels", action="store_true", help="list the kernels of the first recipe")
     parser.add_argument(
         "--times", type=Path, help='the device\'s time of kernels, lines "PART OF A NAME microseconds": the host then waits'

@@ -13,6 +13,7 @@ pictures stay in build/gpu.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import importlib.metadata
 import importlib.util
 import json
@@ -147,10 +148,11 @@ def prepare(parts: Path) -> dict[str, str]:
     environment = os.environ | {"SCENE_EXPERTS_GPU": "1", "PYTHONUNBUFFERED": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     environment["PYTHONPATH"] = os.pathsep.join([*map(str, path), *filter(None, [os.environ.get("PYTHONPATH")])])
     environment.setdefault("OMP_NUM_THREADS", "4")
-    if (parts / "triton.tar.xz").is_file() and "TRITON_CACHE_DIR" not in environment:
-        cache = WORK / "triton-cache"
+    packed = parts / "triton.tar.xz"
+    if packed.is_file() and "TRITON_CACHE_DIR" not in environment:
+        cache = WORK / f"triton-{hashlib.sha256(packed.read_bytes()).hexdigest()[:12]}"
         if not cache.is_dir():
-            unpack_cache(parts / "triton.tar.xz", cache)
+            unpack_cache(packed, cache)
         environment["TRITON_CACHE_DIR"] = str(cache)
     native = ROOT / "src" / "scene_experts" / "_native"
     if (parts / "native").is_dir() and not native.exists() and importlib.util.find_spec("scene_experts") is None:  # not installed here
