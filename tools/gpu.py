@@ -41,6 +41,8 @@ TESTS = (
     *("tests/unit/scene/anchors/test_triton_decode.py", "tests/unit/scene/anchors/test_triton_kernels.py"),
     *("tests/unit/scene/anchors/test_frozen.py", "tests/unit/training/test_triton_loss.py", "tests/unit/training/test_triton_adam.py"),
     *("tests/unit/training/test_triton_peer.py", "tests/unit/native/test_triton.py", "tests/unit/native/test_triton_probe.py"),
+    *("tests/unit/training/test_direct.py", "tests/unit/scene/test_triton_gaussians.py", "tests/unit/strategy/test_observe.py"),
+    *("tests/unit/scene/graph/test_fused.py", "tests/unit/scene/graph/test_triton_kernels.py"),
     *("tests/unit/core/test_transfer.py", "tests/unit/evaluate/test_metrics.py"),
 )
 """The tests of what runs on CUDA. Named, because others import packages that a GPU machine need not have."""

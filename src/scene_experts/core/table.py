@@ -15,7 +15,7 @@ class Table(nn.Module):
 
     `params` are learned. `facts` are constant for each row (positions on the lattice, levels).
     `stats` are the statistics for densification. `averages` are averages of the parameters over the
-    training, if there are any. `version` changes whenever a parameter becomes another object. Rows are added only by `append` and removed only by `keep`, which
+    training, if there are any. Rows are added only by `append` and removed only by `keep`, which
     keep all columns and moments aligned.
     """
 

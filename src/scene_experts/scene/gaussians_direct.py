@@ -5,26 +5,33 @@ from __future__ import annotations
 
 import importlib
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-import torch
+from torch import Tensor
 
 from scene_experts.core.slopes import GaussianSlopes, PullScene, Regularisers
+from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians
 from scene_experts.native import triton
 from scene_experts.scene import Cull
-
-if TYPE_CHECKING:
-    from scene_experts.scene.gaussians import GaussianScene
 
 BLOCK = 128  # Gaussians per program
 COLUMNS = ("means", "log_scales", "quats", "raw_opacity", "sh_dc", "sh_rest")
 
 
+class ExplicitScene(Protocol):
+    """What is used of a `GaussianScene`."""
+
+    table: Table
+
+    def visible(self, camera: Camera, cull: Cull) -> Tensor: ...
+    def degree(self, step: int) -> int: ...
+
+
 class DirectGaussians:
     """Draws views of a scene as long as its rows do not change."""
 
-    def __init__(self, scene: GaussianScene) -> None:
+    def __init__(self, scene: ExplicitScene) -> None:
         self.scene = scene
         params = [scene.table.params[name] for name in COLUMNS]
         self.columns = [p.detach() for p in params]

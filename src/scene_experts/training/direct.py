@@ -50,6 +50,13 @@ class DirectStep:
         assert self.drawing is not None
         return self.drawing
 
+    def describe(self, scene: Scene, step: int) -> str:
+        """Say how the view of iteration `step` is differentiated, for the start of a training."""
+        if self.refused:
+            return f"through autograd ({self.refused})"
+        self.prepare(scene, step)
+        return f"without autograd, but for the decode ({self.why})" if self.why else "without autograd"
+
     @torch.no_grad()
     def see(self, scene: Scene, camera: Camera, number: int, target: Tensor, mask: Tensor | None, background: Tensor) -> Seen:
         """Draw a training view as iteration `number`, and add the slopes of its loss to the

@@ -102,7 +102,9 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
     writes = folder is not None and run.group.first
     run.begin(training)
     about = training.scene.describe_decode(training.step + 1)
-    yield Started(training.step, total, training.scene.table.total, training.scene.traits, about)
+    direct = direct_of(training, rasterize, training.scene)
+    slopes = "" if direct is None else "through autograd (--shard)" if run.shard else direct.describe(training.scene, training.step + 1)
+    yield Started(training.step, total, training.scene.table.total, training.scene.traits, about, slopes)
     saved, parts = training.step, {}
     while training.step < total and not exchange.stopping:
         with training.clock.running():
@@ -262,7 +264,7 @@ def see_view(
     target, mask = photographs.see(index)
     training.seed_view(number)
     direct = direct_of(training, rasterize, scene)
-    if direct is not None:
+    if direct is not None and not direct.refused:
         decoded, render, terms = direct.see(scene, camera, number, target, mask, photographs.background(color))
         training.largest.see(decoded, render)
         return Iteration(decoded, render, terms, target, mask)
@@ -287,14 +289,14 @@ def resident_of(training: Training, run: Job, capture: Capture) -> Resident:
 
 
 def direct_of(training: Training, rasterize: Rasterizer, scene: Scene) -> DirectStep | None:
-    """Return what draws the views of a training on a GPU without autograd; None where autograd
-    draws them."""
+    """Return what draws the views of a training on a GPU without autograd, if it does not refuse;
+    None on a CPU, and for a scene that several processes share."""
     if scene is not training.scene or scene.table.device.type != "cuda":
         return None
     known = training.direct
     if known is None or known.rasterize is not rasterize:
         known = training.direct = DirectStep(rasterize, training.cfg.loss)
-    return None if known.refused else known
+    return known
 
 
 def survey_of(training: Training, run: Job, capture: Capture, rasterize: Rasterizer) -> Survey:

@@ -146,6 +146,15 @@ class FusedAdam(torch.optim.Adam):
 
     step.hooked = True  # type: ignore[attr-defined]  # torch puts no record of its own around the step: 25 us a step
 
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Remove the gradients, or clear them, as torch does in ten times as long."""
+        if not set_to_none:
+            return super().zero_grad(set_to_none=False)
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
+        return None
+
     def _prepared(self, parameter: Tensor, group: dict[str, Any], rows: Tensor | None) -> tuple[Tensor, Tensor | None, float, float, dict]:
         """Count the step. Return (parameter, its rows or None for all, step size, root of the
         second bias correction, group)."""

@@ -183,7 +183,8 @@ def photometric_slopes(image: Tensor, target: Tensor, lambda_dssim: float, mask:
     if not (triton.covers(image, target) and image.numel()):
         with torch.enable_grad():
             leaf = image.detach().requires_grad_()
-            (gradient,) = torch.autograd.grad(sum(photometric(leaf, target, lambda_dssim, mask)), leaf)
+            l1_term, dssim_term = photometric(leaf, target, lambda_dssim, mask)
+            (gradient,) = torch.autograd.grad(l1_term + dssim_term, leaf)
         return gradient
     if mask is None:
         return _launch_forward(image, target, float(lambda_dssim), True, both=True)[1]

@@ -74,6 +74,8 @@ class TrainingProgress:
                 self.print_line(f"{verb}: {event.anchors:,} {rows}{lattice}, {event.total:,} iterations")
                 if event.decode:
                     self.print_line(f"decode: {event.decode}")
+                if event.slopes:
+                    self.print_line(f"step: {event.slopes}")
             case Stepped():
                 self.show_step(event)
             case Densified():

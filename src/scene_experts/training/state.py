@@ -175,9 +175,7 @@ class Training:
             self.optimizer.step()
         else:
             self.optimizer.step(rows=rows)  # type: ignore[call-arg]
-        for group in self.optimizer.param_groups:
-            for parameter in group["params"]:
-                parameter.grad = None
+        self.optimizer.zero_grad(set_to_none=True)
 
     def companions(self, parameter: Tensor) -> list[Tensor]:
         """Return the tensors that follow a parameter of a network, each of its shape: the

@@ -1,5 +1,6 @@
 """The kernels of explicit Gaussians against plain torch in float64."""
 
+import importlib
 from dataclasses import replace
 
 import pytest
@@ -62,9 +63,6 @@ def test_value_and_slopes_are_the_equations(degree, seen):
 @pytest.mark.parametrize("name", ["decode", "pull_back"])
 def test_they_compile(name, target):
     types = {"rows": "*i64", "A": "i32", "volume": "fp32"}
-    pointers = dict.fromkeys(
-        "means log_scales quats raw dc rest camera out_means out_quats out_scales out_opacities out_colors unit_quats scales opacities "
-        "colors by_means by_quats by_scales by_opacities by_colors d_means d_log_scales d_quats d_raw d_dc d_rest".split(),
-        "*fp32",
-    )
+    module = importlib.import_module(MODULE)
+    pointers = {p.name: "*fp32" for p in getattr(module, name).params if not p.is_constexpr}
     compile_for_gpu(MODULE, name, {**pointers, **types}, {"REST": 15, "COUNT": 16, "B": 128}, target)

@@ -7,25 +7,39 @@ Gaussians alone (fading levels, masked slots, smoothing), goes through autograd 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 
 from scene_experts.core.lazy import LazyMapping
 from scene_experts.core.slopes import GaussianSlopes, PullScene, Regularisers
+from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Mode, Routing
 from scene_experts.scene import Cull
 from scene_experts.scene.anchors import triton_decode as fused
-from scene_experts.scene.anchors.appearance import fold
-from scene_experts.scene.anchors.mlp import ATTRIBUTES, HeadWeights
-
-if TYPE_CHECKING:
-    from scene_experts.scene.anchors.scene import AnchorScene
+from scene_experts.scene.anchors.appearance import Codes, fold
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, Head, HeadWeights
 
 COLUMNS = ("feature", "log_scaling", "offsets")
 PARTS = ("means", "quats", "scales", "opacities", "colors")
+
+
+class DecodedScene(Protocol):
+    """What is used of an `AnchorScene`."""
+
+    table: Table
+    config: Any
+    extent: float
+    codes: Codes | None
+    heads: Mapping[str, Head]
+
+    @property
+    def changes_drawn(self) -> bool: ...
+    def choose(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> tuple[Tensor, Camera]: ...
+    def finish(self, decoded: Decoded, camera: Camera, step: int, mode: Mode) -> Decoded: ...
 
 
 @dataclass(frozen=True)
@@ -70,7 +84,7 @@ def _tensors(w: HeadWeights) -> list[Tensor]:
 class DirectAnchors:
     """Draws views of a scene as long as its rows and the phase of its networks do not change."""
 
-    def __init__(self, scene: AnchorScene, weights: dict[str, HeadWeights], load: bool) -> None:
+    def __init__(self, scene: DecodedScene, weights: dict[str, HeadWeights], load: bool) -> None:
         """weights: those of the phase, see `explain_uncovered`. load: whether the loss has the
         load-balancing term."""
         table, config = scene.table, scene.config
@@ -79,7 +93,7 @@ class DirectAnchors:
         self.columns = [p.detach() for p in self.params]
         given = {**weights, "color": fold(weights["color"], self.codes.table[0])} if self.codes else weights
         with_dist = {a: a in config.add_dist for a in ATTRIBUTES}
-        self.nets = fused.Networks(given, with_dist, config.F, config.K, constant=not load)
+        self.nets = fused.KernelNetworks(given, with_dist, config.F, config.K, constant=not load)
         self.weights = [getattr(weights[a], name).detach() for a in ATTRIBUTES for name in fused.NETWORK]
         self.routers = [getattr(weights[a], name) for a in ATTRIBUTES for name in ("router_w", "router_b")]
         sizes = [p.numel() for p in self.params]
@@ -90,7 +104,7 @@ class DirectAnchors:
         self.larger: list[Tensor] = []  # gradients of parameters of which the kernels take a part
         self.moves: tuple[list[Tensor], list[Tensor]] = [], []  # their parts, and where the kernels write these
         self._place(weights)
-        self.kept: tuple[Any, fused.Routed] | None = None  # routing of the table that nothing trains
+        self.kept: tuple[Any, fused.RoutingArrays] | None = None  # routing of the table that nothing trains
 
     def _place(self, weights: dict[str, HeadWeights]) -> None:
         """Find the gradient of each parameter of the networks."""
@@ -135,7 +149,7 @@ class DirectAnchors:
             weights = [*weights[:8], color.w1.contiguous(), color.b1.contiguous(), *weights[10:]]
         xyz = scene.table.facts["xyz"]
         position = seen_from.position.to(xyz.device)
-        view = fused.View(self.nets, rows, xyz, position, self.columns, weights, self.routers, scene.extent)
+        view = fused.AnchorView(self.nets, rows, xyz, position, self.columns, weights, self.routers, scene.extent)
         drawn = fused.draw(view, self._route(view))
         decoded = Decoded(drawn.gaussians, rows, drawn.raw, LazyMapping(lambda: self._find_routing(drawn, step)))
         shown, graph = self._finish(decoded, camera, step)
@@ -147,7 +161,7 @@ class DirectAnchors:
             self.slopes.zero_()
             self._pull(drawn, shown, graph, slopes, terms)
             if self.moves[0]:
-                torch._foreach_copy_(*self.moves)
+                torch._foreach_copy_(*self.moves)  # pyright: ignore[reportPrivateImportUsage]
             if code is not None:
                 self._unfold(camera, code)
             for parameter, gradient in self.grads:
@@ -155,7 +169,7 @@ class DirectAnchors:
 
         return shown, pull
 
-    def _route(self, view: fused.View) -> fused.Routed:
+    def _route(self, view: fused.AnchorView) -> fused.RoutingArrays:
         """Return the routing. Where nothing trains it, it is that of the whole table, made once."""
         nets = self.nets
         learned = any(t is not None and t.requires_grad for t in self.routers)
@@ -165,10 +179,10 @@ class DirectAnchors:
         if self.kept is None or self.kept[0] != key:
             everyone = torch.arange(len(view.xyz), device=view.xyz.device)
             made = fused.route(replace(view, rows=everyone))
-            self.kept = key, fused.Routed(made.stride, by_row=True, keys=made.keys)
+            self.kept = key, fused.RoutingArrays(made.stride, by_row=True, keys=made.keys)
         return self.kept[1]
 
-    def _find_routing(self, drawn: fused.Drawn, step: int) -> dict[str, Routing]:
+    def _find_routing(self, drawn: fused.DrawnView, step: int) -> dict[str, Routing]:
         """Return the routing of the anchors as the scene's own decode gives it."""
         view, routed = drawn.view, {ATTRIBUTES[i]: i for i in self.nets.routed}
         if drawn.routed.gates is not None:
@@ -196,7 +210,7 @@ class DirectAnchors:
 
     def _pull(
         self,
-        drawn: fused.Drawn,
+        drawn: fused.DrawnView,
         shown: Decoded,
         graph: tuple[list[Tensor], list[Tensor]] | None,
         slopes: GaussianSlopes,

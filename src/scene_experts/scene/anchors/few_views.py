@@ -47,12 +47,20 @@ def displace(camera: Camera, distance: float) -> Camera:
     place = camera.world_to_cam.clone()
     moved = camera.position + torch.randn(3, dtype=place.dtype, device=place.device) * (distance / math.sqrt(3.0))
     place[:3, 3] = -(place[:3, :3] @ moved)
-    return replace(camera, world_to_cam=place)
+    made = replace(camera, world_to_cam=place)
+    if place.is_cuda:  # known already; four kernels less
+        made.__dict__["position"] = moved
+    return made
 
 
 def drop_anchors(rows: Tensor, share: float) -> Tensor:
     """Return the rows [A] without a random `share` of them."""
-    return rows[torch.rand(len(rows), device=rows.device) >= share]
+    return rows[keep_at_random(len(rows), share, rows.device)]
+
+
+def keep_at_random(count: int, share: float, device: torch.device) -> Tensor:
+    """Return [count] bool: false for a random `share` of them."""
+    return torch.rand(count, device=device) >= share
 
 
 def find_weight(few: int, views: int) -> float:

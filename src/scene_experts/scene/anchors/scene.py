@@ -34,7 +34,7 @@ from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors.appearance import Codes, fold
 from scene_experts.scene.anchors.direct import DirectAnchors, explain_uncovered
 from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
-from scene_experts.scene.anchors.few_views import displace, drop_anchors, find_spacings, find_weight
+from scene_experts.scene.anchors.few_views import displace, find_spacings, find_weight
 from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, Attribute, Decoder, Head, HeadWeights, Plain
 from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, drop_masked, fade_opacities, visible_rows
@@ -259,9 +259,10 @@ class AnchorScene(LatticeScene):
     def choose(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> tuple[Tensor, Camera]:
         """Return the rows [A] that are decoded for `camera` at `step`, and the camera that they are
         decoded for."""
-        rows, seen_from, config = self.visible(camera, step, mode, cull), camera, self.config
+        seen_from, config, share = camera, self.config, 0.0
         if config.dropout and self.few_weight and mode is Mode.TRAIN:
-            rows = drop_anchors(rows, config.dropout * self.few_weight * min(1.0, step / config.dropout_full))
+            share = config.dropout * self.few_weight * min(1.0, step / config.dropout_full)
+        rows = self.visible(camera, step, mode, cull, share)
         if config.view_jitter and self.few_weight and mode is Mode.TRAIN:
             seen_from = displace(camera, config.view_jitter * self.few_weight * self.spacings.get(camera.id, 0.0))
         return rows, seen_from
@@ -286,12 +287,13 @@ class AnchorScene(LatticeScene):
             return "a decoder with phases of its own"
         return explain_uncovered(weights) or DirectAnchors(self, weights, load)
 
-    def visible(self, camera: Camera, step: int, mode: Mode, cull: Cull) -> Tensor:
-        """Return the rows [A] that `camera` sees at `step`."""
+    def visible(self, camera: Camera, step: int, mode: Mode, cull: Cull, dropped: float = 0.0) -> Tensor:
+        """Return the rows [A] that `camera` sees at `step`, without a random share `dropped` of
+        them."""
         table = self.table
         sizes = table.params["log_scaling"].detach()[:, :3]
         scales = (sizes if sizes.is_cuda else sizes.contiguous()).exp()  # takes 7 times as long on a CPU where they are not contiguous
-        return visible_rows(self.select(table, camera, step, mode), table.facts["xyz"], scales, camera, cull)
+        return visible_rows(self.select(table, camera, step, mode), table.facts["xyz"], scales, camera, cull, dropped)
 
     def with_table(self, table: Table) -> AnchorScene:
         """Return a scene with the same networks and the anchors of `table`."""

@@ -21,6 +21,7 @@ from scene_experts.core.types import Camera, Decoded, Gaussians, Mode
 from scene_experts.geometry.voxel import find_unique_cells, to_lattice
 from scene_experts.scene import Cull
 from scene_experts.scene.anchors import levels as lattices
+from scene_experts.scene.anchors.few_views import drop_anchors, keep_at_random
 from scene_experts.scene.anchors.levels import LevelRule, Levels, blend_levels, whole
 
 
@@ -285,13 +286,18 @@ class LevelSelector:
         return {"levels": self.lattices.meta()}
 
 
-def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera: Camera, cull: Cull) -> Tensor:
-    """Return rows [A] of the selected anchors whose ellipsoid overlaps the image. means [N, 3],
-    scales [N, 3]; no gradient."""
+def visible_rows(selected: Tensor | None, means: Tensor, scales: Tensor, camera: Camera, cull: Cull, dropped: float = 0.0) -> Tensor:
+    """Return rows [A] of the selected anchors whose ellipsoid overlaps the image, without a random
+    share `dropped` of them. means [N, 3], scales [N, 3]; no gradient."""
     with torch.no_grad():
         if selected is None:
-            return cull(means, scales, camera).nonzero().squeeze(1)
-        return selected[cull(means.index_select(0, selected), scales.index_select(0, selected), camera)]
+            seen = cull(means, scales, camera)
+            if dropped and means.is_cuda:  # one list of rows, and one wait of the host for its length, instead of two
+                seen = seen & keep_at_random(len(means), dropped, means.device)
+            rows = seen.nonzero().squeeze(1)
+        else:
+            rows = selected[cull(means.index_select(0, selected), scales.index_select(0, selected), camera)]
+        return drop_anchors(rows, dropped) if dropped and not (selected is None and means.is_cuda) else rows
 
 
 def fade_opacities(decoded: Decoded, fade: Tensor | None, rows: int, K: int) -> Decoded:

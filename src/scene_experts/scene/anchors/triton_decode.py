@@ -58,7 +58,7 @@ def pad(n: int, least: int = 16) -> int:
 
 
 @dataclass(frozen=True)
-class Head:
+class KernelHead:
     """The kernels' view of one attribute."""
 
     E: int
@@ -77,7 +77,7 @@ class Head:
         return self.E, self.k, self.bias, self.position
 
 
-class Networks:
+class KernelNetworks:
     """The networks of a scene as the kernels take them: the compile-time constants, and where the
     slopes of each tensor lie in one array."""
 
@@ -155,7 +155,7 @@ def _count(shape: tuple[int, ...]) -> int:
     return torch.Size(shape).numel()
 
 
-def _head(attribute: str, h: HeadWeights, distance: bool, F: int, K: int, constant: bool) -> Head:
+def _head(attribute: str, h: HeadWeights, distance: bool, F: int, K: int, constant: bool) -> KernelHead:
     E, H, D = h.w1.shape
     C = CHANNELS[attribute]
     if F + 3 + distance != D or tuple(h.w2.shape) != (E, K * C, H):
@@ -172,11 +172,11 @@ def _head(attribute: str, h: HeadWeights, distance: bool, F: int, K: int, consta
     kind = PLAIN if not routed else DENSE if not k else LOCAL if k == 1 and constant and not h.routed_outside else SPARSE
     shapes = tuple(tuple(getattr(h, name).shape) for name in NETWORK)
     router = tuple(tuple(t.shape) for t in (h.router_w, h.router_b) if t is not None and not h.routed_outside)
-    return Head(E, k, kind, h.routed_outside, distance, h.position, h.router_b is not None, shapes, router)
+    return KernelHead(E, k, kind, h.routed_outside, distance, h.position, h.router_b is not None, shapes, router)
 
 
 @dataclass
-class Routed:
+class RoutingArrays:
     """Arrays of routing, those of head h from h * stride on. They belong to the anchors of a view,
     or to all rows of a table (`by_row`)."""
 
@@ -188,7 +188,7 @@ class Routed:
     keys: Tensor | None = None
     counts: Tensor | None = None
 
-    def part(self, nets: Networks, i: int, A: int) -> tuple[Tensor | None, Tensor | None]:
+    def part(self, nets: KernelNetworks, i: int, A: int) -> tuple[Tensor | None, Tensor | None]:
         """Return the gates [A, E] and the chosen experts [A, k] of head i, as `Routing` has them."""
         h = nets.heads[i]
         if not h.router or self.gates is None:
@@ -201,11 +201,11 @@ class Routed:
 
 
 @dataclass
-class View:
+class AnchorView:
     """What anchors are decoded from: the inputs that have no slopes, and the tensors of the
     networks."""
 
-    nets: Networks
+    nets: KernelNetworks
     rows: Tensor  # [A] int64
     xyz: Tensor  # [N, 3]
     camera: Tensor  # [3]
@@ -216,11 +216,11 @@ class View:
 
 
 @dataclass
-class Drawn:
+class DrawnView:
     """The Gaussians of a view, and what `pull_back` needs."""
 
-    view: View
-    routed: Routed
+    view: AnchorView
+    routed: RoutingArrays
     order: Tensor | None
     gaussians: Gaussians
     raw: Tensor  # [A, K]
@@ -285,7 +285,7 @@ def decode(
     Raises:
         ValueError: The shapes do not match, or the kernels do not support a network.
     """
-    nets = Networks(heads, with_dist, feature.shape[1], offsets.shape[1])
+    nets = KernelNetworks(heads, with_dist, feature.shape[1], offsets.shape[1])
     given = (nets, rows.contiguous(), xyz.detach().contiguous(), camera_position.detach().to(xyz).contiguous(), extent)
     weights = [getattr(heads[a], name) for a in ATTRIBUTES for name in NETWORK]
     routers = [getattr(heads[a], name) for a in ATTRIBUTES for name in ("router_w", "router_b")]
@@ -316,7 +316,7 @@ class _Decode(torch.autograd.Function):
         nets, rows, xyz, camera, extent = given
         columns = [t.detach().contiguous() for t in (feature, log_scaling, offsets)]
         plain = [None if t is None else t.detach().contiguous() for t in weights]
-        view = View(nets, rows, xyz, camera, columns, plain[:12], plain[12:18], extent)  # type: ignore[arg-type]
+        view = AnchorView(nets, rows, xyz, camera, columns, plain[:12], plain[12:18], extent)  # type: ignore[arg-type]
         drawn = draw(view, route(view, plain[18:], keys))
         parts = [drawn.routed.part(nets, i, len(rows)) for i in range(3)]
         gates, chosen = zip(*parts)
@@ -328,7 +328,7 @@ class _Decode(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
-        drawn: Drawn = ctx.drawn
+        drawn: DrawnView = ctx.drawn
         ctx.drawn = None
         nets, columns = drawn.view.nets, drawn.view.columns
         means, quats, scales, opacities, colors, _, raw = (g.contiguous() for g in upstream[:7])
@@ -346,7 +346,7 @@ class _Decode(torch.autograd.Function):
 # --- routing ------------------------------------------------------------------------------------------------------------------------------
 
 
-def route(view: View, mixed: Sequence[Tensor | None] = (None,) * 3, keys: Sequence[Tensor | None] = (None,) * 3) -> Routed:
+def route(view: AnchorView, mixed: Sequence[Tensor | None] = (None,) * 3, keys: Sequence[Tensor | None] = (None,) * 3) -> RoutingArrays:
     """Return the routing of the anchors of a view.
 
     mixed, keys: for heads that are routed outside, the weights [A, E] and the sets of chosen
@@ -354,11 +354,11 @@ def route(view: View, mixed: Sequence[Tensor | None] = (None,) * 3, keys: Sequen
     """
     nets, A = view.nets, view.rows.shape[0]
     if not nets.routed:
-        return Routed()
+        return RoutingArrays()
     stride, EM = _align(A), nets.EM
     new = lambda n, dtype=torch.float32: torch.empty(3 * stride * n, dtype=dtype, device=view.rows.device)  # noqa: E731
     most = max(h.k for h in nets.heads)
-    out = Routed(stride, gates=new(EM), chosen=new(most, torch.int64) if most else None, keys=new(1, torch.int32) if most else None)
+    out = RoutingArrays(stride, gates=new(EM), chosen=new(most, torch.int64) if most else None, keys=new(1, torch.int32) if most else None)
     out.weight = new(EM) if most else out.gates
     blocks = -(-A // BLOCK_ROUTES)
     if not A:
@@ -378,7 +378,7 @@ def route(view: View, mixed: Sequence[Tensor | None] = (None,) * 3, keys: Sequen
                 own = slice(i * stride * EM, (i + 1) * stride * EM)
                 out.weight[own] = out.gates[own]  # type: ignore[index]
     for i, (w, key) in enumerate(zip(mixed, keys)):
-        if w is not None:
+        if w is not None and out.weight is not None:
             out.weight[i * stride * EM :][: w.numel()] = w.view(-1)
         if key is not None and out.keys is not None:
             out.keys[i * stride :][:A] = key
@@ -401,7 +401,7 @@ def _align(count: int) -> int:
     return max(-(-count // 16) * 16, 16)
 
 
-def arrange(view: View, routed: Routed) -> Tensor | None:
+def arrange(view: AnchorView, routed: RoutingArrays) -> Tensor | None:
     """Return the indices of the anchors sorted by their keys, [A] or [3, stride]; None where no
     head needs them."""
     nets, A = view.nets, view.rows.shape[0]
@@ -429,7 +429,7 @@ def arrange(view: View, routed: Routed) -> Tensor | None:
 # --- decode -------------------------------------------------------------------------------------------------------------------------------
 
 
-def draw(view: View, routed: Routed) -> Drawn:
+def draw(view: AnchorView, routed: RoutingArrays) -> DrawnView:
     """Decode routed anchors."""
     nets, rows, A = view.nets, view.rows, view.rows.shape[0]
     feature, log_scaling, offsets = view.columns
@@ -454,17 +454,17 @@ def draw(view: View, routed: Routed) -> Drawn:
         nets.launch("shape_and_color_forward", BY_ROW=routed.by_row)((*grid, 2), *arguments)
         placed = (rows, view.xyz, offsets, log_scaling, raw, cov, dst, means, quats, scales, opacities, source, A)
         _place_launch("place", K=K, B=BLOCK, KP=pad(K, 1))(grid, *placed)
-    return Drawn(view, routed, order, Gaussians(means, quats, scales, opacities, colors, source), raw, dst, cov)
+    return DrawnView(view, routed, order, Gaussians(means, quats, scales, opacities, colors, source), raw, dst, cov)
 
 
-def pull_back(drawn: Drawn, slopes: Slopes, into: Sequence[Tensor], flat: Tensor) -> list[Tensor | None]:
+def pull_back(drawn: DrawnView, slopes: Slopes, into: Sequence[Tensor], flat: Tensor) -> list[Tensor | None]:
     """Write the slopes of the inputs of a view from those of its outputs.
 
     Args:
         drawn: The view. Only the routing of LOCAL heads may be that of the rows of the table.
         slopes: Slopes of the outputs, contiguous.
         into: Zeros of the shapes of feature, log-scaling and offsets, for their slopes.
-        flat: [width], for the slopes of the networks and routers, see `Networks.shapes`.
+        flat: [width], for the slopes of the networks and routers, see `KernelNetworks.shapes`.
 
     Returns:
         The slopes of given mixture weights [A, E] by head; None where they were not given.
@@ -505,7 +505,7 @@ def pull_back(drawn: Drawn, slopes: Slopes, into: Sequence[Tensor], flat: Tensor
     return [d_logits[i * far : i * far + A * h.E].view(A, h.E) if h.outside else None for i, h in enumerate(nets.heads)]
 
 
-def _push_features(drawn: Drawn, slopes: Slopes, d_all: Tensor, d_cov: Tensor, d_feature: Tensor) -> Tensor | None:
+def _push_features(drawn: DrawnView, slopes: Slopes, d_all: Tensor, d_cov: Tensor, d_feature: Tensor) -> Tensor | None:
     """Write the slopes of the features. Return those of the logits of all heads, or None if there
     are none."""
     view, routed, order = drawn.view, drawn.routed, drawn.order
@@ -538,7 +538,7 @@ def _push_features(drawn: Drawn, slopes: Slopes, d_all: Tensor, d_cov: Tensor, d
     return d_logits
 
 
-def find_load_slopes(drawn: Drawn, weight: float) -> Tensor:
+def find_load_slopes(drawn: DrawnView, weight: float) -> Tensor:
     """Return the slopes [3, EM] of the load-balancing loss, times `weight`, in the gates of every
     anchor. They are those of eq. 7 while a head is dense, and of eq. 6 after it."""
     view, routed, nets, A = drawn.view, drawn.routed, drawn.view.nets, len(drawn.view.rows)
@@ -583,7 +583,7 @@ class Routes:
     ) -> None:
         """xyz [N, 3]; columns: feature [N, F], log_scaling [N, 6], offsets [N, K, 3], all
         contiguous. Other arguments: see `decode`."""
-        self.nets = Networks(heads, with_dist, columns[0].shape[1], columns[2].shape[1], constant=True)
+        self.nets = KernelNetworks(heads, with_dist, columns[0].shape[1], columns[2].shape[1], constant=True)
         self.xyz, self.columns, self.extent = xyz, columns, extent
         mixed, keys = zip(*(_spread(outside[a], len(heads[a].w1)) if a in outside else (None, None) for a in ATTRIBUTES))
         everyone = torch.arange(len(xyz), device=xyz.device)
@@ -597,10 +597,10 @@ class Routes:
     def bytes(self) -> int:
         return sum(t.numel() * t.element_size() for t in (self.routed.weight, self.routed.keys) if t is not None)
 
-    def _view(self, rows: Tensor, camera: Tensor, heads: dict[str, HeadWeights]) -> View:
+    def _view(self, rows: Tensor, camera: Tensor, heads: dict[str, HeadWeights]) -> AnchorView:
         weights = [getattr(heads[a], name).contiguous() for a in ATTRIBUTES for name in NETWORK]
         routers = [getattr(heads[a], name) for a in ATTRIBUTES for name in ("router_w", "router_b")]
-        return View(self.nets, rows.contiguous(), self.xyz, camera, self.columns, weights, routers, self.extent)
+        return AnchorView(self.nets, rows.contiguous(), self.xyz, camera, self.columns, weights, routers, self.extent)
 
     @torch.no_grad()
     def decode(self, rows: Tensor, camera_position: Tensor, heads: dict[str, HeadWeights]) -> tuple[Gaussians, Tensor]:
