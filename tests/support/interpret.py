@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -21,23 +22,38 @@ def kernels(module: str = "scene_experts.scene.anchors.triton_kernels"):
 
 
 COMPILE = """
-import importlib, json, sys, triton
+import importlib, json, os, re, subprocess, sys, tempfile, triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 module, name, types, sizes, target, options = json.loads(sys.argv[1])
 kernel = getattr(importlib.import_module(module), name)
 signature = {p.name: "constexpr" if p.is_constexpr else types.get(p.name, "fp32") for p in kernel.params}
 constants = {p.name: sizes[p.name] for p in kernel.params if p.is_constexpr}
-made = triton.compile(ASTSource(kernel, signature, constants), target=GPUTarget("cuda", target, 32), options=options)
-print("compiled", made.metadata.shared)
+aligned = {(i,): [["tt.divisibility", 16]] for i, p in enumerate(kernel.params) if signature[p.name].startswith("*")}
+made = triton.compile(ASTSource(kernel, signature, constants, aligned), target=GPUTarget("cuda", target, 32), options=options)
+tool = os.path.join(os.path.dirname(triton.__file__), "backends", "nvidia", "bin", "cuobjdump")
+with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+    file.write(made.asm["cubin"])
+    file.flush()
+    said = subprocess.run([tool, "-res-usage", file.name], capture_output=True, text=True)
+found = re.search(r"REG:(\\d+) STACK:(\\d+)", said.stdout + said.stderr)
+print("compiled", made.metadata.shared, *(found.groups() if found else (-1, -1)))
 """
 
 
-def compile_for_gpu(module: str, name: str, types: dict[str, str], sizes: dict, target: int, **options) -> int:
-    """Compile a kernel for a GPU of this compute capability and return its bytes of shared memory. Arguments without a type are fp32."""
+class Usage(NamedTuple):
+    """What a kernel takes of a GPU: bytes of shared memory for a block, registers and bytes of local memory for a thread."""
+
+    shared: int
+    registers: int
+    local: int
+
+
+def compile_for_gpu(module: str, name: str, types: dict[str, str], sizes: dict, target: int, **options) -> Usage:
+    """Compile a kernel for a GPU of this compute capability, with addresses that 16 divides. Arguments without a type are fp32."""
     pytest.importorskip("triton", reason="triton is not installed")
     environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"} | {"PYTHONPATH": os.pathsep.join(sys.path)}
     given = json.dumps([module, name, types, sizes, target, options])
     done = subprocess.run([sys.executable, "-c", COMPILE, given], env=environment, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr[-3000:]
-    return int(done.stdout.split()[-1])
+    return Usage(*map(int, done.stdout.split()[-3:]))

@@ -20,18 +20,18 @@ class Most(NamedTuple):
 
 
 LEAN = {
-    "scaffold-gs:fused": Most(105, 3, 1.25e6),
-    "scaffold-gs:sparse": Most(105, 3, 1.25e6),
-    "moe-gs:fused": Most(178, 3, 4.0e6),
+    "scaffold-gs:fused": Most(29, 3, 1.1e6),
+    "scaffold-gs:sparse": Most(29, 3, 1.1e6),
+    "moe-gs:fused": Most(37, 3, 4.7e6),
 }
 FAMILIES = {
-    "scaffold-gs-bank:composed": Most(235, 3, 2.2e6),
-    "scene-experts:fused": Most(140, 4, 4.0e6),  # with dropout, whose rows are counted on the host, and the displaced position
-    "octree-gs:fused": Most(126, 4, 0.75e6),
-    "moe-gs-balance:composed": Most(490, 12, 7.9e6),  # counts its experts on the host
-    "3dgs:composed": Most(278, 2, 0.7e6),
-    "3dgs-mcmc:composed": Most(345, 2, 0.32e6),
-    "sags:composed": Most(145, 4, 63e6),  # Adam and the gradient of the whole hash grid are most of the bytes
+    "scaffold-gs-bank:composed": Most(200, 3, 2.1e6),
+    "scene-experts:fused": Most(40, 3, 3.6e6),  # with dropout and the displaced position
+    "octree-gs:fused": Most(48, 4, 0.7e6),
+    "moe-gs-balance:composed": Most(440, 12, 7.6e6),  # counts its experts on the host
+    "3dgs:composed": Most(25, 2, 0.27e6),
+    "3dgs-mcmc:composed": Most(97, 2, 0.16e6),
+    "sags:composed": Most(117, 4, 63e6),
 }
 GROUPS = [list(LEAN)[:2], list(LEAN)[2:], *(list(FAMILIES)[i : i + 2] for i in range(0, len(FAMILIES), 2))]  # a process each
 CLOSE = 1e-4  # relative, of losses and gradients

@@ -59,5 +59,8 @@ def test_the_kernels_compile(target):
     images = dict.fromkeys(("image", "target", "gradient", "sums", "by_l1", "by_dssim", "out"), "*fp32")
     types, sizes = images | {"H": "i32", "W": "i32", "count": "i32"}, {"R": 5, "SCALE": 0.2, "NORM": 3.76, "C1": 1e-4, "C2": 9e-4}
     sizes |= {"T": module.TILE, "WANTED": True, "PRECISION": module.PRECISION}
-    compile_for_gpu("scene_experts.training.triton_loss", "forward", types, sizes, target, num_warps=module.WARPS)
+    for both in (True, False):
+        constants = sizes | {"BOTH": both}
+        found = compile_for_gpu("scene_experts.training.triton_loss", "forward", types, constants, target, num_warps=module.WARPS)
+        assert found.local == 0, found
     compile_for_gpu("scene_experts.training.triton_loss", "backward", types, {"B": 1024}, target)

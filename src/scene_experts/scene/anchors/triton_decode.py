@@ -36,9 +36,10 @@ BLOCK_WEIGHTS = 16  # anchors per step of `heads_weights`, which also keeps the 
 BLOCK_ROUTES = 64  # anchors per program of the routing
 BLOCK_SLOTS = 1024  # slots per program of `number`
 BLOCK_BACKWARD = 16  # anchors per program of `heads_backward`
-WARPS_BACKWARD = WARPS_WEIGHTS = 8
-"""Warps of `heads_backward` and `heads_weights`: with these blocks, nothing is kept in local memory
-(sm_90). For one head, 8 warps were up to four times as fast as 4 on an H100."""
+WARPS_BACKWARD = 8
+WARPS_WEIGHTS = {16: 8, 32: 8, 64: 16}
+"""Warps of `heads_backward`, and of `heads_weights` by padded hidden width: next to nothing is kept in
+local memory (sm_90). For one head, 8 and 16 were four times as fast as 4 on an H100."""
 MOST_EXPERTS = 30  # a set of experts is stored as the bits of an int32
 MOST_BINS = 64  # keys that the anchors are sorted by counting; more are sorted by torch
 WIDEST = 256  # largest padded number of outputs
@@ -125,7 +126,7 @@ class KernelNetworks:
         self.back = {**kinds, **of(("OUT", "outside"), ("POS", "position")), **columns, **size, "EM": self.EM}
         self.back |= {"EP": pad(self.EM), "B": BLOCK_BACKWARD, "num_warps": WARPS_BACKWARD}
         self.sums = {**kinds, **columns, **size, "EM": self.EM, "ONE_ORDER": self.one_order, "B": BLOCK_WEIGHTS}
-        self.sums |= {"C_AT": self.places[1], "R_AT": self.places[2], "WIDTH": self.width, "num_warps": WARPS_WEIGHTS}
+        self.sums |= {"C_AT": self.places[1], "R_AT": self.places[2], "WIDTH": self.width, "num_warps": WARPS_WEIGHTS[pad(self.H)]}
 
     def launch(self, name: str, **extra: Any) -> triton.Launch:
         """Return a kernel of `triton_kernels` with its constants."""

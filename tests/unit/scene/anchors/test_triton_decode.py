@@ -282,3 +282,16 @@ def test_on_cuda_the_host_waits_once(triton):
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert sum("synchroniz" in str(w.message) for w in caught) == 1
+
+
+@pytest.mark.usefixtures("triton")
+@pytest.mark.parametrize("case", [{"E": 5, "k": 2}, {"E": 3, "k": (2, 0, None)}, {"E": 4, "k": 1}, {"E": 7, "k": 2}])
+def test_routing_of_the_whole_table_draws_a_part_of_it_as_decode_does(case):
+    rows, columns, camera, heads, with_dist = problem(A=37, N=90, **case)
+    columns, heads = moved(columns, heads)
+    kept = triton_decode.Routes(columns["xyz"], [columns[n] for n in ("feature", "log_scaling", "offsets")], heads, with_dist, EXTENT)
+    with torch.no_grad():
+        expected, expected_raw, _ = call(rows, columns, camera, heads, with_dist)
+        found, raw = kept.decode(rows.to(DEVICE), camera.float().to(DEVICE), heads)
+    assert torch.equal(raw, expected_raw)
+    assert all(torch.equal(getattr(found, n), getattr(expected, n)) for n in (*PARTS, "source"))

@@ -1,64 +1,85 @@
 """The parts of the Triton kernels that the decode's own tests do not see, and whether the kernels compile for a GPU (none is needed)."""
 
-import os
-import subprocess
-import sys
+import importlib
 
 import pytest
 import torch
 
-from support.interpret import DEVICE, kernels
+from scene_experts.scene.anchors import triton_decode
+from scene_experts.scene.anchors.mlp import HeadWeights
+from support.interpret import DEVICE, compile_for_gpu, kernels
 
 triton_kernels = kernels()  # skips this file where triton is not installed
 import triton  # noqa: E402
 import triton.language as tl  # noqa: E402
 
-COMPILE = """
-import torch, triton
-from triton.backends.compiler import GPUTarget
-from triton.compiler import ASTSource
-from scene_experts.scene.anchors import triton_decode, triton_kernels
-from scene_experts.scene.anchors.mlp import HeadWeights
+TYPES = {"rows": "*i64", "order": "*i32", "keys": "*i32", "chosen": "*i64", "dst": "*i32", "source": "*i64", "positive": "*i32"}
+TYPES |= {"counts": "*i32", "counted": "*i32", "A": "i32", "blocks": "i32", "stride": "i32", "to_stride": "i32"}
+NUMBERS = ("extent", "volume", "hinge", "tau", "factor")
+PHASES = {  # experts, those chosen (0: no router, None: all), hidden width; and the bytes of local memory that its kernels may take
+    "scaffold-gs": (1, 0, 32, 0),
+    "moe-gs, dense": (5, None, 32, 0),
+    "moe-gs, sparse": (5, 2, 32, 32),
+    "scene-experts, one": (1, 0, 64, 160),
+    "scene-experts, places": (5, 1, 64, 64),
+}
 
-TYPES = {"rows": "*i64", "order": "*i64", "keys": "*i32", "chosen": "*i64", "dst": "*i32", "source": "*i64", "A": "i32", "blocks": "i32"}
-TYPES["extent"] = "fp32"
-F, K, H, E = 8, 2, 16, 3
 
-def check(name, sizes, target):
-    kernel = getattr(triton_kernels, name)
-    signature = {p.name: "constexpr" if p.is_constexpr else TYPES.get(p.name, "*fp32") for p in kernel.params}
-    constants = {p.name: sizes[p.name] for p in kernel.params if p.is_constexpr}
-    triton.compile(ASTSource(kernel, signature, constants), target=GPUTarget("cuda", target, 32))
+def networks(E, k, H, F=32, K=10):
+    """The constants of a recipe's kernels."""
+    heads = {}
+    for a in triton_decode.ATTRIBUTES:
+        out, router = K * triton_decode.CHANNELS[a], (None, None) if k == 0 else (torch.zeros(E, F), torch.zeros(E))
+        shapes = (torch.zeros(E, H, F + 3), torch.zeros(E, H), torch.zeros(E, out, H), torch.zeros(E, out))
+        heads[a] = HeadWeights(*router, *shapes, k or None)
+    return triton_decode.KernelNetworks(heads, dict.fromkeys(heads, False), F, K, constant=True)
 
-def head(a, k, E):
-    out = K * triton_decode.CHANNELS[a]
-    router = None if k == 0 else torch.zeros(E, F)
-    weights = HeadWeights(router, None, torch.zeros(E, H, F + 3), torch.zeros(E, H), torch.zeros(E, out, H), torch.zeros(E, out), k or None)
-    return triton_decode._head(a, weights, False, F, K).sizes
 
-target = int(sys.argv[1])
-common = {"B": 16, "EP": 16, "FP": 16, "KP": 2, "K": K}
-check("place", common, target)
-check("place_backward", common, target)
-check("route", {**common, "F": F, "E": E, "TOP": 2, "BIAS": True, "POSITION": True, "PRECISION": "ieee"}, target)
-for a, k, experts in (("opacity", 2, E), ("color", None, E), ("cov", 0, 1)):
-    for kernel in ("head_forward", "head_backward", "weight_backward"):
-        check(kernel, {**common, "POSITION": k == 2, "OUTSIDE": False, **head(a, k, experts)}, target)
-check("head_backward", {**common, "POSITION": False, "OUTSIDE": True, **head("cov", 2, E)}, target)
-print("compiled")
-"""
+def usage(module, name, sizes, target):
+    module = f"scene_experts.scene.anchors.{module}"
+    kernel = getattr(importlib.import_module(module), name)
+    types = {p: TYPES.get(p, "*fp32") for p in kernel.arg_names if p not in NUMBERS}
+    options = {"num_warps": sizes["num_warps"]} if "num_warps" in sizes else {}
+    return compile_for_gpu(module, name, types, {n: v for n, v in sizes.items() if n != "num_warps"}, target, **options)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("target", ["80", "90"])
-def test_the_kernels_compile(target):
-    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"} | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    script = "import sys; exec(sys.stdin.read())"
-    # Kernels are compiled from their source files; only this driver comes over the pipe.
-    done = subprocess.run(
-        [sys.executable, "-c", script, target], input=COMPILE, env=environment, capture_output=True, text=True, timeout=500
-    )
-    assert done.returncode == 0 and "compiled" in done.stdout, done.stderr[-2000:]
+@pytest.mark.parametrize("phase", PHASES)
+def test_the_networks_kernels_stay_in_registers(phase):
+    """Of an H100. Local memory is 10 times as slow, and one kernel took 9 kB of it."""
+    E, k, H, most = PHASES[phase]
+    nets, by_row, alone = networks(E, k, H), k == 1, "shape_and_color_forward"
+    found = {alone: usage("triton_kernels", alone, {**nets.rest, "BY_ROW": by_row}, 90)}
+    found["opacity_forward"] = usage("triton_kernels", "opacity_forward", {**nets.opacity, "BY_ROW": by_row}, 90)
+    for heads in [7] if nets.one_order else [1, 2, 4]:
+        sizes = {
+            "HEADS": heads,
+            "ORDERED": bool(nets.ordered),
+            "BY_ROW": by_row,
+            "ADD": heads in (2, 4),
+            "WITH_GATES": 2 * (k not in (0, 1)),
+        }
+        found[f"heads_backward {heads}"] = usage("triton_kernels", "heads_backward", {**nets.back, **sizes}, 90)
+    found["heads_weights"] = usage("triton_kernels", "heads_weights", {**nets.sums, "BY_ROW": by_row}, 90)
+    assert all(u.registers > 0 and 0 <= u.local <= most for u in found.values()), found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", [80, 90])
+def test_the_others_compile(target):
+    small, route = {"K": 2, "B": 16, "KP": 2}, {"HEADS": 7, "BINS": 8, "B": 16}
+    nets = networks(3, 2, 16, 8, 2)
+    for sizes in ({"RAW": True, "TERMS": False}, {"RAW": False, "TERMS": True}):
+        usage("triton_places", "place_backward", {**small, **sizes}, target)
+    usage("triton_places", "place", small, target)
+    of = {"E": 3, "EM": 3, "F": 8, "BIAS": True, "POSITION": True, "EP": 16, "PRECISION": "ieee"}
+    usage("triton_routes", "route", {**of, **route, "TOP": 2, "FP": 16}, target)
+    usage("triton_routes", "count_keys", {**route, "BY_ROW": True}, target)
+    usage("triton_routes", "arrange", {**route, "BY_ROW": False}, target)
+    usage("triton_routes", "load_slopes", {"E": 3, "EM": 3, "HEADS": 7, "SPARSE": True, "B": 16, "EP": 16}, target)
+    usage("triton_routes", "router_weights", {**of, "HEADS": 7, "AT0": 0, "AT1": 10, "AT2": 20, "WIDTH": 30, "B": 16, "RP": 16}, target)
+    outside = {**nets.back, "OOUT": True, "HEADS": 1, "ORDERED": True, "BY_ROW": False, "ADD": False, "WITH_GATES": 1}
+    usage("triton_kernels", "heads_backward", outside, target)
 
 
 @triton.jit
