@@ -6,7 +6,8 @@ slopes of the loss in the result, and returns those in its inputs, or adds them 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -36,6 +37,19 @@ class Regularisers:
     mean_size: float = 0.0
 
 
+def allocate(like: Tensor, shapes: Sequence[tuple[int, ...]]) -> tuple[Tensor, list[Tensor]]:
+    """Return an array of zeros, with the dtype and device of `like`, and views of it with these
+    shapes, which begin at multiples of 64 bytes: Triton compiles anew for other addresses."""
+    counts = [math.prod(shape) for shape in shapes]
+    whole = like.new_zeros(sum(-(-count // APART) * APART for count in counts))
+    at, views = 0, []
+    for shape, count in zip(shapes, counts):
+        views.append(whole[at : at + count].view(shape))
+        at += -(-count // APART) * APART
+    return whole, views
+
+
+APART = 16  # values of 4 bytes
 PullPicture = Callable[[Tensor], GaussianSlopes]
 """Takes the slopes of a picture [H, W, 3]."""
 PullScene = Callable[[GaussianSlopes, Regularisers], None]

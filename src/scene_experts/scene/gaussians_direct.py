@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from scene_experts.core.slopes import GaussianSlopes, PullScene, Regularisers
+from scene_experts.core.slopes import GaussianSlopes, PullScene, Regularisers, allocate
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians
 from scene_experts.native import triton
@@ -35,9 +35,8 @@ class DirectGaussians:
         self.scene = scene
         params = [scene.table.params[name] for name in COLUMNS]
         self.columns = [p.detach() for p in params]
-        self.slopes = self.columns[0].new_zeros(sum(p.numel() for p in params))
-        parts = self.slopes.split([p.numel() for p in params])
-        self.grads = [(p, part.view_as(p)) for p, part in zip(params, parts)]
+        self.slopes, parts = allocate(self.columns[0], [tuple(p.shape) for p in params])
+        self.grads = list(zip(params, parts))
 
     def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, PullScene]:
         """See `DirectScene.draw`."""

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from scene_experts.core.lazy import LazyMapping
-from scene_experts.core.slopes import GaussianSlopes, PullScene, Regularisers
+from scene_experts.core.slopes import GaussianSlopes, PullScene, Regularisers, allocate
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Mode, Routing
 from scene_experts.scene import Cull
@@ -96,10 +96,8 @@ class DirectAnchors:
         self.nets = fused.KernelNetworks(given, with_dist, config.F, config.K, constant=not load)
         self.weights = [getattr(weights[a], name).detach() for a in ATTRIBUTES for name in fused.NETWORK]
         self.routers = [getattr(weights[a], name) for a in ATTRIBUTES for name in ("router_w", "router_b")]
-        sizes = [p.numel() for p in self.params]
-        self.slopes = self.columns[0].new_zeros(sum(sizes) + self.nets.width)
-        *parts, self.flat = self.slopes.split([*sizes, self.nets.width])
-        self.into = [part.view_as(p) for part, p in zip(parts, self.params)]
+        shapes = [tuple(p.shape) for p in self.params]
+        self.slopes, (*self.into, self.flat) = allocate(self.columns[0], [*shapes, (self.nets.width,)])
         self.grads: list[tuple[nn.Parameter, Tensor]] = list(zip(self.params, self.into))
         self.larger: list[Tensor] = []  # gradients of parameters of which the kernels take a part
         self.moves: tuple[list[Tensor], list[Tensor]] = [], []  # their parts, and where the kernels write these
