@@ -114,13 +114,14 @@ bench: $(STAMP)
 # Kept out of .venv: Triton's interpreter needs an older numpy, and gsplat without CUDA only warns.
 PRETEND := build/pretend
 WITHOUT_GPU := gsplat==1.5.3 jaxtyping==0.3.11 triton==3.5.1 numpy==2.2.6
-PRETEND_TESTS ?= tests/system/test_pretend_cuda.py tests/system/test_gpu_plan.py tests/unit/native/test_triton_probe.py tests/unit/training/test_triton_*.py \
-  tests/unit/render/test_*project*.py tests/unit/training/test_direct.py tests/unit/scene/test_triton_gaussians.py tests/unit/scene/anchors/test_triton_*.py tests/unit/scene/anchors/test_frozen.py \
-  tests/unit/scene/graph/test_fused.py tests/unit/scene/graph/test_triton_kernels.py -k "not other_recipes"
+PRETEND_TESTS ?= tests/system/test_pretend_cuda.py tests/system/test_gpu_plan.py tests/unit/native/test_triton*.py tests/unit/render/test_*project*.py \
+  tests/unit/render/test_gsplat_direct.py tests/unit/training/test_direct.py tests/unit/training/test_triton_*.py tests/unit/strategy/test_*observe.py \
+  tests/unit/scene/test_*gaussians*.py tests/unit/scene/anchors/test_triton_*.py tests/unit/scene/anchors/test_direct.py \
+  tests/unit/scene/anchors/test_frozen.py tests/unit/scene/graph/test_fused.py tests/unit/scene/graph/test_triton_kernels.py -k "not other_recipes"
 
 pretend: $(STAMP)
 	@test -d $(PRETEND)/gsplat || $(BIN)/pip install -q --no-deps --target $(PRETEND) $(WITHOUT_GPU) || echo "gsplat and triton could not be fetched: skipped"
-	PYTHONPATH=$(abspath $(PRETEND)) $(BIN)/python -m pytest -q -W ignore $(PARALLEL) $(PRETEND_TESTS)
+	TRITON_INTERPRET=1 PYTHONPATH=$(abspath $(PRETEND)) $(BIN)/python -m pytest -q -W ignore $(PARALLEL) $(PRETEND_TESTS)
 
 # An environment of their own: neither torch nor this project is needed to build wheels.
 WHEELS_ENV := build/wheels-env
