@@ -1,6 +1,5 @@
 """The kernels of explicit Gaussians against plain torch in float64."""
 
-import importlib
 from dataclasses import replace
 
 import pytest
@@ -63,6 +62,5 @@ def test_value_and_slopes_are_the_equations(degree, seen):
 @pytest.mark.parametrize("name", ["decode", "pull_back"])
 def test_they_compile(name, target):
     types = {"rows": "*i64", "A": "i32", "volume": "fp32"}
-    module = importlib.import_module(MODULE)
-    pointers = {p.name: "*fp32" for p in getattr(module, name).params if not p.is_constexpr}
+    pointers = {p.name: "*fp32" for p in getattr(kernels(MODULE), name).params if not p.is_constexpr}
     compile_for_gpu(MODULE, name, {**pointers, **types}, {"REST": 15, "COUNT": 16, "B": 128}, target)
