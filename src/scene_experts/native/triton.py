@@ -58,11 +58,16 @@ def guard(device: torch.device) -> AbstractContextManager[Any]:
 
 def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **sizes: Any) -> None:
     """Launch a kernel once, see `Launch`."""
+    find_launch(kernel, **sizes)(grid, *arguments)
+
+
+def find_launch(kernel: Any, **sizes: Any) -> Launch:
+    """Return the launch of a kernel with these constants and options, made once."""
     key = (id(kernel), *sizes.items())
     known = _launches.get(key)
     if known is None:
         known = _launches[key] = Launch(kernel, **sizes)
-    known(grid, *arguments)
+    return known
 
 
 class Launch:
@@ -80,7 +85,7 @@ class Launch:
         self.special: tuple[int, ...] = ()  # numbers after them that the kernel is compiled for
         self.ints: tuple[int, ...] = ()
         self.kept: dict[Any, tuple[Callable[..., Any], Any, Any, list[Any]]] = {}
-        self.key: tuple[Any, ...] | None = None  # of the last launch, if its addresses were multiples of 16 bytes
+        self.last: tuple[Any, Any] = None, None  # key and value of the last launch
 
     def __call__(self, grid: tuple[int, ...], *arguments: Any) -> None:
         if not self.compiled:
@@ -99,16 +104,16 @@ class Launch:
             if not -(2**31) <= numbers[i] < 2**31:
                 key += ("wide", *(-(2**31) <= numbers[i] < 2**31 for i in self.ints))
                 break
-        if key == self.key:  # quicker than a look into the dictionary, which hashes it
-            kept = self.last
-        else:
+        last, kept = self.last
+        if key != last:  # quicker than a look into the dictionary, which hashes it
             kept = self.kept.get(key)
-            self.key, self.last = key, kept
+            self.last = key, kept
         with _NOTHING if torch.cuda.current_device() == device else torch.cuda.device(device):
             if kept is None:
                 made = self.kernel[grid](*arguments, **self.sizes)
                 constants = [self.sizes[name] for name in self.kernel.arg_names if name in self.sizes]
-                self.kept[key] = self.last = made.run, made.function, made.packed_metadata, constants
+                self.kept[key] = kept = made.run, made.function, made.packed_metadata, constants
+                self.last = key, kept
                 return
             run, function, metadata, constants = kept
             run(*(*grid, 1, 1)[:3], _stream_of(device), function, metadata, None, None, None, *addresses, *numbers, *constants)

@@ -41,16 +41,16 @@ def _half_sides(width: int, height: int, device: torch.device) -> Tensor:
 
 
 @cache
-def _no_alpha(width: int, height: int, device: torch.device) -> Tensor:
-    return torch.zeros(1, height, width, 1, device=device)
+def _zero(device: torch.device) -> Tensor:
+    return torch.zeros((), device=device)
 
 
-def _no_depths(count: int, device: torch.device) -> Tensor:
-    """Return zeros [1, count], of an array that grows."""
+def _nothing(count: int, device: torch.device) -> Tensor:
+    """Return zeros [count], of an array that grows. Nothing may write to them."""
     known = _zeros.get(device)
-    if known is None or known.shape[1] < count:
-        known = _zeros[device] = torch.zeros(1, count + count // 4, device=device)
-    return known[:, :count]
+    if known is None or known.shape[0] < count:
+        known = _zeros[device] = torch.zeros(count + count // 4, device=device)
+    return known[:count]
 
 
 _zeros: dict[torch.device, Tensor] = {}
@@ -84,9 +84,9 @@ def draw(g: Gaussians, camera: Camera, background: Tensor, antialias: bool, abso
     shade = alpha[0, ..., 0]
 
     def pull(d_picture: Tensor) -> GaussianSlopes:
-        nothing = _no_alpha(width, height, device)
+        no_alpha = _nothing(height * width, device).view(1, height, width, 1)
         sums, d_means2d, d_conics, d_colors, d_opacities = library.rasterize_to_pixels_3dgs_bwd(
-            *blended, alpha, last, d_picture[None], nothing, absolute
+            *blended, alpha, last, d_picture[None], no_alpha, absolute
         )
         d_factors = None
         if antialias:
@@ -94,9 +94,9 @@ def draw(g: Gaussians, camera: Camera, background: Tensor, antialias: bool, abso
             d_opacities = d_opacities * factors.clamp_min(MIN_COMPENSATION)
         d_means, _, d_quats, d_scales, _ = library.projection_ewa_3dgs_fused_bwd(
             g.means, None, g.quats, g.scales, view, K, *size, model, extents, conics, factors if antialias else None,
-            d_means2d, _no_depths(count, device), d_conics, d_factors, False,
+            d_means2d, _nothing(count, device)[None], d_conics, d_factors, False,
         )  # fmt: skip
         torch.mul((sums if absolute else d_means2d)[0], _half_sides(width, height, device), out=mean2d_grad)
         return GaussianSlopes(d_means, d_quats, d_scales, d_opacities[0], d_colors[0])
 
-    return Render(picture[0], shade, _no_alpha(width, height, device)[0, ..., 0], radii, mean2d_grad), pull
+    return Render(picture[0], shade, _zero(device).expand(height, width), radii, mean2d_grad), pull

@@ -84,7 +84,8 @@ class Strategy(Part, Generic[S], ABC):
     def adds(self, step: int) -> bool:
         """Whether `update` at `step` may add rows. The default is the safe answer, True.
 
-        With --max-memory, memory is measured and given back only then.
+        With --max-memory, memory is measured and given back only then. On a GPU, what drew the
+        rows is made anew after it.
         """
         return True
 

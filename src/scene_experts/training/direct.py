@@ -35,6 +35,7 @@ class DirectStep:
         foreign = weights.terms is not Weights.terms
         self.refused = "a loss with other terms" if foreign else explain_indirect(rasterize) or ""  # why autograd draws the views
         self.scene: Scene | None = None
+        self.drawing: DirectScene | None = None
         self.version = -1
         self.dense = False
         self.why = ""  # why the scene goes through autograd; "": it does not
@@ -43,12 +44,16 @@ class DirectStep:
         """Return what draws the scene at `step`."""
         version, dense = scene.table.version, step <= scene.dense_until
         if scene is not self.scene or version != self.version or dense != self.dense:
-            self.drawing: DirectScene | None = None  # frees the slopes of the rows that were
+            self.drawing = None  # frees the slopes of the rows that were
             found = scene.direct(step, self.weights.load != 0)
             self.why, self.drawing = (found, ThroughAutograd(scene, self.weights)) if isinstance(found, str) else ("", found)
             self.scene, self.version, self.dense = scene, version, dense
         assert self.drawing is not None
         return self.drawing
+
+    def forget(self) -> None:
+        """Let go of the columns and slopes of the scene, before its rows change."""
+        self.scene = self.drawing = None
 
     def describe(self, scene: Scene, step: int) -> str:
         """Say how the view of iteration `step` is differentiated, for the start of a training."""

@@ -105,18 +105,20 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
     direct = direct_of(training, rasterize, training.scene)
     slopes = "" if direct is None else "through autograd (--shard)" if run.shard else direct.describe(training.scene, training.step + 1)
     yield Started(training.step, total, training.scene.table.total, training.scene.traits, about, slopes)
-    saved, parts = training.step, {}
+    saved = training.step
+    parts: Mapping[str, Tensor] = {}  # terms of the last iteration
     while training.step < total and not exchange.stopping:
+        parts = {}  # terms that nobody has read hold on to the last frame
         with training.clock.running():
             done = iterate(training, run, capture, rasterize, exchange)
-        step, parts = training.step, done.terms
+        step = training.step
         if broken := find_broken(training.optimizer, step, cfg.batch):
             check_finite(step, parts)
             raise RunError(explain(f"the parameter '{broken}' or its gradient", step, folder))
         for number, edit in done.edits:
             yield Densified(number, edit)
         if step == total or passes(step, cfg.batch, run.options.log_every):
-            check_finite(step, parts)
+            check_finite(step, done.terms)
             if run.group.first:
                 yield measure_step(training, done)
         if run.options.preview_every and (step == total or passes(step, cfg.batch, run.options.preview_every)):
@@ -124,13 +126,14 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
             if shown is not None:
                 yield shown
         if folder and (step == total or passes(step, cfg.batch, run.options.save_every)):
-            check_finite(step, parts)
+            check_finite(step, done.terms)
             exchange.complete()
             tensors = exchange.tensors()
             if writes:
                 yield Saved(step, save(training, folder, run.keep, tensors))
             del tensors
             saved = step
+        parts = done.terms
         del done  # frees its memory before the next frame
         run.watch(training)
     if folder and saved != training.step:
@@ -227,6 +230,8 @@ def iterate(training: Training, run: Job, capture: Capture, rasterize: Rasterize
     if limited:
         give_back()
     cap = exchange.limit(anchor_cap(scene, cfg.growth.max_anchors, run.max_memory, training.largest), run.max_memory > 0)
+    if training.direct is not None and any(cfg.growth.adds(number) for number in numbers):
+        training.direct.forget()  # columns and slopes that the edits replace
     edits, survey = [], survey_of(training, run, capture, rasterize)
     for number in numbers:
         cfg.growth.survey(scene, survey, number, training.growth_rng)

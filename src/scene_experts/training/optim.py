@@ -134,6 +134,7 @@ class FusedAdam(torch.optim.Adam):
         if self._triton and rows is None:
             self._step_all()
             return loss
+        self._table = None
         calls = [self._prepared(p, group, rows) for group in self.param_groups for p in group["params"] if p.grad is not None]
         if self._native:
             self._call(calls)

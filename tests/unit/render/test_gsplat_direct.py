@@ -24,11 +24,11 @@ def test_another_gsplat_is_left_to_autograd(monkeypatch):
     assert "reference" in (explain_indirect(ReferenceRasterizer()) or "")
 
 
-def test_slopes_of_no_depth_come_from_one_array():
+def test_slopes_of_what_nothing_depends_on_come_from_one_array():
     device = torch.device("cpu")
-    few, many = gsplat_direct._no_depths(3, device), gsplat_direct._no_depths(50, device)
-    assert few.shape == (1, 3) and many.shape == (1, 50) and many.is_contiguous() and not many.any()
-    assert gsplat_direct._no_depths(40, device).data_ptr() == many.data_ptr()
+    few, many = gsplat_direct._nothing(3, device), gsplat_direct._nothing(50, device)
+    assert few.shape == (3,) and many.shape == (50,) and not many.any()
+    assert gsplat_direct._nothing(40, device).data_ptr() == many.data_ptr()
     del gsplat_direct._zeros[device]
 
 

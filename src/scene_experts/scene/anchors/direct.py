@@ -7,7 +7,7 @@ Gaussians alone (fading levels, masked slots, smoothing), goes through autograd 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -97,7 +97,8 @@ class DirectAnchors:
         self.weights = [getattr(weights[a], name).detach() for a in ATTRIBUTES for name in fused.NETWORK]
         self.routers = [getattr(weights[a], name) for a in ATTRIBUTES for name in ("router_w", "router_b")]
         shapes = [tuple(p.shape) for p in self.params]
-        self.slopes, (*self.into, self.flat) = allocate(self.columns[0], [*shapes, (self.nets.width,)])
+        self.slopes, self.into = allocate(self.columns[0], shapes)
+        self.flat = self.columns[0].new_zeros(self.nets.width)  # apart: the gradients of networks outlive the columns
         self.grads: list[tuple[nn.Parameter, Tensor]] = list(zip(self.params, self.into))
         self.larger: list[Tensor] = []  # gradients of parameters of which the kernels take a part
         self.moves: tuple[list[Tensor], list[Tensor]] = [], []  # their parts, and where the kernels write these
@@ -115,13 +116,14 @@ class DirectAnchors:
         for tensor, part in given:
             own = Own.of(tensor)
             assert own is not None
-            if not own.parameter.requires_grad:
+            changed = any(tensor is f for f in folded)
+            if not own.parameter.requires_grad and not changed:
                 continue
-            if own.whole and not any(tensor is f for f in folded):
+            if own.whole and not changed:
                 self.grads.append((own.parameter, part))
                 continue
             whole[own.parameter] = torch.zeros_like(own.parameter)
-            if not any(tensor is f for f in folded):
+            if not changed:
                 self.moves[0].append(own.of_whole(whole[own.parameter]))
                 self.moves[1].append(part)
         if self.codes:
@@ -149,7 +151,7 @@ class DirectAnchors:
         position = seen_from.position.to(xyz.device)
         view = fused.AnchorView(self.nets, rows, xyz, position, self.columns, weights, self.routers, scene.extent)
         drawn = fused.draw(view, self._route(view))
-        decoded = Decoded(drawn.gaussians, rows, drawn.raw, LazyMapping(lambda: self._find_routing(drawn, step)))
+        decoded = Decoded(drawn.gaussians, rows, drawn.raw, LazyMapping(self._routing_of(drawn, step)))
         shown, graph = self._finish(decoded, camera, step)
 
         def pull(slopes: GaussianSlopes, terms: Regularisers) -> None:
@@ -180,14 +182,20 @@ class DirectAnchors:
             self.kept = key, fused.RoutingArrays(made.stride, by_row=True, keys=made.keys)
         return self.kept[1]
 
-    def _find_routing(self, drawn: fused.DrawnView, step: int) -> dict[str, Routing]:
-        """Return the routing of the anchors as the scene's own decode gives it."""
-        view, routed = drawn.view, {ATTRIBUTES[i]: i for i in self.nets.routed}
-        if drawn.routed.gates is not None:
-            return {a: Routing(*drawn.routed.part(self.nets, i, len(view.rows))) for a, i in routed.items()}  # type: ignore[arg-type]
-        feature, position = self.columns[0].index_select(0, view.rows), view.xyz.index_select(0, view.rows) / view.extent
-        found = {a: self.scene.heads[a].route(feature, step, position) for a in ATTRIBUTES if a in routed}
-        return {a: made[0] for a, made in found.items() if made is not None}
+    def _routing_of(self, drawn: fused.DrawnView, step: int) -> Callable[[], dict[str, Routing]]:
+        """Return a function that finds the routing of the anchors as the scene's own decode gives
+        it. It keeps no slopes alive."""
+        nets, view, arrays, heads = self.nets, drawn.view, drawn.routed, self.scene.heads
+        routed = {ATTRIBUTES[i]: i for i in nets.routed}
+
+        def find() -> dict[str, Routing]:
+            if arrays.gates is not None:
+                return {a: Routing(*arrays.part(nets, i, len(view.rows))) for a, i in routed.items()}  # type: ignore[arg-type]
+            feature, position = view.columns[0].index_select(0, view.rows), view.xyz.index_select(0, view.rows) / view.extent
+            found = {a: heads[a].route(feature, step, position) for a in routed}
+            return {a: made[0] for a, made in found.items() if made is not None}
+
+        return find
 
     def _finish(self, decoded: Decoded, camera: Camera, step: int) -> tuple[Decoded, tuple[list[Tensor], list[Tensor]] | None]:
         """Apply to a decoded view what acts on drawn Gaussians alone. Returns it, and the two ends

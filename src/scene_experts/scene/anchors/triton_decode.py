@@ -134,7 +134,7 @@ class KernelNetworks:
         found = self.launches.get(key)
         if found is None:
             sizes = {"opacity_forward": self.opacity, "shape_and_color_forward": self.rest, "heads_backward": self.back}
-            found = self.launches[key] = triton.Launch(getattr(_kernels(), name), **{**sizes.get(name, self.sums), **extra})
+            found = self.launches[key] = triton.find_launch(getattr(_kernels(), name), **{**sizes.get(name, self.sums), **extra})
         return found
 
     def shapes(self) -> list[tuple[int, tuple[int, ...]]]:
