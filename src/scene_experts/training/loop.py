@@ -111,14 +111,14 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
         parts = {}  # terms that nobody has read hold on to the last frame
         with training.clock.running():
             done = iterate(training, run, capture, rasterize, exchange)
-        step = training.step
+        step, parts = training.step, done.terms
         if broken := find_broken(training.optimizer, step, cfg.batch):
             check_finite(step, parts)
             raise RunError(explain(f"the parameter '{broken}' or its gradient", step, folder))
         for number, edit in done.edits:
             yield Densified(number, edit)
         if step == total or passes(step, cfg.batch, run.options.log_every):
-            check_finite(step, done.terms)
+            check_finite(step, parts)
             if run.group.first:
                 yield measure_step(training, done)
         if run.options.preview_every and (step == total or passes(step, cfg.batch, run.options.preview_every)):
@@ -126,14 +126,13 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
             if shown is not None:
                 yield shown
         if folder and (step == total or passes(step, cfg.batch, run.options.save_every)):
-            check_finite(step, done.terms)
+            check_finite(step, parts)
             exchange.complete()
             tensors = exchange.tensors()
             if writes:
                 yield Saved(step, save(training, folder, run.keep, tensors))
             del tensors
             saved = step
-        parts = done.terms
         del done  # frees its memory before the next frame
         run.watch(training)
     if folder and saved != training.step:
