@@ -149,3 +149,26 @@ def test_views_are_left_to_autograd_where_nothing_else_can_draw_them():
     assert DirectStep(reference, own()).refused == "a loss with other terms"
     assert "reference" in DirectStep(reference, Weights()).refused
     assert "reference" in DirectStep(reference, Weights()).describe(None, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["scene-experts, one", "appearance", "moe-gs, sparse"])
+def test_gradients_of_two_views_of_a_batch_add_up(name, capture):
+    cfg, step, _ = CASES[name]
+    training = start_changed(cfg, capture, DEVICE)
+    training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
+    training.scene.begin_iteration(0, step, training.companions)
+    drawing, background = DirectStep(for_training(choose("auto", DEVICE), False), cfg.loss), torch.zeros(3, device=DEVICE)
+    parameters = [p for g in training.optimizer.param_groups for p in g["params"] if p.requires_grad]
+
+    def gradients(views):
+        training.optimizer.zero_grad()
+        for index in views:
+            torch.manual_seed(index)
+            camera = capture.views[index].camera.to(DEVICE, torch.float32)
+            drawing.see(training.scene, camera, step, capture.frame(index).rgb.to(DEVICE) / 255, None, background)
+        return [torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in parameters]
+
+    a, b = capture.train[:2]
+    for both, one, other in zip(gradients([a, b]), gradients([a]), gradients([b])):
+        torch.testing.assert_close(both, one + other, rtol=1e-5, atol=1e-6 * float(both.abs().max()) + 1e-12)
