@@ -43,13 +43,15 @@ local memory (sm_90). For one head, 8 and 16 were four times as fast as 4 on an 
 MOST_EXPERTS = 30  # a set of experts is stored as the bits of an int32
 MOST_BINS = 64  # keys that the anchors are sorted by counting; more are sorted by torch
 WIDEST = 256  # largest padded number of outputs
+LARGEST_LAYER = 64 * 128  # padded weights of a last layer: with more, the 99 KiB of shared memory of an RTX 30, 40 or 50 are too few
 
 
 def covers(attribute: str, h: HeadWeights, F: int, K: int) -> bool:
     """Whether the kernels support a network (two layers, held in registers) and its number of
     experts."""
     E, H = h.w1.shape[:2]
-    fits = pad(F + 5) <= 64 and pad(H) <= 64 and pad(K * CHANNELS[attribute]) <= WIDEST
+    outputs = pad(K * CHANNELS[attribute])
+    fits = pad(F + 5) <= 64 and pad(H) <= 64 and outputs <= WIDEST and pad(H) * outputs <= LARGEST_LAYER
     return h.middle_w is None and fits and E <= MOST_EXPERTS
 
 
