@@ -28,9 +28,8 @@ from scene_experts.geometry.sh import MAX_DEGREE, rgb_to_dc
 from scene_experts.geometry.sh_colors import compute_sh_colors
 from scene_experts.native import triton
 from scene_experts.scene import EXPLICIT, Cull, LearningRates, Scene, SceneConfig, Traits
-from scene_experts.scene.gaussians_direct import DirectGaussians
+from scene_experts.scene.gaussians_direct import COLUMNS, DirectGaussians
 
-COLUMNS = ("means", "log_scales", "quats", "raw_opacity", "sh_dc", "sh_rest")
 FILE_VALUES = 3 + 3 + 1 + 3 + 4  # position, normal, opacity, scale and rotation in the 3DGS file, without the harmonics
 _EPS = 1e-12
 _ROUND = 1.001  # margin of the bounding ball in the visibility test, against rounding errors
