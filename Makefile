@@ -116,7 +116,7 @@ PRETEND := build/pretend
 WITHOUT_GPU := gsplat==1.5.3 jaxtyping==0.3.11 triton==3.5.1 numpy==2.2.6
 PRETEND_TESTS ?= tests/system/test_pretend_cuda.py tests/system/test_gpu_plan.py tests/unit/native/test_triton*.py tests/unit/render/test_*project*.py \
   tests/unit/render/test_gsplat_direct.py tests/unit/training/test_direct.py tests/unit/training/test_triton_*.py tests/unit/strategy/test_*observe.py \
-  tests/unit/scene/test_*gaussians*.py tests/unit/scene/anchors/test_triton_*.py tests/unit/scene/anchors/test_direct.py \
+  tests/unit/scene/test_*gaussians*.py tests/unit/geometry/test_triton_rotation.py tests/unit/scene/anchors/test_triton_*.py tests/unit/scene/anchors/test_direct.py \
   tests/unit/scene/anchors/test_frozen.py tests/unit/scene/graph/test_fused.py tests/unit/scene/graph/test_triton_kernels.py -k "not other_recipes"
 
 pretend: $(STAMP)

@@ -19,7 +19,7 @@ import torch
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded
 from scene_experts.native.triton import explain_missing
-from scene_experts.scene.anchors import triton_decode
+from scene_experts.scene.anchors import triton_networks
 from scene_experts.scene.anchors.experts import Experts
 from scene_experts.scene.anchors.mlp import Plain
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
@@ -126,7 +126,7 @@ def main() -> None:
     args = make_parser().parse_args()
     if not torch.cuda.is_available() or explain_missing() is not None:
         raise SystemExit(explain_missing() or "expected a CUDA device, found none; run this on a machine with one")
-    triton_decode.PRECISION = args.precision
+    triton_networks.PRECISION = args.precision
     pose = torch.eye(4)
     pose[2, 3] = 6.0
     camera = Camera(pose, torch.eye(3), 800, 544).to("cuda")

@@ -39,6 +39,7 @@ PHASES = ("scaffold-gs@3000", "scene-experts@12000", "moe-gs@3000", "moe-gs@1200
 TESTS = (
     *("tests/unit/render/test_gsplat.py", "tests/unit/render/test_project_cuda.py", "tests/unit/render/test_triton_project.py"),
     *("tests/unit/scene/anchors/test_triton_decode.py", "tests/unit/scene/anchors/test_triton_kernels.py"),
+    *("tests/unit/scene/anchors/test_triton_routing.py", "tests/unit/geometry/test_triton_rotation.py"),
     *("tests/unit/scene/anchors/test_frozen.py", "tests/unit/training/test_triton_loss.py", "tests/unit/training/test_triton_adam.py"),
     *("tests/unit/training/test_triton_peer.py", "tests/unit/native/test_triton.py", "tests/unit/native/test_triton_probe.py"),
     *("tests/unit/training/test_direct.py", "tests/unit/scene/test_triton_gaussians.py", "tests/unit/strategy/test_observe.py"),

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.slopes import GaussianSlopes, PullPicture
+from scene_experts.core.gradients import BackwardPicture, GaussianGradients
 from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.native import library as native
 
@@ -96,30 +96,30 @@ def for_training(rasterize: Rasterizer, absolute: bool) -> Rasterizer:
 
 
 def explain_indirect(rasterize: Rasterizer) -> str | None:
-    """Return None if the rasteriser can pull slopes back by itself, else the reason why autograd
+    """Return None if the rasteriser can go backward by itself, else the reason why autograd
     has to."""
     explain = getattr(rasterize, "explain_indirect", None)
     return explain() if explain is not None else f"the rasteriser `{rasterize.name}`"
 
 
-def draw_with_slopes(rasterize: Rasterizer, g: Gaussians, camera: Camera, background: Tensor) -> tuple[Render, PullPicture]:
-    """Draw Gaussians without a graph. Returns the picture with the function that takes the slopes of
+def draw_with_gradients(rasterize: Rasterizer, g: Gaussians, camera: Camera, background: Tensor) -> tuple[Render, BackwardPicture]:
+    """Draw Gaussians without a graph. Returns the picture with the function that takes the gradients of
     the picture, and returns those of the Gaussians and fills the picture's `mean2d_grad`.
 
-    A rasteriser that cannot pull slopes back by itself goes through autograd.
+    A rasteriser that cannot go backward by itself goes through autograd.
     """
-    direct = getattr(rasterize, "draw_with_slopes", None)
+    direct = getattr(rasterize, "draw_with_gradients", None)
     if direct is not None and len(g) and explain_indirect(rasterize) is None:
         return direct(g, camera, background)
     with torch.enable_grad():
         leaves = {name: getattr(g, name).detach().requires_grad_() for name in ("means", "quats", "scales", "opacities", "colors")}
         made = rasterize(replace(g, **leaves), camera, background)
 
-    def pull(d_picture: Tensor) -> GaussianSlopes:
+    def backward(d_picture: Tensor) -> GaussianGradients:
         found = torch.autograd.grad(made.image, list(leaves.values()), d_picture, allow_unused=True)
-        return GaussianSlopes(*(torch.zeros_like(t) if f is None else f.contiguous() for t, f in zip(leaves.values(), found)))
+        return GaussianGradients(*(torch.zeros_like(t) if f is None else f.contiguous() for t, f in zip(leaves.values(), found)))
 
-    return replace(made, image=made.image.detach(), alpha=made.alpha.detach(), depth=made.depth.detach()), pull
+    return replace(made, image=made.image.detach(), alpha=made.alpha.detach(), depth=made.depth.detach()), backward
 
 
 def _best(device: torch.device) -> str:

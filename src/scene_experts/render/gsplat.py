@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.slopes import PullPicture
+from scene_experts.core.gradients import BackwardPicture
 from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.native import triton
 from scene_experts.render import gsplat_direct
@@ -81,13 +81,13 @@ class GsplatRasterizer:
         return Render(picture[..., :3], alpha, depth, radii, grad)
 
     def explain_indirect(self) -> str | None:
-        """Return None if `draw_with_slopes` can draw, else the reason."""
+        """Return None if `draw_with_gradients` can draw, else the reason."""
         if self.depth:
             return "a picture with depth"
         return triton.explain_missing() or gsplat_direct.explain_unknown()
 
-    def draw_with_slopes(self, g: Gaussians, camera: Camera, background: Tensor) -> tuple[Render, PullPicture]:
-        """See `render.draw_with_slopes`; at least one Gaussian, float32."""
+    def draw_with_gradients(self, g: Gaussians, camera: Camera, background: Tensor) -> tuple[Render, BackwardPicture]:
+        """See `render.draw_with_gradients`; at least one Gaussian, float32."""
         return gsplat_direct.draw(g, camera, background, self.antialias, self.absolute)
 
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:

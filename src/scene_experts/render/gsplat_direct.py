@@ -1,4 +1,4 @@
-"""Draws one view with the compiled functions of gsplat, and pulls slopes back through them, without
+"""Draws one view with the compiled functions of gsplat, and goes backward through them, without
 autograd. The pictures are those of `gsplat.GsplatRasterizer` without the depth.
 
 The functions are gsplat's own and no public interface, so one version is known. With any other,
@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scene_experts.core.slopes import GaussianSlopes, PullPicture
+from scene_experts.core.gradients import BackwardPicture, GaussianGradients
 from scene_experts.core.types import Camera, Gaussians, Render
 from scene_experts.render.project_cuda import find_radii
 from scene_experts.render.reference import BLUR, MIN_COMPENSATION, TILE
@@ -56,10 +56,10 @@ def _nothing(count: int, device: torch.device) -> Tensor:
 _zeros: dict[torch.device, Tensor] = {}
 
 
-def draw(g: Gaussians, camera: Camera, background: Tensor, antialias: bool, absolute: bool) -> tuple[Render, PullPicture]:
+def draw(g: Gaussians, camera: Camera, background: Tensor, antialias: bool, absolute: bool) -> tuple[Render, BackwardPicture]:
     """Draw at least one Gaussian over `background` [3]. See `GsplatRasterizer` for the settings.
 
-    Returns the picture without depth (zeros), and the function that takes the slopes of the picture
+    Returns the picture without depth (zeros), and the function that takes the gradients of the picture
     and returns those of the Gaussians; it also fills the picture's `mean2d_grad`.
     """
     library, device, count = _library(), g.means.device, g.means.shape[0]
@@ -83,7 +83,7 @@ def draw(g: Gaussians, camera: Camera, background: Tensor, antialias: bool, abso
     mean2d_grad = g.means.new_empty(count, 2)
     shade = alpha[0, ..., 0]
 
-    def pull(d_picture: Tensor) -> GaussianSlopes:
+    def backward(d_picture: Tensor) -> GaussianGradients:
         no_alpha = _nothing(height * width, device).view(1, height, width, 1)
         sums, d_means2d, d_conics, d_colors, d_opacities = library.rasterize_to_pixels_3dgs_bwd(
             *blended, alpha, last, d_picture[None], no_alpha, absolute
@@ -97,6 +97,6 @@ def draw(g: Gaussians, camera: Camera, background: Tensor, antialias: bool, abso
             d_means2d, _nothing(count, device)[None], d_conics, d_factors, False,
         )  # fmt: skip
         torch.mul((sums if absolute else d_means2d)[0], _half_sides(width, height, device), out=mean2d_grad)
-        return GaussianSlopes(d_means, d_quats, d_scales, d_opacities[0], d_colors[0])
+        return GaussianGradients(d_means, d_quats, d_scales, d_opacities[0], d_colors[0])
 
-    return Render(picture[0], shade, _zero(device).expand(height, width), radii, mean2d_grad), pull
+    return Render(picture[0], shade, _zero(device).expand(height, width), radii, mean2d_grad), backward

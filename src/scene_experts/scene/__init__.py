@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.gradients import BackwardScene
 from scene_experts.core.parts import Part
-from scene_experts.core.slopes import PullScene
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Mode, Points, Routing
 
@@ -67,9 +67,9 @@ class Traits:
 class DirectScene(Protocol):
     """Draws training views without autograd."""
 
-    def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, PullScene]:
+    def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, BackwardScene]:
         """Return the same as `Scene.forward` in `Mode.TRAIN`, without a graph, and the function that
-        adds the slopes of the parameters to their `grad`."""
+        adds the gradients of the parameters to their `grad`."""
         ...
 
 

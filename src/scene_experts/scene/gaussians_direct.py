@@ -1,5 +1,5 @@
 """Views of explicit Gaussians on CUDA without autograd: two Triton kernels, and one array that keeps
-the slopes of all columns. `GaussianScene.forward` with autograd is the reference."""
+the gradients of all columns. `GaussianScene.forward` with autograd is the reference."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from scene_experts.core.slopes import GaussianSlopes, PullScene, Regularisers, allocate
+from scene_experts.core.gradients import BackwardScene, GaussianGradients, Regularisers, ReusedGradients, allocate
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians
 from scene_experts.native import triton
@@ -35,10 +35,10 @@ class DirectGaussians:
         self.scene = scene
         params = [scene.table.params[name] for name in COLUMNS]
         self.columns = [p.detach() for p in params]
-        self.slopes, parts = allocate(self.columns[0], [tuple(p.shape) for p in params])
-        self.grads = list(zip(params, parts))
+        self.gradients, parts = allocate(self.columns[0], [tuple(p.shape) for p in params])
+        self.grads, self.parts = ReusedGradients(zip(params, parts)), parts
 
-    def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, PullScene]:
+    def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, BackwardScene]:
         """See `DirectScene.draw`."""
         means, log_scales, quats, raw, dc, rest = self.columns
         rows = self.scene.visible(camera, cull)
@@ -51,25 +51,22 @@ class DirectGaussians:
         if A:
             _launch("decode", *sizes)(grid, rows, means, log_scales, quats, raw, dc, rest, position, *out, A)
 
-        def pull(slopes: GaussianSlopes, terms: Regularisers) -> None:
-            for parameter, gradient in self.grads:  # of an earlier view of the batch
-                if parameter.grad is gradient:
-                    parameter.grad = gradient.clone()
-            self.slopes.zero_()
-            by = (slopes.means, slopes.quats, slopes.scales, slopes.opacities, slopes.colors)
+        def backward(gradients: GaussianGradients, terms: Regularisers) -> None:
+            self.grads.release()
+            self.gradients.zero_()
+            by = (gradients.means, gradients.quats, gradients.scales, gradients.opacities, gradients.colors)
             given = (rows, means, quats, rest, position, g.quats, g.scales, g.opacities, g.colors, *by)
-            to = [gradient for _, gradient in self.grads]
+            to = self.parts
             if A:
-                _launch("pull_back", *sizes)(grid, *given, *to, A, terms.volume / A)
+                _launch("backward", *sizes)(grid, *given, *to, A, terms.volume / A)
             if terms.mean_opacity:
                 opacity, share = raw.sigmoid(), terms.mean_opacity / max(raw.numel(), 1)
                 to[3].add_(opacity, alpha=share).addcmul_(opacity, opacity, value=-share)
             if terms.mean_size:
                 to[1].add_(log_scales.exp(), alpha=terms.mean_size / max(log_scales.numel(), 1))
-            for parameter, gradient in self.grads:
-                parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+            self.grads.add()
 
-        return Decoded(g, rows, None, {}, population=(raw, log_scales)), pull
+        return Decoded(g, rows, None, {}, population=(raw, log_scales)), backward
 
 
 @cache

@@ -9,6 +9,7 @@ import triton
 import triton.language as tl
 
 from scene_experts.geometry import sh
+from scene_experts.geometry.triton_rotation import write_unit, write_unit_backward
 
 EPS = tl.constexpr(1e-12)  # equals that of gaussians.py
 C0, C1 = tl.constexpr(sh.C0), tl.constexpr(sh.C1)
@@ -79,13 +80,7 @@ def decode(
     for c in tl.static_range(3):
         tl.store(out_means + at * 3 + c, tl.load(means + row * 3 + c, mask=inside, other=0.0), mask=inside)
         tl.store(out_scales + at * 3 + c, tl.exp(tl.load(log_scales + row * 3 + c, mask=inside, other=0.0)), mask=inside)
-    length = tl.zeros((B,), tl.float32)
-    for c in tl.static_range(4):
-        q = tl.load(quats + row * 4 + c, mask=inside, other=1.0)
-        length += q * q
-    length = tl.maximum(tl.sqrt_rn(length), EPS)
-    for c in tl.static_range(4):
-        tl.store(out_quats + at * 4 + c, tl.load(quats + row * 4 + c, mask=inside, other=1.0) / length, mask=inside)
+    write_unit(quats + row * 4, out_quats + at * 4, inside)
     o = tl.load(raw + row, mask=inside, other=0.0)
     tl.store(out_opacities + at, 1.0 / (1.0 + tl.exp(-o)), mask=inside)
     x, y, z, _ = look(means, camera, row, inside)
@@ -104,12 +99,12 @@ def decode(
 
 
 @triton.jit(do_not_specialize=["A"])
-def pull_back(
+def backward(
     rows, means, quats, rest, camera, unit_quats, scales, opacities, colors, by_means, by_quats, by_scales, by_opacities, by_colors,
     d_means, d_log_scales, d_quats, d_raw, d_dc, d_rest, A, volume,
     REST: tl.constexpr, COUNT: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Write the slopes of the columns at `rows` [A] from those of the Gaussians, and of `volume`
+    """Write the gradients of the columns at `rows` [A] from those of the Gaussians, and of `volume`
     times the sum of their volumes."""
     at = tl.program_id(0) * B + tl.arange(0, B)
     inside = at < A
@@ -120,19 +115,7 @@ def pull_back(
         d = tl.load(by_scales + at * 3 + c, mask=inside, other=0.0)
         d += volume * side * tl.load(scales + at * 3 + (c + 2) % 3, mask=inside, other=0.0)
         tl.store(d_log_scales + row * 3 + c, d * s, mask=inside)
-    length, along = tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32)
-    for c in tl.static_range(4):
-        q = tl.load(quats + row * 4 + c, mask=inside, other=1.0)
-        length += q * q
-        u = tl.load(unit_quats + at * 4 + c, mask=inside, other=0.0)
-        along += u * tl.load(by_quats + at * 4 + c, mask=inside, other=0.0)
-    length = tl.sqrt_rn(length)
-    along = tl.where(length > EPS, along, 0.0)
-    length = tl.maximum(length, EPS)
-    for c in tl.static_range(4):
-        u = tl.load(unit_quats + at * 4 + c, mask=inside, other=0.0)
-        d = tl.load(by_quats + at * 4 + c, mask=inside, other=0.0)
-        tl.store(d_quats + row * 4 + c, (d - u * along) / length, mask=inside)
+    write_unit_backward(quats + row * 4, unit_quats + at * 4, by_quats + at * 4, d_quats + row * 4, inside)
     o = tl.load(opacities + at, mask=inside, other=0.0)
     tl.store(d_raw + row, tl.load(by_opacities + at, mask=inside, other=0.0) * o * (1.0 - o), mask=inside)
     x, y, z, distance = look(means, camera, row, inside)

@@ -1,4 +1,4 @@
-"""One view of a training without a graph: each part draws, and then pulls slopes back.
+"""One view of a training without a graph: each part draws, and then goes backward.
 
 On a GPU the host needs several times as long to build a graph of autograd and to walk through it as
 the device needs for the kernels. Here the parts are called one after the other. Where no kernel
@@ -13,13 +13,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from scene_experts.core.gradients import BackwardScene, GaussianGradients, Regularisers
 from scene_experts.core.lazy import LazyMapping
-from scene_experts.core.slopes import GaussianSlopes, PullScene, Regularisers
 from scene_experts.core.types import Camera, Decoded, Mode, Render
-from scene_experts.render import Rasterizer, draw_with_slopes, explain_indirect
+from scene_experts.render import Rasterizer, draw_with_gradients, explain_indirect
 from scene_experts.scene import Cull, DirectScene, Scene
 from scene_experts.training.losses import Sample, Weights, compute_scene_terms, compute_terms
-from scene_experts.training.photometric import photometric_slopes
+from scene_experts.training.photometric import photometric_gradients
 
 PARTS = ("means", "quats", "scales", "opacities", "colors")
 Seen = tuple[Decoded, Render, LazyMapping[Tensor]]
@@ -44,7 +44,7 @@ class DirectStep:
         """Return what draws the scene at `step`."""
         version, dense = scene.table.version, step <= scene.dense_until
         if scene is not self.scene or version != self.version or dense != self.dense:
-            self.drawing = None  # frees the slopes of the rows that were
+            self.drawing = None  # frees the gradients of the rows that were
             found = scene.direct(step, self.weights.load != 0)
             self.why, self.drawing = (found, ThroughAutograd(scene, self.weights)) if isinstance(found, str) else ("", found)
             self.scene, self.version, self.dense = scene, version, dense
@@ -52,7 +52,7 @@ class DirectStep:
         return self.drawing
 
     def forget(self) -> None:
-        """Let go of the columns and slopes of the scene, before its rows change."""
+        """Let go of the columns and gradients of the scene, before its rows change."""
         self.scene = self.drawing = None
 
     def describe(self, scene: Scene, step: int) -> str:
@@ -64,22 +64,22 @@ class DirectStep:
 
     @torch.no_grad()
     def see(self, scene: Scene, camera: Camera, number: int, target: Tensor, mask: Tensor | None, background: Tensor) -> Seen:
-        """Draw a training view as iteration `number`, and add the slopes of its loss to the
+        """Draw a training view as iteration `number`, and add the gradients of its loss to the
         gradients of the parameters.
 
         target [H, W, 3], mask [H, W] or None and background [3] are on the device of the scene.
         Returns the decoded view, its picture and the terms of the loss.
         """
         w = self.weights
-        decoded, pull_scene = self.prepare(scene, number).draw(camera, number, self.rasterize.visible)
-        render, pull_picture = draw_with_slopes(self.rasterize, decoded.gaussians, camera, background)
+        decoded, backward_scene = self.prepare(scene, number).draw(camera, number, self.rasterize.visible)
+        render, backward_picture = draw_with_gradients(self.rasterize, decoded.gaussians, camera, background)
         weight = w.weigh_pixels(render.image, target, mask, number)
-        slopes = pull_picture(photometric_slopes(render.image, target, w.dssim, weight))
+        gradients = backward_picture(photometric_gradients(render.image, target, w.dssim, weight))
         terms = LazyMapping(lambda: compute_terms(Sample(decoded, render, target, mask, number), w))
         if w.regularises:  # these see parameters, which the optimiser is about to move
             dict(terms)
         hinge = w.opacity if w.has_hinge(number) else 0.0
-        pull_scene(slopes, Regularisers(w.scale, hinge, w.tau, w.load, w.mean_opacity, w.mean_size))
+        backward_scene(gradients, Regularisers(w.scale, hinge, w.tau, w.load, w.mean_opacity, w.mean_size))
         return decoded, render, terms
 
 
@@ -89,7 +89,7 @@ class ThroughAutograd:
     def __init__(self, scene: Scene, weights: Weights) -> None:
         self.scene, self.weights = scene, weights
 
-    def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, PullScene]:
+    def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, BackwardScene]:
         """See `DirectScene.draw`. The regularisers are computed as terms of the loss."""
         with torch.enable_grad():
             decoded = self.scene(camera, step, Mode.TRAIN, cull)
@@ -102,13 +102,13 @@ class ThroughAutograd:
             population=None if population is None else (population[0].detach(), population[1].detach()),
         )
 
-        def pull(slopes: GaussianSlopes, terms: Regularisers) -> None:
-            ends = [(getattr(g, name), getattr(slopes, name)) for name in PARTS]
+        def backward(gradients: GaussianGradients, terms: Regularisers) -> None:
+            ends = [(getattr(g, name), getattr(gradients, name)) for name in PARTS]
             with torch.enable_grad():
                 terms_of_scene = compute_scene_terms(decoded, step, self.weights)
             ends += [(term, torch.ones_like(term)) for term in terms_of_scene.values()]
-            wanted = [(end, slope) for end, slope in ends if end.requires_grad]
+            wanted = [(end, gradient) for end, gradient in ends if end.requires_grad]
             if wanted:
-                torch.autograd.backward([end for end, _ in wanted], [slope for _, slope in wanted])
+                torch.autograd.backward([end for end, _ in wanted], [gradient for _, gradient in wanted])
 
-        return without, pull
+        return without, backward

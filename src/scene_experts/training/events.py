@@ -26,7 +26,7 @@ class Started:
     decode: str = ""
     """Which implementation decodes the scene in the first iteration, and why not the fused one;
     empty without a choice."""
-    slopes: str = ""
+    gradients: str = ""
     """On a GPU: whether training views are differentiated without autograd, and why not."""
 
 

@@ -103,8 +103,8 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
     run.begin(training)
     about = training.scene.describe_decode(training.step + 1)
     direct = direct_of(training, rasterize, training.scene)
-    slopes = "" if direct is None else "through autograd (--shard)" if run.shard else direct.describe(training.scene, training.step + 1)
-    yield Started(training.step, total, training.scene.table.total, training.scene.traits, about, slopes)
+    gradients = "" if direct is None else "through autograd (--shard)" if run.shard else direct.describe(training.scene, training.step + 1)
+    yield Started(training.step, total, training.scene.table.total, training.scene.traits, about, gradients)
     saved = training.step
     parts: Mapping[str, Tensor] = {}  # terms of the last iteration
     while training.step < total and not exchange.stopping:
@@ -230,7 +230,7 @@ def iterate(training: Training, run: Job, capture: Capture, rasterize: Rasterize
         give_back()
     cap = exchange.limit(anchor_cap(scene, cfg.growth.max_anchors, run.max_memory, training.largest), run.max_memory > 0)
     if training.direct is not None and any(cfg.growth.adds(number) for number in numbers):
-        training.direct.forget()  # columns and slopes that the edits replace
+        training.direct.forget()  # columns and gradients that the edits replace
     edits, survey = [], survey_of(training, run, capture, rasterize)
     for number in numbers:
         cfg.growth.survey(scene, survey, number, training.growth_rng)

@@ -179,7 +179,7 @@ def _forward(tile: int, wanted: bool, both: bool, precision: str, warps: int) ->
     return triton.Launch(_kernels().forward, **sizes, PRECISION=precision, num_warps=warps)
 
 
-def photometric_slopes(image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None) -> Tensor:
+def photometric_gradients(image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor | None = None) -> Tensor:
     """Return the gradient [H, W, 3] of the sum of both terms of `photometric` in the image, with
     its arguments, without a graph. On CUDA it is one Triton kernel."""
     if not (triton.covers(image, target) and image.numel()):

@@ -74,8 +74,8 @@ class TrainingProgress:
                 self.print_line(f"{verb}: {event.anchors:,} {rows}{lattice}, {event.total:,} iterations")
                 if event.decode:
                     self.print_line(f"decode: {event.decode}")
-                if event.slopes:
-                    self.print_line(f"step: {event.slopes}")
+                if event.gradients:
+                    self.print_line(f"step: {event.gradients}")
             case Stepped():
                 self.show_step(event)
             case Densified():

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from scene_experts.render import draw_with_slopes, explain_indirect, gsplat_direct
+from scene_experts.render import draw_with_gradients, explain_indirect, gsplat_direct
 from scene_experts.render.gsplat import GsplatRasterizer
 from scene_experts.render.reference import ReferenceRasterizer
 from support.gaussians import make_camera, make_scene
@@ -24,7 +24,7 @@ def test_another_gsplat_is_left_to_autograd(monkeypatch):
     assert "reference" in (explain_indirect(ReferenceRasterizer()) or "")
 
 
-def test_slopes_of_what_nothing_depends_on_come_from_one_array():
+def test_gradients_of_what_nothing_depends_on_come_from_one_array():
     device = torch.device("cpu")
     few, many = gsplat_direct._nothing(3, device), gsplat_direct._nothing(50, device)
     assert few.shape == (3,) and many.shape == (50,) and not many.any()
@@ -33,7 +33,7 @@ def test_slopes_of_what_nothing_depends_on_come_from_one_array():
 
 
 def compare(draw, device, close):
-    """Slopes with `draw_with_slopes` and through autograd."""
+    """Gradients with `draw_with_gradients` and through autograd."""
     scene, camera, background = make_scene(60, seed=1), make_camera(40, 30).to(device, torch.float32), torch.tensor([0.1, 0.5, 0.2])
     leaves = {n: getattr(scene, n).float().to(device).requires_grad_() for n in ("means", "quats", "scales", "opacities", "colors")}
     g = type(scene)(**leaves, source=scene.source.to(device))
@@ -41,13 +41,13 @@ def compare(draw, device, close):
     expected = draw(g, camera, background.to(device))
     (expected.image * up).sum().backward()
     with torch.no_grad():
-        render, pull = draw_with_slopes(draw, g, camera, background.to(device))
-        slopes = pull(up)
+        render, backward = draw_with_gradients(draw, g, camera, background.to(device))
+        gradients = backward(up)
     torch.testing.assert_close(render.image, expected.image.detach())
     assert torch.equal(render.radii, expected.radii) and not render.image.requires_grad
     torch.testing.assert_close(render.mean2d_grad, expected.mean2d_grad, rtol=close, atol=close)
     for name, leaf in leaves.items():
-        torch.testing.assert_close(getattr(slopes, name), leaf.grad, rtol=close, atol=close, msg=name)
+        torch.testing.assert_close(getattr(gradients, name), leaf.grad, rtol=close, atol=close, msg=name)
 
 
 def test_a_rasteriser_of_its_own_goes_through_autograd():
@@ -57,5 +57,5 @@ def test_a_rasteriser_of_its_own_goes_through_autograd():
 @pytest.mark.gpu
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("absolute", [False, True])
-def test_pictures_and_slopes_are_those_of_gsplat_through_autograd(antialias, absolute):
+def test_pictures_and_gradients_are_those_of_gsplat_through_autograd(antialias, absolute):
     compare(GsplatRasterizer(antialias=antialias, absolute=absolute, depth=False), DEVICE, 1e-4)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from scene_experts.core.slopes import GaussianSlopes, Regularisers
+from scene_experts.core.gradients import GaussianGradients, Regularisers
 from scene_experts.core.types import Camera
 from scene_experts.geometry.sh import sh_to_rgb
 from scene_experts.scene.gaussians_direct import COLUMNS, DirectGaussians
@@ -26,7 +26,7 @@ def decode(p, rows, position, degree):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("seen", [150, 1, 0])
-def test_value_and_slopes_are_the_equations(degree, seen):
+def test_value_and_gradients_are_the_equations(degree, seen):
     kernels(MODULE)
     scene = make_gaussians().to(DEVICE)
     for parameter in scene.table.params.values():
@@ -37,7 +37,7 @@ def test_value_and_slopes_are_the_equations(degree, seen):
     pose = torch.eye(4)
     pose[:3, 3] = torch.tensor([0.3, -0.2, 1.5])
     camera = Camera(pose.to(DEVICE), torch.eye(3, device=DEVICE), 40, 30)
-    decoded, pull = DirectGaussians(scene).draw(camera, 10 * degree if degree else 1, None)
+    decoded, backward = DirectGaussians(scene).draw(camera, 10 * degree if degree else 1, None)
     exact = {name: scene.table.params[name].detach().double().requires_grad_() for name in COLUMNS}
     expected = decode(exact, rows, camera.position.double(), degree)
     g = decoded.gaussians
@@ -48,18 +48,18 @@ def test_value_and_slopes_are_the_equations(degree, seen):
     loss = sum((a * b.double()).sum() for a, b in zip(expected, up)) + 0.7 * expected[2].prod(1).sum() / max(seen, 1)
     (loss + 0.3 * exact["raw_opacity"].sigmoid().mean() + 0.2 * exact["log_scales"].exp().mean()).backward()
     with torch.no_grad():
-        pull(GaussianSlopes(*up), TERMS)
+        backward(GaussianGradients(*up), TERMS)
         once = {name: scene.table.params[name].grad.clone() for name in COLUMNS}
         for name in COLUMNS:
             torch.testing.assert_close(once[name].double(), exact[name].grad, rtol=1e-5, atol=2e-6, msg=name)
-        pull(GaussianSlopes(*up), TERMS)  # a second view of a batch adds up
+        backward(GaussianGradients(*up), TERMS)  # a second view of a batch adds up
         for name in COLUMNS:
             torch.testing.assert_close(scene.table.params[name].grad, 2 * once[name])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", [80, 90])
-@pytest.mark.parametrize("name", ["decode", "pull_back"])
+@pytest.mark.parametrize("name", ["decode", "backward"])
 def test_they_compile(name, target):
     types = {"rows": "*i64", "A": "i32", "volume": "fp32"}
     pointers = dict.fromkeys(getattr(kernels(MODULE), name).arg_names, "*fp32")

@@ -24,7 +24,7 @@ from support.trainings import start_changed
 
 CLOSE = 1e-5 if DEVICE == "cpu" else 1e-4  # relative, of losses and of the norm of a gradient
 ROUNDED = (
-    1e-4  # of slopes of explicit Gaussians: their kernels round a last bit otherwise than torch, test_triton_gaussians.py has them alone
+    1e-4  # of gradients of explicit Gaussians: their kernels round a last bit otherwise than torch, test_triton_gaussians.py has them alone
 )
 LATE = 20_000  # an iteration after every warm-up
 MANY = {"dropout": 0.3, "dropout_full": 1, "view_jitter": 0.5}

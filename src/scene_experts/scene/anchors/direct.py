@@ -1,5 +1,5 @@
 """Views of an anchor scene on CUDA without autograd: the halves of `triton_decode` are called one
-after the other, and the slopes of all parameters lie in one array that is kept.
+after the other, and the gradients of all parameters lie in one array that is kept.
 
 `AnchorScene.forward` with autograd is the reference. What few scenes have, and what acts on drawn
 Gaussians alone (fading levels, masked slots, smoothing), goes through autograd here too.
@@ -14,14 +14,18 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from scene_experts.core.gradients import BackwardScene, GaussianGradients, Regularisers, ReusedGradients, allocate
 from scene_experts.core.lazy import LazyMapping
-from scene_experts.core.slopes import GaussianSlopes, PullScene, Regularisers, allocate
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Mode, Routing
 from scene_experts.scene import Cull
-from scene_experts.scene.anchors import triton_decode as fused
 from scene_experts.scene.anchors.appearance import Codes, fold
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, Head, HeadWeights
+from scene_experts.scene.anchors.triton_decode import DecodeGradients, DrawnView
+from scene_experts.scene.anchors.triton_decode import backward as decode_backward
+from scene_experts.scene.anchors.triton_decode import draw as draw_anchors
+from scene_experts.scene.anchors.triton_networks import LOCAL, NETWORK, AnchorView, KernelNetworks
+from scene_experts.scene.anchors.triton_routing import RoutingArrays, find_load_gradients, route
 
 COLUMNS = ("feature", "log_scaling", "offsets")
 PARTS = ("means", "quats", "scales", "opacities", "colors")
@@ -93,22 +97,21 @@ class DirectAnchors:
         self.columns = [p.detach() for p in self.params]
         given = {**weights, "color": fold(weights["color"], self.codes.table[0])} if self.codes else weights
         with_dist = {a: a in config.add_dist for a in ATTRIBUTES}
-        self.nets = fused.KernelNetworks(given, with_dist, config.F, config.K, constant=not load)
-        self.weights = [getattr(weights[a], name).detach() for a in ATTRIBUTES for name in fused.NETWORK]
+        self.nets = KernelNetworks(given, with_dist, config.F, config.K, constant=not load)
+        self.weights = [getattr(weights[a], name).detach() for a in ATTRIBUTES for name in NETWORK]
         self.routers = [getattr(weights[a], name) for a in ATTRIBUTES for name in ("router_w", "router_b")]
         shapes = [tuple(p.shape) for p in self.params]
-        self.slopes, self.into = allocate(self.columns[0], shapes)
+        self.gradients, self.into = allocate(self.columns[0], shapes)
         self.flat = self.columns[0].new_zeros(self.nets.width)  # apart: the gradients of networks outlive the columns
-        self.grads: list[tuple[nn.Parameter, Tensor]] = list(zip(self.params, self.into))
-        self.larger: list[Tensor] = []  # gradients of parameters of which the kernels take a part
         self.moves: tuple[list[Tensor], list[Tensor]] = [], []  # their parts, and where the kernels write these
-        self._place(weights)
-        self.kept: tuple[Any, fused.RoutingArrays] | None = None  # routing of the table that nothing trains
+        self.grads = ReusedGradients([*zip(self.params, self.into), *self._place(weights)])
+        self.kept: tuple[Any, RoutingArrays] | None = None  # routing of the table that nothing trains
 
-    def _place(self, weights: dict[str, HeadWeights]) -> None:
-        """Find the gradient of each parameter of the networks."""
+    def _place(self, weights: dict[str, HeadWeights]) -> list[tuple[nn.Parameter, Tensor]]:
+        """Return each parameter of the networks with the tensor of its gradient."""
+        found: list[tuple[nn.Parameter, Tensor]] = []
         parts = iter(self.nets.split(self.flat))
-        given = [(getattr(weights[a], name), next(parts)) for a in ATTRIBUTES for name in fused.NETWORK]
+        given = [(getattr(weights[a], name), next(parts)) for a in ATTRIBUTES for name in NETWORK]
         given += [(t, next(parts)) for t in self.routers if t is not None]
         folded = (self.color.w1, self.color.b1) if self.codes else ()
         self.folded = [part for t, part in given if any(t is f for f in folded)]
@@ -120,7 +123,7 @@ class DirectAnchors:
             if not own.parameter.requires_grad and not changed:
                 continue
             if own.whole and not changed:
-                self.grads.append((own.parameter, part))
+                found.append((own.parameter, part))
                 continue
             whole[own.parameter] = torch.zeros_like(own.parameter)
             if not changed:
@@ -129,17 +132,16 @@ class DirectAnchors:
         if self.codes:
             self.unfolded = [self._part(t, whole) for t in folded]
             whole[self.codes.table] = self.d_codes = torch.zeros_like(self.codes.table)
-        self.grads += whole.items()
-        self.larger = list(whole.values())
+        return [*found, *whole.items()]
 
     def _part(self, tensor: Tensor, whole: dict[nn.Parameter, Tensor]) -> Tensor:
         own = Own.of(tensor)
         assert own is not None
         return own.of_whole(whole[own.parameter])
 
-    def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, PullScene]:
+    def draw(self, camera: Camera, step: int, cull: Cull) -> tuple[Decoded, BackwardScene]:
         """Decode a training view, as `AnchorScene.forward` in `Mode.TRAIN`. Returns it with the
-        function that adds the slopes of the parameters to their `grad`. Both run without autograd's
+        function that adds the gradients of the parameters to their `grad`. Both run without autograd's
         recording."""
         scene, weights, code = self.scene, self.weights, None
         rows, seen_from = scene.choose(camera, step, Mode.TRAIN, cull)
@@ -149,42 +151,39 @@ class DirectAnchors:
             weights = [*weights[:8], color.w1.contiguous(), color.b1.contiguous(), *weights[10:]]
         xyz = scene.table.facts["xyz"]
         position = seen_from.position.to(xyz.device)
-        view = fused.AnchorView(self.nets, rows, xyz, position, self.columns, weights, self.routers, scene.extent)
-        drawn = fused.draw(view, self._route(view))
+        view = AnchorView(self.nets, rows, xyz, position, self.columns, weights, self.routers, scene.extent)
+        drawn = draw_anchors(view, self._route(view))
         decoded = Decoded(drawn.gaussians, rows, drawn.raw, LazyMapping(self._routing_of(drawn, step)))
         shown, graph = self._finish(decoded, camera, step)
 
-        def pull(slopes: GaussianSlopes, terms: Regularisers) -> None:
-            for parameter, gradient in self.grads:  # of an earlier view of the batch
-                if parameter.grad is gradient:
-                    parameter.grad = gradient.clone()
-            self.slopes.zero_()
-            self._pull(drawn, shown, graph, slopes, terms)
+        def backward(gradients: GaussianGradients, terms: Regularisers) -> None:
+            self.grads.release()
+            self.gradients.zero_()
+            self._backward(drawn, shown, graph, gradients, terms)
             if self.moves[0]:
                 torch._foreach_copy_(*self.moves)  # pyright: ignore[reportPrivateImportUsage]
             if code is not None:
                 self._unfold(camera, code)
-            for parameter, gradient in self.grads:
-                parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+            self.grads.add()
 
-        return shown, pull
+        return shown, backward
 
-    def _route(self, view: fused.AnchorView) -> fused.RoutingArrays:
+    def _route(self, view: AnchorView) -> RoutingArrays:
         """Return the routing. Where nothing trains it, it is that of the whole table, made once."""
         nets = self.nets
         learned = any(t is not None and t.requires_grad for t in self.routers)
-        if learned or not nets.routed or any(nets.heads[i].kind != fused.LOCAL for i in nets.routed):
-            return fused.route(view)
+        if learned or not nets.routed or any(nets.heads[i].kind != LOCAL for i in nets.routed):
+            return route(view)
         key = [t._version for t in self.routers if t is not None]
         if self.kept is None or self.kept[0] != key:
             everyone = torch.arange(len(view.xyz), device=view.xyz.device)
-            made = fused.route(replace(view, rows=everyone))
-            self.kept = key, fused.RoutingArrays(made.stride, by_row=True, keys=made.keys)
+            made = route(replace(view, rows=everyone))
+            self.kept = key, RoutingArrays(made.stride, by_row=True, keys=made.keys)
         return self.kept[1]
 
-    def _routing_of(self, drawn: fused.DrawnView, step: int) -> Callable[[], dict[str, Routing]]:
+    def _routing_of(self, drawn: DrawnView, step: int) -> Callable[[], dict[str, Routing]]:
         """Return a function that finds the routing of the anchors as the scene's own decode gives
-        it. It keeps no slopes alive."""
+        it. It keeps no gradients alive."""
         nets, view, arrays, heads = self.nets, drawn.view, drawn.routed, self.scene.heads
         routed = {ATTRIBUTES[i]: i for i in nets.routed}
 
@@ -214,17 +213,17 @@ class DirectAnchors:
         shown = replace(out, gaussians=replace(out.gaussians, **made), raw_opacity=ends[-1].detach())
         return shown, ([*leaves.values(), raw], ends)
 
-    def _pull(
+    def _backward(
         self,
-        drawn: fused.DrawnView,
+        drawn: DrawnView,
         shown: Decoded,
         graph: tuple[list[Tensor], list[Tensor]] | None,
-        slopes: GaussianSlopes,
+        gradients: GaussianGradients,
         terms: Regularisers,
     ) -> None:
         A, M = len(drawn.view.rows), len(shown.gaussians)
         volume, hinge = terms.volume / max(M, 1), terms.hinge / max(A * self.nets.K, 1)
-        given, raw = [slopes.means, slopes.quats, slopes.scales, slopes.opacities, slopes.colors], None
+        given, raw = [gradients.means, gradients.quats, gradients.scales, gradients.opacities, gradients.colors], None
         if graph is not None:
             leaves, ends = graph
             sizes, below = shown.gaussians.scales, shown.raw_opacity
@@ -235,12 +234,12 @@ class DirectAnchors:
             found = torch.autograd.grad(ends, leaves, up, allow_unused=True)
             *given, raw = [torch.zeros_like(t) if f is None else f.contiguous() for t, f in zip(leaves, found)]
             volume = hinge = 0.0
-        shared = fused.find_load_slopes(drawn, terms.load) if terms.load and self.nets.groups else None
-        made = fused.Slopes(*given, raw=raw, volume=volume, hinge=hinge, tau=float(terms.tau), shared_gates=shared)
-        fused.pull_back(drawn, made, self.into, self.flat)
+        shared = find_load_gradients(drawn.view, drawn.routed, terms.load) if terms.load and self.nets.groups else None
+        made = DecodeGradients(*given, raw=raw, volume=volume, hinge=hinge, tau=float(terms.tau), shared_gates=shared)
+        decode_backward(drawn, made, self.into, self.flat)
 
     def _unfold(self, camera: Camera, code: Tensor) -> None:
-        """Turn the slopes of the folded first layer of the colour into those of its weights, its
+        """Turn the gradients of the folded first layer of the colour into those of its weights, its
         bias and the codes."""
         assert self.codes is not None
         (d_w1, d_b1), (to_w1, to_b1), D = self.folded, self.unfolded, self.folded[0].shape[2]

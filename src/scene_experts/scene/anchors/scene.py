@@ -39,6 +39,7 @@ from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, Attribute, Decoder, Head, HeadWeights, Plain
 from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, drop_masked, fade_opacities, visible_rows
 from scene_experts.scene.anchors.smoothing import find_intervals, smooth
+from scene_experts.scene.anchors.triton_networks import covers
 
 log: logging.Logger = logging.getLogger(__name__)
 NEARLY_ALL = 0.95  # the lattice has almost no effect if this share of the points is alone in its voxel
@@ -351,7 +352,7 @@ class AnchorScene(LatticeScene):
             return f"tensors of {feature.dtype}"
         if not feature.is_cuda:
             return ""
-        wide = [a for a, w in weights.items() if not triton_decode.covers(a, w, self.config.F, self.K)]
+        wide = [a for a, w in weights.items() if not covers(a, w, self.config.F, self.K)]
         if len({w.w1.shape[1] for w in weights.values()}) > 1:
             return "networks of several widths"
         return f"networks of {wide[0]} that are too deep or too wide for the kernels" if wide else ""

@@ -13,7 +13,7 @@ product computes the first layer and one its gradient. A network that does not s
 Heads are numbered 0 opacity, 1 covariance, 2 colour. The kinds of a head are PLAIN (one network),
 DENSE (all experts, with weights), SPARSE (the experts whose bits are set in a key, with weights)
 and LOCAL (one expert, with weight 1). Arrays of routing hold those of all heads: head h has its
-order and keys at h * stride, and its weights, gates and slopes of logits at h * stride * EM, where
+order and keys at h * stride, and its weights, gates and gradients of logits at h * stride * EM, where
 EM is the largest number of experts. BY_ROW: keys and weights are those of the rows of the table,
 not of the anchors of the view. `dst` [A * K] is the index of each slot among the drawn Gaussians, or
 -1 if the slot is not drawn.
@@ -47,7 +47,7 @@ def activate(y, ACT: tl.constexpr):
 
 
 @triton.jit
-def slope(a, ACT: tl.constexpr):
+def derivative(a, ACT: tl.constexpr):
     """Derivative of the activation, computed from its value `a`."""
     if ACT == 0:
         return 1.0 - a * a
@@ -207,17 +207,17 @@ def shape_and_color_forward(
 
 
 @triton.jit
-def slopes_of_block(
+def gradients_of_block(
     dx, x, anchor, key, inside, weight, gates, router, w1, b1, w2, b2, dst, d_out, d_gates, d_logits,
     E: tl.constexpr, KIND: tl.constexpr, DISTANCE: tl.constexpr, WITH_GATES: tl.constexpr, OUTSIDE: tl.constexpr, POSITION: tl.constexpr,
     F: tl.constexpr, H: tl.constexpr, K: tl.constexpr, C: tl.constexpr, ACT: tl.constexpr, COMPACT: tl.constexpr,
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, EP: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Return `dx` [B, XP] plus the slopes of the inputs through one head. Write those of the logits
+    """Return `dx` [B, XP] plus the gradients of the inputs through one head. Write those of the logits
     [A, E].
 
-    OUTSIDE: the mixture weights are given. Their slopes take the place of those of the logits, and
-    there is no router. WITH_GATES: `d_gates` are slopes of the gates, [A, E] (1) or the same [E] for
+    OUTSIDE: the mixture weights are given. Their gradients take the place of those of the logits, and
+    there is no router. WITH_GATES: `d_gates` are gradients of the gates, [A, E] (1) or the same [E] for
     every anchor (2).
     """
     at, there = outputs(dst, anchor, inside, K, C, COLS, COMPACT)
@@ -235,7 +235,7 @@ def slopes_of_block(
             if KIND == 1 or KIND == 2:
                 d_weight = tl.where((expert == e) & mine[:, None], tl.sum(back * a, axis=1)[:, None], d_weight)
                 back = back * tl.load(weight + anchor * E + e, mask=mine, other=0.0)[:, None]
-            dh = tl.dot(back * slope(a, ACT), tl.trans(w), input_precision=PRECISION)
+            dh = tl.dot(back * derivative(a, ACT), tl.trans(w), input_precision=PRECISION)
             dx += tl.dot(tl.where(h > 0, dh, 0.0), tl.trans(first), input_precision=PRECISION)
     if KIND == 1 or KIND == 2:
         real = inside[:, None] & (expert < E)
@@ -272,8 +272,8 @@ def heads_backward(
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, OC: tl.constexpr, CC: tl.constexpr, RC: tl.constexpr, EP: tl.constexpr,
     PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Write the slopes of the features [N, F] through the heads whose bits are set in HEADS, and
-    those of the logits. Grid: blocks. ADD: add to the slopes that are there.
+    """Write the gradients of the features [N, F] through the heads whose bits are set in HEADS, and
+    those of the logits. Grid: blocks. ADD: add to the gradients that are there.
 
     Several heads share one pass where their anchors have the same order, at `order`, or none
     (ORDERED).
@@ -291,7 +291,7 @@ def heads_backward(
     if (HEADS & 1) != 0:
         key = tl.load(keys + at, mask=inside, other=0) if OKIND >= 2 else anchor.to(tl.int32)
         d_gates = d_gates0
-        dx = slopes_of_block(
+        dx = gradients_of_block(
             dx, x, anchor, key, inside, weight, gates,
             router0, ow1, ob1, ow2, ob2, dst, d_raw, d_gates, d_logits,
             OE, OKIND, ODISTANCE, WITH_GATES, OOUT, OPOS, F, H, K, 1, 0, False, B, XP, HP, OC, EP, PRECISION,
@@ -299,7 +299,7 @@ def heads_backward(
     if (HEADS & 2) != 0:
         key = tl.load(keys + stride + at, mask=inside, other=0) if CKIND >= 2 else anchor.to(tl.int32)
         d_gates = d_gates0 + EM if WITH_GATES == 2 else d_gates1
-        dx = slopes_of_block(
+        dx = gradients_of_block(
             dx, x, anchor, key, inside, weight + stride * EM, gates + stride * EM,
             router1, cw1, cb1, cw2, cb2, dst, d_cov, d_gates, d_logits + stride * EM,
             CE, CKIND, CDISTANCE, WITH_GATES, COUT, CPOS, F, H, K, 7, 1, True, B, XP, HP, CC, EP, PRECISION,
@@ -307,7 +307,7 @@ def heads_backward(
     if (HEADS & 4) != 0:
         key = tl.load(keys + 2 * stride + at, mask=inside, other=0) if RKIND >= 2 else anchor.to(tl.int32)
         d_gates = d_gates0 + 2 * EM if WITH_GATES == 2 else d_gates2
-        dx = slopes_of_block(
+        dx = gradients_of_block(
             dx, x, anchor, key, inside, weight + 2 * stride * EM, gates + 2 * stride * EM,
             router2, rw1, rb1, rw2, rb2, dst, d_colors, d_gates, d_logits + 2 * stride * EM,
             RE, RKIND, RDISTANCE, WITH_GATES, ROUT, RPOS, F, H, K, 3, 2, True, B, XP, HP, RC, EP, PRECISION,
@@ -326,7 +326,7 @@ def sum_weights(
     F: tl.constexpr, H: tl.constexpr, K: tl.constexpr, C: tl.constexpr, ACT: tl.constexpr, COMPACT: tl.constexpr,
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, COLS: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Sum the weight slopes of expert e over every P-th block. Write them to `to`: w1 [E, H, D], b1
+    """Sum the weight gradients of expert e over every P-th block. Write them to `to`: w1 [E, H, D], b1
     [E, H], w2 [E, K C, H], b2 [E, K C], one after the other."""
     e, part = tl.program_id(0), tl.program_id(1)
     D: tl.constexpr = F + 3 + DISTANCE
@@ -345,7 +345,7 @@ def sum_weights(
             back = tl.load(d_out + at, mask=there, other=0.0)
             if KIND == 1 or KIND == 2:
                 back = back * tl.load(weight + anchor * E + e, mask=mine, other=0.0)[:, None]
-            back = back * slope(a, ACT)
+            back = back * derivative(a, ACT)
             sum_b += tl.sum(back, axis=0)
             sum2 += tl.dot(tl.trans(h), back, input_precision=PRECISION)
             dh = tl.dot(back, tl.trans(w), input_precision=PRECISION)
@@ -371,7 +371,7 @@ def heads_weights(
     C_AT: tl.constexpr, R_AT: tl.constexpr, WIDTH: tl.constexpr, F: tl.constexpr, H: tl.constexpr, K: tl.constexpr,
     B: tl.constexpr, XP: tl.constexpr, HP: tl.constexpr, OC: tl.constexpr, CC: tl.constexpr, RC: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Write part p of the weight slopes of all heads to row p of `parts` [P, WIDTH]: those of the
+    """Write part p of the weight gradients of all heads to row p of `parts` [P, WIDTH]: those of the
     covariance begin at C_AT, those of the colour at R_AT. Grid: EM, P, 3."""
     stride = stride.to(tl.int64)
     e, head = tl.program_id(0), tl.program_id(2)

@@ -7,7 +7,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from scene_experts.scene.anchors.triton_kernels import EPS, activate
+from scene_experts.geometry.triton_rotation import write_unit, write_unit_backward
+from scene_experts.scene.anchors.triton_kernels import activate
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -44,13 +45,7 @@ def place(
         centre = tl.load(xyz + row * 3 + c, mask=inside, other=0.0)
         tl.store(means + d * 3 + c, centre[:, None] + offset * size[:, None], mask=drawn)
         tl.store(scales + d * 3 + c, bound[:, None] * activate(tl.load(cov + d * 7 + c, mask=drawn, other=0.0), 2), mask=drawn)
-    length = tl.zeros((B, KP), tl.float32)
-    for c in tl.static_range(4):
-        q = tl.load(cov + d * 7 + 3 + c, mask=drawn, other=1.0)
-        length += q * q
-    length = tl.maximum(tl.sqrt_rn(length), EPS)
-    for c in tl.static_range(4):
-        tl.store(quats + d * 4 + c, tl.load(cov + d * 7 + 3 + c, mask=drawn, other=0.0) / length, mask=drawn)
+    write_unit(cov + d * 7 + 3, quats + d * 4, drawn)
 
 
 @triton.jit(do_not_specialize=["A"])
@@ -59,10 +54,10 @@ def place_backward(
     d_offsets, d_log_scaling, d_cov, d_opacity_head, A, volume, hinge, tau,
     RAW: tl.constexpr, TERMS: tl.constexpr, K: tl.constexpr, B: tl.constexpr, KP: tl.constexpr,
 ):  # fmt: skip
-    """Compute the slopes of offsets, log-scaling, `cov` [M, 7] and the opacities [A, K] of all
+    """Compute the gradients of offsets, log-scaling, `cov` [M, 7] and the opacities [A, K] of all
     slots from those of the Gaussians.
 
-    RAW: with slopes `d_raw` [A, K] of the opacities. TERMS: add those of two terms of the loss,
+    RAW: with gradients `d_raw` [A, K] of the opacities. TERMS: add those of two terms of the loss,
     `volume` times the sum of the Gaussians' volumes, and `hinge` times the sum of max(0, tau - raw).
     """
     anchor = tl.program_id(0) * B + tl.arange(0, B)
@@ -94,15 +89,4 @@ def place_backward(
         d_log = d_scale * bound[:, None] * part
         tl.store(d_log_scaling + row * 6 + 3 + c, tl.sum(d_log, axis=1), mask=inside)
         tl.store(d_cov + d * 7 + c, d_log * (1.0 - part), mask=drawn)
-    length, along = tl.zeros((B, KP), tl.float32), tl.zeros((B, KP), tl.float32)
-    for c in tl.static_range(4):
-        q = tl.load(cov + d * 7 + 3 + c, mask=drawn, other=1.0)
-        length += q * q
-        along += tl.load(quats + d * 4 + c, mask=drawn, other=0.0) * tl.load(d_quats + d * 4 + c, mask=drawn, other=0.0)
-    length = tl.sqrt_rn(length)
-    along = tl.where(length > EPS, along, 0.0)
-    length = tl.maximum(length, EPS)
-    for c in tl.static_range(4):
-        q = tl.load(quats + d * 4 + c, mask=drawn, other=0.0)
-        d_q = tl.load(d_quats + d * 4 + c, mask=drawn, other=0.0)
-        tl.store(d_cov + d * 7 + 3 + c, (d_q - q * along) / length, mask=drawn)
+    write_unit_backward(cov + d * 7 + 3, quats + d * 4, d_quats + d * 4, d_cov + d * 7 + 3, drawn)

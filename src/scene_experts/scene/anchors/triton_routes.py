@@ -1,6 +1,6 @@
 # pyright: basic, reportMissingImports=false
 """Triton kernels of the routing in the CUDA decode: gates, chosen experts, the order of the anchors
-and the slopes of the routers. `triton_decode` calls them.
+and the gradients of the routers. `triton_decode` calls them.
 
 Arrays of routing hold those of all three heads, as in `triton_kernels`: head h has its gates and
 weights at h * stride * EM, its chosen experts at h * stride * TOP, and its keys and order at
@@ -135,7 +135,7 @@ def router_weights(
     POSITION: tl.constexpr, F: tl.constexpr, E: tl.constexpr, EM: tl.constexpr,
     B: tl.constexpr, RP: tl.constexpr, EP: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Write part p of the slopes of the routers, w [E, R] and then b [E], to row p of `parts` [P,
+    """Write part p of the gradients of the routers, w [E, R] and then b [E], to row p of `parts` [P,
     WIDTH], those of head h from AT_h on. Grid: P, 3."""
     part, head = tl.program_id(0), tl.program_id(1)
     if ((HEADS >> head) & 1) != 0:
@@ -164,11 +164,11 @@ def router_weights(
 
 
 @triton.jit(do_not_specialize=["A", "stride", "blocks"])
-def load_slopes(
+def load_gradients(
     gates, keys, parts, A, stride, blocks, factor,
     E: tl.constexpr, EM: tl.constexpr, HEADS: tl.constexpr, SPARSE: tl.constexpr, B: tl.constexpr, EP: tl.constexpr,
 ):  # fmt: skip
-    """Write part p of the slopes of the load-balancing loss to row p of `parts` [P, 3, EM]:
+    """Write part p of the gradients of the load-balancing loss to row p of `parts` [P, 3, EM]:
     `factor` times how many anchors chose an expert (SPARSE), or times the sum of its gates. Grid:
     P, 3."""
     part, head = tl.program_id(0), tl.program_id(1)

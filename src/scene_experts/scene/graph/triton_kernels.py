@@ -16,6 +16,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from scene_experts.geometry.triton_rotation import write_unit, write_unit_backward
+
 EPS = tl.constexpr(1e-12)  # equals EPS of scene.py
 
 
@@ -311,13 +313,7 @@ def place_points(
         tl.store(means + at * 3 + c, mean, mask=inside)
         tl.store(scales + at * 3 + c, bound * sigmoid(tl.load(shape + at * 7 + c, mask=inside, other=0.0)), mask=inside)
         tl.store(colors + at * 3 + c, sigmoid(tl.load(color + at * 3 + c, mask=inside, other=0.0)), mask=inside)
-    length = tl.zeros((B,), tl.float32)
-    for c in tl.static_range(4):
-        q = tl.load(shape + at * 7 + 3 + c, mask=inside, other=1.0)
-        length += q * q
-    length = tl.maximum(tl.sqrt_rn(length), EPS)
-    for c in tl.static_range(4):
-        tl.store(quats + at * 4 + c, tl.load(shape + at * 7 + 3 + c, mask=inside, other=0.0) / length, mask=inside)
+    write_unit(shape + at * 7 + 3, quats + at * 4, inside)
 
 
 @triton.jit(do_not_specialize=["M"])
@@ -343,15 +339,4 @@ def place_points_backward(
         tl.store(d_shape + at * 7 + c, grown * (1.0 - part), mask=inside)
         value = tl.load(colors + at * 3 + c, mask=inside, other=0.0)
         tl.store(d_color + at * 3 + c, tl.load(d_colors + at * 3 + c, mask=inside, other=0.0) * value * (1.0 - value), mask=inside)
-    length, along = tl.zeros((B,), tl.float32), tl.zeros((B,), tl.float32)
-    for c in tl.static_range(4):
-        q = tl.load(shape + at * 7 + 3 + c, mask=inside, other=1.0)
-        length += q * q
-        along += tl.load(quats + at * 4 + c, mask=inside, other=0.0) * tl.load(d_quats + at * 4 + c, mask=inside, other=0.0)
-    length = tl.sqrt_rn(length)
-    along = tl.where(length > EPS, along, 0.0)
-    length = tl.maximum(length, EPS)
-    for c in tl.static_range(4):
-        q = tl.load(quats + at * 4 + c, mask=inside, other=0.0)
-        turned = tl.load(d_quats + at * 4 + c, mask=inside, other=0.0) - q * along
-        tl.store(d_shape + at * 7 + 3 + c, turned / length, mask=inside)
+    write_unit_backward(shape + at * 7 + 3, quats + at * 4, d_quats + at * 4, d_shape + at * 7 + 3, inside)

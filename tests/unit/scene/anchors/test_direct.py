@@ -58,7 +58,7 @@ def test_parts_of_parameters_get_the_gradient_of_the_whole():
     assert alone.nets.EM == 1 and placed.nets.EM == 3
     for made in (alone, placed):
         shapes = {id(p): p.shape for p in scene.parameters() if p.requires_grad}
-        assert {id(p): g.shape for p, g in made.grads} == shapes
+        assert {id(p): g.shape for p, g in made.grads.pairs} == shapes
     assert len(alone.moves[0]) == 12 and not placed.moves[0]
 
 

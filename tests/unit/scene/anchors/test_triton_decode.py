@@ -8,12 +8,12 @@ import torch
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Gaussians, Routing
 from scene_experts.native.triton import explain_missing
-from scene_experts.scene.anchors import native_decode, triton_decode
+from scene_experts.scene.anchors import native_decode, triton_decode, triton_networks
 from scene_experts.scene.anchors import scene as anchors
 from scene_experts.scene.anchors.experts import Experts
-from scene_experts.scene.anchors.mlp import NOT_ROUTED, HeadWeights, Plain
+from scene_experts.scene.anchors.mlp import NOT_ROUTED, Plain
 from scene_experts.scene.anchors.routers import Linear
-from scene_experts.scene.anchors.scene import ATTRIBUTES, Anchors, AnchorScene
+from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 from support.decoding import CASES, EXTENT, OUTSIDE, compare, leaves, objective, oracle, problem, single_precision, without_routers
 from support.interpret import DEVICE, kernels
 from support.messages import naming
@@ -31,7 +31,7 @@ PARTS = ("means", "quats", "scales", "opacities", "colors")
 def triton():
     with pytest.MonkeyPatch.context() as patch:
         if DEVICE == "cpu":
-            patch.setattr(triton_decode, "BLOCK_WEIGHTS", 32)  # fewer programs to interpret
+            patch.setattr(triton_networks, "BLOCK_WEIGHTS", 32)  # fewer programs to interpret
         yield kernels()
 
 
@@ -190,7 +190,7 @@ def test_without_gradients():
 
 @pytest.mark.usefixtures("triton")
 def test_the_tf32_forms_are_a_choice(monkeypatch):
-    monkeypatch.setattr(triton_decode, "PRECISION", "tf32x3")  # the interpreter accepts it and computes in float32
+    monkeypatch.setattr(triton_networks, "PRECISION", "tf32x3")  # the interpreter accepts it and computes in float32
     data = problem(A=20)
     exact = oracle(*data)[0]
     compare(run(*data)[0].colors, exact.colors, 1e-4, "colors")
@@ -204,19 +204,11 @@ def test_what_does_not_fit_is_refused_or_left_to_torch():
         triton_decode.decode(rows, *c, camera.float(), heads, with_dist | {"color": True})
     with pytest.raises(ValueError, match=naming("cov", 3, 4)):
         triton_decode.decode(rows, *c, camera.float(), heads | {"cov": replace(heads["cov"], k=4)}, with_dist)
-    assert all(triton_decode.covers(a, heads[a], 8, 4) for a in ATTRIBUTES)
     deep = replace(heads["cov"], middle_w=torch.zeros(3, 1, 16, 16), middle_b=torch.zeros(3, 1, 16))
-    assert not triton_decode.covers("cov", deep, 8, 4)
     with pytest.raises(ValueError, match=naming("cov", 3)):
         triton_decode.decode(rows, *c, camera.float(), heads | {"cov": deep}, with_dist)
     with pytest.raises(ValueError, match=naming("cov", 11, 8)):
         triton_decode.decode(rows, *c, camera.float(), heads | {"cov": replace(heads["cov"], position=True)}, with_dist)
-    wide = HeadWeights(None, None, torch.zeros(1, 200, 35), torch.zeros(1, 200), torch.zeros(1, 70, 200), torch.zeros(1, 70), None)
-    assert not triton_decode.covers("cov", wide, 32, 10)
-
-
-def test_tiles_are_powers_of_two():
-    assert [triton_decode.pad(n) for n in (1, 16, 17, 36, 70)] == [16, 16, 32, 64, 128] and triton_decode.pad(5, 1) == 8
 
 
 def scene(config: Anchors, n: int) -> AnchorScene:

@@ -1,54 +1,32 @@
-"""The order of anchors and the slopes of the load-balancing loss. test_triton_decode.py has gates, choices and routers."""
+"""The counts of keys, and whether the kernels compile. test_triton_routing.py has what they compute together."""
 
 import pytest
 import torch
 
-from scene_experts.core.types import Routing
-from scene_experts.scene.anchors import triton_decode as fused
-from scene_experts.scene.anchors.mlp import ATTRIBUTES
-from scene_experts.training.losses import load
-from support.decoding import EXTENT, problem
-from support.interpret import DEVICE, kernels
+from support.interpret import DEVICE, compile_for_gpu, kernels
+
+MODULE = "scene_experts.scene.anchors.triton_routes"
+TYPES = {"rows": "*i64", "order": "*i32", "keys": "*i32", "chosen": "*i64", "counts": "*i32", "counted": "*i32"}
+TYPES |= {"A": "i32", "blocks": "i32", "stride": "i32", "to_stride": "i32"}
 
 
-def view_of(A=70, constant=False, **how):
-    kernels("scene_experts.scene.anchors.triton_routes")
-    rows, columns, camera, heads, with_dist = problem(A=A, N=100, **how)
-    nets = fused.KernelNetworks(heads, with_dist, 8, 4, constant)
-    on = lambda t: t.float().to(DEVICE)  # noqa: E731
-    given = [on(columns[name]) for name in ("feature", "log_scaling", "offsets")]
-    weights = [on(getattr(heads[a], name)) for a in ATTRIBUTES for name in fused.NETWORK]
-    routers = [None if t is None else on(t) for a in ATTRIBUTES for t in (heads[a].router_w, heads[a].router_b)]
-    return fused.AnchorView(nets, rows.to(DEVICE), on(columns["xyz"]), on(camera), given, weights, routers, EXTENT)
+def test_the_keys_of_each_block_are_counted():
+    keys = torch.tensor([3, 1, 1, 0, 7, 3, 3, 2, 5, 5], dtype=torch.int32, device=DEVICE)
+    rows = torch.tensor([9, 0, 1, 2, 3, 5], device=DEVICE)
+    counts = torch.full((3, 8, 2), -1, dtype=torch.int32, device=DEVICE)
+    kernels(MODULE).count_keys[(2, 3)](rows, keys, counts, 6, 0, 2, HEADS=1, BY_ROW=True, BINS=8, B=4)
+    expected = [torch.bincount(keys[rows[part]], minlength=8) for part in (slice(0, 4), slice(4, 6))]
+    assert torch.equal(counts[0].cpu(), torch.stack(expected, 1).cpu().int()) and (counts[1:] == -1).all()
 
 
-@pytest.mark.parametrize("how", [{"E": 5, "k": 2}, {"E": 7, "k": 3}, {"E": 3, "k": (2, 0, 1)}, {"E": 5, "k": 1, "constant": True}])
-@pytest.mark.parametrize("by_row", [False, True])
-def test_anchors_are_sorted_by_their_keys_and_else_stay_in_their_order(how, by_row):
-    view = view_of(**how)
-    nets, A, N = view.nets, len(view.rows), len(view.xyz)
-    routed = fused.route(view)
-    own = [routed.keys[i * routed.stride :][:A] for i in range(3)]
-    if by_row:
-        whole = torch.zeros(3, 112, dtype=torch.int32, device=DEVICE)
-        for i in nets.ordered:
-            whole[i, view.rows] = own[i]
-        routed = fused.RoutingArrays(112, True, keys=whole.view(-1))
-    order = fused.arrange(view, routed)
-    for place, i in enumerate(nets.sorted):
-        at = 0 if nets.one_order else i * routed.stride
-        assert order[at : at + A].tolist() == own[i].argsort(stable=True).tolist(), (place, N)
-
-
-@pytest.mark.parametrize("how", [{"E": 5, "k": 2}, {"E": 4, "k": None}, {"E": 3, "k": (2, 0, None)}])
-def test_slopes_of_the_load_are_those_of_its_equations(how):
-    view = view_of(**how)
-    drawn = fused.draw(view, fused.route(view))
-    found = fused.find_load_slopes(drawn, 0.3)
-    for i, h in enumerate(view.nets.heads):
-        if h.kind == fused.PLAIN:
-            continue
-        gates, chosen = drawn.routed.part(view.nets, i, len(view.rows))
-        leaf = gates.double().requires_grad_()
-        (0.3 * load({"it": Routing(leaf, chosen)})).backward()
-        torch.testing.assert_close(found[i, : h.E].double().expand_as(leaf), leaf.grad, rtol=1e-5, atol=1e-9)
+@pytest.mark.slow
+@pytest.mark.parametrize("target", [80, 90])
+def test_they_compile(target):
+    of = {"E": 3, "EM": 3, "F": 8, "BIAS": True, "POSITION": True, "EP": 16, "PRECISION": "ieee"}
+    sort = {"HEADS": 7, "BINS": 8, "B": 16}
+    named = {"route": {**of, **sort, "TOP": 2, "FP": 16}, "count_keys": {**sort, "BY_ROW": True}, "arrange": {**sort, "BY_ROW": False}}
+    named["load_gradients"] = {"E": 3, "EM": 3, "HEADS": 7, "SPARSE": True, "B": 16, "EP": 16}
+    named["router_weights"] = {**of, "HEADS": 7, "AT0": 0, "AT1": 10, "AT2": 20, "WIDTH": 30, "B": 16, "RP": 16}
+    for name, sizes in named.items():
+        types = {p: TYPES.get(p, "*fp32") for p in getattr(kernels(MODULE), name).arg_names if p not in ("extent", "factor")}
+        compile_for_gpu(MODULE, name, types, sizes, target)
